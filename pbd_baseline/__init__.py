@@ -1,0 +1,1 @@
+"""Mesh-based PBD muscles: the baseline that RBF muscles are compared with."""

@@ -1,0 +1,39 @@
+"""Muscles as implicit RBF surfaces that move with the bones.
+
+Public names are loaded when first used, so that ``import rbfmuscle`` stays light.
+"""
+
+import importlib
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "BoneSDF": "rbfmuscle.sim.sdf",
+    "LimitExceededError": "rbfmuscle.validation",
+    "MeshError": "rbfmuscle.validation",
+    "MissingPartError": "rbfmuscle.validation",
+    "NumericalWarning": "rbfmuscle.validation",
+    "RBFField": "rbfmuscle.implicit.field",
+    "RBFMuscle": "rbfmuscle.muscle",
+    "RBFMuscleError": "rbfmuscle.validation",
+    "Run": "rbfmuscle.run",
+    "Scene": "rbfmuscle.sim.scene",
+    "SceneError": "rbfmuscle.validation",
+    "SolveError": "rbfmuscle.validation",
+    "phantom_scene": "rbfmuscle.sim.phantom",
+    "simulate": "rbfmuscle.run",
+}
+
+__all__ = [*_HOME, "__version__"]  # noqa: PLE0604
+
+
+def __getattr__(name):
+    if name in _HOME:
+        value = getattr(importlib.import_module(_HOME[name]), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module 'rbfmuscle' has no attribute {name!r}")
+
+
+def __dir__():
+    return sorted(__all__)

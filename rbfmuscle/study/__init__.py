@@ -1,0 +1,1 @@
+"""Measures and shows; changes nothing."""

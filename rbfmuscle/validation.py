@@ -1,0 +1,127 @@
+"""Checks at the public edges, and the errors that the command line turns into exit codes.
+
+The one module that every room may import; it imports nothing of ours.
+"""
+
+import numpy as np
+
+
+class RBFMuscleError(Exception):
+    """Base of the errors meant for users: one line that names file, object, value and remedy."""
+
+    exit_code = 1
+
+
+class UsageError(RBFMuscleError, ValueError):
+    """The call itself is wrong (exit code 2)."""
+
+    exit_code = 2
+
+
+class SceneError(RBFMuscleError, ValueError):
+    """The scene file, or a name or number in it, is wrong (exit code 3)."""
+
+    exit_code = 3
+
+
+class MeshError(RBFMuscleError, ValueError):
+    """A mesh cannot be used (exit code 4)."""
+
+    exit_code = 4
+
+
+class SolveError(RBFMuscleError, RuntimeError):
+    """A frame could not be solved; frames so far are kept (exit code 5)."""
+
+    exit_code = 5
+
+
+class LimitExceededError(RBFMuscleError, RuntimeError):
+    """A limit given with ``--fail-on`` was exceeded (exit code 6)."""
+
+    exit_code = 6
+
+
+class MissingPartError(RBFMuscleError, ImportError):
+    """An optional part (graphics, an extra) is missing (exit code 7)."""
+
+    exit_code = 7
+
+
+class NumericalWarning(UserWarning):
+    """A result is usable but less accurate than asked; the message names the cause and the remedy."""
+
+
+def check_points(points, *, name="points"):
+    """Return points as a finite, C-contiguous (n, 3) float64 array.
+
+    Parameters
+    ----------
+    points : (n, 3) array_like
+    name : str
+        What the message calls them.
+
+    Raises
+    ------
+    ValueError
+        On any other shape, or on NaN or infinity.
+    """
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"{name} must have shape (n, 3), got {points.shape}")
+    check_finite(points, name=name)
+    return points
+
+
+def check_vectors(vectors, count, *, name="normals"):
+    """Return (count, 3) finite float64 vectors, one for each point."""
+    vectors = check_points(vectors, name=name)
+    if len(vectors) != count:
+        raise ValueError(f"{name} must have one row a point ({count}), got {len(vectors)}")
+    return vectors
+
+
+def check_values(values, count, *, name="values"):
+    """Return (count,) finite float64 values, one for each point."""
+    values = np.ascontiguousarray(values, dtype=np.float64)
+    if values.shape != (count,):
+        raise ValueError(f"{name} must have shape ({count},), got {values.shape}")
+    check_finite(values, name=name)
+    return values
+
+
+def check_finite(array, *, name):
+    """Raise ValueError naming the first row that holds NaN or infinity."""
+    if not np.isfinite(array).all():
+        row = int(np.argwhere(~np.isfinite(array))[0][0])
+        raise ValueError(f"{name} must be finite, row {row} is {array[row]}")
+
+
+def check_positive(value, *, name):
+    """Return value as a finite float above zero."""
+    value = float(value)
+    if not (np.isfinite(value) and value > 0):
+        raise ValueError(f"{name} must be a positive number, got {value}")
+    return value
+
+
+def check_mesh(vertices, faces, *, name="mesh"):
+    """Return ``(vertices, faces)`` as (n, 3) float64 and (m, 3) int64, indices in range.
+
+    Raises
+    ------
+    MeshError
+        If the mesh is empty, has non-finite vertices or indices out of range.
+    """
+    try:
+        vertices = check_points(vertices, name=f"vertices of {name}")
+    except ValueError as error:
+        raise MeshError(str(error)) from None
+    faces = np.ascontiguousarray(faces, dtype=np.int64)
+    if faces.ndim != 2 or faces.shape[1] != 3:
+        raise MeshError(f"faces of {name} must have shape (m, 3), got {faces.shape}")
+    if len(vertices) == 0 or len(faces) == 0:
+        raise MeshError(f"{name} is empty ({len(vertices)} vertices, {len(faces)} faces)")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise MeshError(f"faces of {name} point outside its {len(vertices)} vertices")
+    return vertices, faces
