@@ -1,0 +1,49 @@
+"""Model name -> model, loaded on demand: the only file that names both models."""
+
+import difflib
+import importlib
+
+from rbfmuscle.validation import UsageError
+
+# Name: module, class, options that the name itself stands for.
+_HOME = {
+    "rbf": ("rbfmuscle.muscle", "RBFMuscle", {}),
+    "pbd": ("pbd_baseline.muscle", "PBDMuscle", {"method": "pbd"}),
+    "xpbd": ("pbd_baseline.muscle", "PBDMuscle", {"method": "xpbd"}),
+    "arap-pbd": ("pbd_baseline.muscle", "PBDMuscle", {"method": "arap-pbd"}),
+    "arap-volume": ("pbd_baseline.muscle", "PBDMuscle", {"method": "arap-volume"}),
+    "arap-interleaved": ("pbd_baseline.muscle", "PBDMuscle", {"method": "arap-interleaved"}),
+}
+
+MODEL_NAMES = tuple(_HOME)
+
+
+def build_model(muscle, scene, name=None):
+    """Return the model of one muscle of a scene.
+
+    Parameters
+    ----------
+    muscle : Muscle
+    scene : Scene
+    name : str, optional
+        One of ``MODEL_NAMES``; the scene's own choice where not given. The options of the scene's model
+        table are for the class of models that it names, and are left out for another.
+
+    Raises
+    ------
+    UsageError
+        On an unknown name, with the nearest right one.
+    """
+    name = muscle.model if name is None else name
+    module, class_name, implied = _HOME[_check_name(name)]
+    same_class = _HOME[_check_name(muscle.model)][1] == class_name
+    options = {**(muscle.options if same_class else {}), **implied}
+    return getattr(importlib.import_module(module), class_name)(muscle, scene, **options)
+
+
+def _check_name(name):
+    if name in _HOME:
+        return name
+    near = difflib.get_close_matches(str(name).lower().replace("_", "-"), MODEL_NAMES, n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(MODEL_NAMES)}"
+    raise UsageError(f"unknown model {name!r}, {hint}")

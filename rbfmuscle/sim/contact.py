@@ -1,0 +1,216 @@
+"""Which points touch which obstacles, and the way out: contacts as half-spaces, several bones at once.
+
+Obstacles are the bones' distance fields, which stay in bone coordinates and are never rebuilt, and, where a scene
+asks for sliding, the surfaces of neighbouring muscles. Nothing here knows how a muscle is represented.
+"""
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from rbfmuscle.validation import check_points
+
+# Share of a queried distance that later calls may rely on: a field is exact near its bone and coarser far away.
+TRUSTED_SHARE = 0.8
+
+
+@dataclass(frozen=True)
+class HalfSpaces:
+    """Linearised contacts: a displacement ``dp`` of point ``index`` is admissible where ``gap + normal . dp >= 0``.
+
+    Attributes
+    ----------
+    index : (c,) ndarray of int
+        Contact point.
+    gap : (c,) ndarray
+        Signed distance now [scene unit]; negative is violated.
+    normal : (c, 3) ndarray
+        Unit direction of growing distance, world axes.
+    source : (c,) ndarray of int
+        Index of the bone, or ``-1 - k`` for sliding neighbour k.
+    """
+
+    index: np.ndarray
+    gap: np.ndarray
+    normal: np.ndarray
+    source: np.ndarray
+
+    def __len__(self):
+        return len(self.index)
+
+
+class BoneContacts:
+    """The obstacles of one muscle, in one pose.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Names of all bones of the scene.
+    fields : sequence of BoneSDF or None
+        One for each name; None where the muscle cannot reach the bone. Fields may be shared between muscles.
+    contact_bone : (n,) array_like of int, optional
+        Bone that contact point i is attached to, -1 where free. Attached points take no contact.
+    """
+
+    def __init__(self, names, fields, *, contact_bone=None):
+        if len(names) != len(fields):
+            raise ValueError(f"one field a bone is needed, got {len(fields)} for {len(names)} bones")
+        self.names = list(names)
+        self.fields = list(fields)
+        self.reached = [b for b, field in enumerate(self.fields) if field is not None]
+        self.contact_bone = None if contact_bone is None else np.asarray(contact_bone, dtype=np.int64)
+        self.poses = {name: np.eye(4) for name in self.names}
+        self.allowed = {}
+        self.neighbours = []
+        self._known = {}
+
+    def move(self, poses):
+        """Take the bones' poses, a dict of bone name to (4, 4) rest-to-world transform."""
+        missing = [self.names[b] for b in self.reached if self.names[b] not in poses]
+        if missing:
+            raise ValueError(f"poses lack the bone {missing[0]!r}")
+        self.poses = poses
+        self._known = {}
+
+    def allow(self, bone_index, depth):
+        """Let each contact point be up to ``depth`` (n,) inside a bone, [scene unit]; zeros take it back."""
+        if np.any(depth > 0.0):
+            self.allowed[bone_index] = np.array(depth, dtype=np.float64)
+        else:
+            self.allowed.pop(bone_index, None)
+        self._known = {}
+
+    def distance_and_direction(self, points, bone_index):
+        """Signed distance (n,) to one bone and the unit direction (n, 3) in which it grows, world axes."""
+        points = check_points(points)
+        return self._query(points, bone_index)
+
+    def nearest(self, points):
+        """Smallest distance over all bones and neighbours at any points: what an extracted surface is cut by.
+
+        Returns
+        -------
+        (n,) ndarray
+            [scene unit], negative inside a bone; infinity where no bone is in reach. Against a sliding neighbour it
+            is half the difference of the two muscles' distances, so that both are cut at the same surface.
+        """
+        points = check_points(points)
+        smallest = np.full(len(points), np.inf)
+        for b in self.reached:
+            np.minimum(
+                smallest, self.fields[b].distance(points, pose=self.poses[self.names[b]]), out=smallest
+            )
+        for neighbour in self.neighbours:
+            np.minimum(smallest, neighbour.cut(points), out=smallest)
+        return smallest
+
+    def query(self, points, reach):
+        """Contacts of each bone: a list, one entry a bone, of ``(index, distance, direction)``."""
+        points = check_points(points)
+        free = self._free(len(points))
+        empty = (np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)))
+        found = [empty] * len(self.names)
+        for b in self.reached:
+            near = self._near(points, free, b, float(reach))
+            if len(near) == 0:
+                continue
+            distance, direction = self._query(points[near], b)
+            self._remember(points, near, distance, b)
+            if b in self.allowed and len(self.allowed[b]) == len(points):
+                distance = distance + self.allowed[b][near]
+            keep = distance < reach
+            found[b] = (near[keep], distance[keep], direction[keep])
+        return found
+
+    def half_spaces(self, points, reach):
+        """All pairs of contact point and obstacle nearer than ``reach``, as :class:`HalfSpaces`.
+
+        Parameters
+        ----------
+        points : (n, 3) array_like
+            The model's contact points, in their order.
+        reach : float
+            [scene unit].
+        """
+        points = check_points(points)
+        parts = [(*found, b) for b, found in enumerate(self.query(points, reach)) if len(found[0])]
+        for k, neighbour in enumerate(self.neighbours):
+            parts.extend((*found, -1 - k) for found in neighbour.contacts(points, reach) if len(found[0]))
+        if not parts:
+            return HalfSpaces(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64))
+        index, gap, normal = (np.concatenate([part[k] for part in parts]) for k in range(3))
+        source = np.concatenate([np.full(len(part[0]), part[3], dtype=np.int64) for part in parts])
+        return HalfSpaces(index, gap, normal, source)
+
+    def _free(self, count):
+        if self.contact_bone is None:
+            return np.ones(count, dtype=np.bool_)
+        if len(self.contact_bone) != count:
+            raise ValueError(f"half-spaces need all {len(self.contact_bone)} contact points, got {count}")
+        return self.contact_bone < 0
+
+    def _query(self, points, b):
+        distance, gradient = self.fields[b].distance_and_gradient(points, pose=self.poses[self.names[b]])
+        length = np.linalg.norm(gradient, axis=1)
+        flat = length < 1e-9
+        if flat.any():
+            # On the medial surface the field has no direction; away from the bone's middle is as good as any.
+            middle = self.fields[b].bounds.mean(axis=0)
+            pose = self.poses[self.names[b]]
+            gradient = np.array(gradient)
+            gradient[flat] = points[flat] - (pose[:3, :3] @ middle + pose[:3, 3]) + 1e-12
+            length = np.linalg.norm(gradient, axis=1)
+        return distance, gradient / length[:, None]
+
+    def _near(self, points, free, b, reach):
+        """Contact points that may be nearer than ``reach`` to bone b, by its box and by what was asked before."""
+        pose, bounds = self.poses[self.names[b]], np.asarray(self.fields[b].bounds, dtype=np.float64)
+        if _boxes_apart(points, pose, bounds, reach):
+            return np.zeros(0, dtype=np.int64)
+        anchor, bound = self._known.setdefault(b, (np.zeros_like(points), np.full(len(points), -np.inf)))
+        if len(bound) != len(points):
+            anchor, bound = self._known[b] = (np.zeros_like(points), np.full(len(points), -np.inf))
+        found = np.zeros(len(points), dtype=np.int64)
+        count = _near_loop(points, free, pose, bounds, reach, anchor, bound, found)
+        return found[:count]
+
+    def _remember(self, points, near, distance, b):
+        anchor, bound = self._known[b]
+        anchor[near] = points[near]
+        bound[near] = TRUSTED_SHARE * distance
+
+
+def moved_box(bounds, pose):
+    """World box (2, 3) that holds a box given in bone coordinates, after a pose."""
+    centre, half = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
+    middle, reach = pose[:3, :3] @ centre + pose[:3, 3], np.abs(pose[:3, :3]) @ half
+    return np.array([middle - reach, middle + reach])
+
+
+def _boxes_apart(points, pose, bounds, reach):
+    box = moved_box(bounds, pose)
+    low, high = points.min(axis=0), points.max(axis=0)
+    return bool(np.any(low - reach > box[1]) or np.any(high + reach < box[0]))
+
+
+@numba.njit(cache=True, nogil=True)
+def _near_loop(points, free, pose, bounds, reach, anchor, bound, found):
+    """Fill ``found`` with free points that neither the bone's box nor an earlier distance rules out."""
+    count = 0
+    for i in range(len(points)):
+        if not free[i]:
+            continue
+        moved, outside = 0.0, 0.0
+        for k in range(3):
+            local = 0.0
+            moved += (points[i, k] - anchor[i, k]) ** 2
+            for j in range(3):
+                local += pose[j, k] * (points[i, j] - pose[j, 3])
+            beyond = max(bounds[0, k] - local, local - bounds[1, k], 0.0)
+            outside += beyond * beyond
+        if outside > reach * reach or bound[i] - np.sqrt(moved) > reach:
+            continue
+        found[count] = i
+        count += 1
+    return count

@@ -1,0 +1,287 @@
+"""The frame loop: any muscle model against any bones, and what a model must offer to be run by it."""
+
+import time
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numba
+import numpy as np
+
+from rbfmuscle.sim.contact import BoneContacts
+from rbfmuscle.sim.motion import bone_poses
+from rbfmuscle.sim.reach import build_fields, reached_bones, split_step
+from rbfmuscle.validation import SolveError
+
+
+@dataclass(frozen=True)
+class ModelSurface:
+    """A closed, outward surface and what the model knows about it.
+
+    Attributes
+    ----------
+    vertices : (n, 3) ndarray
+    faces : (m, 3) ndarray of int
+    quantities : dict of str to float
+        For example ``solver_penetration_max``, ``condition``, ``time_fit``, ``time_extract``.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    quantities: dict = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something a user should know of: ``count`` points of a muscle at a bone, and what was done about them."""
+
+    frame: int
+    muscle: str
+    bone: str
+    count: int
+    action: str
+
+
+@dataclass
+class Frame:
+    """One written frame.
+
+    Attributes
+    ----------
+    index : int
+        Place in the scene's motion.
+    coordinates : dict of str to float
+        [radian].
+    poses : dict of str to (4, 4) ndarray
+    surfaces : dict of str to ModelSurface
+        Empty where no surfaces were asked for.
+    carried : dict of str to (vertices, faces)
+        Material surfaces of constant topology.
+    events : list of Event
+        Since the frame written before.
+    times : dict of str to dict
+        For each muscle ``time_predict``, ``time_solve``, ... and their sum ``time_frame`` [s], since the frame before.
+    wall : float
+        Time for all muscles together [s], since the frame before.
+    """
+
+    index: int
+    coordinates: dict
+    poses: dict
+    surfaces: dict
+    carried: dict
+    events: list
+    times: dict
+    wall: float
+
+
+class MuscleModel(Protocol):
+    """What the loop asks of a muscle.
+
+    Attributes
+    ----------
+    name : str
+        The muscle's name.
+    contact_bone : (n,) ndarray of int
+        Index of the bone that a contact point is attached to, -1 where it is free.
+    """
+
+    name: str
+    contact_bone: np.ndarray
+
+    def contact_points(self) -> np.ndarray:
+        """Points (n, 3) that contacts act on, now; number and order never change."""
+
+    def predict(self, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> None:
+        """Go along with the bones from one set of poses to the next."""
+
+    def solve(self, contacts: BoneContacts) -> None:
+        """Settle under the model's own constraints and these contacts."""
+
+    def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
+        """Move the contact points marked in a bool mask (n,) by a (4, 4) transform."""
+
+    def snapshot(self) -> Any:
+        """Everything that :meth:`restore` needs to go back to this moment."""
+
+    def restore(self, state: Any) -> None:
+        """Go back to a snapshot; it can be used again."""
+
+    def carried_mesh(self) -> tuple:
+        """Vertices and faces of a surface that moves with the material, of constant topology."""
+
+    def surface(self, contacts: BoneContacts) -> ModelSurface:
+        """Surface as it is shown: closed and outward."""
+
+    def neighbour_distance(self, points: np.ndarray) -> tuple:
+        """Signed distance (n,) of points to this muscle and its unit gradient (n, 3), for muscles that slide on it."""
+
+
+class _Lane:
+    """One muscle on its way through the motion: its model, its obstacles, its clock and its events."""
+
+    def __init__(self, model, contacts, scene):
+        self.model, self.contacts, self.scene = model, contacts, scene
+        self.name = model.name
+        self.times, self.events = {}, []
+        self.frame = 0
+
+    @contextmanager
+    def timed(self, stage):
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            key = f"time_{stage}"
+            self.times[key] = self.times.get(key, 0.0) + time.perf_counter() - start
+
+    def advance(self, stops):
+        """Go through the sub-steps ``stops``, a list of coordinates of which the first is where the muscle is."""
+        for before, after in zip(stops[:-1], stops[1:]):
+            self.step(before, after)
+
+    def step(self, before, after):
+        poses = bone_poses(self.scene, before), bone_poses(self.scene, after)
+        self.contacts.move(poses[1])
+        with self.timed("predict"):
+            self.model.predict(*poses)
+        self.solve(after)
+
+    def solve(self, coordinates):
+        """Solve, and refuse what is not finite."""
+        with self.timed("solve"):
+            try:
+                self.model.solve(self.contacts)
+            except (np.linalg.LinAlgError, FloatingPointError) as error:
+                raise SolveError(f"{self._place(coordinates)}: {error}") from error
+        bad = ~np.isfinite(self.model.contact_points()).all(axis=1)
+        if bad.any():
+            raise SolveError(
+                f"{self._place(coordinates)}: {int(bad.sum())} of {len(bad)} positions are not finite; "
+                "try a smaller substep_angle in [contact]"
+            )
+
+    def show(self):
+        with self.timed("surface"):
+            return self.model.surface(self.contacts)
+
+    def report(self, bone, count, action):
+        self.events.append(Event(self.frame, self.name, bone, int(count), action))
+
+    def collect(self):
+        """Times and events since the last call."""
+        times, events = self.times, self.events
+        times["time_frame"] = sum(times.values())
+        self.times, self.events = {}, []
+        return times, events
+
+    def _place(self, coordinates):
+        where = ", ".join(f"{name} = {np.degrees(value):.6g} deg" for name, value in coordinates.items())
+        return f"muscle {self.name!r}, frame {self.frame} ({where or 'rest'})"
+
+
+class _Crew:
+    """Runs the lanes: side by side with one thread each, or a single one with all threads."""
+
+    def __init__(self, count):
+        self.workers = min(count, numba.get_num_threads())
+        self.pool = None
+        if self.workers > 1:
+            from threadpoolctl import ThreadpoolController
+
+            self.blas = ThreadpoolController()
+            self.pool = ThreadPoolExecutor(self.workers, initializer=numba.set_num_threads, initargs=(1,))
+
+    def one_thread_each(self):
+        """Context in which BLAS leaves the cores to the muscles; a single muscle keeps them all."""
+        return self.blas.limit(limits=1, user_api="blas") if self.pool else nullcontext()
+
+    def each(self, act, items):
+        """``[act(item) for item in items]``, in parallel where that pays."""
+        if self.pool is None or len(items) < 2:
+            return [act(item) for item in items]
+        return list(self.pool.map(act, items))
+
+    def close(self):
+        if self.pool is not None:
+            self.pool.shutdown(wait=True, cancel_futures=True)
+
+
+def simulate_frames(scene, models, *, surfaces=True, written=None, fields=None) -> Iterator[Frame]:
+    """Run models through a scene's motion, from the rest pose on, and yield its frames one by one.
+
+    Whatever ends it early (an interrupt, a ``SolveError``), the frames yielded so far stand.
+
+    Parameters
+    ----------
+    scene : Scene
+    models : list of MuscleModel, or dict of str to MuscleModel
+        In their rest state.
+    surfaces : bool
+        Whether frames carry surfaces; without, none is extracted.
+    written : collection of int, optional
+        Indices of the frames to yield; all where not given. The others are simulated and not shown.
+    fields : dict of str to BoneSDF, optional
+        Distance fields of the bones; built for the bones that muscles can reach where not given.
+
+    Raises
+    ------
+    SolveError
+        If a muscle cannot be solved, naming muscle, frame and coordinates.
+    SceneError
+        If muscles overlap bones at rest and the scene's ``initial`` is ``"error"``.
+    """
+    models = list(models.values()) if isinstance(models, Mapping) else list(models)
+    lanes = [
+        _Lane(model, contacts, scene) for model, contacts in zip(models, _obstacles(scene, models, fields))
+    ]
+    crew = _Crew(len(lanes))
+    try:
+        yield from _run(scene, lanes, crew, surfaces, written)
+    finally:
+        crew.close()
+
+
+def _obstacles(scene, models, fields):
+    """One BoneContacts for each model, with fields of the bones that it can reach."""
+    regions = reached_bones(scene) if fields is None else None
+    built = build_fields(scene, regions) if fields is None else fields
+    names = [bone.name for bone in scene.bones]
+    for model in models:
+        reached = [built.get(n) if regions is None or (model.name, n) in regions else None for n in names]
+        yield BoneContacts(names, reached, contact_bone=model.contact_bone)
+
+
+def _run(scene, lanes, crew, surfaces, written):
+    here = dict.fromkeys(scene.motion.frames[0], 0.0) if scene.motion.frames else {}
+    wall = 0.0
+    for index, coordinates in enumerate(scene.motion.frames):
+        start = time.perf_counter()
+        shown = written is None or index in written
+        with crew.one_thread_each():
+            _go(scene, lanes, crew, index, [here, *split_step(scene, here, coordinates)])
+            skins = crew.each(_Lane.show, lanes) if shown and surfaces else []
+        wall += time.perf_counter() - start
+        if shown:
+            yield _frame(scene, lanes, index, coordinates, skins, wall)
+            wall = 0.0
+        here = coordinates
+
+
+def _go(scene, lanes, crew, index, stops):
+    for lane in lanes:
+        lane.frame = index
+    crew.each(lambda lane: lane.advance(stops), lanes)
+
+
+def _frame(scene, lanes, index, coordinates, skins, wall):
+    surfaces = {lane.name: skin for lane, skin in zip(lanes, skins)}
+    carried = {lane.name: lane.model.carried_mesh() for lane in lanes}
+    times, events = {}, []
+    for lane in lanes:
+        times[lane.name], happened = lane.collect()
+        events.extend(happened)
+    poses = bone_poses(scene, coordinates)
+    return Frame(index, dict(coordinates), poses, surfaces, carried, events, times, wall)
