@@ -1,0 +1,207 @@
+"""Control triangulation: a closed triangle mesh contracted, cluster by cluster, to one vertex a cluster.
+
+The dual of a clustering (ACVD: Valette & Chassery 2004) is a closed 2-manifold only if every cluster is a disc
+and any two meet in one piece. Here the same triangulation is reached by contracting edges inside each cluster,
+each contraction allowed only where it keeps the manifold (link condition: the ends of the edge share exactly two
+neighbours; Dey et al. 1999). What cannot be contracted goes to a neighbouring cluster. The result is therefore
+closed, 2-manifold and of the input's genus, whatever the clusters look like.
+"""
+
+import numba
+import numpy as np
+
+from rbfmuscle.validation import MeshError
+
+
+def contract_clusters(faces, labels, weights, count):
+    """Contract a closed mesh to ``count`` vertices, following a clustering as far as the topology allows.
+
+    Parameters
+    ----------
+    faces : (m, 3) int array
+        Closed, consistently oriented 2-manifold.
+    labels : (n,) int array
+        Cluster of each vertex, 0 .. count - 1.
+    weights : (n,) array
+        Vertex weights [area]; the heaviest piece of a cluster that falls apart keeps its name.
+    count : int
+        Vertices wanted, at least 4 a connected component (more for handles).
+
+    Returns
+    -------
+    labels : (n,) ndarray
+        Final cluster of each vertex: equal to the input but for pieces that had to change.
+    control_faces : (k, 3) ndarray
+        Triangles over the ``count`` clusters, oriented like ``faces``.
+
+    Raises
+    ------
+    MeshError
+        If no contraction to so few vertices keeps the topology.
+    """
+    twin = opposite_half_edges(faces)
+    tail = faces.ravel().copy()
+    out = np.full(len(labels), -1)
+    out[tail] = np.arange(len(tail))
+    used = out >= 0
+    parent = np.arange(len(labels))
+    label = labels.astype(np.int64)
+    weight = weights.astype(np.float64).copy()
+    live = _contract_loop(tail, twin, out, parent, label, weight, int(used.sum()), count)
+    if live != count:
+        raise MeshError(
+            f"mesh cannot be contracted to {count} points without changing its topology ({live} remain); "
+            "ask for more points, or remove small components and handles"
+        )
+    roots = np.flatnonzero(used & (parent == np.arange(len(parent))))
+    order = np.full(len(labels), -1)
+    # A cluster keeps its number where it can, so that results do not hinge on vertex order.
+    order[roots[np.argsort(label[roots], kind="stable")]] = np.arange(count)
+    final = order[_find_roots_loop(parent)]
+    alive = tail.reshape(-1, 3)
+    alive = alive[alive[:, 0] >= 0]
+    return final, order[alive]
+
+
+def opposite_half_edges(faces):
+    """Index of the opposite half-edge of each half-edge ``3 * face + corner``.
+
+    Raises
+    ------
+    MeshError
+        Unless every edge is shared by exactly two faces with opposite directions.
+    """
+    start = faces.ravel()
+    end = np.roll(faces, -1, axis=1).ravel()
+    size = int(faces.max()) + 1
+    key = start * size + end
+    order = np.argsort(key)
+    place = np.searchsorted(key[order], end * size + start)
+    place[place == len(key)] = 0
+    twin = order[place]
+    doubled = (np.diff(key[order]) == 0).any()
+    if doubled or (key[twin] != end * size + start).any():
+        raise MeshError("mesh must be a closed, consistently oriented 2-manifold; repair it first")
+    return twin
+
+
+@numba.njit(cache=True, nogil=True)
+def _following(h):
+    return h - 2 if h % 3 == 2 else h + 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _preceding(h):
+    return h + 2 if h % 3 == 0 else h - 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _is_contractible(h, tail, twin, mark):
+    """Whether the ends of half-edge h share exactly two neighbours (link condition)."""
+    a, b = tail[h], tail[twin[h]]
+    g = h
+    while True:
+        mark[tail[twin[g]]] = h
+        g = twin[_preceding(g)]
+        if g == h:
+            break
+    common = 0
+    g = twin[h]
+    while True:
+        w = tail[twin[g]]
+        if w != a and mark[w] == h:
+            common += 1
+        g = twin[_preceding(g)]
+        if g == twin[h]:
+            break
+    g = h
+    while True:
+        mark[tail[twin[g]]] = -1
+        g = twin[_preceding(g)]
+        if g == h:
+            break
+    return common == 2 and a != b
+
+
+@numba.njit(cache=True, nogil=True)
+def _contract(h, tail, twin, out, parent, weight):
+    """Contract half-edge h = (a -> b): b is merged into a, two faces vanish."""
+    a, b = tail[h], tail[twin[h]]
+    g = twin[h]
+    last = g
+    while True:
+        tail[g] = a
+        g = twin[_preceding(g)]
+        if g == last:
+            break
+    for side in (h, last):
+        first, second = twin[_following(side)], twin[_preceding(side)]
+        twin[first], twin[second] = second, first
+        out[tail[first]] = first
+        out[tail[second]] = second
+        face = side - side % 3
+        for c in range(3):
+            tail[face + c] = -1
+    parent[b] = a
+    weight[a] += weight[b]
+
+
+@numba.njit(cache=True, nogil=True)
+def _contract_inside(tail, twin, out, parent, label, weight, mark, live, count):
+    """Contract edges inside clusters until none can be; return the number of vertices left."""
+    changed = True
+    while changed and live > count:
+        changed = False
+        for h in range(len(tail)):
+            if tail[h] < 0 or live <= count:
+                continue
+            a, b = tail[h], tail[twin[h]]
+            if label[a] == label[b] and weight[a] >= weight[b] and _is_contractible(h, tail, twin, mark):
+                _contract(h, tail, twin, out, parent, weight)
+                live -= 1
+                changed = True
+    return live
+
+
+@numba.njit(cache=True, nogil=True)
+def _contract_one(tail, twin, out, parent, label, weight, mark, main):
+    """Contract the lightest left-over piece into a neighbour; any light pair where no such piece can be."""
+    best, best_cost = -1, np.inf
+    for h in range(len(tail)):
+        if tail[h] < 0:
+            continue
+        a, b = tail[h], tail[twin[h]]
+        cost = weight[b] if main[label[b]] != b else 1e30 * (weight[a] + weight[b])
+        if cost < best_cost and _is_contractible(h, tail, twin, mark):
+            best, best_cost = h, cost
+    if best >= 0:
+        _contract(best, tail, twin, out, parent, weight)
+    return best >= 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _contract_loop(tail, twin, out, parent, label, weight, live, count):
+    mark = np.full(len(parent), -1)
+    main = np.full(label.max() + 1, -1)
+    while True:
+        live = _contract_inside(tail, twin, out, parent, label, weight, mark, live, count)
+        if live <= count:
+            return live
+        main[:] = -1
+        for v in range(len(parent)):
+            if parent[v] == v and out[v] >= 0 and (main[label[v]] < 0 or weight[v] > weight[main[label[v]]]):
+                main[label[v]] = v
+        if not _contract_one(tail, twin, out, parent, label, weight, mark, main):
+            return live
+        live -= 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _find_roots_loop(parent):
+    root = np.empty_like(parent)
+    for v in range(len(parent)):
+        r = v
+        while parent[r] != r:
+            r = parent[r]
+        root[v] = r
+    return root

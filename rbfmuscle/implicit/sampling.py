@@ -1,0 +1,236 @@
+"""Centres on a closed mesh: even cover, normals, areas, and the control triangulation over them."""
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from rbfmuscle.implicit.clustering import cluster_mesh, face_normals, refine_mesh
+from rbfmuscle.implicit.control_mesh import opposite_half_edges
+from rbfmuscle.validation import check_mesh, check_points, check_positive, check_vectors
+
+
+@dataclass(frozen=True)
+class SurfaceSample:
+    """Points on a closed mesh with what the surface looks like there.
+
+    Attributes
+    ----------
+    points : (K, 3) ndarray
+        Positions on the surface [scene unit].
+    normals : (K, 3) ndarray
+        Unit outward normals.
+    areas : (K,) ndarray
+        Surface area that each point stands for [scene unit squared]; they add up to the mesh's area.
+    face : (K,) ndarray
+        Input triangle that holds each point.
+    barycentric : (K, 3) ndarray
+        Its coordinates in that triangle.
+    vertex : (K,) ndarray
+        The corner of that triangle nearest to the point.
+    control_faces : (m, 3) ndarray
+        Closed, outward, 2-manifold triangulation over the K points.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    areas: np.ndarray
+    face: np.ndarray
+    barycentric: np.ndarray
+    vertex: np.ndarray
+    control_faces: np.ndarray
+
+
+def sample_surface(vertices, faces, count, *, seed=0, placement="even"):
+    """Cover a closed mesh with ``count`` points.
+
+    The mesh is split into ``count`` connected cells of equal size (farthest points by distance along the
+    surface, then clustering as in Valette & Chassery 2004); each cell gives one point. Cells never reach
+    through a thin sheet, as distance and connection are those of the surface.
+
+    Parameters
+    ----------
+    vertices : (n, 3) array_like
+        Vertices of a closed, outward 2-manifold [scene unit].
+    faces : (m, 3) array_like of int
+        Its triangles.
+    count : int
+        Points wanted, at least 4 for each connected component.
+    seed : int
+        Chooses the first point; the rest follows.
+    placement : {"even"}
+        Even cells.
+
+    Returns
+    -------
+    SurfaceSample
+
+    Raises
+    ------
+    MeshError
+        If the mesh is not a closed 2-manifold, or its topology needs more points.
+    ValueError
+        If ``count`` or ``placement`` is not allowed.
+    """
+    vertices, faces = check_mesh(vertices, faces)
+    count = int(count)
+    if count < 4:
+        raise ValueError(f"count must be at least 4, got {count}")
+    if placement not in PLACEMENTS:
+        raise ValueError(f"placement must be one of {', '.join(PLACEMENTS)}, got {placement!r}")
+    opposite_half_edges(faces)
+    fine = refine_mesh(vertices, faces, count)
+    labels, control = cluster_mesh(fine, np.ones(len(fine.vertices)), count, seed)
+    return _gather(vertices, faces, fine, labels, control, count)
+
+
+PLACEMENTS = ("even",)
+
+
+def off_surface_points(points, normals, *, distance=None, safety=0.5):
+    """Points on and off a surface with their signed distances, for fits to values.
+
+    Each point x gives f(x) = 0, f(x + d n) = d and f(x - d n) = -d (Carr et al. 2001). The step d is cut back
+    until x is still the nearest of all points to x + d n: for a neighbour q that means
+    d <= |q - x|^2 / (2 n.(q - x)), the radius of the ball that touches the surface in x and passes through q.
+
+    Parameters
+    ----------
+    points : (K, 3) array_like
+        Positions on the surface [scene unit].
+    normals : (K, 3) array_like
+        Unit outward normals.
+    distance : float, optional
+        Longest step; by default half the median distance to the nearest other point.
+    safety : float
+        Part of the touching ball's radius that a step may use, above 0 and at most 1.
+
+    Returns
+    -------
+    points : (3K, 3) ndarray
+        On the surface, outside, inside.
+    values : (3K,) ndarray
+        0, then +d, then -d.
+
+    Raises
+    ------
+    ValueError
+        On wrong shapes, fewer than two points, or a distance or safety out of range.
+    """
+    points = check_points(points)
+    normals = check_vectors(normals, len(points))
+    if len(points) < 2:
+        raise ValueError(f"points must be at least 2, got {len(points)}")
+    if not 0 < safety <= 1:
+        raise ValueError(f"safety must be above 0 and at most 1, got {safety}")
+    steps = np.empty((2, len(points)))
+    nearest = np.empty(len(points))
+    _touching_ball_loop(points, normals, steps, nearest)
+    distance = 0.5 * np.median(nearest) if distance is None else check_positive(distance, name="distance")
+    outside, inside = np.minimum(safety * steps, distance)
+    where = np.vstack([points, points + outside[:, None] * normals, points - inside[:, None] * normals])
+    return where, np.concatenate([np.zeros(len(points)), outside, -inside])
+
+
+@numba.njit(cache=True, nogil=True)
+def _touching_ball_loop(points, normals, steps, nearest):
+    """Radii of the empty balls that touch each point from outside (row 0) and inside (row 1)."""
+    for i in range(len(points)):
+        steps[:, i] = np.inf
+        least = np.inf
+        for j in range(len(points)):
+            square, along = 0.0, 0.0
+            for c in range(3):
+                d = points[j, c] - points[i, c]
+                square += d * d
+                along += d * normals[i, c]
+            if j == i:
+                continue
+            least = min(least, square)
+            side = 0 if along > 0 else 1
+            if along != 0.0:
+                steps[side, i] = min(steps[side, i], square / (2 * abs(along)))
+        nearest[i] = np.sqrt(least)
+
+
+def _gather(vertices, faces, fine, labels, control, count):
+    """Points, normals and areas of the cells."""
+    vectors = face_normals(fine.vertices, fine.faces)
+    third = np.linalg.norm(vectors, axis=1) / 3
+    corner = labels[fine.faces]
+    areas = np.bincount(corner.ravel(), np.repeat(third, 3), count)
+    normals, centroid = np.zeros((count, 3)), np.zeros((count, 3))
+    middle = fine.vertices[fine.faces].mean(axis=1)
+    for axis in range(3):
+        normals[:, axis] = np.bincount(corner.ravel(), np.repeat(vectors[:, axis], 3), count)
+        centroid[:, axis] = np.bincount(corner.ravel(), np.repeat(third * middle[:, axis], 3), count)
+    centroid /= np.maximum(areas, np.finfo(float).tiny)[:, None]
+    # The nearest point of the cell itself, not of the mesh: that could lie on the other side of a thin sheet.
+    points, face, distance = np.zeros((count, 3)), np.zeros(count, dtype=np.int64), np.full(count, np.inf)
+    _nearest_in_cell_loop(fine.vertices, fine.faces, corner, centroid, points, face, distance)
+    face = fine.parent[face]
+    barycentric = _barycentric(points, vertices[faces[face]])
+    vertex = faces[face, barycentric.argmax(axis=1)]
+    length = np.linalg.norm(normals, axis=1)
+    flat = length < 1e-9 * areas
+    normals[flat] = face_normals(vertices, faces)[face[flat]]
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    return SurfaceSample(points, normals, areas, face, barycentric, vertex, control)
+
+
+def _barycentric(points, corners):
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    normal = np.cross(b - a, c - a)
+    square = np.einsum("ij,ij->i", normal, normal)
+    v = np.einsum("ij,ij->i", np.cross(points - a, c - a), normal) / square
+    w = np.einsum("ij,ij->i", np.cross(b - a, points - a), normal) / square
+    out = np.clip(np.column_stack([1 - v - w, v, w]), 0, 1)
+    return out / out.sum(axis=1)[:, None]
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest_on_triangle(p, a, b, c, out):
+    """Nearest point of a triangle (Ericson 2005, section 5.1.5); returns the squared distance."""
+    ab, ac, ap = b - a, c - a, p - a
+    d1, d2 = np.dot(ab, ap), np.dot(ac, ap)
+    bp, cp = p - b, p - c
+    d3, d4, d5, d6 = np.dot(ab, bp), np.dot(ac, bp), np.dot(ab, cp), np.dot(ac, cp)
+    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+    v, w = 0.0, 0.0
+    if d1 <= 0 and d2 <= 0:
+        pass
+    elif d3 >= 0 and d4 <= d3:
+        v = 1.0
+    elif vc <= 0 and d1 >= 0 and d3 <= 0:
+        v = d1 / (d1 - d3)
+    elif d6 >= 0 and d5 <= d6:
+        w = 1.0
+    elif vb <= 0 and d2 >= 0 and d6 <= 0:
+        w = d2 / (d2 - d6)
+    elif va <= 0 and d4 - d3 >= 0 and d5 - d6 >= 0:
+        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        v = 1.0 - w
+    elif va + vb + vc > 0:
+        v, w = vb / (va + vb + vc), vc / (va + vb + vc)
+    total = 0.0
+    for k in range(3):
+        out[k] = a[k] + v * ab[k] + w * ac[k]
+        total += (p[k] - out[k]) ** 2
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest_in_cell_loop(vertices, faces, corner, target, points, face, distance):
+    """Of the triangles that touch cell k, the point nearest to target[k]."""
+    q = np.empty(3)
+    for f in range(len(faces)):
+        for c in range(3):
+            k = corner[f, c]
+            if (c > 0 and corner[f, 0] == k) or (c > 1 and corner[f, 1] == k):
+                continue
+            a, b, d = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+            square = _nearest_on_triangle(target[k], a, b, d, q)
+            if square < distance[k]:
+                distance[k] = square
+                face[k] = f
+                points[k] = q
