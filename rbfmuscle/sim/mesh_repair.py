@@ -1,0 +1,280 @@
+"""Mending meshes where it is safe: what is changed never moves a vertex by more than rounding."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from rbfmuscle.validation import MeshError
+
+MERGE_TOLERANCE = 1e-7  # of the diagonal: float32 files repeat vertices to about this
+HOLE_LIMIT = 0.1  # of the diagonal: a longer hole's rim is not closed by guesswork
+CRUMB_LIMIT = 0.01  # of the largest part's area: smaller loose parts are dropped
+
+
+@dataclass
+class Repaired:
+    """Arrays of a mended mesh; ``vertex_map`` takes old vertex numbers to new ones (-1: dropped)."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    vertex_map: np.ndarray
+    notes: list = field(default_factory=list)
+    closed: bool = True
+
+
+def repair(vertices, faces, *, place, may_be_open=False):
+    """Return the mesh closed, manifold, outward; say what was done.
+
+    Parameters
+    ----------
+    vertices : (n, 3) ndarray
+    faces : (m, 3) ndarray of int
+    place : str
+        Begins each message: the file or the object.
+    may_be_open : bool
+        Keep holes and several parts (bones) instead of refusing them.
+
+    Raises
+    ------
+    MeshError
+        If holes, non-manifold edges or several parts remain that cannot be mended safely.
+    """
+    vertices = np.asarray(vertices, dtype=np.float64)
+    state = Repaired(vertices, np.asarray(faces, dtype=np.int64), np.arange(len(vertices)))
+    _drop_degenerate(state)
+    if not _is_closed(state.faces):
+        _merge_equal(state)
+        _drop_fins(state)
+    if len(state.faces) == 0:
+        raise MeshError(f"{place}: nothing is left of the mesh without degenerate triangles")
+    _drop_crumbs(state, keep_parts=may_be_open)
+    _drop_unused(state)
+    if not _is_closed(state.faces):
+        _check_manifold(state.faces, place)
+        _fill_holes(state)
+    _orient(state, place)
+    state.closed = _is_closed(state.faces)
+    if not state.closed:
+        count = int((_edge_uses(state.faces)[1] == 1).sum())
+        if not may_be_open:
+            raise MeshError(f"{place}: the surface is open ({count} boundary edges); close its holes")
+        state.notes.append(f"the surface is open ({count} boundary edges)")
+    elif not may_be_open:
+        _check_one_part(state, place)
+    return state
+
+
+def _edge_uses(faces):
+    """Undirected edges (sorted pairs), how many faces use each, and the edge of each face's side."""
+    keys, width = _edge_keys(faces)
+    unique, inverse, count = np.unique(keys, return_inverse=True, return_counts=True)
+    return np.column_stack([unique // width, unique % width]), count, inverse.reshape(-1, 3)
+
+
+def _edge_keys(faces):
+    """One number for each side of each face, the same for both directions of an edge."""
+    width = int(faces.max()) + 1
+    ends = faces[:, [1, 2, 0]]
+    return (np.minimum(faces, ends) * width + np.maximum(faces, ends)).ravel(), width
+
+
+def _is_closed(faces):
+    return len(faces) > 0 and bool((_edge_uses(faces)[1] == 2).all())
+
+
+def _drop_degenerate(state):
+    f = state.faces
+    degenerate = (f[:, 0] == f[:, 1]) | (f[:, 1] == f[:, 2]) | (f[:, 2] == f[:, 0])
+    width = int(f.max()) + 1
+    low, middle, high = np.sort(f, axis=1).T
+    _, first = np.unique((low * width + middle) * width + high, return_index=True)
+    keep = np.zeros(len(f), dtype=bool)
+    keep[first] = True
+    keep &= ~degenerate
+    if not keep.all():
+        state.notes.append(f"{int((~keep).sum())} degenerate or repeated triangles dropped")
+        state.faces = f[keep]
+
+
+def _merge_equal(state):
+    diagonal = np.linalg.norm(np.ptp(state.vertices, axis=0))
+    if diagonal == 0:
+        return
+    keys = np.round((state.vertices - state.vertices.min(axis=0)) / (MERGE_TOLERANCE * diagonal)).astype(
+        np.int64
+    )
+    _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    merged = first[inverse.ravel()]
+    count = int((merged != np.arange(len(merged))).sum())
+    if count:
+        state.notes.append(f"{count} repeated vertices merged")
+        state.faces = merged[state.faces]
+        state.vertex_map = merged[state.vertex_map]
+        _drop_degenerate(state)
+
+
+def _drop_fins(state):
+    """Triangles that hang on an edge of more than two faces and end in the open."""
+    dropped = 0
+    while len(state.faces):
+        _, count, sides = _edge_uses(state.faces)
+        uses = count[sides]
+        fin = (uses > 2).any(axis=1) & (uses == 1).any(axis=1)
+        if not fin.any():
+            break
+        dropped += int(fin.sum())
+        state.faces = state.faces[~fin]
+    if dropped:
+        state.notes.append(f"{dropped} dangling triangles dropped")
+
+
+def _parts(faces, count):
+    """Number of the connected part that each face belongs to, and how many parts."""
+    rows, columns = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
+    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    _, labels = connected_components(graph, directed=False)
+    _, part = np.unique(labels[faces[:, 0]], return_inverse=True)
+    return part, int(part.max()) + 1
+
+
+def _areas(vertices, faces):
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def _drop_crumbs(state, *, keep_parts):
+    part, count = _parts(state.faces, len(state.vertices))
+    if count == 1:
+        return
+    area = np.bincount(part, weights=_areas(state.vertices, state.faces), minlength=count)
+    keep = area >= CRUMB_LIMIT * area.max()
+    if not keep.all():
+        state.faces = state.faces[keep[part]]
+        state.notes.append(f"{int((~keep).sum())} loose parts of less than 1 % of the surface dropped")
+    if keep_parts and keep.sum() > 1:
+        state.notes.append(f"the surface has {int(keep.sum())} parts")
+
+
+def _drop_unused(state):
+    used = np.zeros(len(state.vertices), dtype=bool)
+    used[state.faces] = True
+    if used.all():
+        return
+    number = np.cumsum(used) - 1
+    new = np.where(used, number, -1)
+    state.vertices = state.vertices[used]
+    state.faces = new[state.faces]
+    state.vertex_map = new[state.vertex_map]
+
+
+def _check_manifold(faces, place):
+    edges, count, _ = _edge_uses(faces)
+    bad = np.flatnonzero(count > 2)
+    if len(bad):
+        a, b = edges[bad[0]].tolist()
+        raise MeshError(
+            f"{place}: {len(bad)} edges belong to more than two triangles (first: vertices {a} and {b}); "
+            "make the surface manifold, for instance by remeshing"
+        )
+
+
+def _fill_holes(state):
+    """Close each hole whose rim is short by a fan about the rim's centre."""
+    diagonal = np.linalg.norm(np.ptp(state.vertices, axis=0))
+    filled = 0
+    for rim in _rims(state.faces):
+        points = state.vertices[rim]
+        if np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum() > HOLE_LIMIT * diagonal:
+            continue
+        if len(rim) == 3:
+            fan = np.array([[rim[2], rim[1], rim[0]]])
+        else:
+            centre = len(state.vertices)
+            state.vertices = np.vstack([state.vertices, points.mean(axis=0)])
+            fan = np.column_stack([np.roll(rim, -1), rim, np.full(len(rim), centre)])
+        state.faces = np.vstack([state.faces, fan])
+        filled += 1
+    if filled:
+        state.notes.append(f"{filled} small holes closed")
+
+
+def _rims(faces):
+    """Closed loops of boundary edges in the direction of their faces; knotted ones are left out."""
+    sides = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    _, count, used = _edge_uses(faces)
+    rim_sides = sides[count[used.ravel()] == 1]
+    starts, repeats = np.unique(rim_sides[:, 0], return_counts=True)
+    following = dict(rim_sides.tolist())
+    knots = set(starts[repeats > 1].tolist())
+    loops = []
+    while following:
+        start, current = following.popitem()
+        loop = [start]
+        while current != start and current in following:
+            loop.append(current)
+            current = following.pop(current)
+        if current == start and len(loop) >= 3 and not knots.intersection(loop):
+            loops.append(np.array(loop))
+    return loops
+
+
+def _orient(state, place):
+    """Make neighbouring faces agree, then turn what was mended, or the whole, outward.
+
+    A consistent inner shell (a cavity of a bone) rightly faces the other way and stays.
+    """
+    turned = _consistent_turns(state.faces, place)
+    part, count = _parts(state.faces, len(state.vertices))
+    faces = np.where(turned[:, None], state.faces[:, ::-1], state.faces)
+    a, b, c = (state.vertices - state.vertices.mean(axis=0))[faces].transpose(1, 0, 2)
+    volume = np.bincount(part, weights=np.einsum("ij,ij->i", a, np.cross(b, c)), minlength=count)
+    mended = np.bincount(part, weights=turned, minlength=count) > 0
+    turned ^= mended[part] & (volume[part] < 0)
+    volume[mended] = np.abs(volume[mended])
+    if volume.sum() < 0:
+        turned ^= ~mended[part]
+    if turned.all():
+        state.notes.append("all triangles faced inward: turned outward")
+    elif turned.any():
+        state.notes.append(f"{int(turned.sum())} triangles faced the wrong way: turned")
+    state.faces = np.ascontiguousarray(np.where(turned[:, None], state.faces[:, ::-1], state.faces))
+
+
+def _consistent_turns(faces, place):
+    """Which faces to turn so that each shared edge is used once in either direction."""
+    sides = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    forward = sides[:, 0] < sides[:, 1]
+    keys, _ = _edge_keys(faces)
+    order = np.argsort(keys, kind="stable")
+    sorted_edges = keys[order]
+    pair = np.flatnonzero(sorted_edges[1:] == sorted_edges[:-1])
+    first, second = order[pair], order[pair + 1]
+    clash = forward[first] == forward[second]
+    one, two = first // 3, second // 3
+    m = len(faces)
+    if not clash.any():
+        return np.zeros(m, dtype=bool)
+    # A double cover: face k and its turned copy m + k; a clash joins a face to the other's turned copy.
+    rows = np.concatenate([one, one + m])
+    columns = np.concatenate([np.where(clash, two + m, two), np.where(clash, two, two + m)])
+    _, label = connected_components(
+        coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(2 * m, 2 * m)), directed=False
+    )
+    if (label[:m] == label[m:]).any():
+        raise MeshError(f"{place}: the surface has one side only (no consistent orientation); remesh it")
+    turned = label[:m] > label[m:]
+    part, count = _parts(faces, int(faces.max()) + 1)
+    most = np.bincount(part, weights=turned, minlength=count) * 2 > np.bincount(part, minlength=count)
+    return turned ^ most[part]
+
+
+def _check_one_part(state, place):
+    part, count = _parts(state.faces, len(state.vertices))
+    if count > 1:
+        sizes = sorted(np.bincount(part).tolist(), reverse=True)
+        raise MeshError(
+            f"{place}: the surface has {count} separate parts (triangles: {', '.join(map(str, sizes[:5]))}); "
+            "a muscle is one closed surface, split or join them"
+        )

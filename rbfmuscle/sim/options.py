@@ -1,0 +1,182 @@
+"""The tables of a scene that hold settings: contact, sliding, detection, output, motion.
+
+They check themselves, so the same rules hold for a file, for code and for ``--set``.
+"""
+
+import difflib
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
+
+from rbfmuscle.validation import SceneError
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
+
+
+def _check_length(vector):
+    if not any(vector):
+        raise ValueError("must not be the zero vector")
+    return vector
+
+
+Axis = Annotated[Vector, AfterValidator(_check_length)]
+
+
+def did_you_mean(word, known):
+    """Return "did you mean 'x'?", or the list of what is known when nothing is near."""
+    known = [str(name) for name in known]
+    lower = {name.lower(): name for name in known}
+    near = difflib.get_close_matches(str(word).lower(), lower, n=1, cutoff=0.5)
+    if near:
+        return f"did you mean {lower[near[0]]!r}?"
+    return "known: " + ", ".join(known) if known else "there are none"
+
+
+class Table(BaseModel):
+    """A table whose unknown keys are errors that name the nearest right one."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, populate_by_name=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name_unknown_keys(cls, data):
+        if not isinstance(data, dict):
+            return data
+        known = [field.alias or name for name, field in cls.model_fields.items()]
+        for key in data:
+            if key not in known and key not in cls.model_fields:
+                raise PydanticCustomError(
+                    "unknown_key",
+                    "unknown key '{key}', {hint}",
+                    {"key": key, "hint": did_you_mean(key, known)},
+                )
+        return data
+
+    @classmethod
+    def build(cls, values, *, place):
+        """Return the table made from a dict, or raise SceneError that begins with ``place``."""
+        try:
+            return cls.model_validate(values)
+        except ValidationError as error:
+            raise SceneError(f"{place}{describe_error(error)}") from None
+
+    def changed(self, key, value, *, place):
+        """Return a copy with the dotted ``key`` set to ``value``, checked again."""
+        values = self.model_dump(by_alias=True, exclude_unset=True)
+        table = values
+        *parents, last = key.split(".")
+        for parent in parents:
+            table = table.setdefault(parent, {})
+            if not isinstance(table, dict):
+                raise SceneError(f"{place}{key}: {parent!r} is not a table")
+        table[last] = value
+        return type(self).build(values, place=place)
+
+
+def describe_error(error, *, root="", name_row=None):
+    """Return the first problem of a pydantic error as "where: what, given value".
+
+    Parameters
+    ----------
+    error : pydantic.ValidationError
+    root : str
+        Prefix of the location.
+    name_row : callable, optional
+        Turns the location (a tuple) into the words that a user knows the place by.
+    """
+    first = error.errors(include_url=False)[0]
+    where = name_row(first["loc"]) if name_row else ".".join(str(part) for part in first["loc"])
+    message = first["msg"].removeprefix("Value error, ")
+    message = message[0].lower() + message[1:]
+    given = first.get("input")
+    shown = (
+        "" if first["type"] in ("unknown_key", "missing") or isinstance(given, dict) else f", got {given!r}"
+    )
+    return ": ".join(part for part in (root, where, message + shown) if part)
+
+
+class ContactOptions(Table):
+    """``[contact]``: how muscles meet bones."""
+
+    initial: Literal["resolve", "keep", "error"] = "resolve"
+    detector: Literal["sdf", "voxel", "bvh", "fcl"] = "sdf"
+    tolerance: Positive | None = None
+    substep_angle: Annotated[float, Field(gt=0, le=90)] = 2.0
+    margin: NotNegative = 0.0
+
+
+class SlidingOptions(Table):
+    """``[sliding]``: neighbouring muscles that keep their distance and slide."""
+
+    threshold: Positive | None = None
+    strip: NotNegative | None = None
+    release: Positive | None = None
+    bones: bool = False
+    pairs: list[Annotated[list[str], Field(min_length=2, max_length=2)]] | None = None
+    join: bool = True
+    cut: bool = True
+
+
+class TunnellingOptions(Table):
+    """``detect.tunnelling``: points that pass through a bone in one step."""
+
+    angle: Annotated[float, Field(gt=0, lt=180)] = 135.0
+    action: Literal["report", "rotate", "substep"] = "substep"
+    swept: bool = True
+    smallest_step: Positive = 0.1
+
+
+class DetectOptions(Table):
+    """``[detect]``: what is looked for while a motion runs."""
+
+    tunnelling: TunnellingOptions | None = None
+
+
+SURFACE_FORMATS = ("pvd", "vtp", "ply", "stl", "obj", "glb")
+
+
+class SurfaceOptions(Table):
+    """``output.surfaces``: the surfaces written for every frame."""
+
+    format: Literal["pvd", "vtp", "ply", "stl", "obj", "glb"] = "pvd"
+
+
+class OutputOptions(Table):
+    """``[output]``: what a run leaves behind."""
+
+    surfaces: SurfaceOptions | Literal[False] = SurfaceOptions()
+    metrics: bool = True
+    report: bool = True
+    preview: bool = True
+
+
+class RampOptions(Table):
+    """One coordinate from one angle to another [degree]."""
+
+    start: Finite = Field(alias="from", default=0.0)
+    end: Finite = Field(alias="to")
+    step: Positive
+
+
+class MotionOptions(Table):
+    """``[motion]``: a ramp, waypoints or an OpenSim file; without any, the rest pose alone."""
+
+    ramp: dict[str, RampOptions] | None = None
+    waypoints: Annotated[list[dict[str, Finite]], Field(min_length=1)] | None = None
+    step: Positive | None = None
+    file: str | None = None
+
+    @model_validator(mode="after")
+    def _check_one_source(self):
+        given = [key for key in ("ramp", "waypoints", "file") if getattr(self, key) is not None]
+        if len(given) > 1:
+            raise ValueError(f"give one of ramp, waypoints and file, not {' and '.join(given)}")
+        if self.waypoints is not None and len(self.waypoints) > 1 and self.step is None:
+            raise ValueError("waypoints need a step (degrees between frames)")
+        if self.step is not None and self.waypoints is None:
+            raise ValueError("step belongs to waypoints; a ramp has its own step")
+        return self

@@ -1,0 +1,188 @@
+"""The scene file: its tables, and the scene that they describe."""
+
+import tomllib
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError
+
+from rbfmuscle.sim.attachments import AttachTable
+from rbfmuscle.sim.motion import Motion
+from rbfmuscle.sim.options import (
+    Axis,
+    ContactOptions,
+    DetectOptions,
+    MotionOptions,
+    OutputOptions,
+    Positive,
+    SlidingOptions,
+    Table,
+    Vector,
+    describe_error,
+)
+from rbfmuscle.validation import MeshError, SceneError
+
+
+class SceneTable(Table):
+    """``[scene]``."""
+
+    format: Literal[1]
+    name: str | None = None
+    units: Literal["m", "cm", "mm"]
+
+
+class BoneTable(Table):
+    """``[[bone]]``."""
+
+    name: str
+    mesh: str
+    scale: Positive = 1.0
+
+
+class JointTable(Table):
+    """``[[joint]]``."""
+
+    name: str
+    parent: str
+    child: str
+    centre: Vector
+    axes: dict[str, Axis] = Field(min_length=1)
+
+
+class DefaultsTable(Table):
+    """``[defaults]``: any key of a muscle, for all that do not give it themselves."""
+
+    model: Any = "rbf"
+    scale: Positive = 1.0
+    attach: list[AttachTable] = []
+    fibres: str | None = None
+
+
+class MuscleTable(DefaultsTable):
+    """``[[muscle]]``."""
+
+    name: str
+    mesh: str
+
+
+class SceneFile(Table):
+    """A whole scene file."""
+
+    scene: SceneTable
+    defaults: DefaultsTable = DefaultsTable()
+    bone: list[BoneTable] = []
+    joint: list[JointTable] = []
+    motion: MotionOptions = MotionOptions()
+    muscle: list[MuscleTable] = []
+    contact: ContactOptions = ContactOptions()
+    sliding: SlidingOptions | None = None
+    detect: DetectOptions | None = None
+    output: OutputOptions = OutputOptions()
+
+
+def read_scene_file(path):
+    """Return the checked SceneFile of a TOML file, paths as written.
+
+    Raises
+    ------
+    SceneError
+        Naming the file, the table, the key, the value and what is right.
+    """
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except IsADirectoryError:
+        raise SceneError(f"{path}: is a folder, give a scene file (.toml)") from None
+    except FileNotFoundError:
+        raise SceneError(f"{path}: no such scene file") from None
+    except OSError as error:
+        raise SceneError(f"{path}: cannot read the scene file: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise SceneError(f"{path}: not a text file in UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError(f"{path}: not valid TOML: {error}") from None
+    try:
+        return SceneFile.model_validate(data)
+    except ValidationError as error:
+        raise SceneError(
+            describe_error(error, root=str(path), name_row=lambda at: _place(at, data))
+        ) from None
+
+
+def load_scene(cls, path):
+    """Return the scene (of class ``cls``) of a TOML file, its meshes read and checked."""
+    tables = read_scene_file(path)
+    folder = path.parent
+    try:
+        return _build(cls(tables.scene.name or path.stem, units=tables.scene.units), tables, folder, path)
+    except (SceneError, MeshError) as error:
+        raise type(error)(f"{path}: {error}") from None
+
+
+def _build(scene, tables, folder, path):
+    from rbfmuscle.sim.scene_check import check_extents
+
+    scene.path = path
+    for bone in tables.bone:
+        scene.add_bone(bone.name, str(folder / bone.mesh), scale=bone.scale)
+    for joint in tables.joint:
+        scene.add_joint(joint.name, joint.parent, joint.child, joint.centre, joint.axes)
+    for muscle in tables.muscle:
+        _add_muscle(scene, muscle, tables.defaults, folder)
+    scene.motion = Motion.from_options(tables.motion, scene.joints, folder=folder)
+    scene.contact = tables.contact
+    scene.sliding = tables.sliding
+    scene.detect = tables.detect
+    scene.output = tables.output
+    scene.validate()
+    check_extents(scene)
+    return scene
+
+
+def _add_muscle(scene, muscle, defaults, folder):
+    given = {key: getattr(muscle, key) for key in muscle.model_fields_set}
+    for key in defaults.model_fields_set:
+        given.setdefault(key, getattr(defaults, key))
+    fibres = given.get("fibres")
+    scene.add_muscle(
+        muscle.name,
+        str(folder / muscle.mesh),
+        attach=[_from_folder(entry, folder) for entry in given.get("attach", [])],
+        model=_merge_model(given.get("model", "rbf"), defaults.model),
+        fibres=str(folder / fibres) if fibres is not None else None,
+        scale=given.get("scale", 1.0),
+    )
+
+
+def _merge_model(model, default):
+    """A model table without a name changes some options of the default model."""
+    if isinstance(model, dict) and "name" not in model:
+        return {**({"name": default} if isinstance(default, str) else default), **model}
+    return model
+
+
+def _from_folder(entry, folder):
+    if isinstance(entry.vertices, str):
+        return entry.model_copy(update={"vertices": str(folder / entry.vertices)})
+    return entry
+
+
+def _place(location, data):
+    """Words for a pydantic location: ("muscle", 1, "attach", 0) -> [[muscle]] 'iliacus' attach 1."""
+    words = []
+    here = data
+    for depth, part in enumerate(location):
+        known = isinstance(here, list) or (isinstance(here, dict) and part in here)
+        if isinstance(part, str) and not known and depth < len(location) - 1:
+            continue  # the name of one of several types that pydantic tried
+        here = here[part] if known and not (isinstance(here, list) and not isinstance(part, int)) else None
+        if isinstance(part, int):
+            name = here.get("name") if isinstance(here, dict) else None
+            words.append(repr(name) if name else str(part + 1))
+        elif depth == 0:
+            words.append(f"[[{part}]]" if isinstance(here, list) else f"[{part}]")
+        else:
+            words.append(part)
+    return " ".join(words)
+
+
+__all__ = ["SceneFile", "load_scene", "read_scene_file"]
