@@ -1,0 +1,157 @@
+"""Connections of a closed triangle mesh: edges, wings, one-rings, and the colouring that makes sweeps parallel."""
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from rbfmuscle.validation import MeshError, check_mesh
+
+
+@dataclass(frozen=True)
+class Topology:
+    """Connections of a closed, consistently oriented mesh; every array is read only.
+
+    Attributes
+    ----------
+    faces : (m, 3) ndarray of int
+    edges : (e, 2) ndarray of int
+        Each undirected edge once, the smaller vertex first.
+    wings : (e, 2) ndarray of int
+        Vertices opposite to an edge: first in the face that runs along it from ``edges[:, 0]`` to ``edges[:, 1]``,
+        then in the face that runs against it.
+    ring_start, ring : (n + 1,), (2 e,) ndarray of int
+        Neighbours of vertex i are ``ring[ring_start[i]:ring_start[i + 1]]``, sorted.
+    ring_edge : (2 e,) ndarray of int
+        Edge that leads to each neighbour.
+    """
+
+    faces: np.ndarray
+    edges: np.ndarray
+    wings: np.ndarray
+    ring_start: np.ndarray
+    ring: np.ndarray
+    ring_edge: np.ndarray
+
+    @classmethod
+    def from_mesh(cls, vertices, faces):
+        """Connect a mesh.
+
+        Raises
+        ------
+        MeshError
+            If it is not closed and consistently oriented, or a vertex belongs to no face.
+        """
+        vertices, faces = check_mesh(vertices, faces)
+        edges, wings = _edges_and_wings(faces)
+        ring_start, ring, ring_edge = _one_rings(edges, len(vertices))
+        lonely = np.flatnonzero(np.diff(ring_start) == 0)
+        if len(lonely):
+            raise MeshError(
+                f"{len(lonely)} vertices of the muscle belong to no face, the first is {lonely[0]}"
+            )
+        parts = faces, edges, wings, ring_start, ring, ring_edge
+        for part in parts:
+            part.setflags(write=False)
+        return cls(*parts)
+
+    @property
+    def vertex_count(self):
+        """Number of vertices."""
+        return len(self.ring_start) - 1
+
+
+def _edges_and_wings(faces):
+    half = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    opposite = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]])
+    along = half[:, 0] < half[:, 1]
+    if (half[:, 0] == half[:, 1]).any():
+        raise MeshError("the muscle has a face that uses one vertex twice")
+    forward, backward = half[along], half[~along][:, ::-1]
+    first, second = np.lexsort(forward.T[::-1]), np.lexsort(backward.T[::-1])
+    forward, backward = forward[first], backward[second]
+    closed = len(forward) == len(backward) and np.array_equal(forward, backward)
+    if not closed or (len(forward) > 1 and (np.diff(forward, axis=0) == 0).all(axis=1).any()):
+        raise MeshError("the muscle is not a closed, consistently oriented 2-manifold; repair it first")
+    wings = np.column_stack([opposite[along][first], opposite[~along][second]])
+    return np.ascontiguousarray(forward), np.ascontiguousarray(wings)
+
+
+def _one_rings(edges, count):
+    source = np.concatenate([edges[:, 0], edges[:, 1]])
+    target = np.concatenate([edges[:, 1], edges[:, 0]])
+    index = np.tile(np.arange(len(edges)), 2)
+    order = np.lexsort((target, source))
+    start = np.concatenate([[0], np.cumsum(np.bincount(source, minlength=count))])
+    return start, np.ascontiguousarray(target[order]), np.ascontiguousarray(index[order])
+
+
+def colour(members, count):
+    """Order constraints so that those of one colour share no vertex.
+
+    Greedy: each constraint takes the smallest colour that none of its vertices has yet. Constraints of one colour
+    may be projected in any order, or at once, with the same result to the last bit.
+
+    Parameters
+    ----------
+    members : (c, k) ndarray of int
+        Vertices of each constraint.
+    count : int
+        Number of vertices.
+
+    Returns
+    -------
+    order : (c,) ndarray of int
+        Constraints sorted by colour, then by their first vertex for the sake of the cache.
+    start : (colours + 1,) ndarray of int
+        Colour q is ``order[start[q]:start[q + 1]]``.
+    """
+    members = np.ascontiguousarray(members, dtype=np.int64)
+    if len(members) == 0:
+        return np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64)
+    colours = np.empty(len(members), dtype=np.int64)
+    words = 1 + members.shape[1] * int(np.bincount(members.ravel(), minlength=count).max()) // 63
+    taken = np.zeros((count, words), dtype=np.int64)
+    _colour_loop(members, taken, colours)
+    order = np.lexsort((members.min(axis=1), colours))
+    start = np.concatenate([[0], np.cumsum(np.bincount(colours))])
+    return order, start
+
+
+@numba.njit(cache=True, nogil=True)
+def _colour_loop(members, taken, colours):
+    """Bit q of ``taken[v]`` (63 to a word) says that colour q is used at vertex v."""
+    for c in range(len(members)):
+        for word in range(taken.shape[1]):
+            used = np.int64(0)
+            for v in members[c]:
+                used |= taken[v, word]
+            if used == 0x7FFFFFFFFFFFFFFF:
+                continue
+            bit = 0
+            while used >> bit & 1:
+                bit += 1
+            colours[c] = 63 * word + bit
+            for v in members[c]:
+                taken[v, word] |= np.int64(1) << bit
+            break
+
+
+def curve_order(points):
+    """Order of points along a Morton curve, so that neighbours in space are neighbours in memory.
+
+    Parameters
+    ----------
+    points : (n, 3) ndarray
+
+    Returns
+    -------
+    (n,) ndarray of int
+    """
+    low, extent = points.min(axis=0), np.ptp(points, axis=0).max()
+    cell = np.clip((points - low) / max(extent, 1e-300) * 1023.0, 0, 1023).astype(np.int64)
+    code = np.zeros(len(points), dtype=np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= (cell[:, axis] >> bit & 1) << (3 * bit + axis)
+    return np.argsort(code, kind="stable")
