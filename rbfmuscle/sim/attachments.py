@@ -88,14 +88,14 @@ def _select(table, read, bone, place):
     chosen = np.flatnonzero(distance <= limit)
     if len(chosen) == 0:
         raise SceneError(
-            f"{place}: {what} = {limit:g} reaches no vertex of the muscle, the nearest is {distance.min():.4g} away "
-            f"from {bone.name!r}; raise it"
+            f"{place}: {what} = {limit:g} reaches no vertex of the muscle, "
+            f"the nearest is {distance.min():.4g} away; raise it"
         )
     return chosen
 
 
 def signed_distances(points, mesh):
-    """Exact distance of points to a mesh, negative inside (pseudonormals; winding numbers where it is open)."""
+    """Exact distance of points to a mesh, negative inside (by pseudonormals, or winding numbers if open)."""
     import igl
 
     kind = "PSEUDONORMAL" if mesh.is_watertight else "FAST_WINDING_NUMBER"
@@ -115,7 +115,8 @@ def _listed_vertices(listed, read, place):
     wrong = (numbers < 0) | (numbers >= len(read.vertex_map))
     if wrong.any():
         raise SceneError(
-            f"{place}: vertex {numbers[wrong][0]} is out of range, the mesh has vertices 0 to {len(read.vertex_map) - 1}"
+            f"{place}: vertex {numbers[wrong][0]} is out of range, "
+            f"the mesh has vertices 0 to {len(read.vertex_map) - 1}"
         )
     kept = read.vertex_map[numbers]
     kept = kept[kept >= 0]

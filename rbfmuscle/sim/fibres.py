@@ -1,5 +1,6 @@
 """Reading muscle fibres: polylines from JSON, or from VTK and VTP PolyData."""
 
+import itertools
 import json
 from pathlib import Path
 
@@ -77,4 +78,4 @@ def _read_polydata_lines(path, place):
     points = vtk_to_numpy(data.GetPoints().GetData()).astype(np.float64)
     offsets = vtk_to_numpy(data.GetLines().GetOffsetsArray())
     numbers = vtk_to_numpy(data.GetLines().GetConnectivityArray())
-    return [points[numbers[a:b]] for a, b in zip(offsets[:-1], offsets[1:])]
+    return [points[numbers[a:b]] for a, b in itertools.pairwise(offsets)]

@@ -77,8 +77,8 @@ def prepare_mesh(vertices, faces, *, place, name, may_be_open=False):
     bad = bad[used[bad]]
     if len(bad):
         raise MeshError(
-            f"{place}: {len(bad)} vertices are not finite, the first is number {bad[0]} {vertices[bad[0]].tolist()}; "
-            "export the mesh again"
+            f"{place}: {len(bad)} vertices are not finite, "
+            f"the first is number {bad[0]} {vertices[bad[0]].tolist()}; export the mesh again"
         )
     vertices = np.where(np.isfinite(vertices), vertices, 0.0)
     try:

@@ -1,5 +1,6 @@
 """From joint coordinates to the poses of bones: ramps, waypoints and OpenSim motion files."""
 
+import itertools
 import math
 from pathlib import Path
 
@@ -160,7 +161,7 @@ def _known(name, known):
 
 
 def _ramp_frames(ramps):
-    """All coordinates go together; the one that needs most steps sets the pace and its last step may be short."""
+    """All coordinates go together; the one that needs most steps sets the pace, its last may be short."""
     pace = max((abs(ramp.end - ramp.start) / ramp.step for ramp in ramps.values()), default=0.0)
     return [
         {name: math.radians(r.start + t * (r.end - r.start)) for name, r in ramps.items()}
@@ -176,7 +177,7 @@ def _waypoint_frames(stops, step):
         for row in range(len(stops)):
             held = table[row, column] = held if np.isnan(table[row, column]) else table[row, column]
     rows = [table[0]]
-    for before, after in zip(table[:-1], table[1:]):
+    for before, after in itertools.pairwise(table):
         pace = np.abs(after - before).max() / step
         rows.extend(before + t * (after - before) for t in _marks(pace)[1:])
     return [dict(zip(names, np.radians(row).tolist())) for row in rows]

@@ -4,8 +4,7 @@ A scene is loaded from a TOML file or built in code; both pass the same checks.
 """
 
 import copy
-import hashlib
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,57 +12,16 @@ import numpy as np
 from rbfmuscle.sim.attachments import Attachment, resolve_attachments
 from rbfmuscle.sim.meshes import prepare_mesh, read_mesh
 from rbfmuscle.sim.motion import Motion, coordinate_names
+from rbfmuscle.sim.objects import Bone, Joint, Muscle
 from rbfmuscle.sim.options import (
     ContactOptions,
-    DetectOptions,
     MotionOptions,
     OutputOptions,
-    SlidingOptions,
     did_you_mean,
 )
 from rbfmuscle.validation import SceneError, check_points, check_positive
 
 MM_PER_UNIT = {"m": 1000.0, "cm": 10.0, "mm": 1.0}
-
-
-@dataclass
-class Bone:
-    """A rigid body: its mesh (trimesh.Trimesh, outward, rest pose), where it came from, what was mended."""
-
-    name: str
-    mesh: object
-    source: str = ""
-    closed: bool = True
-    notes: list = field(default_factory=list)
-
-
-@dataclass
-class Joint:
-    """Turns ``child`` (and all that hangs on it) against ``parent`` about ``centre`` (3,).
-
-    ``axes`` maps a coordinate's name to its unit axis (3,), in the rest pose; several coordinates are a product
-    of rotations in that order.
-    """
-
-    name: str
-    parent: str
-    child: str
-    centre: np.ndarray
-    axes: dict
-
-
-@dataclass
-class Muscle:
-    """A closed surface (trimesh.Trimesh, outward, rest pose) held by bones, and the model that moves it."""
-
-    name: str
-    mesh: object
-    model: str = "rbf"
-    options: dict = field(default_factory=dict)
-    attachments: list = field(default_factory=list)
-    fibres: list | None = None
-    source: str = ""
-    notes: list = field(default_factory=list)
 
 
 class Scene:
@@ -186,8 +144,8 @@ class Scene:
         mesh : path, trimesh.Trimesh or (vertices, faces)
             Closed; mended where that is safe.
         attach : list of Attachment or dict
-            A dict holds ``bone`` and one of ``vertices`` (indices or a file), ``near`` (distance) and ``sphere``
-            (``centre``, ``radius``).
+            A dict holds ``bone`` and one of ``vertices`` (indices or a file), ``near`` (distance) and
+            ``sphere`` (``centre``, ``radius``).
         model : str or dict
             A model's name, or a table with ``name`` and the model's own options.
         fibres : path or list of (k, 3) array_like, optional
@@ -281,44 +239,14 @@ class Scene:
 
     def resolved(self):
         """Return the scene as plain data for ``run.json``: names, counts, options, sources and hashes."""
-        return {
-            "name": self.name,
-            "units": self.units,
-            "file": str(self.path) if self.path else None,
-            "bones": [{"name": b.name, **_mesh_facts(b)} for b in self.bones],
-            "joints": [
-                {
-                    "name": j.name,
-                    "parent": j.parent,
-                    "child": j.child,
-                    "centre": j.centre.tolist(),
-                    "axes": {key: axis.tolist() for key, axis in j.axes.items()},
-                }
-                for j in self.joints
-            ],
-            "motion": {
-                **self.motion.options.model_dump(by_alias=True, exclude_none=True),
-                "frames": len(self.motion.frames),
-            },
-            "muscles": [self._resolved_muscle(muscle) for muscle in self.muscles],
-            "contact": self.contact.model_dump(),
-            "sliding": self.sliding.model_dump() if self.sliding else None,
-            "detect": self.detect.model_dump() if self.detect else None,
-            "output": self.output.model_dump(),
-        }
+        from rbfmuscle.sim.scene_file import describe_scene
 
-    def _resolved_muscle(self, muscle):
-        return {
-            "name": muscle.name,
-            "model": {"name": muscle.model, **muscle.options},
-            "attach": [{"bone": a.bone, "vertices": len(a.vertices)} for a in muscle.attachments],
-            "fibres": len(muscle.fibres) if muscle.fibres else 0,
-            **_mesh_facts(muscle),
-        }
+        return describe_scene(self)
 
     def __repr__(self):
-        muscles = ", ".join(f"{muscle.name} ({muscle.model})" for muscle in self.muscles)
-        return f"<Scene {self.name!r}, {self.units}: {len(self.bones)} bones, {muscles}, {len(self.motion)} frames>"
+        muscles = ", ".join(f"{muscle.name} ({muscle.model})" for muscle in self.muscles) or "no muscles"
+        counts = f"{len(self.bones)} bones, {muscles}, {len(self.motion)} frames"
+        return f"<Scene {self.name!r}, {self.units}: {counts}>"
 
 
 def split_model(model, *, place):
@@ -381,19 +309,6 @@ def _as_mesh(mesh, name, scale, *, may_be_open):
     return prepare_mesh(
         vertices, np.asarray(faces), place=f"mesh {name!r}", name=name, may_be_open=may_be_open
     ), ""
-
-
-def _mesh_facts(item):
-    vertices = np.ascontiguousarray(item.mesh.vertices, dtype=np.float64)
-    faces = np.ascontiguousarray(item.mesh.faces, dtype=np.int64)
-    return {
-        "mesh": item.source,
-        "vertices": len(vertices),
-        "triangles": len(faces),
-        "volume": float(item.mesh.volume),
-        "sha256": hashlib.sha256(vertices.tobytes() + faces.tobytes()).hexdigest(),
-        "mended": list(item.notes),
-    }
 
 
 __all__ = ["Attachment", "Bone", "Joint", "Muscle", "Scene"]

@@ -1,4 +1,4 @@
-"""Looking a scene over before it is solved: sizes, overlaps at rest, bones that the motion drives together."""
+"""Looking a scene over before it is solved: sizes, overlaps at rest, bones that meet in the motion."""
 
 import math
 from dataclasses import dataclass
@@ -57,8 +57,8 @@ def check_extents(scene):
             millimetres = size / scene.length(1.0)
             if not SMALLEST_MM <= millimetres <= LARGEST_MM:
                 raise MeshError(
-                    f"{kind} {item.name!r} ({item.source or 'built in code'}) is {size:.4g} {scene.units} across, which "
-                    f"cannot be right; set its scale ({_likely_scale(millimetres)})"
+                    f"{kind} {item.name!r} ({item.source or 'built in code'}) is {size:.4g} {scene.units} "
+                    f"across, which cannot be right; set its scale ({_likely_scale(millimetres)})"
                 )
     if not scene.bones:
         return
@@ -69,8 +69,9 @@ def check_extents(scene):
         away = np.maximum(low - muscle.mesh.bounds[1], muscle.mesh.bounds[0] - high).clip(min=0)
         if np.linalg.norm(away) > FAR_AWAY * diagonal:
             raise MeshError(
-                f"muscle {muscle.name!r} ({muscle.source or 'built in code'}) lies {np.linalg.norm(away):.4g} "
-                f"{scene.units} away from all bones; bring the meshes into one frame and unit (scale)"
+                f"muscle {muscle.name!r} ({muscle.source or 'built in code'}) lies "
+                f"{np.linalg.norm(away):.4g} {scene.units} away from all bones; "
+                "bring the meshes into one frame and unit (scale)"
             )
 
 
@@ -186,7 +187,8 @@ def _bone_collisions(scene):
         Finding(
             "warning",
             f"{first} and {second}",
-            f"the motion drives the bones into each other, from about frame {start}, up to {deepest:.3g} {scene.units}",
+            f"the motion drives the bones into each other, from about frame {start}, "
+            f"up to {deepest:.3g} {scene.units}",
         )
         for (first, second), (start, deepest) in worst.items()
     ]

@@ -1,9 +1,10 @@
 """The scene file: its tables, and the scene that they describe."""
 
+import hashlib
 import tomllib
-from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import Field, ValidationError
 
 from rbfmuscle.sim.attachments import AttachTable
@@ -54,7 +55,7 @@ class DefaultsTable(Table):
 
     model: Any = "rbf"
     scale: Positive = 1.0
-    attach: list[AttachTable] = []
+    attach: list[AttachTable] = Field(default_factory=list)
     fibres: str | None = None
 
 
@@ -70,10 +71,10 @@ class SceneFile(Table):
 
     scene: SceneTable
     defaults: DefaultsTable = DefaultsTable()
-    bone: list[BoneTable] = []
-    joint: list[JointTable] = []
+    bone: list[BoneTable] = Field(default_factory=list)
+    joint: list[JointTable] = Field(default_factory=list)
     motion: MotionOptions = MotionOptions()
-    muscle: list[MuscleTable] = []
+    muscle: list[MuscleTable] = Field(default_factory=list)
     contact: ContactOptions = ContactOptions()
     sliding: SlidingOptions | None = None
     detect: DetectOptions | None = None
@@ -185,4 +186,53 @@ def _place(location, data):
     return " ".join(words)
 
 
-__all__ = ["SceneFile", "load_scene", "read_scene_file"]
+def describe_scene(scene):
+    """Return the scene as plain data for ``run.json``: names, counts, options, sources and hashes."""
+    return {
+        "name": scene.name,
+        "units": scene.units,
+        "file": str(scene.path) if scene.path else None,
+        "bones": [{"name": b.name, **_mesh_facts(b)} for b in scene.bones],
+        "joints": [
+            {
+                "name": j.name,
+                "parent": j.parent,
+                "child": j.child,
+                "centre": j.centre.tolist(),
+                "axes": {key: axis.tolist() for key, axis in j.axes.items()},
+            }
+            for j in scene.joints
+        ],
+        "motion": {
+            **scene.motion.options.model_dump(by_alias=True, exclude_none=True),
+            "frames": len(scene.motion.frames),
+        },
+        "muscles": [_describe_muscle(muscle) for muscle in scene.muscles],
+        "contact": scene.contact.model_dump(),
+        "sliding": scene.sliding.model_dump() if scene.sliding else None,
+        "detect": scene.detect.model_dump() if scene.detect else None,
+        "output": scene.output.model_dump(),
+    }
+
+
+def _describe_muscle(muscle):
+    return {
+        "name": muscle.name,
+        "model": {"name": muscle.model, **muscle.options},
+        "attach": [{"bone": a.bone, "vertices": len(a.vertices)} for a in muscle.attachments],
+        "fibres": len(muscle.fibres) if muscle.fibres else 0,
+        **_mesh_facts(muscle),
+    }
+
+
+def _mesh_facts(item):
+    vertices = np.ascontiguousarray(item.mesh.vertices, dtype=np.float64)
+    faces = np.ascontiguousarray(item.mesh.faces, dtype=np.int64)
+    return {
+        "mesh": item.source,
+        "vertices": len(vertices),
+        "triangles": len(faces),
+        "volume": float(item.mesh.volume),
+        "sha256": hashlib.sha256(vertices.tobytes() + faces.tobytes()).hexdigest(),
+        "mended": list(item.notes),
+    }

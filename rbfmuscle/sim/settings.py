@@ -25,8 +25,9 @@ def apply_setting(scene, key, value):
     """Set one dotted key of a scene, in place.
 
     ``model`` or ``model.KEY`` change every muscle, ``muscle.NAME.model`` or ``muscle.NAME.model.KEY`` one;
-    ``contact.KEY``, ``sliding.KEY``, ``detect.KEY`` and ``output.KEY`` change a table (a table that the scene lacks
-    is switched on); ``motion.step`` changes the step of every ramp, ``motion.ramp.NAME.COORDINATE.KEY`` one.
+    ``contact.KEY``, ``sliding.KEY``, ``detect.KEY`` and ``output.KEY`` change a table (one that the scene
+    lacks is switched on); ``motion.step`` changes the step of every ramp and
+    ``motion.ramp.NAME.COORDINATE.KEY`` one key of one.
 
     Raises
     ------
