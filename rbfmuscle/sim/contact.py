@@ -1,7 +1,7 @@
 """Which points touch which obstacles, and the way out: contacts as half-spaces, several bones at once.
 
-Obstacles are the bones' distance fields, which stay in bone coordinates and are never rebuilt, and, where a scene
-asks for sliding, the surfaces of neighbouring muscles. Nothing here knows how a muscle is represented.
+Obstacles are the bones' distance fields, which stay in bone coordinates and are never rebuilt, and, where a
+scene asks for sliding, the surfaces of neighbouring muscles. Nothing here knows how a muscle is represented.
 """
 
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ import numpy as np
 
 from rbfmuscle.validation import check_points
 
-# Share of a queried distance that later calls may rely on: a field is exact near its bone and coarser far away.
+# Share of a queried distance that later calls rely on: a field is exact near its bone, coarser far away.
 TRUSTED_SHARE = 0.8
 
 
 @dataclass(frozen=True)
 class HalfSpaces:
-    """Linearised contacts: a displacement ``dp`` of point ``index`` is admissible where ``gap + normal . dp >= 0``.
+    """Linearised contacts: moving point ``index`` by ``dp`` is admissible where ``gap + normal . dp >= 0``.
 
     Attributes
     ----------
@@ -51,9 +51,11 @@ class BoneContacts:
         One for each name; None where the muscle cannot reach the bone. Fields may be shared between muscles.
     contact_bone : (n,) array_like of int, optional
         Bone that contact point i is attached to, -1 where free. Attached points take no contact.
+    margin : float
+        Gap that contact points keep from bones [scene unit].
     """
 
-    def __init__(self, names, fields, *, contact_bone=None):
+    def __init__(self, names, fields, *, contact_bone=None, margin=0.0):
         if len(names) != len(fields):
             raise ValueError(f"one field a bone is needed, got {len(fields)} for {len(names)} bones")
         self.names = list(names)
@@ -61,6 +63,7 @@ class BoneContacts:
         self.reached = [b for b, field in enumerate(self.fields) if field is not None]
         self.contact_bone = None if contact_bone is None else np.asarray(contact_bone, dtype=np.int64)
         self.poses = {name: np.eye(4) for name in self.names}
+        self.margin = float(margin)
         self.allowed = {}
         self.neighbours = []
         self._known = {}
@@ -92,8 +95,8 @@ class BoneContacts:
         Returns
         -------
         (n,) ndarray
-            [scene unit], negative inside a bone; infinity where no bone is in reach. Against a sliding neighbour it
-            is half the difference of the two muscles' distances, so that both are cut at the same surface.
+            [scene unit], negative inside a bone; infinity where no bone is in reach. Against a sliding
+            neighbour it is half the difference of the two muscles' distances, so that both are cut alike.
         """
         points = check_points(points)
         smallest = np.full(len(points), np.inf)
@@ -108,15 +111,16 @@ class BoneContacts:
     def query(self, points, reach):
         """Contacts of each bone: a list, one entry a bone, of ``(index, distance, direction)``."""
         points = check_points(points)
-        free = self._free(len(points))
+        free = self.free(len(points))
         empty = (np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)))
         found = [empty] * len(self.names)
         for b in self.reached:
-            near = self._near(points, free, b, float(reach))
+            near = self._near(points, free, b, reach + self.margin)
             if len(near) == 0:
                 continue
             distance, direction = self._query(points[near], b)
             self._remember(points, near, distance, b)
+            distance = distance - self.margin
             if b in self.allowed and len(self.allowed[b]) == len(points):
                 distance = distance + self.allowed[b][near]
             keep = distance < reach
@@ -143,7 +147,17 @@ class BoneContacts:
         source = np.concatenate([np.full(len(part[0]), part[3], dtype=np.int64) for part in parts])
         return HalfSpaces(index, gap, normal, source)
 
-    def _free(self, count):
+    def lower_bound(self, points, bone_index):
+        """What is known of the contact points' distances (n,) to a bone without asking its field."""
+        bounds = np.asarray(self.fields[bone_index].bounds, dtype=np.float64)
+        unknown = (np.zeros_like(points), np.full(len(points), -np.inf))
+        anchor, bound = self._known.get(bone_index, unknown)
+        out = np.empty(len(points))
+        _bound_loop(points, self.poses[self.names[bone_index]], bounds, anchor, bound, out)
+        return out
+
+    def free(self, count):
+        """Mask (n,) of the contact points that are attached to no bone."""
         if self.contact_bone is None:
             return np.ones(count, dtype=np.bool_)
         if len(self.contact_bone) != count:
@@ -164,7 +178,7 @@ class BoneContacts:
         return distance, gradient / length[:, None]
 
     def _near(self, points, free, b, reach):
-        """Contact points that may be nearer than ``reach`` to bone b, by its box and by what was asked before."""
+        """Contact points that may be nearer than ``reach`` to bone b, by its box and by earlier answers."""
         pose, bounds = self.poses[self.names[b]], np.asarray(self.fields[b].bounds, dtype=np.float64)
         if _boxes_apart(points, pose, bounds, reach):
             return np.zeros(0, dtype=np.int64)
@@ -195,22 +209,32 @@ def _boxes_apart(points, pose, bounds, reach):
 
 
 @numba.njit(cache=True, nogil=True)
+def _lower_bound(points, i, pose, bounds, anchor, bound):
+    """Distance that point i has at least: from the bone's box, or an earlier answer less the way since."""
+    moved, outside = 0.0, 0.0
+    for k in range(3):
+        local = 0.0
+        moved += (points[i, k] - anchor[i, k]) ** 2
+        for j in range(3):
+            local += pose[j, k] * (points[i, j] - pose[j, 3])
+        beyond = max(bounds[0, k] - local, local - bounds[1, k], 0.0)
+        outside += beyond * beyond
+    known = bound[i] - np.sqrt(moved)
+    return max(np.sqrt(outside), known) if outside > 0.0 else known
+
+
+@numba.njit(cache=True, nogil=True)
 def _near_loop(points, free, pose, bounds, reach, anchor, bound, found):
-    """Fill ``found`` with free points that neither the bone's box nor an earlier distance rules out."""
+    """Fill ``found`` with the free points that may be nearer than ``reach``; return their number."""
     count = 0
     for i in range(len(points)):
-        if not free[i]:
-            continue
-        moved, outside = 0.0, 0.0
-        for k in range(3):
-            local = 0.0
-            moved += (points[i, k] - anchor[i, k]) ** 2
-            for j in range(3):
-                local += pose[j, k] * (points[i, j] - pose[j, 3])
-            beyond = max(bounds[0, k] - local, local - bounds[1, k], 0.0)
-            outside += beyond * beyond
-        if outside > reach * reach or bound[i] - np.sqrt(moved) > reach:
-            continue
-        found[count] = i
-        count += 1
+        if free[i] and _lower_bound(points, i, pose, bounds, anchor, bound) <= reach:
+            found[count] = i
+            count += 1
     return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _bound_loop(points, pose, bounds, anchor, bound, out):
+    for i in range(len(points)):
+        out[i] = _lower_bound(points, i, pose, bounds, anchor, bound)

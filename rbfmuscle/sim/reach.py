@@ -1,5 +1,6 @@
-"""What a motion can bring together: swept boxes, the fields that are worth building, the sub-steps that are needed."""
+"""What a motion can bring together: swept boxes, the fields worth building, the sub-steps needed."""
 
+import itertools
 import math
 from concurrent.futures import ThreadPoolExecutor
 
@@ -11,7 +12,7 @@ from rbfmuscle.sim.motion import bone_poses, interpolate
 
 # Poses of a motion that a swept box is made of; arcs between them are covered by the padding.
 SAMPLED_POSES = 48
-# Padding of a swept box, as a share of the muscle's diagonal: a muscle bulges beyond the boxes of its bones' motions.
+# Padding of a swept box, as a share of the muscle's diagonal, as a muscle bulges beyond its bones' motions.
 PADDING = 0.1
 # No attached point moves farther against a bone in one sub-step than this share of its muscle's diagonal.
 TRAVEL = 1.0 / 30.0
@@ -44,7 +45,7 @@ def sampled_poses(scene):
     chosen = sorted({round(k) for k in np.linspace(0, len(frames) - 1, min(len(frames), SAMPLED_POSES))})
     stops = [{}, *(frames[k] for k in chosen)]
     poses = [bone_poses(scene, {})]
-    for before, after in zip(stops[:-1], stops[1:]):
+    for before, after in itertools.pairwise(stops):
         count = max(1, math.ceil(_largest_change(before, after) / math.radians(10.0)))
         poses.extend(bone_poses(scene, interpolate(before, after, (k + 1) / count)) for k in range(count))
     return poses
@@ -72,8 +73,7 @@ def build_fields(scene, regions):
 
     def build(bone):
         boxes = [box for (_, name), box in regions.items() if name == bone.name]
-        region = np.array([np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)])
-        return BoneSDF.from_mesh(bone.mesh, region=region, **options)
+        return BoneSDF.from_mesh(bone.mesh, region=_union(boxes), **options)
 
     bones = [bone for bone in scene.bones if any(name == bone.name for _, name in regions)]
     if len(bones) < 2:
@@ -85,7 +85,8 @@ def build_fields(scene, regions):
 def split_step(scene, before, after):
     """Coordinates of the sub-steps from one frame to the next, ``before`` left out and ``after`` last.
 
-    No bone turns by more than the scene's ``substep_angle`` in one, and no attached point moves far against a bone.
+    No bone turns by more than the scene's ``substep_angle`` in one, and no attached point moves far against
+    a bone.
 
     Returns
     -------
@@ -100,7 +101,7 @@ def split_step(scene, before, after):
     while True:
         stops = [interpolate(before, after, k / count) for k in range(count + 1)]
         poses = [bone_poses(scene, stop) for stop in stops]
-        excess = max(_excess(scene, a, b, limit) for a, b in zip(poses[:-1], poses[1:]))
+        excess = max(_excess(scene, a, b, limit) for a, b in itertools.pairwise(poses))
         if excess <= 1.0 + 1e-9:
             return stops[1:]
         count = max(count + 1, math.ceil(count * min(excess, 4.0)))
@@ -134,6 +135,10 @@ def turned_angle(rotation):
         [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
     )
     return math.atan2(float(np.linalg.norm(skew)), float(np.trace(rotation)) - 1.0)
+
+
+def _union(boxes):
+    return np.array([np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)])
 
 
 def _corners(points):

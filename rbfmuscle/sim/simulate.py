@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -11,9 +11,12 @@ import numba
 import numpy as np
 
 from rbfmuscle.sim.contact import BoneContacts
+from rbfmuscle.sim.lane import Event, Lane
 from rbfmuscle.sim.motion import bone_poses
+from rbfmuscle.sim.overlap import settle_rest
 from rbfmuscle.sim.reach import build_fields, reached_bones, split_step
-from rbfmuscle.validation import SolveError
+
+__all__ = ["Event", "Frame", "ModelSurface", "MuscleModel", "simulate_frames"]
 
 
 @dataclass(frozen=True)
@@ -31,17 +34,6 @@ class ModelSurface:
     vertices: np.ndarray
     faces: np.ndarray
     quantities: dict = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Event:
-    """Something a user should know of: ``count`` points of a muscle at a bone, and what was done about them."""
-
-    frame: int
-    muscle: str
-    bone: str
-    count: int
-    action: str
 
 
 @dataclass
@@ -62,7 +54,8 @@ class Frame:
     events : list of Event
         Since the frame written before.
     times : dict of str to dict
-        For each muscle ``time_predict``, ``time_solve``, ... and their sum ``time_frame`` [s], since the frame before.
+        For each muscle ``time_predict``, ``time_solve``, ... and their sum ``time_frame`` [s], since the
+        frame before.
     wall : float
         Time for all muscles together [s], since the frame before.
     """
@@ -116,70 +109,7 @@ class MuscleModel(Protocol):
         """Surface as it is shown: closed and outward."""
 
     def neighbour_distance(self, points: np.ndarray) -> tuple:
-        """Signed distance (n,) of points to this muscle and its unit gradient (n, 3), for muscles that slide on it."""
-
-
-class _Lane:
-    """One muscle on its way through the motion: its model, its obstacles, its clock and its events."""
-
-    def __init__(self, model, contacts, scene):
-        self.model, self.contacts, self.scene = model, contacts, scene
-        self.name = model.name
-        self.times, self.events = {}, []
-        self.frame = 0
-
-    @contextmanager
-    def timed(self, stage):
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            key = f"time_{stage}"
-            self.times[key] = self.times.get(key, 0.0) + time.perf_counter() - start
-
-    def advance(self, stops):
-        """Go through the sub-steps ``stops``, a list of coordinates of which the first is where the muscle is."""
-        for before, after in zip(stops[:-1], stops[1:]):
-            self.step(before, after)
-
-    def step(self, before, after):
-        poses = bone_poses(self.scene, before), bone_poses(self.scene, after)
-        self.contacts.move(poses[1])
-        with self.timed("predict"):
-            self.model.predict(*poses)
-        self.solve(after)
-
-    def solve(self, coordinates):
-        """Solve, and refuse what is not finite."""
-        with self.timed("solve"):
-            try:
-                self.model.solve(self.contacts)
-            except (np.linalg.LinAlgError, FloatingPointError) as error:
-                raise SolveError(f"{self._place(coordinates)}: {error}") from error
-        bad = ~np.isfinite(self.model.contact_points()).all(axis=1)
-        if bad.any():
-            raise SolveError(
-                f"{self._place(coordinates)}: {int(bad.sum())} of {len(bad)} positions are not finite; "
-                "try a smaller substep_angle in [contact]"
-            )
-
-    def show(self):
-        with self.timed("surface"):
-            return self.model.surface(self.contacts)
-
-    def report(self, bone, count, action):
-        self.events.append(Event(self.frame, self.name, bone, int(count), action))
-
-    def collect(self):
-        """Times and events since the last call."""
-        times, events = self.times, self.events
-        times["time_frame"] = sum(times.values())
-        self.times, self.events = {}, []
-        return times, events
-
-    def _place(self, coordinates):
-        where = ", ".join(f"{name} = {np.degrees(value):.6g} deg" for name, value in coordinates.items())
-        return f"muscle {self.name!r}, frame {self.frame} ({where or 'rest'})"
+        """Signed distance (n,) of points to this muscle and its unit gradient (n, 3), for sliding muscles."""
 
 
 class _Crew:
@@ -235,7 +165,7 @@ def simulate_frames(scene, models, *, surfaces=True, written=None, fields=None) 
     """
     models = list(models.values()) if isinstance(models, Mapping) else list(models)
     lanes = [
-        _Lane(model, contacts, scene) for model, contacts in zip(models, _obstacles(scene, models, fields))
+        Lane(model, contacts, scene) for model, contacts in zip(models, _obstacles(scene, models, fields))
     ]
     crew = _Crew(len(lanes))
     try:
@@ -248,21 +178,24 @@ def _obstacles(scene, models, fields):
     """One BoneContacts for each model, with fields of the bones that it can reach."""
     regions = reached_bones(scene) if fields is None else None
     built = build_fields(scene, regions) if fields is None else fields
-    names = [bone.name for bone in scene.bones]
+    names, margin = [bone.name for bone in scene.bones], scene.contact.margin
     for model in models:
         reached = [built.get(n) if regions is None or (model.name, n) in regions else None for n in names]
-        yield BoneContacts(names, reached, contact_bone=model.contact_bone)
+        yield BoneContacts(names, reached, contact_bone=model.contact_bone, margin=margin)
 
 
 def _run(scene, lanes, crew, surfaces, written):
     here = dict.fromkeys(scene.motion.frames[0], 0.0) if scene.motion.frames else {}
-    wall = 0.0
+    start = time.perf_counter()
+    with crew.one_thread_each():
+        crew.each(lambda lane: settle_rest(lane, here), lanes)
+    wall = time.perf_counter() - start
     for index, coordinates in enumerate(scene.motion.frames):
         start = time.perf_counter()
         shown = written is None or index in written
         with crew.one_thread_each():
             _go(scene, lanes, crew, index, [here, *split_step(scene, here, coordinates)])
-            skins = crew.each(_Lane.show, lanes) if shown and surfaces else []
+            skins = crew.each(Lane.show, lanes) if shown and surfaces else []
         wall += time.perf_counter() - start
         if shown:
             yield _frame(scene, lanes, index, coordinates, skins, wall)

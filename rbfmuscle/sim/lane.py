@@ -1,0 +1,160 @@
+"""One muscle on its way through the motion: its model, its obstacles, its clock and its events."""
+
+import itertools
+import math
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from rbfmuscle.sim.motion import bone_poses, interpolate
+from rbfmuscle.sim.tunnelling import find_crossings, turn_back
+from rbfmuscle.validation import SolveError
+
+# Depth [mm] below which a path through a bone counts as touching it; above the error of a bone's field.
+TOUCH = 0.1
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something a user should know of: ``count`` points of a muscle at a bone, and what was done.
+
+    ``action`` is ``"angle_flag"`` (the angle test spoke), ``"reported"`` (crossed, nothing done),
+    ``"rotated"``, ``"halved"`` (the step was), ``"unresolved"`` (crossed, and no correction helped),
+    ``"overlap_kept"`` or ``"overlap_resolved"`` (at rest, before the first frame).
+    """
+
+    frame: int
+    muscle: str
+    bone: str
+    count: int
+    action: str
+
+
+class Lane:
+    """Drives one model through sub-steps.
+
+    Parameters
+    ----------
+    model : MuscleModel
+    contacts : BoneContacts
+        Of this muscle alone.
+    scene : Scene
+    """
+
+    def __init__(self, model, contacts, scene):
+        self.model, self.contacts, self.scene = model, contacts, scene
+        self.name = model.name
+        self.detect = scene.detect.tunnelling if scene.detect is not None else None
+        self.tolerance = scene.length(TOUCH)
+        self.times, self.events = {}, []
+        self.frame = 0
+
+    @contextmanager
+    def timed(self, stage):
+        """Add the time spent inside to ``time_<stage>``."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            key = f"time_{stage}"
+            self.times[key] = self.times.get(key, 0.0) + time.perf_counter() - start
+
+    def advance(self, stops):
+        """Go through sub-steps: a list of coordinates, the first of which is where the muscle is."""
+        for before, after in itertools.pairwise(stops):
+            self.step(before, after)
+
+    def step(self, before, after):
+        """One sub-step, watched for tunnelling where the scene asks for it."""
+        poses = bone_poses(self.scene, before), bone_poses(self.scene, after)
+        if self.detect is None:
+            self._move(poses, after)
+            return
+        state, start = self.model.snapshot(), self.model.contact_points().copy()
+        self._move(poses, after)
+        crossings = self._crossings(start, poses)
+        if crossings:
+            self._correct(state, start, poses, before, after, crossings)
+
+    def solve(self, coordinates):
+        """Solve, and refuse what is not finite.
+
+        Raises
+        ------
+        SolveError
+            Naming muscle, frame and coordinates.
+        """
+        with self.timed("solve"):
+            try:
+                self.model.solve(self.contacts)
+            except (np.linalg.LinAlgError, FloatingPointError) as error:
+                raise SolveError(f"{self._place(coordinates)}: {error}") from error
+        bad = ~np.isfinite(self.model.contact_points()).all(axis=1)
+        if bad.any():
+            raise SolveError(
+                f"{self._place(coordinates)}: {int(bad.sum())} of {len(bad)} positions are not finite; "
+                "try a smaller substep_angle in [contact]"
+            )
+
+    def show(self):
+        """The model's surface, timed."""
+        with self.timed("surface"):
+            return self.model.surface(self.contacts)
+
+    def report(self, bone, count, action):
+        """Note an event of the present frame."""
+        self.events.append(Event(self.frame, self.name, bone, int(count), action))
+
+    def collect(self):
+        """Times and events since the last call."""
+        times, events = self.times, self.events
+        times["time_frame"] = sum(times.values())
+        self.times, self.events = {}, []
+        return times, events
+
+    def _move(self, poses, after, crossings=(), start=None):
+        self.contacts.move(poses[1])
+        with self.timed("predict"):
+            self.model.predict(*poses)
+        if crossings:
+            turn_back(self.model, crossings, start, *poses, self.contacts.names)
+        self.solve(after)
+
+    def _crossings(self, start, poses, *, flag=True):
+        with self.timed("tunnelling"):
+            end = self.model.contact_points()
+            found = find_crossings(self.contacts, start, end, *poses, self.detect, tolerance=self.tolerance)
+        for crossing in found:
+            if flag and crossing.flagged:
+                self.report(self.contacts.names[crossing.bone], crossing.flagged, "angle_flag")
+        return [crossing for crossing in found if len(crossing.index)]
+
+    def _correct(self, state, start, poses, before, after, crossings):
+        """Turn what crossed with the bone and solve again; then halve the step, down to the smallest."""
+        if self.detect.action == "report":
+            self._report_all(crossings, "reported")
+            return
+        self.model.restore(state)
+        self._move(poses, after, crossings, start)
+        remaining = self._crossings(start, poses, flag=False)
+        if not remaining:
+            self._report_all(crossings, "rotated")
+            return
+        angle = max(abs(after.get(k, 0.0) - before.get(k, 0.0)) for k in {*before, *after})
+        if self.detect.action == "rotate" or angle <= 2.0 * math.radians(self.detect.smallest_step):
+            self._report_all(remaining, "unresolved")
+            return
+        self._report_all(remaining, "halved")
+        self.model.restore(state)
+        middle = interpolate(before, after, 0.5)
+        self.advance([before, middle, after])
+
+    def _report_all(self, crossings, action):
+        for crossing in crossings:
+            self.report(self.contacts.names[crossing.bone], len(crossing.index), action)
+
+    def _place(self, coordinates):
+        where = ", ".join(f"{name} = {np.degrees(value):.6g} deg" for name, value in coordinates.items())
+        return f"muscle {self.name!r}, frame {self.frame} ({where or 'rest'})"

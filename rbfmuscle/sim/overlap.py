@@ -1,0 +1,74 @@
+"""What overlaps at rest, as bones and muscles come from different sources: kept, resolved or refused."""
+
+import math
+
+import numpy as np
+
+from rbfmuscle.validation import SceneError
+
+# Depth [mm] below which nothing overlaps, and the movement [mm] below which a muscle has settled.
+DEPTH = 0.02
+SETTLED = 0.01
+# Bones grow into a muscle by this much [mm] in one solve, so that contact never has to guess the way out.
+GROWTH = 1.0
+MOST_SOLVES = 60
+
+
+def rest_overlap(contacts, points):
+    """Depths at rest: dict of bone index to (n,) depth of each free contact point inside that bone."""
+    free = contacts.free(len(points))
+    overlap = {}
+    for b in contacts.reached:
+        distance, _ = contacts.distance_and_direction(points, b)
+        depth = np.where(free, np.maximum(-distance, 0.0), 0.0)
+        overlap[b] = depth
+    return overlap
+
+
+def settle_rest(lane, coordinates):
+    """Deal with overlap at rest as the scene's ``[contact] initial`` says; for lanes in their rest pose.
+
+    ``"resolve"`` lets the bones grow from the muscle's surface to their true size while the model holds its
+    shape and volume; the muscle gives way by the least that its own elasticity knows. ``"keep"`` measures
+    every gap from the depth at rest.
+
+    Raises
+    ------
+    SceneError
+        With ``"error"``, naming muscle, bone and depth.
+    """
+    contacts, scene = lane.contacts, lane.scene
+    least = scene.length(DEPTH)
+    overlap = rest_overlap(contacts, lane.model.contact_points())
+    overlap = {b: depth for b, depth in overlap.items() if depth.max(initial=0.0) > least}
+    if not overlap:
+        return
+    if scene.contact.initial == "error":
+        b = max(overlap, key=lambda key: overlap[key].max())
+        count, depth = int((overlap[b] > least).sum()), overlap[b].max()
+        raise SceneError(
+            f"muscle {lane.name!r} overlaps bone {contacts.names[b]!r} at rest: {count} points, "
+            f"{depth:.3g} {scene.units} deep; set [contact] initial to 'resolve' or 'keep'"
+        )
+    for b, depth in overlap.items():
+        contacts.allow(b, depth)
+        action = "overlap_kept" if scene.contact.initial == "keep" else "overlap_resolved"
+        lane.report(contacts.names[b], (depth > least).sum(), action)
+    if scene.contact.initial == "resolve":
+        _resolve(lane, coordinates, overlap)
+
+
+def _resolve(lane, coordinates, overlap):
+    contacts, model = lane.contacts, lane.model
+    model.predict(contacts.poses, contacts.poses)
+    deepest = max(float(depth.max()) for depth in overlap.values())
+    growths = max(1, math.ceil(deepest / lane.scene.length(GROWTH)))
+    settled = lane.scene.length(SETTLED)
+    for k in range(MOST_SOLVES + growths):
+        for b, depth in overlap.items():
+            contacts.allow(b, depth * max(0.0, 1.0 - (k + 1) / growths))
+        before = model.contact_points().copy()
+        lane.solve(coordinates)
+        moved = np.linalg.norm(model.contact_points() - before, axis=1).max()
+        if k + 1 >= growths and moved < settled:
+            return

@@ -1,0 +1,213 @@
+"""Points that pass through a bone within one step: the angle test, the swept test, and the way back.
+
+Both tests look at a point's path relative to the bone, that is in bone coordinates. The angle test compares
+the directions to the bone at the two ends (Cervenka et al. 2023, equation 1, with the bound on d . d' stated
+as the text means it: below cos 135 degrees); it misses most short crossings. The swept test follows the path
+by sphere tracing (Hart 1996) in the bone's distance field and cannot miss what is thicker than its tolerance.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+# 135 degrees, the bound of the angle test.
+RIGHT_ANGLE_AND_HALF = 0.75 * math.pi
+# The field's interpolation may change a little faster than the distance does.
+STEP_SHARE = 0.9
+# A path that leaves a bone facing within 90 degrees of where it went in has slid along, not passed through.
+SLIDING_COSINE = 0.0
+# Rounds of tracing after which what is still under way counts as traced to where it is.
+MAX_ROUNDS = 10_000
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What the paths of some points did at one bone.
+
+    Attributes
+    ----------
+    index : (c,) ndarray of int
+        Points whose paths may have touched the bone; all others stayed clear of it.
+    lowest : (c,) ndarray
+        Smallest distance found along the path [scene unit]; negative inside.
+    through : (c,) ndarray of bool
+        Went in deeper than the tolerance, and came out (or ended) facing another way than it went in.
+    flagged : (c,) ndarray of bool
+        The angle test's answer: directions at the two ends differ by more than its angle.
+    """
+
+    index: np.ndarray
+    lowest: np.ndarray
+    through: np.ndarray
+    flagged: np.ndarray
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """Points that passed through one bone in a step."""
+
+    bone: int
+    index: np.ndarray
+    depth: float
+    flagged: int
+
+
+def sweep_paths(field, start, end, *, tolerance, angle=RIGHT_ANGLE_AND_HALF):
+    """Follow straight paths through a bone's distance field.
+
+    Parameters
+    ----------
+    field : BoneSDF
+    start, end : (n, 3) ndarray
+        Ends of each path in bone coordinates.
+    tolerance : float
+        Depth below which nothing counts, the field's own error [scene unit].
+    angle : float
+        Bound of the angle test [radian].
+
+    Returns
+    -------
+    Sweep
+    """
+    length = np.linalg.norm(end - start, axis=1)
+    distance = field.distance(start)
+    index = np.flatnonzero(distance < length)
+    ends = distance[index] + field.distance(end[index])
+    index = index[ends <= length[index] + tolerance]
+    if len(index) == 0:
+        nothing = np.zeros(0, dtype=bool)
+        return Sweep(index, np.zeros(0), nothing, nothing)
+    start, end = start[index], end[index]
+    lowest, first, last = _trace(field, start, end, tolerance)
+    deep = lowest < -tolerance
+    through = np.zeros(len(index), dtype=bool)
+    if deep.any():
+        way = end[deep] - start[deep]
+        entry = _directions(field, start[deep] + first[deep, None] * way)
+        leave = _directions(field, start[deep] + last[deep, None] * way)
+        through[deep] = np.einsum("ij,ij->i", entry, leave) < SLIDING_COSINE
+    cosine = np.einsum("ij,ij->i", _directions(field, start), _directions(field, end))
+    return Sweep(index, lowest, through, cosine < math.cos(angle))
+
+
+def find_crossings(contacts, start, end, before, after, options, *, tolerance):
+    """Points that passed through bones while the bones went from one set of poses to another.
+
+    Parameters
+    ----------
+    contacts : BoneContacts
+        In the poses ``after``.
+    start, end : (n, 3) ndarray
+        Contact points before and after the step, world coordinates.
+    before, after : dict of str to (4, 4) ndarray
+    options : TunnellingOptions
+        ``angle`` in degrees; with ``swept`` false the angle test alone decides.
+    tolerance : float
+        [scene unit].
+
+    Returns
+    -------
+    list of Crossing
+        One for each bone that was crossed or flagged.
+    """
+    crossings = []
+    for b in contacts.reached:
+        name = contacts.names[b]
+        back = np.linalg.inv(before[name]), np.linalg.inv(after[name])
+        bound = contacts.lower_bound(end, b)
+        count, index, first, second = _candidates(start, end, *back, bound, contacts.free(len(end)))
+        if count == 0:
+            continue
+        sweep = sweep_paths(
+            contacts.fields[b], first, second, tolerance=tolerance, angle=math.radians(options.angle)
+        )
+        crossed = sweep.through if options.swept else sweep.flagged
+        if crossed.any() or sweep.flagged.any():
+            depth = float(max(0.0, -sweep.lowest[crossed].min())) if crossed.any() else 0.0
+            crossings.append(Crossing(b, index[sweep.index[crossed]], depth, int(sweep.flagged.sum())))
+    return crossings
+
+
+def turn_back(model, crossings, start, before, after, names):
+    """Put points that crossed back where they were relative to the bone: turned with it about its joint.
+
+    The bone's own motion from ``before`` to ``after`` is the rotation about the joint centre by the step's
+    angle, so a point that is moved by it keeps its place at the bone. The model has predicted already; it is
+    handed the rigid transform from where it predicted the points to where they belong.
+    """
+    for crossing in crossings:
+        motion = after[names[crossing.bone]] @ np.linalg.inv(before[names[crossing.bone]])
+        wanted = start[crossing.index] @ motion[:3, :3].T + motion[:3, 3]
+        which = np.zeros(len(start), dtype=bool)
+        which[crossing.index] = True
+        model.turn(which, rigid_fit(model.contact_points()[crossing.index], wanted))
+
+
+def rigid_fit(points, targets):
+    """Rigid (4, 4) transform that takes points nearest to targets by least squares (Kabsch 1976)."""
+    middle, aim = points.mean(axis=0), targets.mean(axis=0)
+    u, _, vt = np.linalg.svd((points - middle).T @ (targets - aim))
+    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
+    transform = np.eye(4)
+    if len(points) > 2:
+        transform[:3, :3] = vt.T @ mirror @ u.T
+    transform[:3, 3] = aim - transform[:3, :3] @ middle
+    return transform
+
+
+def _trace(field, start, end, tolerance):
+    """Smallest distance along each path, and the first and last place (fraction) that was inside."""
+    length = np.linalg.norm(end - start, axis=1)
+    lowest = np.full(len(start), np.inf)
+    first, last, at = np.ones(len(start)), np.zeros(len(start)), np.zeros(len(start))
+    under_way = np.arange(len(start))
+    for _ in range(MAX_ROUNDS):
+        t = at[under_way]
+        distance = field.distance(start[under_way] + t[:, None] * (end[under_way] - start[under_way]))
+        lowest[under_way] = np.minimum(lowest[under_way], distance)
+        inside = under_way[distance < 0.0]
+        first[inside] = np.minimum(first[inside], at[inside])
+        last[inside] = at[inside]
+        share = np.where(distance < 0.0, 0.5, STEP_SHARE)
+        stride = np.maximum(share * np.abs(distance), 0.5 * tolerance)
+        at[under_way] = np.minimum(t + stride / np.maximum(length[under_way], 1e-300), 1.0)
+        under_way = under_way[t < 1.0]
+        if len(under_way) == 0:
+            break
+    return lowest, first, last
+
+
+def _directions(field, points):
+    gradient = field.distance_and_gradient(points)[1]
+    return gradient / np.maximum(np.linalg.norm(gradient, axis=1), 1e-12)[:, None]
+
+
+def _candidates(start, end, back_before, back_after, bound, free):
+    first, second = np.empty_like(start), np.empty_like(end)
+    index = np.empty(len(start), dtype=np.int64)
+    count = _candidates_loop(start, end, back_before, back_after, bound, free, index, first, second)
+    return count, index[:count], first[:count], second[:count]
+
+
+@numba.njit(cache=True, nogil=True)
+def _candidates_loop(start, end, back_before, back_after, bound, free, index, first, second):
+    """Paths, in bone coordinates, of the free points not farther from the bone than their path is long."""
+    count = 0
+    for i in range(len(start)):
+        if not free[i]:
+            continue
+        squared = 0.0
+        for k in range(3):
+            a, b = back_before[k, 3], back_after[k, 3]
+            for j in range(3):
+                a += back_before[k, j] * start[i, j]
+                b += back_after[k, j] * end[i, j]
+            first[count, k], second[count, k] = a, b
+            squared += (b - a) ** 2
+        if bound[i] > 0.0 and squared < bound[i] * bound[i]:
+            continue
+        index[count] = i
+        count += 1
+    return count

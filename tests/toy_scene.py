@@ -1,0 +1,217 @@
+"""Analytic bones and a small elastic muscle for tests of contact: no distance grids, no real model."""
+
+from types import SimpleNamespace
+
+import igl
+import numpy as np
+import trimesh
+
+from rbfmuscle.sim.motion import Motion
+from rbfmuscle.sim.options import ContactOptions, DetectOptions
+from rbfmuscle.sim.simulate import ModelSurface
+
+
+class AnalyticBone:
+    """The query interface of a bone's distance field, for a formula in bone coordinates."""
+
+    closed = True
+    memory = 0
+
+    def __init__(self, formula, bounds):
+        self.formula, self.bounds = formula, np.asarray(bounds, dtype=float)
+
+    def distance_and_gradient(self, points, pose=None):
+        pose = np.eye(4) if pose is None else pose
+        value, gradient = self.formula((points - pose[:3, 3]) @ pose[:3, :3])
+        return value, gradient @ pose[:3, :3].T
+
+    def distance(self, points, pose=None):
+        return self.distance_and_gradient(points, pose)[0]
+
+
+def sphere(radius=1.0, centre=(0, 0, 0)):
+    centre = np.asarray(centre, dtype=float)
+
+    def formula(p):
+        d = p - centre
+        r = np.maximum(np.linalg.norm(d, axis=1), 1e-12)
+        return r - radius, d / r[:, None]
+
+    return AnalyticBone(formula, [centre - radius, centre + radius])
+
+
+def cylinder(radius=1.0, half_length=50.0):
+    """Endless along z inside its box."""
+
+    def formula(p):
+        d = p * [1, 1, 0]
+        r = np.maximum(np.linalg.norm(d, axis=1), 1e-12)
+        return r - radius, d / r[:, None]
+
+    return AnalyticBone(formula, [[-radius, -radius, -half_length], [radius, radius, half_length]])
+
+
+def box(half, centre=(0, 0, 0)):
+    """Exact distance of a box with half sizes ``half``: a thin plate where one is small."""
+    half, centre = np.asarray(half, dtype=float), np.asarray(centre, dtype=float)
+
+    def formula(p):
+        q = p - centre
+        a = np.abs(q) - half
+        sign = np.where(q < 0, -1.0, 1.0)
+        outer = np.maximum(a, 0)
+        far = np.linalg.norm(outer, axis=1)
+        face = np.eye(3)[np.argmax(a, axis=1)]
+        gradient = np.where((far > 1e-12)[:, None], outer / np.maximum(far, 1e-12)[:, None], face) * sign
+        return far + np.minimum(a.max(axis=1), 0), gradient
+
+    return AnalyticBone(formula, [centre - half, centre + half])
+
+
+class ToyMuscle:
+    """An ellipsoid of vertices on springs to where the bones' blended motion would take them.
+
+    Energy (x - t)' K (x - t) / 2 with K a graph Laplacian plus a share of the identity; contacts by
+    projected Gauss-Seidel through the inverse of K. Attached vertices go with their bones.
+    """
+
+    def __init__(self, muscle, scene, *, sweeps=6):
+        self.name, self.muscle = muscle.name, muscle
+        self.names = [bone.name for bone in scene.bones]
+        self.rest = np.array(muscle.mesh.vertices, dtype=float)
+        self.faces = np.array(muscle.mesh.faces)
+        self.contact_bone = np.full(len(self.rest), -1)
+        for attachment in muscle.attachments:
+            self.contact_bone[attachment.vertices] = self.names.index(attachment.bone)
+        self.sweeps = sweeps
+        self.reach = 0.1 * np.ptp(self.rest, axis=0).max()
+        self.x, self.target = self.rest.copy(), self.rest.copy()
+        self.solves = 0
+        self._prepare()
+
+    def _prepare(self):
+        n = len(self.rest)
+        laplacian = np.zeros((n, n))
+        for a, b in np.vstack([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]]):
+            laplacian[a, b] = laplacian[b, a] = -1
+        laplacian -= np.diag(laplacian.sum(axis=1))
+        self.free = self.contact_bone < 0
+        weights = np.eye(len(self.names))[self.contact_bone]
+        fixed = ~self.free
+        if fixed.any():
+            inner = laplacian[np.ix_(self.free, self.free)]
+            weights[self.free] = -np.linalg.solve(inner, laplacian[np.ix_(self.free, fixed)] @ weights[fixed])
+        self.weights = weights
+        self.inverse = np.zeros((n, n))
+        stiff = laplacian[np.ix_(self.free, self.free)] + 0.05 * np.eye(self.free.sum())
+        self.inverse[np.ix_(self.free, self.free)] = np.linalg.inv(stiff)
+
+    def _blend(self, poses):
+        moved = np.stack([self.rest @ poses[n][:3, :3].T + poses[n][:3, 3] for n in self.names], axis=1)
+        return np.einsum("nb,nbk->nk", self.weights, moved)
+
+    def contact_points(self):
+        return self.x
+
+    def predict(self, before, after):
+        target = self._blend(after)
+        self.x = self.x + target - self._blend(before)
+        self.target = target
+
+    def solve(self, contacts):
+        self.solves += 1
+        x = self.target.copy()
+        for _ in range(self.sweeps):
+            near = contacts.half_spaces(self.x, self.reach)
+            pressure = np.zeros(len(near))
+            x = self.target.copy()
+            for _ in range(80):
+                for c in range(len(near)):
+                    i, normal = near.index[c], near.normal[c]
+                    gap = near.gap[c] + normal @ (x[i] - self.x[i])
+                    step = max(-gap / self.inverse[i, i], -pressure[c])
+                    pressure[c] += step
+                    x += self.inverse[:, i : i + 1] * (step * normal)
+            self.x = x
+
+    def turn(self, which, transform):
+        self.x[which] = self.x[which] @ transform[:3, :3].T + transform[:3, 3]
+
+    def snapshot(self):
+        return self.x.copy(), self.target.copy()
+
+    def restore(self, state):
+        self.x, self.target = state[0].copy(), state[1].copy()
+
+    def carried_mesh(self):
+        return self.x.copy(), self.faces
+
+    def surface(self, contacts):
+        return ModelSurface(self.x.copy(), self.faces, {"solver_penetration_max": 0.0})
+
+    def neighbour_distance(self, points):
+        distance, _, _, normals = igl.signed_distance(
+            points, self.x, self.faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
+        )[:4]
+        return distance, normals
+
+
+def ellipsoid(half, centre=(0, 0, 0), *, subdivisions=2):
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
+    return trimesh.Trimesh(mesh.vertices * np.asarray(half) + np.asarray(centre), mesh.faces, process=False)
+
+
+def attach(mesh, bone, where):
+    return SimpleNamespace(bone=bone, vertices=np.flatnonzero(where(mesh.vertices)))
+
+
+def bone(name, field):
+    """A bone whose mesh is the box of its field (only its bounds and the name are used)."""
+    low, high = field.bounds
+    mesh = trimesh.creation.box(extents=high - low)
+    mesh.apply_translation(0.5 * (low + high))
+    return SimpleNamespace(name=name, mesh=mesh, source=None)
+
+
+def joint(name, parent, child, centre, **axes):
+    axes = {key: np.asarray(axis, dtype=float) for key, axis in axes.items()}
+    return SimpleNamespace(name=name, parent=parent, child=child, centre=np.asarray(centre, float), axes=axes)
+
+
+def muscle(name, mesh, attachments, **options):
+    return SimpleNamespace(
+        name=name, mesh=mesh, attachments=attachments, model="rbf", options=options, fibres=None
+    )
+
+
+def scene(bones, joints, muscles, frames, *, initial="keep", sliding=None, tunnelling=None, substep=2.0):
+    """The parts of a scene that the frame loop reads."""
+    return SimpleNamespace(
+        name="toy",
+        units="mm",
+        length=lambda mm: mm,
+        bones=bones,
+        joints=joints,
+        muscles=muscles,
+        motion=Motion(frames),
+        contact=ContactOptions(initial=initial, substep_angle=substep),
+        sliding=sliding,
+        detect=None if tunnelling is None else DetectOptions(tunnelling=tunnelling),
+        output=None,
+    )
+
+
+def hinged_scene(angles, **options):
+    """An arm that turns about z at the origin, with a long muscle over a round bone: (scene, fields)."""
+    fields = {"trunk": sphere(8.0, (0, 0, 0)), "arm": box((15, 2, 2), (30, 0, 0))}
+    mesh = ellipsoid((32, 4, 4), (0, 14, 0))
+    ends = [attach(mesh, "trunk", lambda v: v[:, 0] < -24), attach(mesh, "arm", lambda v: v[:, 0] > 24)]
+    frames = [{"hinge.bend": np.radians(a)} for a in angles]
+    made = scene(
+        [bone(name, field) for name, field in fields.items()],
+        [joint("hinge", "trunk", "arm", (0, 0, 0), bend=(0, 0, -1))],
+        [muscle("strap", mesh, ends)],
+        frames,
+        **options,
+    )
+    return made, fields
