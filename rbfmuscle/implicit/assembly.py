@@ -1,0 +1,119 @@
+"""Matrices of RBF systems.
+
+Unknowns of a Hermite fit are grouped: all values, then all x-, y- and z-derivatives, so that every
+column of every block is one contiguous run. Only the lower triangle (Fortran order) is filled.
+"""
+
+import numpy as np
+from numba import njit
+
+from rbfmuscle.implicit.radial import _radial_loop
+
+
+def exponents(degree):
+    """Exponents (q, 3) of the monomials of total degree up to ``degree``; (0, 3) for degree -1."""
+    rows = [
+        (i, j, total - i - j)
+        for total in range(degree + 1)
+        for i in range(total, -1, -1)
+        for j in range(total - i, -1, -1)
+    ]
+    return np.array(rows, dtype=np.int64).reshape(-1, 3)
+
+
+def monomials(points, powers):
+    """Monomials at points: (q, n)."""
+    out = np.ones((len(powers), len(points)))
+    for row, power in zip(out, powers):
+        for axis in range(3):
+            if power[axis]:
+                row *= points[:, axis] ** power[axis]
+    return out
+
+
+def monomial_gradients(points, powers):
+    """Derivatives of the monomials at points: (3, q, n)."""
+    out = np.zeros((3, len(powers), len(points)))
+    for axis in range(3):
+        lower = powers.copy()
+        lower[:, axis] -= 1
+        some = lower[:, axis] >= 0
+        out[axis, some] = powers[some, axis, None] * monomials(points, lower[some])
+    return out
+
+
+def hermite_polynomials(points, powers):
+    """Polynomial block (q, 4n): values, then the three derivatives, at each point."""
+    return np.hstack([monomials(points, powers), *monomial_gradients(points, powers)])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _offsets_loop(x, j, scale2, first, d, u):
+    """d (3, m) = x[:, first + i] - x[:, j], u = squared length times scale2."""
+    for i in range(u.size):
+        dx = x[0, first + i] - x[0, j]
+        dy = x[1, first + i] - x[1, j]
+        dz = x[2, first + i] - x[2, j]
+        d[0, i] = dx
+        d[1, i] = dy
+        d[2, i] = dz
+        u[i] = (dx * dx + dy * dy + dz * dz) * scale2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _ridge_loop(gamma, polynomials, column, first, out):
+    """out += gamma * (P^T P)[first:, column]."""
+    for q in range(polynomials.shape[0]):
+        c = gamma * polynomials[q, column]
+        if c != 0.0:
+            for i in range(out.size):
+                out[i] += c * polynomials[q, first + i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _value_matrix_loop(x, epsilon, base, parameter, compact, table, gamma, polynomials, out):
+    """out[j, i] = phi(|x_i - x_j|) + gamma P^T P for i >= j; x is (3, n), out the transpose of the matrix."""
+    n = x.shape[1]
+    d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((4, n)), np.empty((4, n))
+    for j in range(n):
+        m = n - j
+        _offsets_loop(x, j, epsilon * epsilon, j, d[:, :m], u[:m])
+        _radial_loop(base, parameter, compact, table, 1, u[:m], work, radial)
+        column = out[j, j:]
+        for i in range(m):
+            column[i] = radial[0, i]
+        _ridge_loop(gamma, polynomials, j, j, column)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _hermite_matrix_loop(x, epsilon, base, parameter, compact, table, gamma, polynomials, out):
+    """Lower triangle of the Hermite matrix plus gamma P^T P; out[column, row] is its transpose.
+
+    Blocks: (value, value) phi; (d/dx_c, value) first * d_c; (d/dx_c, d/dx_e) -(first * delta + second * d_c d_e).
+    """
+    n = x.shape[1]
+    e2 = epsilon * epsilon
+    d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((4, n)), np.empty((4, n))
+    for j in range(n):
+        _offsets_loop(x, j, e2, 0, d, u)
+        _radial_loop(base, parameter, compact, table, 7, u, work, radial)
+        phi, first, second = radial[0], radial[1], radial[2]
+        column = out[j]
+        for i in range(j, n):
+            column[i] = phi[i]
+        for c in range(3):
+            target, dc = column[(c + 1) * n : (c + 2) * n], d[c]
+            for i in range(n):
+                target[i] = e2 * first[i] * dc[i]
+        _ridge_loop(gamma, polynomials, j, j, column[j:])
+        for e in range(3):
+            de = d[e]
+            column = out[(e + 1) * n + j]
+            for i in range(j, n):
+                column[(e + 1) * n + i] = -e2 * (first[i] + e2 * second[i] * de[i] * de[i])
+            for c in range(e + 1, 3):
+                target, dc = column[(c + 1) * n : (c + 2) * n], d[c]
+                for i in range(n):
+                    target[i] = -e2 * e2 * second[i] * dc[i] * de[i]
+            start = (e + 1) * n + j
+            _ridge_loop(gamma, polynomials, start, start, column[start:])

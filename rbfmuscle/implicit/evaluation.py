@@ -1,0 +1,244 @@
+"""Evaluation of an RBF field: values, gradients and Hessians at many points.
+
+Points are handled in blocks that stay in the first-level cache; the inner loops run over the points of
+a block. Large sets are split over threads.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numba
+import numpy as np
+from numba import njit
+
+from rbfmuscle.implicit.radial import _radial_loop
+
+_BLOCK = 256
+_SERIAL = 400_000  # pairs below which starting threads does not pay
+_POOLS = {}
+
+
+def run_in_chunks(loop, count, cost):
+    """Call ``loop(start, stop)`` over 0 ... count, on threads where ``cost`` (pairs) is worth it."""
+    threads = min(numba.get_num_threads(), -(-count // _BLOCK))
+    if threads < 2 or cost < _SERIAL:
+        loop(0, count)
+        return
+    if threads not in _POOLS:
+        _POOLS[threads] = ThreadPoolExecutor(threads - 1, thread_name_prefix="rbf-field")
+    edges = [count * k // threads for k in range(threads + 1)]
+    others = [_POOLS[threads].submit(loop, edges[k], edges[k + 1]) for k in range(1, threads)]
+    loop(0, edges[1])
+    for other in others:
+        other.result()
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _cubic_value_loop(p, cx, cy, cz, a, acc):
+    """acc += a r^3."""
+    for i in range(acc.size):
+        dx, dy, dz = p[0, i] - cx, p[1, i] - cy, p[2, i] - cz
+        u = dx * dx + dy * dy + dz * dz
+        acc[i] += a * u * np.sqrt(u)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _cubic_gradient_loop(p, cx, cy, cz, a, acc, g):
+    """acc += a r^3, g += 3 a r d."""
+    for i in range(acc.size):
+        dx, dy, dz = p[0, i] - cx, p[1, i] - cy, p[2, i] - cz
+        u = dx * dx + dy * dy + dz * dz
+        w = a * np.sqrt(u)
+        acc[i] += w * u
+        g[0, i] += 3.0 * w * dx
+        g[1, i] += 3.0 * w * dy
+        g[2, i] += 3.0 * w * dz
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _cubic_hermite_value_loop(p, cx, cy, cz, a, bx, by, bz, acc):
+    """acc += a r^3 - 3 r (B . d)."""
+    for i in range(acc.size):
+        dx, dy, dz = p[0, i] - cx, p[1, i] - cy, p[2, i] - cz
+        u = dx * dx + dy * dy + dz * dz
+        acc[i] += np.sqrt(u) * (a * u - 3.0 * (bx * dx + by * dy + bz * dz))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _cubic_hermite_gradient_loop(p, cx, cy, cz, a, bx, by, bz, acc, g):
+    """Adds 3 a r d - 3 r B - 3/r (B . d) d to g, the value to acc."""
+    for i in range(acc.size):
+        dx, dy, dz = p[0, i] - cx, p[1, i] - cy, p[2, i] - cz
+        u = dx * dx + dy * dy + dz * dz + 1e-300
+        r = np.sqrt(u)
+        bd = 3.0 * (bx * dx + by * dy + bz * dz)
+        acc[i] += r * (a * u - bd)
+        radial = 3.0 * a * r - bd / r
+        r3 = 3.0 * r
+        g[0, i] += radial * dx - r3 * bx
+        g[1, i] += radial * dy - r3 * by
+        g[2, i] += radial * dz - r3 * bz
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _offsets_loop(p, cx, cy, cz, e2, d, u):
+    """d = p - centre, u = e2 |d|^2."""
+    for i in range(u.size):
+        dx, dy, dz = p[0, i] - cx, p[1, i] - cy, p[2, i] - cz
+        d[0, i] = dx
+        d[1, i] = dy
+        d[2, i] = dz
+        u[i] = e2 * (dx * dx + dy * dy + dz * dz)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _add_value_loop(a, bx, by, bz, e2, hermite, radial, d, acc):
+    """acc += a phi - first (B . d)."""
+    phi, first = radial[0], radial[1]
+    if not hermite:
+        for i in range(acc.size):
+            acc[i] += a * phi[i]
+        return
+    for i in range(acc.size):
+        acc[i] += a * phi[i] - e2 * first[i] * (bx * d[0, i] + by * d[1, i] + bz * d[2, i])
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _add_gradient_loop(a, bx, by, bz, e2, hermite, radial, d, g):
+    """g += a first d - first B - second (B . d) d."""
+    first, second = radial[1], radial[2]
+    if not hermite:
+        for i in range(d.shape[1]):
+            w = a * e2 * first[i]
+            g[0, i] += w * d[0, i]
+            g[1, i] += w * d[1, i]
+            g[2, i] += w * d[2, i]
+        return
+    e4 = e2 * e2
+    for i in range(d.shape[1]):
+        bd = bx * d[0, i] + by * d[1, i] + bz * d[2, i]
+        f = e2 * first[i]
+        w = a * f - e4 * second[i] * bd
+        g[0, i] += w * d[0, i] - f * bx
+        g[1, i] += w * d[1, i] - f * by
+        g[2, i] += w * d[2, i] - f * bz
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _add_hessian_loop(a, b, e2, hermite, radial, d, h):
+    """h (6: xx yy zz xy xz yz) += a (first I + second d d^T) minus, for Hermite weights B,
+
+    second ((B . d) I + d B^T + B d^T) + third (B . d) d d^T.
+    """
+    first, second, third = radial[1], radial[2], radial[3]
+    e4 = e2 * e2
+    for i in range(d.shape[1]):
+        x, y, z = d[0, i], d[1, i], d[2, i]
+        s = e4 * second[i]
+        on, outer = a * e2 * first[i], a * s
+        if hermite:
+            bd = b[0] * x + b[1] * y + b[2] * z
+            on -= s * bd
+            outer -= e4 * e2 * third[i] * bd
+        else:
+            s = 0.0
+        h[0, i] += on + outer * x * x - 2.0 * s * b[0] * x
+        h[1, i] += on + outer * y * y - 2.0 * s * b[1] * y
+        h[2, i] += on + outer * z * z - 2.0 * s * b[2] * z
+        h[3, i] += outer * x * y - s * (b[0] * y + b[1] * x)
+        h[4, i] += outer * x * z - s * (b[0] * z + b[2] * x)
+        h[5, i] += outer * y * z - s * (b[1] * z + b[2] * y)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cubic_block_loop(centres, a, b, hermite, gradient, p, acc, g):
+    """The cubic kernel with epsilon 1, the commonest by far, without intermediate arrays."""
+    for j in range(centres.shape[1]):
+        cx, cy, cz, w = centres[0, j], centres[1, j], centres[2, j], a[j]
+        if hermite and gradient:
+            _cubic_hermite_gradient_loop(p, cx, cy, cz, w, b[0, j], b[1, j], b[2, j], acc, g)
+        elif hermite:
+            _cubic_hermite_value_loop(p, cx, cy, cz, w, b[0, j], b[1, j], b[2, j], acc)
+        elif gradient:
+            _cubic_gradient_loop(p, cx, cy, cz, w, acc, g)
+        else:
+            _cubic_value_loop(p, cx, cy, cz, w, acc)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _general_block_loop(
+    centres, a, b, hermite, order, epsilon, base, parameter, compact, table, p, scratch, acc, g, h
+):
+    """Any kernel: radial functions into a scratch block, then their sums. epsilon (K,)."""
+    n = acc.size
+    d, u, work, radial = scratch[0:3, :n], scratch[3, :n], scratch[4:8], scratch[8:12]
+    wanted = (2 << (order + hermite)) - 1
+    for j in range(centres.shape[1]):
+        e2 = epsilon[j] * epsilon[j]
+        _offsets_loop(p, centres[0, j], centres[1, j], centres[2, j], e2, d, u)
+        _radial_loop(base, parameter, compact, table, wanted, u, work, radial)
+        _add_value_loop(a[j], b[0, j], b[1, j], b[2, j], e2, hermite, radial, d, acc)
+        if order > 0:
+            _add_gradient_loop(a[j], b[0, j], b[1, j], b[2, j], e2, hermite, radial, d, g)
+        if order > 1:
+            _add_hessian_loop(a[j], b[:, j], e2, hermite, radial, d, h)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _evaluate_loop(
+    points, origin, scale, centres, a, b, hermite, order, epsilon, base, parameter, compact, table, cubic,
+    start, stop, out
+):  # fmt: skip
+    """out[0] value, out[1:4] gradient, out[4:10] Hessian (order 0, 1, 2) at points[start:stop], scaled coordinates."""
+    p, scratch = np.empty((3, _BLOCK)), np.empty((12, _BLOCK))
+    for low in range(start, stop, _BLOCK):
+        n = min(_BLOCK, stop - low)
+        for i in range(n):
+            for c in range(3):
+                p[c, i] = (points[low + i, c] - origin[c]) / scale
+        block = out[:, low : low + n]
+        if cubic and order < 2:
+            _cubic_block_loop(centres, a, b, hermite, order == 1, p[:, :n], block[0], block[1:4])
+        else:
+            _general_block_loop(
+                centres, a, b, hermite, order, epsilon, base, parameter, compact, table,
+                p[:, :n], scratch, block[0], block[1:4], block[4:10],
+            )  # fmt: skip
+
+
+def evaluate(points, origin, scale, centres, weights, kernel, epsilon, order):
+    """Radial part of a field in scaled coordinates.
+
+    Parameters
+    ----------
+    points : (n, 3) ndarray
+    origin : (3,) ndarray
+    scale : float
+        Scaled coordinates are (points - origin) / scale.
+    centres : (3, K) ndarray
+        Scaled.
+    weights : (4, K) or (1, K) ndarray
+        a, and for a Hermite fit B.
+    kernel : Kernel
+    epsilon : (K,) ndarray
+        In scaled coordinates.
+    order : int
+        0 value, 1 with gradient, 2 with Hessian.
+
+    Returns
+    -------
+    (1, n), (4, n) or (10, n) ndarray
+        Value, gradient, Hessian (xx, yy, zz, xy, xz, yz), derivatives with respect to scaled coordinates.
+    """
+    hermite = len(weights) == 4
+    b = weights[1:] if hermite else np.zeros((3, weights.shape[1]))
+    cubic = kernel.name == "cubic" and bool((epsilon == 1.0).all())
+    out = np.zeros(((1, 4, 10)[order], len(points)))
+
+    def loop(start, stop):
+        _evaluate_loop(
+            points, origin, scale, centres, weights[0], b, hermite, order, epsilon,
+            kernel.base, kernel.parameter, kernel.compact, kernel.table, cubic, start, stop, out,
+        )  # fmt: skip
+
+    run_in_chunks(loop, len(points), len(points) * centres.shape[1])
+    return out

@@ -1,0 +1,200 @@
+"""Loops that fill the radial functions of any kernel for a block of squared distances.
+
+The kernel is chosen once a block, outside the inner loops, which are short enough to become vector code.
+exp and log are written out here because calls into the C library keep a loop from being vectorised.
+"""
+
+import numpy as np
+from numba import njit
+
+ONE, EXP, GAUSS, BINOMIAL, CUT, LOG, POWER = range(7)
+"""Bases: 1, exp(-s), exp(-s^2), (1+s^2)^beta, (1-s)+, log s, s^a."""
+
+_LOG2E = 1.4426950408889634
+_LN2_HIGH = 6.93147180369123816490e-01
+_LN2_LOW = 1.90821492927058770002e-10
+_SHIFTER = 6755399441055744.0  # 1.5 * 2**52: adding it leaves the rounded integer in the low bits
+_TINY = 2.2250738585072014e-308
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _exp_loop(factor, x, bits, out):
+    """out = exp(factor * x), relative error of the exponential below 3e-16; 0 where factor * x < -708.
+
+    x, bits (scratch) and out must not overlap, or the loops are not vectorised.
+    """
+    whole = bits.view(np.int64)
+    for i in range(x.size):
+        bits[i] = min(max(factor * x[i], -708.0), 709.0) * _LOG2E + _SHIFTER
+    for i in range(x.size):
+        n = bits[i] - _SHIFTER
+        t = min(max(factor * x[i], -708.0), 709.0)
+        r = (t - n * _LN2_HIGH) - n * _LN2_LOW
+        p = 1.0 / 6227020800.0
+        p = p * r + 1.0 / 479001600.0
+        p = p * r + 1.0 / 39916800.0
+        p = p * r + 1.0 / 3628800.0
+        p = p * r + 1.0 / 362880.0
+        p = p * r + 1.0 / 40320.0
+        p = p * r + 1.0 / 5040.0
+        p = p * r + 1.0 / 720.0
+        p = p * r + 1.0 / 120.0
+        p = p * r + 1.0 / 24.0
+        p = p * r + 1.0 / 6.0
+        p = p * r + 0.5
+        p = p * r + 1.0
+        p = p * r + 1.0
+        whole[i] = (whole[i] + 1023) << 52
+        out[i] = p * bits[i] if factor * x[i] >= -708.0 else 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _log_loop(x, bits, out):
+    """out = log(x) for x > 0, relative error below 4e-16; 0 is taken as the smallest normal number."""
+    whole = bits.view(np.int64)
+    for i in range(x.size):
+        bits[i] = max(x[i], _TINY)
+    for i in range(x.size):
+        b = whole[i]
+        e = (b - 4604544271217802189) >> 52  # bits of sqrt(1/2): mantissa then lies in [0.707, 1.414)
+        out[i] = e
+        whole[i] = b - (e << 52)
+    for i in range(x.size):
+        m = bits[i]
+        s = (m - 1.0) / (m + 1.0)
+        z = s * s
+        p = 1.0 / 23.0
+        p = p * z + 1.0 / 21.0
+        p = p * z + 1.0 / 19.0
+        p = p * z + 1.0 / 17.0
+        p = p * z + 1.0 / 15.0
+        p = p * z + 1.0 / 13.0
+        p = p * z + 1.0 / 11.0
+        p = p * z + 1.0 / 9.0
+        p = p * z + 1.0 / 7.0
+        p = p * z + 1.0 / 5.0
+        p = p * z + 1.0 / 3.0
+        f = m - 1.0
+        # log m = 2s + 2s^3 p with 2s = f - s f, so that the leading term is exact
+        out[i] = out[i] * _LN2_HIGH + (f - s * (f - 2.0 * z * p) + out[i] * _LN2_LOW)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _base_loop(base, parameter, u, s, b, bits, more):
+    """s = sqrt(u) and b = the kernel's base; bits and more are scratch."""
+    for i in range(u.size):
+        s[i] = np.sqrt(u[i])
+    if base == EXP:
+        _exp_loop(-1.0, s, bits, b)
+    elif base == GAUSS:
+        _exp_loop(-1.0, u, bits, b)
+    elif base == LOG:
+        _log_loop(u, bits, b)
+        for i in range(u.size):
+            b[i] = 0.5 * b[i]
+    elif base == BINOMIAL:
+        _binomial_loop(parameter, u, b, bits, more)
+    elif base == POWER:
+        _log_loop(u, bits, more)
+        _exp_loop(0.5 * parameter, more, bits, b)
+        for i in range(u.size):
+            b[i] = b[i] if u[i] > 0.0 else 0.0
+    elif base == CUT:
+        for i in range(u.size):
+            b[i] = max(1.0 - s[i], 0.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _binomial_loop(beta, u, b, bits, more):
+    """b = (1 + u)**beta, by roots where beta is a half."""
+    if beta == 0.5:
+        for i in range(u.size):
+            b[i] = np.sqrt(1.0 + u[i])
+    elif beta == -0.5:
+        for i in range(u.size):
+            b[i] = 1.0 / np.sqrt(1.0 + u[i])
+    elif beta == -1.0:
+        for i in range(u.size):
+            b[i] = 1.0 / (1.0 + u[i])
+    elif beta == 1.5:
+        for i in range(u.size):
+            b[i] = (1.0 + u[i]) * np.sqrt(1.0 + u[i])
+    else:
+        for i in range(u.size):
+            b[i] = 1.0 + u[i]
+        _log_loop(b, bits, more)
+        _exp_loop(beta, more, bits, b)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _inner_loop(base, row, u, s, b, out):
+    """out = base * A(s)."""
+    a0, a1, a2, a3, a4 = row[2], row[3], row[4], row[5], row[6]
+    if base == ONE or (a0 == 0.0 and a1 == 0.0 and a2 == 0.0 and a4 == 0.0):
+        for i in range(u.size):
+            out[i] = 0.0
+        return
+    if a1 == 0.0 and a2 == 0.0 and a3 == 0.0 and a4 == 0.0:
+        for i in range(u.size):
+            out[i] = a0
+    else:
+        for i in range(u.size):
+            out[i] = a0 + s[i] * (a1 + s[i] * (a2 + s[i] * (a3 + s[i] * a4)))
+    if base == CUT:
+        for _ in range(int(row[1])):
+            for i in range(u.size):
+                out[i] *= b[i]
+        return
+    for i in range(u.size):
+        out[i] *= b[i]
+    if base == BINOMIAL:
+        for _ in range(int(row[1])):
+            for i in range(u.size):
+                out[i] = out[i] / (1.0 + u[i])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _radial_loop(base, parameter, compact, table, wanted, u, work, out):
+    """Fill out[k] (4, n) with the k-th radial function of s**2 = u for every bit k set in wanted.
+
+    work is a (4, n) scratch array. Where a function is infinite at u = 0 a finite value stands in: it is only ever
+    multiplied by components of the zero vector.
+    """
+    s, b = work[0, : u.size], work[1, : u.size]
+    _base_loop(base, parameter, u, s, b, work[2, : u.size], work[3, : u.size])
+    for k in range(4):
+        if not (wanted >> k) & 1:
+            continue
+        row = table[k]
+        values = out[k, : u.size]
+        _inner_loop(base, row, u, s, b, values)
+        c0, c1, c2, c3, c4 = row[7], row[8], row[9], row[10], row[11]
+        if c1 != 0.0 or c2 != 0.0 or c3 != 0.0 or c4 != 0.0:
+            for i in range(u.size):
+                values[i] += c0 + s[i] * (c1 + s[i] * (c2 + s[i] * (c3 + s[i] * c4)))
+        elif c0 != 0.0:
+            for i in range(u.size):
+                values[i] += c0
+        _times_power_loop(int(row[0]), u, s, values)
+        if compact:
+            for i in range(u.size):
+                values[i] = values[i] if u[i] < 1.0 else 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _times_power_loop(power, u, s, values):
+    """values *= s**power; for a negative power the value at s = 0 becomes 0."""
+    if power > 0:
+        if power & 1:
+            for i in range(u.size):
+                values[i] *= s[i]
+        for _ in range(power // 2):
+            for i in range(u.size):
+                values[i] *= u[i]
+    elif power < 0:
+        for i in range(u.size):
+            values[i] = values[i] / (s[i] if s[i] > 0.0 else 1.0)
+            values[i] = values[i] if s[i] > 0.0 else 0.0
+        for _ in range(-power - 1):
+            for i in range(u.size):
+                values[i] = values[i] / (s[i] if s[i] > 0.0 else 1.0)
