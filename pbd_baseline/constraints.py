@@ -1,8 +1,9 @@
 """Edge, bending and volume constraints: one class a family, one loop each, for PBD and XPBD alike.
 
 Every projection is ``dlambda = (-C - a lambda) / (sum_i w_i |grad_i C|^2 + a)``,
-``dx_i = k w_i grad_i C dlambda`` with the compliance a over the time of the step (Macklin 2016); ``a = 0`` is the
-hard constraint of PBD, and k in [0, 1] its stiffness (Müller 2007). w is the inverse mass, 0 where a vertex is held.
+``dx_i = k w_i grad_i C dlambda`` with the compliance a over the time of the step (Macklin 2016); ``a = 0`` is
+the hard constraint of PBD, and k in [0, 1] its stiffness (Müller 2007). w is the inverse mass, 0 where a vertex
+is held.
 """
 
 import numba
@@ -10,7 +11,7 @@ import numpy as np
 
 from pbd_baseline.topology import colour
 
-# A gradient shorter than this share of its natural size belongs to a collapsed element, which has no direction.
+# A gradient shorter than this share of its natural size belongs to a collapsed element: it has no direction.
 TINY = 1e-12
 # No dihedral angle turns back by more than 2 atan(1) = 90 degrees in one projection.
 LARGEST_HALF_TANGENT = 1.0
@@ -58,10 +59,10 @@ class EdgeConstraint:
 class BendingConstraint:
     """Keeps dihedral angles: C = 2 tan((t - t0) / 2), t the signed angle between the faces at an edge.
 
-    C is t - t0 to third order, is defined by sine and cosine alone (no arc cosine to clamp) and grows without bound
-    towards a fold. grad C = (1 + C^2 / 4) grad t, with the gradient of t by Bridson et al. 2003: for edge (0, 1),
-    length |e|, wings 2 and 3 and unnormalised face normals n_2 and n_3, grad_2 t = -|e| n_2 / |n_2|^2,
-    grad_3 t = -|e| n_3 / |n_3|^2, and the edge's ends take the opposite, split by where the wings' feet fall.
+    C is t - t0 to third order, is defined by sine and cosine alone (no arc cosine to clamp) and grows without
+    bound towards a fold. grad C = (1 + C^2 / 4) grad t, with the gradient of t by Bridson et al. 2003: for edge
+    (0, 1), length |e|, wings 2 and 3 and unnormalised face normals n_2 and n_3, grad_2 t = -|e| n_2 / |n_2|^2,
+    grad_3 t = -|e| n_3 / |n_3|^2; the edge's ends take the opposite, split by where the wings' feet fall.
 
     Parameters
     ----------
@@ -139,8 +140,8 @@ class VolumeConstraint:
     def restore(self, points, direction):
         """Move points along a direction (n, 3) until the volume is the rest volume; return the factor s.
 
-        V(x + s d) is a cubic in s, computed exactly, so the volume is met to rounding. Where the direction cannot
-        meet it (no real root near zero), nothing moves and s is 0.
+        V(x + s d) is a cubic in s, computed exactly, so the volume is met to rounding. Where the direction
+        cannot meet it (no real root near zero), nothing moves and s is 0.
         """
         s = _cubic_step(_cubic_loop(points, direction, self.faces), self.rest)
         points += s * direction
@@ -195,7 +196,7 @@ def _edge_loop(points, inverse_mass, edges, rest, stiffness, compliance, multipl
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _wing_frame(points, i, j, k, m):
-    """Edge j - i with its squared length, normals of faces (i, j, k) and (j, i, m) with theirs, feet of the wings."""
+    """Squared length of edge j - i, normals of faces (i, j, k) and (j, i, m) with theirs, feet of the wings."""
     ex, ey, ez = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
     ax, ay, az = points[k, 0] - points[i, 0], points[k, 1] - points[i, 1], points[k, 2] - points[i, 2]
     bx, by, bz = points[m, 0] - points[i, 0], points[m, 1] - points[i, 1], points[m, 2] - points[i, 2]
@@ -274,9 +275,9 @@ def _volume_loop(points, faces, origin):
 
 @numba.njit(cache=True, nogil=True)
 def _volume_gradient_loop(points, faces, out):
-    """Sum of (b - o) x (c - o) / 6 over the faces of each vertex, o the face's own vertex: a third of its area vector.
+    """A third of the area vector of each face, summed at its vertices.
 
-    On a closed mesh it equals the sum of b x c / 6, without the cancellation far from the origin.
+    On a closed mesh this equals the sum of b x c / 6, without the cancellation far from the origin.
     """
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]

@@ -1,4 +1,4 @@
-"""Connections of a closed triangle mesh: edges, wings, one-rings, and the colouring that makes sweeps parallel."""
+"""Connections of a closed triangle mesh: edges, wings, one-rings, and the colouring of constraints."""
 
 from dataclasses import dataclass
 
@@ -18,8 +18,8 @@ class Topology:
     edges : (e, 2) ndarray of int
         Each undirected edge once, the smaller vertex first.
     wings : (e, 2) ndarray of int
-        Vertices opposite to an edge: first in the face that runs along it from ``edges[:, 0]`` to ``edges[:, 1]``,
-        then in the face that runs against it.
+        Vertices opposite to an edge: first in the face that runs along it from ``edges[:, 0]`` to
+        ``edges[:, 1]``, then in the face that runs against it.
     ring_start, ring : (n + 1,), (2 e,) ndarray of int
         Neighbours of vertex i are ``ring[ring_start[i]:ring_start[i + 1]]``, sorted.
     ring_edge : (2 e,) ndarray of int
@@ -89,8 +89,8 @@ def _one_rings(edges, count):
 def colour(members, count):
     """Order constraints so that those of one colour share no vertex.
 
-    Greedy: each constraint takes the smallest colour that none of its vertices has yet. Constraints of one colour
-    may be projected in any order, or at once, with the same result to the last bit.
+    Greedy: each constraint takes the smallest colour that none of its vertices has yet. Constraints of one
+    colour may be projected in any order, or at once, with the same result to the last bit.
 
     Parameters
     ----------

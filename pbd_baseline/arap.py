@@ -1,0 +1,241 @@
+"""As-rigid-as-possible energy on a surface mesh: local rotations, the global solve, the PBD constraint.
+
+E(x) = 1/4 sum over edges of w_ij (|e_ij - R_i E_ij|^2 + |e_ij - R_j E_ij|^2), e = x_i - x_j, E at rest, each R_i
+the rotation that makes E least (Sorkine and Alexa 2007). With the rotations optimal the gradient of E is its
+partial derivative with R frozen: grad_i E = sum_j w_ij (e_ij - (R_i + R_j) E_ij / 2).
+"""
+
+import numba
+import numpy as np
+
+from pbd_baseline.topology import colour
+from rbfmuscle.sim.harmonic import cotangent_laplacian
+
+# Newton steps for the rotations: warm starts need one or two, a turn by 30 degrees at once four.
+ROTATION_STEPS = 8
+ROTATION_ERROR = 1e-12
+
+
+class ARAP:
+    """ARAP energy of a mesh with its current rotations.
+
+    Parameters
+    ----------
+    vertices : (n, 3) ndarray
+        Rest positions.
+    topology : Topology
+
+    Attributes
+    ----------
+    quaternions : (n, 4) ndarray
+        Rotation of each vertex, (w, x, y, z); identity at rest.
+    laplacian : (n, n) scipy.sparse.csc_matrix
+        Cotangent weights clamped from below: a long mesh has 22 % negative ones.
+    """
+
+    def __init__(self, vertices, topology):
+        self.topology = topology
+        self.laplacian = cotangent_laplacian(vertices, topology.faces)
+        i, j = topology.edges.T
+        self.weights = -np.asarray(self.laplacian[i, j]).ravel()
+        self.rest = np.ascontiguousarray(vertices[i] - vertices[j])
+        self.quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (topology.vertex_count, 1))
+
+    def fit_rotations(self, points, *, steps=ROTATION_STEPS):
+        """The local step: the best rotation of every one-ring, from the present ones on."""
+        t = self.topology
+        _rotation_loop(
+            points,
+            t.ring_start,
+            t.ring,
+            t.ring_edge,
+            t.edges,
+            self.rest,
+            self.weights,
+            self.quaternions,
+            steps,
+        )
+
+    def energy(self, points):
+        """E with the present rotations [unit^2, as the cotangents have none]."""
+        return _energy_loop(points, self.topology.edges, self.rest, self.weights, self.quaternions)
+
+    def targets(self):
+        """Right side (n, 3) of the global step: sum_j w_ij (R_i + R_j) E_ij / 2."""
+        out = np.zeros((len(self.quaternions), 3))
+        _target_loop(self.topology.edges, self.rest, self.weights, self.quaternions, out)
+        return out
+
+    def gradient(self, points):
+        """Gradient (n, 3) of E with the rotations frozen; the full one where they are optimal."""
+        return self.laplacian @ points - self.targets()
+
+
+class ARAPConstraint:
+    """The ARAP energy as PBD constraints, a vector one an edge: the paper's section 6.2, first option.
+
+    C = (x_i - x_j) - (R_i + R_j) (X_i - X_j) / 2, grad_i C = 1 = -grad_j C in each component, compliance
+    1 / w_ij: at convergence the gradient of the sum is that of the ARAP energy.
+
+    Parameters
+    ----------
+    arap : ARAP
+    compliance : float
+        Factor of 1 / w_ij; over the time of the step.
+    """
+
+    def __init__(self, arap, *, compliance=1.0):
+        self.arap = arap
+        edges = arap.topology.edges
+        order, self.colours = colour(edges, arap.topology.vertex_count)
+        self.order = order
+        self.edges = np.ascontiguousarray(edges[order])
+        self.rest = np.ascontiguousarray(arap.rest[order])
+        self.compliance = compliance / arap.weights[order]
+        self.multiplier = np.zeros((len(order), 3))
+
+    def reset(self):
+        """Forget the multipliers, as each time step does."""
+        self.multiplier[:] = 0.0
+
+    def project(self, points, inverse_mass, *, time=1.0):
+        """One Gauss-Seidel sweep over ``points`` (n, 3), in place, with the arap's rotations."""
+        _constraint_loop(
+            points,
+            inverse_mass,
+            self.edges,
+            self.rest,
+            self.arap.quaternions,
+            self.compliance,
+            time,
+            self.multiplier,
+        )
+
+
+@numba.njit(cache=True, nogil=True)
+def _matrix(q):
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _rotate(q, v):
+    """Rotate v by a unit quaternion."""
+    tx = 2.0 * (q[2] * v[2] - q[3] * v[1])
+    ty = 2.0 * (q[3] * v[0] - q[1] * v[2])
+    tz = 2.0 * (q[1] * v[1] - q[2] * v[0])
+    return (
+        v[0] + q[0] * tx + q[2] * tz - q[3] * ty,
+        v[1] + q[0] * ty + q[3] * tx - q[1] * tz,
+        v[2] + q[0] * tz + q[1] * ty - q[2] * tx,
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _rotation_loop(points, start, ring, ring_edge, edges, rest, weights, quaternions, steps):
+    moment = np.empty((3, 3))
+    for i in range(len(quaternions)):
+        moment[:] = 0.0
+        for k in range(start[i], start[i + 1]):
+            j, c = ring[k], ring_edge[k]
+            sign = weights[c] if edges[c, 0] == i else -weights[c]
+            for a in range(3):
+                pull = sign * (points[i, a] - points[j, a])
+                for b in range(3):
+                    moment[a, b] += pull * rest[c, b]
+        for _ in range(steps):
+            if _turn_towards(moment, quaternions[i]) < ROTATION_ERROR:
+                break
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _turn_towards(moment, q):
+    """One Newton step of maximising tr(R^T A) over rotations R; return its squared angle.
+
+    With B = R^T A and S its symmetric part, the step solves (tr(S) 1 - S) omega = axial(B). One-rings are
+    nearly flat, so A has rank two and a polar decomposition is not defined; this maximum is.
+    """
+    r = _matrix(q)
+    b = np.empty((3, 3))
+    for m in range(3):
+        for n in range(3):
+            b[m, n] = r[0][m] * moment[0, n] + r[1][m] * moment[1, n] + r[2][m] * moment[2, n]
+    trace = b[0, 0] + b[1, 1] + b[2, 2]
+    vx, vy, vz = b[2, 1] - b[1, 2], b[0, 2] - b[2, 0], b[1, 0] - b[0, 1]
+    size = abs(trace) + abs(vx) + abs(vy) + abs(vz)
+    if size <= 0.0:
+        return 0.0
+    xx, yy, zz = trace - b[0, 0], trace - b[1, 1], trace - b[2, 2]
+    xy, xz, yz = -0.5 * (b[0, 1] + b[1, 0]), -0.5 * (b[0, 2] + b[2, 0]), -0.5 * (b[1, 2] + b[2, 1])
+    first, second = xx * yy - xy * xy, yy * zz - yz * yz
+    third, fourth = xy * yz - xz * yy, xy * xz - xx * yz
+    det = zz * first + xz * third + yz * fourth
+    if xx > 1e-6 * size and first > 1e-12 * size * size and det > 1e-18 * size * size * size:
+        ox = (second * vx + (xz * yz - xy * zz) * vy + third * vz) / det
+        oy = ((xz * yz - xy * zz) * vx + (xx * zz - xz * xz) * vy + fourth * vz) / det
+        oz = (third * vx + fourth * vy + first * vz) / det
+    else:
+        ox, oy, oz = vx / size, vy / size, vz / size
+    square = ox * ox + oy * oy + oz * oz
+    if square > 1.0:
+        ox, oy, oz = ox / np.sqrt(square), oy / np.sqrt(square), oz / np.sqrt(square)
+    _turn_quaternion(q, 0.5 * ox, 0.5 * oy, 0.5 * oz)
+    return square
+
+
+@numba.njit(cache=True, nogil=True)
+def _turn_quaternion(q, x, y, z):
+    """q <- q (1, x, y, z), normalised: exact to third order in the half angle, the fixed point is unchanged."""
+    a, b, c, d = q[0], q[1], q[2], q[3]
+    q[0] = a - b * x - c * y - d * z
+    q[1] = b + a * x + c * z - d * y
+    q[2] = c + a * y + d * x - b * z
+    q[3] = d + a * z + b * y - c * x
+    size = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    for k in range(4):
+        q[k] /= size
+
+
+@numba.njit(cache=True, nogil=True)
+def _energy_loop(points, edges, rest, weights, quaternions):
+    total = 0.0
+    for c in range(len(edges)):
+        i, j = edges[c, 0], edges[c, 1]
+        one, two = _rotate(quaternions[i], rest[c]), _rotate(quaternions[j], rest[c])
+        for k in range(3):
+            e = points[i, k] - points[j, k]
+            total += weights[c] * ((e - one[k]) ** 2 + (e - two[k]) ** 2)
+    return 0.25 * total
+
+
+@numba.njit(cache=True, nogil=True)
+def _target_loop(edges, rest, weights, quaternions, out):
+    for c in range(len(edges)):
+        i, j = edges[c, 0], edges[c, 1]
+        one, two = _rotate(quaternions[i], rest[c]), _rotate(quaternions[j], rest[c])
+        for k in range(3):
+            pull = 0.5 * weights[c] * (one[k] + two[k])
+            out[i, k] += pull
+            out[j, k] -= pull
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _constraint_loop(points, inverse_mass, edges, rest, quaternions, compliance, time, multiplier):
+    for c in range(len(edges)):
+        i, j = edges[c, 0], edges[c, 1]
+        wi, wj = inverse_mass[i], inverse_mass[j]
+        soft = compliance[c] / time
+        total = wi + wj + soft
+        if wi + wj <= 0.0:
+            continue
+        one, two = _rotate(quaternions[i], rest[c]), _rotate(quaternions[j], rest[c])
+        for k in range(3):
+            value = points[i, k] - points[j, k] - 0.5 * (one[k] + two[k])
+            change = -(value + soft * multiplier[c, k]) / total
+            multiplier[c, k] += change
+            points[i, k] += wi * change
+            points[j, k] -= wj * change

@@ -1,0 +1,172 @@
+"""PBDMuscle: a muscle as a triangle mesh held together by constraints, the baseline of the RBF muscle."""
+
+import math
+
+import numba
+import numpy as np
+
+from pbd_baseline.collision import CollisionConstraint
+from pbd_baseline.motion import carry
+from pbd_baseline.options import PBDOptions
+from pbd_baseline.rest import Rest
+from pbd_baseline.shapes import SHAPES
+from rbfmuscle.sim.simulate import ModelSurface
+
+# Bones are looked for within this distance [mm] of the predicted vertices, and within the second while finishing.
+REACH = 6.0
+FINISHING_REACH = 2.0
+# Rounds of contact and volume after the last sweep, and what they have to meet: depth [mm], share of the volume.
+FINISHING_ROUNDS = 4
+DEPTH = 0.05
+VOLUME_ERROR = 1e-4
+# Motion that makes the time of one XPBD step [radian].
+STEP_ANGLE = math.radians(2.0)
+
+
+class PBDMuscle:
+    """A mesh muscle of any of the paper's kinds; implements ``rbfmuscle.sim.simulate.MuscleModel``.
+
+    Parameters
+    ----------
+    muscle : Muscle
+        Mesh, attachments and fibres, from a scene.
+    scene : Scene
+    **options
+        See :class:`~pbd_baseline.options.PBDOptions`; ``method`` chooses the kind.
+
+    Raises
+    ------
+    SceneError
+        On an unknown option or a muscle that nothing holds.
+    MeshError
+        If the mesh is not a closed, consistently oriented surface.
+    """
+
+    def __init__(self, muscle, scene, **options):
+        self.name = muscle.name
+        self.options = PBDOptions.build(options, place=f"muscle {muscle.name!r} model: ")
+        self.rest = Rest.from_muscle(muscle)
+        self.shape = SHAPES[self.options.method](self.rest, self.options)
+        self.collision = CollisionConstraint(reach=scene.length(REACH), response=self.options.response)
+        self.finishing_reach, self.depth = scene.length(FINISHING_REACH), scene.length(DEPTH)
+        names = [bone.name for bone in scene.bones]
+        numbers = np.array([names.index(bone) for bone in self.rest.bones])
+        self.contact_bone = np.where(self.rest.holder < 0, -1, numbers[self.rest.holder])
+        self.points = self.rest.vertices.copy()
+        self.before = self.points.copy()
+        self.time = 1.0
+        self.penetration = 0.0
+
+    def contact_points(self):
+        """The vertices (n, 3), in this model's own order."""
+        return self.points
+
+    def predict(self, before, after):
+        """Go along with the bones; held vertices arrive exactly."""
+        motions = np.array([_relative(before[bone], after[bone]) for bone in self.rest.bones])
+        self.time = max(1.0, _largest_angle(motions) / STEP_ANGLE)
+        if self.options.prediction == "harmonic":
+            carry(self.points, self.rest.weights, motions)
+        elif self.options.prediction == "velocity":
+            velocity = self.points - self.before
+            self.before = self.points.copy()
+            self.points += self.options.damping * velocity
+        for b, bone in enumerate(self.rest.bones):
+            held = self.rest.holder == b
+            self.points[held] = self.rest.vertices[held] @ after[bone][:3, :3].T + after[bone][:3, 3]
+
+    def solve(self, contacts):
+        """Sweep the shape, contacts inside the iteration and last, the volume on what is not in contact."""
+        self.collision.find(contacts, self.points)
+        for _ in range(self.options.sweeps):
+            self.shape.sweep(self.points, self.time / self.options.sweeps)
+            self.collision.project(self.points)
+            self._restore_volume()
+        self._finish(contacts)
+
+    def turn(self, which, transform):
+        """Move the vertices marked in a bool mask (n,) by a (4, 4) transform; held ones stay."""
+        which = which & (self.rest.holder < 0)
+        self.points[which] = self.points[which] @ transform[:3, :3].T + transform[:3, 3]
+
+    def snapshot(self):
+        """Everything that :meth:`restore` needs."""
+        arap = getattr(self.shape, "arap", None)
+        rotations = None if arap is None else arap.quaternions.copy()
+        return self.points.copy(), self.before.copy(), rotations, self.time, self.penetration
+
+    def restore(self, state):
+        """Go back to a snapshot."""
+        points, before, rotations, self.time, self.penetration = state
+        self.points[:], self.before = points, before.copy()
+        if rotations is not None:
+            self.shape.arap.quaternions[:] = rotations
+
+    def carried_mesh(self):
+        """Vertices and faces, numbered as in the muscle's mesh but for the order of the faces."""
+        vertices = np.empty_like(self.points)
+        vertices[self.rest.order] = self.points
+        return vertices, self.rest.order[self.rest.topology.faces]
+
+    def surface(self, contacts):
+        """The mesh itself."""
+        vertices, faces = self.carried_mesh()
+        return ModelSurface(vertices, faces, {"solver_penetration_max": self.penetration})
+
+    def volume(self):
+        """Enclosed volume now [unit^3]."""
+        return self.rest.volume.volume(self.points)
+
+    def _finish(self, contacts):
+        """Contact and volume in turn until both hold; the penetration is measured after the last move."""
+        for k in range(FINISHING_ROUNDS):
+            self.penetration = self.collision.find(contacts, self.points, reach=self.finishing_reach)
+            error = abs(self.volume() / self.rest.volume.rest - 1.0)
+            if self.penetration <= self.depth and error <= VOLUME_ERROR and k > 0:
+                return
+            self.collision.project(self.points)
+            self._restore_volume()
+        self.penetration = self.collision.find(contacts, self.points, reach=self.finishing_reach)
+
+    def _restore_volume(self):
+        volume = self.rest.volume
+        if self.options.method == "arap-interleaved":
+            volume.project(self.points, self.rest.inverse_mass)
+            return
+        gradient = volume.gradient(self.points)
+        if self.options.method == "arap-volume":
+            direction = self.shape.smooth(gradient)
+        else:
+            direction = gradient.copy()
+            _scale_loop(direction, self.rest.room)
+        slope = np.vdot(gradient, direction)
+        if slope > 0.0:
+            step = (volume.rest - volume.volume(self.points)) / slope
+            self.collision.clear_way(self.points, direction, step)
+            volume.restore(self.points, direction)
+
+
+def _relative(before, after):
+    if np.array_equal(before, after):
+        return np.eye(4)
+    return after @ np.linalg.inv(before)
+
+
+def _largest_angle(motions):
+    """Largest angle between any two of the motions [radian]."""
+    largest = 0.0
+    for i, one in enumerate(motions):
+        for other in motions[:i]:
+            turn = one[:3, :3] @ other[:3, :3].T
+            largest = max(largest, math.acos(min(1.0, max(-1.0, 0.5 * (np.trace(turn) - 1.0)))))
+    return largest
+
+
+@numba.njit(cache=True, nogil=True)
+def _scale_loop(direction, length):
+    """Give each row the length asked for."""
+    for i in range(len(direction)):
+        size = np.sqrt(direction[i, 0] ** 2 + direction[i, 1] ** 2 + direction[i, 2] ** 2)
+        factor = length[i] / size if size > 0.0 else 0.0
+        for k in range(3):
+            direction[i, k] *= factor

@@ -1,0 +1,42 @@
+"""Options of a PBD muscle, as the scene's model table gives them."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from rbfmuscle.sim.options import NotNegative, Positive, Table
+
+METHODS = ("pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
+# Sweeps a solve: the authors' three for PBD; sub-steps of one sweep for XPBD.
+ITERATIONS = {"pbd": 3, "xpbd": 10, "arap-pbd": 10, "arap-volume": 6, "arap-interleaved": 6}
+
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class PBDOptions(Table):
+    """``[muscle.model]`` of the mesh models.
+
+    ``iterations`` sweeps a solve (0: the method's own number). ``edge`` and ``bending`` are PBD stiffnesses,
+    ``edge_compliance`` and ``bending_compliance`` those of XPBD and ``arap_compliance`` of the ARAP constraint,
+    all over a time that passes by one for each two degrees of motion. ``fibre_exponent`` is a of
+    k = (1 - |cos|)^a. ``prediction``: vertices go with the bones by harmonic weights, or keep their velocity
+    times ``damping`` as the authors' do, or stay. ``response`` to several bones: the sum of the ways out, or the
+    longest alone.
+    """
+
+    method: Literal["pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved"] = "pbd"
+    iterations: Annotated[int, Field(ge=0, le=10_000)] = 0
+    prediction: Literal["harmonic", "velocity", "none"] = "harmonic"
+    damping: Share = 0.99
+    fibre_exponent: NotNegative = 0.5
+    edge: Share = 1.0
+    bending: Share = 0.9
+    edge_compliance: NotNegative = 0.2
+    bending_compliance: NotNegative = 0.2
+    arap_compliance: Positive = 1.0
+    response: Literal["sum", "nearest"] = "sum"
+
+    @property
+    def sweeps(self):
+        """Number of iterations in effect."""
+        return self.iterations or ITERATIONS[self.method]

@@ -1,0 +1,86 @@
+"""What is known of a mesh muscle at rest, found once and shared by all its models."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pbd_baseline.constraints import VolumeConstraint
+from pbd_baseline.fibres import fibre_directions, swelling_room
+from pbd_baseline.topology import Topology, curve_order
+from rbfmuscle.sim.harmonic import harmonic_weights
+from rbfmuscle.validation import SceneError
+
+
+@dataclass(frozen=True)
+class Rest:
+    """A muscle at rest, its vertices renumbered along a space-filling curve.
+
+    Attributes
+    ----------
+    order : (n,) ndarray of int
+        The mesh's number of each vertex.
+    vertices : (n, 3) ndarray
+    topology : Topology
+    bones : list of str
+        Bones that hold the muscle.
+    weights : (n, len(bones)) ndarray
+        Harmonic weights, 1 on a bone's own vertices.
+    holder : (n,) ndarray of int
+        Position in ``bones`` of the bone that holds a vertex, -1 where it is free.
+    inverse_mass : (n,) ndarray
+        0 where held, else 1.
+    fibres : (n, 3) ndarray
+        Unit directions of the fibres.
+    room : (n,) ndarray
+        Local half thickness, falling to 0 at held vertices.
+    volume : VolumeConstraint
+    """
+
+    order: np.ndarray
+    vertices: np.ndarray
+    topology: Topology
+    bones: list
+    weights: np.ndarray
+    holder: np.ndarray
+    inverse_mass: np.ndarray
+    fibres: np.ndarray
+    room: np.ndarray
+    volume: VolumeConstraint
+
+    @classmethod
+    def from_muscle(cls, muscle):
+        """Measure a muscle of a scene.
+
+        Raises
+        ------
+        MeshError
+            If its mesh is not closed.
+        SceneError
+            If nothing holds it.
+        """
+        if not muscle.attachments:
+            raise SceneError(f"muscle {muscle.name!r} has no attachment, give attach a place on two bones")
+        order = curve_order(np.asarray(muscle.mesh.vertices, dtype=np.float64))
+        place = np.argsort(order)
+        vertices = np.ascontiguousarray(muscle.mesh.vertices, dtype=np.float64)[order]
+        faces = _sorted_faces(place[np.asarray(muscle.mesh.faces)])
+        topology = Topology.from_mesh(vertices, faces)
+        bones = list(dict.fromkeys(attachment.bone for attachment in muscle.attachments))
+        holder = np.full(len(vertices), -1)
+        for attachment in muscle.attachments:
+            holder[place[attachment.vertices]] = bones.index(attachment.bone)
+        weights = harmonic_weights(vertices, faces, [np.flatnonzero(holder == b) for b in range(len(bones))])
+        volume = VolumeConstraint(vertices, faces)
+        inverse_mass = np.where(holder < 0, 1.0, 0.0)
+        normals = volume.gradient(vertices)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        fibres = fibre_directions(vertices, faces, weights, muscle.fibres)
+        room = swelling_room(vertices, faces, normals, holder >= 0)
+        return cls(
+            order, vertices, topology, bones, weights, holder, inverse_mass, fibres, room, volume
+        )  # fmt: skip
+
+
+def _sorted_faces(faces):
+    """Faces in the order of their vertices, for the cache; each keeps its orientation."""
+    return np.ascontiguousarray(faces[np.argsort(faces.min(axis=1), kind="stable")], dtype=np.int64)
