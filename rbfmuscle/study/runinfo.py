@@ -1,0 +1,128 @@
+"""The facts in ``run.json``: what was run, with what, on what, how long it took and how it went."""
+
+import hashlib
+import importlib.metadata
+import os
+import platform
+from collections import defaultdict
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+import rbfmuscle
+
+FORMAT = 1
+_PACKAGES = ("numpy", "scipy", "numba", "scikit-image", "trimesh", "pyvista", "vtk", "libigl")
+
+
+def build_info(scene, *, started, status, message, times, stages, frames, summary, limits, options):
+    """Assemble ``run.json``.
+
+    Parameters
+    ----------
+    scene : Scene
+    started : datetime
+    status : {"running", "complete", "interrupted", "failed"}
+    message : str
+        Why it ended, where it was not complete.
+    times : dict of str to float
+        Wall time of the parts of the run [s].
+    stages : Stages
+    frames : list of dict
+        Frame number, coordinates [degree] and wall time of each written frame.
+    summary : dict
+        From `Summary.table`.
+    limits : dict
+        Quantity -> limit in the unit of ``metrics.csv``.
+    options : dict
+        What the caller asked for.
+
+    Returns
+    -------
+    dict
+    """
+    return {
+        "format": FORMAT,
+        "status": status,
+        "message": message,
+        "started": started.isoformat(timespec="seconds"),
+        "written": datetime.now(UTC).isoformat(timespec="seconds"),
+        "scene": scene.resolved(),
+        "options": options,
+        "versions": versions(),
+        "machine": machine(),
+        "inputs": input_hashes(scene),
+        "times": times,
+        "stages": stages.table(),
+        "limits": limits,
+        "muscles": {name: facts for name, facts in summary.items() if name != "all"},
+        "frame_time": summary.get("all", {}).get("time_frame"),
+        "frames": frames,
+    }
+
+
+class Stages:
+    """Time of each stage of each muscle over the frames."""
+
+    def __init__(self):
+        self._values = defaultdict(lambda: defaultdict(list))
+
+    def add(self, frame):
+        """Take in a frame's times and those that its surfaces report."""
+        for name, times in frame.times.items():
+            surface = frame.surfaces.get(name)
+            inner = surface.quantities if surface is not None else {}
+            for source in (times, inner):
+                for key, value in source.items():
+                    if key.startswith("time_"):
+                        self._values[name][key].append(float(value))
+
+    def table(self):
+        """Nested dict: muscle -> stage -> total, median, 95th percentile and first [s]."""
+        return {
+            name: {
+                key: {
+                    "total": float(np.sum(values)),
+                    "median": float(np.median(values)),
+                    "p95": float(np.percentile(values, 95)),
+                    "first": values[0],
+                }
+                for key, values in stages.items()
+            }
+            for name, stages in self._values.items()
+        }
+
+
+def versions():
+    """Versions of Python, this library and what it computes with."""
+    found = {"python": platform.python_version(), "rbfmuscle": rbfmuscle.__version__}
+    for name in _PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def machine():
+    """What the times belong to."""
+    import numba
+
+    return {
+        "system": platform.platform(),
+        "processor": platform.processor() or platform.machine(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "threads": numba.get_num_threads(),
+    }
+
+
+def input_hashes(scene):
+    """SHA-256 of the scene file and of every mesh file it names; files that are gone are left out."""
+    sources = [scene.path, *(item.source for item in [*scene.bones, *scene.muscles])]
+    found = {}
+    for source in dict.fromkeys(str(s) for s in sources if s):
+        path = Path(source)
+        if path.is_file():
+            found[source] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return found
