@@ -24,9 +24,9 @@ class MeshDistance:
     Notes
     -----
     The sign comes from the pseudonormal of the feature (face, edge or vertex) that holds the closest point
-    (Baerentzen and Aanaes 2005), which is exact for closed, consistently oriented meshes. Where that normal is
-    nearly square to the way to the point, as at a sliver folded on itself, and for meshes with holes, the winding
-    number decides (Jacobson et al. 2013; Barill et al. 2018): inside where it exceeds one half.
+    (Baerentzen and Aanaes 2005), which is exact for closed, consistently oriented meshes. Where that normal
+    is nearly square to the way to the point, as at a sliver folded on itself, and for meshes with holes, the
+    winding number decides (Jacobson et al. 2013; Barill et al. 2018): inside where it exceeds one half.
     """
 
     def __init__(self, vertices, faces, *, closed=True, whole=None):
@@ -184,7 +184,7 @@ def _sign_loop(
 
 @numba.njit(cache=True, nogil=True)
 def _winding_loop(point, vertices, faces):
-    """Winding number of a mesh about one point: the sum of the triangles' solid angles (van Oosterom 1983)."""
+    """Winding number of a mesh about one point, by solid angles of triangles (van Oosterom 1983)."""
     total = 0.0
     for f in range(len(faces)):
         a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
