@@ -77,9 +77,9 @@ def _value_matrix_loop(x, epsilon, base, parameter, compact, table, gamma, polyn
     d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((4, n)), np.empty((4, n))
     for j in range(n):
         m = n - j
-        _offsets_loop(x, j, epsilon * epsilon, j, d[:, :m], u[:m])
+        _offsets_loop(x, j, epsilon * epsilon, j, d, u[:m])
         _radial_loop(base, parameter, compact, table, 1, u[:m], work, radial)
-        column = out[j, j:]
+        column = out[j][j:]
         for i in range(m):
             column[i] = radial[0, i]
         _ridge_loop(gamma, polynomials, j, j, column)

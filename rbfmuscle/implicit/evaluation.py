@@ -124,7 +124,7 @@ def _add_gradient_loop(a, bx, by, bz, e2, hermite, radial, d, g):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _add_hessian_loop(a, b, e2, hermite, radial, d, h):
+def _add_hessian_loop(a, bx, by, bz, e2, hermite, radial, d, h):
     """h (6: xx yy zz xy xz yz) += a (first I + second d d^T) minus, for Hermite weights B,
 
     second ((B . d) I + d B^T + B d^T) + third (B . d) d d^T.
@@ -136,17 +136,17 @@ def _add_hessian_loop(a, b, e2, hermite, radial, d, h):
         s = e4 * second[i]
         on, outer = a * e2 * first[i], a * s
         if hermite:
-            bd = b[0] * x + b[1] * y + b[2] * z
+            bd = bx * x + by * y + bz * z
             on -= s * bd
             outer -= e4 * e2 * third[i] * bd
         else:
             s = 0.0
-        h[0, i] += on + outer * x * x - 2.0 * s * b[0] * x
-        h[1, i] += on + outer * y * y - 2.0 * s * b[1] * y
-        h[2, i] += on + outer * z * z - 2.0 * s * b[2] * z
-        h[3, i] += outer * x * y - s * (b[0] * y + b[1] * x)
-        h[4, i] += outer * x * z - s * (b[0] * z + b[2] * x)
-        h[5, i] += outer * y * z - s * (b[1] * z + b[2] * y)
+        h[0, i] += on + outer * x * x - 2.0 * s * bx * x
+        h[1, i] += on + outer * y * y - 2.0 * s * by * y
+        h[2, i] += on + outer * z * z - 2.0 * s * bz * z
+        h[3, i] += outer * x * y - s * (bx * y + by * x)
+        h[4, i] += outer * x * z - s * (bx * z + bz * x)
+        h[5, i] += outer * y * z - s * (by * z + bz * y)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -165,22 +165,21 @@ def _cubic_block_loop(centres, a, b, hermite, gradient, p, acc, g):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _general_block_loop(
-    centres, a, b, hermite, order, epsilon, base, parameter, compact, table, p, scratch, acc, g, h
-):
-    """Any kernel: radial functions into a scratch block, then their sums. epsilon (K,)."""
-    n = acc.size
-    d, u, work, radial = scratch[0:3, :n], scratch[3, :n], scratch[4:8], scratch[8:12]
+def _general_block_loop(centres, a, b, hermite, order, epsilon, base, parameter, compact, table, p, acc, g, h):
+    """Any kernel: radial functions into scratch blocks, then their sums. epsilon (K,)."""
+    d, u, work, radial = np.empty_like(p), np.empty_like(acc), np.empty((4, _BLOCK)), np.empty((4, _BLOCK))
     wanted = (2 << (order + hermite)) - 1
     for j in range(centres.shape[1]):
         e2 = epsilon[j] * epsilon[j]
         _offsets_loop(p, centres[0, j], centres[1, j], centres[2, j], e2, d, u)
+        if compact and u.min() >= 1.0:
+            continue
         _radial_loop(base, parameter, compact, table, wanted, u, work, radial)
         _add_value_loop(a[j], b[0, j], b[1, j], b[2, j], e2, hermite, radial, d, acc)
         if order > 0:
             _add_gradient_loop(a[j], b[0, j], b[1, j], b[2, j], e2, hermite, radial, d, g)
         if order > 1:
-            _add_hessian_loop(a[j], b[:, j], e2, hermite, radial, d, h)
+            _add_hessian_loop(a[j], b[0, j], b[1, j], b[2, j], e2, hermite, radial, d, h)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -188,21 +187,28 @@ def _evaluate_loop(
     points, origin, scale, centres, a, b, hermite, order, epsilon, base, parameter, compact, table, cubic,
     start, stop, out
 ):  # fmt: skip
-    """out[0] value, out[1:4] gradient, out[4:10] Hessian (order 0, 1, 2) at points[start:stop], scaled coordinates."""
-    p, scratch = np.empty((3, _BLOCK)), np.empty((12, _BLOCK))
+    """out[0] value, out[1:4] gradient, out[4:10] Hessian (order 0, 1, 2) at points[start:stop].
+
+    Blocks have a fixed length (the last one repeats its last point), so that all rows are contiguous.
+    """
+    p = np.empty((3, _BLOCK))
     for low in range(start, stop, _BLOCK):
         n = min(_BLOCK, stop - low)
-        for i in range(n):
+        for i in range(_BLOCK):
             for c in range(3):
-                p[c, i] = (points[low + i, c] - origin[c]) / scale
-        block = out[:, low : low + n]
+                p[c, i] = (points[low + min(i, n - 1), c] - origin[c]) / scale
+        acc, g, h = np.zeros(_BLOCK), np.zeros((3, _BLOCK)), np.zeros((6, _BLOCK))
         if cubic and order < 2:
-            _cubic_block_loop(centres, a, b, hermite, order == 1, p[:, :n], block[0], block[1:4])
+            _cubic_block_loop(centres, a, b, hermite, order == 1, p, acc, g)
         else:
             _general_block_loop(
-                centres, a, b, hermite, order, epsilon, base, parameter, compact, table,
-                p[:, :n], scratch, block[0], block[1:4], block[4:10],
-            )  # fmt: skip
+                centres, a, b, hermite, order, epsilon, base, parameter, compact, table, p, acc, g, h
+            )
+        out[0, low : low + n] = acc[:n]
+        if order > 0:
+            out[1:4, low : low + n] = g[:, :n]
+        if order > 1:
+            out[4:10, low : low + n] = h[:, :n]
 
 
 def evaluate(points, origin, scale, centres, weights, kernel, epsilon, order):

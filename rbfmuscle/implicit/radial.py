@@ -160,13 +160,13 @@ def _radial_loop(base, parameter, compact, table, wanted, u, work, out):
     work is a (4, n) scratch array. Where a function is infinite at u = 0 a finite value stands in: it is only ever
     multiplied by components of the zero vector.
     """
-    s, b = work[0, : u.size], work[1, : u.size]
-    _base_loop(base, parameter, u, s, b, work[2, : u.size], work[3, : u.size])
+    s, b, bits, more = work[0][: u.size], work[1][: u.size], work[2][: u.size], work[3][: u.size]
+    _base_loop(base, parameter, u, s, b, bits, more)
     for k in range(4):
         if not (wanted >> k) & 1:
             continue
         row = table[k]
-        values = out[k, : u.size]
+        values = out[k][: u.size]
         _inner_loop(base, row, u, s, b, values)
         c0, c1, c2, c3, c4 = row[7], row[8], row[9], row[10], row[11]
         if c1 != 0.0 or c2 != 0.0 or c3 != 0.0 or c4 != 0.0:
