@@ -1,7 +1,8 @@
 """Matrices of RBF systems.
 
-Unknowns of a Hermite fit are grouped: all values, then all x-, y- and z-derivatives, so that every
-column of every block is one contiguous run. Only the lower triangle (Fortran order) is filled.
+Unknowns of a Hermite fit are grouped: all values, then all x-, y- and z-derivatives (or all normal
+derivatives), so that every column of every block is one contiguous run. Only the lower triangle (Fortran
+order) is filled.
 """
 
 import numpy as np
@@ -39,6 +40,17 @@ def monomial_gradients(points, powers):
         lower[:, axis] -= 1
         some = lower[:, axis] >= 0
         out[axis, some] = powers[some, axis, None] * monomials(points, lower[some])
+    return out
+
+
+def monomial_hessians(points, powers):
+    """Second derivatives of the monomials at points: (3, 3, q, n)."""
+    out = np.zeros((3, 3, len(powers), len(points)))
+    for axis in range(3):
+        lower = powers.copy()
+        lower[:, axis] -= 1
+        some = lower[:, axis] >= 0
+        out[axis][:, some] = powers[some, axis, None] * monomial_gradients(points, lower[some])
     return out
 
 
@@ -89,7 +101,8 @@ def _value_matrix_loop(x, epsilon, base, parameter, compact, table, gamma, polyn
 def _hermite_matrix_loop(x, epsilon, base, parameter, compact, table, gamma, polynomials, out):
     """Lower triangle of the Hermite matrix plus gamma P^T P; out[column, row] is its transpose.
 
-    Blocks: (value, value) phi; (d/dx_c, value) first * d_c; (d/dx_c, d/dx_e) -(first * delta + second * d_c d_e).
+    Blocks: (value, value) phi; (d/dx_c, value) first * d_c;
+    (d/dx_c, d/dx_e) -(first * delta + second * d_c d_e).
     """
     n = x.shape[1]
     e2 = epsilon * epsilon
@@ -117,3 +130,37 @@ def _hermite_matrix_loop(x, epsilon, base, parameter, compact, table, gamma, pol
                     target[i] = -e2 * e2 * second[i] * dc[i] * de[i]
             start = (e + 1) * n + j
             _ridge_loop(gamma, polynomials, start, start, column[start:])
+
+
+def normal_polynomials(points, normals, powers):
+    """Polynomial block (q, 2n): values, then derivatives along the normals, at each point."""
+    along = np.einsum("cqn,nc->qn", monomial_gradients(points, powers), normals)
+    return np.hstack([monomials(points, powers), along])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _normal_matrix_loop(x, normals, epsilon, base, parameter, compact, table, gamma, polynomials, out):
+    """As `_hermite_matrix_loop`, with the derivative along the unit normal (3, n) alone.
+
+    Blocks: (value, value) phi; (normal i, value j) first (d . n_i);
+    (normal i, normal j) -(first n_i . n_j + second (d . n_i)(d . n_j)).
+    """
+    n = x.shape[1]
+    e2 = epsilon * epsilon
+    d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((4, n)), np.empty((4, n))
+    for j in range(n):
+        _offsets_loop(x, j, e2, 0, d, u)
+        _radial_loop(base, parameter, compact, table, 7, u, work, radial)
+        phi, first, second = radial[0], radial[1], radial[2]
+        value, slope = out[j], out[n + j]
+        nx, ny, nz = normals[0, j], normals[1, j], normals[2, j]
+        for i in range(j, n):
+            value[i] = phi[i]
+        for i in range(n):
+            at_i = d[0, i] * normals[0, i] + d[1, i] * normals[1, i] + d[2, i] * normals[2, i]
+            at_j = d[0, i] * nx + d[1, i] * ny + d[2, i] * nz
+            both = nx * normals[0, i] + ny * normals[1, i] + nz * normals[2, i]
+            value[n + i] = e2 * first[i] * at_i
+            slope[n + i] = -e2 * (first[i] * both + e2 * second[i] * at_i * at_j)
+        _ridge_loop(gamma, polynomials, j, j, value[j:])
+        _ridge_loop(gamma, polynomials, n + j, n + j, slope[n + j :])

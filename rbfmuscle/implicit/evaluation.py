@@ -165,7 +165,9 @@ def _cubic_block_loop(centres, a, b, hermite, gradient, p, acc, g):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _general_block_loop(centres, a, b, hermite, order, epsilon, base, parameter, compact, table, p, acc, g, h):
+def _general_block_loop(
+    centres, a, b, hermite, order, epsilon, base, parameter, compact, table, p, acc, g, h
+):
     """Any kernel: radial functions into scratch blocks, then their sums. epsilon (K,)."""
     d, u, work, radial = np.empty_like(p), np.empty_like(acc), np.empty((4, _BLOCK)), np.empty((4, _BLOCK))
     wanted = (2 << (order + hermite)) - 1

@@ -8,12 +8,13 @@ Hessians and Hermite fits need are ``2**k d^k phi / du^k``::
     k = 2   second  (phi'' - phi'/r) / r**2
     k = 3   third   second'/r
 
-All of them, for all kernels, have the form ``s**j * (base(s) * A(s) + B(s))`` with polynomials A and B of degree four
-at most. A row lists j, A and B for k = 0 ... 3; the loops in ``radial.py`` know the bases and no kernel.
+All of them, for all kernels, have the form ``s**j * (base(s) * A(s) + B(s))`` with polynomials A and B of
+degree four at most. A row lists j, A and B for k = 0 ... 3; the loops in ``radial.py`` know the bases and
+no kernel.
 
-Sources: Fasshauer, *Meshfree Approximation Methods with MATLAB* (2007); Wendland (1995); Buhmann (2000); SciPy's
-``RBFInterpolator`` for names and signs. ``skala_cervenka`` is second-hand: r^2 (r^a - 1) is quoted from a later
-paper of its authors, the original of 2019 was not at hand.
+Sources: Fasshauer, *Meshfree Approximation Methods with MATLAB* (2007); Wendland (1995); Buhmann (2000);
+SciPy's ``RBFInterpolator`` for names and signs. ``skala_cervenka`` is second-hand: the formula r^2 (r^a - 1)
+was not checked against the original of 2019, and neither was the default exponent.
 """
 
 import difflib
@@ -82,7 +83,7 @@ class Kernel:
         return self._radial(r, epsilon, 2)
 
     def third(self, r, epsilon=1.0):
-        """Derivative of ``second`` divided by r, with its limit at r = 0 (infinite unless the kernel is C6)."""
+        """Derivative of ``second`` divided by r, with its limit at r = 0 (infinite below C6)."""
         return self._radial(r, epsilon, 3)
 
     def _radial(self, r, epsilon, k):

@@ -157,8 +157,8 @@ def _inner_loop(base, row, u, s, b, out):
 def _radial_loop(base, parameter, compact, table, wanted, u, work, out):
     """Fill out[k] (4, n) with the k-th radial function of s**2 = u for every bit k set in wanted.
 
-    work is a (4, n) scratch array. Where a function is infinite at u = 0 a finite value stands in: it is only ever
-    multiplied by components of the zero vector.
+    work is a (4, n) scratch array. Where a function is infinite at u = 0 a finite value stands in: it is
+    only ever multiplied by components of the zero vector.
     """
     s, b, bits, more = work[0][: u.size], work[1][: u.size], work[2][: u.size], work[3][: u.size]
     _base_loop(base, parameter, u, s, b, bits, more)
