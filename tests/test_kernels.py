@@ -101,7 +101,7 @@ def test_limits_at_zero_are_exact(name):
 @pytest.mark.parametrize("name", KERNELS)
 def test_epsilon_multiplies_the_distance(name):
     kernel = KERNELS[name]
-    r = np.array([0.1, 0.4, 2.0])
+    r = np.array([0.1, 0.4, 2.2])
     assert np.allclose(kernel.phi(r, 0.5), kernel.phi(0.5 * r), rtol=1e-14)
     h = 1e-5
     slope = (kernel.phi(r + h, 0.5) - kernel.phi(r - h, 0.5)) / (2 * h)
@@ -111,7 +111,7 @@ def test_epsilon_multiplies_the_distance(name):
 @pytest.mark.parametrize("name", COMPACT)
 def test_compact_kernels_end_at_one_over_epsilon(name):
     assert KERNELS[name].phi(0.999 / 0.3, 0.3) >= 0
-    assert KERNELS[name].phi([1 / 0.3, 5.0, 1e300], 0.3).tolist() == [0, 0, 0]
+    assert KERNELS[name].phi([1 / 0.3, 5.0, 1e100], 0.3).tolist() == [0, 0, 0]
 
 
 def least_eigenvalue(kernel, points, degree):

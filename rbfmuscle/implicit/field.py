@@ -27,7 +27,7 @@ class RBFField:
     centres : (K, 3) ndarray
         In the coordinates of the caller.
     kernel : Kernel
-    epsilon : float
+    epsilon : float or (K,) ndarray
         Shape parameter [1/length]; multiplies r.
     weights : (K,) or (K, 4) ndarray
         a_j, or for a Hermite fit a_j and B_j, for centred and scaled coordinates.
@@ -46,7 +46,8 @@ class RBFField:
         self.condition = condition
         self._scaled = np.ascontiguousarray(((centres - origin) / scale).T)
         self._rows = np.ascontiguousarray(weights.reshape(len(centres), -1).T)
-        self._shape = np.full(len(centres), epsilon * scale if kernel.has_epsilon else 1.0)
+        shape = epsilon * scale if kernel.has_epsilon else 1.0
+        self._shape = np.ascontiguousarray(np.broadcast_to(shape, len(centres)), dtype=float)
 
     @classmethod
     def fit(cls, points, values, *, kernel="cubic", epsilon=1.0, degree=None, smoothing=0.0):
@@ -279,7 +280,8 @@ def collocation(points, centres, kernel, epsilon, degree, origin, scale):
     shape = epsilon * scale if kernel.has_epsilon else 1.0
     at, centred = (points - origin) / scale, (centres - origin) / scale
     powers = assembly.exponents(degree)
-    return np.hstack([kernel.phi(cdist(at, centred), shape), assembly.monomials(at, powers).T]), powers
+    radial = kernel.phi(cdist(at, centred) * shape)
+    return np.hstack([radial, assembly.monomials(at, powers).T]), powers
 
 
 def _check_degree(kernel, degree, count):

@@ -198,11 +198,12 @@ def _warn(basis, condition, dropped):
     close = _nearest_pair(basis.points)
     pair = f"; centres {close[0]} and {close[1]} are only {close[2]:.1e} of the extent apart"
     warnings.warn(
-        f"fit with kernel '{basis.kernel.name}' has condition {condition:.1e}: the conditions are met to a few "
-        f"digits only ({dropped} directions of {basis.size} left out){pair if close[2] < 1e-5 else ''}; {remedy}",
+        f"fit with kernel '{basis.kernel.name}' has condition {condition:.1e}: its conditions are met to a "
+        f"few digits only ({dropped} of {basis.size} directions left out)"
+        f"{pair if close[2] < 1e-5 else ''}; {remedy}",
         NumericalWarning,
         stacklevel=5,
-    )  # fmt: skip
+    )
 
 
 def _nearest_pair(points):

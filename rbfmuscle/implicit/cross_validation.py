@@ -1,0 +1,119 @@
+"""Errors of a fit at points it has not seen, in closed form.
+
+Rippa (1999): leaving condition k out changes the prediction there by w_k / (F^-1)_kk with F the full
+augmented matrix. For a Hermite fit a centre is left out with all its conditions, and w_k / (F^-1)_kk becomes
+a small block solve.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+from scipy.linalg import lapack
+
+from rbfmuscle.implicit import fitting
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """What leaving each centre out costs.
+
+    Attributes
+    ----------
+    values : (K,) ndarray
+        Predicted minus given value at each left-out centre has this size, in units of the right side.
+    gcv : float
+        Generalised cross-validation, n |w|^2 / (tr F^-1)^2.
+    condition : float
+    """
+
+    values: np.ndarray
+    gcv: float
+    condition: float
+
+
+def leave_one_out(basis, right, *, smoothing=0.0):
+    """Leave-one-out residuals of a fit, for about the time of two.
+
+    Parameters
+    ----------
+    basis : fitting.Basis
+    right : (size,) ndarray
+    smoothing : float
+
+    Returns
+    -------
+    Residuals
+        For Hermite fits the value component of the residual of each left-out centre.
+    """
+    count = len(basis.points)
+    gamma = basis.gamma
+    matrix = basis.matrix(gamma)
+    if smoothing:
+        matrix.ravel(order="K")[:: basis.size + 1] += smoothing
+    norm = fitting._largest(matrix)
+    factor, info = lapack.dpotrf(matrix, lower=1, overwrite_a=1, clean=1)
+    solved = fitting._schur(basis, factor, right, norm) if info == 0 else None
+    if solved is None or solved[2] > fitting.DOUBTFUL:
+        return _from_eigenvectors(basis, right, smoothing)
+    weights, _, condition = solved
+    if len(basis.powers):
+        first = lapack.dtrtrs(factor, np.asfortranarray(basis.polynomials.T), lower=1)[0]
+    inverse, _ = lapack.dtrtri(factor, lower=1, overwrite_c=1)
+    columns = inverse.reshape(basis.size, -1, count)
+    blocks = np.einsum("mak,mbk->kab", columns, columns, optimize=True)
+    if len(basis.powers):
+        # F^-1 = M^-1 - (S^-1/2 P M^-1)^T (S^-1/2 P M^-1), S = P M^-1 P^T
+        root = np.linalg.cholesky(first.T @ first)
+        less = linalg.solve_triangular(root, (inverse.T @ first).T, lower=True).reshape(len(root), -1, count)
+        blocks -= np.einsum("qak,qbk->kab", less, less)
+    return _residuals(blocks, weights, count, condition)
+
+
+def _residuals(blocks, weights, count, condition):
+    per_centre = weights.reshape(-1, count).T
+    values = np.linalg.solve(blocks, per_centre[:, :, None])[:, 0, 0]
+    trace = np.trace(blocks, axis1=1, axis2=2).sum()
+    gcv = weights.size * float(weights @ weights) / trace**2
+    return Residuals(values, gcv, condition)
+
+
+def _from_eigenvectors(basis, right, smoothing):
+    """The same where Cholesky fails: F^-1 without its smallest eigenvalues."""
+    count, size = len(basis.points), basis.size
+    values, vectors = linalg.eigh(basis.full_matrix(smoothing), driver="evd")
+    sizes = np.abs(values)
+    keep = sizes > 1e-14 * sizes.max()
+    rows = vectors[:size, keep]
+    weights = rows @ ((rows.T @ right) / values[keep])
+    parts = rows.T.reshape(rows.shape[1], -1, count)
+    blocks = np.einsum("mak,m,mbk->kab", parts, 1 / values[keep], parts, optimize=True)
+    # a truncated inverse can lose a block: keep it invertible
+    blocks += np.eye(blocks.shape[1]) * np.abs(blocks).max() * 1e-15
+    return _residuals(blocks, weights, count, sizes.max() / max(sizes.min(), 1e-300))
+
+
+def least_squares_residuals(matrix, right, *, smoothing=0.0, cutoff=1e-14):
+    """Leave-one-out residuals (y - Hy)_k / (1 - H_kk) and GCV of a ridge or truncated least-squares fit.
+
+    Parameters
+    ----------
+    matrix : (n, m) ndarray
+        Collocation matrix, n > m.
+    right : (n,) ndarray
+    smoothing : float
+        Tikhonov term; see `fitting.solve_least_squares`.
+    cutoff : float
+
+    Returns
+    -------
+    Residuals
+    """
+    left, values, _ = linalg.svd(matrix, full_matrices=False)
+    keep = values > cutoff * values[0]
+    damp = values[keep] ** 2 / (values[keep] ** 2 + smoothing)
+    left = left[:, keep]
+    residual = right - left @ (damp * (left.T @ right))
+    hat = (left * left) @ damp
+    gcv = len(right) * float(residual @ residual) / (len(right) - hat.sum()) ** 2
+    return Residuals(residual / (1 - hat), gcv, float(values[0] / max(values[-1], 1e-300)))

@@ -1,0 +1,234 @@
+"""Choosing the shape parameter epsilon."""
+
+import math
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from rbfmuscle.implicit.cross_validation import leave_one_out
+from rbfmuscle.implicit.field import RBFField, frame, hermite_system
+from rbfmuscle.implicit.fitting import DOUBTFUL, Basis, solve
+from rbfmuscle.implicit.kernels import get_kernel
+from rbfmuscle.validation import (
+    NumericalWarning,
+    UsageError,
+    check_points,
+    check_positive,
+    check_values,
+    check_vectors,
+)
+
+CRITERIA = ("loo", "gcv", "held_out", "condition")
+_GOLDEN = 0.5 * (math.sqrt(5) - 1)
+_NOISE = 2.0  # an objective computed beyond DOUBTFUL must be this much better to be believed
+
+
+@dataclass(frozen=True)
+class EpsilonChoice:
+    """A chosen shape parameter and the way to it.
+
+    Attributes
+    ----------
+    epsilon : float
+        [1/length]
+    objective : float
+        The criterion there: root mean square of the residuals [unit of the values, for Hermite fits length],
+        GCV score, or |log10 of condition over target|.
+    condition : float
+        Estimate of the condition there.
+    tried : (n, 3) ndarray
+        epsilon, objective, condition of all evaluations, by epsilon.
+    """
+
+    epsilon: float
+    objective: float
+    condition: float
+    tried: np.ndarray
+
+
+def hardy_epsilon(points):
+    """Hardy (1971): 1 / (0.815 d), d the mean distance to the nearest neighbour."""
+    return 1.0 / (0.815 * spacing(points).mean())
+
+
+def franke_epsilon(points):
+    """Franke (1982): 0.8 sqrt(N) / D, D the diameter of the bounding sphere of `frame`."""
+    points = check_points(points)
+    return 0.8 * math.sqrt(len(points)) / (2 * frame(points)[1])
+
+
+def spacing_epsilon(points, *, factor=0.5):
+    """factor / h, h the mean distance to the nearest neighbour: what scattered points in 3-D ask for."""
+    return check_positive(factor, name="factor") / spacing(points).mean()
+
+
+def spacing(points, *, neighbours=1):
+    """Distance (n,) of each point to its nearest neighbours, their mean.
+
+    Raises
+    ------
+    UsageError
+        For fewer points than asked for, or coinciding ones.
+    """
+    points = check_points(points)
+    if len(points) <= neighbours:
+        raise UsageError(f"spacing needs more than {neighbours} points, got {len(points)}")
+    distance = cKDTree(points).query(points, k=neighbours + 1)[0][:, 1:].mean(axis=1)
+    if not distance.all():
+        raise UsageError(f"point {int(np.argmin(distance))} coincides with another; remove duplicates")
+    return distance
+
+
+def choose_epsilon(
+    points,
+    *,
+    values=None,
+    normals=None,
+    kernel="gaussian",
+    criterion="loo",
+    held_out=None,
+    target=1e10,
+    derivatives="all",
+    smoothing=0.0,
+    span=(0.02, 20.0),
+    coarse=13,
+    refine=8,
+):
+    """Search epsilon for a fit to values or, with normals, for a Hermite fit.
+
+    A log-spaced scan brackets the minimum, golden sections narrow it. Where the condition exceeds 1e13 the
+    objective is rounding noise, so such a value is believed only if it is twice as good as any sound one.
+
+    Parameters
+    ----------
+    points : (K, 3) array_like
+    values : (K,) array_like, optional
+    normals : (K, 3) array_like, optional
+        Exactly one of values and normals.
+    kernel : str or Kernel
+    criterion : {"loo", "gcv", "held_out", "condition"}
+    held_out : (n, 3) array_like, optional
+        Other points of the surface, for "held_out": root mean square of f / |grad f| there.
+    target : float
+        Condition wanted, for "condition".
+    derivatives, smoothing
+        As in `RBFField.fit_hermite`.
+    span : (float, float)
+        Searched range, in multiples of 1 / (mean distance to the nearest neighbour).
+    coarse, refine : int
+        Evaluations of the scan and of the refinement.
+
+    Returns
+    -------
+    EpsilonChoice
+
+    Raises
+    ------
+    UsageError
+        For a kernel without epsilon, an unknown criterion, or missing data.
+    """
+    points, kernel = check_points(points), get_kernel(kernel)
+    _check_request(kernel, criterion, values, normals, held_out)
+    objective = _objective(
+        points, values, normals, kernel, criterion, held_out, target, derivatives, smoothing
+    )
+    unit = 1.0 / spacing(points).mean()
+    tried = [_trial(objective, e * unit) for e in np.geomspace(*span, coarse)]
+    best = _best(tried)
+    low, high = tried[max(best - 1, 0)][0], tried[min(best + 1, coarse - 1)][0]
+    tried += _golden(objective, low, high, refine)
+    tried = np.array(sorted(tried))
+    best = tried[_best(tried)]
+    return EpsilonChoice(float(best[0]), float(best[1]), float(best[2]), tried)
+
+
+def _check_request(kernel, criterion, values, normals, held_out):
+    if not kernel.has_epsilon:
+        raise UsageError(
+            f"kernel '{kernel.name}' has no shape parameter: epsilon does not change its interpolant"
+        )
+    if criterion not in CRITERIA:
+        raise UsageError(f"criterion must be one of {', '.join(CRITERIA)}, got '{criterion}'")
+    if (values is None) == (normals is None):
+        raise UsageError("give either values or normals")
+    if (criterion == "held_out") != (held_out is not None):
+        raise UsageError("held_out points are needed for, and only for, criterion 'held_out'")
+
+
+def _objective(points, values, normals, kernel, criterion, held_out, target, derivatives, smoothing):
+    """epsilon -> (objective, condition)."""
+    if values is not None:
+        values = check_values(values, len(points))
+    else:
+        normals = check_vectors(normals, len(points))
+    if held_out is not None:
+        held_out = check_points(held_out, name="held_out")
+
+    def system(epsilon):
+        if normals is not None:
+            return hermite_system(points, normals, kernel, epsilon, derivatives)[:2]
+        origin, scale = frame(points)
+        return Basis((points - origin) / scale, kernel, epsilon * scale, kernel.degree), values
+
+    def by_residuals(epsilon):
+        found = leave_one_out(*system(epsilon), smoothing=smoothing)
+        score = found.gcv if criterion == "gcv" else math.sqrt((found.values**2).mean())
+        return score, found.condition
+
+    def by_held_out(epsilon):
+        if normals is not None:
+            field = RBFField.fit_hermite(
+                points, normals, kernel=kernel, epsilon=epsilon, smoothing=smoothing, derivatives=derivatives
+            )
+        else:
+            field = RBFField.fit(points, values, kernel=kernel, epsilon=epsilon, smoothing=smoothing)
+        value, gradient = field.value_and_gradient(held_out)
+        slope = np.maximum(np.linalg.norm(gradient, axis=1), 1e-12)
+        return math.sqrt(((value / slope) ** 2).mean()), field.condition
+
+    def by_condition(epsilon):
+        condition = solve(*system(epsilon), smoothing=smoothing)[2]
+        return abs(math.log10(condition / target)), condition
+
+    return {"held_out": by_held_out, "condition": by_condition}.get(criterion, by_residuals)
+
+
+def _trial(objective, epsilon):
+    """(epsilon, objective, condition); infinite where the fit fails."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NumericalWarning)
+        try:
+            score, condition = objective(epsilon)
+        except np.linalg.LinAlgError:
+            return epsilon, math.inf, math.inf
+    return epsilon, score if math.isfinite(score) else math.inf, condition
+
+
+def _believed(trial):
+    return trial[1] * (_NOISE if trial[2] > DOUBTFUL else 1.0)
+
+
+def _best(tried):
+    return int(np.argmin([_believed(trial) for trial in tried]))
+
+
+def _golden(objective, low, high, count):
+    """Golden-section search of the logarithm between low and high."""
+    a, b = math.log(low), math.log(high)
+    x, y = b - _GOLDEN * (b - a), a + _GOLDEN * (b - a)
+    left, right = _trial(objective, math.exp(x)), _trial(objective, math.exp(y))
+    tried = [left, right]
+    for _ in range(count - 2):
+        if _believed(left) <= _believed(right):
+            b, y, right = y, x, left
+            x = b - _GOLDEN * (b - a)
+            left = _trial(objective, math.exp(x))
+            tried.append(left)
+        else:
+            a, x, left = x, y, right
+            y = a + _GOLDEN * (b - a)
+            right = _trial(objective, math.exp(y))
+            tried.append(right)
+    return tried
