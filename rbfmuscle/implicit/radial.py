@@ -44,8 +44,12 @@ def _exp_loop(factor, x, bits, out):
         p = p * r + 0.5
         p = p * r + 1.0
         p = p * r + 1.0
+        out[i] = p if factor * x[i] >= -708.0 else 0.0
+    # bits and whole share memory: in one loop they would keep it from being vectorised
+    for i in range(x.size):
         whole[i] = (whole[i] + 1023) << 52
-        out[i] = p * bits[i] if factor * x[i] >= -708.0 else 0.0
+    for i in range(x.size):
+        out[i] *= bits[i]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

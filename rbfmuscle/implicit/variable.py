@@ -74,8 +74,8 @@ def fit_variable(points, values, epsilon, *, kernel="gaussian", degree=None):
     solution, condition, rank = solve_least_squares(matrix, np.append(values, np.zeros(len(powers))))
     if rank < len(matrix):
         warnings.warn(
-            f"variable epsilon between {epsilon.min():.3g} and {epsilon.max():.3g}: rank {rank} of {len(matrix)}, "
-            "the values are met in the least-squares sense only; raise epsilon",
+            f"variable epsilon between {epsilon.min():.3g} and {epsilon.max():.3g}: rank {rank} of "
+            f"{len(matrix)}, the values are met in the least-squares sense only; raise epsilon",
             NumericalWarning,
             stacklevel=2,
         )
