@@ -8,6 +8,7 @@ import pytest
 import trimesh
 
 from rbfmuscle.implicit.control_mesh import contract_clusters
+from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.sampling import off_surface_points, sample_surface
 from rbfmuscle.validation import MeshError
 
@@ -69,7 +70,7 @@ def test_points_lie_on_the_surface_where_their_coordinates_say(shape):
 
 def test_sphere_is_covered_evenly_with_radial_normals():
     mesh = trimesh.creation.icosphere(subdivisions=5, radius=10.0)
-    sample = sample_surface(mesh.vertices, mesh.faces, 300)
+    sample = sample_surface(mesh.vertices, mesh.faces, 300, placement="even")
     assert sample.areas.std() / sample.areas.mean() < 0.1
     gaps = trimesh.proximity.cKDTree(sample.points).query(sample.points, k=2)[0][:, 1]
     # Hexagonal packing would give 2.2; clusters of mesh vertices come within a third of it.
@@ -81,7 +82,7 @@ def test_sphere_is_covered_evenly_with_radial_normals():
 
 def test_both_sides_of_a_thin_plate_get_their_own_points():
     mesh = plate(0.05)
-    sample = sample_surface(mesh.vertices, mesh.faces, 300)
+    sample = sample_surface(mesh.vertices, mesh.faces, 300, placement="even")
     broad = np.abs(sample.normals[:, 2]) > 0.9
     upper, lower = (
         sample.points[broad & (sample.points[:, 2] > 0)],
@@ -133,6 +134,46 @@ def test_too_few_points_for_the_topology_are_refused():
         sample_surface(mesh.vertices, mesh.faces, 3)
 
 
+@pytest.mark.parametrize("placement", ["adaptive", "greedy"])
+@pytest.mark.parametrize("shape", ["ellipsoid", "torus"])
+def test_other_placements_cover_everything_with_a_manifold(shape, placement):
+    mesh = SHAPES[shape]()
+    sample = sample_surface(mesh.vertices, mesh.faces, 100, placement=placement)
+    check_control(mesh, sample, 100)
+    assert sample.areas.max() < 4 * sample.areas.mean()
+    # No two points may meet, or the fit is singular.
+    gaps = trimesh.proximity.cKDTree(sample.points).query(sample.points, k=2)[0][:, 1]
+    assert gaps.min() > 0.1 * np.sqrt(mesh.area / 100)
+
+
+def test_adapted_placement_puts_points_where_the_surface_bends():
+    mesh = SHAPES["ellipsoid"]()
+    even, adaptive = (
+        sample_surface(mesh.vertices, mesh.faces, 100, placement=p) for p in ("even", "adaptive")
+    )
+    tips = [(np.abs(s.points[:, 0]) > 24).sum() for s in (even, adaptive)]
+    assert tips[1] > 1.3 * tips[0]
+
+
+@needs_hip
+@pytest.mark.parametrize("muscle, count", [("gluteus_maximus", 300), ("iliacus", 150)])
+def test_adapted_placements_halve_the_largest_miss_of_a_fit(muscle, count):
+    mesh = trimesh.load(HIP / f"{muscle}.ply", process=False)
+    misses = []
+    for placement in ("even", "adaptive", "greedy"):
+        sample = sample_surface(mesh.vertices, mesh.faces, count, placement=placement)
+        misses.append(np.abs(RBFField.fit_hermite(sample.points, sample.normals)(mesh.vertices)))
+    rms = [np.sqrt((m**2).mean()) for m in misses]
+    assert rms[1] < rms[0] and rms[2] < rms[1]
+    assert misses[2].max() < 0.8 * misses[0].max()
+
+
+def test_greedy_placement_of_thousands_is_refused():
+    mesh = trimesh.creation.icosphere(2)
+    with pytest.raises(ValueError, match="greedy"):
+        sample_surface(mesh.vertices, mesh.faces, 2000, placement="greedy")
+
+
 def test_unknown_placement_is_refused():
     mesh = trimesh.creation.icosphere(2)
     with pytest.raises(ValueError, match="placement"):
@@ -144,7 +185,7 @@ def test_unknown_placement_is_refused():
 @pytest.mark.parametrize("muscle", MUSCLES)
 def test_real_muscles_get_an_even_cover_and_a_closed_control_mesh(muscle, count):
     mesh = trimesh.load(HIP / f"{muscle}.ply", process=False)
-    sample = sample_surface(mesh.vertices, mesh.faces, count)
+    sample = sample_surface(mesh.vertices, mesh.faces, count, placement="even")
     check_control(mesh, sample, count)
     assert sample.areas.std() / sample.areas.mean() < 0.25
     control = trimesh.Trimesh(sample.points, sample.control_faces, process=False)

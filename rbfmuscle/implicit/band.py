@@ -196,8 +196,6 @@ class Band:
         triangles : (m, 3) ndarray
         open_vertex : (n,) ndarray of bool
             Vertices on the outermost cells, where the surface leaves the grid.
-        cell_start : (cells + 1,) ndarray
-            First triangle of each visited cell.
         """
         count = self.cell_count
         ambiguous, first, start, table = marching_tables()
@@ -205,16 +203,15 @@ class Band:
         node = np.empty(4 * self.node_count + 4, dtype=np.int64)
         shift = np.empty((4 * self.node_count + 4, 3))
         triangles = np.empty((12 * count + 12, 3), dtype=np.int64)
-        cell_start = np.empty(count + 1, dtype=np.int64)
         n_vertices, n_triangles = _march_loop(
             self.cells, self.grid.strides, self.index, self._f, self._c, level, EDGE_CORNER, EDGE_AXIS,
-            FACE_CORNERS, ambiguous, first, start, table, vertex_of, node, shift, triangles, cell_start,
+            FACE_CORNERS, ambiguous, first, start, table, vertex_of, node, shift, triangles,
         )  # fmt: skip
         lower = np.column_stack(np.unravel_index(node[:n_vertices], self.grid.shape))
         coordinates = lower + shift[:n_vertices]
         last = np.array(self.grid.shape) - 1
         open_vertex = ((coordinates < 1e-9) | (coordinates > last - 1e-9)).any(axis=1)
-        return coordinates, triangles[:n_triangles], open_vertex, cell_start
+        return coordinates, triangles[:n_triangles], open_vertex
 
 
 @numba.njit(cache=True, nogil=True)

@@ -82,7 +82,7 @@ def cluster_mesh(fine, density, count, seed):
     """Cells of equal ``density`` times area, and the triangulation dual to them."""
     area = np.linalg.norm(face_normals(fine.vertices, fine.faces), axis=1)
     weight = np.bincount(fine.faces.ravel(), np.repeat(area / 3, 3), len(fine.vertices)) * density
-    edges = _unique_edges(fine.faces)
+    edges = unique_edges(fine.faces)
     start, other = _neighbours(edges, len(fine.vertices))
     tail = np.repeat(np.arange(len(start) - 1), np.diff(start))
     length = np.linalg.norm(fine.vertices[tail] - fine.vertices[other], axis=1)
@@ -97,7 +97,7 @@ def cluster_mesh(fine, density, count, seed):
     return contract_clusters(fine.faces, labels, weight, count)
 
 
-def _unique_edges(faces):
+def unique_edges(faces):
     sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
     return sides[sides[:, 0] < sides[:, 1]]
 

@@ -11,6 +11,7 @@ import numba
 import numpy as np
 
 from rbfmuscle.implicit.band import Band, BandGrid
+from rbfmuscle.implicit.obstacles import push_off_points
 from rbfmuscle.validation import check_finite, check_points, check_positive
 
 
@@ -48,17 +49,9 @@ class ExtractedSurface:
 
 
 def extract_surface(
-    field,
-    *,
-    points,
-    resolution=48,
-    cut=None,
-    volume=None,
-    level=0.0,
-    keep="largest",
-    search="band",
-    axes=None,
-):
+    field, *, points, resolution=48, cut=None, volume=None, level=0.0, keep="largest", search="band",
+    axes=None, obstacle_points=None, obstacle_tolerance=None,
+):  # fmt: skip
     """Extract the zero set of max(field - level, -cut) as a closed mesh.
 
     Parameters
@@ -81,6 +74,11 @@ def extract_surface(
         Follow the surface from the points, or visit the whole box (finds every spurious sheet in it).
     axes : (3, 3) array_like, optional
         Rotation whose rows are the grid's axes. In a frame that moves with the scene the mesh does too.
+    obstacle_points : (k, 3) array_like, optional
+        Vertices of the bones behind ``cut``: triangles whose chords cut across a convex bone are moved until
+        none of these is inside the mesh by more than the tolerance.
+    obstacle_tolerance : float, optional
+        By default 1 % of a grid cell [scene unit].
 
     Returns
     -------
@@ -98,12 +96,14 @@ def extract_surface(
     if keep not in ("largest", "all") or search not in ("band", "box"):
         raise ValueError(f"keep must be largest or all, search band or box, got {keep!r} and {search!r}")
     target = None if volume is None else check_positive(volume, name="volume")
+    obstacles = None if obstacle_points is None else check_points(obstacle_points, name="obstacle_points")
     padding = 3
     while True:
         grid = BandGrid.around(points, resolution=resolution, padding=padding, axes=axes)
         band = Band(grid, field, cut)
         _start(band, points, level, search)
-        surface = _reach_volume(band, target, level, keep)
+        tolerance = 0.01 * grid.spacing if obstacle_tolerance is None else float(obstacle_tolerance)
+        surface = _reach_volume(band, target, level, keep, (obstacles, tolerance))
         if surface is not None:
             return surface
         if padding >= resolution:
@@ -130,11 +130,11 @@ def _start(band, points, level, search):
         band.grow(level)
 
 
-def _reach_volume(band, target, level, keep):
+def _reach_volume(band, target, level, keep, obstacles):
     """Mesh at the level that gives the target volume; None where the surface leaves the grid."""
     spacing = band.grid.spacing
     for _ in range(20):
-        if not band.crosses(level):
+        if target is not None and not band.crosses(level):
             raise ValueError(f"no level gives a volume of {target:g}: the level set is empty at {level:g}")
         band.grow(level)
         found = _closed_sheets(band, level, keep)
@@ -153,17 +153,20 @@ def _reach_volume(band, target, level, keep):
             level += step
             projector.shift(step)
             if np.abs(step * projector.slope).max() < 2e-3 * spacing:
-                return _finish(band, projector, faces, target, level, components, spurious)
+                return _finish(band, projector, faces, target, level, components, spurious, obstacles)
             projector.project(level)
             step = projector.volume_step(faces, target)
         largest = np.abs(projector.slope).max()
         level += float(np.clip(step, -spacing / largest, spacing / largest))
     else:
         raise ValueError(f"no level gives a volume of {target:g}; is it the volume of the surface fitted?")
-    return _finish(band, projector, faces, target, level, components, spurious)
+    return _finish(band, projector, faces, target, level, components, spurious, obstacles)
 
 
-def _finish(band, projector, faces, target, level, components, spurious):
+def _finish(band, projector, faces, target, level, components, spurious, obstacles):
+    points, tolerance = obstacles
+    if points is not None:
+        projector.push_off(faces, points, tolerance)
     if target is not None:
         for _ in range(3):
             step = projector.volume_step(faces, target)
@@ -185,7 +188,7 @@ def _finish(band, projector, faces, target, level, components, spurious):
 
 def _closed_sheets(band, level, keep):
     """Vertices, faces, number of sheets and of those left out; None where the wanted one is open."""
-    coordinates, faces, on_border, _ = band.march(level)
+    coordinates, faces, on_border = band.march(level)
     label, sheets = _label_sheets_loop(faces, len(coordinates))
     volume = np.bincount(
         label[faces[:, 0]], _volume_terms(coordinates - coordinates.mean(axis=0), faces), sheets
@@ -238,8 +241,21 @@ def _label_sheets_loop(faces, size):
 
 
 def _volume_terms(vertices, faces):
-    a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
-    return np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
+    """Signed volume of the tetrahedron under each triangle, (m,)."""
+    out = np.empty(len(faces))
+    _volume_loop(vertices, faces, out)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _volume_loop(x, faces, out):
+    for f in range(len(faces)):
+        i, a, b = faces[f, 0], faces[f, 1], faces[f, 2]
+        out[f] = (
+            x[i, 0] * (x[a, 1] * x[b, 2] - x[a, 2] * x[b, 1])
+            + x[i, 1] * (x[a, 2] * x[b, 0] - x[a, 0] * x[b, 2])
+            + x[i, 2] * (x[a, 0] * x[b, 1] - x[a, 1] * x[b, 0])
+        ) / 6.0
 
 
 def mesh_volume(vertices, faces):
@@ -254,6 +270,7 @@ class _Projector:
         self.vertices = vertices
         self.spacing = spacing
         self._field = with_gradient(field, 1e-4 * spacing)
+        self._cut_value = cut
         self._cut = None if cut is None else with_gradient(cut, 1e-4 * spacing)
         self.slope = np.zeros(len(vertices))
         self._direction = np.zeros_like(vertices)
@@ -269,7 +286,7 @@ class _Projector:
             self._direction[todo] = gradient / square[:, None]
             self.slope[todo] = 1.0 / np.sqrt(square)
             step = -((f - level) / square)[:, None] * gradient
-            if self._cut is not None:
+            if self._cut_value is not None:
                 on_field[todo] = self._turn_to_cut(x, f - level, square, step)
             length = np.linalg.norm(step, axis=1)
             step *= np.minimum(1.0, self.spacing / np.maximum(length, 1e-300))[:, None]
@@ -283,11 +300,13 @@ class _Projector:
 
     def _turn_to_cut(self, x, f, square, step):
         """Replace the steps of vertices that lie on the cut; returns which lie on the field's own surface."""
-        distance, outward = self._cut(x)
-        size = np.maximum(np.einsum("ij,ij->i", outward, outward), np.finfo(float).tiny)
-        on_field = f / np.sqrt(square) >= -distance / np.sqrt(size)
-        rows = ~on_field
-        step[rows] = -(distance[rows] / size[rows])[:, None] * outward[rows]
+        # The slope of a distance is one; it is worked out only where the cut is the surface.
+        on_field = f / np.sqrt(square) >= -self._cut_value(x)
+        rows = np.flatnonzero(~on_field)
+        if len(rows):
+            distance, outward = self._cut(x[rows])
+            size = np.maximum(np.einsum("ij,ij->i", outward, outward), np.finfo(float).tiny)
+            step[rows] = -(distance / size)[:, None] * outward
         return on_field
 
     def volume_step(self, faces, target):
@@ -299,6 +318,12 @@ class _Projector:
         if not rate > 0:
             raise ValueError(f"no level gives a volume of {target:g}: the cut leaves no surface of the field")
         return lack / rate
+
+    def push_off(self, faces, points, tolerance):
+        """Move the vertices around points that came through a triangle; these no longer follow the level."""
+        moved = push_off_points(self.vertices, faces, points, self.spacing, tolerance)
+        self._direction[moved] = 0.0
+        self.slope[moved] = 0.0
 
     def shift(self, step):
         """Move the vertices as the level set moves with its level, to first order."""

@@ -140,7 +140,7 @@ def _crossing(f0, f1, c0, c1, level):
 @numba.njit(cache=True, nogil=True)
 def _march_loop(
     cells, strides, index, f, c, level, corner, axis, faces4, ambiguous, first, start, table,
-    vertex_of, vertex_node, vertex_shift, triangles, cell_start,
+    vertex_of, vertex_node, vertex_shift, triangles,
 ):  # fmt: skip
     """Triangles of all cells; returns the numbers of vertices and triangles.
 
@@ -150,47 +150,24 @@ def _march_loop(
     local = np.empty(16, dtype=np.int64)
     n_vertices, n_triangles = 0, 0
     for n in range(len(cells)):
-        cell_start[n] = n_triangles
-        case = 0
-        for q in range(8):
-            flat = cells[n] + (q & 1) * strides[0] + (q >> 1 & 1) * strides[1] + (q >> 2) * strides[2]
-            nodes[q] = index[flat]
-            values[q] = _combined(f[nodes[q]], c[nodes[q]], level)
-            if values[q] < 0:
-                case |= 1 << q
-        if case == 0 or case == 255:
+        entry = _entry_of(cells[n], strides, index, f, c, level, faces4, ambiguous, first, nodes, values)
+        if entry < 0:
             continue
-        bits = 0
-        for b in range(6):
-            k = ambiguous[case, b]
-            if k < 0:
-                break
-            product = (
-                values[faces4[k, 0]] * values[faces4[k, 2]] - values[faces4[k, 1]] * values[faces4[k, 3]]
-            )
-            first_inside = values[faces4[k, 0]] < 0
-            if (product > 0) == first_inside and product != 0:
-                bits |= 1 << b
+        rows = table[start[entry] : start[entry + 1]]
         local[:] = -1
-        for t in range(start[first[case] + bits], start[first[case] + bits + 1]):
+        for t in range(len(rows)):
             for s in range(3):
-                e = table[t, s]
+                e = rows[t, s]
                 if e < 12 and local[e] < 0:
-                    low = nodes[corner[e]]
-                    if vertex_of[low, axis[e]] < 0:
-                        high = nodes[corner[e] + (1 << axis[e])]
-                        vertex_of[low, axis[e]] = n_vertices
-                        q = corner[e]
-                        vertex_node[n_vertices] = (
-                            cells[n]
-                            + (q & 1) * strides[0]
-                            + (q >> 1 & 1) * strides[1]
-                            + (q >> 2) * strides[2]
-                        )
+                    q, a = corner[e], axis[e]
+                    low, high = nodes[q], nodes[q + (1 << a)]
+                    if vertex_of[low, a] < 0:
+                        vertex_of[low, a] = n_vertices
+                        vertex_node[n_vertices] = _corner_node(cells[n], q, strides)
                         vertex_shift[n_vertices] = 0.0
-                        vertex_shift[n_vertices, axis[e]] = _crossing(f[low], f[high], c[low], c[high], level)
+                        vertex_shift[n_vertices, a] = _crossing(f[low], f[high], c[low], c[high], level)
                         n_vertices += 1
-                    local[e] = vertex_of[low, axis[e]]
+                    local[e] = vertex_of[low, a]
                 elif e >= 12 and local[e] < 0:
                     local[e] = n_vertices
                     n_vertices += 1
@@ -198,10 +175,37 @@ def _march_loop(
             n_triangles += 1
         for e in range(12, 16):
             if local[e] >= 0:
-                rows = table[start[first[case] + bits] : start[first[case] + bits + 1]]
                 _centre_vertex(cells[n], local, e, rows, corner, vertex_shift, vertex_node)
-    cell_start[len(cells)] = n_triangles
     return n_vertices, n_triangles
+
+
+@numba.njit(cache=True, nogil=True)
+def _corner_node(cell, q, strides):
+    """Flat number of corner q of a cell."""
+    return cell + (q & 1) * strides[0] + (q >> 1 & 1) * strides[1] + (q >> 2) * strides[2]
+
+
+@numba.njit(cache=True, nogil=True)
+def _entry_of(cell, strides, index, f, c, level, faces4, ambiguous, first, nodes, values):
+    """Table entry of a cell, -1 where it is not crossed; its nodes and values go to the last two arrays."""
+    case = 0
+    for q in range(8):
+        nodes[q] = index[_corner_node(cell, q, strides)]
+        values[q] = _combined(f[nodes[q]], c[nodes[q]], level)
+        if values[q] < 0:
+            case |= 1 << q
+    if case == 0 or case == 255:
+        return -1
+    bits = 0
+    for b in range(6):
+        k = ambiguous[case, b]
+        if k < 0:
+            break
+        product = values[faces4[k, 0]] * values[faces4[k, 2]] - values[faces4[k, 1]] * values[faces4[k, 3]]
+        # The saddle is inside where the product of the inside corners is the larger one.
+        if product != 0 and (product > 0) == (values[faces4[k, 0]] < 0):
+            bits |= 1 << b
+    return first[case] + bits
 
 
 @numba.njit(cache=True, nogil=True)

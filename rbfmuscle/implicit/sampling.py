@@ -1,12 +1,14 @@
 """Centres on a closed mesh: even cover, normals, areas, and the control triangulation over them."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numba
 import numpy as np
 
 from rbfmuscle.implicit.clustering import cluster_mesh, face_normals, refine_mesh
 from rbfmuscle.implicit.control_mesh import opposite_half_edges
+from rbfmuscle.implicit.placement import GREEDY_LARGEST, curvature_density, greedy_sample
 from rbfmuscle.validation import check_mesh, check_points, check_positive, check_vectors
 
 
@@ -41,7 +43,7 @@ class SurfaceSample:
     control_faces: np.ndarray
 
 
-def sample_surface(vertices, faces, count, *, seed=0, placement="even"):
+def sample_surface(vertices, faces, count, *, seed=0, placement="adaptive"):
     """Cover a closed mesh with ``count`` points.
 
     The mesh is split into ``count`` connected cells of equal size (farthest points by distance along the
@@ -58,8 +60,9 @@ def sample_surface(vertices, faces, count, *, seed=0, placement="even"):
         Points wanted, at least 4 for each connected component.
     seed : int
         Chooses the first point; the rest follows.
-    placement : {"even"}
-        Even cells.
+    placement : {"even", "adaptive", "greedy"}
+        Cells of equal size; smaller where the surface bends; smaller where a cubic Hermite fit misses the
+        mesh (the most accurate, at 0.2 to 1 s; up to 1000 points).
 
     Returns
     -------
@@ -76,15 +79,19 @@ def sample_surface(vertices, faces, count, *, seed=0, placement="even"):
     count = int(count)
     if count < 4:
         raise ValueError(f"count must be at least 4, got {count}")
+    if placement == "greedy" and count > GREEDY_LARGEST:
+        raise ValueError(f"count must be at most {GREEDY_LARGEST} for placement greedy, got {count}")
     if placement not in PLACEMENTS:
         raise ValueError(f"placement must be one of {', '.join(PLACEMENTS)}, got {placement!r}")
     opposite_half_edges(faces)
     fine = refine_mesh(vertices, faces, count)
-    labels, control = cluster_mesh(fine, np.ones(len(fine.vertices)), count, seed)
-    return _gather(vertices, faces, fine, labels, control, count)
+    if placement == "greedy":
+        return greedy_sample(fine, count, seed, partial(_gather, vertices, faces, fine, count))
+    density = curvature_density(fine, count) if placement == "adaptive" else np.ones(len(fine.vertices))
+    return _gather(vertices, faces, fine, count, *cluster_mesh(fine, density, count, seed))
 
 
-PLACEMENTS = ("even",)
+PLACEMENTS = ("even", "adaptive", "greedy")
 
 
 def off_surface_points(points, normals, *, distance=None, safety=0.5):
@@ -153,7 +160,7 @@ def _touching_ball_loop(points, normals, steps, nearest):
         nearest[i] = np.sqrt(least)
 
 
-def _gather(vertices, faces, fine, labels, control, count):
+def _gather(vertices, faces, fine, count, labels, control):
     """Points, normals and areas of the cells."""
     vectors = face_normals(fine.vertices, fine.faces)
     third = np.linalg.norm(vectors, axis=1) / 3
@@ -221,16 +228,29 @@ def _nearest_on_triangle(p, a, b, c, out):
 
 @numba.njit(cache=True, nogil=True)
 def _nearest_in_cell_loop(vertices, faces, corner, target, points, face, distance):
-    """Of the triangles that touch cell k, the point nearest to target[k]."""
+    """Of the triangles wholly in cell k, the point nearest to target[k]; a cell without one gives a vertex.
+
+    Triangles between cells are left out: at a thin rim two cells would take the same point of one.
+    """
     q = np.empty(3)
+    for f in range(len(faces)):
+        k = corner[f, 0]
+        if corner[f, 1] != k or corner[f, 2] != k:
+            continue
+        a, b, d = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+        square = _nearest_on_triangle(target[k], a, b, d, q)
+        if square < distance[k]:
+            distance[k] = square
+            face[k] = f
+            points[k] = q
+    whole = np.isfinite(distance)
     for f in range(len(faces)):
         for c in range(3):
             k = corner[f, c]
-            if (c > 0 and corner[f, 0] == k) or (c > 1 and corner[f, 1] == k):
+            if whole[k]:
                 continue
-            a, b, d = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
-            square = _nearest_on_triangle(target[k], a, b, d, q)
+            square = np.sum((vertices[faces[f, c]] - target[k]) ** 2)
             if square < distance[k]:
                 distance[k] = square
                 face[k] = f
-                points[k] = q
+                points[k] = vertices[faces[f, c]]
