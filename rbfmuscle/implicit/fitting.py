@@ -187,7 +187,9 @@ def _solve_truncated(basis, right, smoothing):
     right = np.append(right, np.zeros(len(full) - basis.size))
     solution = vectors[:, keep] @ ((vectors[:, keep].T @ right) / values[keep])
     condition = sizes.max() / max(sizes.min(), np.finfo(float).tiny)
-    _warn(basis, condition, len(keep) - int(keep.sum()))
+    dropped = len(keep) - int(keep.sum())
+    if dropped or condition >= DOUBTFUL:
+        _warn(basis, condition, dropped)
     return solution[: basis.size], solution[basis.size :], condition
 
 

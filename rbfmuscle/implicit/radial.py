@@ -17,7 +17,7 @@ _SHIFTER = 6755399441055744.0  # 1.5 * 2**52: adding it leaves the rounded integ
 _TINY = 2.2250738585072014e-308
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _exp_loop(factor, x, bits, out):
     """out = exp(factor * x), relative error of the exponential below 3e-16; 0 where factor * x < -708.
 
@@ -52,7 +52,7 @@ def _exp_loop(factor, x, bits, out):
         out[i] *= bits[i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _log_loop(x, bits, out):
     """out = log(x) for x > 0, relative error below 4e-16; 0 is taken as the smallest normal number."""
     whole = bits.view(np.int64)
@@ -86,8 +86,9 @@ def _log_loop(x, bits, out):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _base_loop(base, parameter, u, s, b, bits, more):
     """s = sqrt(u) and b = the kernel's base; bits and more are scratch."""
-    for i in range(u.size):
-        s[i] = np.sqrt(u[i])
+    if base != GAUSS and base != BINOMIAL:  # functions of u alone
+        for i in range(u.size):
+            s[i] = np.sqrt(u[i])
     if base == EXP:
         _exp_loop(-1.0, s, bits, b)
     elif base == GAUSS:
@@ -130,7 +131,7 @@ def _binomial_loop(beta, u, b, bits, more):
         _exp_loop(beta, more, bits, b)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _inner_loop(base, row, u, s, b, out):
     """out = base * A(s)."""
     a0, a1, a2, a3, a4 = row[2], row[3], row[4], row[5], row[6]
@@ -139,19 +140,23 @@ def _inner_loop(base, row, u, s, b, out):
             out[i] = 0.0
         return
     if a1 == 0.0 and a2 == 0.0 and a3 == 0.0 and a4 == 0.0:
-        for i in range(u.size):
-            out[i] = a0
-    else:
+        if base == CUT:
+            for i in range(u.size):
+                out[i] = a0
+        else:
+            for i in range(u.size):
+                out[i] = a0 * b[i]
+    elif base == CUT:
         for i in range(u.size):
             out[i] = a0 + s[i] * (a1 + s[i] * (a2 + s[i] * (a3 + s[i] * a4)))
+    else:
+        for i in range(u.size):
+            out[i] = b[i] * (a0 + s[i] * (a1 + s[i] * (a2 + s[i] * (a3 + s[i] * a4))))
     if base == CUT:
         for _ in range(int(row[1])):
             for i in range(u.size):
                 out[i] *= b[i]
-        return
-    for i in range(u.size):
-        out[i] *= b[i]
-    if base == BINOMIAL:
+    elif base == BINOMIAL:
         for _ in range(int(row[1])):
             for i in range(u.size):
                 out[i] = out[i] / (1.0 + u[i])
