@@ -111,7 +111,7 @@ def test_epsilon_multiplies_the_distance(name):
 @pytest.mark.parametrize("name", COMPACT)
 def test_compact_kernels_end_at_one_over_epsilon(name):
     assert KERNELS[name].phi(0.999 / 0.3, 0.3) >= 0
-    assert KERNELS[name].phi([1 / 0.3, 5.0, 1e100], 0.3).tolist() == [0, 0, 0]
+    assert KERNELS[name].phi([1 / 0.3, 5.0, 1e60], 0.3).tolist() == [0, 0, 0]
 
 
 def least_eigenvalue(kernel, points, degree):
