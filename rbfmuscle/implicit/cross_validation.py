@@ -60,8 +60,8 @@ def leave_one_out(basis, right, *, smoothing=0.0):
     if len(basis.powers):
         first = lapack.dtrtrs(factor, np.asfortranarray(basis.polynomials.T), lower=1)[0]
     inverse, _ = lapack.dtrtri(factor, lower=1, overwrite_c=1)
-    columns = inverse.reshape(basis.size, -1, count)
-    blocks = np.einsum("mak,mbk->kab", columns, columns, optimize=True)
+    rows = inverse.T.reshape(-1, count, basis.size)  # LAPACK's order: rows are contiguous here
+    blocks = np.stack([[np.einsum("km,km->k", a, b) for b in rows] for a in rows]).transpose(2, 0, 1).copy()
     if len(basis.powers):
         # F^-1 = M^-1 - (S^-1/2 P M^-1)^T (S^-1/2 P M^-1), S = P M^-1 P^T
         root = np.linalg.cholesky(first.T @ first)

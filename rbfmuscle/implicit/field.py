@@ -100,7 +100,7 @@ class RBFField:
         kernel, epsilon, smoothing
             As in `fit`; the kernel must be C2.
         derivatives : {"all", "normal"}
-            "normal" asks only for the derivative along the normal: 2K unknowns in place of 4K, a fifth
+            "normal" asks only for the derivative along the normal: 2K unknowns in place of 4K, a quarter
             of the time for nearly the same surface (see ``docs/field.md``).
 
         Returns
