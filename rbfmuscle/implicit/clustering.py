@@ -27,6 +27,14 @@ def face_normals(vertices, faces):
     return 0.5 * np.cross(b - a, c - a)
 
 
+def vertex_normals(vertices, faces):
+    """Unit normals at vertices, mean of the faces around weighted by area; zero where these cancel."""
+    vectors = np.repeat(face_normals(vertices, faces), 3, axis=0)
+    sums = [np.bincount(faces.ravel(), vectors[:, k], len(vertices)) for k in range(3)]
+    normals = np.stack(sums, axis=1)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1), np.finfo(float).tiny)[:, None]
+
+
 def refine_mesh(vertices, faces, count):
     area = np.linalg.norm(face_normals(vertices, faces), axis=1).sum()
     limit = np.sqrt(2 / np.sqrt(3) * area / count) / FINENESS

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rbfmuscle.implicit.clustering import cluster_mesh, face_normals, unique_edges
+from rbfmuscle.implicit.clustering import cluster_mesh, face_normals, unique_edges, vertex_normals
 from rbfmuscle.implicit.field import RBFField
 
 # Densities stay within this ratio, so that no part of the surface is left without centres that carry it.
@@ -29,13 +29,8 @@ def curvature_density(fine, count):
     (n,) ndarray
         At the fine mesh's vertices, 1 or more.
     """
-    vectors = face_normals(fine.vertices, fine.faces)
-    area = np.linalg.norm(vectors, axis=1)
-    normals = np.stack(
-        [np.bincount(fine.faces.ravel(), np.repeat(vectors[:, k], 3), len(fine.vertices)) for k in range(3)],
-        axis=1,
-    )
-    normals /= np.maximum(np.linalg.norm(normals, axis=1), np.finfo(float).tiny)[:, None]
+    area = np.linalg.norm(face_normals(fine.vertices, fine.faces), axis=1)
+    normals = vertex_normals(fine.vertices, fine.faces)
     i, j = unique_edges(fine.faces).T
     length = np.linalg.norm(fine.vertices[i] - fine.vertices[j], axis=1)
     turn = ((normals[i] - normals[j]) ** 2).sum(axis=1)

@@ -6,7 +6,7 @@ from functools import partial
 import numba
 import numpy as np
 
-from rbfmuscle.implicit.clustering import cluster_mesh, face_normals, refine_mesh
+from rbfmuscle.implicit.clustering import cluster_mesh, face_normals, refine_mesh, vertex_normals
 from rbfmuscle.implicit.control_mesh import opposite_half_edges
 from rbfmuscle.implicit.placement import GREEDY_LARGEST, curvature_density, greedy_sample
 from rbfmuscle.validation import check_mesh, check_points, check_positive, check_vectors
@@ -91,6 +91,8 @@ def sample_surface(vertices, faces, count, *, seed=0, placement="adaptive"):
     return _gather(vertices, faces, fine, count, *cluster_mesh(fine, density, count, seed))
 
 
+# Weight of the cell's mean normal beside the normal at its point: 0 lets rims bulge, more blunts them.
+CELL_SHARE = 0.5
 PLACEMENTS = ("even", "adaptive", "greedy")
 
 
@@ -162,27 +164,39 @@ def _touching_ball_loop(points, normals, steps, nearest):
 
 def _gather(vertices, faces, fine, count, labels, control):
     """Points, normals and areas of the cells."""
-    vectors = face_normals(fine.vertices, fine.faces)
-    third = np.linalg.norm(vectors, axis=1) / 3
+    third = np.linalg.norm(face_normals(fine.vertices, fine.faces), axis=1) / 3
     corner = labels[fine.faces]
     areas = np.bincount(corner.ravel(), np.repeat(third, 3), count)
-    normals, centroid = np.zeros((count, 3)), np.zeros((count, 3))
     middle = fine.vertices[fine.faces].mean(axis=1)
-    for axis in range(3):
-        normals[:, axis] = np.bincount(corner.ravel(), np.repeat(vectors[:, axis], 3), count)
-        centroid[:, axis] = np.bincount(corner.ravel(), np.repeat(third * middle[:, axis], 3), count)
-    centroid /= np.maximum(areas, np.finfo(float).tiny)[:, None]
+    moments = [np.bincount(corner.ravel(), np.repeat(third * middle[:, k], 3), count) for k in range(3)]
+    centroid = np.stack(moments, axis=1) / np.maximum(areas, np.finfo(float).tiny)[:, None]
     # The nearest point of the cell itself, not of the mesh: that could lie on the other side of a thin sheet.
-    points, face, distance = np.zeros((count, 3)), np.zeros(count, dtype=np.int64), np.full(count, np.inf)
-    _nearest_in_cell_loop(fine.vertices, fine.faces, corner, centroid, points, face, distance)
-    face = fine.parent[face]
+    points, piece, distance = np.zeros((count, 3)), np.zeros(count, dtype=np.int64), np.full(count, np.inf)
+    _nearest_in_cell_loop(fine.vertices, fine.faces, corner, centroid, points, piece, distance)
+    normals = _normals_at(fine, points, piece, corner)
+    face = fine.parent[piece]
     barycentric = _barycentric(points, vertices[faces[face]])
     vertex = faces[face, barycentric.argmax(axis=1)]
-    length = np.linalg.norm(normals, axis=1)
-    flat = length < 1e-9 * areas
-    normals[flat] = face_normals(vertices, faces)[face[flat]]
-    normals /= np.linalg.norm(normals, axis=1)[:, None]
     return SurfaceSample(points, normals, areas, face, barycentric, vertex, control)
+
+
+def _normals_at(fine, points, piece, corner):
+    """Normals in triangles ``piece``, drawn towards the mean of each point's cell.
+
+    The mean alone flattens what the field shows between the points; the normal of the point alone makes the
+    field bulge far out where a few points stand on a sharp rim.
+    """
+    corners = fine.faces[piece]
+    weights = _barycentric(points, fine.vertices[corners])
+    here = np.einsum("kc,kcd->kd", weights, vertex_normals(fine.vertices, fine.faces)[corners])
+    vectors = face_normals(fine.vertices, fine.faces)
+    mean = [np.bincount(corner.ravel(), np.repeat(vectors[:, k], 3), len(points)) for k in range(3)]
+    mean = np.stack(mean, axis=1)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1), np.finfo(float).tiny)[:, None]
+    normals = here + CELL_SHARE * mean
+    cancelled = np.linalg.norm(normals, axis=1) < 1e-6
+    normals[cancelled] = vectors[piece[cancelled]]
+    return normals / np.linalg.norm(normals, axis=1)[:, None]
 
 
 def _barycentric(points, corners):
