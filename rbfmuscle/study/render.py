@@ -15,7 +15,7 @@ from rbfmuscle.study.appearance import BACKGROUND, BONE_COLOUR, muscle_colours
 from rbfmuscle.study.saved import SavedRun
 from rbfmuscle.validation import MissingPartError, RBFMuscleError, UsageError
 
-# Direction from which the camera looks, and what is up; z is up as in the medical axes (left, posterior, superior).
+# Where the camera stands; z is up, as in the medical axes (left, posterior, superior).
 VIEWS = {
     "front": ((0.0, -1.0, 0.12), "from -y"),
     "side": ((-1.0, -0.12, 0.12), "from -x"),
@@ -99,12 +99,12 @@ def draw(directory, jobs, seconds=5.0):
         words = [line.strip() for line in done.stderr.splitlines() if line.strip()]
         reason = words[-1][-160:] if words else f"the drawing process ended with code {done.returncode}"
         raise MissingPartError(
-            f"no pictures: {reason}; drawing needs OpenGL (a display, or Mesa's libegl1 and libgl1 for software)"
+            f"no pictures: {reason}; drawing needs OpenGL (a display, or Mesa's libegl1 and libgl1)"
         )
 
 
 class Stage:
-    """An off-screen window with the same scene in several views, its camera fixed on the muscles' whole path."""
+    """An off-screen window with several views of a scene, each aimed at the muscles' whole path."""
 
     def __init__(self, saved, views, size):
         import pyvista
@@ -141,6 +141,8 @@ class Stage:
             mesh = pyvista.make_tri_mesh(*self.saved.surface(muscle, frame))
             mesh = mesh.compute_normals(split_vertices=False, auto_orient_normals=False)
             self.skins += [self._add(k, mesh, self.colours[muscle]) for k in range(len(self.views))]
+        for renderer in self.plotter.renderers:
+            renderer.ResetCameraClippingRange()
         return self.plotter.screenshot(return_img=True)
 
     def close(self):
@@ -149,9 +151,15 @@ class Stage:
     def _add(self, column, mesh, colour):
         self.plotter.subplot(0, column)
         return self.plotter.add_mesh(
-            mesh, color=colour, smooth_shading=True, specular=0.25, specular_power=18, ambient=0.12, render=False,
+            mesh,
+            color=colour,
+            smooth_shading=True,
+            specular=0.25,
+            specular_power=18,
+            ambient=0.12,
+            render=False,
             reset_camera=False,
-        )  # fmt: skip
+        )
 
     def _aim(self, direction, bounds, size):
         """Parallel projection that holds the box in this view."""
@@ -171,8 +179,6 @@ class Stage:
         camera.up = up
         camera.parallel_projection = True
         camera.parallel_scale = 1.04 * max(tall, wide)
-        self.plotter.renderer.ResetCameraClippingRange()
-        self.plotter.renderer.SetClippingRangeExpansion(0.5)
 
 
 def _path_bounds(saved):
