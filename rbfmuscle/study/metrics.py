@@ -21,7 +21,7 @@ QUANTITIES = {
     "bone_penetration_max": ("length", "deepest bone vertex inside the muscle"),
     "solver_penetration_max": ("length", "deepest point inside a bone before the bone is cut away"),
     "components": ("1", "closed pieces of the surface"),
-    "tunnelled": ("1", "points that were found to have passed through a bone"),
+    "tunnelled": ("1", "points that passed through a bone and were not brought back"),
     "rest_error_rms": ("length", "distance between extracted surface and input mesh at rest, both ways"),
     "rest_error_max": ("length", "the same, greatest (Hausdorff)"),
     "edge_strain_rms": ("1", "relative change of edge lengths of the carried mesh"),
@@ -35,6 +35,9 @@ QUANTITIES = {
 }
 ALL = "all"
 _FROM_MODEL = ("solver_penetration_max", "condition", "time_fit", "time_extract")
+
+# Events whose points stayed beyond a bone; those turned back or halved away are in events.csv only.
+_THROUGH = ("reported", "unresolved")
 
 
 class Row(NamedTuple):
@@ -154,7 +157,8 @@ class _Tracker:
             found.update(self._of_surface(surface, frame, probes, at_rest and not self.rest_measured))
             self.rest_measured = self.rest_measured or at_rest
             found.update({q: surface.quantities[q] for q in _FROM_MODEL if q in surface.quantities})
-        found["tunnelled"] = sum(e.count for e in frame.events if e.muscle == self.name and e.bone)
+        mine = [event for event in frame.events if event.muscle == self.name]
+        found["tunnelled"] = sum(event.count for event in mine if event.action in _THROUGH)
         found["edge_strain_rms"] = edge_strain(frame.carried[self.name][0], self.edges, self.rest_lengths)
         self.length = self.length_of(frame)
         if self.line is not None:

@@ -184,7 +184,7 @@ def _summary(saved):
             mark = ' class="bad"' if (muscle, name) in beyond else ""
             cells.append(f"<td{mark}>{_cell(name, found.get(name))}</td>")
         shown = "" if limit is None else f"≤ {limit:g}"
-        label = name if unit == "1" else f"{name} <small>{unit}</small>"
+        label = name if unit in ("1", "s") else f"{name} <small>{unit}</small>"
         rows.append(f"<tr><th>{label}</th>{''.join(cells)}<td>{shown}</td></tr>")
     return f"<table><tr><th></th>{head}<th>limit</th></tr>{''.join(rows)}</table>"
 
@@ -195,7 +195,7 @@ def _cell(name, facts):
     if name in ("length", "edge_strain_rms"):
         return f"{facts['min']:.4g} … {facts['max']:.4g}"
     if name == "time_frame":
-        return f"{facts['median']:.3g} <small>median</small>"
+        return f"{1000 * facts['median']:.3g} ms <small>median</small>"
     small = f" <small>frame {facts['worst_frame']}</small>" if facts["worst"] else ""
     return f"{facts['worst']:.3g}{small}"
 
