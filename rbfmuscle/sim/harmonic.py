@@ -3,6 +3,7 @@
 import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
+from scipy.spatial.transform import Rotation
 
 
 def cotangent_laplacian(vertices, faces):
@@ -89,3 +90,51 @@ def surface_gradient(vertices, faces, values):
         np.add.at(total, faces[:, k], area * gradient)
         np.add.at(weight, faces[:, k], area)
     return total / np.maximum(weight, 1e-300)
+
+
+def blended_motion(points, weights, motions):
+    """Move each point by a weighted mean of rigid motions.
+
+    The motions' twists (logarithms in se(3)) are averaged with the point's weights and exponentiated, so a motion
+    that all bones share moves every point rigidly, and a weight of one gives that bone's motion exactly.
+
+    Parameters
+    ----------
+    points : (n, 3) ndarray
+    weights : (n, b) ndarray
+        Rows sum to one.
+    motions : (b, 4, 4) ndarray
+        Rigid motions from the old to the new positions.
+
+    Returns
+    -------
+    (n, 3) ndarray
+    """
+    twists = np.array([_twist(motion) for motion in motions])
+    blended = weights @ twists
+    omega, velocity = blended[:, :3], blended[:, 3:]
+    angle = np.linalg.norm(omega, axis=1)
+    small = angle < 1e-6
+    safe = np.where(small, 1.0, angle)
+    # sin a / a, (1 - cos a) / a², (a - sin a) / a³ with their limits
+    first = np.where(small, 1 - angle**2 / 6, np.sin(angle) / safe)[:, None]
+    second = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(angle)) / safe**2)[:, None]
+    third = np.where(small, 1 / 6 - angle**2 / 120, (angle - np.sin(angle)) / safe**3)[:, None]
+    turn = np.cross(omega, points)
+    shift = np.cross(omega, velocity)
+    rotated = points + first * turn + second * np.cross(omega, turn)
+    return rotated + velocity + second * shift + third * np.cross(omega, shift)
+
+
+def _twist(motion):
+    """Logarithm of a rigid 4x4 motion as (omega, velocity)."""
+    rotation = Rotation.from_matrix(motion[:3, :3])
+    omega = rotation.as_rotvec()
+    angle = np.linalg.norm(omega)
+    cross = np.array([[0, -omega[2], omega[1]], [omega[2], 0, -omega[0]], [-omega[1], omega[0], 0]])
+    if angle < 1e-4:
+        third = 1 / 12 + angle**2 / 720
+    else:
+        third = 1 / angle**2 - (1 + np.cos(angle)) / (2 * angle * np.sin(angle))
+    inverse = np.eye(3) - 0.5 * cross + third * (cross @ cross)
+    return np.concatenate([omega, inverse @ motion[:3, 3]])

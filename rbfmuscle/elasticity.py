@@ -1,0 +1,204 @@
+"""Local and global steps of an RBF muscle, with volume and contact projected inside the iteration."""
+
+import numba
+import numpy as np
+
+from rbfmuscle.constraints import contact_gram, solve_contact_forces
+
+CONTACT_SWEEPS = 60
+CONTACT_ROUNDS = 6
+CONTACT_TOLERANCE = 2e-5  # of the muscle's size: some micrometres
+REACH_MARGIN = 0.01  # of the muscle's size
+
+
+@numba.njit(cache=True, nogil=True)
+def _move_loop(dx, columns, shares, out):
+    """Motion of each contact point: Σ_k share_k dx_k."""
+    for s in range(len(columns)):
+        for a in range(3):
+            value = 0.0
+            for k in range(columns.shape[1]):
+                value += shares[s, k] * dx[columns[s, k], a]
+            out[s, a] = value
+
+
+@numba.njit(cache=True, nogil=True)
+def _gather_loop(gradient, columns, shares, out):
+    """Transpose of `_move_loop`: out_k = Σ_s share_sk gradient_s."""
+    out[:] = 0.0
+    for s in range(len(columns)):
+        for k in range(columns.shape[1]):
+            for a in range(3):
+                out[columns[s, k], a] += shares[s, k] * gradient[s, a]
+
+
+@numba.njit(cache=True, nogil=True)
+def _carry_all_loop(x, target, rest, points, columns, shares, out):
+    """Positions of the contact points: Σ_k share_k (x_k + T_k (X_s - X_k))."""
+    for s in range(len(points)):
+        for a in range(3):
+            out[s, a] = 0.0
+        for k in range(columns.shape[1]):
+            if shares[s, k] == 0.0:
+                continue
+            j = columns[s, k]
+            dx, dy, dz = points[s, 0] - rest[j, 0], points[s, 1] - rest[j, 1], points[s, 2] - rest[j, 2]
+            t = target[j]
+            for a in range(3):
+                out[s, a] += shares[s, k] * (x[j, a] + t[a, 0] * dx + t[a, 1] * dy + t[a, 2] * dz)
+
+
+class ElasticSolver:
+    """Alternates local targets with one dense global solve, accelerated (Anderson), contacts inside.
+
+    Parameters
+    ----------
+    shape : ShapeConstraint
+    volume : VolumeConstraint
+        On the samples.
+    points : (K + S, 3) ndarray
+        Contact points at rest: centres, then samples.
+    columns, shares : (K + S, 6)
+        How the contact points hang on the centres.
+    free, held : int arrays
+        Centres that move, and those that their bones carry.
+    """
+
+    def __init__(self, shape, volume, points, columns, shares, free, held, *, iterations, contacts, memory):
+        self.shape, self.volume, self.points = shape, volume, points
+        self.columns, self.shares = columns, shares
+        self.free, self.held = free, held
+        self.iterations, self.batch, self.memory = iterations, contacts, memory
+        self.centres = len(shape.rest)
+        laplacian = shape.laplacian
+        self.inverse = np.linalg.inv(laplacian[np.ix_(free, free)])
+        self.inverse = 0.5 * (self.inverse + self.inverse.T)
+        self.coupling = laplacian[np.ix_(free, held)]
+        dense = np.zeros((self.centres, len(points)))
+        np.add.at(dense, (columns, np.arange(len(points))[:, None]), shares)
+        self.influence = np.zeros((self.centres, len(points)))
+        self.influence[free] = self.inverse @ dense[free]
+        self.scale = float(np.ptp(shape.rest, axis=0).max())
+        self.forces = {}
+
+    def snapshot(self):
+        return dict(self.forces)
+
+    def restore(self, forces):
+        self.forces = dict(forces)
+
+    def carry(self, x):
+        """Contact points at centres x with the present targets, (K + S, 3)."""
+        out = np.empty_like(self.points)
+        _carry_all_loop(x, self.shape.target, self.shape.rest, self.points, self.columns, self.shares, out)
+        return out
+
+    def solve(self, x, contacts):
+        """Return the settled centres, (K, 3)."""
+        x = x.copy()
+        mixer = _Anderson(self.memory)
+        for step in range(self.iterations):
+            new = self._iterate(x, contacts)
+            if step + 1 < self.iterations:
+                x[self.free] = mixer.mix(x[self.free], new[self.free])
+            else:
+                x = new
+        self.shape.localise(x)
+        return x
+
+    def _iterate(self, x, contacts):
+        right = self.shape.localise(x)
+        new = x.copy()
+        new[self.free] = self.inverse @ (right[self.free] - self.coupling @ x[self.held])
+        here = self.carry(x)
+        motion = np.empty_like(here)
+        _move_loop(new - x, self.columns, self.shares, motion)
+        excess, gradient = self.volume.evaluate(here[self.centres :])
+        missing = -excess - np.vdot(gradient, motion[self.centres :])
+        pull = np.empty_like(x)
+        _gather_loop(gradient, self.columns[self.centres :], self.shares[self.centres :], pull)
+        response = np.zeros_like(x)
+        response[self.free] = self.inverse @ pull[self.free]
+        stiffness = np.vdot(pull, response)
+        push, lost = self._contact(here, motion, response, missing, stiffness, contacts)
+        new += push + response * ((missing - lost) / stiffness)
+        return new
+
+    def _contact(self, here, motion, response, missing, stiffness, contacts):
+        """Contact correction of the centres, and the volume that it adds by itself.
+
+        The working set starts from the contacts that pushed before and takes in the deepest violations round by
+        round until none is left: few contacts push at a time, but leaving one out would let the muscle jump
+        between poses.
+        """
+        reach = 1.5 * float(np.sqrt((motion**2).sum(axis=1).max())) + REACH_MARGIN * self.scale
+        spaces = contacts.half_spaces(here, reach)
+        moved = np.empty_like(here)
+        _move_loop(response, self.columns, self.shares, moved)
+        row = np.einsum("ca,ca->c", spaces.normal, moved[spaces.index])
+        need = -spaces.gap - np.einsum("ca,ca->c", spaces.normal, motion[spaces.index])
+        need -= row * (missing / stiffness)
+        keys = spaces.index * 64 + spaces.source
+        force = np.array([self.forces.get(key, 0.0) for key in keys.tolist()])
+        tolerance = CONTACT_TOLERANCE * self.scale
+        chosen = np.flatnonzero(force > 0.0)
+        lacking = need
+        push, lost = np.zeros((self.centres, 3)), 0.0
+        for _ in range(CONTACT_ROUNDS):
+            added = _deepest(lacking, chosen, tolerance, self.batch)
+            if len(added) == 0 and len(chosen) == 0:
+                break
+            chosen = np.concatenate([chosen, added])
+            index, normal = spaces.index[chosen], spaces.normal[chosen]
+            gram = contact_gram(index, normal, self.influence, self.columns, self.shares)
+            gram -= np.outer(row[chosen], row[chosen]) / stiffness
+            # A contact on held centres alone cannot be moved: its row is zero.
+            gram[np.diag_indices_from(gram)] += 1e-9 * np.abs(np.diag(gram)).max()
+            strength = solve_contact_forces(
+                gram, need[chosen], force[chosen], sweeps=CONTACT_SWEEPS, tolerance=0.1 * tolerance
+            )
+            force[chosen] = strength
+            push = self.influence[:, index] @ (normal * strength[:, None])
+            lost = float(row[chosen] @ strength)
+            if len(added) == 0:
+                break
+            _move_loop(push, self.columns, self.shares, moved)
+            lacking = need - np.einsum("ca,ca->c", spaces.normal, moved[spaces.index]) + row * (lost / stiffness)
+        active = chosen[force[chosen] > 0.0]
+        self.forces = dict(zip(keys[active].tolist(), force[active].tolist()))
+        return push, lost
+
+
+def _deepest(lacking, chosen, tolerance, most):
+    """Contacts, not yet chosen, that lack the most motion."""
+    lacking = lacking.copy()
+    lacking[chosen] = -np.inf
+    found = np.flatnonzero(lacking > tolerance)
+    return found[np.argsort(-lacking[found], kind="stable")[:most]]
+
+
+class _Anderson:
+    """Anderson acceleration of a fixed-point map (Walker & Ni 2011), with plain steps until it has memory."""
+
+    def __init__(self, memory):
+        self.memory = memory
+        self.values, self.residuals = [], []
+
+    def mix(self, x, g):
+        """Next iterate from x and its image g."""
+        if self.memory == 0:
+            return g
+        residual = (g - x).ravel()
+        self.values.append(g.ravel().copy())
+        self.residuals.append(residual)
+        if len(self.values) > self.memory + 1:
+            del self.values[0], self.residuals[0]
+        if len(self.values) == 1:
+            return g
+        df = np.diff(np.array(self.residuals), axis=0)
+        dg = np.diff(np.array(self.values), axis=0)
+        gram = df @ df.T
+        gram[np.diag_indices_from(gram)] *= 1.0 + 1e-8
+        gram[np.diag_indices_from(gram)] += 1e-300
+        share = np.linalg.solve(gram, df @ residual)
+        return (g.ravel() - share @ dg).reshape(g.shape)

@@ -1,0 +1,270 @@
+"""RBFMuscle: an implicit RBF surface whose centres follow the bones."""
+
+import time
+from dataclasses import dataclass, fields
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from rbfmuscle.binding import bind_samples, build_clusters
+from rbfmuscle.constraints import ShapeConstraint, VolumeConstraint
+from rbfmuscle.elasticity import ElasticSolver
+from rbfmuscle.implicit.extraction import extract_surface
+from rbfmuscle.implicit.field import RBFField
+from rbfmuscle.implicit.sampling import sample_surface
+from rbfmuscle.sim.harmonic import blended_motion, harmonic_weights, surface_gradient
+from rbfmuscle.sim.simulate import ModelSurface
+from rbfmuscle.validation import SceneError
+
+AREA_A_CENTRE = 260.0  # mm², from which the number of centres follows where the scene names none
+LEAST_CENTRES = 150
+LEAST_ATTACHED = 4
+
+
+@dataclass(frozen=True)
+class RBFOptions:
+    """Settings of an RBF muscle; each is a key of the muscle's model table in the scene file."""
+
+    centres: int = 0
+    samples: int = 2000
+    iterations: int = 8
+    contacts: int = 24
+    resolution: int = 48
+    kernel: str = "cubic"
+    epsilon: float = 1.0
+    stretch_low: float = 0.5
+    stretch_high: float = 2.0
+    stretch_hold: float = 0.3
+    across: int = 3
+    across_weight: float = 1.0
+    acceleration: int = 5
+    placement: str = "greedy"
+    derivatives: str = "all"
+    seed: int = 0
+
+    @classmethod
+    def from_table(cls, table, *, muscle):
+        """Build from a scene's model table; raises SceneError naming an unknown or impossible key."""
+        known = {field.name: field.type for field in fields(cls)}
+        for key, value in table.items():
+            if key not in known:
+                raise SceneError(
+                    f"muscle {muscle!r}: model rbf has no setting {key!r}; it has {', '.join(known)}"
+                )
+            if known[key] is not str and (isinstance(value, bool) or not isinstance(value, (int, float))):
+                raise SceneError(f"muscle {muscle!r}: {key} must be a number, got {value!r}")
+        return cls(**table)
+
+
+class RBFMuscle:
+    """A muscle as the zero level set of an RBF field with moving centres.
+
+    Parameters
+    ----------
+    muscle : rbfmuscle.sim.scene.Muscle
+        Rest mesh, attachments and fibres.
+    scene : rbfmuscle.sim.scene.Scene
+        Gives units and the names of the bones.
+    **options
+        See `RBFOptions`.
+
+    Raises
+    ------
+    SceneError
+        If a setting is unknown or no centre is left free to move.
+    """
+
+    def __init__(self, muscle, scene, **options):
+        self.name = muscle.name
+        self.options = RBFOptions.from_table(options, muscle=muscle.name)
+        self.bones = [bone.name for bone in scene.bones]
+        self.bone_vertices = [np.asarray(bone.mesh.vertices, dtype=float) for bone in scene.bones]
+        vertices = np.asarray(muscle.mesh.vertices, dtype=float)
+        faces = np.asarray(muscle.mesh.faces)
+        self.rest_volume = float(muscle.mesh.volume)
+        count = self.options.centres or self._default_centres(muscle.mesh.area, scene)
+        seed = self.options.seed
+        centres = sample_surface(vertices, faces, count, seed=seed, placement=self.options.placement)
+        samples = sample_surface(vertices, faces, self.options.samples, seed=seed, placement="even")
+        self.rest, self.rest_normals = centres.points, centres.normals
+        self.control_faces = centres.control_faces
+        self.samples, self.sample_faces = samples.points, samples.control_faces
+        self._attach(muscle, vertices, faces)
+        self._build_elasticity(muscle, vertices, faces, samples.normals)
+        self.x = self.rest.copy()
+        self.level = 0.0
+        # Cells along the muscle's own axes are smaller than along the scene's, and turn with the scene.
+        self.axes = np.linalg.svd(self.samples - self.samples.mean(axis=0), full_matrices=False)[2]
+
+    @staticmethod
+    def _default_centres(area, scene):
+        return max(LEAST_CENTRES, int(round(area / (AREA_A_CENTRE * scene.length(1.0) ** 2), -1)))
+
+    def _attach(self, muscle, vertices, faces):
+        """Fix the centres on attachment patches and give every centre its share of each bone's motion."""
+        groups = [np.asarray(attachment.vertices) for attachment in muscle.attachments]
+        owner = np.full(len(vertices), -1)
+        for attachment, group in zip(muscle.attachments, groups):
+            owner[group] = self.bones.index(attachment.bone)
+        tree = cKDTree(vertices)
+        nearest = tree.query(self.rest)[1]
+        fixed = owner[nearest]
+        for attachment, group in zip(muscle.attachments, groups):
+            bone = self.bones.index(attachment.bone)
+            inside = np.isin(nearest, group)
+            if inside.sum() < LEAST_ATTACHED:
+                # A patch smaller than the spacing of the centres still has to hold the muscle against turning.
+                distance = cKDTree(vertices[group]).query(self.rest)[0]
+                fixed[np.argsort(distance, kind="stable")[:LEAST_ATTACHED]] = bone
+        self.fixed_bone = fixed
+        self.free = np.flatnonzero(fixed < 0)
+        self.held = np.flatnonzero(fixed >= 0)
+        if len(self.free) == 0:
+            raise SceneError(f"muscle {self.name!r}: every centre lies on an attachment; nothing is free to move")
+        self.contact_bone = np.concatenate([fixed, owner[tree.query(self.samples)[1]]])
+        used = sorted(set(owner[owner >= 0]))
+        self.motion_bones = [self.bones[bone] for bone in used]
+        on_mesh = harmonic_weights(vertices, faces, [np.flatnonzero(owner == bone) for bone in used])
+        self.motion_weights = on_mesh[nearest]
+        self.motion_weights[self.held] = np.array(used) == fixed[self.held, None]
+        # Fibres run up the harmonic field from the first attachment to the last.
+        self._mesh_fibre = surface_gradient(vertices, faces, on_mesh @ np.arange(len(used)))[nearest]
+
+    def _build_elasticity(self, muscle, vertices, faces, sample_normals):
+        options = self.options
+        start, other, weight = build_clusters(
+            self.rest, self.rest_normals, self.control_faces, self.samples, sample_normals,
+            across=options.across, across_weight=options.across_weight,
+        )  # fmt: skip
+        fibre = self._fibre_directions(muscle)
+        limits = (options.stretch_low, options.stretch_high)
+        self.shape = ShapeConstraint(
+            self.rest, start, other, weight, fibre, limits=limits, hold=options.stretch_hold
+        )
+        columns, shares = bind_samples(self.samples, sample_normals, self.rest, self.rest_normals)
+        count = len(self.rest)
+        alone = np.repeat(np.arange(count)[:, None], columns.shape[1], axis=1)
+        self.columns = np.concatenate([alone, columns])
+        self.shares = np.concatenate([np.eye(1, columns.shape[1]).repeat(count, axis=0), shares])
+        self.volume = VolumeConstraint(self.sample_faces, 0.0)
+        self.volume.volume = self.volume.evaluate(self.samples)[0]
+        self.solver = ElasticSolver(
+            self.shape, self.volume, np.concatenate([self.rest, self.samples]), self.columns, self.shares,
+            self.free, self.held,
+            iterations=options.iterations, contacts=options.contacts, memory=options.acceleration,
+        )  # fmt: skip
+
+    def _fibre_directions(self, muscle):
+        direction = self._mesh_fibre
+        if muscle.fibres:
+            middle = np.concatenate([0.5 * (line[1:] + line[:-1]) for line in muscle.fibres])
+            along = np.concatenate([np.diff(line, axis=0) for line in muscle.fibres])
+            distance, index = cKDTree(middle).query(self.rest, k=min(3, len(middle)))
+            distance, index = distance.reshape(len(self.rest), -1), index.reshape(len(self.rest), -1)
+            unit = along / np.linalg.norm(along, axis=1, keepdims=True)
+            direction = (unit[index] / np.maximum(distance, 1e-9)[:, :, None]).sum(axis=1)
+        length = np.linalg.norm(direction, axis=1)
+        weak = length < 1e-9 * max(length.max(), 1e-300)
+        axis = self.rest[self.held].mean(axis=0) - self.rest[self.free].mean(axis=0)
+        direction = np.where(weak[:, None], axis, direction)
+        return direction / np.linalg.norm(direction, axis=1, keepdims=True)
+
+    # --- the MuscleModel protocol -------------------------------------------------------------------------
+
+    def contact_points(self):
+        """Centres, then surface samples, (K + S, 3)."""
+        return self.solver.carry(self.x)
+
+    def carried_mesh(self):
+        """The samples and their triangulation: a material surface of constant topology."""
+        return self.contact_points()[len(self.x) :], self.sample_faces
+
+    def predict(self, before, after):
+        """Move every centre with its share of the bones' motions between two poses."""
+        motions = np.array([after[bone] @ np.linalg.inv(before[bone]) for bone in self.motion_bones])
+        self.x = blended_motion(self.x, self.motion_weights, motions)
+        for bone in set(self.fixed_bone[self.held]):
+            own = np.flatnonzero(self.fixed_bone == bone)
+            pose = after[self.bones[bone]]
+            self.x[own] = self.rest[own] @ pose[:3, :3].T + pose[:3, 3]
+
+    def solve(self, contacts):
+        """Settle the centres under shape, volume and contact at the contacts' present poses."""
+        self.x = self.solver.solve(self.x, contacts)
+
+    def turn(self, which, transform):
+        """Move the centres that carry the contact points ``which`` by a rigid 4x4 transform."""
+        hit = np.zeros(len(self.x), dtype=bool)
+        hit[self.columns[which, 0]] = True
+        hit[self.held] = False
+        self.x[hit] = self.x[hit] @ transform[:3, :3].T + transform[:3, 3]
+
+    def snapshot(self):
+        """State that ``restore`` brings back."""
+        return self.x.copy(), self.shape.quaternion.copy(), self.level, self.solver.snapshot()
+
+    def restore(self, state):
+        """Return to an earlier ``snapshot``."""
+        x, quaternion, level, solver = state
+        self.x, self.level = x.copy(), level
+        self.shape.quaternion[:] = quaternion
+        self.solver.restore(solver)
+        self.shape.localise(self.x)
+
+    def normals(self):
+        """Unit normals at the centres, turned with the local deformation by its cofactor, (K, 3)."""
+        f = self.shape.deformation
+        n = self.rest_normals
+        helper = np.where(np.abs(n[:, :1]) < 0.6, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+        u = np.cross(n, helper)
+        v = np.cross(n, u)
+        turned = np.cross(np.einsum("kab,kb->ka", f, u), np.einsum("kab,kb->ka", f, v))
+        return turned / np.linalg.norm(turned, axis=1, keepdims=True)
+
+    def field(self):
+        """The RBF field through the present centres."""
+        return RBFField.fit_hermite(
+            self.x, self.normals(), kernel=self.options.kernel, epsilon=self.options.epsilon,
+            derivatives=self.options.derivatives,
+        )  # fmt: skip
+
+    def _near_bone_vertices(self, points, poses):
+        """Bone vertices in the box of the points, in world positions, (k, 3)."""
+        margin = 0.05 * self.solver.scale
+        found = [np.zeros((0, 3))]
+        for name, vertices in zip(self.bones, self.bone_vertices):
+            pose = poses[name]
+            local = (points - pose[:3, 3]) @ pose[:3, :3]
+            low, high = local.min(axis=0) - margin, local.max(axis=0) + margin
+            inside = vertices[((vertices > low) & (vertices < high)).all(axis=1)]
+            found.append(inside @ pose[:3, :3].T + pose[:3, 3])
+        return np.concatenate(found)
+
+    def surface(self, contacts):
+        """Refit the field, cut the bones away and extract the closed surface at the rest volume."""
+        started = time.perf_counter()
+        field = self.field()
+        fitted = time.perf_counter()
+        points = self.contact_points()
+        free = self.contact_bone < 0
+        depth = max(0.0, -float(contacts.nearest(points[free]).min(initial=np.inf)))
+        cut = contacts.nearest if contacts.names else None
+        axes = self.axes @ contacts.poses[self.motion_bones[0]][:3, :3].T
+        result = extract_surface(
+            field, points=points, resolution=self.options.resolution, cut=cut,
+            volume=self.rest_volume, level=self.level, axes=axes,
+            obstacle_points=self._near_bone_vertices(points, contacts.poses) if contacts.names else None,
+        )  # fmt: skip
+        self.level = result.level
+        return ModelSurface(
+            vertices=result.vertices,
+            faces=result.faces,
+            quantities={
+                "solver_penetration_max": depth,
+                "components": result.components,
+                "condition": field.condition,
+                "level": result.level,
+                "time_fit": fitted - started,
+                "time_extract": time.perf_counter() - fitted,
+            },
+        )
