@@ -1,57 +1,133 @@
 """BoneSDF: signed distance and gradient of a rigid bone, in any pose.
 
-The field is a tricubic B-spline over exact distances; it stays in bone coordinates and is never rebuilt. Only
-this module converts a foreign sign: distances are negative inside.
+The field stays in bone coordinates and is never rebuilt; queries carry points there inside their loop.
+Distances are negative inside. What a query reads, and how, is in ``sdf_query.py``; how it is built, in
+``sdf_build.py``.
 """
 
-import numba
+import logging
+from functools import cached_property
+
 import numpy as np
 
-from rbfmuscle.validation import MeshError, check_mesh, check_points
+from rbfmuscle.sim.exact_distance import ExactDistance
+from rbfmuscle.sim.sdf_build import build_cells, grid_shape
+from rbfmuscle.sim.sdf_cache import content_key, load_arrays, store_arrays
+from rbfmuscle.sim.sdf_mesh import BoneMesh, prepare_bone, winding_test
+from rbfmuscle.sim.sdf_query import BLOCK, FieldData, gradient_loop, value_loop
+from rbfmuscle.sim.threads import in_chunks
+from rbfmuscle.sim.triangles import FIRST
+from rbfmuscle.validation import MeshError, check_points, check_positive
+
+log = logging.getLogger(__name__)
 
 IDENTITY = np.eye(4)
+# Fine cells against the mean edge of the mesh, and at least this many along its longest side.
+CELL_SHARE, LEAST_CELLS = 0.45, 32
+# Fine cells cover points nearer than this many of their edges.
+BAND = 1.75
+# Default tolerance as a share of the mean edge: facets are flat, so errors scale with them.
+TOLERANCE_SHARE = 0.004
+# Points at which a field measures itself, and how often it may be refined.
+PROBES, ATTEMPTS = 4000, 5
+# Bytes that a field may take unless told otherwise.
+MEMORY_LIMIT = 2**28
 
 
 class BoneSDF:
-    """Distance field of one bone; build it with :meth:`from_mesh`."""
+    """Distance field of one bone; build it with :meth:`from_mesh`.
 
-    def __init__(self, vertices, faces, origin, spacing, coefficients):
-        self.vertices = vertices
-        self.faces = faces
-        self.origin = origin
-        self.spacing = spacing
-        self.coefficients = coefficients
-        self.bounds = np.array([vertices.min(axis=0), vertices.max(axis=0)])
-        self.closed = True
+    Attributes
+    ----------
+    vertices, faces : (n, 3) and (m, 3) ndarray
+        The mesh as used: degenerate and duplicate faces left out.
+    bounds : (2, 3) ndarray
+        Box of the mesh, bone coordinates.
+    spacing : float
+        Edge of a fine cell [unit of the mesh].
+    band : float
+        Distance up to which fine cells answer.
+    error : float
+        RMS error within the band, measured when it was built.
+    closed : bool
+        Whether the sign comes from the mesh itself (else from winding numbers).
+    notes : tuple of str
+        What was found about the mesh.
+    data : FieldData
+        Arrays for queries in other modules' compiled loops (``sdf_query.field_value``).
+    """
+
+    def __init__(self, mesh, data, *, spacing, error, closed):
+        self.vertices, self.faces, self.notes = mesh.vertices, mesh.faces, tuple(mesh.notes)
+        used = self.vertices[np.unique(self.faces)]
+        self.bounds = np.array([used.min(axis=0), used.max(axis=0)])
+        self.data, self.spacing, self.error, self.closed = data, spacing, error, closed
+        self.band = BAND * spacing
 
     @property
     def memory(self):
-        """Bytes held by the field."""
-        return self.coefficients.nbytes
+        """Bytes that queries read."""
+        return sum(array.nbytes for array in self.data)
+
+    @property
+    def fine_cells(self):
+        """Number of fine cells."""
+        return self.data.cells.size
+
+    @cached_property
+    def exact(self):
+        """The exact distance to the mesh (:class:`ExactDistance`), built when first asked for."""
+        return ExactDistance((self.vertices, self.faces))
 
     @classmethod
-    def from_mesh(cls, mesh, *, tolerance=None, region=None, cache=True):
-        """Build the field of a closed mesh (a trimesh.Trimesh or a pair of vertices and faces)."""
-        import igl
-        from scipy.ndimage import spline_filter
+    def from_mesh(
+        cls, mesh, *, tolerance=None, region=None, cache=True, memory_limit=MEMORY_LIMIT, name="bone"
+    ):
+        """Build the field of a bone, or take it from the cache.
 
+        Parameters
+        ----------
+        mesh : trimesh.Trimesh or pair of (n, 3) vertices and (m, 3) faces
+            Rest (bone) coordinates. Closed and outward for exact signs; others are signed by winding
+            numbers, and the log says so.
+        tolerance : float, optional
+            RMS error near the surface [unit of the mesh]. By default 0.4 % of the mean edge, or what the
+            memory allows.
+        region : (2, 3) array_like, optional
+            Box, bone coordinates, that points come from. Outside of it the field is coarse, but still right.
+        cache : bool
+            Look the field up on disk, and keep it there.
+        memory_limit : int
+            Bytes the field may take.
+        name : str
+            What messages call the bone.
+
+        Raises
+        ------
+        MeshError
+            If the mesh is unusable, or the tolerance needs more memory than allowed.
+        """
         vertices, faces = (mesh.vertices, mesh.faces) if hasattr(mesh, "faces") else mesh
-        vertices, faces = check_mesh(np.asarray(vertices), np.asarray(faces), name="bone")
-        low, high = vertices.min(axis=0), vertices.max(axis=0)
-        extent = float((high - low).max())
-        if extent == 0.0:
-            raise MeshError("bone has no extent")
-        spacing = (np.prod(high - low + 0.1 * extent) / 4e5) ** (1 / 3)
-        pad = 0.05 * extent + 2 * spacing
-        origin = low - pad
-        shape = np.ceil((high - low + 2 * pad) / spacing).astype(int) + 1
-        axes = [origin[k] + spacing * np.arange(shape[k]) for k in range(3)]
-        nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        exact = igl.signed_distance(nodes, vertices, faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL)[0]
-        coefficients = spline_filter(exact.reshape(shape), order=3, mode="mirror")
-        return cls(vertices, faces, origin, spacing, np.ascontiguousarray(coefficients))
+        vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
+        tolerance = None if tolerance is None else check_positive(tolerance, name="tolerance")
+        region = None if region is None else check_points(region, name="region")
+        if region is not None and (region.shape != (2, 3) or np.any(region[0] > region[1])):
+            raise ValueError(f"region must be (2, 3), least corner first, got {region.tolist()}")
+        box = None if region is None else region.tolist()
+        key = content_key(vertices, faces, (tolerance, box, memory_limit)) if cache else None
+        arrays = load_arrays(key) if cache else None
+        field = None if arrays is None else _from_arrays(cls, arrays)
+        if field is None:
+            field = _build(
+                cls, prepare_bone(vertices, faces, name=name), tolerance, region, memory_limit, name
+            )
+            if cache:
+                store_arrays(key, _to_arrays(field))
+        for note in field.notes:
+            log.warning("%s: %s", name, note)
+        return field
 
-    def distance(self, points, pose=None):
+    def distance(self, points, pose=None, *, reach=np.inf):
         """Signed distance of points, (n,) [unit of the mesh], negative inside the bone.
 
         Parameters
@@ -59,100 +135,180 @@ class BoneSDF:
         points : (n, 3) array_like
             World coordinates if ``pose`` is given, else bone coordinates.
         pose : (4, 4) array_like, optional
-            Bone to world.
+            Bone to world, rigid.
+        reach : float
+            Points further away than this may get any lower bound of their distance that is above it: much
+            faster.
         """
-        return self.distance_and_gradient(points, pose)[0]
+        points, pose = check_points(points), _check_pose(pose)
+        out = np.empty(len(points))
+
+        def work(a, b):
+            value_loop(points[a:b], pose, float(reach), out[a:b], self.data)
+
+        in_chunks(len(points), work, least=4096)
+        return out
 
     def gradient(self, points, pose=None):
-        """Gradient of the distance, (n, 3), in the axes of ``points``."""
+        """Gradient of the distance, (n, 3) unit vectors in the axes of ``points``."""
         return self.distance_and_gradient(points, pose)[1]
 
-    def distance_and_gradient(self, points, pose=None, reach=None):
-        """Signed distance (n,) and its gradient (n, 3), from the same functions."""
-        points = check_points(points)
-        pose = IDENTITY if pose is None else np.ascontiguousarray(pose, dtype=np.float64)
+    def distance_and_gradient(self, points, pose=None, reach=np.inf):
+        """Signed distance (n,) and its gradient (n, 3), which is a unit vector; parameters as for `distance`.
+
+        On the surface the gradient is the normal of the triangle. It is zero where only a lower bound is
+        given.
+        """
+        points, pose = check_points(points), _check_pose(pose)
+        reach = np.inf if reach is None else float(reach)
         distance, gradient = np.empty(len(points)), np.empty((len(points), 3))
-        _evaluate_loop(points, pose, self.origin, self.spacing, self.coefficients, distance, gradient)
+
+        def work(a, b):
+            gradient_loop(points[a:b], pose, reach, distance[a:b], gradient[a:b], self.data)
+
+        in_chunks(len(points), work, least=4096)
         return distance, gradient
 
     def direction(self, points, pose=None):
-        """Unit direction (n, 3) in which the distance grows."""
-        gradient = self.gradient(points, pose)
-        return gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-300)
+        """Unit direction (n, 3) in which the distance grows: out of the bone, also from inside."""
+        return self.gradient(points, pose)
 
     def closest_point(self, points, pose=None):
-        """Closest point (n, 3) of the bone's surface."""
-        points = check_points(points)
-        for _ in range(3):
-            distance, gradient = self.distance_and_gradient(points, pose)
-            square = np.maximum((gradient * gradient).sum(axis=1), 0.25)
-            points = points - (distance / square)[:, None] * gradient
-        return points
+        """Nearest point (n, 3) of the bone's mesh, exact."""
+        points, pose = check_points(points), _check_pose(pose)
+        local = (points - pose[:3, 3]) @ pose[:3, :3]
+        return self.exact.closest_point(local) @ pose[:3, :3].T + pose[:3, 3]
 
 
-@numba.njit(cache=True, nogil=True)
-def _evaluate_loop(points, pose, origin, spacing, coefficients, distance, gradient):
-    weight, slope = np.empty((3, 4)), np.empty((3, 4))
-    base, local, inside, grad = np.empty(3, np.int64), np.empty(3), np.empty(3), np.empty(3)
-    for n in range(len(points)):
-        for k in range(3):
-            local[k] = 0.0
-            for j in range(3):
-                local[k] += pose[j, k] * (points[n, j] - pose[j, 3])
-            high = origin[k] + spacing * (coefficients.shape[k] - 1.001)
-            inside[k] = min(max(local[k], origin[k] + 0.001 * spacing), high)
-            u = (inside[k] - origin[k]) / spacing
-            base[k] = int(u)
-            _weights(u - base[k], spacing, weight[k], slope[k])
-        value = _sum(coefficients, base, weight, slope, grad)
-        beyond = 0.0
-        for k in range(3):
-            beyond += (local[k] - inside[k]) ** 2
-        if beyond > 0.0:
-            # Outside the grid: the closest surface point of the nearest grid point is kept.
-            square = 0.0
-            for k in range(3):
-                grad[k] = local[k] - inside[k] + value * grad[k]
-                square += grad[k] ** 2
-            value = np.sqrt(square)
-            for k in range(3):
-                grad[k] /= value
-        distance[n] = value
-        for k in range(3):
-            gradient[n, k] = pose[k, 0] * grad[0] + pose[k, 1] * grad[1] + pose[k, 2] * grad[2]
+def _check_pose(pose):
+    if pose is None:
+        return IDENTITY
+    pose = np.ascontiguousarray(pose, dtype=np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise ValueError(f"pose must be a finite (4, 4) transform, got shape {pose.shape}")
+    return pose
 
 
-@numba.njit(cache=True, nogil=True)
-def _weights(t, spacing, weight, slope):
-    s = 1.0 - t
-    weight[0] = s * s * s / 6.0
-    weight[1] = (4.0 - 6.0 * t * t + 3.0 * t * t * t) / 6.0
-    weight[2] = (4.0 - 6.0 * s * s + 3.0 * s * s * s) / 6.0
-    weight[3] = t * t * t / 6.0
-    slope[0] = -0.5 * s * s / spacing
-    slope[1] = (1.5 * t * t - 2.0 * t) / spacing
-    slope[2] = (2.0 * s - 1.5 * s * s) / spacing
-    slope[3] = 0.5 * t * t / spacing
+def _build(cls, mesh, tolerance, region, memory_limit, name):
+    """Refine until the field errs by no more than the tolerance."""
+    exact = ExactDistance((mesh.vertices, mesh.faces))
+    edge = _mean_edge(mesh)
+    used = mesh.vertices[np.unique(mesh.faces)]
+    extent = float(np.ptp(used, axis=0).max())
+    spacing = min(CELL_SHARE * edge, extent / LEAST_CELLS)
+    wanted = TOLERANCE_SHARE * edge if tolerance is None else tolerance
+    inside = None if mesh.closed else winding_test(mesh)
+    for _ in range(ATTEMPTS):
+        spacing = _check_memory(mesh, exact, spacing, tolerance, memory_limit, name)
+        cells = build_cells(
+            exact, spacing, BAND * spacing, inside=inside, region=region, doubtful=mesh.doubtful
+        )
+        if inside is None and not cells.sound:
+            mesh.notes.append("intersects itself: the sign comes from winding numbers")
+            inside = winding_test(mesh)
+            continue
+        data = pack_field(exact, cells)
+        field = cls(mesh, data, spacing=spacing, error=0.0, closed=inside is None)
+        field.error = _measure(field, exact, region)
+        if field.error <= wanted:
+            return field
+        spacing *= max(0.5, 0.9 * (wanted / field.error) ** (1 / 3))
+    mesh.notes.append(f"errs by {field.error:.3g} RMS near the surface, {wanted:.3g} was asked for")
+    field.notes = tuple(mesh.notes)
+    return field
 
 
-@numba.njit(cache=True, nogil=True)
-def _sum(coefficients, base, weight, slope, grad):
-    value, grad[:] = 0.0, 0.0
-    nx, ny, nz = coefficients.shape
-    for a in range(4):
-        i = abs(base[0] + a - 1)
-        i = i if i < nx else 2 * nx - 2 - i
-        for b in range(4):
-            j = abs(base[1] + b - 1)
-            j = j if j < ny else 2 * ny - 2 - j
-            line, lean = 0.0, 0.0
-            for c in range(4):
-                k = abs(base[2] + c - 1)
-                k = k if k < nz else 2 * nz - 2 - k
-                line += weight[2, c] * coefficients[i, j, k]
-                lean += slope[2, c] * coefficients[i, j, k]
-            value += weight[0, a] * weight[1, b] * line
-            grad[0] += slope[0, a] * weight[1, b] * line
-            grad[1] += weight[0, a] * slope[1, b] * line
-            grad[2] += weight[0, a] * weight[1, b] * lean
-    return value
+def _mean_edge(mesh):
+    corners = mesh.vertices[mesh.faces]
+    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
+
+
+def _check_memory(mesh, exact, spacing, tolerance, limit, name):
+    """Spacing that fits in the memory: larger if the caller asked for no tolerance, else an error."""
+    low, high = exact.vertices.min(axis=0), exact.vertices.max(axis=0)
+    corners = mesh.vertices[mesh.faces]
+    area = 0.5 * np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+
+    def need(h):
+        table = 4.0 * np.prod(BLOCK * grid_shape(low, high, h, BAND * h).astype(np.float64))
+        return table + 25.0 * (2 * BAND + 6) * float(area.sum()) / h**2 + 160.0 * len(mesh.faces)
+
+    if need(spacing) <= limit:
+        return spacing
+    if tolerance is not None:
+        raise MeshError(
+            f"{name}: a tolerance of {tolerance:g} needs about {need(spacing) / 2**20:.0f} MB, "
+            f"{limit / 2**20:.0f} MB are allowed; raise the tolerance or the memory limit"
+        )
+    start = spacing
+    while need(spacing) > limit and spacing < 1e3 * start:
+        spacing *= 1.25
+    if need(spacing) > limit:
+        raise MeshError(f"{name}: its {len(mesh.faces)} faces do not fit in {limit / 2**20:.0f} MB")
+    return spacing
+
+
+def _measure(field, exact, region):
+    """RMS error at points spread over the band, in the region."""
+    rng = np.random.default_rng(0)
+    corners = field.vertices[field.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    if region is not None:
+        area = area * np.all((corners.min(axis=1) <= region[1]) & (corners.max(axis=1) >= region[0]), axis=1)
+    if area.sum() == 0.0:
+        return 0.0
+    which = rng.choice(len(area), PROBES, p=area / area.sum())
+    weight = rng.dirichlet(np.ones(3), PROBES)
+    points = np.einsum("nk,nkj->nj", weight, corners[which])
+    unit = normal[which] / np.linalg.norm(normal[which], axis=1, keepdims=True)
+    points += unit * rng.uniform(-field.band, field.band, (PROBES, 1))
+    difference = np.abs(field.distance(points)) - np.abs(exact.signed_distance(points))
+    return float(np.sqrt(np.mean(difference**2)))
+
+
+def pack_field(exact, cells):
+    """Arrays for queries, single precision and relative to the grid's origin, where that loses nothing."""
+    records = np.empty((len(exact.records), 16), dtype=np.float32)
+    records[:, :3] = exact.records[:, :3] - cells.origin
+    records[:, 3:] = exact.records[:, 3:16]
+    turn = (exact.records[:, FIRST].astype(np.int64)[:, None] + np.arange(3)) % 3
+    rows = exact.order[:, None]
+    return FieldData(
+        grid=np.array([*cells.origin, 1.0 / cells.block, cells.unit]),
+        blocks=cells.blocks,
+        cells=cells.cells,
+        lists=cells.lists,
+        corners=cells.corners,
+        far=cells.far,
+        records=records,
+        edge_normals=exact.edge_normals[rows, turn].astype(np.float32),
+        vertex_normals=exact.vertex_normals.astype(np.float32),
+        vertices=exact.faces[rows, turn].astype(np.int32),
+    )
+
+
+def _to_arrays(field):
+    arrays = {"data_" + name: array for name, array in field.data._asdict().items()}
+    numbers = np.array([field.spacing, field.error, float(field.closed)])
+    notes = np.array("\n".join(field.notes))
+    return {
+        **arrays,
+        "mesh_vertices": field.vertices,
+        "mesh_faces": field.faces,
+        "numbers": numbers,
+        "notes": notes,
+    }
+
+
+def _from_arrays(cls, arrays):
+    if not {"numbers", "notes", "mesh_vertices", "mesh_faces"} <= arrays.keys():
+        return None
+    notes = [note for note in str(arrays["notes"]).split("\n") if note]
+    faces = arrays["mesh_faces"]
+    mesh = BoneMesh(arrays["mesh_vertices"], faces, np.zeros(len(faces), dtype=np.bool_), notes)
+    data = FieldData(**{name: arrays["data_" + name] for name in FieldData._fields})
+    spacing, error, closed = arrays["numbers"]
+    return cls(mesh, data, spacing=float(spacing), error=float(error), closed=bool(closed))

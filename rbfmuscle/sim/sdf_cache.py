@@ -1,0 +1,98 @@
+"""Distance fields kept on disk, named by the content of mesh and options.
+
+An entry is an uncompressed archive of arrays, whose checksums are tested on reading. It is written beside
+its place and moved there, so that several processes may build the same field and none reads half of it.
+"""
+
+import contextlib
+import hashlib
+import logging
+import os
+import tempfile
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+log = logging.getLogger(__name__)
+
+# Part of every name: raise it when the arrays or the way they are built change.
+VERSION = 1
+SUFFIX = ".sdf.npz"
+# What reading a damaged, foreign or half-removed archive may raise.
+_DAMAGE = (OSError, ValueError, KeyError, EOFError, IndexError, NotImplementedError, zipfile.BadZipFile)
+
+
+def cache_path():
+    """Folder of the cache: ``RBFMUSCLE_CACHE``, or the user's cache folder of the platform."""
+    import platformdirs
+
+    place = os.environ.get("RBFMUSCLE_CACHE")
+    return Path(place) if place else Path(platformdirs.user_cache_dir("rbfmuscle", appauthor=False)) / "sdf"
+
+
+def cache_list():
+    """Entries as a list of dict: name, bytes, modified (seconds since the epoch), latest first."""
+    found = []
+    for path in cache_path().glob("*" + SUFFIX):
+        with contextlib.suppress(FileNotFoundError):
+            state = path.stat()
+            found.append(
+                {"name": path.name.removesuffix(SUFFIX), "bytes": state.st_size, "modified": state.st_mtime}
+            )
+    return sorted(found, key=lambda entry: -entry["modified"])
+
+
+def cache_clear():
+    """Remove all entries, and what an interrupted process left; return their number and bytes."""
+    count = size = 0
+    for path in cache_path().glob("*" + SUFFIX + "*"):
+        with contextlib.suppress(FileNotFoundError):
+            size += path.stat().st_size
+            path.unlink()
+            count += 1
+    return count, size
+
+
+def content_key(vertices, faces, options):
+    """Name of an entry: a digest of the mesh and of all options that shape the field."""
+    digest = hashlib.sha256(repr((VERSION, np.dtype(float).byteorder, options)).encode())
+    for array in (vertices, faces):
+        digest.update(repr((array.shape, array.dtype.str)).encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()[:32]
+
+
+def load_arrays(key):
+    """Arrays of an entry by name, or None where there is none; a damaged entry is removed."""
+    path = cache_path() / (key + SUFFIX)
+    if not path.exists():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        if str(arrays.pop("key")) != key:
+            raise ValueError("the entry belongs to another mesh")
+    except _DAMAGE as error:
+        log.warning("distance field cache: %s is damaged (%s) and is built again", path, error)
+        with contextlib.suppress(OSError):
+            path.unlink()
+        return None
+    return arrays
+
+
+def store_arrays(key, arrays):
+    """Keep arrays under a name; a cache that cannot be written is reported in the log and does no harm."""
+    folder = cache_path()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=key, suffix=SUFFIX + ".part", dir=folder)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                np.savez(file, key=np.array(key), **arrays)
+            Path(name).replace(folder / (key + SUFFIX))
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        log.warning("distance field cache: %s cannot be written (%s); the field is not kept", folder, error)

@@ -1,0 +1,349 @@
+"""Queries of a bone's distance field inside compiled loops.
+
+The field is a sparse grid of cells. Each cell names the few triangles that are nearest to its corners; a
+query takes the nearest of them, so it answers with a true distance to the mesh, with its sharp gradient, and
+not with an interpolation. Cells are fine in a band about the surface and coarser elsewhere, and outside the
+grid those of its border serve.
+
+``field_value`` and ``field_gradient`` take one point in bone coordinates and the arrays of ``BoneSDF.data``,
+for other modules' loops: ``field_value(x, y, z, reach, *data)``. Passed one by one, arrays cost a loop
+nothing; a tuple of them does.
+"""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from rbfmuscle.sim.triangles import CORNER, EDGE, FACE, nearest_in_frame
+
+# What a cell says of its side.
+CROSSED, OUTSIDE, INSIDE, MIXED = 0, 1, 2, 3
+# A header counts triangles in its low four bits, holds the side in two more and the lower bound above them.
+COUNT, SIDE, BOUND = 15, 4, 6
+# Cells along one edge of a block, on every level.
+BLOCK = 4
+# Columns of ``grid``: origin of the grid, inverse edge of a block, unit of the lower bounds.
+INVERSE, UNIT = 3, 4
+# Offsets below this share of the unit are lost in the rounding of the records (single precision).
+ROUNDING = 1e-3
+# Marks a far point beside the number of its fine cell.
+CELL_FAR = 128
+# Points of one stage: their reads of memory overlap instead of waiting for each other.
+STAGE = 64
+
+
+class FieldData(NamedTuple):
+    """What a query reads.
+
+    Attributes
+    ----------
+    grid : (5,) ndarray
+        Origin, 1 / edge of a block, and the unit of the lower bounds in ``lists``.
+    blocks : (a, b, c) ndarray of int32
+        For each block the offset of its list, or -1 - k where it is cut into the fine cells k.
+    cells : (k, 64) ndarray of int32
+        Offsets of the fine cells' lists.
+    lists : (l,) ndarray of int32
+        Header and triangles of each cell; of mixed cells the row of ``corners`` after them.
+    corners : (q, 12) ndarray of float32
+        Signed distances at the corners of cells where the mesh itself gives no sign, least corner, 1 / edge.
+    far : (f,) ndarray of int32
+        Triangles that face the outside, for points beyond the grid.
+    records : (m, 16) ndarray of float32
+        Frames of the triangles, relative to the grid's origin.
+    edge_normals, vertex_normals : (m, 3, 3) and (n, 3) ndarray of float32
+        Pseudonormals, edges in the order of the records.
+    vertices : (m, 3) ndarray of int32
+        Corners A, B and C of each record.
+    """
+
+    grid: np.ndarray
+    blocks: np.ndarray
+    cells: np.ndarray
+    lists: np.ndarray
+    corners: np.ndarray
+    far: np.ndarray
+    records: np.ndarray
+    edge_normals: np.ndarray
+    vertex_normals: np.ndarray
+    vertices: np.ndarray
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _block_entry(x, y, z, scale, blocks):
+    """Entry of the block that holds a point relative to the origin, the fine cell in it, and whether it is
+    far."""
+    u, v, w = x * scale, y * scale, z * scale
+    nx, ny, nz = blocks.shape
+    far = u < -1.0 or v < -1.0 or w < -1.0 or u > nx + 1.0 or v > ny + 1.0 or w > nz + 1.0
+    # The cells of the border serve beyond the grid.
+    u = min(max(u, 0.0), nx - 1e-6)
+    v = min(max(v, 0.0), ny - 1e-6)
+    w = min(max(w, 0.0), nz - 1e-6)
+    i, j, k = int(u), int(v), int(w)
+    cell = (int((u - i) * BLOCK) * BLOCK + int((v - j) * BLOCK)) * BLOCK + int((w - k) * BLOCK)
+    return blocks[i, j, k], cell, far
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _square(n, x, y, z, records):
+    """Squared distance to record n of a point relative to the origin; without branches, as they are a
+    toss-up."""
+    qx, qy, qz = x - records[n, 0], y - records[n, 1], z - records[n, 2]
+    u = qx * records[n, 3] + qy * records[n, 4] + qz * records[n, 5]
+    v = qx * records[n, 6] + qy * records[n, 7] + qz * records[n, 8]
+    w = qx * records[n, 9] + qy * records[n, 10] + qz * records[n, 11]
+    bx, cx, cy = records[n, 12], records[n, 13], records[n, 14]
+    du = u - min(max(u, 0.0), bx)
+    ab = du * du + v * v
+    ex, eu = cx - bx, u - bx
+    t = min(max((eu * ex + v * cy) * records[n, 15], 0.0), 1.0)
+    bc = (eu - t * ex) ** 2 + (v - t * cy) ** 2
+    t = min(max((u * cx + v * cy) / (cx * cx + cy * cy), 0.0), 1.0)
+    ca = (u - t * cx) ** 2 + (v - t * cy) ** 2
+    inside = (v >= 0.0) & (eu * cy - v * ex <= 0.0) & (v * cx - u * cy <= 0.0)
+    return w * w + (0.0 if inside else min(min(ab, bc), ca))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _nearest_listed(x, y, z, entry, far_point, lists, far, records):
+    """Nearest of the triangles of a cell: record and squared distance."""
+    best, square = -1, np.inf
+    for m in range(entry + 1, entry + 1 + (lists[entry] & COUNT)):
+        n = lists[m]
+        s = _square(n, x, y, z, records)
+        if s < square:
+            best, square = n, s
+    if far_point:
+        for m in range(len(far)):
+            s = _square(far[m], x, y, z, records)
+            if s < square:
+                best, square = far[m], s
+    return best, square
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _mixed_side(x, y, z, entry, lists, corners):
+    """Trilinear interpolation of the signed distances at the corners of the cell."""
+    row = lists[entry + 1 + (lists[entry] & COUNT)]
+    u = min(max((x - corners[row, 8]) * corners[row, 11], 0.0), 1.0)
+    v = min(max((y - corners[row, 9]) * corners[row, 11], 0.0), 1.0)
+    w = min(max((z - corners[row, 10]) * corners[row, 11], 0.0), 1.0)
+    side = 0.0
+    for k in range(8):
+        a = u if k & 4 else 1.0 - u
+        b = v if k & 2 else 1.0 - v
+        c = w if k & 1 else 1.0 - w
+        side += a * b * c * corners[row, k]
+    return side
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _offset(n, x, y, z, records):
+    """Offset of a point from its nearest point of record n, in the record's frame, and the feature."""
+    qx, qy, qz = x - records[n, 0], y - records[n, 1], z - records[n, 2]
+    u = qx * records[n, 3] + qy * records[n, 4] + qz * records[n, 5]
+    v = qx * records[n, 6] + qy * records[n, 7] + qz * records[n, 8]
+    w = qx * records[n, 9] + qy * records[n, 10] + qz * records[n, 11]
+    cx, cy = records[n, 13], records[n, 14]
+    du, dv, feature = nearest_in_frame(
+        records[n, 12], cx, cy, records[n, 15], 1.0 / (cx * cx + cy * cy), u, v
+    )
+    return du, dv, w, feature
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _world(n, du, dv, dw, records):
+    gx = du * records[n, 3] + dv * records[n, 6] + dw * records[n, 9]
+    gy = du * records[n, 4] + dv * records[n, 7] + dw * records[n, 10]
+    gz = du * records[n, 5] + dv * records[n, 8] + dw * records[n, 11]
+    return gx, gy, gz
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _crossed_side(n, feature, du, dv, dw, records, edge_normals, vertex_normals, vertices):
+    """Projection of an offset from the surface on the pseudonormal of the feature it starts from."""
+    if feature == FACE:
+        return dw
+    gx, gy, gz = _world(n, du, dv, dw, records)
+    if feature < CORNER:
+        k = feature - EDGE
+        return gx * edge_normals[n, k, 0] + gy * edge_normals[n, k, 1] + gz * edge_normals[n, k, 2]
+    k = vertices[n, feature - CORNER]
+    return gx * vertex_normals[k, 0] + gy * vertex_normals[k, 1] + gz * vertex_normals[k, 2]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _signed(x, y, z, entry, n, square, lists, corners, records, edge_normals, vertex_normals, vertices):
+    """Signed distance to record n."""
+    state = lists[entry] >> SIDE & 3
+    distance = np.sqrt(square)
+    if state == OUTSIDE:
+        return distance
+    if state == INSIDE:
+        return -distance
+    if state == MIXED:
+        side = _mixed_side(x, y, z, entry, lists, corners)
+    else:
+        du, dv, dw, feature = _offset(n, x, y, z, records)
+        side = _crossed_side(n, feature, du, dv, dw, records, edge_normals, vertex_normals, vertices)
+    return distance if side >= 0.0 else -distance
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _unit_gradient(x, y, z, n, distance, least, records):
+    """Gradient of the distance; the normal of the triangle where the offset is lost in rounding."""
+    if abs(distance) <= least:
+        return records[n, 9], records[n, 10], records[n, 11]
+    du, dv, dw, _ = _offset(n, x, y, z, records)
+    gx, gy, gz = _world(n, du, dv, dw, records)
+    return gx / distance, gy / distance, gz / distance
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _query(x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices):
+    """Signed distance and record; or a lower bound above ``reach`` and -1."""
+    entry, cell, far_point = _block_entry(x, y, z, grid[INVERSE], blocks)
+    if entry < 0:
+        entry = cells[-1 - entry, cell]
+    bound = (lists[entry] >> BOUND) * grid[UNIT]
+    if bound > reach:
+        return bound, -1
+    n, square = _nearest_listed(x, y, z, entry, far_point, lists, far, records)
+    return _signed(x, y, z, entry, n, square, lists, corners, records, en, vn, vertices), n
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def field_value(x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices):
+    """Signed distance at one point in bone coordinates.
+
+    Parameters
+    ----------
+    x, y, z : float
+        The point [unit of the mesh].
+    reach : float
+        Where the bone is surely further away, outside, a lower bound above ``reach`` may be returned.
+        Infinity asks for the distance everywhere.
+    grid, ..., vertices
+        ``*BoneSDF.data``.
+
+    Returns
+    -------
+    float
+        [unit of the mesh], negative inside.
+    """
+    x, y, z = x - grid[0], y - grid[1], z - grid[2]
+    return _query(x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices)[0]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def field_gradient(x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices):
+    """Signed distance and its unit gradient at one point in bone coordinates: ``(d, gx, gy, gz)``.
+
+    Parameters as for :func:`field_value`. The gradient is zero where only a lower bound was asked for.
+    """
+    x, y, z = x - grid[0], y - grid[1], z - grid[2]
+    d, n = _query(x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices)
+    if n < 0:
+        return d, 0.0, 0.0, 0.0
+    gx, gy, gz = _unit_gradient(x, y, z, n, d, ROUNDING * grid[UNIT], records)
+    return d, gx, gy, gz
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _stage(points, pose, reach, grid, blocks, cells, lists, far, records, local, entry, best, square):
+    """Nearest record of up to STAGE points; each pass reads what the next one needs.
+
+    Fills the points relative to the origin, their cells, their nearest record (-1 where the bone is out of reach)
+    and the squared distance (the lower bound where out of reach).
+    """
+    scale, unit = grid[INVERSE], grid[UNIT]
+    for n in range(len(points)):
+        p, q, r = points[n, 0] - pose[0, 3], points[n, 1] - pose[1, 3], points[n, 2] - pose[2, 3]
+        x = pose[0, 0] * p + pose[1, 0] * q + pose[2, 0] * r - grid[0]
+        y = pose[0, 1] * p + pose[1, 1] * q + pose[2, 1] * r - grid[1]
+        z = pose[0, 2] * p + pose[1, 2] * q + pose[2, 2] * r - grid[2]
+        local[n, 0], local[n, 1], local[n, 2] = x, y, z
+        entry[n], cell, far_point = _block_entry(x, y, z, scale, blocks)
+        best[n] = cell | (CELL_FAR if far_point else 0)
+    for n in range(len(points)):
+        if entry[n] < 0:
+            entry[n] = cells[-1 - entry[n], best[n] & (CELL_FAR - 1)]
+    for n in range(len(points)):
+        bound = (lists[entry[n]] >> BOUND) * unit
+        square[n] = bound
+        if bound > reach:
+            best[n] = -1
+        else:
+            # Read so that the record is at hand in the next pass.
+            square[n] = records[lists[entry[n] + 1], 0]
+    for n in range(len(points)):
+        if best[n] >= 0:
+            far_point = best[n] >= CELL_FAR
+            x, y, z = local[n, 0], local[n, 1], local[n, 2]
+            best[n], square[n] = _nearest_listed(x, y, z, entry[n], far_point, lists, far, records)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def value_loop(points, pose, reach, out, data):
+    """Distances (n,) of points in world coordinates."""
+    grid, blocks, cells, lists, corners, far, records, edge_normals, vertex_normals, vertices = data
+    local, entry = np.empty((STAGE, 3)), np.empty(STAGE, np.int32)
+    best, square = np.empty(STAGE, np.int32), np.empty(STAGE)
+    for start in range(0, len(points), STAGE):
+        some = points[start : start + STAGE]
+        _stage(some, pose, reach, grid, blocks, cells, lists, far, records, local, entry, best, square)
+        for n in range(len(some)):
+            x, y, z = local[n, 0], local[n, 1], local[n, 2]
+            d = square[n]
+            if best[n] >= 0:
+                d = _signed(
+                    x,
+                    y,
+                    z,
+                    entry[n],
+                    best[n],
+                    d,
+                    lists,
+                    corners,
+                    records,
+                    edge_normals,
+                    vertex_normals,
+                    vertices,
+                )
+            out[start + n] = d
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def gradient_loop(points, pose, reach, distance, gradient, data):
+    """Distances (n,) and gradients (n, 3), world axes, of points in world coordinates."""
+    grid, blocks, cells, lists, corners, far, records, edge_normals, vertex_normals, vertices = data
+    local, entry = np.empty((STAGE, 3)), np.empty(STAGE, np.int32)
+    best, square = np.empty(STAGE, np.int32), np.empty(STAGE)
+    least = ROUNDING * grid[UNIT]
+    for start in range(0, len(points), STAGE):
+        some = points[start : start + STAGE]
+        _stage(some, pose, reach, grid, blocks, cells, lists, far, records, local, entry, best, square)
+        for n in range(len(some)):
+            x, y, z = local[n, 0], local[n, 1], local[n, 2]
+            d, gx, gy, gz = square[n], 0.0, 0.0, 0.0
+            if best[n] >= 0:
+                d = _signed(
+                    x,
+                    y,
+                    z,
+                    entry[n],
+                    best[n],
+                    d,
+                    lists,
+                    corners,
+                    records,
+                    edge_normals,
+                    vertex_normals,
+                    vertices,
+                )
+                gx, gy, gz = _unit_gradient(x, y, z, best[n], d, least, records)
+            distance[start + n] = d
+            for k in range(3):
+                gradient[start + n, k] = pose[k, 0] * gx + pose[k, 1] * gy + pose[k, 2] * gz

@@ -1,0 +1,33 @@
+"""Large loops over points, split over a few threads; the loops themselves are serial and release the lock."""
+
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from itertools import pairwise
+
+import numba
+
+# Fewer points than this a thread cost more to hand over than to do.
+LEAST_SHARE = 1024
+
+
+@lru_cache(maxsize=4)
+def _pool(workers):
+    return ThreadPoolExecutor(workers, thread_name_prefix="rbfmuscle")
+
+
+def in_chunks(count, work, *, least=LEAST_SHARE):
+    """Call ``work(start, stop)`` over the range of ``count``, on at most ``numba.get_num_threads()`` threads.
+
+    The number of threads is the caller's own (numba keeps it for each thread), so what already runs in
+    parallel sets it to one and stays serial here.
+    """
+    workers = min(numba.get_num_threads(), count // least)
+    if workers < 2:
+        work(0, count)
+        return
+    # Several pieces a thread, as pieces differ in cost.
+    pieces = min(4 * workers, count // least)
+    limits = [count * k // pieces for k in range(pieces + 1)]
+    futures = [_pool(workers).submit(work, a, b) for a, b in pairwise(limits)]
+    for future in futures:
+        future.result()

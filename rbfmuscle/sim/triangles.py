@@ -1,0 +1,193 @@
+"""Distance from a point to a triangle, and the normals that give it a sign.
+
+Each triangle has a record: a plane frame with the longest edge on its x-axis. In that frame the two angles at
+the x-axis are acute, so the nearest feature follows from a few comparisons. A triangle of zero area is its
+longest edge. The sign comes from angle-weighted pseudonormals (Baerentzen & Aanaes 2005, "Signed distance
+computation using the angle weighted pseudonormal").
+"""
+
+import numba
+import numpy as np
+
+# Columns of a record: corner A, x-axis, y-axis, normal, then x of B, x and y of C, and 1/|BC|^2, 1/|CA|^2.
+WIDTH = 18
+BX, CX, CY, INVERSE_BC, INVERSE_CA = 12, 13, 14, 15, 16
+# The last column tells which corner of the face is A.
+FIRST = 17
+# Features: the face, the edges AB, BC, CA, the corners A, B, C.
+FACE, EDGE, CORNER = 0, 1, 4
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_records(vertices, faces, order, records):
+    """Fill ``records`` (m, WIDTH) with the frames of the triangles ``faces[order]``; zero area is allowed."""
+    length = np.empty(3)
+    corner = np.empty((3, 3))
+    for n in range(len(order)):
+        face = order[n]
+        for k in range(3):
+            total = 0.0
+            for j in range(3):
+                total += (vertices[faces[face, (k + 1) % 3], j] - vertices[faces[face, k], j]) ** 2
+            length[k] = total
+        first = 0
+        for k in range(1, 3):
+            if length[k] > length[first]:
+                first = k
+        for k in range(3):
+            for j in range(3):
+                corner[k, j] = vertices[faces[face, (first + k) % 3], j]
+        _fill_record(corner, records[n])
+        records[n, FIRST] = first
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill_record(corner, record):
+    bx, along, cy = 0.0, 0.0, 0.0
+    for j in range(3):
+        record[j] = corner[0, j]
+        record[3 + j] = corner[1, j] - corner[0, j]
+        bx += record[3 + j] ** 2
+    bx = np.sqrt(bx)
+    if bx > 0.0:
+        for j in range(3):
+            record[3 + j] /= bx
+    else:
+        record[3], record[4], record[5] = 1.0, 0.0, 0.0
+    for j in range(3):
+        along += (corner[2, j] - corner[0, j]) * record[3 + j]
+    for j in range(3):
+        record[6 + j] = corner[2, j] - corner[0, j] - along * record[3 + j]
+        cy += record[6 + j] ** 2
+    cy = np.sqrt(cy)
+    if cy > 1e-14 * bx:
+        for j in range(3):
+            record[6 + j] /= cy
+    else:
+        cy = 0.0
+        _any_normal(record)
+    for j in range(3):
+        a, b = (j + 1) % 3, (j + 2) % 3
+        record[9 + j] = record[3 + a] * record[6 + b] - record[3 + b] * record[6 + a]
+    record[BX], record[CX], record[CY] = bx, along, cy
+    bc, ca = (along - bx) ** 2 + cy**2, along**2 + cy**2
+    record[INVERSE_BC] = 1.0 / bc if bc > 0.0 else 0.0
+    record[INVERSE_CA] = 1.0 / ca if ca > 0.0 else 0.0
+
+
+@numba.njit(cache=True, nogil=True)
+def _any_normal(record):
+    least = 0
+    for j in range(1, 3):
+        if abs(record[3 + j]) < abs(record[3 + least]):
+            least = j
+    scale = 1.0 / np.sqrt(1.0 - record[3 + least] ** 2)
+    for j in range(3):
+        unit = 1.0 if j == least else 0.0
+        record[6 + j] = scale * (unit - record[3 + least] * record[3 + j])
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def nearest_in_frame(bx, cx, cy, inverse_bc, inverse_ca, x, y):
+    """In-plane offset from the triangle to (x, y), and the feature nearest to it: ``(dx, dy, feature)``."""
+    if y <= 0.0 or cy <= 0.0:
+        if x <= 0.0:
+            return x, y, CORNER
+        if x >= bx:
+            return x - bx, y, CORNER + 1
+        return 0.0, y, EDGE
+    # Outside of an edge where the cross product with its direction is negative.
+    beyond_bc = (x - bx) * cy + y * (bx - cx)
+    beyond_ca = y * cx - x * cy
+    if beyond_bc <= 0.0 and beyond_ca <= 0.0:
+        return 0.0, 0.0, FACE
+    best, dx, dy, feature = np.inf, 0.0, 0.0, FACE
+    if beyond_bc > 0.0:
+        t = ((x - bx) * (cx - bx) + y * cy) * inverse_bc
+        feature = CORNER + 1 if t <= 0.0 else (CORNER + 2 if t >= 1.0 else EDGE + 1)
+        t = min(max(t, 0.0), 1.0)
+        dx, dy = x - bx - t * (cx - bx), y - t * cy
+        best = dx * dx + dy * dy
+    if beyond_ca > 0.0:
+        t = (x * cx + y * cy) * inverse_ca
+        ax, ay = x - min(max(t, 0.0), 1.0) * cx, y - min(max(t, 0.0), 1.0) * cy
+        if ax * ax + ay * ay < best:
+            dx, dy = ax, ay
+            feature = CORNER if t <= 0.0 else (CORNER + 2 if t >= 1.0 else EDGE + 2)
+    return dx, dy, feature
+
+
+@numba.njit(cache=True, nogil=True)
+def vertex_faces(faces, count):
+    """Faces around each vertex: ``(start, list)``, those of vertex v in ``list[start[v]:start[v + 1]]``."""
+    start = np.zeros(count + 2, dtype=np.int64)
+    for n in range(len(faces)):
+        for k in range(3):
+            start[faces[n, k] + 2] += 1
+    start = np.cumsum(start)
+    around = np.empty(3 * len(faces), dtype=np.int64)
+    for n in range(len(faces)):
+        for k in range(3):
+            v = faces[n, k] + 1
+            around[start[v]] = n
+            start[v] += 1
+    return start[:-1], around
+
+
+@numba.njit(cache=True, nogil=True)
+def opposite_faces(faces, start, around):
+    """Face across edge k (corner k to k + 1) of each face, (m, 3).
+
+    -1 where the edge has no face on the other side; -2 where the other side is not a single face in the
+    opposite direction (inconsistent orientation, or more than two faces).
+    """
+    across = np.full((len(faces), 3), -1, dtype=np.int64)
+    for n in range(len(faces)):
+        for k in range(3):
+            a, b = faces[n, k], faces[n, (k + 1) % 3]
+            count = 0
+            for m in range(start[a], start[a + 1]):
+                other = around[m]
+                if other == n:
+                    continue
+                for j in range(3):
+                    c, d = faces[other, j], faces[other, (j + 1) % 3]
+                    if c == b and d == a:
+                        across[n, k] = other
+                        count += 1
+                    elif c == a and d == b:
+                        count += 2
+            if count > 1:
+                across[n, k] = -2
+    return across
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_pseudonormals(vertices, faces, across, edge_normals, vertex_normals):
+    """Fill the directions that sign a distance: ``edge_normals`` (m, 3, 3), ``vertex_normals`` (n, 3).
+
+    Edge k of a face takes the sum of the two unit face normals, a vertex the normals weighted by their angle.
+    """
+    unit = np.zeros((len(faces), 3))
+    vertex_normals[:] = 0.0
+    for n in range(len(faces)):
+        a, b, c = vertices[faces[n, 0]], vertices[faces[n, 1]], vertices[faces[n, 2]]
+        ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+        vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        area = np.sqrt(nx * nx + ny * ny + nz * nz)
+        if area == 0.0:
+            continue
+        unit[n, 0], unit[n, 1], unit[n, 2] = nx / area, ny / area, nz / area
+        wx, wy, wz = vx - ux, vy - uy, vz - uz
+        angle_a = np.arctan2(area, ux * vx + uy * vy + uz * vz)
+        angle_b = np.arctan2(area, -(ux * wx + uy * wy + uz * wz))
+        for j in range(3):
+            vertex_normals[faces[n, 0], j] += angle_a * unit[n, j]
+            vertex_normals[faces[n, 1], j] += angle_b * unit[n, j]
+            vertex_normals[faces[n, 2], j] += (np.pi - angle_a - angle_b) * unit[n, j]
+    for n in range(len(faces)):
+        for k in range(3):
+            other = across[n, k]
+            for j in range(3):
+                edge_normals[n, k, j] = unit[n, j] + (unit[other, j] if other >= 0 else 0.0)
