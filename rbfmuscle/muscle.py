@@ -95,6 +95,7 @@ class RBFMuscle:
         self.level = 0.0
         # Cells along the muscle's own axes are smaller than along the scene's, and turn with the scene.
         self.axes = np.linalg.svd(self.samples - self.samples.mean(axis=0), full_matrices=False)[2]
+        self.axes[2] *= np.sign(np.linalg.det(self.axes))
 
     @staticmethod
     def _default_centres(area, scene):
