@@ -89,8 +89,14 @@ class BoneContacts:
         points = check_points(points)
         return self._query(points, bone_index)
 
-    def nearest(self, points):
+    def nearest(self, points, reach=np.inf):
         """Smallest distance over all bones and neighbours at any points: what an extracted surface is cut by.
+
+        Parameters
+        ----------
+        points : (n, 3) array_like
+        reach : float
+            Where a bone is farther than this, a lower bound beyond ``reach`` suffices [scene unit].
 
         Returns
         -------
@@ -118,7 +124,7 @@ class BoneContacts:
             near = self._near(points, free, b, reach + self.margin)
             if len(near) == 0:
                 continue
-            distance, direction = self._query(points[near], b)
+            distance, direction = self._query(points[near], b, reach)
             self._remember(points, near, distance, b)
             distance = distance - self.margin
             if b in self.allowed and len(self.allowed[b]) == len(points):
@@ -164,8 +170,12 @@ class BoneContacts:
             raise ValueError(f"half-spaces need all {len(self.contact_bone)} contact points, got {count}")
         return self.contact_bone < 0
 
-    def _query(self, points, b):
-        distance, gradient = self.fields[b].distance_and_gradient(points, pose=self.poses[self.names[b]])
+    def _distance(self, points, b, reach):
+        return self.fields[b].distance(points, pose=self.poses[self.names[b]], reach=reach)
+
+    def _query(self, points, b, reach=np.inf):
+        pose = self.poses[self.names[b]]
+        distance, gradient = self.fields[b].distance_and_gradient(points, pose=pose, reach=reach)
         length = np.linalg.norm(gradient, axis=1)
         flat = length < 1e-9
         if flat.any():
