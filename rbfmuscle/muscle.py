@@ -248,9 +248,9 @@ class RBFMuscle:
         fitted = time.perf_counter()
         points = self.contact_points()
         free = self.contact_bone < 0
-        depth = max(0.0, -float(contacts.nearest(points[free], reach).min(initial=np.inf)))
         # Farther than a cell from the bones a lower bound will do: no vertex gets there.
         reach = self.solver.scale / self.options.resolution
+        depth = max(0.0, -float(contacts.nearest(points[free], reach).min(initial=np.inf)))
         cut = (lambda x: contacts.nearest(x, reach)) if contacts.names else None
         axes = self.axes @ contacts.poses[self.motion_bones[0]][:3, :3].T
         result = extract_surface(
