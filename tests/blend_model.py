@@ -1,0 +1,90 @@
+"""A muscle without mechanics, for tests of what lies around models: vertices blend their bones' motion."""
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from rbfmuscle.sim.harmonic import harmonic_weights
+from rbfmuscle.sim.options import OutputOptions
+from rbfmuscle.sim.scene import Scene
+from rbfmuscle.sim.simulate import ModelSurface
+from rbfmuscle.validation import SolveError
+
+
+class BlendMuscle:
+    """Shows its input mesh carried along; raises SolveError at the ``fail_at``-th solve."""
+
+    fail_at = None
+
+    def __init__(self, muscle, scene):
+        self.name = muscle.name
+        self.rest, self.faces = np.array(muscle.mesh.vertices), np.array(muscle.mesh.faces)
+        names = [bone.name for bone in scene.bones]
+        self.contact_bone = np.full(len(self.rest), -1)
+        groups = {}
+        for attachment in muscle.attachments:
+            groups.setdefault(attachment.bone, []).append(np.asarray(attachment.vertices))
+            self.contact_bone[attachment.vertices] = names.index(attachment.bone)
+        self.bones = list(groups)
+        self.weights = harmonic_weights(self.rest, self.faces, [np.concatenate(g) for g in groups.values()])
+        self.x, self.solves = self.rest.copy(), 0
+
+    def contact_points(self):
+        return self.x
+
+    def predict(self, before, after):
+        moved = (self.rest @ after[bone][:3, :3].T + after[bone][:3, 3] for bone in self.bones)
+        self.x = sum(self.weights[:, [k]] * points for k, points in enumerate(moved))
+
+    def solve(self, contacts):
+        self.solves += 1
+        if self.solves == self.fail_at:
+            raise SolveError(f"muscle {self.name!r}: planted failure")
+
+    def turn(self, which, transform):
+        self.x[which] = self.x[which] @ transform[:3, :3].T + transform[:3, 3]
+
+    def snapshot(self):
+        return self.x.copy()
+
+    def restore(self, state):
+        self.x = state.copy()
+
+    def carried_mesh(self):
+        return self.x.copy(), self.faces
+
+    def surface(self, contacts):
+        return ModelSurface(self.x.copy(), self.faces, {"solver_penetration_max": 0.0, "time_extract": 0.001})
+
+
+def arm_scene(*, end=20, step=10, units="mm", **output):
+    """Two boxes with a hinge between them and an egg of a muscle above, from rest to ``end`` degrees."""
+    scene = Scene("arm", units=units)
+    upper, fore = trimesh.creation.box((40, 6, 6)), trimesh.creation.box((40, 6, 6))
+    upper.apply_translation([-22, 0, 0])
+    fore.apply_translation([22, 0, 0])
+    egg = trimesh.creation.icosphere(subdivisions=3)
+    egg = trimesh.Trimesh(egg.vertices * [26, 5, 5] + [0, 0, 9.5], egg.faces, process=False)
+    x = egg.vertices[:, 0]
+    attach = [
+        {"bone": "upper", "vertices": np.flatnonzero(x < -19).tolist()},
+        {"bone": "fore", "vertices": np.flatnonzero(x > 19).tolist()},
+    ]
+    scene.add_bone("upper", upper).add_bone("fore", fore)
+    scene.add_joint("elbow", "upper", "fore", (0, 0, 0), {"flexion": (0, -1, 0)})
+    scene.add_muscle("biceps", egg, attach=attach)
+    scene.set_motion(ramp={"elbow.flexion": {"to": float(end), "step": float(step)}})
+    scene.output = OutputOptions(**{"report": False, "preview": False, **output})
+    return scene
+
+
+def use_blend_model(monkeypatch, fail_at=None):
+    """Let `rbfmuscle.run` build BlendMuscle for every muscle."""
+    monkeypatch.setattr(BlendMuscle, "fail_at", fail_at)
+    monkeypatch.setattr("rbfmuscle.run.build_model", BlendMuscle)
+
+
+def files_in(folder):
+    """Names of all files below a folder, relative to it."""
+    return sorted(str(path.relative_to(folder)) for path in Path(folder).rglob("*") if path.is_file())
