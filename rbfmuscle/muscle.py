@@ -56,6 +56,19 @@ class RBFOptions:
         return cls(**table)
 
 
+class _BoneCut:
+    """What the bones cut away: their smallest distance, a lower bound where it is beyond ``reach``."""
+
+    def __init__(self, contacts, reach):
+        self.contacts, self.reach = contacts, reach
+
+    def __call__(self, points):
+        return self.contacts.nearest(points, self.reach)
+
+    def value_and_gradient(self, points):
+        return self.contacts.nearest_with_gradient(points)
+
+
 class RBFMuscle:
     """A muscle as the zero level set of an RBF field with moving centres.
 
@@ -251,7 +264,7 @@ class RBFMuscle:
         # Farther than a cell from the bones a lower bound will do: no vertex gets there.
         reach = self.solver.scale / self.options.resolution
         depth = max(0.0, -float(contacts.nearest(points[free], reach).min(initial=np.inf)))
-        cut = (lambda x: contacts.nearest(x, reach)) if contacts.names else None
+        cut = _BoneCut(contacts, reach) if contacts.names else None
         axes = self.axes @ contacts.poses[self.motion_bones[0]][:3, :3].T
         result = extract_surface(
             field, points=points, resolution=self.options.resolution, cut=cut,

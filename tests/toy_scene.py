@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import igl
+import numba
 import numpy as np
 import trimesh
 
@@ -20,12 +21,12 @@ class AnalyticBone:
     def __init__(self, formula, bounds):
         self.formula, self.bounds = formula, np.asarray(bounds, dtype=float)
 
-    def distance_and_gradient(self, points, pose=None):
+    def distance_and_gradient(self, points, pose=None, reach=np.inf):
         pose = np.eye(4) if pose is None else pose
         value, gradient = self.formula((points - pose[:3, 3]) @ pose[:3, :3])
         return value, gradient @ pose[:3, :3].T
 
-    def distance(self, points, pose=None):
+    def distance(self, points, pose=None, reach=np.inf):
         return self.distance_and_gradient(points, pose)[0]
 
 
@@ -40,15 +41,17 @@ def sphere(radius=1.0, centre=(0, 0, 0)):
     return AnalyticBone(formula, [centre - radius, centre + radius])
 
 
-def cylinder(radius=1.0, half_length=50.0):
-    """Endless along z inside its box."""
+def cylinder(radius=1.0, half_length=50.0, axis=(0.0, 0.0)):
+    """Along z through ``axis``, endless inside its box."""
+    centre = np.array([*axis, 0.0])
 
     def formula(p):
-        d = p * [1, 1, 0]
+        d = (p - centre) * [1, 1, 0]
         r = np.maximum(np.linalg.norm(d, axis=1), 1e-12)
         return r - radius, d / r[:, None]
 
-    return AnalyticBone(formula, [[-radius, -radius, -half_length], [radius, radius, half_length]])
+    half = np.array([radius, radius, half_length])
+    return AnalyticBone(formula, [centre - half, centre + half])
 
 
 def box(half, centre=(0, 0, 0)):
@@ -66,6 +69,26 @@ def box(half, centre=(0, 0, 0)):
         return far + np.minimum(a.max(axis=1), 0), gradient
 
     return AnalyticBone(formula, [centre - half, centre + half])
+
+
+@numba.njit(cache=True)
+def press(target, now, inverse, index, gap, normal):
+    """Least energy under half-spaces, by projected Gauss-Seidel on their pressures."""
+    x, pressure = target.copy(), np.zeros(len(index))
+    for _ in range(80):
+        for c in range(len(index)):
+            i = index[c]
+            if inverse[i, i] == 0.0:
+                continue
+            violation = gap[c]
+            for k in range(3):
+                violation += normal[c, k] * (x[i, k] - now[i, k])
+            step = max(-violation / inverse[i, i], -pressure[c])
+            pressure[c] += step
+            for j in range(len(x)):
+                for k in range(3):
+                    x[j, k] += inverse[j, i] * step * normal[c, k]
+    return x
 
 
 class ToyMuscle:
@@ -120,19 +143,9 @@ class ToyMuscle:
 
     def solve(self, contacts):
         self.solves += 1
-        x = self.target.copy()
         for _ in range(self.sweeps):
             near = contacts.half_spaces(self.x, self.reach)
-            pressure = np.zeros(len(near))
-            x = self.target.copy()
-            for _ in range(80):
-                for c in range(len(near)):
-                    i, normal = near.index[c], near.normal[c]
-                    gap = near.gap[c] + normal @ (x[i] - self.x[i])
-                    step = max(-gap / self.inverse[i, i], -pressure[c])
-                    pressure[c] += step
-                    x += self.inverse[:, i : i + 1] * (step * normal)
-            self.x = x
+            self.x = press(self.target, self.x, self.inverse, near.index, near.gap, near.normal)
 
     def turn(self, which, transform):
         self.x[which] = self.x[which] @ transform[:3, :3].T + transform[:3, 3]

@@ -107,12 +107,23 @@ class BoneContacts:
         points = check_points(points)
         smallest = np.full(len(points), np.inf)
         for b in self.reached:
-            np.minimum(
-                smallest, self.fields[b].distance(points, pose=self.poses[self.names[b]]), out=smallest
-            )
+            pose = self.poses[self.names[b]]
+            distance = self.fields[b].distance(points, pose=pose, reach=reach)
+            np.minimum(smallest, distance, out=smallest)
         for neighbour in self.neighbours:
             np.minimum(smallest, neighbour.cut(points), out=smallest)
         return smallest
+
+    def nearest_with_gradient(self, points):
+        """Smallest distance (n,) over all bones and neighbours, exact, and its gradient (n, 3), world axes."""
+        points = check_points(points)
+        smallest, gradient = np.full(len(points), np.inf), np.zeros((len(points), 3))
+        answers = [self._query(points, b) for b in self.reached]
+        answers += [neighbour.cut_with_gradient(points) for neighbour in self.neighbours]
+        for distance, direction in answers:
+            closer = distance < smallest
+            smallest[closer], gradient[closer] = distance[closer], direction[closer]
+        return smallest, gradient
 
     def query(self, points, reach):
         """Contacts of each bone: a list, one entry a bone, of ``(index, distance, direction)``."""
@@ -124,7 +135,7 @@ class BoneContacts:
             near = self._near(points, free, b, reach + self.margin)
             if len(near) == 0:
                 continue
-            distance, direction = self._query(points[near], b, reach)
+            distance, direction = self._query(points[near], b, reach + self.margin)
             self._remember(points, near, distance, b)
             distance = distance - self.margin
             if b in self.allowed and len(self.allowed[b]) == len(points):
@@ -169,9 +180,6 @@ class BoneContacts:
         if len(self.contact_bone) != count:
             raise ValueError(f"half-spaces need all {len(self.contact_bone)} contact points, got {count}")
         return self.contact_bone < 0
-
-    def _distance(self, points, b, reach):
-        return self.fields[b].distance(points, pose=self.poses[self.names[b]], reach=reach)
 
     def _query(self, points, b, reach=np.inf):
         pose = self.poses[self.names[b]]
