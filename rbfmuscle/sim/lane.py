@@ -48,7 +48,7 @@ class Lane:
         self.name = model.name
         self.detect = scene.detect.tunnelling if scene.detect is not None else None
         self.tolerance = scene.length(TOUCH)
-        self.times, self.events = {}, []
+        self.times, self.events = {}, {}
         self.frame = 0
 
     @contextmanager
@@ -104,14 +104,16 @@ class Lane:
             return self.model.surface(self.contacts)
 
     def report(self, bone, count, action):
-        """Note an event of the present frame."""
-        self.events.append(Event(self.frame, self.name, bone, int(count), action))
+        """Note an event of the present frame; of one kind the most points at one time are kept."""
+        key = (self.frame, bone, action)
+        self.events[key] = max(int(count), self.events.get(key, 0))
 
     def collect(self):
         """Times and events since the last call."""
-        times, events = self.times, self.events
+        times = self.times
+        events = [Event(k, self.name, bone, n, action) for (k, bone, action), n in self.events.items()]
         times["time_frame"] = sum(times.values())
-        self.times, self.events = {}, []
+        self.times, self.events = {}, {}
         return times, events
 
     def _move(self, poses, after, crossings=(), start=None):
