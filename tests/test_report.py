@@ -105,6 +105,10 @@ def test_pictures_show_bone_and_muscle(folder, graphics):
     assert ivory > 0.02
     with Image.open(folder / "preview.webp") as preview:
         assert preview.n_frames == 7
+        first = colours_of(preview.crop((0, 30, preview.width, preview.height - 40)))
+        preview.seek(6)
+        last = colours_of(preview.crop((0, 30, preview.width, preview.height - 40)))
+    assert (np.abs(first - last).max(axis=1) > 60).mean() > 0.03  # the forearm has risen by 60 degrees
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.gif", "a.webp"])

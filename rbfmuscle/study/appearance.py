@@ -2,8 +2,8 @@
 
 BONE_COLOUR = "#ece2cb"
 BACKGROUND = "#ffffff"
-# Reds of different lightness and warmth, so that neighbours stand apart, then tones for many muscles.
-MUSCLE_COLOURS = ("#b5443f", "#d97b66", "#8f2f3c", "#c9605a", "#e09a86", "#a14d52", "#7b2a2f", "#d2706f")
+# Flesh tones of different lightness and hue, so that neighbours stand apart.
+MUSCLE_COLOURS = ("#b5443f", "#dd8468", "#7f2638", "#c96a80", "#e9b39a", "#a1562f", "#94404f", "#d2505a")
 # Plots need more distance between lines than flesh tones give.
 LINE_COLOURS = ("#b5443f", "#2f6f8f", "#d99a2b", "#4f8a5b", "#7a5aa6", "#8c6d5a", "#c86fa0", "#5d6d7e")
 

@@ -23,6 +23,7 @@ VIEWS = {
 }
 ANIMATIONS = (".webp", ".gif")
 _STRIP = 30
+_BONE_TRIANGLES = 12_000
 _TIMEOUT = 1800
 
 
@@ -119,6 +120,8 @@ class Stage:
         self.bones = []
         for name in saved.bones:
             mesh = pyvista.make_tri_mesh(*saved.bone(name))
+            if mesh.n_cells > _BONE_TRIANGLES:  # software drawing pays for each of them in every frame
+                mesh = mesh.decimate(1.0 - _BONE_TRIANGLES / mesh.n_cells)
             mesh = mesh.compute_normals(split_vertices=False, auto_orient_normals=False)
             self.bones.append((name, [self._add(k, mesh, BONE_COLOUR) for k in range(len(views))]))
         self.skins = []
@@ -143,6 +146,7 @@ class Stage:
             self.skins += [self._add(k, mesh, self.colours[muscle]) for k in range(len(self.views))]
         for renderer in self.plotter.renderers:
             renderer.ResetCameraClippingRange()
+        self.plotter.render()  # a screenshot alone shows what was drawn last
         return self.plotter.screenshot(return_img=True)
 
     def close(self):
@@ -236,7 +240,7 @@ def _draw_job(saved, job, seconds):
     if len(images) > 1:
         pause = max(20, int(1000 * seconds / len(images)))
         pauses = [pause] * (len(images) - 1) + [900]
-        kind = {".webp": {"quality": 82, "method": 3}, ".gif": {"optimize": False}}[Path(job["file"]).suffix]
+        kind = {".webp": {"quality": 82, "method": 2}, ".gif": {"optimize": False}}[Path(job["file"]).suffix]
         if job["file"].endswith(".gif"):
             images = [image.quantize(128, dither=Image.Dither.NONE) for image in images]
         images[0].save(job["file"], save_all=True, append_images=images[1:], duration=pauses, loop=0, **kind)
