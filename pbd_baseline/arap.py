@@ -1,8 +1,8 @@
 """As-rigid-as-possible energy on a surface mesh: local rotations, the global solve, the PBD constraint.
 
-E(x) = 1/4 sum over edges of w_ij (|e_ij - R_i E_ij|^2 + |e_ij - R_j E_ij|^2), e = x_i - x_j, E at rest, each R_i
-the rotation that makes E least (Sorkine and Alexa 2007). With the rotations optimal the gradient of E is its
-partial derivative with R frozen: grad_i E = sum_j w_ij (e_ij - (R_i + R_j) E_ij / 2).
+E(x) = 1/4 sum over edges of w_ij (|e_ij - R_i E_ij|^2 + |e_ij - R_j E_ij|^2), with e = x_i - x_j, E the same
+at rest, each R_i the rotation that makes E least (Sorkine and Alexa 2007). With the rotations optimal the
+gradient of E is its partial derivative with R frozen: grad_i E = sum_j w_ij (e_ij - (R_i + R_j) E_ij / 2).
 """
 
 import numba
@@ -189,7 +189,7 @@ def _turn_towards(moment, q):
 
 @numba.njit(cache=True, nogil=True)
 def _turn_quaternion(q, x, y, z):
-    """q <- q (1, x, y, z), normalised: exact to third order in the half angle, the fixed point is unchanged."""
+    """q <- q (1, x, y, z), normalised: right to third order, and the fixed point is unchanged."""
     a, b, c, d = q[0], q[1], q[2], q[3]
     q[0] = a - b * x - c * y - d * z
     q[1] = b + a * x + c * z - d * y

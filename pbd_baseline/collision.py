@@ -36,6 +36,12 @@ class CollisionConstraint:
         self.anchor = points[self.index]
         return max(0.0, -float(self.gap.min(initial=0.0)))
 
+    def depth(self, points):
+        """Greatest depth of the points in the half-spaces found last."""
+        if len(self.index) == 0:
+            return 0.0
+        return _depth_loop(points, self.index, self.gap, self.normal, self.anchor, np.empty(len(self.index)))
+
     def project(self, points):
         """Push vertices out of the half-spaces, in place; return the greatest violation before."""
         if len(self.index) == 0:
@@ -49,9 +55,10 @@ class CollisionConstraint:
         return worst
 
     def clear_way(self, points, direction, step):
-        """Take out of ``step * direction`` what would lead into a half-space; ``direction`` changes in place."""
-        if len(self.index):
-            _clear_loop(points, self.index, self.gap, self.normal, self.anchor, direction, step)
+        """Take out of ``step * direction``, in place, what would lead into a half-space; say if anything."""
+        if len(self.index) == 0 or step == 0.0:
+            return False
+        return _clear_loop(points, self.index, self.gap, self.normal, self.anchor, direction, step)
 
 
 def _keep_deepest(index, depth, count):
@@ -83,6 +90,7 @@ def _push_loop(points, index, normal, depth):
 
 @numba.njit(cache=True, nogil=True)
 def _clear_loop(points, index, gap, normal, anchor, direction, step):
+    cleared = False
     for c in range(len(index)):
         i = index[c]
         value, along = gap[c], 0.0
@@ -92,3 +100,5 @@ def _clear_loop(points, index, gap, normal, anchor, direction, step):
         if step * along < 0.0 and value + 2.0 * step * along < 0.0:
             for k in range(3):
                 direction[i, k] -= along * normal[c, k]
+            cleared = True
+    return cleared

@@ -79,9 +79,7 @@ def swelling_room(vertices, faces, normals, held):
     """
     radius = _inner_balls(vertices, normals)
     reach = SMOOTHING_SHARE * float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    area = np.zeros(len(vertices))
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    np.add.at(area, faces, np.linalg.norm(np.cross(b - a, c - a), axis=1)[:, None] / 6.0)
+    area = vertex_areas(vertices, faces)
     free = np.flatnonzero(~held)
     room = np.zeros(len(vertices))
     if len(free):
@@ -89,6 +87,14 @@ def swelling_room(vertices, faces, normals, held):
         matrix = (cotangent_laplacian(vertices, faces) + sparse.diags(mass)).tocsc()
         room[free] = spsolve(matrix[free][:, free], (mass * radius)[free])
     return np.maximum(room, 0.0)
+
+
+def vertex_areas(vertices, faces):
+    """A third of the area of the faces around each vertex, (n,)."""
+    area = np.zeros(len(vertices))
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    np.add.at(area, faces, np.linalg.norm(np.cross(b - a, c - a), axis=1)[:, None] / 6.0)
+    return area
 
 
 def _inner_balls(vertices, normals, rounds=12):

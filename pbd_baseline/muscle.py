@@ -12,13 +12,12 @@ from pbd_baseline.rest import Rest
 from pbd_baseline.shapes import SHAPES
 from rbfmuscle.sim.simulate import ModelSurface
 
-# Bones are looked for within this distance [mm] of the predicted vertices, and within the second while finishing.
+# Bones are looked for within this distance [mm] of the vertices as predicted, and as swept.
 REACH = 6.0
 FINISHING_REACH = 2.0
-# Rounds of contact and volume after the last sweep, and what they have to meet: depth [mm], share of the volume.
+# Rounds of contact and volume after the last sweep, and the depth [mm] that ends them.
 FINISHING_ROUNDS = 4
 DEPTH = 0.05
-VOLUME_ERROR = 1e-4
 # Motion that makes the time of one XPBD step [radian].
 STEP_ANGLE = math.radians(2.0)
 
@@ -65,7 +64,7 @@ class PBDMuscle:
         """Go along with the bones; held vertices arrive exactly."""
         motions = np.array([_relative(before[bone], after[bone]) for bone in self.rest.bones])
         self.time = max(1.0, _largest_angle(motions) / STEP_ANGLE)
-        if self.options.prediction == "harmonic":
+        if self.options.prediction == "carried":
             carry(self.points, self.rest.weights, motions)
         elif self.options.prediction == "velocity":
             velocity = self.points - self.before
@@ -118,15 +117,19 @@ class PBDMuscle:
         return self.rest.volume.volume(self.points)
 
     def _finish(self, contacts):
-        """Contact and volume in turn until both hold; the penetration is measured after the last move."""
+        """Contact and volume in turn until both hold where the bones are now known to be.
+
+        The half-spaces are found again where the last round still left something to do.
+        """
+        self.penetration = self.collision.find(contacts, self.points, reach=self.finishing_reach)
         for k in range(FINISHING_ROUNDS):
-            self.penetration = self.collision.find(contacts, self.points, reach=self.finishing_reach)
-            error = abs(self.volume() / self.rest.volume.rest - 1.0)
-            if self.penetration <= self.depth and error <= VOLUME_ERROR and k > 0:
-                return
+            settled = self.penetration <= self.depth
             self.collision.project(self.points)
             self._restore_volume()
-        self.penetration = self.collision.find(contacts, self.points, reach=self.finishing_reach)
+            if settled or k == FINISHING_ROUNDS - 1:
+                self.penetration = self.collision.depth(self.points)
+                return
+            self.penetration = self.collision.find(contacts, self.points, reach=self.finishing_reach)
 
     def _restore_volume(self):
         volume = self.rest.volume
@@ -139,11 +142,7 @@ class PBDMuscle:
         else:
             direction = gradient.copy()
             _scale_loop(direction, self.rest.room)
-        slope = np.vdot(gradient, direction)
-        if slope > 0.0:
-            step = (volume.rest - volume.volume(self.points)) / slope
-            self.collision.clear_way(self.points, direction, step)
-            volume.restore(self.points, direction)
+        volume.restore(self.points, direction, clear_way=self.collision.clear_way)
 
 
 def _relative(before, after):

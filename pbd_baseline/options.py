@@ -17,23 +17,29 @@ class PBDOptions(Table):
     """``[muscle.model]`` of the mesh models.
 
     ``iterations`` sweeps a solve (0: the method's own number). ``edge`` and ``bending`` are PBD stiffnesses,
-    ``edge_compliance`` and ``bending_compliance`` those of XPBD and ``arap_compliance`` of the ARAP constraint,
-    all over a time that passes by one for each two degrees of motion. ``fibre_exponent`` is a of
-    k = (1 - |cos|)^a. ``prediction``: vertices go with the bones by harmonic weights, or keep their velocity
-    times ``damping`` as the authors' do, or stay. ``response`` to several bones: the sum of the ways out, or the
-    longest alone.
+    ``edge_compliance`` and ``bending_compliance`` those of XPBD, ``arap_compliance`` of the ARAP constraint,
+    all over a time that passes by one for each two degrees of motion. ``arap_reach`` is how far one global step
+    carries, as a share of the muscle's diagonal. ``fibre_exponent`` is a of
+    k = (1 - |cos|)^a; edges longer than ``soft_length`` medians are softer in inverse proportion (0: none);
+    those shorter or longer than ``limits`` times their rest length are hard in any case.
+    ``prediction``: vertices are carried along by the bones (see ``pbd_baseline.weights``), or keep their
+    velocity times ``damping`` as the authors' do, or stay (none). ``response`` to several bones: the sum of
+    the ways out, or the longest alone.
     """
 
     method: Literal["pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved"] = "pbd"
     iterations: Annotated[int, Field(ge=0, le=10_000)] = 0
-    prediction: Literal["harmonic", "velocity", "none"] = "harmonic"
+    prediction: Literal["carried", "velocity", "none"] = "carried"
     damping: Share = 0.99
     fibre_exponent: NotNegative = 0.5
+    limits: Annotated[list[Positive], Field(min_length=2, max_length=2, default_factory=lambda: [0.6, 2.2])]
+    soft_length: NotNegative = 0.3
     edge: Share = 1.0
     bending: Share = 0.9
     edge_compliance: NotNegative = 0.2
     bending_compliance: NotNegative = 0.2
     arap_compliance: Positive = 1.0
+    arap_reach: Positive = 0.1
     response: Literal["sum", "nearest"] = "sum"
 
     @property

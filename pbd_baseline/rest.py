@@ -7,7 +7,7 @@ import numpy as np
 from pbd_baseline.constraints import VolumeConstraint
 from pbd_baseline.fibres import fibre_directions, swelling_room
 from pbd_baseline.topology import Topology, curve_order
-from rbfmuscle.sim.harmonic import harmonic_weights
+from pbd_baseline.weights import even_weights
 from rbfmuscle.validation import SceneError
 
 
@@ -24,7 +24,7 @@ class Rest:
     bones : list of str
         Bones that hold the muscle.
     weights : (n, len(bones)) ndarray
-        Harmonic weights, 1 on a bone's own vertices.
+        Weights of their motions, 1 on a bone's own vertices.
     holder : (n,) ndarray of int
         Position in ``bones`` of the bone that holds a vertex, -1 where it is free.
     inverse_mass : (n,) ndarray
@@ -69,7 +69,7 @@ class Rest:
         holder = np.full(len(vertices), -1)
         for attachment in muscle.attachments:
             holder[place[attachment.vertices]] = bones.index(attachment.bone)
-        weights = harmonic_weights(vertices, faces, [np.flatnonzero(holder == b) for b in range(len(bones))])
+        weights = even_weights(vertices, faces, [np.flatnonzero(holder == b) for b in range(len(bones))])
         volume = VolumeConstraint(vertices, faces)
         inverse_mass = np.where(holder < 0, 1.0, 0.0)
         normals = volume.gradient(vertices)
@@ -79,6 +79,17 @@ class Rest:
         return cls(
             order, vertices, topology, bones, weights, holder, inverse_mass, fibres, room, volume
         )  # fmt: skip
+
+    def relative_lengths(self):
+        """Length of each edge in units of the median one.
+
+        A piece of an elastic sheet is the softer the longer it is. With one stiffness for all edges the
+        shortest ones of an uneven mesh take up the whole stretch: twelvefold on the hip, against twofold.
+        """
+        one, two = self.vertices[self.topology.edges[:, 0]], self.vertices[self.topology.edges[:, 1]]
+        length = np.linalg.norm(one - two, axis=1)
+        median = np.median(length)
+        return np.maximum(length / median, 1e-3)
 
 
 def _sorted_faces(faces):

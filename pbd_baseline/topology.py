@@ -118,6 +118,12 @@ def colour(members, count):
     return order, start
 
 
+def spread(value, order):
+    """A constraint's parameter, one number or one a constraint, as an array in the order of the colours."""
+    value = np.asarray(value, dtype=np.float64)
+    return np.ascontiguousarray(value[order]) if value.ndim else np.full(len(order), float(value))
+
+
 @numba.njit(cache=True, nogil=True)
 def _colour_loop(members, taken, colours):
     """Bit q of ``taken[v]`` (63 to a word) says that colour q is used at vertex v."""

@@ -1,0 +1,79 @@
+"""Weights between the bones' motions that stretch the surface evenly: harmonic ones, made flatter.
+
+A harmonic function is singular at the rim of a small patch that is held: a prediction by it stretches edges
+there fivefold, and local sweeps cannot take that back. The p-Laplace equation, minimising the integral of
+|grad w|^p, spreads the gradient over the whole length; p = 4 nearly halves the worst stretch on the hip.
+"""
+
+import numpy as np
+import scipy.sparse as sparse
+from scipy.sparse.linalg import splu
+
+from rbfmuscle.sim.harmonic import harmonic_weights
+
+POWER = 4.0
+ROUNDS = 8
+# Faces whose gradient is below this share of the largest count as having this much.
+LEAST_GRADIENT = 1e-3
+LEAST_COTANGENT = 1e-3
+
+
+def even_weights(vertices, faces, groups):
+    """Weights in [0, 1] that sum to one, 1 on a group's own vertices, by re-weighted Laplace solves.
+
+    Parameters
+    ----------
+    vertices, faces : (n, 3), (m, 3) ndarray
+    groups : list of (k_g,) int arrays
+        Vertices held by each bone.
+
+    Returns
+    -------
+    (n, len(groups)) ndarray
+    """
+    weights = harmonic_weights(vertices, faces, groups)
+    held = np.zeros(len(vertices), dtype=bool)
+    for group in groups:
+        held[group] = True
+    free, fixed = np.flatnonzero(~held), np.flatnonzero(held)
+    if len(free) == 0 or len(groups) < 2:
+        return weights
+    cotangents, gradients = _face_operators(vertices, faces)
+    for _ in range(ROUNDS):
+        size = np.sqrt(sum(((gradient @ weights) ** 2).sum(axis=1) for gradient in gradients))
+        conductance = np.maximum(size / size.max(), LEAST_GRADIENT) ** (POWER - 2.0)
+        laplacian = _laplacian(faces, cotangents * conductance[:, None], len(vertices))[free]
+        solved = splu(laplacian[:, free].tocsc()).solve(-(laplacian[:, fixed] @ weights[fixed]))
+        # a full step oscillates for p > 3; this one is Newton's where the direction of the gradient stays
+        weights[free] += (solved - weights[free]) / (POWER - 1.0)
+    weights = np.clip(weights, 0.0, 1.0)
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def _face_operators(vertices, faces):
+    """Half cotangents (m, 3) opposite to each corner's edge, and three (m, n) gradient matrices."""
+    corners = [vertices[faces[:, k]] for k in range(3)]
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    square = np.maximum(np.einsum("ij,ij->i", normal, normal), 1e-300)
+    cotangents, slopes = np.empty((len(faces), 3)), []
+    for k in range(3):
+        one, two = corners[(k + 1) % 3], corners[(k + 2) % 3]
+        dot = np.einsum("ij,ij->i", one - corners[k], two - corners[k])
+        cotangents[:, k] = np.maximum(0.5 * dot / np.sqrt(square), LEAST_COTANGENT)
+        slopes.append(np.cross(normal, two - one) / square[:, None])
+    rows = np.tile(np.arange(len(faces)), 3)
+    shape = (len(faces), len(vertices))
+    columns = faces.T.ravel()
+    matrices = [
+        sparse.csr_matrix((np.concatenate([slope[:, d] for slope in slopes]), (rows, columns)), shape=shape)
+        for d in range(3)
+    ]
+    return cotangents, matrices
+
+
+def _laplacian(faces, cotangents, count):
+    rows = np.concatenate([faces[:, (k + 1) % 3] for k in range(3)])
+    columns = np.concatenate([faces[:, (k + 2) % 3] for k in range(3)])
+    half = sparse.csr_matrix((cotangents.T.ravel(), (rows, columns)), shape=(count, count))
+    full = half + half.T
+    return (sparse.diags(np.asarray(full.sum(axis=1)).ravel()) - full).tocsr()
