@@ -166,7 +166,7 @@ def _reach_volume(band, target, level, keep, obstacles):
 def _finish(band, projector, faces, target, level, components, spurious, obstacles):
     points, tolerance = obstacles
     if points is not None:
-        projector.push_off(faces, points, tolerance)
+        projector.push_off(faces, points, tolerance, level)
     if target is not None:
         for _ in range(3):
             step = projector.volume_step(faces, target)
@@ -269,6 +269,7 @@ class _Projector:
     def __init__(self, field, cut, vertices, spacing):
         self.vertices = vertices
         self.spacing = spacing
+        self._field_value = field
         self._field = with_gradient(field, 1e-4 * spacing)
         self._cut_value = cut
         self._cut = None if cut is None else with_gradient(cut, 1e-4 * spacing)
@@ -319,11 +320,27 @@ class _Projector:
             raise ValueError(f"no level gives a volume of {target:g}: the cut leaves no surface of the field")
         return lack / rate
 
-    def push_off(self, faces, points, tolerance):
-        """Move the vertices around points that came through a triangle; these no longer follow the level."""
-        moved = push_off_points(self.vertices, faces, points, self.spacing, tolerance)
-        self._direction[moved] = 0.0
-        self.slope[moved] = 0.0
+    def push_off(self, faces, points, tolerance, level):
+        """Move the vertices around points that came through a triangle; these no longer follow the level.
+
+        A chord leaves the surface by a part of a cell, so only points that near to the field's inside count.
+        """
+        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
+        points = points[((points > low) & (points < high)).all(axis=1)]
+        if len(points) == 0:
+            return
+        points = points[self._field_value(points) - level < 0.3 * self.spacing]
+        for _ in range(2):
+            moved = np.flatnonzero(push_off_points(self.vertices, faces, points, self.spacing, tolerance))
+            self._direction[moved] = 0.0
+            self.slope[moved] = 0.0
+            if self._cut_value is None or len(moved) == 0:
+                break
+            # What was pushed off one bone vertex must not end in the bone beside it.
+            inside = moved[self._cut_value(self.vertices[moved]) < 0.0]
+            distance, outward = self._cut(self.vertices[inside])
+            size = np.maximum(np.einsum("ij,ij->i", outward, outward), 1e-12)
+            self.vertices[inside] -= (distance / size)[:, None] * outward
 
     def shift(self, step):
         """Move the vertices as the level set moves with its level, to first order."""

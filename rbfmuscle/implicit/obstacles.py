@@ -10,7 +10,8 @@ def push_off_points(vertices, faces, obstacles, spacing, tolerance, rounds=4):
     """Move the vertices of triangles that obstacle points have come through, into the surface.
 
     A point behind a triangle (inside the mesh) by more than ``tolerance`` moves its three corners along the
-    normal, by barycentric weights, until it is not. Only points less than ``spacing`` deep are seen.
+    normal, by barycentric weights, until it is not. Only points less than 0.35 ``spacing`` deep are seen: a chord
+    is never farther from its surface, and a deeper point is behind some other part of the muscle.
 
     Parameters
     ----------
@@ -81,7 +82,7 @@ def _push_loop(vertices, faces, points, where, order, start, strides, reach, tol
                         signed = depth
         if signed < -0.1 * reach:
             where[p] = -1
-        if signed <= tolerance:
+        if signed <= tolerance or signed > 0.35 * reach:
             continue
         number += 1
         square = best_weight[0] ** 2 + best_weight[1] ** 2 + best_weight[2] ** 2
