@@ -81,9 +81,9 @@ class ARAPShape:
 class GlobalARAPShape:
     """Local rotations and one prefactored global solve: the ARAP of the paper's second option.
 
-    The global step is E(x) + |x - z|^2 / (2 l^2) in the surface's own measure, z where contact and volume have
-    left the vertices: without it (l infinite) every step forgets the contacts, and a stretched muscle is pulled
-    through the bone that it wraps. A fixed point is the same for any l.
+    The global step makes E(x) + |x - z|^2 / (2 l^2) least in the surface's own measure, z where contact and
+    volume have left the vertices: without it (l infinite) every step forgets the contacts, and a stretched
+    muscle is pulled through the bone that it wraps. A free fixed point is the same for any l.
     """
 
     def __init__(self, rest, options):
