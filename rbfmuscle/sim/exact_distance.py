@@ -219,6 +219,16 @@ def record_square(records, n, x, y, z):
 
 
 @numba.njit(cache=True, nogil=True)
+def record_feature(records, n, x, y, z):
+    """Feature of the triangle of record n (FACE, EDGE + k, CORNER + k) that is nearest to a point."""
+    qx, qy, qz = x - records[n, 0], y - records[n, 1], z - records[n, 2]
+    u = qx * records[n, 3] + qy * records[n, 4] + qz * records[n, 5]
+    v = qx * records[n, 6] + qy * records[n, 7] + qz * records[n, 8]
+    bx, cx, cy = records[n, BX], records[n, CX], records[n, CY]
+    return nearest_in_frame(bx, cx, cy, records[n, INVERSE_BC], records[n, INVERSE_CA], u, v)[2]
+
+
+@numba.njit(cache=True, nogil=True)
 def nearest_triangle(boxes, starts, records, x, y, z, best, square, nodes, squares):
     """Record of the triangle nearest to a point, and the squared distance.
 

@@ -23,9 +23,9 @@ log = logging.getLogger(__name__)
 
 IDENTITY = np.eye(4)
 # Fine cells against the mean edge of the mesh, and at least this many along its longest side.
-CELL_SHARE, LEAST_CELLS = 0.45, 32
+CELL_SHARE, LEAST_CELLS = 0.54, 40
 # Fine cells cover points nearer than this many of their edges.
-BAND = 1.75
+BAND = 1.2
 # Default tolerance as a share of the mean edge: facets are flat, so errors scale with them.
 TOLERANCE_SHARE = 0.004
 # Points at which a field measures itself, and how often it may be refined.

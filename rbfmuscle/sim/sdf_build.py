@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from rbfmuscle.sim.exact_distance import STACK, nearest_triangle, record_square, signed_side
-from rbfmuscle.sim.sdf_query import BLOCK, BOUND, CROSSED, INSIDE, MIXED, OUTSIDE, SIDE
+from rbfmuscle.sim.exact_distance import STACK, nearest_triangle, record_feature, record_square, signed_side
+from rbfmuscle.sim.sdf_query import BLOCK, BOUND, COUNT, CROSSED, INSIDE, MIXED, OUTSIDE, SIDE
 from rbfmuscle.sim.threads import in_chunks
+from rbfmuscle.sim.triangles import CORNER, EDGE, FACE, FIRST
 
 # Fine cells of a block.
 CUT = BLOCK**3
@@ -21,8 +22,15 @@ COARSE_ERROR = 0.02
 UNIT_SHARE = 1 / 16
 # Directions in which triangles are sought for points beyond the grid.
 FAR_DIRECTIONS = 200
-# Header, eight corners, centre, row of the corners' distances.
-LONGEST = 11
+# Points of a cell, beside its corners, from which a walk over the surface looks for triangles to list.
+PROBES = 0.25 * np.array([[0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=np.float64)
+# At most this many triangles a cell; a header, and the row of the corners' distances.
+MOST, LONGEST = 15, 17
+# Steps of one walk, at most.
+WALK = 8
+# Cells whose triangles' normals differ by more than 60 degrees ask the tree at their probes, unless further
+# away than this many of their edges.
+FOLD, FOLD_REACH = 0.5, 2.0
 # Lists before this one that are looked through for the same content.
 LOOK_BACK = 6
 
@@ -62,19 +70,24 @@ class _Builder:
         self.doubtful = (
             np.zeros(len(exact.faces), dtype=np.bool_) if doubtful is None else doubtful[exact.order]
         )
+        place = np.full(len(exact.order) + 1, -1, dtype=np.int32)
+        place[exact.order] = np.arange(len(exact.order))
+        turn = (exact.records[:, FIRST].astype(np.int64)[:, None] + np.arange(3)) % 3
+        self.across = place[np.maximum(exact.across[exact.order[:, None], turn], -1)]
         self.lists, self.corners = [], []
         self.length = self.rows = self.count = 0
         self.sound = True
 
-    def nodes(self, index, edge):
-        """Exact distances at lattice points ``index`` (n, 3) times ``edge``."""
+    def nodes(self, index, edge, near=None):
+        """Exact distances at lattice points ``index`` (n, 3) times ``edge``; ``near`` names a near record."""
         points = self.origin + edge * index
         record, distance = np.empty(len(points), dtype=np.int32), np.empty(len(points))
+        near = np.full(len(points), -1, dtype=np.int32) if near is None else near
         exact = self.exact
         normals = (exact.edge_normals, exact.vertex_normals, exact.faces, exact.order)
 
         def work(a, b):
-            _node_loop(points[a:b], exact.tree, normals, record[a:b], distance[a:b])
+            _node_loop(points[a:b], near[a:b], exact.tree, normals, record[a:b], distance[a:b])
 
         in_chunks(len(points), work, least=256)
         self.count += len(points)
@@ -88,19 +101,30 @@ class _Builder:
     def write(self, low, edge, ids, corners, centres):
         """Lists of cells with least corner ``low`` (n, 3) in edges; returns their offsets (n,)."""
         count = len(ids)
-        lists, offsets = np.empty(count * LONGEST, dtype=np.int32), np.empty(count, dtype=np.int32)
+        offsets = np.empty(count, dtype=np.int32)
         rows = np.empty((count if self.inside is not None else 0, 12), dtype=np.float32)
-        centre = np.full(count, -1, dtype=np.int32) if centres is None else centres.record
+        centre = np.full(count, -1, dtype=np.int32) if centres is None else centres
         nodes = (corners.record, corners.distance, corners.doubt)
-        used, mixed, sound = _list_loop(
-            low, ids, nodes, centre, float(edge), self.unit, self.doubtful, (lists, offsets, rows, self.rows)
-        )
-        offsets += self.length
-        self.lists.append(lists[:used].copy())
-        self.corners.append(rows[:mixed].copy())
-        self.length += used
-        self.rows += mixed
-        self.sound = self.sound and sound
+        mesh = (self.exact.tree, self.across, self.origin, self.doubtful)
+        written = {}
+
+        def work(a, b):
+            lists = np.empty((b - a) * LONGEST, dtype=np.int32)
+            out = (lists, offsets[a:b], rows, self.rows)
+            used, mixed, sound = _list_loop(
+                low[a:b], ids[a:b], nodes, centre[a:b], float(edge), self.unit, mesh, out
+            )
+            written[a, b] = (lists[:used].copy(), mixed, sound)
+
+        # Rows of mixed cells are numbered in order.
+        in_chunks(count, work, least=1024 if self.inside is None else count + 1)
+        for (a, b), (lists, mixed, sound) in sorted(written.items(), key=lambda item: item[0]):
+            offsets[a:b] += self.length
+            self.lists.append(lists)
+            self.corners.append(rows[:mixed].copy())
+            self.length += len(lists)
+            self.rows += mixed
+            self.sound = self.sound and sound
         return offsets
 
 
@@ -155,7 +179,7 @@ def _coarse_level(builder, shape, edge, band, box):
     low = _lattice(shape)
     corners, centres = builder.nodes(_lattice(shape + 1), edge), builder.nodes(low + 0.5, edge)
     ids = _corner_ids(low, np.arange(len(corners.record), dtype=np.int32).reshape(shape + 1))
-    offsets = builder.write(low, edge, ids, corners, centres)
+    offsets = builder.write(low, edge, ids, corners, centres.record)
     table = offsets.reshape(shape)
     for axis in range(3):
         table = table.repeat(BLOCK, axis)
@@ -178,15 +202,26 @@ def _block_level(builder, table, chosen, edge, band, box):
         index[tuple((chosen + step).T)] = 0
     wanted = np.argwhere(index == 0)
     index[tuple(wanted.T)] = np.arange(len(wanted), dtype=np.int32)
-    corners, centres = builder.nodes(wanted, edge), builder.nodes(chosen + 0.5, edge)
+    corners = builder.nodes(wanted, edge)
     ids = _corner_ids(chosen, index)
-    offsets = builder.write(chosen, edge, ids, corners, centres)
-    table[tuple(chosen.T)] = offsets
-    cut = np.abs(centres.distance) - 0.5 * np.sqrt(3) * edge < band
+    # Only blocks that may be cut are looked at in their centre.
+    least = np.abs(corners.distance[ids]).argmin(axis=1)
+    nearest = ids[np.arange(len(ids)), least]
+    cut = np.abs(corners.distance[nearest]) - 0.5 * np.sqrt(3) * edge < band
     cut &= np.all((chosen + 1 > box[0]) & (chosen < box[1]), axis=1)
+    centres = builder.nodes(chosen[cut] + 0.5, edge, near=corners.record[nearest[cut]])
+    record = np.full(len(chosen), -1, dtype=np.int32)
+    record[cut] = centres.record
+    offsets = builder.write(chosen, edge, ids, corners, record)
+    table[tuple(chosen.T)] = offsets
+    kept = np.abs(centres.distance) - 0.5 * np.sqrt(3) * edge < band
+    cut[cut] = kept
     blocks = chosen[cut]
     active = np.zeros((len(blocks), CUT), dtype=np.bool_)
-    _active_loop(ids[cut], corners.distance, centres.distance[cut], edge, band, active)
+    _active_loop(ids[cut], corners.distance, centres.distance[kept], edge, band, active)
+    if builder.inside is None:
+        lists = builder.lists[-1] if len(builder.lists) == 1 else np.concatenate(builder.lists)
+        _near_loop(blocks, offsets[cut], lists, builder.exact.records, builder.origin, edge, band, active)
     cells = np.repeat(offsets[cut][:, None], CUT, axis=1)
     table[tuple(blocks.T)] = -1 - np.arange(len(blocks), dtype=np.int32)
     _fine_level(builder, table.shape, blocks, active, edge / BLOCK, cells)
@@ -232,12 +267,14 @@ def _corner_ids(low, index):
 
 
 @numba.njit(cache=True, nogil=True)
-def _node_loop(points, tree, normals, record, distance):
+def _node_loop(points, near, tree, normals, record, distance):
     boxes, starts, records = tree
     nodes, squares, closest, normal = np.empty(STACK, np.int64), np.empty(STACK), np.empty(3), np.empty(3)
     best = 0
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        # Where nothing nearer is named, the last answer bounds this one.
+        best = near[i] if near[i] >= 0 else best
         square = record_square(records, best, x, y, z)
         best, square = nearest_triangle(boxes, starts, records, x, y, z, best, square, nodes, squares)
         record[i] = best
@@ -275,6 +312,29 @@ def _active_loop(ids, distance, centre, edge, band, active):
 
 
 @numba.njit(cache=True, nogil=True)
+def _near_loop(blocks, offsets, lists, records, origin, edge, band, active):
+    """Unmark fine cells that the triangles of a block show to be out of the band, unless the surface is
+    folded."""
+    fine = edge / BLOCK
+    limit = (band + 0.5 * np.sqrt(3.0) * fine) ** 2
+    for i in range(len(blocks)):
+        first = offsets[i] + 1
+        count = lists[offsets[i]] & COUNT
+        if _folded(records, lists[first : first + count], count):
+            continue
+        for cell in range(CUT):
+            if not active[i, cell]:
+                continue
+            x = origin[0] + edge * blocks[i, 0] + (cell // (BLOCK * BLOCK) + 0.5) * fine
+            y = origin[1] + edge * blocks[i, 1] + (cell // BLOCK % BLOCK + 0.5) * fine
+            z = origin[2] + edge * blocks[i, 2] + (cell % BLOCK + 0.5) * fine
+            near = False
+            for m in range(first, first + count):
+                near = near or record_square(records, lists[m], x, y, z) < limit
+            active[i, cell] = near
+
+
+@numba.njit(cache=True, nogil=True)
 def _slot(block, cell, step, owner):
     """Block that owns a corner of a fine cell, and the corner's place in it."""
     a = cell // (BLOCK * BLOCK) + step // 4
@@ -303,26 +363,26 @@ def _fine_ids_loop(blocks, which, cell, owner, number, ids):
 
 
 @numba.njit(cache=True, nogil=True)
-def _list_loop(low, ids, nodes, centre, edge, unit, doubtful, out):
+def _list_loop(low, ids, nodes, centre, edge, unit, mesh, out):
     """Write the list of each cell; return the lengths used and whether all signs agree with the distances."""
     record, distance, doubt = nodes
     lists, offsets, rows, first_row = out
     used, mixed, sound = 0, 0, True
+    nodes_left, squares = np.empty(STACK, np.int64), np.empty(STACK)
     for i in range(len(ids)):
-        count, doubted = 0, False
+        listed = lists[used + 1 : used + 1 + MOST]
+        count = 0
+        doubted = False
         for k in range(9):
             n = centre[i] if k == 8 else record[ids[i, k]]
-            if n < 0:
-                continue
-            known = False
-            for m in range(count):
-                known = known or lists[used + 1 + m] == n
-            if not known:
-                lists[used + 1 + count] = n
-                count += 1
-                doubted = doubted or doubtful[n]
+            if n >= 0:
+                count = _add(listed, count, n)
             if k < 8:
                 doubted = doubted or doubt[ids[i, k]]
+        folded = abs(distance[ids[i, 0]]) < FOLD_REACH * edge and _folded(mesh[0][2], listed, count)
+        count = _probe(listed, count, folded, low[i], edge, mesh, nodes_left, squares)
+        for k in range(count):
+            doubted = doubted or mesh[3][listed[k]]
         state, bound = _cell_state(ids[i], distance, edge)
         if state == CROSSED:
             sound = sound and _signs_agree(ids[i], distance, edge)
@@ -337,6 +397,80 @@ def _list_loop(low, ids, nodes, centre, edge, unit, doubtful, out):
         if offsets[i] == used:
             used += size
     return used, mixed, sound
+
+
+@numba.njit(cache=True, nogil=True)
+def _add(listed, count, n):
+    """Append n to the first ``count`` triangles of a list if it is new and has room; return their number."""
+    for m in range(count):
+        if listed[m] == n:
+            return count
+    if count == MOST:
+        return count
+    listed[count] = n
+    return count + 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _folded(records, listed, count):
+    """Whether the triangles of a list face different ways."""
+    first = listed[0]
+    for m in range(1, count):
+        n, dot = listed[m], 0.0
+        for k in range(3):
+            dot += records[first, 9 + k] * records[n, 9 + k]
+        if dot < FOLD:
+            return True
+    return False
+
+
+@numba.njit(cache=True, nogil=True)
+def _probe(listed, count, folded, low, edge, mesh, nodes_left, squares):
+    """Add the triangles nearest to points inside the cell.
+
+    Where a corner's nearest point lies on an edge or a vertex, several triangles are equally near and the
+    corner names only one of them; inside the cell another may be nearer by far. A walk downhill over the
+    surface, from the nearest triangle listed, finds it; where the surface is folded the tree is asked.
+    """
+    (boxes, starts, records), across, origin, _ = mesh
+    for k in range(len(PROBES)):
+        x = origin[0] + edge * (low[0] + 0.5 + PROBES[k, 0])
+        y = origin[1] + edge * (low[1] + 0.5 + PROBES[k, 1])
+        z = origin[2] + edge * (low[2] + 0.5 + PROBES[k, 2])
+        best, square = listed[0], np.inf
+        for m in range(count):
+            s = record_square(records, listed[m], x, y, z)
+            if s < square:
+                best, square = listed[m], s
+        if folded:
+            end, _ = nearest_triangle(boxes, starts, records, x, y, z, best, square, nodes_left, squares)
+        else:
+            end = _walk(best, square, x, y, z, records, across)
+        if end != best:
+            count = _add(listed, count, end)
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _walk(best, square, x, y, z, records, across):
+    """Triangle at which a walk over neighbours, always to a nearer one, ends."""
+    for _ in range(WALK):
+        feature = record_feature(records, best, x, y, z)
+        if feature == FACE:
+            return best
+        step = best
+        # Edges BC and so on follow their first corner: those at corner k are k and k - 1.
+        first = feature - EDGE if feature < CORNER else feature - CORNER
+        for turn in range(1 if feature < CORNER else 2):
+            n = across[best, (first + 2 * turn) % 3]
+            if n >= 0:
+                s = record_square(records, n, x, y, z)
+                if s < square * (1 - 1e-9):
+                    step, square = n, s
+        if step == best:
+            return best
+        best = step
+    return best
 
 
 @numba.njit(cache=True, nogil=True)

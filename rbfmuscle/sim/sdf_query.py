@@ -109,17 +109,19 @@ def _square(n, x, y, z, records):
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _nearest_listed(x, y, z, entry, far_point, lists, far, records):
     """Nearest of the triangles of a cell: record and squared distance."""
-    best, square = -1, np.inf
-    for m in range(entry + 1, entry + 1 + (lists[entry] & COUNT)):
-        n = lists[m]
+    best, square = np.int32(-1), np.inf
+    first = np.uint32(entry)
+    for m in range(np.uint32(lists[first] & COUNT)):
+        # Unsigned, so that no index is tested for counting from the end.
+        n = np.uint32(lists[first + np.uint32(1) + m])
         s = _square(n, x, y, z, records)
-        if s < square:
-            best, square = n, s
+        best = np.int32(n) if s < square else best
+        square = min(s, square)
     if far_point:
         for m in range(len(far)):
             s = _square(far[m], x, y, z, records)
-            if s < square:
-                best, square = far[m], s
+            best = far[m] if s < square else best
+            square = min(s, square)
     return best, square
 
 
@@ -139,18 +141,21 @@ def _mixed_side(x, y, z, entry, lists, corners):
     return side
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _offset(n, x, y, z, records):
-    """Offset of a point from its nearest point of record n, in the record's frame, and the feature."""
+    """Offset of a point from its nearest point of record n, in the record's frame; and whether that is
+    inside."""
     qx, qy, qz = x - records[n, 0], y - records[n, 1], z - records[n, 2]
     u = qx * records[n, 3] + qy * records[n, 4] + qz * records[n, 5]
     v = qx * records[n, 6] + qy * records[n, 7] + qz * records[n, 8]
     w = qx * records[n, 9] + qy * records[n, 10] + qz * records[n, 11]
-    cx, cy = records[n, 13], records[n, 14]
-    du, dv, feature = nearest_in_frame(
-        records[n, 12], cx, cy, records[n, 15], 1.0 / (cx * cx + cy * cy), u, v
-    )
-    return du, dv, w, feature
+    bx, cx, cy = records[n, 12], records[n, 13], records[n, 14]
+    ex, eu = cx - bx, u - bx
+    inside = (v >= 0.0) & (eu * cy - v * ex <= 0.0) & (v * cx - u * cy <= 0.0)
+    if inside:
+        return 0.0, 0.0, w, True
+    du, dv, _ = nearest_in_frame(bx, cx, cy, records[n, 15], 1.0 / (cx * cx + cy * cy), u, v)
+    return du, dv, w, False
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -161,12 +166,20 @@ def _world(n, du, dv, dw, records):
     return gx, gy, gz
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _crossed_side(n, feature, du, dv, dw, records, edge_normals, vertex_normals, vertices):
-    """Projection of an offset from the surface on the pseudonormal of the feature it starts from."""
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _crossed_side(x, y, z, n, records, edge_normals, vertex_normals, vertices):
+    """Projection of the offset from an edge or a corner of record n on its pseudonormal."""
+    qx, qy, qz = x - records[n, 0], y - records[n, 1], z - records[n, 2]
+    u = qx * records[n, 3] + qy * records[n, 4] + qz * records[n, 5]
+    v = qx * records[n, 6] + qy * records[n, 7] + qz * records[n, 8]
+    w = qx * records[n, 9] + qy * records[n, 10] + qz * records[n, 11]
+    cx, cy = records[n, 13], records[n, 14]
+    du, dv, feature = nearest_in_frame(
+        records[n, 12], cx, cy, records[n, 15], 1.0 / (cx * cx + cy * cy), u, v
+    )
     if feature == FACE:
-        return dw
-    gx, gy, gz = _world(n, du, dv, dw, records)
+        return w
+    gx, gy, gz = _world(n, du, dv, w, records)
     if feature < CORNER:
         k = feature - EDGE
         return gx * edge_normals[n, k, 0] + gy * edge_normals[n, k, 1] + gz * edge_normals[n, k, 2]
@@ -174,44 +187,38 @@ def _crossed_side(n, feature, du, dv, dw, records, edge_normals, vertex_normals,
     return gx * vertex_normals[k, 0] + gy * vertex_normals[k, 1] + gz * vertex_normals[k, 2]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _signed(x, y, z, entry, n, square, lists, corners, records, edge_normals, vertex_normals, vertices):
-    """Signed distance to record n."""
-    state = lists[entry] >> SIDE & 3
-    distance = np.sqrt(square)
-    if state == OUTSIDE:
-        return distance
-    if state == INSIDE:
-        return -distance
-    if state == MIXED:
-        side = _mixed_side(x, y, z, entry, lists, corners)
-    else:
-        du, dv, dw, feature = _offset(n, x, y, z, records)
-        side = _crossed_side(n, feature, du, dv, dw, records, edge_normals, vertex_normals, vertices)
-    return distance if side >= 0.0 else -distance
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _slow_side(x, y, z, entry, n, lists, corners, records, edge_normals, vertex_normals, vertices):
+    """Positive outside: where neither the cell nor the side of a face tells."""
+    if lists[entry] >> SIDE & 3 == MIXED:
+        return _mixed_side(x, y, z, entry, lists, corners)
+    return _crossed_side(x, y, z, n, records, edge_normals, vertex_normals, vertices)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _unit_gradient(x, y, z, n, distance, least, records):
+def _unit_gradient(n, distance, du, dv, dw, least, records):
     """Gradient of the distance; the normal of the triangle where the offset is lost in rounding."""
-    if abs(distance) <= least:
-        return records[n, 9], records[n, 10], records[n, 11]
-    du, dv, dw, _ = _offset(n, x, y, z, records)
-    gx, gy, gz = _world(n, du, dv, dw, records)
-    return gx / distance, gy / distance, gz / distance
+    lost = abs(distance) <= least
+    scale = 0.0 if lost else 1.0 / distance
+    return _world(n, scale * du, scale * dv, 1.0 if lost else scale * dw, records)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _query(x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices):
-    """Signed distance and record; or a lower bound above ``reach`` and -1."""
+    """Signed distance, record, and offset in its frame; or a lower bound above ``reach`` and record -1."""
     entry, cell, far_point = _block_entry(x, y, z, grid[INVERSE], blocks)
     if entry < 0:
         entry = cells[-1 - entry, cell]
     bound = (lists[entry] >> BOUND) * grid[UNIT]
     if bound > reach:
-        return bound, -1
+        return bound, -1, 0.0, 0.0, 0.0
     n, square = _nearest_listed(x, y, z, entry, far_point, lists, far, records)
-    return _signed(x, y, z, entry, n, square, lists, corners, records, en, vn, vertices), n
+    du, dv, dw, inside = _offset(n, x, y, z, records)
+    state = lists[entry] >> SIDE & 3
+    side = 1.0 if state == OUTSIDE else (-1.0 if state == INSIDE else dw)
+    if state == MIXED or (state == CROSSED and not inside):
+        side = _slow_side(x, y, z, entry, n, lists, corners, records, en, vn, vertices)
+    return np.sqrt(square) if side >= 0.0 else -np.sqrt(square), n, du, dv, dw
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -244,10 +251,12 @@ def field_gradient(x, y, z, reach, grid, blocks, cells, lists, corners, far, rec
     Parameters as for :func:`field_value`. The gradient is zero where only a lower bound was asked for.
     """
     x, y, z = x - grid[0], y - grid[1], z - grid[2]
-    d, n = _query(x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices)
+    d, n, du, dv, dw = _query(
+        x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices
+    )
     if n < 0:
         return d, 0.0, 0.0, 0.0
-    gx, gy, gz = _unit_gradient(x, y, z, n, d, ROUNDING * grid[UNIT], records)
+    gx, gy, gz = _unit_gradient(n, d, du, dv, dw, ROUNDING * grid[UNIT], records)
     return d, gx, gy, gz
 
 
@@ -286,64 +295,56 @@ def _stage(points, pose, reach, grid, blocks, cells, lists, far, records, local,
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _finish(count, local, entry, best, square, offset, lists, corners, records, en, vn, vertices):
+    """Turn squared into signed distances, and fill the offsets from the surface in the frames of the
+    records."""
+    for n in range(count):
+        if best[n] < 0:
+            continue
+        x, y, z = local[n, 0], local[n, 1], local[n, 2]
+        du, dv, dw, inside = _offset(best[n], x, y, z, records)
+        offset[n, 0], offset[n, 1], offset[n, 2] = du, dv, dw
+        state = lists[entry[n]] >> SIDE & 3
+        side = 1.0 if state == OUTSIDE else (-1.0 if state == INSIDE else dw)
+        if state == MIXED or (state == CROSSED and not inside):
+            side = _slow_side(x, y, z, entry[n], best[n], lists, corners, records, en, vn, vertices)
+        d = np.sqrt(square[n])
+        square[n] = d if side >= 0.0 else -d
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def value_loop(points, pose, reach, out, data):
     """Distances (n,) of points in world coordinates."""
-    grid, blocks, cells, lists, corners, far, records, edge_normals, vertex_normals, vertices = data
-    local, entry = np.empty((STAGE, 3)), np.empty(STAGE, np.int32)
-    best, square = np.empty(STAGE, np.int32), np.empty(STAGE)
+    grid, blocks, cells, lists, corners, far, records, en, vn, vertices = data
+    local, offset, entry = np.empty((STAGE, 3)), np.empty((STAGE, 3)), np.empty(STAGE, np.int32)
+    best = np.empty(STAGE, np.int32)
     for start in range(0, len(points), STAGE):
-        some = points[start : start + STAGE]
-        _stage(some, pose, reach, grid, blocks, cells, lists, far, records, local, entry, best, square)
-        for n in range(len(some)):
-            x, y, z = local[n, 0], local[n, 1], local[n, 2]
-            d = square[n]
-            if best[n] >= 0:
-                d = _signed(
-                    x,
-                    y,
-                    z,
-                    entry[n],
-                    best[n],
-                    d,
-                    lists,
-                    corners,
-                    records,
-                    edge_normals,
-                    vertex_normals,
-                    vertices,
-                )
-            out[start + n] = d
+        some, d = points[start : start + STAGE], out[start : start + STAGE]
+        _stage(some, pose, reach, grid, blocks, cells, lists, far, records, local, entry, best, d)
+        _finish(len(some), local, entry, best, d, offset, lists, corners, records, en, vn, vertices)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def gradient_loop(points, pose, reach, distance, gradient, data):
     """Distances (n,) and gradients (n, 3), world axes, of points in world coordinates."""
-    grid, blocks, cells, lists, corners, far, records, edge_normals, vertex_normals, vertices = data
-    local, entry = np.empty((STAGE, 3)), np.empty(STAGE, np.int32)
-    best, square = np.empty(STAGE, np.int32), np.empty(STAGE)
+    grid, blocks, cells, lists, corners, far, records, en, vn, vertices = data
+    local, offset, entry = np.empty((STAGE, 3)), np.empty((STAGE, 3)), np.empty(STAGE, np.int32)
+    best = np.empty(STAGE, np.int32)
     least = ROUNDING * grid[UNIT]
     for start in range(0, len(points), STAGE):
-        some = points[start : start + STAGE]
-        _stage(some, pose, reach, grid, blocks, cells, lists, far, records, local, entry, best, square)
-        for n in range(len(some)):
-            x, y, z = local[n, 0], local[n, 1], local[n, 2]
-            d, gx, gy, gz = square[n], 0.0, 0.0, 0.0
-            if best[n] >= 0:
-                d = _signed(
-                    x,
-                    y,
-                    z,
-                    entry[n],
-                    best[n],
-                    d,
-                    lists,
-                    corners,
-                    records,
-                    edge_normals,
-                    vertex_normals,
-                    vertices,
-                )
-                gx, gy, gz = _unit_gradient(x, y, z, best[n], d, least, records)
-            distance[start + n] = d
-            for k in range(3):
-                gradient[start + n, k] = pose[k, 0] * gx + pose[k, 1] * gy + pose[k, 2] * gz
+        some, d = points[start : start + STAGE], distance[start : start + STAGE]
+        _stage(some, pose, reach, grid, blocks, cells, lists, far, records, local, entry, best, d)
+        _finish(len(some), local, entry, best, d, offset, lists, corners, records, en, vn, vertices)
+        _turn(len(some), pose, least, best, d, offset, records, gradient[start : start + STAGE])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _turn(count, pose, least, best, distance, offset, records, gradient):
+    """Gradients in world axes; zero where the bone is out of reach."""
+    for n in range(count):
+        gx, gy, gz = 0.0, 0.0, 0.0
+        if best[n] >= 0:
+            du, dv, dw = offset[n, 0], offset[n, 1], offset[n, 2]
+            gx, gy, gz = _unit_gradient(best[n], distance[n], du, dv, dw, least, records)
+        for k in range(3):
+            gradient[n, k] = pose[k, 0] * gx + pose[k, 1] * gy + pose[k, 2] * gz
