@@ -2,7 +2,6 @@
 
 from types import SimpleNamespace
 
-import igl
 import numba
 import numpy as np
 import trimesh
@@ -161,12 +160,6 @@ class ToyMuscle:
 
     def surface(self, contacts):
         return ModelSurface(self.x.copy(), self.faces, {"solver_penetration_max": 0.0})
-
-    def neighbour_distance(self, points):
-        distance, _, _, normals = igl.signed_distance(
-            points, self.x, self.faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-        )[:4]
-        return distance, normals
 
 
 def ellipsoid(half, centre=(0, 0, 0), *, subdivisions=2):

@@ -28,7 +28,7 @@ class HalfSpaces:
     normal : (c, 3) ndarray
         Unit direction of growing distance, world axes.
     source : (c,) ndarray of int
-        Index of the bone, or ``-1 - k`` for sliding neighbour k.
+        Index of the bone, or ``-1 - k`` for virtual edges of family k.
     """
 
     index: np.ndarray
@@ -65,7 +65,7 @@ class BoneContacts:
         self.poses = {name: np.eye(4) for name in self.names}
         self.margin = float(margin)
         self.allowed = {}
-        self.neighbours = []
+        self.neighbours, self.cuts = [], []
         self._known = {}
 
     def move(self, poses):
@@ -110,16 +110,16 @@ class BoneContacts:
             pose = self.poses[self.names[b]]
             distance = self.fields[b].distance(points, pose=pose, reach=reach)
             np.minimum(smallest, distance, out=smallest)
-        for neighbour in self.neighbours:
+        for neighbour in self.cuts:
             np.minimum(smallest, neighbour.cut(points), out=smallest)
         return smallest
 
     def nearest_with_gradient(self, points):
-        """Smallest distance (n,) over all bones and neighbours, exact, and its gradient (n, 3), world axes."""
+        """Smallest distance (n,) over bones and neighbours, exact, and its gradient (n, 3), world axes."""
         points = check_points(points)
         smallest, gradient = np.full(len(points), np.inf), np.zeros((len(points), 3))
         answers = [self._query(points, b) for b in self.reached]
-        answers += [neighbour.cut_with_gradient(points) for neighbour in self.neighbours]
+        answers += [neighbour.cut_with_gradient(points) for neighbour in self.cuts]
         for distance, direction in answers:
             closer = distance < smallest
             smallest[closer], gradient[closer] = distance[closer], direction[closer]
@@ -157,7 +157,9 @@ class BoneContacts:
         points = check_points(points)
         parts = [(*found, b) for b, found in enumerate(self.query(points, reach)) if len(found[0])]
         for k, neighbour in enumerate(self.neighbours):
-            parts.extend((*found, -1 - k) for found in neighbour.contacts(points, reach) if len(found[0]))
+            found = neighbour.contacts(points, reach)
+            if len(found[0]):
+                parts.append((*found, -1 - k))
         if not parts:
             return HalfSpaces(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64))
         index, gap, normal = (np.concatenate([part[k] for part in parts]) for k in range(3))

@@ -50,6 +50,8 @@ class Lane:
         self.tolerance = scene.length(TOUCH)
         self.times, self.events = {}, {}
         self.frame = 0
+        self.path, self.saved = None, None
+        self.measured = {}
 
     @contextmanager
     def timed(self, stage):
@@ -68,15 +70,26 @@ class Lane:
 
     def step(self, before, after):
         """One sub-step, watched for tunnelling where the scene asks for it."""
-        poses = bone_poses(self.scene, before), bone_poses(self.scene, after)
-        if self.detect is None:
-            self._move(poses, after)
-            return
-        state, start = self.model.snapshot(), self.model.contact_points().copy()
-        self._move(poses, after)
-        crossings = self._crossings(start, poses)
-        if crossings:
-            self._correct(state, start, poses, before, after, crossings)
+        self.begin(before, after)
+        self.finish()
+
+    def begin(self, before, after):
+        """First half of a sub-step: the bones move, the muscle goes along."""
+        self.path, poses = (before, after), (bone_poses(self.scene, before), bone_poses(self.scene, after))
+        self.saved = None
+        if self.detect is not None:
+            self.saved = self.model.snapshot(), self.model.contact_points().copy(), poses
+        self._predict(poses)
+
+    def finish(self):
+        """Second half: the muscle settles, and what passed through a bone is brought back."""
+        before, after = self.path
+        self.solve(after)
+        if self.saved is not None:
+            state, start, poses = self.saved
+            crossings = self._crossings(start, poses)
+            if crossings:
+                self._correct(state, start, poses, before, after, crossings)
 
     def solve(self, coordinates):
         """Solve, and refuse what is not finite.
@@ -99,9 +112,11 @@ class Lane:
             )
 
     def show(self):
-        """The model's surface, timed."""
+        """The model's surface, timed, with what was measured beside it."""
         with self.timed("surface"):
-            return self.model.surface(self.contacts)
+            surface = self.model.surface(self.contacts)
+        surface.quantities.update(self.measured)
+        return surface
 
     def report(self, bone, count, action):
         """Note an event of the present frame; of one kind the most points at one time are kept."""
@@ -116,13 +131,10 @@ class Lane:
         self.times, self.events = {}, {}
         return times, events
 
-    def _move(self, poses, after, crossings=(), start=None):
+    def _predict(self, poses):
         self.contacts.move(poses[1])
         with self.timed("predict"):
             self.model.predict(*poses)
-        if crossings:
-            turn_back(self.model, crossings, start, *poses, self.contacts.names)
-        self.solve(after)
 
     def _crossings(self, start, poses, *, flag=True):
         with self.timed("tunnelling"):
@@ -139,7 +151,9 @@ class Lane:
             self._report_all(crossings, "reported")
             return
         self.model.restore(state)
-        self._move(poses, after, crossings, start)
+        self._predict(poses)
+        turn_back(self.model, crossings, start, *poses, self.contacts.names)
+        self.solve(after)
         remaining = self._crossings(start, poses, flag=False)
         if not remaining:
             self._report_all(crossings, "rotated")

@@ -1,5 +1,6 @@
 """The frame loop: any muscle model against any bones, and what a model must offer to be run by it."""
 
+import itertools
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -108,9 +109,6 @@ class MuscleModel(Protocol):
     def surface(self, contacts: BoneContacts) -> ModelSurface:
         """Surface as it is shown: closed and outward."""
 
-    def neighbour_distance(self, points: np.ndarray) -> tuple:
-        """Signed distance (n,) of points to this muscle and its unit gradient (n, 3), for sliding muscles."""
-
 
 class _Crew:
     """Runs the lanes: side by side with one thread each, or a single one with all threads."""
@@ -189,13 +187,14 @@ def _run(scene, lanes, crew, surfaces, written):
     start = time.perf_counter()
     with crew.one_thread_each():
         crew.each(lambda lane: settle_rest(lane, here), lanes)
+        sliding = _sliding(scene, lanes)
     wall = time.perf_counter() - start
     for index, coordinates in enumerate(scene.motion.frames):
         start = time.perf_counter()
         shown = written is None or index in written
         with crew.one_thread_each():
-            _go(scene, lanes, crew, index, [here, *split_step(scene, here, coordinates)])
-            skins = crew.each(Lane.show, lanes) if shown and surfaces else []
+            _go(lanes, crew, sliding, index, [here, *split_step(scene, here, coordinates)])
+            skins = _show(lanes, crew, sliding) if shown and surfaces else []
         wall += time.perf_counter() - start
         if shown:
             yield _frame(scene, lanes, index, coordinates, skins, wall)
@@ -203,10 +202,38 @@ def _run(scene, lanes, crew, surfaces, written):
         here = coordinates
 
 
-def _go(scene, lanes, crew, index, stops):
+def _sliding(scene, lanes):
+    """The links between muscles, or None where the scene asks for none."""
+    if scene.sliding is None:
+        return None
+    from rbfmuscle.sim.sliding import Sliding
+
+    return Sliding(scene, lanes)
+
+
+def _go(lanes, crew, sliding, index, stops):
     for lane in lanes:
         lane.frame = index
-    crew.each(lambda lane: lane.advance(stops), lanes)
+    if sliding is None:
+        crew.each(lambda lane: lane.advance(stops), lanes)
+        return
+    for before, after in itertools.pairwise(stops):
+        crew.each(lambda lane: _begin(lane, sliding, before, after), lanes)  # noqa: B023
+        crew.each(sliding.update, lanes)
+        crew.each(Lane.finish, lanes)
+
+
+def _begin(lane, sliding, before, after):
+    lane.begin(before, after)
+    sliding.refresh(lane)
+
+
+def _show(lanes, crew, sliding):
+    if sliding is not None:
+        crew.each(sliding.refresh, lanes)
+        for lane, measured in zip(lanes, crew.each(sliding.measure, lanes)):
+            lane.measured = measured
+    return crew.each(Lane.show, lanes)
 
 
 def _frame(scene, lanes, index, coordinates, skins, wall):

@@ -72,7 +72,7 @@ def sweep_paths(field, start, end, *, tolerance, angle=RIGHT_ANGLE_AND_HALF):
     Sweep
     """
     length = np.linalg.norm(end - start, axis=1)
-    distance = field.distance(start)
+    distance = field.distance(start, reach=float(length.max(initial=0.0)))
     index = np.flatnonzero(distance < length)
     ends = distance[index] + field.distance(end[index])
     index = index[ends <= length[index] + tolerance]
