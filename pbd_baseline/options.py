@@ -6,7 +6,6 @@ from pydantic import Field
 
 from rbfmuscle.sim.options import NotNegative, Positive, Table
 
-METHODS = ("pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
 # Sweeps a solve: the authors' three for PBD; sub-steps of one sweep for XPBD.
 ITERATIONS = {"pbd": 3, "xpbd": 10, "arap-pbd": 10, "arap-volume": 6, "arap-interleaved": 6}
 
@@ -21,9 +20,9 @@ class PBDOptions(Table):
     all over a time that passes by one for each two degrees of motion. ``arap_reach`` is how far one global
     step carries, as a share of the muscle's diagonal. ``fibre_exponent`` is a of k = (1 - |cos|)^a; edges
     longer than ``soft_length`` medians are softer in inverse proportion (0: none); those shorter or longer
-    than ``limits`` times their rest length are hard in any case. ``prediction``: vertices are carried along by
-    the bones (see ``pbd_baseline.weights``), or keep their velocity times ``damping`` as the authors' do, or
-    stay (none). ``response`` to several bones: the sum of the ways out, or the longest alone.
+    than ``limits`` times their rest length are hard in any case. ``prediction``: vertices are carried along
+    by the bones (see ``pbd_baseline.weights``), or keep their velocity times ``damping`` as the authors' do,
+    or stay (none). ``response`` to several bones: the sum of the ways out, or the longest alone.
     """
 
     method: Literal["pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved"] = "pbd"

@@ -6,14 +6,14 @@ import numpy as np
 
 from pbd_baseline.constraints import VolumeConstraint
 from pbd_baseline.fibres import fibre_directions, swelling_room
-from pbd_baseline.topology import Topology, curve_order
+from pbd_baseline.topology import Topology, cache_order
 from pbd_baseline.weights import even_weights
 from rbfmuscle.validation import SceneError
 
 
 @dataclass(frozen=True)
 class Rest:
-    """A muscle at rest, its vertices renumbered along a space-filling curve.
+    """A muscle at rest, its vertices renumbered for the cache.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class Rest:
         """
         if not muscle.attachments:
             raise SceneError(f"muscle {muscle.name!r} has no attachment, give attach a place on two bones")
-        order = curve_order(np.asarray(muscle.mesh.vertices, dtype=np.float64))
+        order = cache_order(np.asarray(muscle.mesh.faces), len(muscle.mesh.vertices))
         place = np.argsort(order)
         vertices = np.ascontiguousarray(muscle.mesh.vertices, dtype=np.float64)[order]
         faces = _sorted_faces(place[np.asarray(muscle.mesh.faces)])

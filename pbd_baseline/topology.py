@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+import scipy.sparse as sparse
+from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from rbfmuscle.validation import MeshError, check_mesh
 
@@ -143,21 +145,23 @@ def _colour_loop(members, taken, colours):
             break
 
 
-def curve_order(points):
-    """Order of points along a Morton curve, so that neighbours in space are neighbours in memory.
+def cache_order(faces, count):
+    """Order of vertices in which neighbours lie near each other in memory (reverse Cuthill and McKee 1969).
+
+    It follows from the connections alone, so a mesh that is moved, turned or scaled keeps its order of sweeps
+    and with it its result.
 
     Parameters
     ----------
-    points : (n, 3) ndarray
+    faces : (m, 3) ndarray of int
+    count : int
+        Number of vertices.
 
     Returns
     -------
-    (n,) ndarray of int
+    (count,) ndarray of int
     """
-    low, extent = points.min(axis=0), np.ptp(points, axis=0).max()
-    cell = np.clip((points - low) / max(extent, 1e-300) * 1023.0, 0, 1023).astype(np.int64)
-    code = np.zeros(len(points), dtype=np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= (cell[:, axis] >> bit & 1) << (3 * bit + axis)
-    return np.argsort(code, kind="stable")
+    rows = np.concatenate([faces[:, 0], faces[:, 1], faces[:, 2]])
+    columns = np.concatenate([faces[:, 1], faces[:, 2], faces[:, 0]])
+    graph = sparse.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    return reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).astype(np.int64)

@@ -1,5 +1,7 @@
 """Known answers of the mesh baseline: connections, colours, constraints, volume."""
 
+import itertools
+
 import numpy as np
 import pytest
 import trimesh
@@ -30,7 +32,7 @@ def rng():
 
 
 def test_each_undirected_edge_is_found_once_with_its_two_wings(body):
-    vertices, faces, topology = body
+    _, faces, topology = body
     assert len(topology.edges) == 3 * len(faces) // 2
     assert len(np.unique(topology.edges, axis=0)) == len(topology.edges)
     triangles = {tuple(np.roll(f, -int(np.argmin(f)))) for f in faces}
@@ -59,7 +61,7 @@ def test_constraints_of_one_colour_share_no_vertex(body):
     members = np.column_stack([topology.edges, topology.wings])
     order, start = colour(members, topology.vertex_count)
     assert sorted(order) == list(range(len(members)))
-    for low, high in zip(start[:-1], start[1:]):
+    for low, high in itertools.pairwise(start):
         used = members[order[low:high]].ravel()
         assert len(np.unique(used)) == len(used)
 
@@ -70,7 +72,7 @@ def test_order_within_a_colour_changes_nothing(body, rng):
     constraint = EdgeConstraint(vertices, topology.edges)
     one, two, mass = start.copy(), start.copy(), np.ones(len(start))
     constraint.project(one, mass)
-    for low, high in zip(constraint.colours[:-1], constraint.colours[1:]):
+    for low, high in itertools.pairwise(constraint.colours):
         constraint.edges[low:high] = constraint.edges[low:high][::-1].copy()
         constraint.rest[low:high] = constraint.rest[low:high][::-1].copy()
     constraint.project(two, mass)
@@ -163,7 +165,7 @@ def test_ellipsoid_volume_converges_as_the_formula_page_says():
     for _ in range(4):
         errors.append(abs(constraint.volume(points) / constraint.rest - 1.0))
         constraint.project(points, np.ones(len(points)))
-    # 0.19, 1e-2, 4e-5, 3e-10: quadratic, and a sixth of the gradient forgotten would leave 0.16 after one step
+    # 0.19, 1e-2, 4e-5, 3e-10: quadratic; the gradient without its sixth would leave 0.16 after one step
     assert errors[0] == pytest.approx(0.19)
     assert errors[1] < 1.5e-2
     assert errors[2] < 1e-4
@@ -182,10 +184,8 @@ def test_restore_leaves_points_where_the_direction_cannot_help(body):
     vertices, faces, _ = body
     constraint = VolumeConstraint(vertices, faces)
     points = 0.9 * vertices
-    assert (
-        constraint.restore(points, np.ones_like(points)) == pytest.approx(0.0, abs=1e-9)
-        or np.isfinite(points).all()
-    )
+    constraint.restore(points, np.ones_like(points))  # a translation changes no volume
+    np.testing.assert_array_equal(points, 0.9 * vertices)
 
 
 def test_factor_agrees_with_a_dense_solve(rng):
