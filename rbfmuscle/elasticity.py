@@ -8,7 +8,7 @@ from rbfmuscle.constraints import contact_gram, solve_contact_forces
 CONTACT_SWEEPS = 60
 CONTACT_ROUNDS = 6
 CONTACT_TOLERANCE = 2e-5  # of the muscle's size: some micrometres
-REACH_MARGIN = 0.01  # of the muscle's size
+REACH_MARGIN = 0.003  # of the muscle's size
 
 
 @numba.njit(cache=True, nogil=True)

@@ -338,6 +338,8 @@ class _Projector:
                 break
             # What was pushed off one bone vertex must not end in the bone beside it.
             inside = moved[self._cut_value(self.vertices[moved]) < 0.0]
+            if len(inside) == 0:
+                break
             distance, outward = self._cut(self.vertices[inside])
             size = np.maximum(np.einsum("ij,ij->i", outward, outward), 1e-12)
             self.vertices[inside] -= (distance / size)[:, None] * outward

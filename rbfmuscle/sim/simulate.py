@@ -4,7 +4,6 @@ import itertools
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -111,20 +110,20 @@ class MuscleModel(Protocol):
 
 
 class _Crew:
-    """Runs the lanes: side by side with one thread each, or a single one with all threads."""
+    """Runs the lanes side by side, each with one thread."""
 
     def __init__(self, count):
+        from threadpoolctl import ThreadpoolController
+
+        self.blas = ThreadpoolController()
         self.workers = min(count, numba.get_num_threads())
         self.pool = None
         if self.workers > 1:
-            from threadpoolctl import ThreadpoolController
-
-            self.blas = ThreadpoolController()
             self.pool = ThreadPoolExecutor(self.workers, initializer=numba.set_num_threads, initargs=(1,))
 
     def one_thread_each(self):
-        """Context in which BLAS leaves the cores to the muscles; a single muscle keeps them all."""
-        return self.blas.limit(limits=1, user_api="blas") if self.pool else nullcontext()
+        """Context in which BLAS uses one thread: its workers spin, and take the cores from the loops."""
+        return self.blas.limit(limits=1, user_api="blas")
 
     def each(self, act, items):
         """``[act(item) for item in items]``, in parallel where that pays."""
