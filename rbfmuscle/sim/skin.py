@@ -1,4 +1,4 @@
-"""A muscle's surface as its neighbours see it: its carried mesh, whose search structure is refitted."""
+"""A muscle's surface as its neighbours see it: its carried mesh, found through cells that are refilled."""
 
 import numba
 import numpy as np
@@ -6,16 +6,18 @@ from scipy.spatial import cKDTree
 
 
 class Skin:
-    """Signed distance to a model's carried mesh.
+    """Signed distance to a model's carried mesh, for points near it.
 
-    The nearest vertex is found by a tree over the vertices now; the nearest point of the surface lies in one
-    of the triangles around it, up to the square of an edge over the radius of curvature. Signs and directions
-    come from vertex normals, interpolated, so that they vary smoothly.
+    The nearest vertex is found through a uniform grid of cells as wide as the reach; the nearest point of the
+    surface lies in one of the triangles around it, up to the square of an edge over the radius of curvature.
+    Signs and directions come from vertex normals, interpolated, so that they vary smoothly.
 
     Parameters
     ----------
     model : MuscleModel
         In its rest state.
+    reach : float
+        Greatest distance that will be asked for [scene unit].
 
     Attributes
     ----------
@@ -25,7 +27,7 @@ class Skin:
     box : (2, 3) ndarray
     """
 
-    def __init__(self, model):
+    def __init__(self, model, reach):
         self.model = model
         vertices, faces = model.carried_mesh()
         self.faces = np.ascontiguousarray(faces, dtype=np.int64)
@@ -33,6 +35,9 @@ class Skin:
         order = np.argsort(corner, kind="stable")
         self.ring = order // 3
         self.start = np.searchsorted(corner[order], np.arange(len(vertices) + 1))
+        sides = vertices[self.faces] - vertices[np.roll(self.faces, 1, axis=1)]
+        self.edge = float(np.linalg.norm(sides, axis=2).mean())
+        self.cell = float(reach) + self.edge
         nearest = cKDTree(model.contact_points()).query(vertices)[1]
         self.fixed = np.asarray(model.contact_bone)[nearest] >= 0
         self.refresh()
@@ -43,11 +48,20 @@ class Skin:
         self.normals = np.zeros_like(self.vertices)
         _normals_loop(self.vertices, self.faces, self.normals)
         self.box = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
-        # A tree that is not balanced builds three times as fast and answers as quickly on a surface.
-        self.tree = cKDTree(self.vertices, leafsize=24, balanced_tree=False, compact_nodes=False)
+        self.shape = (np.ceil((self.box[1] - self.box[0]) / self.cell).astype(np.int64) + 1).clip(1)
+        self.first = np.zeros(int(np.prod(self.shape)) + 1, dtype=np.int64)
+        self.members = np.empty(len(self.vertices), dtype=np.int64)
+        _fill_loop(self.vertices, self.box[0], self.cell, self.shape, self.first, self.members)
 
-    def query(self, points, reach):
-        """Distances of the points nearer to a vertex than ``reach`` and an edge.
+    def query(self, points, which, reach):
+        """Distances of those points that are nearer than ``reach``.
+
+        Parameters
+        ----------
+        points : (n, 3) ndarray
+        which : (n,) ndarray of bool
+            Points that are asked for.
+        reach : float
 
         Returns
         -------
@@ -60,25 +74,69 @@ class Skin:
         nearest : (c,) ndarray of int
             Nearest vertex.
         """
-        if len(points) == 0:
-            return np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64)
-        nearest = self.tree.query(points, distance_upper_bound=1.5 * reach)[1]
-        index = np.flatnonzero(nearest < len(self.vertices))
-        nearest = nearest[index]
-        distance, normal = np.empty(len(index)), np.empty((len(index), 3))
+        index, nearest = np.empty(len(points), dtype=np.int64), np.empty(len(points), dtype=np.int64)
+        count = _nearest_loop(
+            points, which, self.vertices, self.box, self.cell, self.shape, self.first, self.members,
+            min(reach + self.edge, self.cell), index, nearest,
+        )  # fmt: skip
+        index, nearest = index[:count], nearest[:count]
+        distance, normal = np.empty(count), np.empty((count, 3))
         _distance_loop(
-            points[index],
-            nearest,
-            self.vertices,
-            self.normals,
-            self.faces,
-            self.start,
-            self.ring,
-            distance,
-            normal,
-        )
+            points, index, nearest, self.vertices, self.normals, self.faces, self.start, self.ring,
+            distance, normal,
+        )  # fmt: skip
         near = distance < reach
         return index[near], distance[near], normal[near], nearest[near]
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill_loop(vertices, origin, cell, shape, first, members):
+    """Sort the vertices by cell: those of cell c are members[first[c] : first[c + 1]]."""
+    where = np.empty(len(vertices), dtype=np.int64)
+    for v in range(len(vertices)):
+        c = 0
+        for k in range(3):
+            c = c * shape[k] + int((vertices[v, k] - origin[k]) / cell)
+        where[v] = c
+        first[c + 1] += 1
+    for c in range(len(first) - 1):
+        first[c + 1] += first[c]
+    filled = first[:-1].copy()
+    for v in range(len(vertices)):
+        members[filled[where[v]]] = v
+        filled[where[v]] += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest_loop(points, which, vertices, box, cell, shape, first, members, bound, index, nearest):
+    """Nearest vertex within ``bound``, at most a cell, of each point asked for; return how many have one."""
+    count = 0
+    low, high = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)
+    for p in range(len(points)):
+        if not which[p]:
+            continue
+        outside = False
+        for k in range(3):
+            outside = outside or points[p, k] < box[0, k] - bound or points[p, k] > box[1, k] + bound
+            c = int(np.floor((points[p, k] - box[0, k]) / cell))
+            low[k], high[k] = max(c - 1, 0), min(c + 2, shape[k])
+        if outside:
+            continue
+        least, best = bound * bound, -1
+        for a in range(low[0], high[0]):
+            for b in range(low[1], high[1]):
+                row = (a * shape[1] + b) * shape[2]
+                for m in range(first[row + low[2]], first[row + max(high[2], low[2])]):
+                    v = members[m]
+                    squared = 0.0
+                    for k in range(3):
+                        squared += (points[p, k] - vertices[v, k]) ** 2
+                    if squared < least:
+                        least, best = squared, v
+        if best >= 0:
+            index[count], nearest[count] = p, best
+            count += 1
+    return count
 
 
 @numba.njit(cache=True, nogil=True)
@@ -98,11 +156,12 @@ def _normals_loop(vertices, faces, normals):
 
 
 @numba.njit(cache=True, nogil=True)
-def _distance_loop(points, nearest, vertices, normals, faces, start, ring, distance, normal):
+def _distance_loop(points, index, nearest, vertices, normals, faces, start, ring, distance, normal):
     weights, best = np.empty(3), np.empty(3)
-    for p in range(len(points)):
+    for q in range(len(index)):
+        p = index[q]
         least, face = np.inf, -1
-        for r in range(start[nearest[p]], start[nearest[p] + 1]):
+        for r in range(start[nearest[q]], start[nearest[q] + 1]):
             f = ring[r]
             _closest(points[p], vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]], weights)
             squared = 0.0
@@ -120,30 +179,33 @@ def _distance_loop(points, nearest, vertices, normals, faces, start, ring, dista
             for corner in range(3):
                 n += best[corner] * normals[faces[face, corner], k]
                 at += best[corner] * vertices[faces[face, corner], k]
-            normal[p, k] = n
+            normal[q, k] = n
             size += n * n
             side += n * (points[p, k] - at)
         for k in range(3):
-            normal[p, k] /= max(np.sqrt(size), 1e-300)
-        distance[p] = np.sqrt(least) if side >= 0.0 else -np.sqrt(least)
+            normal[q, k] /= max(np.sqrt(size), 1e-300)
+        distance[q] = np.sqrt(least) if side >= 0.0 else -np.sqrt(least)
+
+
+@numba.njit(cache=True, nogil=True)
+def _dot(a, b, p, q):
+    """(b - a) . (p - q), without temporary arrays."""
+    return (b[0] - a[0]) * (p[0] - q[0]) + (b[1] - a[1]) * (p[1] - q[1]) + (b[2] - a[2]) * (p[2] - q[2])
 
 
 @numba.njit(cache=True, nogil=True)
 def _closest(p, a, b, c, weights):
     """Barycentric weights of the point of a triangle nearest to p (Ericson 2005, section 5.1.5)."""
-    ab, ac, ap = b - a, c - a, p - a
-    d1, d2 = ab @ ap, ac @ ap
+    d1, d2 = _dot(a, b, p, a), _dot(a, c, p, a)
     weights[:] = 0.0
     if d1 <= 0.0 and d2 <= 0.0:
         weights[0] = 1.0
         return
-    bp = p - b
-    d3, d4 = ab @ bp, ac @ bp
+    d3, d4 = _dot(a, b, p, b), _dot(a, c, p, b)
     if d3 >= 0.0 and d4 <= d3:
         weights[1] = 1.0
         return
-    cp = p - c
-    d5, d6 = ab @ cp, ac @ cp
+    d5, d6 = _dot(a, b, p, c), _dot(a, c, p, c)
     if d6 >= 0.0 and d5 <= d6:
         weights[2] = 1.0
         return

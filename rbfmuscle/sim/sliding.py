@@ -5,8 +5,8 @@ the neighbour's surface; within a strip it is free, so that it slides; beyond a 
 
 All muscles predict first; then each sees its neighbours' predicted surfaces, and what it may do is written as
 planes through its own predicted points. Each of two muscles may use half of the gap between them, or gives
-way by half of the overlap, so both stay on their own side of one and the same surface whatever the other does:
-the answer does not depend on the order in which muscles are solved, nor on how many run at a time.
+way by half of the overlap, so both stay on their own side of one surface whatever the other does: the answer
+does not depend on the order in which muscles are solved, nor on how many run at a time.
 """
 
 import numpy as np
@@ -16,9 +16,9 @@ from rbfmuscle.sim.skin import Skin
 from rbfmuscle.validation import SceneError
 
 # Defaults [mm]: nearer than THRESHOLD at rest is linked; STRIP beyond is free; RELEASE beyond that lets go.
-THRESHOLD, STRIP, RELEASE = 2.0, 1.0, 6.0
+THRESHOLD, STRIP, RELEASE = 2.0, 1.0, 2.0
 # Neighbours are looked for within this distance [mm] of the predicted points.
-SEARCH = 10.0
+SEARCH = 5.0
 # Distance [mm] between the surfaces as solved below which they are cut, and how deep an overlap may be.
 CUT_FROM, CUT_DEPTH = 1.5, 6.0
 
@@ -108,22 +108,19 @@ class Link:
         value, gradient = np.full(len(points), np.inf), np.zeros((len(points), 3))
         if self.zone is None or not self.limits.cut:
             return value, gradient
-        inside = np.flatnonzero(np.all((points > self.zone[0]) & (points < self.zone[1]), axis=1))
-        near, theirs, normal, _ = self.other.query(points[inside], self.limits.cut_depth)
-        inside = inside[near]
-        near, ours, own, _ = self.skin.query(points[inside], self.limits.cut_depth)
-        value[inside[near]] = 0.5 * (theirs[near] - ours)
-        gradient[inside[near]] = 0.5 * (normal[near] - own)
+        zone, depth = self.zone, self.limits.cut_depth
+        inside = np.all((points > zone[0]) & (points < zone[1]), axis=1)
+        near, theirs, normal, _ = self.other.query(points, inside, depth)
+        inside[:] = False
+        inside[near] = True
+        both, ours, own, _ = self.skin.query(points, inside, depth)
+        match = np.searchsorted(near, both)
+        value[both] = 0.5 * (theirs[match] - ours)
+        gradient[both] = 0.5 * (normal[match] - own)
         return value, gradient
 
     def _near(self):
-        points = self.lane.model.contact_points()
-        box = self.other.box
-        reach = self.limits.search
-        inside = np.all((points > box[0] - reach) & (points < box[1] + reach), axis=1)
-        inside = np.flatnonzero(inside & self.free)
-        near, distance, normal, nearest = self.other.query(points[inside], reach)
-        return inside[near], distance, normal, nearest
+        return self.other.query(self.lane.model.contact_points(), self.free, self.limits.search)
 
     def _slip(self, points, index, normal, nearest):
         if self.before is None or len(index) == 0:
@@ -192,7 +189,10 @@ class Sliding:
         self.links = {lane.name: [] for lane in lanes}
         self.bone_links = {lane.name: [] for lane in lanes}
         pairs = _pairs(scene, [lane.name for lane in lanes], limits.search)
-        self.skins = {lane.name: Skin(lane.model) for lane in lanes if any(lane.name in p for p in pairs)}
+        reach = max(limits.search, limits.cut_depth)
+        self.skins = {
+            lane.name: Skin(lane.model, reach) for lane in lanes if any(lane.name in p for p in pairs)
+        }
         for lane in lanes:
             for other in lanes:
                 if frozenset((lane.name, other.name)) in pairs:
