@@ -44,7 +44,11 @@ def check_scene(scene):
         except RBFMuscleError as error:
             findings.append(Finding("error", scene.name, str(error)))
     findings.extend(_rest_overlaps(scene))
-    findings.extend(_bone_collisions(scene))
+    try:
+        findings.extend(bone_findings(scene))
+    except SceneError as error:
+        if all(str(error) != finding.message for finding in findings):
+            findings.append(Finding("error", scene.name, str(error)))
     order = {"error": 0, "warning": 1, "note": 2}
     return sorted(findings, key=lambda finding: order[finding.level])
 
@@ -174,13 +178,10 @@ def _pair_depths(scene, poses):
     return depths
 
 
-def _bone_collisions(scene):
+def bone_findings(scene):
+    """Return a warning for each pair of bones that the motion drives into each other."""
     worst = {}
-    try:
-        collisions = bone_collisions(scene)
-    except SceneError:
-        return []  # the motion itself is wrong, which validate() reports
-    for frame, first, second, depth in collisions:
+    for frame, first, second, depth in bone_collisions(scene):
         start, deepest = worst.get((first, second), (frame, 0.0))
         worst[first, second] = (start, max(deepest, depth))
     return [

@@ -1,0 +1,31 @@
+"""``rbfmuscle cache``: distance fields of bones kept on disk."""
+
+from cyclopts import App
+
+cache_app = App(name="cache", help="Bone distance fields kept on disk.")
+
+
+@cache_app.command
+def path():
+    """Print the folder of the cache."""
+    from rbfmuscle.sim.sdf_cache import cache_path
+
+    print(cache_path())
+
+
+@cache_app.command(name="list")
+def list_entries():
+    """Print the entries of the cache and their sizes."""
+    from rbfmuscle.sim.sdf_cache import cache_list
+
+    for entry in cache_list():
+        print(f"{entry['name']}  {entry['bytes'] / 1e6:.1f} MB")
+
+
+@cache_app.command
+def clear():
+    """Remove all entries of the cache."""
+    from rbfmuscle.sim.sdf_cache import cache_clear
+
+    count, size = cache_clear()
+    print(f"{count} entries removed, {size / 1e6:.1f} MB")

@@ -1,0 +1,57 @@
+"""``rbfmuscle check``: a scene file and its meshes, nothing solved."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from rbfmuscle.validation import SceneError, UsageError
+
+
+def check(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False):
+    """Check a scene file and its meshes; nothing is solved.
+
+    Parameters
+    ----------
+    scene
+        Scene file (TOML).
+    as_json
+        Print JSON and nothing else.
+    """
+    from rbfmuscle.models import MODEL_NAMES
+    from rbfmuscle.sim.options import did_you_mean
+    from rbfmuscle.sim.scene import Scene
+
+    loaded = Scene.load(scene)
+    for muscle in loaded.muscles:
+        if muscle.model not in MODEL_NAMES:
+            hint = did_you_mean(muscle.model, MODEL_NAMES)
+            raise UsageError(f"{scene}: muscle {muscle.name!r}: unknown model {muscle.model!r}, {hint}")
+    findings = loaded.check()
+    errors = [finding for finding in findings if finding.level == "error"]
+    if as_json:
+        shown = [{"level": f.level, "place": f.place, "message": f.message} for f in findings]
+        print(json.dumps({"scene": loaded.resolved(), "findings": shown}, indent=1))
+    else:
+        _print_scene(loaded)
+        for finding in findings:
+            print(finding)
+        print("not usable" if errors else "usable", file=sys.stderr)
+    return SceneError.exit_code if errors else 0
+
+
+def _print_scene(scene):
+    print(f"{scene.name}: {len(scene.motion)} frames, lengths in {scene.units}")
+    for bone in scene.bones:
+        print(f"  bone {bone.name}: {len(bone.mesh.vertices)} vertices, {len(bone.mesh.faces)} triangles")
+    for joint in scene.joints:
+        print(f"  joint {joint.name}: {joint.parent} to {joint.child}, {', '.join(joint.axes)}")
+    for muscle in scene.muscles:
+        held = ", ".join(f"{len(a.vertices)} on {a.bone}" for a in muscle.attachments)
+        volume = muscle.mesh.volume / scene.length(10.0) ** 3
+        print(
+            f"  muscle {muscle.name}: model {muscle.model}, {len(muscle.mesh.vertices)} vertices, "
+            f"{volume:.4g} cm3, attached: {held}"
+        )

@@ -1,0 +1,43 @@
+"""Progress of a run on stderr: a bar on a terminal, else a line now and then."""
+
+import sys
+import time
+
+EVERY = 10.0  # seconds between lines where there is no terminal
+
+
+class Progress:
+    """Context manager; call it with (done, total)."""
+
+    def __init__(self, title):
+        self.title = title
+        self.bar = None
+
+    def __enter__(self):
+        self.last = time.monotonic()
+        if sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+            from rich.progress import Progress as Bar
+
+            columns = (
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeRemainingColumn(),
+            )
+            self.bar = Bar(*columns, console=Console(stderr=True))
+            self.bar.start()
+            self.task = self.bar.add_task(self.title, total=None)
+        return self
+
+    def __call__(self, done, total):
+        if self.bar is not None:
+            self.bar.update(self.task, completed=done, total=total)
+        elif done == total or time.monotonic() - self.last >= EVERY:
+            self.last = time.monotonic()
+            print(f"{self.title}: frame {done} of {total}", file=sys.stderr)
+
+    def __exit__(self, *error):
+        if self.bar is not None:
+            self.bar.stop()

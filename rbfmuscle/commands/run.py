@@ -1,0 +1,146 @@
+"""``rbfmuscle run`` and ``rbfmuscle demo``: a scene through its motion, into a folder."""
+
+import json
+import math
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from rbfmuscle.commands.progress import Progress
+from rbfmuscle.validation import RBFMuscleError, SceneError
+
+Output = Annotated[Path, Parameter(name=["--output", "-o"])]
+Json = Annotated[bool, Parameter(name="--json", negative="")]
+SHOWN = (
+    "volume_error",
+    "penetration_max",
+    "bone_penetration_max",
+    "solver_penetration_max",
+    "rest_error_rms",
+)
+
+
+def demo(
+    *,
+    output: Output = Path("demo_output"),
+    model: str | None = None,
+    frames: str | None = None,
+    as_json: Json = False,
+):
+    """Run the embedded hip: no data, no network.
+
+    Parameters
+    ----------
+    output
+        Folder for the results.
+    model
+        Model of every muscle.
+    frames
+        Frames of the motion, as A:B:S.
+    as_json
+        Print JSON and nothing else.
+    """
+    from rbfmuscle.sim.phantom import phantom_scene
+
+    _run_scene(
+        phantom_scene(), output, model=model, frames=frames, settings={}, fail_on=None, as_json=as_json
+    )
+
+
+def run(
+    scene: Path,
+    *,
+    output: Output,
+    model: str | None = None,
+    settings: Annotated[list[str] | None, Parameter(name="--set", negative="")] = None,
+    frames: str | None = None,
+    fail_on: str | None = None,
+    as_json: Json = False,
+):
+    """Run a scene through its motion and write surfaces, metrics and a report.
+
+    Parameters
+    ----------
+    scene
+        Scene file (TOML).
+    output
+        Folder for the results.
+    model
+        Model of every muscle, in place of the scene's.
+    settings
+        KEY=VALUE, for instance model.centres=200 or contact.substep_angle=1; may be repeated.
+    frames
+        Frames of the motion, as A:B:S (B not included).
+    fail_on
+        Limits that end with exit code 6, for instance volume_error=0.001,penetration_max, or all.
+    as_json
+        Print JSON and nothing else.
+    """
+    from rbfmuscle.sim.scene import Scene
+    from rbfmuscle.sim.settings import parse_setting
+
+    changes = dict(parse_setting(text) for text in settings or [])
+    loaded = Scene.load(scene)
+    _run_scene(loaded, output, model=model, frames=frames, settings=changes, fail_on=fail_on, as_json=as_json)
+
+
+def _run_scene(scene, output, *, model, frames, settings, fail_on, as_json):
+    from rbfmuscle.run import stream_run
+    from rbfmuscle.sim.scene_check import check_initial
+
+    check_initial(scene.with_options(**settings))
+    _warn_about_bones(scene)
+    start = time.perf_counter()
+    done = 0
+    with Progress(scene.name) as progress:
+
+        def advance(count, total):
+            nonlocal done
+            done = count
+            progress(count, total)
+
+        try:
+            info = stream_run(
+                scene,
+                output,
+                model=model,
+                frames=frames,
+                settings=settings,
+                fail_on=fail_on,
+                progress=advance,
+            )
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"interrupted, {done} frames are kept in {output}") from None
+        except RBFMuscleError as error:
+            if done and error.exit_code == 5:
+                raise type(error)(f"{error}; {done} frames are kept in {output}") from None
+            raise
+    if as_json:
+        print(json.dumps({"directory": str(output), **info}, indent=1, default=str))
+    else:
+        _print_summary(info["muscles"], len(info["frames"]), output, time.perf_counter() - start)
+
+
+def _warn_about_bones(scene):
+    """A motion that drives bones into each other runs, and is reported."""
+    from rbfmuscle.sim.scene_check import bone_findings
+
+    try:
+        for finding in bone_findings(scene):
+            print(f"rbfmuscle: {finding}", file=sys.stderr)
+    except SceneError:
+        return  # the motion is wrong, which the run itself reports
+
+
+def _print_summary(muscles, frames, output, seconds):
+    muscles = {name: facts for name, facts in muscles.items() if any(key in facts for key in SHOWN)}
+    if muscles:
+        width = max(len(name) for name in muscles)
+        print(" ".join([" " * width, *(f"{key:>22}" for key in SHOWN)]))
+    for name, facts in muscles.items():
+        worst = [abs(facts.get(key, {}).get("worst", math.nan)) for key in SHOWN]
+        print(" ".join([f"{name:{width}}", *(f"{value:22.3g}" for value in worst)]))
+    print(f"{frames} frames in {seconds:.1f} s, in {output}")

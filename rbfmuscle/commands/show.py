@@ -1,0 +1,70 @@
+"""``rbfmuscle export`` and ``rbfmuscle render``: what a run left, in other forms."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+
+def export(
+    directory: Path,
+    *,
+    formats: Annotated[list[str], Parameter(name="--format", negative="", consume_multiple=True)],
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    units: str | None = None,
+    frames: str | None = None,
+    ascii: Annotated[bool, Parameter(negative="")] = False,
+):
+    """Write the surfaces of a run in other formats and units.
+
+    Parameters
+    ----------
+    directory
+        Folder of the run.
+    formats
+        pvd, vtp, ply, stl, obj or glb; several may be given.
+    output
+        Folder to write to, DIR/export by default.
+    units
+        m, cm or mm; the scene's by default (glb: m).
+    frames
+        Of the written frames, as A:B:S.
+    ascii
+        VTP as text, as OpenSim reads it.
+    """
+    from rbfmuscle.sim.settings import parse_slice
+    from rbfmuscle.study.export import export_run
+
+    chosen = parse_slice(frames) if frames is not None else None
+    written = export_run(directory, formats, output=output, units=units, frames=chosen, ascii=ascii)
+    folders = sorted({str(path.parent) for path in written})
+    print(f"{len(written)} files in {', '.join(folders)}")
+
+
+def render(
+    directory: Path,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    frame: int | None = None,
+    view: Annotated[list[str] | None, Parameter(negative="")] = None,
+    seconds: float = 5.0,
+):
+    """Draw a run: a picture (.png) or an animation (.gif, .webp).
+
+    Parameters
+    ----------
+    directory
+        Folder of the run.
+    output
+        File to draw.
+    frame
+        Of a picture; the last one by default.
+    view
+        front, side or back; may be repeated; all by default.
+    seconds
+        Length of an animation.
+    """
+    from rbfmuscle.study.render import render_run
+
+    render_run(directory, output, frame=frame, views=view, seconds=seconds)
+    print(output)
