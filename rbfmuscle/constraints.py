@@ -60,9 +60,21 @@ def _local_loop(x, rest, start, other, weight, inverse, fibre, low, high, hold, 
         _rotation_loop(deformation[i], q[i])
         w, qx, qy, qz = q[i, 0], q[i, 1], q[i, 2], q[i, 3]
         r = target[i]
-        r[0, 0], r[0, 1], r[0, 2] = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy - w * qz), 2 * (qx * qz + w * qy)
-        r[1, 0], r[1, 1], r[1, 2] = 2 * (qx * qy + w * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz - w * qx)
-        r[2, 0], r[2, 1], r[2, 2] = 2 * (qx * qz - w * qy), 2 * (qy * qz + w * qx), 1 - 2 * (qx * qx + qy * qy)
+        r[0, 0], r[0, 1], r[0, 2] = (
+            1 - 2 * (qy * qy + qz * qz),
+            2 * (qx * qy - w * qz),
+            2 * (qx * qz + w * qy),
+        )
+        r[1, 0], r[1, 1], r[1, 2] = (
+            2 * (qx * qy + w * qz),
+            1 - 2 * (qx * qx + qz * qz),
+            2 * (qy * qz - w * qx),
+        )
+        r[2, 0], r[2, 1], r[2, 2] = (
+            2 * (qx * qz - w * qy),
+            2 * (qy * qz + w * qx),
+            1 - 2 * (qx * qx + qy * qy),
+        )
         stretch = 0.0
         for a in range(3):
             stretch += (

@@ -163,7 +163,9 @@ class ElasticSolver:
             if len(added) == 0:
                 break
             _move_loop(push, self.columns, self.shares, moved)
-            lacking = need - np.einsum("ca,ca->c", spaces.normal, moved[spaces.index]) + row * (lost / stiffness)
+            lacking = (
+                need - np.einsum("ca,ca->c", spaces.normal, moved[spaces.index]) + row * (lost / stiffness)
+            )
         active = chosen[force[chosen] > 0.0]
         self.forces = dict(zip(keys[active].tolist(), force[active].tolist()))
         return push, lost

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.binding import bind_samples, build_clusters
+from rbfmuscle.binding import RestFrame, bind_samples, build_clusters
 from rbfmuscle.constraints import ShapeConstraint, VolumeConstraint
 from rbfmuscle.elasticity import ElasticSolver
 from rbfmuscle.implicit.extraction import extract_surface
@@ -56,6 +56,13 @@ class RBFOptions:
         return cls(**table)
 
 
+def _principal_axes(points):
+    """Right-handed principal axes as rows."""
+    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    axes[2] *= np.sign(np.linalg.det(axes))
+    return axes
+
+
 class _BoneCut:
     """What the bones cut away: their smallest distance, a lower bound where it is beyond ``reach``."""
 
@@ -92,70 +99,86 @@ class RBFMuscle:
         self.options = RBFOptions.from_table(options, muscle=muscle.name)
         self.bones = [bone.name for bone in scene.bones]
         self.bone_vertices = [np.asarray(bone.mesh.vertices, dtype=float) for bone in scene.bones]
-        vertices = np.asarray(muscle.mesh.vertices, dtype=float)
         faces = np.asarray(muscle.mesh.faces)
         self.rest_volume = float(muscle.mesh.volume)
         count = self.options.centres or self._default_centres(muscle.mesh.area, scene)
+        frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
         seed = self.options.seed
-        centres = sample_surface(vertices, faces, count, seed=seed, placement=self.options.placement)
-        samples = sample_surface(vertices, faces, self.options.samples, seed=seed, placement="even")
-        self.rest, self.rest_normals = centres.points, centres.normals
-        self.control_faces = centres.control_faces
-        self.samples, self.sample_faces = samples.points, samples.control_faces
-        self._attach(muscle, vertices, faces)
-        self._build_elasticity(muscle, vertices, faces, samples.normals)
+        centres = sample_surface(frame.local, faces, count, seed=seed, placement=self.options.placement)
+        samples = sample_surface(frame.local, faces, self.options.samples, seed=seed, placement="even")
+        self.rest, self.rest_normals = frame.points(centres.points), frame.directions(centres.normals)
+        self.samples = frame.points(samples.points)
+        self.control_faces, self.sample_faces = centres.control_faces, samples.control_faces
+        fibre = self._attach(muscle, frame, faces, centres.points, samples.points)
+        self._build_elasticity(centres, samples, fibre)
         self.x = self.rest.copy()
         self.level = 0.0
         # Cells along the muscle's own axes are smaller than along the scene's, and turn with the scene.
-        self.axes = np.linalg.svd(self.samples - self.samples.mean(axis=0), full_matrices=False)[2]
-        self.axes[2] *= np.sign(np.linalg.det(self.axes))
+        self.axes = frame.directions(_principal_axes(samples.points))
 
     @staticmethod
     def _default_centres(area, scene):
         return max(LEAST_CENTRES, int(round(area / (AREA_A_CENTRE * scene.length(1.0) ** 2), -1)))
 
-    def _attach(self, muscle, vertices, faces):
-        """Fix the centres on attachment patches and give every centre its share of each bone's motion."""
+    def _attach(self, muscle, frame, faces, centres, samples):
+        """Fix the centres on attachment patches, share the bones' motions out; returns the fibre directions."""
         groups = [np.asarray(attachment.vertices) for attachment in muscle.attachments]
-        owner = np.full(len(vertices), -1)
+        owner = np.full(len(frame.local), -1)
         for attachment, group in zip(muscle.attachments, groups):
             owner[group] = self.bones.index(attachment.bone)
-        tree = cKDTree(vertices)
-        nearest = tree.query(self.rest)[1]
+        tree = cKDTree(frame.local)
+        nearest = tree.query(centres)[1]
         fixed = owner[nearest]
         for attachment, group in zip(muscle.attachments, groups):
-            bone = self.bones.index(attachment.bone)
-            inside = np.isin(nearest, group)
-            if inside.sum() < LEAST_ATTACHED:
+            if np.isin(nearest, group).sum() < LEAST_ATTACHED:
                 # A patch smaller than the spacing of the centres still has to hold the muscle against turning.
-                distance = cKDTree(vertices[group]).query(self.rest)[0]
-                fixed[np.argsort(distance, kind="stable")[:LEAST_ATTACHED]] = bone
+                distance = cKDTree(frame.local[group]).query(centres)[0]
+                closest = np.argsort(distance, kind="stable")[:LEAST_ATTACHED]
+                fixed[closest] = self.bones.index(attachment.bone)
         self.fixed_bone = fixed
-        self.free = np.flatnonzero(fixed < 0)
-        self.held = np.flatnonzero(fixed >= 0)
+        self.free, self.held = np.flatnonzero(fixed < 0), np.flatnonzero(fixed >= 0)
         if len(self.free) == 0:
-            raise SceneError(f"muscle {self.name!r}: every centre lies on an attachment; nothing is free to move")
-        self.contact_bone = np.concatenate([fixed, owner[tree.query(self.samples)[1]]])
+            raise SceneError(
+                f"muscle {self.name!r}: every centre lies on an attachment; nothing is free to move"
+            )
+        self.contact_bone = np.concatenate([fixed, owner[tree.query(samples)[1]]])
         used = sorted(set(owner[owner >= 0]))
         self.motion_bones = [self.bones[bone] for bone in used]
-        on_mesh = harmonic_weights(vertices, faces, [np.flatnonzero(owner == bone) for bone in used])
+        on_mesh = harmonic_weights(frame.local, faces, [np.flatnonzero(owner == bone) for bone in used])
         self.motion_weights = on_mesh[nearest]
         self.motion_weights[self.held] = np.array(used) == fixed[self.held, None]
         # Fibres run up the harmonic field from the first attachment to the last.
-        self._mesh_fibre = surface_gradient(vertices, faces, on_mesh @ np.arange(len(used)))[nearest]
+        along = frame.directions(
+            surface_gradient(frame.local, faces, on_mesh @ np.arange(len(used)))[nearest]
+        )
+        return self._fibre_directions(along, muscle.fibres)
 
-    def _build_elasticity(self, muscle, vertices, faces, sample_normals):
+    def _fibre_directions(self, direction, fibres):
+        if fibres:
+            middle = np.concatenate([0.5 * (line[1:] + line[:-1]) for line in fibres])
+            along = np.concatenate([np.diff(line, axis=0) for line in fibres])
+            near = min(3, len(middle))
+            distance, index = cKDTree(middle).query(self.rest, k=np.arange(1, near + 1))
+            unit = along / np.linalg.norm(along, axis=1, keepdims=True)
+            floor = 1e-9 * np.ptp(self.rest, axis=0).max()
+            direction = (unit[index] / np.maximum(distance, floor)[:, :, None]).sum(axis=1)
+        length = np.linalg.norm(direction, axis=1)
+        weak = length < 1e-9 * max(length.max(), 1e-300)
+        axis = self.rest[self.held].mean(axis=0) - self.rest[self.free].mean(axis=0)
+        direction = np.where(weak[:, None], axis, direction)
+        return direction / np.linalg.norm(direction, axis=1, keepdims=True)
+
+    def _build_elasticity(self, centres, samples, fibre):
         options = self.options
         start, other, weight = build_clusters(
-            self.rest, self.rest_normals, self.control_faces, self.samples, sample_normals,
+            centres.points, centres.normals, self.control_faces, samples.points, samples.normals,
             across=options.across, across_weight=options.across_weight,
         )  # fmt: skip
-        fibre = self._fibre_directions(muscle)
         limits = (options.stretch_low, options.stretch_high)
         self.shape = ShapeConstraint(
             self.rest, start, other, weight, fibre, limits=limits, hold=options.stretch_hold
         )
-        columns, shares = bind_samples(self.samples, sample_normals, self.rest, self.rest_normals)
+        columns, shares = bind_samples(samples.points, samples.normals, centres.points, centres.normals)
         count = len(self.rest)
         alone = np.repeat(np.arange(count)[:, None], columns.shape[1], axis=1)
         self.columns = np.concatenate([alone, columns])
@@ -167,21 +190,6 @@ class RBFMuscle:
             self.free, self.held,
             iterations=options.iterations, contacts=options.contacts, memory=options.acceleration,
         )  # fmt: skip
-
-    def _fibre_directions(self, muscle):
-        direction = self._mesh_fibre
-        if muscle.fibres:
-            middle = np.concatenate([0.5 * (line[1:] + line[:-1]) for line in muscle.fibres])
-            along = np.concatenate([np.diff(line, axis=0) for line in muscle.fibres])
-            distance, index = cKDTree(middle).query(self.rest, k=min(3, len(middle)))
-            distance, index = distance.reshape(len(self.rest), -1), index.reshape(len(self.rest), -1)
-            unit = along / np.linalg.norm(along, axis=1, keepdims=True)
-            direction = (unit[index] / np.maximum(distance, 1e-9)[:, :, None]).sum(axis=1)
-        length = np.linalg.norm(direction, axis=1)
-        weak = length < 1e-9 * max(length.max(), 1e-300)
-        axis = self.rest[self.held].mean(axis=0) - self.rest[self.free].mean(axis=0)
-        direction = np.where(weak[:, None], axis, direction)
-        return direction / np.linalg.norm(direction, axis=1, keepdims=True)
 
     # --- the MuscleModel protocol -------------------------------------------------------------------------
 

@@ -112,7 +112,10 @@ def test_samples_are_carried_by_near_centres_of_their_own_side(ellipsoid):
     coarse = trimesh.creation.icosphere(subdivisions=2)
     coarse.apply_scale([60.0, 25.0, 15.0])
     columns, shares = bind_samples(
-        np.array(ellipsoid.vertices), ellipsoid.vertex_normals, np.array(coarse.vertices), coarse.vertex_normals
+        np.array(ellipsoid.vertices),
+        ellipsoid.vertex_normals,
+        np.array(coarse.vertices),
+        coarse.vertex_normals,
     )
     np.testing.assert_allclose(shares.sum(axis=1), 1.0, rtol=1e-12)
     assert (shares >= 0.0).all()
