@@ -24,7 +24,7 @@ _HOME = {
     "simulate": "rbfmuscle.run",
 }
 
-__all__ = [*_HOME, "__version__"]  # noqa: PLE0604
+__all__ = [*_HOME, "__version__"]
 
 
 def __getattr__(name):
