@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 IDENTITY = np.eye(4)
 # Fine cells against the mean edge of the mesh, and at least this many along its longest side.
-CELL_SHARE, LEAST_CELLS = 0.54, 40
+CELL_SHARE, LEAST_CELLS = 0.65, 40
 # Fine cells cover points nearer than this many of their edges.
 BAND = 1.2
 # Default tolerance as a share of the mean edge: facets are flat, so errors scale with them.
@@ -287,6 +287,7 @@ def pack_field(exact, cells):
         edge_normals=exact.edge_normals[rows, turn].astype(np.float32),
         vertex_normals=exact.vertex_normals.astype(np.float32),
         vertices=exact.faces[rows, turn].astype(np.int32),
+        across=cells.across,
     )
 
 

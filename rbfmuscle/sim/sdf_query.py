@@ -29,6 +29,8 @@ INVERSE, UNIT = 3, 4
 ROUNDING = 1e-3
 # Marks a far point beside the number of its fine cell.
 CELL_FAR = 128
+# Steps of a walk over the surface, at most, and what counts as nearer there.
+WALK, NEARER = 8, 1 - 1e-6
 # Points of one stage: their reads of memory overlap instead of waiting for each other.
 STAGE = 64
 
@@ -56,6 +58,8 @@ class FieldData(NamedTuple):
         Pseudonormals, edges in the order of the records.
     vertices : (m, 3) ndarray of int32
         Corners A, B and C of each record.
+    across : (m, 3) ndarray of int32
+        Records across the edges AB, BC and CA, -1 where there is none.
     """
 
     grid: np.ndarray
@@ -68,6 +72,7 @@ class FieldData(NamedTuple):
     edge_normals: np.ndarray
     vertex_normals: np.ndarray
     vertices: np.ndarray
+    across: np.ndarray
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -158,6 +163,36 @@ def _offset(n, x, y, z, records):
     return du, dv, w, False
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _walk(best, square, x, y, z, records, across):
+    """Record at which a walk over neighbours, always to a nearer one, ends.
+
+    The nearest triangle listed in a cell is not always the nearest of all; then the point lies beyond one of
+    its edges, mostly that to the nearest.
+    """
+    for _ in range(WALK):
+        qx, qy, qz = x - records[best, 0], y - records[best, 1], z - records[best, 2]
+        u = qx * records[best, 3] + qy * records[best, 4] + qz * records[best, 5]
+        v = qx * records[best, 6] + qy * records[best, 7] + qz * records[best, 8]
+        bx, cx, cy = records[best, 12], records[best, 13], records[best, 14]
+        _, _, feature = nearest_in_frame(bx, cx, cy, records[best, 15], 1.0 / (cx * cx + cy * cy), u, v)
+        if feature == FACE:
+            return best
+        # The edges at corner k are k and k - 1.
+        first = feature - EDGE if feature < CORNER else feature - CORNER
+        step = best
+        for turn in range(1 if feature < CORNER else 2):
+            n = across[best, (first + 2 * turn) % 3]
+            if n >= 0:
+                s = _square(n, x, y, z, records)
+                if s < square * NEARER:
+                    step, square = n, s
+        if step == best:
+            return best
+        best = step
+    return best
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _world(n, du, dv, dw, records):
     gx = du * records[n, 3] + dv * records[n, 6] + dw * records[n, 9]
@@ -204,7 +239,7 @@ def _unit_gradient(n, distance, du, dv, dw, least, records):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _query(x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices):
+def _query(x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices, across):
     """Signed distance, record, and offset in its frame; or a lower bound above ``reach`` and record -1."""
     entry, cell, far_point = _block_entry(x, y, z, grid[INVERSE], blocks)
     if entry < 0:
@@ -215,6 +250,10 @@ def _query(x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en
     n, square = _nearest_listed(x, y, z, entry, far_point, lists, far, records)
     du, dv, dw, inside = _offset(n, x, y, z, records)
     state = lists[entry] >> SIDE & 3
+    if not inside:
+        n = _walk(n, square, x, y, z, records, across)
+        du, dv, dw, inside = _offset(n, x, y, z, records)
+        square = du * du + dv * dv + dw * dw
     side = 1.0 if state == OUTSIDE else (-1.0 if state == INSIDE else dw)
     if state == MIXED or (state == CROSSED and not inside):
         side = _slow_side(x, y, z, entry, n, lists, corners, records, en, vn, vertices)
@@ -222,7 +261,7 @@ def _query(x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def field_value(x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices):
+def field_value(x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices, across):
     """Signed distance at one point in bone coordinates.
 
     Parameters
@@ -232,7 +271,7 @@ def field_value(x, y, z, reach, grid, blocks, cells, lists, corners, far, record
     reach : float
         Where the bone is surely further away, outside, a lower bound above ``reach`` may be returned.
         Infinity asks for the distance everywhere.
-    grid, ..., vertices
+    grid, ..., across
         ``*BoneSDF.data``.
 
     Returns
@@ -241,18 +280,22 @@ def field_value(x, y, z, reach, grid, blocks, cells, lists, corners, far, record
         [unit of the mesh], negative inside.
     """
     x, y, z = x - grid[0], y - grid[1], z - grid[2]
-    return _query(x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices)[0]
+    return _query(
+        x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices, across
+    )[0]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def field_gradient(x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices):
+def field_gradient(
+    x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices, across
+):
     """Signed distance and its unit gradient at one point in bone coordinates: ``(d, gx, gy, gz)``.
 
     Parameters as for :func:`field_value`. The gradient is zero where only a lower bound was asked for.
     """
     x, y, z = x - grid[0], y - grid[1], z - grid[2]
     d, n, du, dv, dw = _query(
-        x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices
+        x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices, across
     )
     if n < 0:
         return d, 0.0, 0.0, 0.0
@@ -264,7 +307,7 @@ def field_gradient(x, y, z, reach, grid, blocks, cells, lists, corners, far, rec
 def _stage(points, pose, reach, grid, blocks, cells, lists, far, records, local, entry, best, square):
     """Nearest record of up to STAGE points; each pass reads what the next one needs.
 
-    Fills the points relative to the origin, their cells, their nearest record (-1 where the bone is out of reach)
+    Fills the points relative to the origin, their cells, their nearest record (-1 where out of reach)
     and the squared distance (the lower bound where out of reach).
     """
     scale, unit = grid[INVERSE], grid[UNIT]
@@ -295,19 +338,23 @@ def _stage(points, pose, reach, grid, blocks, cells, lists, far, records, local,
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _finish(count, local, entry, best, square, offset, lists, corners, records, en, vn, vertices):
+def _finish(count, local, entry, best, square, offset, lists, corners, records, en, vn, vertices, across):
     """Turn squared into signed distances, and fill the offsets from the surface in the frames of the
     records."""
     for n in range(count):
         if best[n] < 0:
             continue
-        x, y, z = local[n, 0], local[n, 1], local[n, 2]
-        du, dv, dw, inside = _offset(best[n], x, y, z, records)
+        x, y, z, m = local[n, 0], local[n, 1], local[n, 2], best[n]
+        du, dv, dw, inside = _offset(m, x, y, z, records)
+        if not inside:
+            m = _walk(m, square[n], x, y, z, records, across)
+            du, dv, dw, inside = _offset(m, x, y, z, records)
+            square[n], best[n] = du * du + dv * dv + dw * dw, m
         offset[n, 0], offset[n, 1], offset[n, 2] = du, dv, dw
         state = lists[entry[n]] >> SIDE & 3
         side = 1.0 if state == OUTSIDE else (-1.0 if state == INSIDE else dw)
         if state == MIXED or (state == CROSSED and not inside):
-            side = _slow_side(x, y, z, entry[n], best[n], lists, corners, records, en, vn, vertices)
+            side = _slow_side(x, y, z, entry[n], m, lists, corners, records, en, vn, vertices)
         d = np.sqrt(square[n])
         square[n] = d if side >= 0.0 else -d
 
@@ -315,26 +362,26 @@ def _finish(count, local, entry, best, square, offset, lists, corners, records, 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def value_loop(points, pose, reach, out, data):
     """Distances (n,) of points in world coordinates."""
-    grid, blocks, cells, lists, corners, far, records, en, vn, vertices = data
+    grid, blocks, cells, lists, corners, far, records, en, vn, vertices, across = data
     local, offset, entry = np.empty((STAGE, 3)), np.empty((STAGE, 3)), np.empty(STAGE, np.int32)
     best = np.empty(STAGE, np.int32)
     for start in range(0, len(points), STAGE):
         some, d = points[start : start + STAGE], out[start : start + STAGE]
         _stage(some, pose, reach, grid, blocks, cells, lists, far, records, local, entry, best, d)
-        _finish(len(some), local, entry, best, d, offset, lists, corners, records, en, vn, vertices)
+        _finish(len(some), local, entry, best, d, offset, lists, corners, records, en, vn, vertices, across)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def gradient_loop(points, pose, reach, distance, gradient, data):
     """Distances (n,) and gradients (n, 3), world axes, of points in world coordinates."""
-    grid, blocks, cells, lists, corners, far, records, en, vn, vertices = data
+    grid, blocks, cells, lists, corners, far, records, en, vn, vertices, across = data
     local, offset, entry = np.empty((STAGE, 3)), np.empty((STAGE, 3)), np.empty(STAGE, np.int32)
     best = np.empty(STAGE, np.int32)
     least = ROUNDING * grid[UNIT]
     for start in range(0, len(points), STAGE):
         some, d = points[start : start + STAGE], distance[start : start + STAGE]
         _stage(some, pose, reach, grid, blocks, cells, lists, far, records, local, entry, best, d)
-        _finish(len(some), local, entry, best, d, offset, lists, corners, records, en, vn, vertices)
+        _finish(len(some), local, entry, best, d, offset, lists, corners, records, en, vn, vertices, across)
         _turn(len(some), pose, least, best, d, offset, records, gradient[start : start + STAGE])
 
 
