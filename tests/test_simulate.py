@@ -1,0 +1,215 @@
+"""The frame loop: sub-steps, reach, parallel muscles, interrupts, times, laziness."""
+
+import sys
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, hinged_scene, joint, muscle, scene, sphere
+
+from rbfmuscle import models
+from rbfmuscle.sim.motion import bone_poses
+from rbfmuscle.sim.options import TunnellingOptions
+from rbfmuscle.sim.reach import reached_bones, sampled_poses, split_step, turned_angle
+from rbfmuscle.sim.simulate import simulate_frames
+from rbfmuscle.validation import SolveError, UsageError
+
+
+def _run(angles, **options):
+    made, fields = hinged_scene(angles, **options)
+    model = ToyMuscle(made.muscles[0], made)
+    return list(simulate_frames(made, [model], fields=fields)), model
+
+
+def test_frames_carry_what_they_promise():
+    frames, model = _run([0, 10, 20], tunnelling=TunnellingOptions())
+    assert [frame.index for frame in frames] == [0, 1, 2]
+    assert frames[2].coordinates == {"hinge.bend": np.radians(20)}
+    last = frames[-1]
+    assert np.array_equal(last.surfaces["strap"].vertices, model.x)
+    assert np.array_equal(last.carried["strap"][0], model.x)
+    assert np.allclose(last.poses["trunk"], np.eye(4))
+    times = last.times["strap"]
+    assert set(times) == {"time_predict", "time_solve", "time_tunnelling", "time_surface", "time_frame"}
+    assert times["time_frame"] == pytest.approx(sum(v for k, v in times.items() if k != "time_frame"))
+    assert last.wall >= times["time_frame"] > 0.0
+
+
+def test_muscle_stays_out_of_the_bone_it_wraps():
+    made, fields = hinged_scene([0, 40, 80])
+    model = ToyMuscle(made.muscles[0], made)
+    for frame in simulate_frames(made, [model], fields=fields):
+        distance = fields["trunk"].distance(model.x[model.contact_bone < 0], frame.poses["trunk"])
+        assert distance.min() > -0.05
+
+
+def test_first_frame_is_reached_from_the_rest_pose():
+    direct, _ = _run([60])
+    stepped, _ = _run([0, 20, 40, 60])
+    assert direct[0].index == 0
+    # The toy's target does not depend on the path; only contact does.
+    assert np.allclose(
+        direct[-1].surfaces["strap"].vertices, stepped[-1].surfaces["strap"].vertices, atol=0.05
+    )
+
+
+def test_split_step_bounds_turn_and_travel():
+    made, _ = hinged_scene([0, 45])
+    before, after = made.motion.frames
+    stops = split_step(made, before, after)
+    assert stops[-1] == after
+    poses = [bone_poses(made, c)["arm"] for c in (before, *stops)]
+    turns = [turned_angle(b[:3, :3] @ a[:3, :3].T) for a, b in pairwise(poses)]
+    assert max(turns) <= np.radians(2.0) * (1 + 1e-9)
+    diagonal = np.linalg.norm(np.ptp(made.muscles[0].mesh.bounds, axis=0))
+    held = made.muscles[0].mesh.vertices[made.muscles[0].attachments[1].vertices]
+    for a, b in pairwise(poses):
+        moved = np.linalg.norm(held @ (b - a)[:3, :3].T + (b - a)[:3, 3], axis=1)
+        assert moved.max() <= diagonal / 30 * (1 + 1e-9)
+    assert split_step(made, after, after) == []
+
+
+def test_whole_turn_in_one_step_is_split():
+    made, _ = hinged_scene([0, 360])
+    assert len(split_step(made, *made.motion.frames)) >= 180
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-7, 0.5, 3.1])
+def test_turned_angle(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    assert turned_angle(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])) == pytest.approx(angle, rel=1e-9)
+
+
+def test_bones_out_of_reach_are_left_out():
+    fields = {"near": sphere(5.0), "far": box((2, 2, 2), (500, 0, 0))}
+    mesh = ellipsoid((10, 3, 3), (0, 0, 9))
+    ends = [attach(mesh, "near", lambda v: v[:, 0] < -8)]
+    made = scene([bone(n, f) for n, f in fields.items()], [], [muscle("m", mesh, ends)], [{}])
+    assert set(reached_bones(made)) == {("m", "near")}
+
+
+def test_swept_region_follows_the_motion():
+    made, fields = hinged_scene([0, 90])
+    fields["post"] = box((2, 2, 2), (0, -30, 0))
+    made.bones.append(bone("post", fields["post"]))
+    assert ("strap", "post") in reached_bones(made)
+    assert len(sampled_poses(made)) > 9
+    made.motion.frames[:] = [{}]
+    assert ("strap", "post") not in reached_bones(made)
+
+
+class _Breaking(ToyMuscle):
+    def solve(self, contacts):
+        super().solve(contacts)
+        if self.solves > 12:
+            self.x = self.x * np.nan
+
+
+class _Interrupting(ToyMuscle):
+    def solve(self, contacts):
+        super().solve(contacts)
+        if self.solves > 12:
+            raise KeyboardInterrupt
+
+
+class _Singular(ToyMuscle):
+    def solve(self, contacts):
+        raise np.linalg.LinAlgError("singular matrix")
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_failing_solve_names_muscle_frame_and_coordinate_and_keeps_the_frames(count):
+    made, fields = hinged_scene([0, 10, 20, 30, 40])
+    parts = [_Breaking(made.muscles[0], made) for _ in range(count)]
+    frames = []
+    with pytest.raises(SolveError, match=r"'strap', frame 3 \(hinge.bend = .*deg\).*not finite"):
+        for frame in simulate_frames(made, parts, fields=fields):
+            frames.append(frame)
+    assert [frame.index for frame in frames] == [0, 1, 2]
+
+
+def test_singular_system_becomes_a_solve_error():
+    made, fields = hinged_scene([0, 10])
+    with pytest.raises(SolveError, match=r"frame 1 .*singular matrix"):
+        list(simulate_frames(made, [_Singular(made.muscles[0], made)], fields=fields))
+
+
+def test_interrupt_keeps_the_frames_so_far():
+    made, fields = hinged_scene([0, 10, 20, 30])
+    frames = []
+    with pytest.raises(KeyboardInterrupt):
+        for frame in simulate_frames(made, [_Interrupting(made.muscles[0], made)], fields=fields):
+            frames.append(frame)
+    assert len(frames) == 3
+
+
+def test_leaving_early_ends_the_workers():
+    made, fields = hinged_scene([0, 10, 20])
+    parts = [ToyMuscle(made.muscles[0], made) for _ in range(2)]
+    course = simulate_frames(made, parts, fields=fields)
+    next(course)
+    course.close()
+    assert parts[0].solves == 0
+
+
+def _several(count):
+    """Muscles of different girth side by side over the same two bones."""
+    fields = {"trunk": sphere(8.0), "arm": box((15, 2, 2), (30, 0, 0))}
+    muscles = []
+    for k in range(count):
+        mesh = ellipsoid((32, 3, 3), (0, 13.5, 8.0 * k - 8.0))
+        ends = [attach(mesh, "trunk", lambda v: v[:, 0] < -24), attach(mesh, "arm", lambda v: v[:, 0] > 24)]
+        muscles.append(muscle(f"m{k}", mesh, ends))
+    joints = [joint("hinge", "trunk", "arm", (0, 0, 0), bend=(0, 0, -1))]
+    frames = [{"hinge.bend": np.radians(a)} for a in (0, 30)]
+    return scene([bone(n, f) for n, f in fields.items()], joints, muscles, frames), fields
+
+
+def test_muscles_in_parallel_give_what_they_give_alone():
+    made, fields = _several(3)
+    together = list(simulate_frames(made, [ToyMuscle(m, made) for m in made.muscles], fields=fields))[-1]
+    for one in made.muscles:
+        alone = list(simulate_frames(made, [ToyMuscle(one, made)], fields=fields))[-1]
+        assert np.array_equal(alone.surfaces[one.name].vertices, together.surfaces[one.name].vertices)
+
+
+def test_models_may_come_as_a_dict_and_frames_be_chosen():
+    made, fields = hinged_scene([0, 10, 20, 30])
+    model = ToyMuscle(made.muscles[0], made)
+    frames = list(simulate_frames(made, {"strap": model}, fields=fields, written={1, 3}))
+    assert [frame.index for frame in frames] == [1, 3]
+
+
+def test_without_surfaces_none_is_extracted():
+    made, fields = hinged_scene([0, 10])
+    model = ToyMuscle(made.muscles[0], made)
+    model.surface = None
+    frames = list(simulate_frames(made, [model], fields=fields, surfaces=False))
+    assert frames[-1].surfaces == {}
+    assert "time_surface" not in frames[-1].times["strap"]
+
+
+def test_without_tables_no_optional_module_is_loaded():
+    for name in ("rbfmuscle.sim.sliding", "rbfmuscle.sim.skin", "rbfmuscle.sim.sdf"):
+        sys.modules.pop(name, None)
+    frames, _ = _run([0, 10])
+    assert not {"rbfmuscle.sim.sliding", "rbfmuscle.sim.skin", "rbfmuscle.sim.sdf"} & set(sys.modules)
+    assert not {"time_sliding", "time_tunnelling"} & set(frames[-1].times["strap"])
+
+
+def test_scene_without_bones_in_reach_builds_no_field():
+    mesh = ellipsoid((10, 3, 3), (0, 0, 200.0))
+    base = sphere(5.0)
+    made = scene(
+        [bone("base", base)], [], [muscle("m", mesh, [attach(mesh, "base", lambda v: v[:, 0] < -8)])], [{}]
+    )
+    sys.modules.pop("rbfmuscle.sim.sdf", None)
+    list(simulate_frames(made, [ToyMuscle(made.muscles[0], made)]))
+
+
+def test_unknown_model_names_the_nearest_right_one():
+    made, _ = hinged_scene([0])
+    with pytest.raises(UsageError, match="unknown model 'xpdb', did you mean 'xpbd'"):
+        models.build_model(made.muscles[0], made, "xpdb")
+    with pytest.raises(UsageError, match="known: rbf, pbd"):
+        models.build_model(made.muscles[0], made, "finite")
