@@ -1,9 +1,9 @@
 """The paper's experiments with the mesh models: where do first penetration and first tunnelling come?
 
 Cervenka, Havlicek, Kohout and Váša (GRAPP 2023) flex, turn and adduct the hip, and extend it by steps of 2,
-4, 5 and 10 degrees to 80. Here each model does so with and without sub-steps of 2 degrees; nothing is corrected
-afterwards, so that what the model itself can do shows. "as printed" is plain PBD as in the paper: vertices
-keep their velocity, all edges are alike, the response is to one bone.
+4, 5 and 10 degrees to 80. Here each model does so with and without sub-steps of 2 degrees; nothing is
+corrected afterwards, so that what the model itself can do shows. "as printed" is plain PBD as in the paper:
+vertices keep their velocity, all edges are alike, the response is to one bone.
 
     python examples/paper_experiments.py                      two motions, two models (half a minute)
     python examples/paper_experiments.py --all [-o FILE.md]   every motion, every model (ten minutes)
