@@ -139,8 +139,8 @@ def test_units_do_not_matter(method):
 def test_there_and_back_is_near_the_rest(method):
     rig = Rig(method=method)
     rest = rig.model.carried_mesh()[0].copy()
-    back = rig.go(*range(2, 42, 2), *range(38, -2, -2), *[0] * 60)
-    # a relaxation, so it comes nearer with every solve; the slowest is at 0.35 mm of a muscle of 90 mm here
+    back = rig.go(*range(2, 42, 2), *range(38, -2, -2), *[0] * 100)
+    # a relaxation, so it comes nearer with every solve; the slowest is at 0.34 mm of a muscle of 90 mm here
     assert np.sqrt(((back - rest) ** 2).sum(axis=1).mean()) < 0.5
 
 
