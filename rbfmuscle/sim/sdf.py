@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 IDENTITY = np.eye(4)
 # Fine cells against the mean edge of the mesh, and at least this many along its longest side.
-CELL_SHARE, LEAST_CELLS = 0.65, 40
+CELL_SHARE, LEAST_CELLS = 0.6, 40
 # Fine cells cover points nearer than this many of their edges.
 BAND = 1.2
 # Default tolerance as a share of the mean edge: facets are flat, so errors scale with them.
