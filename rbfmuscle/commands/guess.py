@@ -109,7 +109,7 @@ def guess_scene(folder, units, base):
     paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
     if len(paths) < 2:
         raise UsageError(
-            f"{folder} holds {len(paths)} meshes ({', '.join(MESH_SUFFIXES)}); a scene needs bones and muscles"
+            f"{folder} holds {len(paths)} meshes ({' '.join(MESH_SUFFIXES)}); a scene needs bones and muscles"
         )
     bones, muscles = _sort(paths, base)
     root, joints = _joints(bones)
@@ -173,7 +173,7 @@ def _joints(bones):
 
 
 def _centre(child, parent):
-    """Centre of the ball that fits the part of the child nearest to its parent, and its radius and misfit."""
+    """Centre, radius and misfit of the ball that fits the part of the child nearest to its parent."""
     points = np.asarray(child.mesh.vertices)
     distance = signed_distances(points, parent.mesh)
     count = min(len(points) - 1, max(20, len(points) // 25))

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from rbfmuscle.validation import MeshError
 
 MERGE_TOLERANCE = 1e-7  # of the diagonal: float32 files repeat vertices to about this
-HOLE_LIMIT = 0.1  # of the diagonal: a longer hole's rim is not closed by guesswork
+HOLE_LIMIT = 0.1  # of the diagonal: a longer rim (of more than four edges) is not closed by guesswork
 CRUMB_LIMIT = 0.01  # of the largest part's area: smaller loose parts are dropped
 
 
@@ -181,12 +181,13 @@ def _check_manifold(faces, place):
 
 
 def _fill_holes(state):
-    """Close each hole whose rim is short by a fan about the rim's centre."""
+    """Close each hole whose rim is short, or of one or two missing triangles, by a fan about its centre."""
     diagonal = np.linalg.norm(np.ptp(state.vertices, axis=0))
     filled = 0
     for rim in _rims(state.faces):
         points = state.vertices[rim]
-        if np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum() > HOLE_LIMIT * diagonal:
+        around = np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum()
+        if len(rim) > 4 and around > HOLE_LIMIT * diagonal:
             continue
         if len(rim) == 3:
             fan = np.array([[rim[2], rim[1], rim[0]]])

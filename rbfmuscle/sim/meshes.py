@@ -27,12 +27,15 @@ class ReadMesh:
     notes : list of str
         What was mended, for the user to read.
     closed : bool
+    source : str
+        The file.
     """
 
     mesh: object
     vertex_map: np.ndarray
     notes: list = field(default_factory=list)
     closed: bool = True
+    source: str = ""
 
 
 def read_mesh(path, *, name=None, scale=1.0, may_be_open=False):
@@ -60,9 +63,11 @@ def read_mesh(path, *, name=None, scale=1.0, may_be_open=False):
     """
     path = Path(path)
     vertices, faces = _read_arrays(path)
-    return prepare_mesh(
+    read = prepare_mesh(
         vertices * scale, faces, place=str(path), name=name or path.stem, may_be_open=may_be_open
     )
+    read.source = str(path)
+    return read
 
 
 def prepare_mesh(vertices, faces, *, place, name, may_be_open=False):

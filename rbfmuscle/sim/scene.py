@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.sim.attachments import Attachment, resolve_attachments
-from rbfmuscle.sim.meshes import prepare_mesh, read_mesh
+from rbfmuscle.sim.meshes import ReadMesh, prepare_mesh, read_mesh
 from rbfmuscle.sim.motion import Motion, coordinate_names
 from rbfmuscle.sim.objects import Bone, Joint, Muscle
 from rbfmuscle.sim.options import (
@@ -95,14 +95,14 @@ class Scene:
         Parameters
         ----------
         name : str
-        mesh : path, trimesh.Trimesh or (vertices, faces)
+        mesh : path, trimesh.Trimesh, (vertices, faces) or ReadMesh
             Mended where that is safe; holes are kept, with a note.
         scale : float
             Factor from the mesh's unit to the scene's.
         """
         _check_new_name(self.bones, name, "bone")
-        read, source = _as_mesh(mesh, name, scale, may_be_open=True)
-        self.bones.append(Bone(name, read.mesh, source, read.closed, read.notes))
+        read = _as_mesh(mesh, name, scale, may_be_open=True)
+        self.bones.append(Bone(name, read.mesh, read.source, read.closed, read.notes))
         return self
 
     def add_joint(self, name, parent, child, centre, axes):
@@ -141,7 +141,7 @@ class Scene:
         Parameters
         ----------
         name : str
-        mesh : path, trimesh.Trimesh or (vertices, faces)
+        mesh : path, trimesh.Trimesh, (vertices, faces) or ReadMesh
             Closed; mended where that is safe.
         attach : list of Attachment or dict
             A dict holds ``bone`` and one of ``vertices`` (indices or a file), ``near`` (distance) and
@@ -155,12 +155,12 @@ class Scene:
         from rbfmuscle.sim.fibres import read_fibres
 
         _check_new_name(self.muscles, name, "muscle")
-        read, source = _as_mesh(mesh, name, scale, may_be_open=False)
+        read = _as_mesh(mesh, name, scale, may_be_open=False)
         model_name, options = split_model(model, place=f"muscle {name!r}")
         attachments = resolve_attachments(attach, read, self.bones, muscle=name)
         lines = None if fibres is None else read_fibres(fibres, scale=scale, muscle=name)
         self.muscles.append(
-            Muscle(name, read.mesh, model_name, options, attachments, lines, source, read.notes)
+            Muscle(name, read.mesh, model_name, options, attachments, lines, read.source, read.notes)
         )
         return self
 
@@ -295,20 +295,18 @@ def _vector(values, name, *, unit=False):
 
 
 def _as_mesh(mesh, name, scale, *, may_be_open):
+    if isinstance(mesh, ReadMesh):
+        return mesh
     try:
         scale = check_positive(scale, name="scale")
     except (ValueError, TypeError) as error:
         raise SceneError(f"{name!r}: {error}") from None
     if isinstance(mesh, (str, Path)):
-        return read_mesh(mesh, name=name, scale=scale, may_be_open=may_be_open), str(mesh)
-    if isinstance(mesh, tuple):
-        vertices, faces = mesh
-    else:
-        vertices, faces = mesh.vertices, mesh.faces
+        return read_mesh(mesh, name=name, scale=scale, may_be_open=may_be_open)
+    vertices, faces = mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)
     vertices = np.asarray(vertices, dtype=np.float64) * scale
-    return prepare_mesh(
-        vertices, np.asarray(faces), place=f"mesh {name!r}", name=name, may_be_open=may_be_open
-    ), ""
+    place = f"mesh {name!r}"
+    return prepare_mesh(vertices, np.asarray(faces), place=place, name=name, may_be_open=may_be_open)
 
 
 __all__ = ["Attachment", "Bone", "Joint", "Muscle", "Scene"]

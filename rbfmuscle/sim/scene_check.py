@@ -57,26 +57,34 @@ def check_extents(scene):
     """Raise MeshError for a mesh whose size or place shows a wrong unit or another frame."""
     for kind, items in (("bone", scene.bones), ("muscle", scene.muscles)):
         for item in items:
-            size = np.linalg.norm(np.ptp(item.mesh.vertices, axis=0))
-            millimetres = size / scene.length(1.0)
-            if not SMALLEST_MM <= millimetres <= LARGEST_MM:
-                raise MeshError(
-                    f"{kind} {item.name!r} ({item.source or 'built in code'}) is {size:.4g} {scene.units} "
-                    f"across, which cannot be right; set its scale ({_likely_scale(millimetres)})"
-                )
+            check_size(scene, kind, item.name, item.mesh, item.source)
+    for muscle in scene.muscles:
+        check_place(scene, muscle.name, muscle.mesh, muscle.source)
+
+
+def check_size(scene, kind, name, mesh, source):
+    """Raise MeshError for a mesh smaller than a mouse's or larger than a person's."""
+    size = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
+    millimetres = size / scene.length(1.0)
+    if not SMALLEST_MM <= millimetres <= LARGEST_MM:
+        raise MeshError(
+            f"{kind} {name!r} ({source or 'built in code'}) is {size:.4g} {scene.units} across, which cannot be "
+            f"right; set its scale ({_likely_scale(millimetres)})"
+        )
+
+
+def check_place(scene, name, mesh, source):
+    """Raise MeshError for a muscle that lies far away from all bones."""
     if not scene.bones:
         return
     corners = np.concatenate([bone.mesh.bounds for bone in scene.bones])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    diagonal = np.linalg.norm(high - low)
-    for muscle in scene.muscles:
-        away = np.maximum(low - muscle.mesh.bounds[1], muscle.mesh.bounds[0] - high).clip(min=0)
-        if np.linalg.norm(away) > FAR_AWAY * diagonal:
-            raise MeshError(
-                f"muscle {muscle.name!r} ({muscle.source or 'built in code'}) lies "
-                f"{np.linalg.norm(away):.4g} {scene.units} away from all bones; "
-                "bring the meshes into one frame and unit (scale)"
-            )
+    away = np.linalg.norm(np.maximum(low - mesh.bounds[1], mesh.bounds[0] - high).clip(min=0))
+    if away > FAR_AWAY * np.linalg.norm(high - low):
+        raise MeshError(
+            f"muscle {name!r} ({source or 'built in code'}) lies {away:.4g} {scene.units} away from all bones; "
+            "bring the meshes into one frame and unit (scale)"
+        )
 
 
 def _likely_scale(millimetres):
@@ -85,7 +93,7 @@ def _likely_scale(millimetres):
         (0.001, 0.1, 0.01, 10.0, 100.0, 1000.0),
         key=lambda s: abs(math.log(max(millimetres, 1e-12) * s / 300)),
     )
-    return f"scale = {best:g} would make it {millimetres * best:.4g} mm"
+    return f"{best:g} times the present one would make it {millimetres * best:.4g} mm"
 
 
 def _rest_overlaps(scene):

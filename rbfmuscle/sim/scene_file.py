@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from rbfmuscle.sim.attachments import AttachTable
+from rbfmuscle.sim.meshes import read_mesh
 from rbfmuscle.sim.motion import Motion
 from rbfmuscle.sim.options import (
     Axis,
@@ -21,6 +22,7 @@ from rbfmuscle.sim.options import (
     Vector,
     describe_error,
 )
+from rbfmuscle.sim.scene_check import check_place, check_size
 from rbfmuscle.validation import MeshError, SceneError
 
 
@@ -120,11 +122,11 @@ def load_scene(cls, path):
 
 
 def _build(scene, tables, folder, path):
-    from rbfmuscle.sim.scene_check import check_extents
-
     scene.path = path
     for bone in tables.bone:
-        scene.add_bone(bone.name, str(folder / bone.mesh), scale=bone.scale)
+        read = read_mesh(folder / bone.mesh, name=bone.name, scale=bone.scale, may_be_open=True)
+        check_size(scene, "bone", bone.name, read.mesh, read.source)
+        scene.add_bone(bone.name, read)
     for joint in tables.joint:
         scene.add_joint(joint.name, joint.parent, joint.child, joint.centre, joint.axes)
     for muscle in tables.muscle:
@@ -134,23 +136,25 @@ def _build(scene, tables, folder, path):
     scene.sliding = tables.sliding
     scene.detect = tables.detect
     scene.output = tables.output
-    scene.validate()
-    check_extents(scene)
-    return scene
+    return scene.validate()
 
 
 def _add_muscle(scene, muscle, defaults, folder):
     given = {key: getattr(muscle, key) for key in muscle.model_fields_set}
     for key in defaults.model_fields_set:
         given.setdefault(key, getattr(defaults, key))
+    scale = given.get("scale", 1.0)
     fibres = given.get("fibres")
+    read = read_mesh(folder / muscle.mesh, name=muscle.name, scale=scale)
+    check_size(scene, "muscle", muscle.name, read.mesh, read.source)
+    check_place(scene, muscle.name, read.mesh, read.source)
     scene.add_muscle(
         muscle.name,
-        str(folder / muscle.mesh),
+        read,
         attach=[_from_folder(entry, folder) for entry in given.get("attach", [])],
         model=_merge_model(given.get("model", "rbf"), defaults.model),
         fibres=str(folder / fibres) if fibres is not None else None,
-        scale=given.get("scale", 1.0),
+        scale=scale,
     )
 
 
