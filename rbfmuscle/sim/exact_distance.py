@@ -229,17 +229,20 @@ def record_feature(records, n, x, y, z):
 
 
 @numba.njit(cache=True, nogil=True)
-def nearest_triangle(boxes, starts, records, x, y, z, best, square, nodes, squares):
+def nearest_triangle(boxes, starts, records, order, x, y, z, best, square, slack, nodes, squares):
     """Record of the triangle nearest to a point, and the squared distance.
 
     Parameters
     ----------
-    boxes, starts, records
-        The tree.
+    boxes, starts, records, order
+        The tree, and the face of each record.
     x, y, z : float
         The point.
     best, square : int, float
         A record known to be as near as this, or -1 and the squared reach.
+    slack : float
+        Of triangles whose squared distances differ by a smaller share, that of the least face number is taken, so
+        that rounding and the order of the questions decide nothing.
     nodes, squares : (STACK,) arrays of int64 and float64
         Working space.
     """
@@ -248,10 +251,9 @@ def nearest_triangle(boxes, starts, records, x, y, z, best, square, nodes, squar
     nodes[0], squares[0] = 1, _box_square(boxes, 1, x, y, z)
     while top >= 0:
         node = nodes[top]
-        if squares[top] >= square:
-            top -= 1
-            continue
         top -= 1
+        if squares[top + 1] > square * (1.0 + slack):
+            continue
         while node < leaves:
             left = _box_square(boxes, 2 * node, x, y, z)
             right = _box_square(boxes, 2 * node + 1, x, y, z)
@@ -260,17 +262,19 @@ def nearest_triangle(boxes, starts, records, x, y, z, best, square, nodes, squar
             if right < left:
                 far, other = left, node
                 node += 1
-            if far < square:
+            if far <= square * (1.0 + slack):
                 top += 1
                 nodes[top], squares[top] = other, far
-            if min(left, right) >= square:
+            if min(left, right) > square * (1.0 + slack):
                 break
         if node < leaves:
             continue
         for n in range(starts[node - leaves], starts[node - leaves + 1]):
             d = record_square(records, n, x, y, z)
-            if d < square:
+            if d < square * (1.0 - slack):
                 best, square = n, d
+            elif d <= square * (1.0 + slack) and best >= 0 and order[n] < order[best]:
+                best, square = n, min(d, square)
     return best, square
 
 
@@ -291,7 +295,9 @@ def _nearest_loop(points, reach, tree, normals, out):
                 square = d
             else:
                 best = -1
-        best, square = nearest_triangle(boxes, starts, records, x, y, z, best, square, nodes, squares)
+        best, square = nearest_triangle(
+            boxes, starts, records, order, x, y, z, best, square, 0.0, nodes, squares
+        )
         if best < 0:
             distance[i], face[i] = reach, -1
             closest[i] = points[i]

@@ -11,7 +11,7 @@ import numba
 import numpy as np
 
 from rbfmuscle.sim.exact_distance import STACK, nearest_triangle, record_square, signed_side
-from rbfmuscle.sim.sdf_lists import LONGEST, folded_list, list_loop
+from rbfmuscle.sim.sdf_lists import LONGEST, SLACK, folded_list, list_loop
 from rbfmuscle.sim.sdf_query import BLOCK, COUNT
 from rbfmuscle.sim.threads import in_chunks
 from rbfmuscle.sim.triangles import FIRST
@@ -20,6 +20,8 @@ from rbfmuscle.sim.triangles import FIRST
 CUT = BLOCK**3
 # Half blocks reach this many fine cells further than the band of the fine cells.
 OUTER = 3.0
+# Shift of the grid from the middle of the bone, in coarse cells.
+OFF_MIDDLE = np.array([0.0137, 0.0291, 0.0173])
 # A coarse cell is cut where its corners' triangles err at its centre by more than this share of the distance.
 COARSE_ERROR = 0.02
 # Lower bounds of the distance are held in multiples of this share of a fine cell.
@@ -100,7 +102,7 @@ class _Builder:
         rows = np.empty((count if self.inside is not None else 0, 12), dtype=np.float32)
         centre = np.full(count, -1, dtype=np.int32) if centres is None else centres
         nodes = (corners.record, corners.distance, corners.doubt)
-        mesh = (self.exact.tree, self.across, self.origin, self.doubtful)
+        mesh = ((*self.exact.tree, self.exact.order), self.across, self.origin, self.doubtful)
         written = {}
 
         def work(a, b):
@@ -148,7 +150,9 @@ def build_cells(exact, spacing, band, *, inside=None, region=None, doubtful=None
     low, high = exact.vertices.min(axis=0), exact.vertices.max(axis=0)
     margin = band + block
     shape = grid_shape(low, high, spacing, band)
-    origin = 0.5 * (low + high) - 0.5 * coarse * shape
+    # Off the middle, so that corners do not lie on the planes of symmetry of symmetric meshes: two triangles
+    # equally near would be told apart by rounding.
+    origin = 0.5 * (low + high) - (0.5 + OFF_MIDDLE / shape) * coarse * shape
     box = np.array([low - margin, high + margin]) if region is None else np.asarray(region, dtype=np.float64)
     builder = _Builder(exact, origin, UNIT_SHARE * spacing, inside, doubtful)
 
@@ -298,7 +302,9 @@ def _node_loop(points, near, tree, normals, record, distance):
         # Where nothing nearer is named, the last answer bounds this one.
         best = near[i] if near[i] >= 0 else best
         square = record_square(records, best, x, y, z)
-        best, square = nearest_triangle(boxes, starts, records, x, y, z, best, square, nodes, squares)
+        best, square = nearest_triangle(
+            boxes, starts, records, normals[3], x, y, z, best, square, SLACK, nodes, squares
+        )
         record[i] = best
         side = signed_side(records[best], normals[3][best], points[i], normals, closest, normal)
         distance[i] = np.sqrt(square) if side >= 0.0 else -np.sqrt(square)

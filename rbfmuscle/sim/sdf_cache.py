@@ -17,7 +17,7 @@ import numpy as np
 log = logging.getLogger(__name__)
 
 # Part of every name: raise it when the arrays or the way they are built change.
-VERSION = 8
+VERSION = 10
 SUFFIX = ".sdf.npz"
 # What reading a damaged, foreign or half-removed archive may raise.
 _DAMAGE = (OSError, ValueError, KeyError, EOFError, IndexError, NotImplementedError, zipfile.BadZipFile)
@@ -69,7 +69,8 @@ def load_arrays(key):
     if not path.exists():
         return None
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        # Opened here, as numpy leaves a damaged file open.
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         if str(arrays.pop("key")) != key:
             raise ValueError("the entry belongs to another mesh")

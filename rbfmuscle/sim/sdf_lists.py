@@ -16,6 +16,8 @@ WALK = 8
 # Cells whose triangles' normals differ by more than 40 degrees ask the tree at their probes, unless further
 # away than this many of their edges.
 FOLD, FOLD_REACH = 0.75, 2.0
+# Triangles whose squared distances differ by less than this share are equally near.
+SLACK = 1e-9
 # Lists before this one that are looked through for the same content.
 LOOK_BACK = 6
 
@@ -91,7 +93,7 @@ def _probe(listed, count, folded, low, edge, mesh, nodes_left, squares):
     corner names only one of them; inside the cell another may be nearer by far. A walk downhill over the
     surface, from the nearest triangle listed, finds it; where the surface is folded the tree is asked.
     """
-    (boxes, starts, records), across, origin, _ = mesh
+    (boxes, starts, records, order), across, origin, _ = mesh
     for k in range(len(PROBES)):
         x = origin[0] + edge * (low[0] + 0.5 + PROBES[k, 0])
         y = origin[1] + edge * (low[1] + 0.5 + PROBES[k, 1])
@@ -99,10 +101,12 @@ def _probe(listed, count, folded, low, edge, mesh, nodes_left, squares):
         best, square = listed[0], np.inf
         for m in range(count):
             s = record_square(records, listed[m], x, y, z)
-            if s < square:
+            if s < square * (1 - SLACK):
                 best, square = listed[m], s
         if folded:
-            end, _ = nearest_triangle(boxes, starts, records, x, y, z, best, square, nodes_left, squares)
+            end, _ = nearest_triangle(
+                boxes, starts, records, order, x, y, z, best, square, SLACK, nodes_left, squares
+            )
         else:
             end = _walk(best, square, x, y, z, records, across)
         if end != best:
@@ -124,7 +128,7 @@ def _walk(best, square, x, y, z, records, across):
             n = across[best, (first + 2 * turn) % 3]
             if n >= 0:
                 s = record_square(records, n, x, y, z)
-                if s < square * (1 - 1e-9):
+                if s < square * (1 - SLACK):
                     step, square = n, s
         if step == best:
             return best
