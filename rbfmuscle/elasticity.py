@@ -131,7 +131,7 @@ class ElasticSolver:
         round until none is left: few contacts push at a time, but leaving one out would let the muscle jump
         between poses.
         """
-        reach = 1.5 * float(np.sqrt((motion**2).sum(axis=1).max())) + REACH_MARGIN * self.scale
+        reach = 1.5 * float(np.sqrt(np.einsum("sa,sa->s", motion, motion).max())) + REACH_MARGIN * self.scale
         spaces = contacts.half_spaces(here, reach)
         moved = np.empty_like(here)
         _move_loop(response, self.columns, self.shares, moved)

@@ -131,8 +131,9 @@ class BoneContacts:
         free = self.free(len(points))
         empty = (np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)))
         found = [empty] * len(self.names)
+        box = np.array([[column.min(), column.max()] for column in points.T]).T
         for b in self.reached:
-            near = self._near(points, free, b, reach + self.margin)
+            near = self._near(points, box, free, b, reach + self.margin)
             if len(near) == 0:
                 continue
             distance, direction = self._query(points[near], b, reach + self.margin)
@@ -197,10 +198,10 @@ class BoneContacts:
             length = np.linalg.norm(gradient, axis=1)
         return distance, gradient / length[:, None]
 
-    def _near(self, points, free, b, reach):
+    def _near(self, points, box, free, b, reach):
         """Contact points that may be nearer than ``reach`` to bone b, by its box and by earlier answers."""
         pose, bounds = self.poses[self.names[b]], np.asarray(self.fields[b].bounds, dtype=np.float64)
-        if _boxes_apart(points, pose, bounds, reach):
+        if _boxes_apart(box, pose, bounds, reach):
             return np.zeros(0, dtype=np.int64)
         anchor, bound = self._known.setdefault(b, (np.zeros_like(points), np.full(len(points), -np.inf)))
         if len(bound) != len(points):
@@ -222,10 +223,9 @@ def moved_box(bounds, pose):
     return np.array([middle - reach, middle + reach])
 
 
-def _boxes_apart(points, pose, bounds, reach):
-    box = moved_box(bounds, pose)
-    low, high = points.min(axis=0), points.max(axis=0)
-    return bool(np.any(low - reach > box[1]) or np.any(high + reach < box[0]))
+def _boxes_apart(box, pose, bounds, reach):
+    other = moved_box(bounds, pose)
+    return bool((box[0] - reach > other[1]).any() or (box[1] + reach < other[0]).any())
 
 
 @numba.njit(cache=True, nogil=True)
