@@ -349,3 +349,20 @@ class TestCheck:
         assert depths[15] == pytest.approx(0.7, abs=0.3)
         assert depths[22] == pytest.approx(9, abs=1)
         assert bone_collisions(Scene.load(hip_data / "gluteus.toml")) == []
+
+
+def test_documented_keys_are_the_schema():
+    """Every key of every table is in docs/scene_file.md, between backticks."""
+    from pathlib import Path
+
+    from rbfmuscle.sim import options
+    from rbfmuscle.sim.attachments import AttachTable, SphereTable
+    from rbfmuscle.sim.scene_file import SceneFile
+
+    text = (Path(__file__).parent.parent / "docs" / "scene_file.md").read_text(encoding="utf-8")
+    tables = [SceneFile, AttachTable, SphereTable, options.RampOptions, options.TunnellingOptions]
+    tables += [options.ContactOptions, options.SlidingOptions, options.OutputOptions, options.MotionOptions]
+    for table in tables:
+        for name, field in table.model_fields.items():
+            key = field.alias or name
+            assert any(mark in text for mark in (f"`{key}`", f"[{key}]", f"{key} = ")), (table.__name__, key)
