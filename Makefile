@@ -13,7 +13,9 @@ $(STAMP): pyproject.toml
 	touch $(STAMP)
 
 demo: $(STAMP)
-	$(BIN)/rbfmuscle demo -o demo_output
+	$(BIN)/rbfmuscle demo --model rbf -o demo_output/rbf
+	$(BIN)/rbfmuscle demo --model pbd -o demo_output/pbd
+	@echo "Open demo_output/rbf/report.html and demo_output/pbd/report.html"
 
 test: $(STAMP)
 	$(BIN)/python -m pytest
