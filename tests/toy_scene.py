@@ -97,7 +97,7 @@ class ToyMuscle:
     projected Gauss-Seidel through the inverse of K. Attached vertices go with their bones.
     """
 
-    def __init__(self, muscle, scene, *, sweeps=6):
+    def __init__(self, muscle, scene, *, sweeps=6, reach=None):
         self.name, self.muscle = muscle.name, muscle
         self.names = [bone.name for bone in scene.bones]
         self.rest = np.array(muscle.mesh.vertices, dtype=float)
@@ -106,7 +106,7 @@ class ToyMuscle:
         for attachment in muscle.attachments:
             self.contact_bone[attachment.vertices] = self.names.index(attachment.bone)
         self.sweeps = sweeps
-        self.reach = 0.1 * np.ptp(self.rest, axis=0).max()
+        self.reach = reach or 0.1 * np.ptp(self.rest, axis=0).max()
         self.x, self.target = self.rest.copy(), self.rest.copy()
         self.solves = 0
         self._prepare()
