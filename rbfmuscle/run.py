@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from rbfmuscle.models import build_model
+from rbfmuscle.sim.scene_check import check_initial
 from rbfmuscle.sim.simulate import simulate_frames
 from rbfmuscle.study.metrics import MetricsRecorder
 from rbfmuscle.study.runinfo import Stages, build_info
@@ -249,6 +250,7 @@ class _Course:
         self.summary, self.stages = Summary(), Stages()
         self.keep_rows, self.rows, self.fresh = keep_rows, [], []
         with self.timed("build"):
+            check_initial(self.scene)
             self.models = [build_model(muscle, scene) for muscle in scene.muscles]
             self.recorder = None
             if scene.output.metrics:

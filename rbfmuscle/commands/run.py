@@ -89,9 +89,6 @@ def run(
 
 def _run_scene(scene, output, *, model, frames, settings, fail_on, as_json):
     from rbfmuscle.run import stream_run
-    from rbfmuscle.sim.scene_check import check_initial
-
-    check_initial(scene.with_options(**settings))
     _warn_about_bones(scene)
     start = time.perf_counter()
     done = 0

@@ -103,7 +103,7 @@ class ContactOptions(Table):
     """``[contact]``: how muscles meet bones."""
 
     initial: Literal["resolve", "keep", "error"] = "resolve"
-    detector: Literal["sdf", "voxel", "bvh", "fcl"] = "sdf"
+    detector: Literal["sdf", "spline", "serendipity", "voxel", "bvh"] = "sdf"
     tolerance: Positive | None = None
     substep_angle: Annotated[float, Field(gt=0, le=90)] = 2.0
     margin: NotNegative = 0.0

@@ -8,6 +8,7 @@ import numba
 import numpy as np
 
 from rbfmuscle.sim.contact import moved_box
+from rbfmuscle.sim.detectors import build_detector
 from rbfmuscle.sim.motion import bone_poses, interpolate
 
 # Poses of a motion that a swept box is made of; arcs between them are covered by the padding.
@@ -65,15 +66,19 @@ def reached_bones(scene):
 
 
 def build_fields(scene, regions):
-    """Distance fields of the bones that some muscle can reach, in parallel: dict of bone name to BoneSDF."""
-    from rbfmuscle.sim.sdf import BoneSDF
+    """Distance fields of the bones that some muscle can reach, in parallel: dict of bone name to field.
 
+    The scene's ``[contact] detector`` says of which kind; only the default is built for the reached part alone.
+    """
+    kind = getattr(scene.contact, "detector", "sdf")
     tolerance = getattr(scene.contact, "tolerance", None)
-    options = {} if tolerance is None else {"tolerance": tolerance}
 
     def build(bone):
+        if kind != "sdf":
+            return build_detector(kind, bone.mesh)
         boxes = [box for (_, name), box in regions.items() if name == bone.name]
-        return BoneSDF.from_mesh(bone.mesh, region=_union(boxes), **options)
+        options = {} if tolerance is None else {"tolerance": tolerance}
+        return build_detector(kind, bone.mesh, region=_union(boxes), **options)
 
     bones = [bone for bone in scene.bones if any(name == bone.name for _, name in regions)]
     if len(bones) < 2:

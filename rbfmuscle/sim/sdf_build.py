@@ -11,6 +11,7 @@ import numba
 import numpy as np
 
 from rbfmuscle.sim.exact_distance import STACK, nearest_triangle, record_square, signed_side
+from rbfmuscle.sim.sdf_lattice import corner_ids, lattice, mark_corners, mark_loop, small_ids_loop
 from rbfmuscle.sim.sdf_lists import LONGEST, SLACK, folded_list, list_loop
 from rbfmuscle.sim.sdf_query import BLOCK, COUNT
 from rbfmuscle.sim.threads import in_chunks
@@ -171,15 +172,11 @@ def grid_shape(low, high, spacing, band):
     return np.maximum(np.ceil((high - low + 2 * margin) / (BLOCK * BLOCK * spacing)).astype(np.int64), 1)
 
 
-def _lattice(shape):
-    return np.stack(np.meshgrid(*[np.arange(n) for n in shape], indexing="ij"), axis=-1).reshape(-1, 3)
-
-
 def _coarse_level(builder, shape, edge, band, box):
     """Block table filled with the lists of coarse cells, and the (n, 3) blocks that are to replace them."""
-    low = _lattice(shape)
-    corners, centres = builder.nodes(_lattice(shape + 1), edge), builder.nodes(low + 0.5, edge)
-    ids = _corner_ids(low, np.arange(len(corners.record), dtype=np.int32).reshape(shape + 1))
+    low = lattice(shape)
+    corners, centres = builder.nodes(lattice(shape + 1), edge), builder.nodes(low + 0.5, edge)
+    ids = corner_ids(low, np.arange(len(corners.record), dtype=np.int32).reshape(shape + 1))
     offsets = builder.write(low, edge, ids, corners, centres.record)
     table = offsets.reshape(shape)
     for axis in range(3):
@@ -190,7 +187,7 @@ def _coarse_level(builder, shape, edge, band, box):
     near = distance - 0.5 * np.sqrt(3) * edge < band
     wanted = near | (guess > (1 + COARSE_ERROR) * distance)
     wanted &= np.all((low + 1 > box[0]) & (low < box[1]), axis=1)
-    chosen = (BLOCK * low[wanted][:, None, :] + _lattice((BLOCK,) * 3)).reshape(-1, 3)
+    chosen = (BLOCK * low[wanted][:, None, :] + lattice((BLOCK,) * 3)).reshape(-1, 3)
     return np.ascontiguousarray(table), chosen
 
 
@@ -199,9 +196,9 @@ def _block_level(builder, table, chosen, edge, bands, box):
     64)."""
     if len(chosen) == 0:
         return np.zeros((0, CUT), dtype=np.int32)
-    index, wanted = _mark_corners(chosen, table.shape)
+    index, wanted = mark_corners(chosen, table.shape)
     corners = builder.nodes(wanted, edge)
-    ids = _corner_ids(chosen, index)
+    ids = corner_ids(chosen, index)
     # Only blocks that may be cut are looked at in their centre.
     least = np.abs(corners.distance[ids]).argmin(axis=1)
     nearest = ids[np.arange(len(ids)), least]
@@ -232,7 +229,7 @@ def _cut_blocks(builder, shape, blocks, offsets, samples, edge, bands):
                 blocks, offsets, lists, builder.exact.records, builder.origin, edge, band, side, active
             )
         marks.append(active)
-    parent = (_lattice((BLOCK,) * 3) // (BLOCK // 2)) @ np.array([4, 2, 1])
+    parent = (lattice((BLOCK,) * 3) // (BLOCK // 2)) @ np.array([4, 2, 1])
     fine, half = marks
     for k in range(8):
         half[:, k] &= ~fine[:, parent == k].all(axis=1)
@@ -242,36 +239,44 @@ def _cut_blocks(builder, shape, blocks, offsets, samples, edge, bands):
     return np.where(fine, _small_cells(builder, shape, blocks, fine, edge, BLOCK), cells)
 
 
+def _active_cells(builder, lists, blocks, offsets, samples, edge, band, side):
+    """Which small cells (k, side^3) may hold points nearer than ``band``."""
+    active = np.zeros((len(blocks), side**3), dtype=np.bool_)
+    ids, corners, centres = samples
+    records, origin = builder.exact.records, builder.origin
+
+    def work(a, b):
+        _active_loop(ids[a:b], corners, centres[a:b], edge, band, side, active[a:b])
+        if builder.inside is None:
+            _near_loop(blocks[a:b], offsets[a:b], lists, records, origin, edge, band, side, active[a:b])
+
+    in_chunks(len(blocks), work, least=256)
+    return active
+
+
 def _small_cells(builder, shape, blocks, active, edge, side):
     """Offsets (k, side^3) of the lists of active cells, ``side`` to an edge of a block."""
     cells = np.zeros(active.shape, dtype=np.int32)
     if not active.any():
         return cells
-    owner, owners = _mark_corners(blocks, shape)
+    owner, owners = mark_corners(blocks, shape)
     number = np.full((len(owners), side**3), -1, dtype=np.int32)
-    _mark_loop(blocks, active, owner, side, number)
+    mark_loop(blocks, active, owner, side, number)
     slots = np.argwhere(number == 0)
     number[number == 0] = np.arange(len(slots), dtype=np.int32)
-    steps = _lattice((side,) * 3)
+    steps = lattice((side,) * 3)
     corners = builder.nodes(side * owners[slots[:, 0]] + steps[slots[:, 1]], edge / side)
     which, cell = np.nonzero(active)
     ids = np.empty((len(which), 8), dtype=np.int32)
-    _small_ids_loop(blocks, which, cell, owner, side, number, ids)
+
+    def work(a, b):
+        small_ids_loop(blocks, which[a:b], cell[a:b], owner, side, number, ids[a:b])
+
+    in_chunks(len(which), work)
     # In the fine cells a query's own walk over the surface finds what the corners missed.
     low, probe = side * blocks[which] + steps[cell], side < BLOCK
     cells[active] = builder.write(low, edge / side, ids, corners, None, probe=probe)
     return cells
-
-
-def _mark_corners(blocks, shape):
-    """Number of each corner of the blocks in a dense table (-1 elsewhere), and the corners (n, 3) in
-    order."""
-    index = np.full(np.array(shape) + 1, -1, dtype=np.int32)
-    for step in _lattice((2, 2, 2)):
-        index[tuple((blocks + step).T)] = 0
-    wanted = np.argwhere(index == 0)
-    index[tuple(wanted.T)] = np.arange(len(wanted), dtype=np.int32)
-    return index, wanted
 
 
 def _far_records(exact, diagonal):
@@ -285,11 +290,6 @@ def _far_records(exact, diagonal):
     place = np.empty(len(exact.order), dtype=np.int32)
     place[exact.order] = np.arange(len(exact.order))
     return np.unique(place[faces])
-
-
-def _corner_ids(low, index):
-    ids = [index[tuple((low + step).T)] for step in _lattice((2, 2, 2))]
-    return np.ascontiguousarray(np.stack(ids, axis=1))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -359,31 +359,3 @@ def _near_loop(blocks, offsets, lists, records, origin, edge, band, side, active
             for m in range(first, first + count):
                 near = near or record_square(records, lists[m], x, y, z) < limit
             active[i, cell] = near
-
-
-@numba.njit(cache=True, nogil=True)
-def _slot(block, cell, step, owner, side):
-    """Block that owns a corner of a small cell, and the corner's place in it."""
-    a = cell // (side * side) + step // 4
-    b = cell // side % side + step // 2 % 2
-    c = cell % side + step % 2
-    home = owner[block[0] + a // side, block[1] + b // side, block[2] + c // side]
-    return home, (a % side * side + b % side) * side + c % side
-
-
-@numba.njit(cache=True, nogil=True)
-def _mark_loop(blocks, active, owner, side, number):
-    for i in range(len(blocks)):
-        for cell in range(active.shape[1]):
-            if active[i, cell]:
-                for k in range(8):
-                    home, place = _slot(blocks[i], cell, k, owner, side)
-                    number[home, place] = 0
-
-
-@numba.njit(cache=True, nogil=True)
-def _small_ids_loop(blocks, which, cell, owner, side, number, ids):
-    for i in range(len(which)):
-        for k in range(8):
-            home, place = _slot(blocks[which[i]], cell[i], k, owner, side)
-            ids[i, k] = number[home, place]
