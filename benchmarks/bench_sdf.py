@@ -1,0 +1,230 @@
+"""Bone distance fields beside libigl's and trimesh's exact distances and the baselines, in one run.
+
+    NUMBA_NUM_THREADS=2 OMP_NUM_THREADS=2 python benchmarks/bench_sdf.py [--data FOLDER] [--bones femur pelvis]
+
+FOLDER holds hip/. Builds use all threads numba is given, queries one. Times are the least of several; errors are
+against libigl's pseudonormal distance at random points within 1 mm of the surface, directions within 2 mm.
+"""
+
+import argparse
+import os
+import tempfile
+import time
+from pathlib import Path
+
+import igl
+import numba
+import numpy as np
+import trimesh
+
+from rbfmuscle.sim.detectors import TreeDetector, VoxelDetector
+from rbfmuscle.sim.exact_distance import ExactDistance
+from rbfmuscle.sim.sdf import BoneSDF
+from rbfmuscle.sim.sdf_serendipity import SerendipityField
+from rbfmuscle.sim.sdf_spline import SplineField
+from rbfmuscle.study.sdf_report import points_near
+
+PSEUDONORMAL = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
+# Points for accuracy, for speed, and for the slow exact tools.
+ACCURACY, SPEED, SLOW = 200_000, 1_000_000, 2_000
+# Bytes of a coefficient or node value of the dense fields.
+FLOAT = 8
+
+
+def least(function, repeats=3):
+    """Least time of a call [s], and its result; the first call, which may compile, is not counted."""
+    result = function()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        result = function()
+        times.append(time.perf_counter() - start)
+    return min(times), result
+
+
+def on_one_thread(function, repeats=3):
+    """Least time of a call [s] with numba on one thread."""
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        return least(function, repeats)[0]
+    finally:
+        numba.set_num_threads(before)
+
+
+def judge(points, vertices, faces):
+    """libigl's signed distances and directions."""
+    distance, _, closest, _ = igl.signed_distance(points, vertices, faces, PSEUDONORMAL)[:4]
+    return distance, (points - closest) / np.where(distance == 0.0, 1.0, distance)[:, None]
+
+
+def accuracy(field, vertices, faces):
+    """Errors in mm and degrees as a line of text."""
+    near, _ = points_near(vertices, faces, ACCURACY, width=1.0)
+    exact, _ = judge(near, vertices, faces)
+    found = field.distance(near)
+    error, wrong = found - exact, np.mean(found * exact < 0.0)
+    band, _ = points_near(vertices, faces, ACCURACY // 4, seed=1, width=2.0)
+    exact, direction = judge(band, vertices, faces)
+    away = np.abs(exact) > 1e-2
+    gradient = field.gradient(band)[away]
+    cosine = np.einsum("ni,ni->n", gradient, direction[away]) / np.maximum(
+        np.linalg.norm(gradient, axis=1), 1e-300
+    )
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return (
+        f"{np.sqrt(np.mean(error**2)):9.5f} {np.abs(error).max():8.3f} {100 * wrong:9.4f} "
+        f"{np.median(angle):8.3f} {np.percentile(angle, 99):7.2f}"
+    )
+
+
+def row(name, field, build, vertices, faces, count=SPEED):
+    """One field's line of the table."""
+    points, _ = points_near(vertices, faces, count, seed=2, width=1.0)
+    ordered = points[np.lexsort(np.floor(points / 4.0).T)]
+    value = on_one_thread(lambda: field.distance(points)) / count
+    both = on_one_thread(lambda: field.distance_and_gradient(points)) / count
+    coherent = on_one_thread(lambda: field.distance_and_gradient(ordered)) / count
+    print(
+        f"{name:22s} {build:7.3f} {field.memory / 1e6:7.1f} {1e9 * value:7.0f} {1e9 * both:7.0f} "
+        f"{1e9 * coherent:7.0f} {accuracy(field, vertices, faces)}",
+        flush=True,
+    )
+
+
+def bone_table(name, mesh):
+    """All fields and detectors on one bone."""
+    vertices, faces = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.int64)
+    print(
+        f"\n{name}: {len(vertices)} vertices, {len(faces)} faces, {numba.get_num_threads()} threads to build"
+    )
+    print(
+        f"{'':22s} {'build':>7s} {'memory':>7s} {'value':>7s} {'+grad':>7s} {'sorted':>7s} "
+        f"{'RMS':>9s} {'worst':>8s} {'sign':>9s} {'angle':>8s} {'99 %':>7s}"
+    )
+    print(
+        f"{'':22s} {'s':>7s} {'MB':>7s} {'ns':>7s} {'ns':>7s} {'ns':>7s} {'mm':>9s} {'mm':>8s} {'% wrong':>9s}"
+    )
+    build, field = least(lambda: BoneSDF.from_mesh((vertices, faces), cache=False))
+    row("BoneSDF", field, build, vertices, faces)
+    build, dense = least(lambda: SerendipityField.from_mesh(mesh, cells=64), 1)
+    row("serendipity 64^3", dense, build, vertices, faces)
+    cells = int((field.memory / FLOAT / 7.0) ** (1 / 3))
+    build, dense = least(lambda: SerendipityField.from_mesh(mesh, cells=cells), 1)
+    row(f"serendipity {cells}^3", dense, build, vertices, faces)
+    build, dense = least(lambda: SplineField.from_mesh(mesh, nodes=field.memory // FLOAT), 1)
+    row("tricubic B-spline", dense, build, vertices, faces)
+    build, voxels = least(lambda: VoxelDetector.from_mesh(mesh), 1)
+    row("voxels 64^3", voxels, build, vertices, faces, SPEED // 10)
+    build, tree = least(lambda: TreeDetector.from_mesh((vertices, faces)))
+    row("exact tree", tree, build, vertices, faces, SPEED // 10)
+    exact_tools(mesh, vertices, faces)
+
+
+def exact_tools(mesh, vertices, faces):
+    """Time of the exact distances of libigl and trimesh."""
+    points, _ = points_near(vertices, faces, 20 * SLOW, seed=2, width=1.0)
+    spent, _ = least(lambda: igl.signed_distance(points, vertices, faces, PSEUDONORMAL), 2)
+    threads = os.environ.get("OMP_NUM_THREADS", "all")
+    print(
+        f"libigl pseudonormals, tree included, {threads} threads: {1e9 * spent / len(points):.0f} ns a value"
+    )
+    try:
+        spent, _ = least(lambda: trimesh.proximity.signed_distance(mesh, points[:SLOW]), 1)
+    except ModuleNotFoundError as error:
+        print(f"trimesh: not measured, {error} (pip install rtree)")
+        return
+    print(f"trimesh: {1e9 * spent / SLOW:.0f} ns a value")
+
+
+def build_stages(mesh):
+    """Cache, larger mesh, open bone."""
+    vertices, faces = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.int64)
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["RBFMUSCLE_CACHE"] = folder
+        print(f"cache hit: {1e3 * least(lambda: BoneSDF.from_mesh(mesh), 5)[0]:.1f} ms")
+        del os.environ["RBFMUSCLE_CACHE"]
+    larger = split_largest(vertices, faces, 45_000)
+    spent, field = least(lambda: BoneSDF.from_mesh(larger, cache=False))
+    print(f"split to {len(larger[0])} vertices: built in {spent:.3f} s, {field.memory / 1e6:.1f} MB")
+    centres = vertices[faces].mean(axis=1)
+    place = centres[len(faces) // 3]
+    hole = np.argsort(np.linalg.norm(centres - place, axis=1))[: len(faces) // 100]
+    radius = np.linalg.norm(centres[hole] - place, axis=1).max()
+    spent, field = least(
+        lambda: BoneSDF.from_mesh((vertices, np.delete(faces, hole, axis=0)), cache=False), 1
+    )
+    points, _ = points_near(vertices, faces, ACCURACY, seed=3, width=3.0)
+    points = points[np.linalg.norm(points - place, axis=1) > 2.0 * radius]
+    right = np.mean(field.distance(points) * judge(points, vertices, faces)[0] >= 0.0)
+    print(
+        f"1 % of the faces removed: built in {spent:.3f} s, sign right for {100 * right:.4f} % away from the hole"
+    )
+
+
+def split_largest(vertices, faces, count):
+    """The mesh with its largest faces split in three, so that it has ``count`` vertices."""
+    corners = vertices[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    chosen = np.argsort(-area)[: max(0, count - len(vertices))]
+    middle = len(vertices) + np.arange(len(chosen))
+    a, b, c = faces[chosen].T
+    parts = [np.column_stack(pair) for pair in ((a, b, middle), (b, c, middle), (c, a, middle))]
+    kept = np.delete(faces, chosen, axis=0)
+    return np.vstack([vertices, corners[chosen].mean(axis=1)]), np.vstack([kept, *parts])
+
+
+def muscle_tree(mesh):
+    """Build and refit of the exact tree on a surface that deforms."""
+    vertices = np.asarray(mesh.vertices, dtype=float)
+    spent, exact = least(lambda: ExactDistance((vertices, mesh.faces)), 5)
+    again, _ = least(lambda: exact.refit(vertices), 5)
+    print(
+        f"\nexact tree, {len(mesh.faces)} triangles: build {1e3 * spent:.1f} ms, refit {1e3 * again:.1f} ms"
+    )
+
+
+def sphere_table():
+    """Largest errors within 0.1 of a sphere of 0.7 in [-1, 1]^3."""
+    rng = np.random.default_rng(0)
+    unit = rng.normal(size=(ACCURACY, 3))
+    points = (
+        unit / np.linalg.norm(unit, axis=1, keepdims=True) * (0.7 + rng.uniform(-0.1, 0.1, (ACCURACY, 1)))
+    )
+
+    def sphere(at):
+        return np.linalg.norm(at, axis=1) - 0.7
+
+    print("\nsphere, largest error in the band at 8 / 16 / 32 / 64 cells")
+    for name, build in (
+        ("serendipity", lambda n: SerendipityField(sphere, [-1.0] * 3, [1.0] * 3, n)),
+        ("tricubic B-spline", lambda n: SplineField(sphere, [-1.0] * 3, [1.0] * 3, 2.0 / n)),
+    ):
+        errors = [np.abs(build(n).distance(points) - sphere(points)).max() for n in (8, 16, 32, 64)]
+        print(f"{name:18s} " + "  ".join(f"{error:.1e}" for error in errors))
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--data", default=os.environ.get("RBFMUSCLE_DATA", "../shared/data"))
+    parser.add_argument("--bones", nargs="*", default=["femur", "pelvis"])
+    arguments = parser.parse_args()
+    folder = Path(arguments.data) / "hip"
+    shapes = {
+        "box 20 x 30 x 40": trimesh.creation.box((20.0, 30.0, 40.0)),
+        "torus 20, 5": trimesh.creation.torus(20.0, 5.0),
+        "thin plate 0.5": trimesh.creation.box((40.0, 30.0, 0.5)),
+    }
+    if folder.is_dir():
+        for name in arguments.bones:
+            mesh = trimesh.load(folder / f"{name}.ply", process=False)
+            bone_table(name, mesh)
+            build_stages(mesh)
+        muscle_tree(trimesh.load(folder / "gluteus_medius.ply", process=False))
+    for name, mesh in shapes.items():
+        bone_table(name, mesh)
+    sphere_table()
+
+
+if __name__ == "__main__":
+    main()
