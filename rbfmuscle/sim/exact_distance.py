@@ -49,7 +49,7 @@ class ExactDistance:
 
     Notes
     -----
-    About 7 ms to build for 10,000 triangles, 1 ms to refit, and 1 microsecond a point near the surface.
+    About 5 ms to build for 10,000 triangles, 1 ms to refit, and 1 microsecond a point near the surface.
     """
 
     def __init__(self, mesh):

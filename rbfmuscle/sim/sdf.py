@@ -141,10 +141,11 @@ class BoneSDF:
             faster.
         """
         points, pose = check_points(points), _check_pose(pose)
+        reach = np.inf if reach is None else float(reach)
         out = np.empty(len(points))
 
         def work(a, b):
-            value_loop(points[a:b], pose, float(reach), out[a:b], self.data)
+            value_loop(points[a:b], pose, reach, out[a:b], self.data)
 
         in_chunks(len(points), work, least=4096)
         return out
