@@ -116,14 +116,18 @@ class _Crew:
         from threadpoolctl import ThreadpoolController
 
         self.blas = ThreadpoolController()
-        self.workers = min(count, numba.get_num_threads())
+        workers = min(count, numba.get_num_threads())
         self.pool = None
-        if self.workers > 1:
-            self.pool = ThreadPoolExecutor(self.workers, initializer=numba.set_num_threads, initargs=(1,))
+        if workers > 1:
+            self.pool = ThreadPoolExecutor(workers, initializer=numba.set_num_threads, initargs=(1,))
 
     def one_thread_each(self):
         """Context in which BLAS uses one thread: its workers spin, and take the cores from the loops."""
         return self.blas.limit(limits=1, user_api="blas")
+
+    def all_threads(self):
+        """Context for work of large matrices: a muscle that is alone takes every thread."""
+        return self.blas.limit(limits=1 if self.pool else numba.get_num_threads(), user_api="blas")
 
     def each(self, act, items):
         """``[act(item) for item in items]``, in parallel where that pays."""
@@ -193,6 +197,7 @@ def _run(scene, lanes, crew, surfaces, written):
         shown = written is None or index in written
         with crew.one_thread_each():
             _go(lanes, crew, sliding, index, [here, *split_step(scene, here, coordinates)])
+        with crew.all_threads():
             skins = _show(lanes, crew, sliding) if shown and surfaces else []
         wall += time.perf_counter() - start
         if shown:
