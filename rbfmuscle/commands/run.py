@@ -89,6 +89,7 @@ def run(
 
 def _run_scene(scene, output, *, model, frames, settings, fail_on, as_json):
     from rbfmuscle.run import stream_run
+
     _warn_about_bones(scene)
     start = time.perf_counter()
     done = 0
