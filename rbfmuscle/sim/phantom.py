@@ -67,7 +67,7 @@ def bone_meshes(spacing=3.5):
 # The first is long and wraps the back of the hip; the second is a fan; the last two lie 1.2 mm apart.
 MUSCLES = {
     "extensor": Tube(
-        points=((8.9, 45.5, 76.3), (-46, 52.5, -36), (-43, 18, -137)),
+        points=((8.2, 45.5, 76.1), (-46, 52.5, -36), (-43, 18, -137)),
         radius=90,
         width=27,
         thickness=11,
@@ -76,7 +76,7 @@ MUSCLES = {
         twist=(0.7, -0.62),
     ),
     "abductor": Tube(
-        points=((-9.5, -19, 130), (-28, -6, 50), (-60, 8, 1)),
+        points=((-9.5, -19, 130), (-28, -6, 50), (-60.3, 8, 1.8)),
         radius=200,
         width=23,
         thickness=7,
@@ -85,7 +85,7 @@ MUSCLES = {
         twist=(0.04, -0.6),
     ),
     "adductor_anterior": Tube(
-        points=((66.4, -42, -44), (23.2, -14, -125.1), (-22, -13, -212)),
+        points=((66.4, -42, -44), (23.2, -14, -125.1), (-20.3, -13.5, -211.9)),
         radius=220,
         width=14,
         thickness=9,
