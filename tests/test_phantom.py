@@ -134,3 +134,17 @@ class TestScene:
         again.muscles[0].mesh.apply_translation([5, 0, 0])
         fresh = phantom_scene()
         assert fresh.muscles[0].mesh.bounds == pytest.approx(scene.muscles[0].mesh.bounds)
+
+
+@pytest.mark.parametrize("model", ["rbf", "pbd"])
+def test_both_models_keep_the_promised_figures_in_flexion(model):
+    from rbfmuscle.run import simulate
+
+    run = simulate(phantom_scene(end=40, step=20), model=model)
+    assert len(run.frames) == 3
+    for muscle in run:
+        assert all(muscle.surface(frame).is_watertight for frame in range(3))
+        assert muscle.values("components") == pytest.approx(1)
+        assert np.abs(muscle.values("volume_error")).max() <= 1e-3
+        assert muscle.values("penetration_max").max() <= 0.5  # mm
+        assert muscle.values("bone_penetration_max").max() <= 0.5  # mm

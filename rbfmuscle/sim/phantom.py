@@ -109,8 +109,8 @@ MUSCLES = {
 ATTACHED_ENDS = {
     "extensor": (0.17, 0.83),
     "abductor": (0.3, 0.87),
-    "adductor_anterior": (0.2, 0.8),
-    "adductor_posterior": (0.2, 0.8),
+    "adductor_anterior": (0.12, 0.88),
+    "adductor_posterior": (0.12, 0.88),
 }
 ATTACHED_WITHIN = 6.0
 FIBRE_PLACES = ((0, 0), (0.55, 0), (-0.55, 0), (0, 0.5), (0, -0.5))
