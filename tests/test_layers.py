@@ -1,6 +1,7 @@
 """The import rules between the rooms, checked on the source."""
 
 import ast
+import shutil
 from pathlib import Path
 
 import pytest
@@ -81,14 +82,18 @@ def wrong_arrows(module, source, *, is_package=False):
     return sorted(name for name in names if not any(starts_with(name, prefix) for prefix in allowed))
 
 
-SOURCES = sorted([*(ROOT / "rbfmuscle").rglob("*.py"), *(ROOT / "pbd_baseline").rglob("*.py")])
+def sources(root):
+    return sorted([*(root / "rbfmuscle").rglob("*.py"), *(root / "pbd_baseline").rglob("*.py")])
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=lambda path: module_name(path))
-def test_imports_only_what_its_room_may(path):
-    module = module_name(path)
+def wrong_arrows_of_file(path, root=ROOT):
     source = path.read_text(encoding="utf-8")
-    assert wrong_arrows(module, source, is_package=path.name == "__init__.py") == []
+    return wrong_arrows(module_name(path, root), source, is_package=path.name == "__init__.py")
+
+
+@pytest.mark.parametrize("path", sources(ROOT), ids=lambda path: module_name(path))
+def test_imports_only_what_its_room_may(path):
+    assert wrong_arrows_of_file(path) == []
 
 
 @pytest.mark.parametrize(
@@ -112,6 +117,21 @@ def test_imports_only_what_its_room_may(path):
 )
 def test_planted_wrong_arrow_is_found(module, source):
     assert wrong_arrows(module, source)
+
+
+def test_wrong_arrow_planted_in_a_copy_of_the_tree_is_found(tmp_path):
+    for package in ("rbfmuscle", "pbd_baseline"):
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    assert len(sources(tmp_path)) == len(sources(ROOT))
+    planted = {
+        "rbfmuscle/sim/simulate.py": "\n\ndef late():\n    from ..implicit.field import RBFField\n",
+        "pbd_baseline/__init__.py": "\nimport rbfmuscle.muscle\n",
+    }
+    for name, text in planted.items():
+        with (tmp_path / name).open("a", encoding="utf-8") as file:
+            file.write(text)
+    found = {path for path in sources(tmp_path) if wrong_arrows_of_file(path, tmp_path)}
+    assert found == {tmp_path / name for name in planted}
 
 
 def test_right_arrows_pass():

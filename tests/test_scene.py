@@ -351,18 +351,9 @@ class TestCheck:
         assert bone_collisions(Scene.load(hip_data / "gluteus.toml")) == []
 
 
-def test_documented_keys_are_the_schema():
-    """Every key of every table is in docs/scene_file.md, between backticks."""
-    from pathlib import Path
-
-    from rbfmuscle.sim import options
-    from rbfmuscle.sim.attachments import AttachTable, SphereTable
-    from rbfmuscle.sim.scene_file import SceneFile
-
-    text = (Path(__file__).parent.parent / "docs" / "scene_file.md").read_text(encoding="utf-8")
-    tables = [SceneFile, AttachTable, SphereTable, options.RampOptions, options.TunnellingOptions]
-    tables += [options.ContactOptions, options.SlidingOptions, options.OutputOptions, options.MotionOptions]
-    for table in tables:
-        for name, field in table.model_fields.items():
-            key = field.alias or name
-            assert any(mark in text for mark in (f"`{key}`", f"[{key}]", f"{key} = ")), (table.__name__, key)
+def test_exit_codes_are_the_promised_ones(folder):
+    with pytest.raises(SceneError) as scene:
+        load(folder, ("step = 10", "step = 0"))
+    with pytest.raises(MeshError) as mesh:
+        load(folder, ('"biceps.ply"', '"bicep.ply"'))
+    assert (scene.value.exit_code, mesh.value.exit_code) == (3, 4)
