@@ -28,20 +28,20 @@ class _Mesh:
 
 
 def _ball(radius=10.0):
-    return _Mesh(trimesh.creation.icosphere(subdivisions=4, radius=radius))
+    return _Mesh(trimesh.creation.icosphere(subdivisions=3, radius=radius))
 
 
 def test_skin_distance_agrees_with_the_sphere():
     skin = Skin(_ball(), reach=3.0)
-    points = np.random.default_rng(0).normal(size=(3000, 3))
-    points *= np.random.default_rng(1).uniform(8, 14, (3000, 1)) / np.linalg.norm(
+    points = np.random.default_rng(0).normal(size=(500, 3))
+    points *= np.random.default_rng(1).uniform(8, 14, (500, 1)) / np.linalg.norm(
         points, axis=1, keepdims=True
     )
     exact = np.linalg.norm(points, axis=1) - 10.0
-    index, distance, normal, nearest = skin.query(points, np.ones(3000, dtype=bool), 3.0)
-    # The triangles lie up to 0.02 below the sphere.
-    assert np.allclose(distance, exact[index], atol=0.03)
-    assert set(np.flatnonzero(exact < 2.95)) <= set(index)
+    index, distance, normal, nearest = skin.query(points, np.ones(500, dtype=bool), 3.0)
+    # The triangles lie up to 0.06 below the sphere.
+    assert np.allclose(distance, exact[index], atol=0.08)
+    assert set(np.flatnonzero(exact < 2.9)) <= set(index)
     assert (
         np.einsum("ij,ij->i", normal, points[index] / np.linalg.norm(points[index], axis=1)[:, None]).min()
         > 0.99
@@ -58,7 +58,7 @@ def test_skin_follows_the_model_and_asks_only_what_it_is_asked():
     points = (np.array([[11.0, 0, 0], [0, 9, 0], [0, 0, 12]])) @ turn[:3, :3].T + turn[:3, 3]
     index, distance, _, _ = skin.query(points, np.array([True, True, False]), 3.0)
     assert index.tolist() == [0, 1]
-    assert np.allclose(distance, [1, -1], atol=0.03)
+    assert np.allclose(distance, [1, -1], atol=0.08)
 
 
 def test_skin_far_away_or_empty_answers_nothing():
