@@ -3,10 +3,8 @@
 import numba
 import numpy as np
 
-from rbfmuscle.constraints import contact_gram, solve_contact_forces
+from rbfmuscle.constraints import ContactConstraint
 
-CONTACT_SWEEPS = 60
-CONTACT_ROUNDS = 6
 CONTACT_TOLERANCE = 2e-5  # of the muscle's size: some micrometres
 REACH_MARGIN = 0.003  # of the muscle's size
 
@@ -76,16 +74,19 @@ class ElasticSolver:
         self.coupling = laplacian[np.ix_(free, held)]
         dense = np.zeros((self.centres, len(points)))
         np.add.at(dense, (columns, np.arange(len(points))[:, None]), shares)
-        self.influence = np.zeros((self.centres, len(points)))
-        self.influence[free] = self.inverse @ dense[free]
+        influence = np.zeros((self.centres, len(points)))
+        influence[free] = self.inverse @ dense[free]
         self.scale = float(np.ptp(shape.rest, axis=0).max())
-        self.forces = {}
+        self.contact = ContactConstraint(
+            np.ascontiguousarray(influence.T), columns, shares,
+            batch=contacts, tolerance=CONTACT_TOLERANCE * self.scale,
+        )  # fmt: skip
 
     def snapshot(self):
-        return dict(self.forces)
+        return self.contact.forces.copy()
 
     def restore(self, forces):
-        self.forces = dict(forces)
+        self.contact.forces = forces.copy()
 
     def carry(self, x):
         """Contact points at centres x with the present targets, (K + S, 3)."""
@@ -107,76 +108,26 @@ class ElasticSolver:
         return x
 
     def _iterate(self, x, contacts):
+        """One local step, one global step, and on top of it pressure and contact together."""
         right = self.shape.localise(x)
         new = x.copy()
         new[self.free] = self.inverse @ (right[self.free] - self.coupling @ x[self.held])
-        here = self.carry(x)
-        motion = np.empty_like(here)
+        here, motion, moved = self.carry(x), np.empty_like(self.points), np.empty_like(self.points)
         _move_loop(new - x, self.columns, self.shares, motion)
         excess, gradient = self.volume.evaluate(here[self.centres :])
-        missing = -excess - np.vdot(gradient, motion[self.centres :])
-        pull = np.empty_like(x)
+        pull, response = np.empty_like(x), np.zeros_like(x)
         _gather_loop(gradient, self.columns[self.centres :], self.shares[self.centres :], pull)
-        response = np.zeros_like(x)
         response[self.free] = self.inverse @ pull[self.free]
-        stiffness = np.vdot(pull, response)
-        push, lost = self._contact(here, motion, response, missing, stiffness, contacts)
-        new += push + response * ((missing - lost) / stiffness)
-        return new
-
-    def _contact(self, here, motion, response, missing, stiffness, contacts):
-        """Contact correction of the centres, and the volume that it adds by itself.
-
-        The working set starts from the contacts that pushed before and takes in the deepest violations round by
-        round until none is left: few contacts push at a time, but leaving one out would let the muscle jump
-        between poses.
-        """
-        reach = 1.5 * float(np.sqrt(np.einsum("sa,sa->s", motion, motion).max())) + REACH_MARGIN * self.scale
-        spaces = contacts.half_spaces(here, reach)
-        moved = np.empty_like(here)
         _move_loop(response, self.columns, self.shares, moved)
-        row = np.einsum("ca,ca->c", spaces.normal, moved[spaces.index])
-        need = -spaces.gap - np.einsum("ca,ca->c", spaces.normal, motion[spaces.index])
-        need -= row * (missing / stiffness)
-        keys = spaces.index * 64 + spaces.source
-        force = np.array([self.forces.get(key, 0.0) for key in keys.tolist()])
-        tolerance = CONTACT_TOLERANCE * self.scale
-        chosen = np.flatnonzero(force > 0.0)
-        lacking = need
-        push, lost = np.zeros((self.centres, 3)), 0.0
-        for _ in range(CONTACT_ROUNDS):
-            added = _deepest(lacking, chosen, tolerance, self.batch)
-            if len(added) == 0 and len(chosen) == 0:
-                break
-            chosen = np.concatenate([chosen, added])
-            index, normal = spaces.index[chosen], spaces.normal[chosen]
-            gram = contact_gram(index, normal, self.influence, self.columns, self.shares)
-            gram -= np.outer(row[chosen], row[chosen]) / stiffness
-            # A contact on held centres alone cannot be moved: its row is zero.
-            gram[np.diag_indices_from(gram)] += 1e-9 * np.abs(np.diag(gram)).max()
-            strength = solve_contact_forces(
-                gram, need[chosen], force[chosen], sweeps=CONTACT_SWEEPS, tolerance=0.1 * tolerance
-            )
-            force[chosen] = strength
-            push = self.influence[:, index] @ (normal * strength[:, None])
-            lost = float(row[chosen] @ strength)
-            if len(added) == 0:
-                break
-            _move_loop(push, self.columns, self.shares, moved)
-            lacking = (
-                need - np.einsum("ca,ca->c", spaces.normal, moved[spaces.index]) + row * (lost / stiffness)
-            )
-        active = chosen[force[chosen] > 0.0]
-        self.forces = dict(zip(keys[active].tolist(), force[active].tolist()))
-        return push, lost
-
-
-def _deepest(lacking, chosen, tolerance, most):
-    """Contacts, not yet chosen, that lack the most motion."""
-    lacking = lacking.copy()
-    lacking[chosen] = -np.inf
-    found = np.flatnonzero(lacking > tolerance)
-    return found[np.argsort(-lacking[found], kind="stable")[:most]]
+        stiffness = np.vdot(pull, response)
+        pressure = -(excess + np.vdot(gradient, motion[self.centres :])) / stiffness
+        motion += pressure * moved
+        spaces = contacts.half_spaces(
+            here, 1.5 * np.sqrt((motion**2).sum(axis=1)) + REACH_MARGIN * self.scale
+        )
+        sources = max(1, len(contacts.names) + len(contacts.neighbours))
+        push, lost = self.contact.project(spaces, sources, motion, moved, stiffness)
+        return new + push + response * (pressure - lost / stiffness)
 
 
 class _Anderson:

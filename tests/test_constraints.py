@@ -96,7 +96,8 @@ def test_contact_forces_solve_the_quadratic_programme():
     half = rng.normal(size=(12, 12))
     gram = half @ half.T + 0.5 * np.eye(12)
     need = rng.normal(size=12)
-    force = solve_contact_forces(gram, need, np.zeros(12), sweeps=2000, tolerance=1e-13)
+    force = np.zeros(12)
+    solve_contact_forces(gram, need, force, sweeps=2000, tolerance=1e-13)
     literal = minimize(
         lambda f: 0.5 * f @ gram @ f - need @ f,
         np.zeros(12),

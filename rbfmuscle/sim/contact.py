@@ -74,7 +74,6 @@ class BoneContacts:
         if missing:
             raise ValueError(f"poses lack the bone {missing[0]!r}")
         self.poses = poses
-        self._known = {}
 
     def allow(self, bone_index, depth):
         """Let each contact point be up to ``depth`` (n,) inside a bone, [scene unit]; zeros take it back."""
@@ -82,7 +81,6 @@ class BoneContacts:
             self.allowed[bone_index] = np.array(depth, dtype=np.float64)
         else:
             self.allowed.pop(bone_index, None)
-        self._known = {}
 
     def distance_and_direction(self, points, bone_index):
         """Signed distance (n,) to one bone and the unit direction (n, 3) in which it grows, world axes."""
@@ -131,17 +129,18 @@ class BoneContacts:
         free = self.free(len(points))
         empty = (np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)))
         found = [empty] * len(self.names)
-        box = np.array([[column.min(), column.max()] for column in points.T]).T
+        reach = np.full(len(points), reach) if np.ndim(reach) == 0 else np.asarray(reach, dtype=np.float64)
         for b in self.reached:
-            near = self._near(points, box, free, b, reach + self.margin)
+            near = self._near(points, free, b, reach + self.margin)
             if len(near) == 0:
                 continue
-            distance, direction = self._query(points[near], b, reach + self.margin)
+            limit = reach[near]
+            distance, direction = self._query(points[near], b, float(limit.max()) + self.margin)
             self._remember(points, near, distance, b)
             distance = distance - self.margin
             if b in self.allowed and len(self.allowed[b]) == len(points):
                 distance = distance + self.allowed[b][near]
-            keep = distance < reach
+            keep = distance < limit
             found[b] = (near[keep], distance[keep], direction[keep])
         return found
 
@@ -152,13 +151,13 @@ class BoneContacts:
         ----------
         points : (n, 3) array_like
             The model's contact points, in their order.
-        reach : float
-            [scene unit].
+        reach : float or (n,) array_like
+            For all, or for each point [scene unit].
         """
         points = check_points(points)
         parts = [(*found, b) for b, found in enumerate(self.query(points, reach)) if len(found[0])]
         for k, neighbour in enumerate(self.neighbours):
-            found = neighbour.contacts(points, reach)
+            found = neighbour.contacts(points, np.max(reach))
             if len(found[0]):
                 parts.append((*found, -1 - k))
         if not parts:
@@ -170,10 +169,10 @@ class BoneContacts:
     def lower_bound(self, points, bone_index):
         """What is known of the contact points' distances (n,) to a bone without asking its field."""
         bounds = np.asarray(self.fields[bone_index].bounds, dtype=np.float64)
-        unknown = (np.zeros_like(points), np.full(len(points), -np.inf))
-        anchor, bound = self._known.get(bone_index, unknown)
         out = np.empty(len(points))
-        _bound_loop(points, self.poses[self.names[bone_index]], bounds, anchor, bound, out)
+        _bound_loop(
+            points, self.poses[self.names[bone_index]], bounds, *self._answers(len(points), bone_index), out
+        )
         return out
 
     def free(self, count):
@@ -198,22 +197,24 @@ class BoneContacts:
             length = np.linalg.norm(gradient, axis=1)
         return distance, gradient / length[:, None]
 
-    def _near(self, points, box, free, b, reach):
-        """Contact points that may be nearer than ``reach`` to bone b, by its box and by earlier answers."""
+    def _near(self, points, free, b, reach):
+        """Contact points that may be nearer than their ``reach`` to bone b, by its box and by earlier answers."""
         pose, bounds = self.poses[self.names[b]], np.asarray(self.fields[b].bounds, dtype=np.float64)
-        if _boxes_apart(box, pose, bounds, reach):
-            return np.zeros(0, dtype=np.int64)
-        anchor, bound = self._known.setdefault(b, (np.zeros_like(points), np.full(len(points), -np.inf)))
-        if len(bound) != len(points):
-            anchor, bound = self._known[b] = (np.zeros_like(points), np.full(len(points), -np.inf))
         found = np.zeros(len(points), dtype=np.int64)
-        count = _near_loop(points, free, pose, bounds, reach, anchor, bound, found)
+        count = _near_loop(points, free, pose, bounds, reach, *self._answers(len(points), b), found)
         return found[:count]
 
+    def _answers(self, count, b):
+        """Earlier places (count, 3) of the contact points in the bone's coordinates, and their distances there.
+
+        They hold wherever the bone goes.
+        """
+        if b not in self._known or len(self._known[b][1]) != count:
+            self._known[b] = np.zeros((count, 3)), np.full(count, -np.inf)
+        return self._known[b]
+
     def _remember(self, points, near, distance, b):
-        anchor, bound = self._known[b]
-        anchor[near] = points[near]
-        bound[near] = TRUSTED_SHARE * distance
+        _remember_loop(points, self.poses[self.names[b]], near, distance, *self._known[b])
 
 
 def moved_box(bounds, pose):
@@ -223,9 +224,15 @@ def moved_box(bounds, pose):
     return np.array([middle - reach, middle + reach])
 
 
-def _boxes_apart(box, pose, bounds, reach):
-    other = moved_box(bounds, pose)
-    return bool((box[0] - reach > other[1]).any() or (box[1] + reach < other[0]).any())
+@numba.njit(cache=True, nogil=True)
+def _remember_loop(points, pose, near, distance, anchor, bound):
+    for n in range(len(near)):
+        i = near[n]
+        bound[i] = TRUSTED_SHARE * distance[n]
+        for k in range(3):
+            anchor[i, k] = 0.0
+            for j in range(3):
+                anchor[i, k] += pose[j, k] * (points[i, j] - pose[j, 3])
 
 
 @numba.njit(cache=True, nogil=True)
@@ -234,9 +241,9 @@ def _lower_bound(points, i, pose, bounds, anchor, bound):
     moved, outside = 0.0, 0.0
     for k in range(3):
         local = 0.0
-        moved += (points[i, k] - anchor[i, k]) ** 2
         for j in range(3):
             local += pose[j, k] * (points[i, j] - pose[j, 3])
+        moved += (local - anchor[i, k]) ** 2
         beyond = max(bounds[0, k] - local, local - bounds[1, k], 0.0)
         outside += beyond * beyond
     known = bound[i] - np.sqrt(moved)
@@ -248,7 +255,7 @@ def _near_loop(points, free, pose, bounds, reach, anchor, bound, found):
     """Fill ``found`` with the free points that may be nearer than ``reach``; return their number."""
     count = 0
     for i in range(len(points)):
-        if free[i] and _lower_bound(points, i, pose, bounds, anchor, bound) <= reach:
+        if free[i] and _lower_bound(points, i, pose, bounds, anchor, bound) <= reach[i]:
             found[count] = i
             count += 1
     return count
