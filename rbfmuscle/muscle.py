@@ -250,34 +250,21 @@ class RBFMuscle:
             derivatives=self.options.derivatives,
         )  # fmt: skip
 
-    def _near_bone_vertices(self, points, poses):
-        """Bone vertices in the box of the points, in world positions, (k, 3)."""
-        margin = 0.05 * self.solver.scale
-        found = [np.zeros((0, 3))]
-        for name, vertices in zip(self.bones, self.bone_vertices):
-            pose = poses[name]
-            local = (points - pose[:3, 3]) @ pose[:3, :3]
-            low, high = local.min(axis=0) - margin, local.max(axis=0) + margin
-            inside = vertices[((vertices > low) & (vertices < high)).all(axis=1)]
-            found.append(inside @ pose[:3, :3].T + pose[:3, 3])
-        return np.concatenate(found)
-
     def surface(self, contacts):
         """Refit the field, cut the bones away and extract the closed surface at the rest volume."""
         started = time.perf_counter()
         field = self.field()
         fitted = time.perf_counter()
         points = self.contact_points()
-        free = self.contact_bone < 0
         # Farther than a cell from the bones a lower bound will do: no vertex gets there.
-        reach = self.solver.scale / self.options.resolution
-        depth = max(0.0, -float(contacts.nearest(points[free], reach).min(initial=np.inf)))
+        reach = 1.25 * self.solver.scale / self.options.resolution
+        depth = contacts.depth(points)
         cut = _BoneCut(contacts, reach) if contacts.names else None
         axes = self.axes @ contacts.poses[self.motion_bones[0]][:3, :3].T
         result = extract_surface(
             field, points=points, resolution=self.options.resolution, cut=cut,
             volume=self.rest_volume, level=self.level, axes=axes,
-            obstacle_points=self._near_bone_vertices(points, contacts.poses) if contacts.names else None,
+            obstacles=[(self.bone_vertices[b], contacts.poses[contacts.names[b]]) for b in contacts.reached],
         )  # fmt: skip
         self.level = result.level
         return ModelSurface(

@@ -74,7 +74,7 @@ def test_any_pattern_of_signs_gives_a_closed_manifold(seed):
     band = Band(grid, lambda x: values[tuple(np.rint(x).astype(int).T)])
     band.visit_all()
     band.grow(0.0)
-    vertices, faces, on_border = band.march(0.0)
+    vertices, faces, on_border, _ = band.march(0.0)
     directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     assert len(np.unique(directed, axis=0)) == len(directed)
     assert (np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)[1] == 2).all()
@@ -91,7 +91,7 @@ def test_vertices_equal_those_of_scikit_image(field, points):
     band = Band(grid, field)
     band.seed(points)
     band.grow(level)
-    vertices, faces, _ = band.march(level)
+    vertices, faces, _, _ = band.march(level)
     dense = field(grid.nodes(np.arange(np.prod(grid.shape)))).reshape(grid.shape)
     theirs, their_faces, _, _ = marching_cubes(dense, level, allow_degenerate=True)
     assert len(theirs) == len(vertices)
@@ -153,9 +153,9 @@ def test_chords_do_not_cut_across_a_convex_bone():
     ball = trimesh.creation.icosphere(4, radius=15.0).apply_translation(CENTRE + [50.0, 0, 0])
     bone = sphere(15.0, CENTRE + [50.0, 0, 0])
     depths = []
-    for points in (None, ball.vertices):
+    for obstacles in (None, [(np.array(ball.vertices), np.eye(4))]):
         surface = extract_surface(
-            sphere(), points=on_sphere(), cut=bone, obstacle_points=points, volume=5e5, resolution=32
+            sphere(), points=on_sphere(), cut=bone, obstacles=obstacles, volume=5e5, resolution=32
         )
         mesh = check_closed(surface)
         assert mesh.volume == pytest.approx(5e5, rel=1e-9)

@@ -21,6 +21,8 @@ from rbfmuscle.validation import check_points
 
 # More nodes than this are refused: 2 bytes of state and 8 of index each.
 MAX_NODES = 50_000_000
+# Where both nodes of a vertex's edge are farther than this from the cut, in cells, it stays clear of the cut.
+NEAR_CUT = 1.2
 
 
 @dataclass(frozen=True)
@@ -194,8 +196,10 @@ class Band:
         coordinates : (n, 3) ndarray
             Vertices in grid coordinates.
         triangles : (m, 3) ndarray
-        open_vertex : (n,) ndarray of bool
+        is_open : (n,) ndarray of bool
             Vertices on the outermost cells, where the surface leaves the grid.
+        near_cut : (n,) ndarray of bool
+            Vertices that a shift by a cell may bring to the cut.
         """
         count = self.cell_count
         ambiguous, first, start, table = marching_tables()
@@ -207,11 +211,32 @@ class Band:
             self.cells, self.grid.strides, self.index, self._f, self._c, level, EDGE_CORNER, EDGE_AXIS,
             FACE_CORNERS, ambiguous, first, start, table, vertex_of, node, shift, triangles,
         )  # fmt: skip
-        lower = np.column_stack(np.unravel_index(node[:n_vertices], self.grid.shape))
-        coordinates = lower + shift[:n_vertices]
-        last = np.array(self.grid.shape) - 1
-        open_vertex = ((coordinates < 1e-9) | (coordinates > last - 1e-9)).any(axis=1)
-        return coordinates, triangles[:n_triangles], open_vertex
+        coordinates = shift[:n_vertices]
+        is_open, near_cut = np.empty(n_vertices, dtype=np.bool_), np.empty(n_vertices, dtype=np.bool_)
+        _place_loop(
+            node, np.array(self.grid.shape), self.grid.strides, self.index, self._c, NEAR_CUT * self.grid.spacing,
+            coordinates, is_open, near_cut,
+        )  # fmt: skip
+        return coordinates, triangles[:n_triangles], is_open, near_cut
+
+
+@numba.njit(cache=True, nogil=True)
+def _place_loop(node, shape, strides, index, c, near, coordinates, is_open, near_cut):
+    """Turn shifts from the nodes into grid coordinates; mark vertices on the border and near the cut."""
+    for v in range(len(coordinates)):
+        flat = node[v]
+        other, axes = flat, 0
+        for a in range(3):
+            if coordinates[v, a] > 0.0:
+                other += strides[a]
+                axes += 1
+        near_cut[v] = axes > 1 or min(c[index[flat]], c[index[other]]) < near
+        coordinates[v, 0] += flat // strides[0]
+        coordinates[v, 1] += flat % strides[0] // strides[1]
+        coordinates[v, 2] += flat % strides[1]
+        is_open[v] = False
+        for a in range(3):
+            is_open[v] |= coordinates[v, a] < 1e-9 or coordinates[v, a] > shape[a] - 1 - 1e-9
 
 
 @numba.njit(cache=True, nogil=True)

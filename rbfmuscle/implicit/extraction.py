@@ -11,7 +11,7 @@ import numba
 import numpy as np
 
 from rbfmuscle.implicit.band import Band, BandGrid
-from rbfmuscle.implicit.obstacles import push_off_points
+from rbfmuscle.implicit.obstacles import CHORD, points_near_cells, push_off_points
 from rbfmuscle.validation import check_finite, check_points, check_positive
 
 
@@ -50,7 +50,7 @@ class ExtractedSurface:
 
 def extract_surface(
     field, *, points, resolution=48, cut=None, volume=None, level=0.0, keep="largest", search="band",
-    axes=None, obstacle_points=None, obstacle_tolerance=None,
+    axes=None, obstacles=None, obstacle_tolerance=None,
 ):  # fmt: skip
     """Extract the zero set of max(field - level, -cut) as a closed mesh.
 
@@ -63,7 +63,8 @@ def extract_surface(
     resolution : int
         Grid cells along the longest side of the points' box.
     cut : callable, optional
-        ``(n, 3) -> (n,)`` distances, negative inside what is to be cut away. ``value_and_gradient`` as above.
+        ``(n, 3) -> (n,)`` distances, negative inside what is to be cut away; beyond 1.2 cells any lower
+        bound of more than that will do. ``value_and_gradient`` as above.
     volume : float, optional
         Wanted volume of the mesh; the level is then moved from ``level`` until the mesh has it, to 1e-9.
     level : float
@@ -74,9 +75,9 @@ def extract_surface(
         Follow the surface from the points, or visit the whole box (finds every spurious sheet in it).
     axes : (3, 3) array_like, optional
         Rotation whose rows are the grid's axes. In a frame that moves with the scene the mesh does too.
-    obstacle_points : (k, 3) array_like, optional
-        Vertices of the bones behind ``cut``: triangles whose chords cut across a convex bone are moved until
-        none of these is inside the mesh by more than the tolerance.
+    obstacles : list of pairs of (k, 3) and (4, 4) ndarrays, optional
+        Vertices of the bones behind ``cut``, each bone in its own coordinates with its pose: triangles whose
+        chords cut across a convex bone are moved until no vertex is inside the mesh by more than the tolerance.
     obstacle_tolerance : float, optional
         By default 1 % of a grid cell [scene unit].
 
@@ -96,14 +97,13 @@ def extract_surface(
     if keep not in ("largest", "all") or search not in ("band", "box"):
         raise ValueError(f"keep must be largest or all, search band or box, got {keep!r} and {search!r}")
     target = None if volume is None else check_positive(volume, name="volume")
-    obstacles = None if obstacle_points is None else check_points(obstacle_points, name="obstacle_points")
     padding = 3
     while True:
         grid = BandGrid.around(points, resolution=resolution, padding=padding, axes=axes)
         band = Band(grid, field, cut)
         _start(band, points, level, search)
         tolerance = 0.01 * grid.spacing if obstacle_tolerance is None else float(obstacle_tolerance)
-        surface = _reach_volume(band, target, level, keep, (obstacles, tolerance))
+        surface = _reach_volume(band, target, level, keep, (obstacles or [], tolerance))
         if surface is not None:
             return surface
         if padding >= resolution:
@@ -140,8 +140,8 @@ def _reach_volume(band, target, level, keep, obstacles):
         found = _closed_sheets(band, level, keep)
         if found is None:
             return None
-        vertices, faces, components, spurious = found
-        projector = _Projector(band.field, band.cut, vertices, spacing)
+        vertices, faces, near_cut, components, spurious = found
+        projector = _Projector(band.field, band.cut, vertices, spacing, near_cut)
         projector.project(level)
         if target is None:
             break
@@ -164,9 +164,11 @@ def _reach_volume(band, target, level, keep, obstacles):
 
 
 def _finish(band, projector, faces, target, level, components, spurious, obstacles):
-    points, tolerance = obstacles
-    if points is not None:
-        projector.push_off(faces, points, tolerance, level)
+    bones, tolerance = obstacles
+    if bones:
+        points = points_near_cells(bones, band.grid, band.state)
+        points = points[band.field(points) - level < CHORD * band.grid.spacing]
+        projector.push_off(faces, points, band.grid, tolerance)
     if target is not None:
         for _ in range(3):
             step = projector.volume_step(faces, target)
@@ -187,8 +189,8 @@ def _finish(band, projector, faces, target, level, components, spurious, obstacl
 
 
 def _closed_sheets(band, level, keep):
-    """Vertices, faces, number of sheets and of those left out; None where the wanted one is open."""
-    coordinates, faces, on_border = band.march(level)
+    """Vertices, faces, which are near the cut, number of sheets and of those left out; None where open."""
+    coordinates, faces, on_border, near_cut = band.march(level)
     label, sheets = _label_sheets_loop(faces, len(coordinates))
     volume = np.bincount(
         label[faces[:, 0]], _volume_terms(coordinates - coordinates.mean(axis=0), faces), sheets
@@ -206,7 +208,8 @@ def _closed_sheets(band, level, keep):
     used = chosen[label]
     number = np.cumsum(used) - 1
     faces = number[faces[used[faces[:, 0]]]]
-    return band.grid.positions(coordinates[used]), faces, sheets, sheets - int(chosen.sum())
+    vertices = band.grid.positions(coordinates[used])
+    return vertices, faces, near_cut[used], sheets, sheets - int(chosen.sum())
 
 
 @numba.njit(cache=True, nogil=True)
@@ -258,21 +261,45 @@ def _volume_loop(x, faces, out):
         ) / 6.0
 
 
+@numba.njit(cache=True, nogil=True)
+def _volume_and_rate_loop(x, faces, origin, direction):
+    """Enclosed volume, and its rate of change as the vertices move along their directions."""
+    volume, rate = 0.0, 0.0
+    p, d = np.empty((3, 3)), np.empty((3, 3))
+    for f in range(len(faces)):
+        for k in range(3):
+            for a in range(3):
+                p[k, a] = x[faces[f, k], a] - origin[a]
+                d[k, a] = direction[faces[f, k], a]
+        for k in range(3):
+            a, b = (k + 1) % 3, (k + 2) % 3
+            nx = p[a, 1] * p[b, 2] - p[a, 2] * p[b, 1]
+            ny = p[a, 2] * p[b, 0] - p[a, 0] * p[b, 2]
+            nz = p[a, 0] * p[b, 1] - p[a, 1] * p[b, 0]
+            rate += d[k, 0] * nx + d[k, 1] * ny + d[k, 2] * nz
+            if k == 0:
+                volume += p[0, 0] * nx + p[0, 1] * ny + p[0, 2] * nz
+    return volume / 6.0, rate / 6.0
+
+
 def mesh_volume(vertices, faces):
     """Volume enclosed by a closed outward mesh."""
     return float(_volume_terms(vertices - vertices.mean(axis=0), faces).sum())
 
 
 class _Projector:
-    """Vertices on their way to the zero set of max(f - level, -d)."""
+    """Vertices on their way to the zero set of max(f - level, -d).
 
-    def __init__(self, field, cut, vertices, spacing):
+    ``near_cut`` (n,) marks the vertices that may lie on or come to the cut.
+    """
+
+    def __init__(self, field, cut, vertices, spacing, near_cut):
         self.vertices = vertices
         self.spacing = spacing
-        self._field_value = field
         self._field = with_gradient(field, 1e-4 * spacing)
         self._cut_value = cut
         self._cut = None if cut is None else with_gradient(cut, 1e-4 * spacing)
+        self._near_cut = near_cut
         self.slope = np.zeros(len(vertices))
         self._direction = np.zeros_like(vertices)
 
@@ -283,55 +310,50 @@ class _Projector:
         for _ in range(rounds):
             x = self.vertices[todo]
             f, gradient = self._field(x)
-            square = np.maximum(np.einsum("ij,ij->i", gradient, gradient), np.finfo(float).tiny)
-            self._direction[todo] = gradient / square[:, None]
-            self.slope[todo] = 1.0 / np.sqrt(square)
-            step = -((f - level) / square)[:, None] * gradient
+            step, slope = np.empty_like(x), np.empty(len(x))
+            _newton_loop(f, np.ascontiguousarray(gradient), level, todo, step, slope, self._direction)
+            self.slope[todo] = slope
             if self._cut_value is not None:
-                on_field[todo] = self._turn_to_cut(x, f - level, square, step)
-            length = np.linalg.norm(step, axis=1)
-            step *= np.minimum(1.0, self.spacing / np.maximum(length, 1e-300))[:, None]
-            self.vertices[todo] = x + step
+                self._turn_to_cut(x, todo, (f - level) * slope, step, on_field)
             # Newton squares the error: what moved by less than 1 % of a cell is there.
-            todo = todo[length > 1e-2 * self.spacing]
+            unsettled = np.empty(len(x), dtype=np.bool_)
+            _step_loop(todo, step, self.spacing, self.vertices, unsettled)
+            todo = todo[unsettled]
             if len(todo) == 0:
                 break
         self._direction[~on_field] = 0.0
         self.slope[~on_field] = 0.0
 
-    def _turn_to_cut(self, x, f, square, step):
-        """Replace the steps of vertices that lie on the cut; returns which lie on the field's own surface."""
+    def _turn_to_cut(self, x, todo, height, step, on_field):
+        """Replace the steps of vertices that lie on the cut; marks which lie on the field's own surface."""
+        rows = np.flatnonzero(self._near_cut[todo])
+        if len(rows) == 0:
+            return
         # The slope of a distance is one; it is worked out only where the cut is the surface.
-        on_field = f / np.sqrt(square) >= -self._cut_value(x)
-        rows = np.flatnonzero(~on_field)
+        on_cut = height[rows] < -self._cut_value(x[rows])
+        on_field[todo[rows]] = ~on_cut
+        rows = rows[on_cut]
         if len(rows):
             distance, outward = self._cut(x[rows])
             size = np.maximum(np.einsum("ij,ij->i", outward, outward), np.finfo(float).tiny)
             step[rows] = -(distance / size)[:, None] * outward
-        return on_field
 
     def volume_step(self, faces, target):
         """Change of level that would bring the mesh to the target volume, to first order."""
-        lack = target - mesh_volume(self.vertices, faces)
+        volume, rate = _volume_and_rate_loop(
+            self.vertices, faces, self.vertices.mean(axis=0), self._direction
+        )
+        lack = target - volume
         if lack == 0.0:
             return 0.0
-        rate = float(np.einsum("ij,ij->", _volume_gradient(self.vertices, faces), self._direction))
         if not rate > 0:
             raise ValueError(f"no level gives a volume of {target:g}: the cut leaves no surface of the field")
         return lack / rate
 
-    def push_off(self, faces, points, tolerance, level):
-        """Move the vertices around points that came through a triangle; these no longer follow the level.
-
-        A chord leaves the surface by a part of a cell, so only points that near to the field's inside count.
-        """
-        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
-        points = points[((points > low) & (points < high)).all(axis=1)]
-        if len(points) == 0:
-            return
-        points = points[self._field_value(points) - level < 0.3 * self.spacing]
+    def push_off(self, faces, points, grid, tolerance):
+        """Move the vertices around points that came through a triangle; these no longer follow the level."""
         for _ in range(2):
-            moved = np.flatnonzero(push_off_points(self.vertices, faces, points, self.spacing, tolerance))
+            moved = np.flatnonzero(push_off_points(self.vertices, faces, points, grid, tolerance))
             self._direction[moved] = 0.0
             self.slope[moved] = 0.0
             if self._cut_value is None or len(moved) == 0:
@@ -349,21 +371,27 @@ class _Projector:
         self.vertices = self.vertices + step * self._direction
 
 
-def _volume_gradient(vertices, faces):
-    """Derivative of the enclosed volume with respect to each vertex, (n, 3)."""
-    out = np.zeros_like(vertices)
-    _volume_gradient_loop(vertices - vertices.mean(axis=0), faces, out)
-    return out
+@numba.njit(cache=True, nogil=True)
+def _newton_loop(f, gradient, level, rows, step, slope, direction):
+    """Newton steps onto f = level, 1 / |g|, and the vertices' motions g / |g|^2 for a change of level."""
+    for n in range(len(rows)):
+        square = gradient[n, 0] ** 2 + gradient[n, 1] ** 2 + gradient[n, 2] ** 2
+        square = max(square, 2.3e-308)
+        slope[n] = 1.0 / np.sqrt(square)
+        for a in range(3):
+            direction[rows[n], a] = gradient[n, a] / square
+            step[n, a] = (level - f[n]) * direction[rows[n], a]
 
 
 @numba.njit(cache=True, nogil=True)
-def _volume_gradient_loop(x, faces, out):
-    for f in range(len(faces)):
-        for k in range(3):
-            i, a, b = faces[f, k], faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
-            out[i, 0] += (x[a, 1] * x[b, 2] - x[a, 2] * x[b, 1]) / 6.0
-            out[i, 1] += (x[a, 2] * x[b, 0] - x[a, 0] * x[b, 2]) / 6.0
-            out[i, 2] += (x[a, 0] * x[b, 1] - x[a, 1] * x[b, 0]) / 6.0
+def _step_loop(rows, step, spacing, vertices, unsettled):
+    """Take the steps, none longer than a cell."""
+    for n in range(len(rows)):
+        length = np.sqrt(step[n, 0] ** 2 + step[n, 1] ** 2 + step[n, 2] ** 2)
+        share = min(1.0, spacing / max(length, 1e-300))
+        for a in range(3):
+            vertices[rows[n], a] += share * step[n, a]
+        unsettled[n] = length > 1e-2 * spacing
 
 
 def with_gradient(function, step):

@@ -3,15 +3,66 @@
 import numba
 import numpy as np
 
-from rbfmuscle.implicit.band import BandGrid
+# A chord is never farther from its surface than this share of a cell.
+CHORD = 0.35
 
 
-def push_off_points(vertices, faces, obstacles, spacing, tolerance, rounds=4):
+def points_near_cells(obstacles, grid, state):
+    """Obstacle points in or beside the cells that a band has visited, in world positions.
+
+    Parameters
+    ----------
+    obstacles : list of pairs of (k, 3) and (4, 4) ndarrays
+        Points in coordinates of their own, and the pose that takes them to the world.
+    grid : BandGrid
+    state : (cells,) ndarray
+        1 where a cell was visited.
+
+    Returns
+    -------
+    (m, 3) ndarray
+    """
+    found = [np.zeros((0, 3))]
+    for points, pose in obstacles:
+        turn = grid.axes @ pose[:3, :3] / grid.spacing
+        shift = grid.axes @ (pose[:3, 3] - grid.origin) / grid.spacing
+        index = np.empty(len(points), dtype=np.int64)
+        count = _near_cells_loop(points, turn, shift, np.array(grid.shape), grid.strides, state, index)
+        found.append(points[index[:count]] @ pose[:3, :3].T + pose[:3, 3])
+    return np.concatenate(found)
+
+
+@numba.njit(cache=True, nogil=True)
+def _near_cells_loop(points, turn, shift, shape, strides, state, index):
+    count = 0
+    low, high = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)
+    for n in range(len(points)):
+        within = True
+        for a in range(3):
+            u = shift[a] + turn[a, 0] * points[n, 0] + turn[a, 1] * points[n, 1] + turn[a, 2] * points[n, 2]
+            if u < 1.0 or u > shape[a] - 2.0:
+                within = False
+                break
+            low[a], high[a] = int(u - CHORD), int(u + CHORD)
+        if not within:
+            continue
+        visited = False
+        for i in range(low[0], high[0] + 1):
+            for j in range(low[1], high[1] + 1):
+                for k in range(low[2], high[2] + 1):
+                    visited |= state[i * strides[0] + j * strides[1] + k] == 1
+        if visited:
+            index[count] = n
+            count += 1
+    return count
+
+
+def push_off_points(vertices, faces, points, grid, tolerance, rounds=4):
     """Move the vertices of triangles that obstacle points have come through, into the surface.
 
     A point behind a triangle (inside the mesh) by more than ``tolerance`` moves its three corners along the
-    normal, by barycentric weights, until it is not. Only points less than 0.35 ``spacing`` deep are seen: a chord
-    is never farther from its surface, and a deeper point is behind some other part of the muscle.
+    normal, by barycentric weights, until it is not. Only points less than ``CHORD`` of a cell deep are seen: a
+    deeper point is behind some other part of the muscle.
 
     Parameters
     ----------
@@ -19,9 +70,11 @@ def push_off_points(vertices, faces, obstacles, spacing, tolerance, rounds=4):
         Changed in place [scene unit].
     faces : (m, 3) ndarray
         Closed, outward.
-    obstacles : (k, 3) ndarray
+    points : (k, 3) ndarray
         Points that must stay outside.
-    spacing, tolerance : float
+    grid : BandGrid
+        In whose cells the triangles are sorted.
+    tolerance : float
 
     Returns
     -------
@@ -29,22 +82,45 @@ def push_off_points(vertices, faces, obstacles, spacing, tolerance, rounds=4):
         Vertices that were moved.
     """
     moved = np.zeros(len(vertices), dtype=bool)
-    low, high = vertices.min(axis=0) - spacing, vertices.max(axis=0) + spacing
-    near = obstacles[((obstacles > low) & (obstacles < high)).all(axis=1)]
-    if len(near) == 0:
+    if len(points) == 0:
         return moved
-    shape = tuple(int(n) for n in np.ceil((high - low) / spacing) + 2)
-    grid = BandGrid(low, spacing, shape, np.eye(3))
-    cell = grid.cells(vertices[faces].mean(axis=1))
-    order = np.argsort(cell, kind="stable")
-    start = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=int(np.prod(shape))))])
-    where = grid.cells(near)
+    start = np.zeros(int(np.prod(grid.shape)) + 1, dtype=np.int64)
+    cell, order = np.empty(len(faces), dtype=np.int64), np.empty(len(faces), dtype=np.int64)
+    last = np.array(grid.shape) - 2
+    turn = grid.axes / grid.spacing
+    _sort_faces_loop(vertices, faces, turn, grid.origin, last, grid.strides, cell, start, order)
+    where = grid.cells(points)
     for _ in range(rounds):
         if not _push_loop(
-            vertices, faces, near, where, order, start, grid.strides, spacing, tolerance, moved
+            vertices, faces, points, where, order, start, grid.strides, grid.spacing, tolerance, moved
         ):
             break
     return moved
+
+
+@numba.njit(cache=True, nogil=True)
+def _sort_faces_loop(vertices, faces, turn, origin, last, strides, cell, start, order):
+    """Sort triangles by the cell of their middle: those of cell c are order[start[c] : start[c + 1]]."""
+    middle = np.empty(3)
+    for f in range(len(faces)):
+        for a in range(3):
+            middle[a] = -origin[a]
+            for k in range(3):
+                middle[a] += vertices[faces[f, k], a] / 3.0
+        number = 0
+        for a in range(3):
+            u = turn[a, 0] * middle[0] + turn[a, 1] * middle[1] + turn[a, 2] * middle[2]
+            number += min(max(int(np.floor(u)), 0), last[a]) * strides[a]
+        cell[f] = number
+        start[number + 1] += 1
+    for c in range(len(start) - 1):
+        start[c + 1] += start[c]
+    for f in range(len(faces) - 1, -1, -1):
+        # Filled from the end: what was the end of a cell's triangles becomes their beginning.
+        start[cell[f] + 1] -= 1
+        order[start[cell[f] + 1]] = f
+    start[:-1] = start[1:]
+    start[-1] = len(faces)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -82,7 +158,7 @@ def _push_loop(vertices, faces, points, where, order, start, strides, reach, tol
                         signed = depth
         if signed < -0.1 * reach:
             where[p] = -1
-        if signed <= tolerance or signed > 0.35 * reach:
+        if signed <= tolerance or signed > CHORD * reach:
             continue
         number += 1
         square = best_weight[0] ** 2 + best_weight[1] ** 2 + best_weight[2] ** 2

@@ -123,6 +123,19 @@ class BoneContacts:
             smallest[closer], gradient[closer] = distance[closer], direction[closer]
         return smallest, gradient
 
+    def depth(self, points):
+        """How deep the deepest free contact point is in a bone, 0 where none is [scene unit]."""
+        points = check_points(points)
+        free, reach = self.free(len(points)), np.zeros(len(points))
+        deepest = 0.0
+        for b in self.reached:
+            near = self._near(points, free, b, reach)
+            if len(near):
+                distance, _ = self._query(points[near], b, 0.0)
+                self._remember(points, near, distance, b)
+                deepest = max(deepest, -float(distance.min()))
+        return deepest
+
     def query(self, points, reach):
         """Contacts of each bone: a list, one entry a bone, of ``(index, distance, direction)``."""
         points = check_points(points)
