@@ -1,4 +1,4 @@
-"""Progress of a run on stderr: a bar on a terminal, else a line now and then."""
+"""Progress of a command on stderr: a bar on a terminal, else a line now and then."""
 
 import sys
 import time
@@ -7,10 +7,10 @@ EVERY = 10.0  # seconds between lines where there is no terminal
 
 
 class Progress:
-    """Context manager; call it with (done, total)."""
+    """Context manager; call it with (done, total), counts of ``what``."""
 
-    def __init__(self, title):
-        self.title = title
+    def __init__(self, title, what="frame"):
+        self.title, self.what = title, what
         self.bar = None
 
     def __enter__(self):
@@ -36,7 +36,7 @@ class Progress:
             self.bar.update(self.task, completed=done, total=total)
         elif done == total or time.monotonic() - self.last >= EVERY:
             self.last = time.monotonic()
-            print(f"{self.title}: frame {done} of {total}", file=sys.stderr)
+            print(f"{self.title}: {self.what} {done} of {total}", file=sys.stderr)
 
     def __exit__(self, *error):
         if self.bar is not None:

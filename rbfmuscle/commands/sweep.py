@@ -1,0 +1,158 @@
+"""``rbfmuscle sweep``: a scene under a grid of settings, error against time a frame."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from rbfmuscle.commands.progress import Progress
+from rbfmuscle.commands.run import Json, Output
+from rbfmuscle.validation import SolveError, UsageError
+
+Texts = Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)]
+PHANTOM = "phantom"
+
+
+def sweep(
+    scene: str | None = None,
+    *,
+    output: Output,
+    grid: Texts = None,
+    model: str | None = None,
+    frames: str | None = None,
+    reference: Texts = None,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    task: str | None = None,
+    merge: Annotated[list[Path] | None, Parameter(negative="", consume_multiple=True)] = None,
+    error: str = "error_rms",
+    retry: Annotated[bool, Parameter(negative="")] = False,
+    as_json: Json = False,
+):
+    """Run a scene under a grid of settings: errors, time a frame, Pareto front.
+
+    Points that the folder holds already are not run again, so a sweep that was ended goes on where it stood.
+
+    Parameters
+    ----------
+    scene
+        Scene file (TOML), or "phantom" for the embedded hip.
+    output
+        Folder for the results; with --merge, of the merged sweep.
+    grid
+        KEY=a,b,c with keys as for run --set, for instance model.centres=100,200,300; MODEL:KEY=a,b for one
+        model of a grid with model=...
+    model
+        Model of every muscle, in place of the scene's.
+    frames
+        Frames of the motion, as A:B:S.
+    reference
+        KEY=VALUE settings of the reference that errors are measured against; by default the finest values
+        of the grid.
+    jobs
+        Points beside each other; all cores by default. The cores are shared out among them.
+    scheduler
+        Address of a Dask scheduler, for instance tcp://127.0.0.1:8786; its workers must see the folder.
+    task
+        I/N, the I-th of N slices, for an array job; 0/N runs the references alone.
+    merge
+        Folders of a sweep's tasks, to be gathered in the output folder.
+    error
+        The quantity that the front trades against time.
+    retry
+        Run points again that failed before.
+    as_json
+        Print JSON and nothing else.
+    """
+    from rbfmuscle.study.sweep import SweepFolder, check_key, parse_task
+    from rbfmuscle.study.sweep_points import VALUES
+
+    check_key(error, VALUES)
+    if merge:
+        from rbfmuscle.study.sweep_table import merge_sweeps
+
+        if scene or grid or task:
+            raise UsageError("--merge takes the folders of a sweep, no scene, grid or task")
+        return _finish(merge_sweeps(merge, output), output, error, as_json)
+    if scene is None:
+        raise UsageError("give a scene file, or --merge with the folders of a sweep")
+    if jobs is not None and jobs < 1:
+        raise UsageError(f"--jobs must be 1 or more, got {jobs}")
+    part = parse_task(task) if task else None
+    plan, ready = _measure(scene, output, grid, model, frames, reference, jobs, scheduler, part, retry)
+    if part and any(SweepFolder(output).read(point.key) is None for point in plan.points):
+        return _finish_task(plan, ready, output, as_json)
+    return _finish(plan, output, error, as_json)
+
+
+def run_point(scene, settings, frames):
+    """One run of a sweep, in memory; module-level, so that it can be sent to other processes."""
+    from rbfmuscle.run import simulate
+
+    return simulate(scene, frames=frames, **settings)
+
+
+def _measure(scene, output, grid, model, frames, reference, jobs, scheduler, part, retry):
+    from rbfmuscle.sim.settings import parse_setting
+    from rbfmuscle.study.sweep import parse_grid, plan_sweep
+    from rbfmuscle.study.sweep_points import SweepRunner
+
+    axes = parse_grid(grid or [])
+    loaded = _load(scene).with_options(model=model)
+    chosen = dict(parse_setting(text) for text in reference or [])
+    plan = plan_sweep(loaded, axes, frames=frames, reference=chosen)
+    with Progress(f"sweep of {loaded.name}", what="point") as progress:
+        runner = SweepRunner(
+            run_point, loaded, plan, output, frames=frames, jobs=jobs, scheduler=scheduler, progress=progress
+        )
+        try:
+            runner.run(part=part, retry=retry)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                f"interrupted; finished points are kept in {output}, the same command goes on"
+            ) from None
+    return plan, runner.total
+
+
+def _load(scene):
+    from rbfmuscle.sim.scene import Scene
+
+    if scene == PHANTOM and not Path(scene).exists():
+        from rbfmuscle.sim.phantom import phantom_scene
+
+        return phantom_scene()
+    return Scene.load(Path(scene))
+
+
+def _finish_task(plan, measured, output, as_json):
+    if as_json:
+        print(json.dumps({"directory": str(output), "measured": measured, "points": len(plan.points)}))
+    else:
+        print(
+            f"{measured} points measured; when all tasks are done: rbfmuscle sweep --merge {output} -o {output}"
+        )
+
+
+def _finish(plan, output, error, as_json):
+    from rbfmuscle.study.sweep_page import write_page
+    from rbfmuscle.study.sweep_table import write_table
+
+    table = write_table(plan, output, quantity=error)
+    write_page(table, output)
+    if as_json:
+        print(json.dumps({"directory": str(output), **table}, indent=1))
+    else:
+        for verdict in table["verdicts"]:
+            print(verdict["text"])
+        print(
+            f"{table['done']} points done, {table['failed']} failed, {table['missing']} missing, in {output}"
+        )
+    bad = [row for row in table["rows"] if row["status"] != "done"]
+    if bad:
+        for row in bad[:5]:
+            print(f"rbfmuscle: point {row['label']}: {row['error'] or row['status']}", file=sys.stderr)
+        raise SolveError(
+            f"{len(bad)} of {len(table['rows'])} points failed or are missing; the others are kept"
+        )

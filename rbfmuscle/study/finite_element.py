@@ -1,0 +1,251 @@
+"""A volumetric finite-element solid, nearly incompressible, quasi-static, against bones: a reference for models.
+
+Eight-node bricks with a constant pressure each (mean dilatation: Simo, Taylor and Pister 1985), neo-Hookean,
+
+    W = mu/2 (J^(-2/3) tr(F'F) - 3) + kappa/2 (Jm - 1)^2,   Jm = mean of J over the brick,
+
+solved by Newton's method with a line search on the energy. Bones push by a penalty on the surface's quadrature
+points. Mesh, shape functions and quadrature are scikit-fem's (the extra ``fem``).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+from scipy.sparse.linalg import splu
+
+from rbfmuscle.validation import MissingPartError, SolveError
+
+MOST_ITERATIONS = 30
+
+
+def _skfem():
+    try:
+        import skfem
+    except ImportError as error:
+        raise MissingPartError(
+            "scikit-fem is not installed, which solids of finite elements need: pip install 'rbfmuscle[fem]'"
+        ) from error
+    return skfem
+
+
+@dataclass(frozen=True)
+class SolidState:
+    """A solved state: displacement of the nodes (n, 3), Newton iterations, relative residual."""
+
+    displacement: np.ndarray
+    iterations: int
+    residual: float
+
+
+class HexSolid:
+    """A solid of bricks.
+
+    Parameters
+    ----------
+    points : (n, 3) ndarray
+        Nodes at rest [scene unit].
+    bricks : (m, 8) ndarray of int
+        In scikit-fem's order, as `brick_grid` gives them.
+    shear : float
+        Shear modulus; the unit of stress.
+    poisson : float
+        Poisson's ratio; 0.495 makes the bulk modulus a hundred times the shear modulus.
+    penalty : float
+        Contact pressure for each unit of depth [shear modulus / scene unit].
+
+    Raises
+    ------
+    MissingPartError
+        If scikit-fem is not installed.
+    """
+
+    def __init__(self, points, bricks, *, shear=1.0, poisson=0.495, penalty=30.0):
+        skfem = _skfem()
+        self.shear, self.penalty = shear, penalty
+        self.bulk = 2.0 * shear * (1.0 + poisson) / (3.0 * (1.0 - 2.0 * poisson))
+        mesh = skfem.MeshHex(np.ascontiguousarray(points.T), np.ascontiguousarray(bricks.T))
+        self.mesh, self.rest = mesh, np.asarray(points, dtype=float)
+        element = skfem.ElementHex1()
+        basis = skfem.Basis(mesh, element, intorder=3)
+        # (brick, quadrature point, node, direction): derivatives of the shape functions at rest.
+        self.slopes = np.stack([np.moveaxis(b[0].grad, 0, -1) for b in basis.basis], axis=2)
+        self.weights, self.nodes = basis.dx, basis.element_dofs.T
+        self.facets = mesh.boundary_facets()
+        side = skfem.FacetBasis(mesh, element, facets=self.facets, intorder=3)
+        self.side_shape = np.stack([np.broadcast_to(b[0].value, side.dx.shape) for b in side.basis], axis=-1)
+        self.side_weights, self.side_nodes = side.dx, side.element_dofs.T
+        self.obstacles = ()
+
+    def surface_quads(self):
+        """Corner nodes of the boundary, (k, 4), in scikit-fem's order."""
+        return self.mesh.facets[:, self.facets].T
+
+    def set_obstacles(self, obstacles, attached):
+        """Bones that push.
+
+        Parameters
+        ----------
+        obstacles : callable
+            ``obstacles(points)`` gives distances (n,), negative inside, and directions (n, 3).
+        attached : (n,) ndarray of bool
+            Nodes on bones; faces with any of them take no contact.
+        """
+        self.obstacles = obstacles
+        self.touching = ~attached[self.surface_quads()].any(axis=1)
+
+    def volume(self, displacement):
+        """Volume of the deformed bricks [scene unit cubed]."""
+        return float((np.linalg.det(self._gradient(displacement)) * self.weights).sum())
+
+    def solve(self, displacement, held, wanted, *, tolerance=1e-6):
+        """Equilibrium with what is ``held`` at the displacements ``wanted`` (n, 3).
+
+        Parameters
+        ----------
+        displacement : (n, 3) ndarray
+            Where to start from.
+        held : (n,) or (n, 3) ndarray of bool
+            Nodes, or single directions of nodes.
+        wanted : (n, 3) ndarray
+        tolerance : float
+            Of the greatest force on a free node, as a share of the greatest force.
+
+        Returns
+        -------
+        SolidState
+
+        Raises
+        ------
+        SolveError
+            If Newton's method does not get there, for instance because bricks turn inside out.
+        """
+        held = np.broadcast_to(held.reshape(len(held), -1), displacement.shape)
+        free = ~held.ravel()
+        first = np.where(held, wanted - displacement, 0.0).ravel()
+        u = displacement.copy()
+        for iteration in range(MOST_ITERATIONS):
+            force, matrix = self._assemble(u)
+            scale = max(np.abs(force).max(), 1e-9 * self.shear)
+            if not first.any() and np.abs(force[free]).max() < tolerance * scale:
+                return SolidState(u, iteration, float(np.abs(force[free]).max() / scale))
+            step = first.copy()
+            right = -(force + matrix @ first)[free]
+            inner = matrix[free][:, free].tocsc()
+            factor = splu(
+                inner, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            )
+            step[free] = factor.solve(right)
+            u = self._walk(u, step.reshape(-1, 3), force, moving=first.any())
+            first[:] = 0.0
+        residual = float(np.abs(force[free]).max() / scale)
+        if residual < 1e3 * tolerance:
+            return SolidState(u, MOST_ITERATIONS, residual)
+        raise SolveError(f"no equilibrium after {MOST_ITERATIONS} iterations, residual {residual:.1e}")
+
+    def _walk(self, u, step, force, *, moving):
+        """Longest of the halved steps that lowers the energy; one that moves held nodes must only stay valid."""
+        if moving:
+            if not np.isfinite(self.energy(u + step)):
+                raise SolveError("bricks turn inside out, take smaller steps")
+            return u + step
+        here, slope = self.energy(u), float(force @ step.ravel())
+        share = 1.0
+        for _ in range(12):
+            if self.energy(u + share * step) <= here + 1e-4 * share * slope + 1e-12 * abs(here):
+                return u + share * step
+            share *= 0.5
+        return u + share * step
+
+    def energy(self, displacement):
+        """Elastic and contact energy; infinite where a brick is turned inside out."""
+        f = self._gradient(displacement)
+        j = np.linalg.det(f)
+        if j.min() <= 0.0:
+            return np.inf
+        mean = (j * self.weights).sum(axis=1) / self.weights.sum(axis=1)
+        shape = j ** (-2 / 3) * np.einsum("eqij,eqij->eq", f, f) - 3.0
+        total = 0.5 * self.shear * (shape * self.weights).sum()
+        total += 0.5 * self.bulk * ((mean - 1.0) ** 2 * self.weights.sum(axis=1)).sum()
+        if self.obstacles:
+            depth = np.minimum(self._gaps(displacement)[0], 0.0)
+            total += 0.5 * self.penalty * (depth**2 * self.side_weights[self.touching]).sum()
+        return float(total)
+
+    def _gradient(self, displacement):
+        return np.eye(3) + np.einsum("eni,eqnj->eqij", displacement[self.nodes], self.slopes, optimize=True)
+
+    def _gaps(self, displacement):
+        shape, nodes = self.side_shape[self.touching], self.side_nodes[self.touching]
+        points = np.einsum("fqn,fni->fqi", shape, (self.rest + displacement)[nodes])
+        gap, direction = self.obstacles(points.reshape(-1, 3))
+        return gap.reshape(points.shape[:2]), direction.reshape(points.shape)
+
+    def _assemble(self, displacement):
+        """Forces (3 n,) and their derivative, a sparse (3 n, 3 n) matrix."""
+        rows = [self._elastic(displacement)]
+        if self.obstacles:
+            rows.append(self._contact(displacement))
+        size = 3 * len(self.rest)
+        force = np.zeros(size)
+        entries = []
+        for nodes, local, stiffness in rows:
+            index = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1)
+            np.add.at(force, index, local)
+            here = np.broadcast_to(index[:, :, None], stiffness.shape).ravel()
+            there = np.broadcast_to(index[:, None, :], stiffness.shape).ravel()
+            entries.append((stiffness.ravel(), here, there))
+        value, here, there = (np.concatenate(parts) for parts in zip(*entries))
+        return force, sparse.coo_matrix((value, (here, there)), shape=(size, size)).tocsr()
+
+    def _elastic(self, displacement):
+        f = self._gradient(displacement)
+        j = np.linalg.det(f)
+        inverse = np.swapaxes(np.linalg.inv(f), -1, -2)  # F^-T
+        volume = self.weights.sum(axis=1)
+        pressure = self.bulk * ((j * self.weights).sum(axis=1) / volume - 1.0)
+        factor = self.shear * j ** (-2 / 3)
+        trace = np.einsum("eqij,eqij->eq", f, f)
+        cofactor = j[..., None, None] * inverse
+        stress = factor[..., None, None] * (f - (trace / 3)[..., None, None] * inverse)
+        stress += pressure[:, None, None, None] * cofactor
+        weighted = self.slopes * self.weights[..., None, None]
+        count = len(self.nodes)
+        force = np.einsum("eqij,eqnj->eni", stress, weighted, optimize=True).reshape(count, 24)
+        tangent = self._tangent(f, inverse, factor, trace, pressure[:, None] * j)
+        stiffness = np.zeros((count, 24, 24))
+        for q in range(self.slopes.shape[1]):
+            b = np.einsum("enj,ik->eijnk", self.slopes[:, q], np.eye(3)).reshape(count, 9, 24)
+            stiffness += np.swapaxes(b, 1, 2) @ (tangent[:, q] * self.weights[:, q, None, None]) @ b
+        mean = np.einsum("eqij,eqnj->eni", cofactor, weighted, optimize=True).reshape(count, 24)
+        stiffness += (self.bulk / volume)[:, None, None] * mean[:, :, None] * mean[:, None, :]
+        return self.nodes, force, stiffness
+
+    @staticmethod
+    def _tangent(f, inverse, factor, trace, pressure):
+        """Derivative of the stress by F at fixed mean dilatation, (brick, point, 9, 9)."""
+        count = f.shape[:2]
+        g, h = f.reshape(*count, 9), inverse.reshape(*count, 9)
+        crossed = np.einsum("eqil,eqkj->eqijkl", inverse, inverse, optimize=True).reshape(*count, 9, 9)
+        mixed = g[..., :, None] * h[..., None, :]
+        out = np.eye(9) - (2 / 3) * (mixed + np.swapaxes(mixed, -1, -2))
+        square = h[..., :, None] * h[..., None, :]
+        out = out + (2 / 9) * trace[..., None, None] * square + (trace / 3)[..., None, None] * crossed
+        return factor[..., None, None] * out + pressure[..., None, None] * (square - crossed)
+
+    def _contact(self, displacement):
+        gap, direction = self._gaps(displacement)
+        shape = self.side_shape[self.touching]
+        depth = np.minimum(gap, 0.0) * self.side_weights[self.touching] * self.penalty
+        active = (gap < 0.0) * self.side_weights[self.touching] * self.penalty
+        pushed = np.einsum("fqn,fqi->fqni", shape, direction).reshape(*shape.shape[:2], 24)
+        force = np.einsum("fq,fqa->fa", depth, pushed)
+        stiffness = np.einsum("fq,fqa,fqb->fab", active, pushed, pushed, optimize=True)
+        return self.side_nodes[self.touching], force, stiffness
+
+
+def brick_grid(cells):
+    """Nodes in the cube [-1, 1]^3 and bricks of a regular grid of ``cells`` (three numbers)."""
+    skfem = _skfem()
+    mesh = skfem.MeshHex.init_tensor(*(np.linspace(-1.0, 1.0, n + 1) for n in cells))
+    return mesh.p.T.copy(), mesh.t.T.copy()

@@ -1,0 +1,323 @@
+"""Measuring the points of a sweep: one after another, side by side, or on a cluster."""
+
+import math
+import os
+import platform
+import time
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import lru_cache
+from multiprocessing import get_context
+
+import numpy as np
+
+from rbfmuscle.study.metrics import ALL, surface_distance
+from rbfmuscle.study.sweep import SweepFolder
+from rbfmuscle.validation import MissingPartError, RBFMuscleError, UsageError
+
+# What a point may fail with and leave the others standing.
+POINT_ERRORS = (
+    RBFMuscleError,
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
+# Worst over muscles and frames, by magnitude.
+WORST = (
+    "volume_error",
+    "penetration_max",
+    "bone_penetration_max",
+    "solver_penetration_max",
+    "rest_error_rms",
+    "edge_strain_rms",
+    "components",
+)
+TIMES = ("time_frame", "time_frame_p95", "time_extract")
+VALUES = ("error_rms", "error_max", *WORST, *TIMES)
+
+
+def measure_point(runner, scene, point, folder, *, frames=None, threads=1, jobs=1):
+    """Run one point, measure it and keep the result; an error becomes the result of a failed point.
+
+    Parameters
+    ----------
+    runner : callable
+        ``runner(scene, settings, frames)`` gives a finished `Run`; module-level, so that it can be sent away.
+    scene : Scene
+    point : SweepPoint
+    folder : SweepFolder
+    frames : str, optional
+    threads, jobs : int
+        Threads for this point, and how many points run beside each other.
+
+    Returns
+    -------
+    dict
+        As kept in ``points/KEY.json``.
+    """
+    start = time.perf_counter()
+    result = {
+        "key": point.key,
+        "settings": point.settings,
+        "status": "done",
+        "error": "",
+        "values": {},
+        "threads": threads,
+        "jobs": jobs,
+        "machine": platform.node(),
+        "process": os.getpid(),
+    }
+    marker = folder.points / f"{point.key}.running"
+    marker.touch()
+    try:
+        with _threads(threads):
+            run = runner(scene, point.settings, frames)
+            result["values"] = _measure(run, point, folder)
+    except POINT_ERRORS as error:
+        result["status"] = "failed"
+        result["error"] = f"{type(error).__name__}: {' '.join(str(error).split())}"
+    result["seconds"] = time.perf_counter() - start
+    folder.write(result)
+    marker.unlink(missing_ok=True)
+    return result
+
+
+class _threads:
+    """Context in which loops and BLAS use so many threads."""
+
+    def __init__(self, count):
+        self.count = count
+
+    def __enter__(self):
+        import numba
+        from threadpoolctl import threadpool_limits
+
+        self.before = numba.get_num_threads()
+        numba.set_num_threads(max(1, min(self.count, numba.config.NUMBA_NUM_THREADS)))
+        self.limits = threadpool_limits(self.count)
+
+    def __exit__(self, *error):
+        import numba
+
+        self.limits.restore_original_limits()
+        numba.set_num_threads(self.before)
+
+
+def _measure(run, point, folder):
+    values = {}
+    for muscle, quantities in run.summary.items():
+        for name in WORST:
+            worst = abs(quantities.get(name, {}).get("worst", math.nan))
+            if muscle != ALL and not math.isnan(worst):
+                values[name] = max(values.get(name, 0.0), worst)
+    # The first frame loads and compiles, and settles what overlaps at rest.
+    walls = np.array([frame.wall for frame in run.frames][1:] or [run.frames[0].wall])
+    values["time_frame"], values["time_frame_p95"] = float(np.median(walls)), float(np.percentile(walls, 95))
+    extract = [
+        sum(surface.quantities.get("time_extract", 0.0) for surface in frame.surfaces.values())
+        for frame in run.frames
+    ]
+    values["time_extract"] = float(np.median(extract[1:] or extract))
+    if point.is_reference:
+        _keep_surfaces(run, folder.surface_file(point.key))
+        return values
+    rms, worst = _distance_to(run, str(folder.surface_file(point.reference)))
+    return {"error_rms": rms, "error_max": worst, **values}
+
+
+def _pose_name(coordinates):
+    return " ".join(f"{name}={angle:.9f}" for name, angle in sorted(coordinates.items())) or "rest"
+
+
+def _keep_surfaces(run, path):
+    """Surfaces of every frame; float32 is 1e-7 of a length, far below any error measured against them."""
+    arrays = {"poses": np.array([_pose_name(frame.coordinates) for frame in run.frames])}
+    for index, frame in enumerate(run.frames):
+        for name, surface in frame.surfaces.items():
+            arrays[f"v:{index}:{name}"] = surface.vertices.astype(np.float32)
+            arrays[f"f:{index}:{name}"] = surface.faces.astype(np.int32)
+    fresh = path.with_name(f".{os.getpid()}.{path.name}")
+    np.savez_compressed(fresh, **arrays)
+    os.replace(fresh, path)
+
+
+@lru_cache(maxsize=2)
+def _kept_surfaces(path, _modified):
+    with np.load(path) as file:
+        poses = {str(pose): index for index, pose in enumerate(file["poses"])}
+        return poses, {name: file[name] for name in file.files if name != "poses"}
+
+
+def _distance_to(run, path):
+    """Surface distance to the reference, root mean square over frames and muscles, and greatest."""
+    try:
+        poses, arrays = _kept_surfaces(path, os.stat(path).st_mtime_ns)
+    except FileNotFoundError:
+        raise UsageError(
+            f"the reference {path} is missing: its point failed, or the folder is not shared"
+        ) from None
+    squares, worst = [], 0.0
+    for frame in run.frames:
+        index = poses.get(_pose_name(frame.coordinates))
+        if index is None:
+            continue
+        for name, surface in frame.surfaces.items():
+            other = arrays[f"v:{index}:{name}"].astype(float), arrays[f"f:{index}:{name}"].astype(np.int64)
+            rms, most = surface_distance(surface.vertices, surface.faces, *other)
+            squares.append(rms**2)
+            worst = max(worst, most)
+    if not squares:
+        raise UsageError("no frame of this point is at a pose of the reference")
+    return math.sqrt(float(np.mean(squares))), worst
+
+
+class SweepRunner:
+    """Measures what is missing of a sweep.
+
+    Parameters
+    ----------
+    runner, scene, plan, directory
+        See `measure_point` and `SweepPlan`.
+    frames : str, optional
+    jobs : int, optional
+        Points beside each other; all cores by default. Each gets cores / jobs threads.
+    scheduler : str, optional
+        Address of a Dask scheduler whose workers see the folder too.
+    progress : callable, optional
+        ``progress(done, total)``.
+    """
+
+    def __init__(
+        self, runner, scene, plan, directory, *, frames=None, jobs=None, scheduler=None, progress=None
+    ):
+        self.runner, self.scene, self.plan, self.frames = runner, scene, plan, frames
+        self.folder = SweepFolder(os.path.abspath(directory))
+        self.cores = available_cores()
+        self.jobs = jobs or self.cores
+        self.scheduler, self.progress = scheduler, progress
+        self.done = 0
+
+    def run(self, *, part=None, retry=False):
+        """Measure the references, then the points of a slice (all by default), leaving out what is there.
+
+        Returns
+        -------
+        int
+            How many points were measured.
+        """
+        self.folder.prepare(self.plan)
+        wanted = self.plan.slice(part)
+        if retry:
+            self._forget_failed(self.plan.references + wanted)
+        for point in self.plan.references:
+            found = self.folder.read(point.key)
+            if found and found["status"] == "done" and not self.folder.surface_file(point.key).exists():
+                self.folder.forget(point.key)
+        stages = [self._missing(self.plan.references), self._missing(wanted)]
+        self.total = sum(len(stage) for stage in stages)
+        for stage in stages:
+            self._measure(stage)
+        return self.total
+
+    def _missing(self, points):
+        return [point for point in points if self.folder.read(point.key) is None]
+
+    def _forget_failed(self, points):
+        for point in points:
+            found = self.folder.read(point.key)
+            if found and found["status"] == "failed":
+                self.folder.forget(point.key)
+
+    def _measure(self, points):
+        """All points of a stage; a process that dies takes only its own point along."""
+        from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+        if not points:
+            return
+        # The same threads for every point of a sweep, also where few are left, so that times compare.
+        jobs = 1 if self.scheduler else self.jobs
+        threads = max(1, self.cores // jobs) if not self.scheduler else 1
+        try:
+            self._side_by_side(points, jobs, threads)
+        except TerminatedWorkerError:
+            left = self._missing(points)
+            suspects = [p for p in left if (self.folder.points / f"{p.key}.running").exists()]
+            for point in suspects or left:
+                self._alone(point, threads)
+            self._measure(self._missing(left))
+
+    def _side_by_side(self, points, jobs, threads):
+        from joblib import Parallel, delayed, parallel_config
+
+        if self.scheduler:
+            self._connect()
+            config = {"backend": "dask"}
+        elif jobs > 1:
+            config = {"backend": "loky", "inner_max_num_threads": threads}
+        else:
+            config = {"backend": "sequential"}
+        with parallel_config(**config):
+            parallel = Parallel(
+                n_jobs=-1 if self.scheduler else jobs, return_as="generator_unordered", batch_size=1
+            )
+            tasks = (
+                delayed(measure_point)(
+                    self.runner,
+                    self.scene,
+                    point,
+                    self.folder,
+                    frames=self.frames,
+                    threads=threads,
+                    jobs=jobs,
+                )
+                for point in points
+            )
+            for _ in parallel(tasks):
+                self._advance()
+
+    def _alone(self, point, threads):
+        """A point that was under way when a process died: in a process of its own, so that it shows which."""
+        kept = {"frames": self.frames, "threads": threads, "jobs": 1}
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+            try:
+                pool.submit(measure_point, self.runner, self.scene, point, self.folder, **kept).result()
+            except BrokenProcessPool:
+                error = "the process ended without a word (out of memory, or a crash)"
+                self.folder.write(
+                    {
+                        "key": point.key,
+                        "settings": point.settings,
+                        "status": "failed",
+                        "error": error,
+                        "values": {},
+                    }
+                )
+                (self.folder.points / f"{point.key}.running").unlink(missing_ok=True)
+        self._advance()
+
+    def _connect(self):
+        try:
+            from distributed import Client
+        except ImportError as error:
+            raise MissingPartError(
+                "Dask is not installed, which --scheduler needs: pip install 'rbfmuscle[cluster]'"
+            ) from error
+        try:
+            self.client = Client(self.scheduler, timeout=10)
+        except (OSError, ValueError) as error:
+            raise UsageError(f"no Dask scheduler answers at {self.scheduler!r} ({error})") from None
+
+    def _advance(self):
+        self.done += 1
+        if self.progress is not None:
+            self.progress(self.done, self.total)
+
+
+def available_cores():
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
