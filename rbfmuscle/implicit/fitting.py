@@ -19,6 +19,7 @@ from scipy.linalg import blas, lapack
 from scipy.spatial import cKDTree
 
 from rbfmuscle.implicit import assembly
+from rbfmuscle.implicit.lapack import factor_cholesky, solve_cholesky
 from rbfmuscle.validation import NumericalWarning
 
 DOUBTFUL = 1e13
@@ -126,9 +127,8 @@ def solve(basis, right, *, smoothing=0.0):
         if smoothing:
             matrix.ravel(order="K")[:: basis.size + 1] += smoothing
         norm = _largest(matrix)
-        factor, info = lapack.dpotrf(matrix, lower=1, overwrite_a=1, clean=0)
-        if info == 0:
-            solution = _schur(basis, factor, right, norm)
+        if factor_cholesky(matrix) == 0:
+            solution = _schur(basis, matrix, right, norm)
             if solution is not None and solution[2] < DOUBTFUL:
                 return solution
     raise_if_singular(basis)
@@ -163,7 +163,8 @@ def _schur(basis, factor, right, norm):
     q = len(polynomials)
     block = np.empty((basis.size, 1 + q + _PROBES), order="F")
     block[:, 0], block[:, 1 : 1 + q], block[:, 1 + q :] = right, polynomials.T, _probe_vectors(factor)
-    solved, _ = lapack.dpotrs(factor, block, lower=1, overwrite_b=1)
+    solve_cholesky(factor, block)
+    solved = block  # in place
     growth = np.sqrt((solved[:, 1 + q :] ** 2).sum(axis=0)).max()
     condition = norm * growth
     weights = solved[:, 0].copy()
