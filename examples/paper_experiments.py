@@ -23,7 +23,7 @@ from rbfmuscle.sim.contact import BoneContacts
 from rbfmuscle.sim.motion import bone_poses
 from rbfmuscle.sim.options import TunnellingOptions
 from rbfmuscle.sim.phantom import phantom_scene
-from rbfmuscle.sim.reach import build_fields, reached_bones, split_step
+from rbfmuscle.sim.reach import Pace, build_fields, reached_bones
 from rbfmuscle.sim.scene import Scene
 from rbfmuscle.sim.tunnelling import find_crossings
 from rbfmuscle.study.penetration import BoneProbe, bone_depth, surface_depth
@@ -85,6 +85,7 @@ class Experiment:
         regions = reached_bones(self.scene)
         fields = build_fields(self.scene, regions)
         self.names = [bone.name for bone in scene.bones]
+        self.pace = Pace(self.scene)
         self.fields = [fields.get(name) for name in self.names]
         self.probes = [BoneProbe(bone.name, bone.mesh) for bone in scene.bones]
 
@@ -95,7 +96,7 @@ class Experiment:
         record = Record(model, self.probes)
         here = {self.coordinate: 0.0}
         for coordinates in self.scene.motion.frames:
-            stops = split_step(self.scene, here, coordinates) if substeps else [coordinates]
+            stops = self.pace.split(here, coordinates) if substeps else [coordinates]
             for after in stops:
                 self.step(model, contacts, here, after, record)
                 here = after

@@ -7,45 +7,6 @@ from scipy.spatial import cKDTree
 SHARES = 6  # centres that carry one sample
 
 
-class RestFrame:
-    """Coordinates of a rest mesh that do not change when the scene is moved, turned or written in another unit.
-
-    Sampling and binding choose between points; two that are equally good must not be told apart by rounding, or
-    a moved scene would get other centres. Here they see the same rounded numbers wherever the scene lies.
-
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-
-    Attributes
-    ----------
-    local : (n, 3) ndarray
-        Vertices in a frame spanned by the first of them, in units of the mesh's size, rounded to 1e-8.
-    """
-
-    def __init__(self, vertices):
-        self.origin = vertices.mean(axis=0)
-        offset = vertices - self.origin
-        distance = np.linalg.norm(offset, axis=1)
-        self.size = float(distance.max())
-        first = offset[np.argmax(distance > 0.3 * self.size)]
-        first = first / np.linalg.norm(first)
-        across = offset - (offset @ first)[:, None] * first
-        span = np.linalg.norm(across, axis=1)
-        second = across[np.argmax(span > 0.3 * span.max())]
-        second = second / np.linalg.norm(second)
-        self.axes = np.array([first, second, np.cross(first, second)])
-        self.local = np.round(offset @ self.axes.T / self.size, 8)
-
-    def points(self, local):
-        """World positions of local points."""
-        return local @ self.axes * self.size + self.origin
-
-    def directions(self, local):
-        """World directions of local ones."""
-        return local @ self.axes
-
-
 def two_rings(faces, count):
     """Sorted neighbours of each point of a triangulation, and the neighbours' neighbours."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])

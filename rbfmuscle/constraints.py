@@ -30,10 +30,14 @@ def _rotation_loop(m, q):
         scale = 1.0 / (abs(trace) + 1e-12)
         ox, oy, oz = ox * scale, oy * scale, oz * scale
         angle = np.sqrt(ox * ox + oy * oy + oz * oz)
-        if angle < 1e-9:
+        if angle < 1e-8:
             break
-        s = np.sin(0.5 * angle) / angle
-        c = np.cos(0.5 * angle)
+        half = 0.125 * angle * angle
+        if angle < 1e-2:
+            # Series that are exact to rounding: the angles are small but for the first of them.
+            s, c = 0.5 - half * (1.0 - 0.1 * half) / 6.0, 1.0 - half * (1.0 - half / 6.0)
+        else:
+            s, c = np.sin(0.5 * angle) / angle, np.cos(0.5 * angle)
         dx, dy, dz = ox * s, oy * s, oz * s
         q[0] = c * w - dx * x - dy * y - dz * z
         q[1] = c * x + dx * w + dy * z - dz * y
@@ -45,16 +49,17 @@ def _rotation_loop(m, q):
 
 
 @numba.njit(cache=True, nogil=True)
-def _local_loop(x, rest, start, other, weight, inverse, fibre, low, high, hold, q, target, deformation):
+def _local_loop(x, arm, start, other, inverse, fibre, low, high, hold, q, target, deformation):
     """Deformation gradient F and target T of each cluster, T = R (t aaᵀ + t^(-1/2) (I - aaᵀ))."""
+    f = np.empty((3, 3))
     for i in range(len(start) - 1):
-        f = np.zeros((3, 3))
+        f[:] = 0.0
         for e in range(start[i], start[i + 1]):
             j = other[e]
             for a in range(3):
-                d = weight[e] * (x[j, a] - x[i, a])
+                d = x[j, a] - x[i, a]
                 for b in range(3):
-                    f[a, b] += d * (rest[j, b] - rest[i, b])
+                    f[a, b] += d * arm[e, b]
         for a in range(3):
             for b in range(3):
                 deformation[i, a, b] = (
@@ -95,16 +100,15 @@ def _local_loop(x, rest, start, other, weight, inverse, fibre, low, high, hold, 
 
 
 @numba.njit(cache=True, nogil=True)
-def _right_side_loop(rest, start, other, weight, target, out):
+def _right_side_loop(arm, start, other, target, out):
     """b = Σ over edges (i, j) of w T_i (X_j - X_i), added at j and taken from i."""
     out[:] = 0.0
     for i in range(len(start) - 1):
         t = target[i]
         for e in range(start[i], start[i + 1]):
             j = other[e]
-            dx, dy, dz = rest[j, 0] - rest[i, 0], rest[j, 1] - rest[i, 1], rest[j, 2] - rest[i, 2]
             for a in range(3):
-                v = weight[e] * (t[a, 0] * dx + t[a, 1] * dy + t[a, 2] * dz)
+                v = t[a, 0] * arm[e, 0] + t[a, 1] * arm[e, 1] + t[a, 2] * arm[e, 2]
                 out[j, a] += v
                 out[i, a] -= v
 
@@ -135,6 +139,7 @@ class ShapeConstraint:
         count = len(rest)
         head = np.repeat(np.arange(count), np.diff(start))
         edge = rest[other] - rest[head]
+        self.arm = weight[:, None] * edge
         moment = np.zeros((count, 3, 3))
         np.add.at(moment, head, weight[:, None, None] * edge[:, :, None] * edge[:, None, :])
         # A nearly flat cluster says nothing across itself: the small multiple keeps F regular there.
@@ -154,10 +159,10 @@ class ShapeConstraint:
         """Update F_i and T_i from the centres and return the right side b of laplacian · x = b, (K, 3)."""
         low, high = self.limits
         _local_loop(
-            x, self.rest, self.start, self.other, self.weight, self.inverse, self.fibre, low, high, self.hold,
+            x, self.arm, self.start, self.other, self.inverse, self.fibre, low, high, self.hold,
             self.quaternion, self.target, self.deformation,
         )  # fmt: skip
-        _right_side_loop(self.rest, self.start, self.other, self.weight, self.target, self.right_side)
+        _right_side_loop(self.arm, self.start, self.other, self.target, self.right_side)
         return self.right_side
 
     def energy(self, x):

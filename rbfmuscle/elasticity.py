@@ -4,9 +4,11 @@ import numba
 import numpy as np
 
 from rbfmuscle.constraints import ContactConstraint
+from rbfmuscle.sim.rest_frame import diameter
 
 CONTACT_TOLERANCE = 2e-5  # of the muscle's size: some micrometres
 REACH_MARGIN = 0.003  # of the muscle's size
+SETTLED = 1e-4  # of the muscle's size: an iteration that moves no centre farther was the last one
 
 
 @numba.njit(cache=True, nogil=True)
@@ -76,7 +78,7 @@ class ElasticSolver:
         np.add.at(dense, (columns, np.arange(len(points))[:, None]), shares)
         influence = np.zeros((self.centres, len(points)))
         influence[free] = self.inverse @ dense[free]
-        self.scale = float(np.ptp(shape.rest, axis=0).max())
+        self.scale = diameter(shape.rest)
         self.contact = ContactConstraint(
             np.ascontiguousarray(influence.T), columns, shares,
             batch=contacts, tolerance=CONTACT_TOLERANCE * self.scale,
@@ -100,10 +102,11 @@ class ElasticSolver:
         mixer = _Anderson(self.memory)
         for step in range(self.iterations):
             new = self._iterate(x, contacts)
-            if step + 1 < self.iterations:
-                x[self.free] = mixer.mix(x[self.free], new[self.free])
-            else:
+            moved = float(np.sqrt(((new - x) ** 2).sum(axis=1).max()))
+            if step + 1 == self.iterations or moved < SETTLED * self.scale:
                 x = new
+                break
+            x[self.free] = mixer.mix(x[self.free], new[self.free])
         self.shape.localise(x)
         return x
 

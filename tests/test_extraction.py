@@ -12,6 +12,7 @@ from skimage.measure import marching_cubes
 from rbfmuscle.implicit.band import Band, BandGrid
 from rbfmuscle.implicit.extraction import extract_surface, mesh_volume
 from rbfmuscle.implicit.field import RBFField
+from rbfmuscle.implicit.obstacles import ObstaclePoints
 from rbfmuscle.implicit.sampling import sample_surface
 
 HIP = Path(os.environ.get("RBFMUSCLE_DATA", Path(__file__).parents[2] / "shared" / "data")) / "hip"
@@ -153,7 +154,7 @@ def test_chords_do_not_cut_across_a_convex_bone():
     ball = trimesh.creation.icosphere(4, radius=15.0).apply_translation(CENTRE + [50.0, 0, 0])
     bone = sphere(15.0, CENTRE + [50.0, 0, 0])
     depths = []
-    for obstacles in (None, [(np.array(ball.vertices), np.eye(4))]):
+    for obstacles in (None, [(ObstaclePoints(ball.vertices), np.eye(4))]):
         surface = extract_surface(
             sphere(), points=on_sphere(), cut=bone, obstacles=obstacles, volume=5e5, resolution=32
         )

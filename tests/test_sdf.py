@@ -4,10 +4,10 @@ import numba
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from rbfmuscle.sim.exact_distance import ExactDistance
 from rbfmuscle.sim.sdf import BoneSDF
-from rbfmuscle.sim.sdf_query import field_gradient, field_value
 from rbfmuscle.validation import MeshError
 
 SHAPES = {
@@ -147,17 +147,6 @@ def test_reach_gives_lower_bounds_beyond_it_and_the_same_within(shape):
         assert np.all(found[~near] <= whole[~near] + 1e-6)
 
 
-def test_loops_of_other_modules_get_the_same_answers(shape):
-    mesh, field = shape
-    points = _near(mesh, 3.0, 300)
-    distance, gradient = field.distance_and_gradient(points)
-    for n, (x, y, z) in enumerate(points):
-        assert field_value(x, y, z, np.inf, *field.data) == distance[n]
-        d, *g = field_gradient(x, y, z, np.inf, *field.data)
-        assert d == distance[n]
-        np.testing.assert_allclose(g, gradient[n], atol=1e-12)
-
-
 def test_order_and_threads_do_not_matter(shape):
     mesh, field = shape
     points = _near(mesh, 3.0, 30000)
@@ -207,7 +196,7 @@ def test_region_is_fine_inside_and_right_outside():
     assert part.memory < 0.8 * whole.memory
     assert np.sqrt(np.mean(error[inside] ** 2)) < 0.01
     # Outside, coarse cells of 16 times the edge answer.
-    assert error.max() < 0.25 * 16 * part.spacing
+    assert error.max() < 0.3 * 16 * part.spacing
     assert np.mean((part.distance(points) * exact < 0.0) & (np.abs(exact) > 0.5)) < 0.01
 
 
@@ -258,3 +247,19 @@ def test_bad_points_and_poses_are_refused():
     with pytest.raises(ValueError, match="pose"):
         field.distance([[0.0, 0.0, 0.0]], pose=np.eye(3))
     assert field.distance(np.zeros((0, 3))).shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("turn", "scale"), [([0.4, -1.0, 2.0], 1.0), ([0.0, 0.0, 0.0], 1e-3), ([3.0, 0.1, 0.0], 10.0)]
+)
+@pytest.mark.parametrize("name", ["torus", "sphere", "box"])
+def test_a_moved_turned_or_scaled_bone_has_the_same_field(name, turn, scale):
+    mesh = SHAPES[name]()
+    points = _near(mesh, 2.0, 2000)
+    rotation, shift = Rotation.from_rotvec(turn).as_matrix(), np.array([300.0, -100.0, 50.0])
+    other = BoneSDF.from_mesh((scale * mesh.vertices @ rotation.T + shift, mesh.faces), cache=False)
+    distance, gradient = BoneSDF.from_mesh(mesh, cache=False).distance_and_gradient(points)
+    moved, turned = other.distance_and_gradient(scale * points @ rotation.T + shift)
+    # A vertex rounded the other way (1e-8 of the size) moves single-precision records by their last digit.
+    np.testing.assert_allclose(moved / scale, distance, rtol=0, atol=1e-7 * np.ptp(mesh.vertices))
+    assert np.median(np.abs(turned @ rotation - gradient)) < 1e-6

@@ -10,7 +10,7 @@ from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, hinged_scene, joi
 from rbfmuscle import models
 from rbfmuscle.sim.motion import bone_poses
 from rbfmuscle.sim.options import TunnellingOptions
-from rbfmuscle.sim.reach import reached_bones, sampled_poses, split_step, turned_angle
+from rbfmuscle.sim.reach import Pace, reached_bones, sampled_poses, turned_angle
 from rbfmuscle.sim.simulate import simulate_frames
 from rbfmuscle.validation import SolveError, UsageError
 
@@ -53,10 +53,10 @@ def test_first_frame_is_reached_from_the_rest_pose():
     )
 
 
-def test_split_step_bounds_turn_and_travel():
+def test_sub_steps_bound_turn_and_travel():
     made, _ = hinged_scene([0, 45])
     before, after = made.motion.frames
-    stops = split_step(made, before, after)
+    stops = Pace(made).split(before, after)
     assert stops[-1] == after
     poses = [bone_poses(made, c)["arm"] for c in (before, *stops)]
     turns = [turned_angle(b[:3, :3] @ a[:3, :3].T) for a, b in pairwise(poses)]
@@ -66,12 +66,30 @@ def test_split_step_bounds_turn_and_travel():
     for a, b in pairwise(poses):
         moved = np.linalg.norm(held @ (b - a)[:3, :3].T + (b - a)[:3, 3], axis=1)
         assert moved.max() <= diagonal / 30 * (1 + 1e-9)
-    assert split_step(made, after, after) == []
+    assert Pace(made).split(after, after) == []
+
+
+def test_sub_steps_end_at_the_same_angles_however_frames_are_spaced():
+    made, _ = hinged_scene([0, 30])
+    start, end = made.motion.frames
+
+    def path(degrees):
+        stops = [start, *({"hinge.bend": np.radians(d)} for d in degrees)]
+        return [s["hinge.bend"] for a, b in pairwise(stops) for s in Pace(made).split(a, b)]
+
+    whole = np.array(path([30]))
+    np.testing.assert_array_equal(path([10, 20, 30]), whole)
+    with_seven = np.array(path([7, 30]))
+    np.testing.assert_allclose(
+        np.setdiff1d(with_seven.round(9), np.radians([7]).round(9)), whole.round(9), rtol=0
+    )
+    back = np.array([s["hinge.bend"] for s in Pace(made).split(end, start)])
+    np.testing.assert_allclose(back[-2::-1], whole[:-1], rtol=0, atol=1e-12)
 
 
 def test_whole_turn_in_one_step_is_split():
     made, _ = hinged_scene([0, 360])
-    assert len(split_step(made, *made.motion.frames)) >= 180
+    assert len(Pace(made).split(*made.motion.frames)) >= 180
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-7, 0.5, 3.1])

@@ -75,7 +75,7 @@ def extract_surface(
         Follow the surface from the points, or visit the whole box (finds every spurious sheet in it).
     axes : (3, 3) array_like, optional
         Rotation whose rows are the grid's axes. In a frame that moves with the scene the mesh does too.
-    obstacles : list of pairs of (k, 3) and (4, 4) ndarrays, optional
+    obstacles : list of pairs of ObstaclePoints and (4, 4) ndarrays, optional
         Vertices of the bones behind ``cut``, each bone in its own coordinates with its pose: triangles whose
         chords cut across a convex bone are moved until no vertex is inside the mesh by more than the tolerance.
     obstacle_tolerance : float, optional

@@ -199,16 +199,11 @@ class BoneContacts:
     def _query(self, points, b, reach=np.inf):
         pose = self.poses[self.names[b]]
         distance, gradient = self.fields[b].distance_and_gradient(points, pose=pose, reach=reach)
-        length = np.linalg.norm(gradient, axis=1)
-        flat = length < 1e-9
-        if flat.any():
-            # On the medial surface the field has no direction; away from the bone's middle is as good as any.
-            middle = self.fields[b].bounds.mean(axis=0)
-            pose = self.poses[self.names[b]]
-            gradient = np.array(gradient)
-            gradient[flat] = points[flat] - (pose[:3, :3] @ middle + pose[:3, 3]) + 1e-12
-            length = np.linalg.norm(gradient, axis=1)
-        return distance, gradient / length[:, None]
+        # On the medial surface the field has no direction; away from the bone's middle is as good as any.
+        middle = pose[:3, :3] @ self.fields[b].bounds.mean(axis=0) + pose[:3, 3]
+        direction = np.empty_like(gradient)
+        _direction_loop(points, gradient, middle, direction)
+        return distance, direction
 
     def _near(self, points, free, b, reach):
         """Contact points that may be nearer than their ``reach`` to bone b, by its box and by earlier answers."""
@@ -235,6 +230,24 @@ def moved_box(bounds, pose):
     centre, half = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
     middle, reach = pose[:3, :3] @ centre + pose[:3, 3], np.abs(pose[:3, :3]) @ half
     return np.array([middle - reach, middle + reach])
+
+
+@numba.njit(cache=True, nogil=True)
+def _direction_loop(points, gradient, middle, out):
+    """Unit gradients; away from the middle where there is none."""
+    for i in range(len(points)):
+        square = 0.0
+        for a in range(3):
+            out[i, a] = gradient[i, a]
+            square += out[i, a] ** 2
+        if square < 1e-18:
+            square = 0.0
+            for a in range(3):
+                out[i, a] = points[i, a] - middle[a] + 1e-12
+                square += out[i, a] ** 2
+        length = np.sqrt(square)
+        for a in range(3):
+            out[i, a] /= length
 
 
 @numba.njit(cache=True, nogil=True)

@@ -7,17 +7,19 @@ Distances are negative inside. What a query reads, and how, is in ``sdf_query.py
 
 import logging
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from rbfmuscle.sim.exact_distance import ExactDistance
+from rbfmuscle.sim.rest_frame import BoneFrame, on_one_line
 from rbfmuscle.sim.sdf_build import build_cells, grid_shape
 from rbfmuscle.sim.sdf_cache import content_key, load_arrays, store_arrays
-from rbfmuscle.sim.sdf_mesh import BoneMesh, prepare_bone, winding_test
+from rbfmuscle.sim.sdf_mesh import prepare_bone, winding_test
 from rbfmuscle.sim.sdf_query import BLOCK, FieldData, gradient_loop, value_loop
 from rbfmuscle.sim.threads import in_chunks
 from rbfmuscle.sim.triangles import FIRST
-from rbfmuscle.validation import MeshError, check_points, check_positive
+from rbfmuscle.validation import MeshError, check_mesh, check_points, check_positive
 
 log = logging.getLogger(__name__)
 
@@ -54,15 +56,18 @@ class BoneSDF:
     notes : tuple of str
         What was found about the mesh.
     data : FieldData
-        Arrays for queries in other modules' compiled loops (``sdf_query.field_value``).
+        What queries read, in a frame of the bone's own: a scene that is moved, turned or written in another unit
+        gives the same field.
     """
 
-    def __init__(self, mesh, data, *, spacing, error, closed):
-        self.vertices, self.faces, self.notes = mesh.vertices, mesh.faces, tuple(mesh.notes)
+    def __init__(self, vertices, frame, parts):
+        self.vertices, self.faces, self.notes = vertices, parts.faces, tuple(parts.notes)
         used = self.vertices[np.unique(self.faces)]
         self.bounds = np.array([used.min(axis=0), used.max(axis=0)])
-        self.data, self.spacing, self.error, self.closed = data, spacing, error, closed
-        self.band = BAND * spacing
+        self.data, self.closed = parts.data, parts.closed
+        self.spacing, self.error = parts.spacing * frame.size, parts.error * frame.size
+        self.band = BAND * self.spacing
+        self._frame = frame
 
     @property
     def memory(self):
@@ -116,16 +121,20 @@ class BoneSDF:
         box = None if region is None else region.tolist()
         key = content_key(vertices, faces, (tolerance, box, memory_limit)) if cache else None
         arrays = load_arrays(key) if cache else None
-        field = None if arrays is None else _from_arrays(cls, arrays)
-        if field is None:
-            field = _build(
-                cls, prepare_bone(vertices, faces, name=name), tolerance, region, memory_limit, name
+        parts = None if arrays is None else _from_arrays(arrays)
+        vertices, faces = check_mesh(vertices, faces, name=name)
+        if parts is None and on_one_line(vertices):
+            raise MeshError(f"{name} has no face with an area")
+        frame = BoneFrame(vertices)
+        if parts is None:
+            parts = _build(
+                prepare_bone(frame.local, faces, name=name), frame, tolerance, region, memory_limit, name
             )
             if cache:
-                store_arrays(key, _to_arrays(field))
-        for note in field.notes:
+                store_arrays(key, _to_arrays(parts))
+        for note in parts.notes:
             log.warning("%s: %s", name, note)
-        return field
+        return cls(vertices, frame, parts)
 
     def distance(self, points, pose=None, *, reach=np.inf):
         """Signed distance of points, (n,) [unit of the mesh], negative inside the bone.
@@ -143,11 +152,13 @@ class BoneSDF:
         points, pose = check_points(points), _check_pose(pose)
         reach = np.inf if reach is None else float(reach)
         out = np.empty(len(points))
+        placed, size = self._frame.placed(pose), self._frame.size
 
         def work(a, b):
-            value_loop(points[a:b], pose, reach, out[a:b], self.data)
+            value_loop(points[a:b], placed, reach / size, out[a:b], self.data)
 
         in_chunks(len(points), work, least=4096)
+        out *= size
         return out
 
     def gradient(self, points, pose=None):
@@ -163,11 +174,14 @@ class BoneSDF:
         points, pose = check_points(points), _check_pose(pose)
         reach = np.inf if reach is None else float(reach)
         distance, gradient = np.empty(len(points)), np.empty((len(points), 3))
+        placed, size = self._frame.placed(pose), self._frame.size
 
         def work(a, b):
-            gradient_loop(points[a:b], pose, reach, distance[a:b], gradient[a:b], self.data)
+            gradient_loop(points[a:b], placed, reach / size, distance[a:b], gradient[a:b], self.data)
 
         in_chunks(len(points), work, least=4096)
+        distance *= size
+        gradient *= size
         return distance, gradient
 
     def direction(self, points, pose=None):
@@ -190,33 +204,45 @@ def _check_pose(pose):
     return pose
 
 
-def _build(cls, mesh, tolerance, region, memory_limit, name):
+class _Parts(NamedTuple):
+    """A field in local units, as it is kept on disk."""
+
+    faces: np.ndarray
+    notes: list
+    data: FieldData
+    spacing: float
+    error: float
+    closed: bool
+
+
+def _build(mesh, frame, tolerance, region, memory_limit, name):
     """Refine until the field errs by no more than the tolerance."""
     exact = ExactDistance((mesh.vertices, mesh.faces))
     edge = _mean_edge(mesh)
     used = mesh.vertices[np.unique(mesh.faces)]
     extent = float(np.ptp(used, axis=0).max())
     spacing = min(CELL_SHARE * edge, extent / LEAST_CELLS)
-    wanted = TOLERANCE_SHARE * edge if tolerance is None else tolerance
+    box = None if region is None else frame.box(region)
+    wanted = TOLERANCE_SHARE * edge if tolerance is None else tolerance / frame.size
     inside = None if mesh.closed else winding_test(mesh)
+    error = np.inf
     for _ in range(ATTEMPTS):
         spacing = _check_memory(mesh, exact, spacing, tolerance, memory_limit, name)
-        cells = build_cells(
-            exact, spacing, BAND * spacing, inside=inside, region=region, doubtful=mesh.doubtful
-        )
+        cells = build_cells(exact, spacing, BAND * spacing, inside=inside, region=box, doubtful=mesh.doubtful)
         if inside is None and not cells.sound:
             mesh.notes.append("intersects itself: the sign comes from winding numbers")
             inside = winding_test(mesh)
             continue
         data = pack_field(exact, cells)
-        field = cls(mesh, data, spacing=spacing, error=0.0, closed=inside is None)
-        field.error = _measure(field, exact, region)
-        if field.error <= wanted:
-            return field
-        spacing *= max(0.5, 0.9 * (wanted / field.error) ** (1 / 3))
-    mesh.notes.append(f"errs by {field.error:.3g} RMS near the surface, {wanted:.3g} was asked for")
-    field.notes = tuple(mesh.notes)
-    return field
+        error = _measure(mesh, data, exact, BAND * spacing, box)
+        reached = _Parts(mesh.faces, mesh.notes, data, spacing, error, inside is None)
+        if error <= wanted:
+            return reached
+        spacing *= max(0.5, 0.9 * (wanted / error) ** (1 / 3))
+    mesh.notes.append(
+        f"errs by {error * frame.size:.3g} RMS near the surface, {wanted * frame.size:.3g} was asked for"
+    )
+    return reached
 
 
 def _mean_edge(mesh):
@@ -251,10 +277,10 @@ def _check_memory(mesh, exact, spacing, tolerance, limit, name):
     return spacing
 
 
-def _measure(field, exact, region):
+def _measure(mesh, data, exact, band, region):
     """RMS error at points spread over the band, in the region."""
     rng = np.random.default_rng(0)
-    corners = field.vertices[field.faces]
+    corners = mesh.vertices[mesh.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normal, axis=1)
     if region is not None:
@@ -265,8 +291,10 @@ def _measure(field, exact, region):
     weight = rng.dirichlet(np.ones(3), PROBES)
     points = np.einsum("nk,nkj->nj", weight, corners[which])
     unit = normal[which] / np.linalg.norm(normal[which], axis=1, keepdims=True)
-    points += unit * rng.uniform(-field.band, field.band, (PROBES, 1))
-    difference = np.abs(field.distance(points)) - np.abs(exact.signed_distance(points))
+    points += unit * rng.uniform(-band, band, (PROBES, 1))
+    distance = np.empty(len(points))
+    value_loop(points, IDENTITY, np.inf, distance, data)
+    difference = np.abs(distance) - np.abs(exact.signed_distance(points))
     return float(np.sqrt(np.mean(difference**2)))
 
 
@@ -292,25 +320,16 @@ def pack_field(exact, cells):
     )
 
 
-def _to_arrays(field):
-    arrays = {"data_" + name: array for name, array in field.data._asdict().items()}
-    numbers = np.array([field.spacing, field.error, float(field.closed)])
-    notes = np.array("\n".join(field.notes))
-    return {
-        **arrays,
-        "mesh_vertices": field.vertices,
-        "mesh_faces": field.faces,
-        "numbers": numbers,
-        "notes": notes,
-    }
+def _to_arrays(parts):
+    arrays = {"data_" + name: array for name, array in parts.data._asdict().items()}
+    numbers = np.array([parts.spacing, parts.error, float(parts.closed)])
+    return {**arrays, "faces": parts.faces, "numbers": numbers, "notes": np.array("\n".join(parts.notes))}
 
 
-def _from_arrays(cls, arrays):
-    if not {"numbers", "notes", "mesh_vertices", "mesh_faces"} <= arrays.keys():
+def _from_arrays(arrays):
+    if not {"numbers", "notes", "faces"} <= arrays.keys():
         return None
     notes = [note for note in str(arrays["notes"]).split("\n") if note]
-    faces = arrays["mesh_faces"]
-    mesh = BoneMesh(arrays["mesh_vertices"], faces, np.zeros(len(faces), dtype=np.bool_), notes)
     data = FieldData(**{name: arrays["data_" + name] for name in FieldData._fields})
     spacing, error, closed = arrays["numbers"]
-    return cls(mesh, data, spacing=float(spacing), error=float(error), closed=bool(closed))
+    return _Parts(arrays["faces"], notes, data, float(spacing), float(error), bool(closed))

@@ -17,7 +17,7 @@ import numpy as np
 log = logging.getLogger(__name__)
 
 # Part of every name: raise it when the arrays or the way they are built change.
-VERSION = 10
+VERSION = 11
 SUFFIX = ".sdf.npz"
 # What reading a damaged, foreign or half-removed archive may raise.
 _DAMAGE = (OSError, ValueError, KeyError, EOFError, IndexError, NotImplementedError, zipfile.BadZipFile)

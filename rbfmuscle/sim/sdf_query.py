@@ -4,10 +4,6 @@ The field is a sparse grid of cells. Each cell names the few triangles that are 
 query takes the nearest of them, so it answers with a true distance to the mesh, with its sharp gradient, and
 not with an interpolation. Cells are fine in a band about the surface and coarser elsewhere, and outside the
 grid those of its border serve.
-
-``field_value`` and ``field_gradient`` take one point in bone coordinates and the arrays of ``BoneSDF.data``,
-for other modules' loops: ``field_value(x, y, z, reach, *data)``. Passed one by one, arrays cost a loop
-nothing; a tuple of them does.
 """
 
 from typing import NamedTuple
@@ -258,49 +254,6 @@ def _query(x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en
     if state == MIXED or (state == CROSSED and not inside):
         side = _slow_side(x, y, z, entry, n, lists, corners, records, en, vn, vertices)
     return np.sqrt(square) if side >= 0.0 else -np.sqrt(square), n, du, dv, dw
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def field_value(x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices, across):
-    """Signed distance at one point in bone coordinates.
-
-    Parameters
-    ----------
-    x, y, z : float
-        The point [unit of the mesh].
-    reach : float
-        Where the bone is surely further away, outside, a lower bound above ``reach`` may be returned.
-        Infinity asks for the distance everywhere.
-    grid, ..., across
-        ``*BoneSDF.data``.
-
-    Returns
-    -------
-    float
-        [unit of the mesh], negative inside.
-    """
-    x, y, z = x - grid[0], y - grid[1], z - grid[2]
-    return _query(
-        x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices, across
-    )[0]
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def field_gradient(
-    x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices, across
-):
-    """Signed distance and its unit gradient at one point in bone coordinates: ``(d, gx, gy, gz)``.
-
-    Parameters as for :func:`field_value`. The gradient is zero where only a lower bound was asked for.
-    """
-    x, y, z = x - grid[0], y - grid[1], z - grid[2]
-    d, n, du, dv, dw = _query(
-        x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices, across
-    )
-    if n < 0:
-        return d, 0.0, 0.0, 0.0
-    gx, gy, gz = _unit_gradient(n, d, du, dv, dw, ROUNDING * grid[UNIT], records)
-    return d, gx, gy, gz
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -14,7 +14,7 @@ from rbfmuscle.sim.contact import BoneContacts
 from rbfmuscle.sim.lane import Event, Lane
 from rbfmuscle.sim.motion import bone_poses
 from rbfmuscle.sim.overlap import settle_rest
-from rbfmuscle.sim.reach import build_fields, reached_bones, split_step
+from rbfmuscle.sim.reach import Pace, build_fields, reached_bones
 
 __all__ = ["Event", "Frame", "ModelSurface", "MuscleModel", "simulate_frames"]
 
@@ -187,6 +187,7 @@ def _obstacles(scene, models, fields):
 
 def _run(scene, lanes, crew, surfaces, written):
     here = dict.fromkeys(scene.motion.frames[0], 0.0) if scene.motion.frames else {}
+    pace = Pace(scene)
     start = time.perf_counter()
     with crew.one_thread_each():
         crew.each(lambda lane: settle_rest(lane, here), lanes)
@@ -195,10 +196,18 @@ def _run(scene, lanes, crew, surfaces, written):
     for index, coordinates in enumerate(scene.motion.frames):
         start = time.perf_counter()
         shown = written is None or index in written
-        with crew.one_thread_each():
-            _go(lanes, crew, sliding, index, [here, *split_step(scene, here, coordinates)])
-        with crew.all_threads():
-            skins = _show(lanes, crew, sliding) if shown and surfaces else []
+        show = shown and surfaces
+        stops = [here, *pace.split(here, coordinates)]
+        if sliding is None and crew.pool is not None:
+            # Nothing waits for another muscle: each goes all the way, and no thread idles in between.
+            with crew.one_thread_each():
+                skins = crew.each(lambda lane: _go_alone(lane, index, stops, show), lanes)  # noqa: B023
+                skins = skins if show else []
+        else:
+            with crew.one_thread_each():
+                _go(lanes, crew, sliding, index, stops)
+            with crew.all_threads():
+                skins = _show(lanes, crew, sliding) if show else []
         wall += time.perf_counter() - start
         if shown:
             yield _frame(scene, lanes, index, coordinates, skins, wall)
@@ -213,6 +222,12 @@ def _sliding(scene, lanes):
     from rbfmuscle.sim.sliding import Sliding
 
     return Sliding(scene, lanes)
+
+
+def _go_alone(lane, index, stops, show):
+    lane.frame = index
+    lane.advance(stops)
+    return lane.show() if show else None
 
 
 def _go(lanes, crew, sliding, index, stops):

@@ -1,0 +1,103 @@
+"""Coordinates of a rest mesh that stay the same wherever its scene lies."""
+
+import numpy as np
+
+
+def diameter(points):
+    """Twice the greatest distance from the mean: a size that does not change when the scene is turned."""
+    return 2.0 * float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
+
+
+class RestFrame:
+    """Coordinates of a rest mesh that do not change when the scene is moved, turned or written in another unit.
+
+    Sampling and binding choose between points; two that are equally good must not be told apart by rounding, or
+    a moved scene would get other centres. Here they see the same rounded numbers wherever the scene lies.
+
+    Parameters
+    ----------
+    vertices : (n, 3) ndarray
+
+    Attributes
+    ----------
+    local : (n, 3) ndarray
+        Vertices in a frame spanned by the first of them, in units of the mesh's size, rounded to 1e-8.
+    """
+
+    def __init__(self, vertices):
+        self.origin = vertices.mean(axis=0)
+        offset = vertices - self.origin
+        distance = np.linalg.norm(offset, axis=1)
+        self.size = float(distance.max())
+        first = offset[np.argmax(distance > 0.3 * self.size)]
+        first = first / np.linalg.norm(first)
+        across = offset - (offset @ first)[:, None] * first
+        span = np.linalg.norm(across, axis=1)
+        second = across[np.argmax(span > 0.3 * span.max())]
+        second = second / np.linalg.norm(second)
+        self.axes = np.array([first, second, np.cross(first, second)])
+        self.local = np.round(offset @ self.axes.T / self.size, 8)
+
+    def points(self, local):
+        """World positions of local points."""
+        return local @ self.axes * self.size + self.origin
+
+    def directions(self, local):
+        """World directions of local ones."""
+        return local @ self.axes
+
+
+def on_one_line(vertices):
+    """Whether all vertices coincide or lie on one line, so that they span no frame."""
+    offset = vertices - vertices.mean(axis=0)
+    sizes = np.linalg.svd(offset, full_matrices=False, compute_uv=False)
+    return bool(sizes[1] <= 1e-12 * max(sizes[0], 1e-300))
+
+
+def _principal_axes(points):
+    """Right-handed principal axes as rows; the axes themselves where rounding would choose between others."""
+    _, sizes, axes = np.linalg.svd(points, full_matrices=False)
+    if np.diff(sizes).max() > -0.02 * sizes[0]:
+        return np.eye(3)
+    axes[2] *= np.sign(np.linalg.det(axes))
+    return axes
+
+
+class BoneFrame:
+    """The rest frame of a bone, along its principal axes so that a grid in it is small.
+
+    Parameters
+    ----------
+    vertices : (n, 3) ndarray
+        Not all on one line.
+
+    Attributes
+    ----------
+    origin : (3,) ndarray
+    axes : (3, 3) ndarray
+        Rows are unit axes in bone coordinates.
+    size : float
+        Length of a local unit.
+    local : (n, 3) ndarray
+        Vertices in local units, rounded to 1e-8.
+    """
+
+    def __init__(self, vertices):
+        frame = RestFrame(vertices)
+        # Found in rounded numbers, so that equal moments give the same axes for every pose of the scene.
+        turn = _principal_axes(frame.local)
+        self.origin, self.size, self.axes = frame.origin, frame.size, turn @ frame.axes
+        self.local = np.round(frame.local @ turn.T, 8)
+
+    def box(self, bounds):
+        """Local box (2, 3) that holds a box given in bone coordinates."""
+        corners = np.array(np.meshgrid(*np.transpose(bounds))).reshape(3, -1).T
+        local = (corners - self.origin) @ self.axes.T / self.size
+        return np.array([local.min(axis=0), local.max(axis=0)])
+
+    def placed(self, pose):
+        """Transform (4, 4) whose transpose takes world points to local units, for a pose of the bone."""
+        out = np.eye(4)
+        out[:3, :3] = pose[:3, :3] @ self.axes.T / self.size
+        out[:3, 3] = pose[:3, :3] @ self.origin + pose[:3, 3]
+        return out
