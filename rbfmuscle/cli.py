@@ -6,6 +6,7 @@ limit exceeded; 7 an optional part missing; 130 interrupted, frames so far kept.
 
 import json
 import os
+import signal
 import sys
 import warnings
 
@@ -40,6 +41,8 @@ def main(arguments=None):
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     sys.excepthook = _report_bug
+    # A job that is told to end keeps its frames, as one that is interrupted.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     warnings.showwarning = _show_warning
     raise SystemExit(_run(arguments))
 

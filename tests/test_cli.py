@@ -108,7 +108,8 @@ class TestRun:
         assert (tmp_path / "o" / "export" / "stl" / "adductor_0000.stl").exists()
         assert call(capsys, "export", tmp_path / "o", "--format", "step")[0] == 2
 
-    def test_interrupt_keeps_the_frames_so_far(self, phantom_folder, tmp_path):
+    @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+    def test_interrupt_keeps_the_frames_so_far(self, end, phantom_folder, tmp_path):
         text = SCENE.replace("to = 8, step = 2", "to = 90, step = 0.5")
         (phantom_folder / "long.toml").write_text(text)
         out = tmp_path / "out"
@@ -120,7 +121,7 @@ class TestRun:
             if len(list(out.glob("surfaces/*_0003.vtp"))) or process.poll() is not None:
                 break
             time.sleep(0.1)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(end)
         _, err = process.communicate(timeout=60)
         assert process.returncode == 130
         assert "interrupted" in err and "frames are kept" in err and "Traceback" not in err
