@@ -263,11 +263,11 @@ class RBFMuscle:
         field = self.field()
         fitted = time.perf_counter()
         points = self.contact_points()
-        # Farther than a cell from the bones a lower bound will do: no vertex gets there.
-        reach = 1.25 * self.solver.scale / self.options.resolution
         depth = contacts.depth(points)
-        cut = _BoneCut(contacts, reach) if contacts.names else None
         axes = self.axes @ contacts.poses[self.motion_bones[0]][:3, :3].T
+        # Farther than a cell from the bones a lower bound will do: no vertex gets there.
+        reach = 1.25 * float(np.ptp(points @ axes.T, axis=0).max()) / self.options.resolution
+        cut = _BoneCut(contacts, reach) if contacts.names else None
         result = extract_surface(
             field, points=points, resolution=self.options.resolution, cut=cut,
             volume=self.rest_volume, level=self.level, axes=axes,

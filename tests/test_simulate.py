@@ -65,7 +65,7 @@ def test_sub_steps_bound_turn_and_travel():
     held = made.muscles[0].mesh.vertices[made.muscles[0].attachments[1].vertices]
     for a, b in pairwise(poses):
         moved = np.linalg.norm(held @ (b - a)[:3, :3].T + (b - a)[:3, 3], axis=1)
-        assert moved.max() <= diagonal / 30 * (1 + 1e-9)
+        assert moved.max() <= diagonal / 27 * (1 + 1e-9)
     assert Pace(made).split(after, after) == []
 
 

@@ -17,7 +17,7 @@ SAMPLED_POSES = 48
 # Padding of a swept box, as a share of the muscle's diagonal, as a muscle bulges beyond its bones' motions.
 PADDING = 0.1
 # No attached point moves farther against a bone in one sub-step than this share of its muscle's diameter.
-TRAVEL = 1.0 / 30.0
+TRAVEL = 1.0 / 27.0
 
 
 def swept_region(muscle, bone_name, poses):

@@ -88,6 +88,16 @@ def _block_entry(x, y, z, scale, blocks):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _beyond(x, y, z, scale, blocks):
+    """Squared distance of a point relative to the origin from the grid."""
+    nx, ny, nz = blocks.shape
+    dx = x - min(max(x, 0.0), nx / scale)
+    dy = y - min(max(y, 0.0), ny / scale)
+    dz = z - min(max(z, 0.0), nz / scale)
+    return dx * dx + dy * dy + dz * dz
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _square(n, x, y, z, records):
     """Squared distance to record n of a point relative to the origin; without branches, as they are a
     toss-up."""
@@ -272,11 +282,15 @@ def _stage(points, pose, reach, grid, blocks, cells, lists, far, records, local,
         local[n, 0], local[n, 1], local[n, 2] = x, y, z
         entry[n], cell, far_point = _block_entry(x, y, z, scale, blocks)
         best[n] = cell | (CELL_FAR if far_point else 0)
+        square[n] = _beyond(x, y, z, scale, blocks) if far_point else 0.0
     for n in range(len(points)):
         if entry[n] < 0:
             entry[n] = cells[-1 - entry[n], best[n] & (CELL_FAR - 1)]
     for n in range(len(points)):
         bound = (lists[entry[n]] >> BOUND) * unit
+        if square[n] > 0.0:
+            # The bone lies in the grid, so the way to the grid and the way on from there are at a right angle or more.
+            bound = np.sqrt(bound * bound + square[n])
         square[n] = bound
         if bound > reach:
             best[n] = -1
