@@ -16,7 +16,10 @@ from scipy.sparse.linalg import splu
 
 from rbfmuscle.validation import MissingPartError, SolveError
 
-MOST_ITERATIONS = 30
+MOST_ITERATIONS = 60
+# A step that would lower the energy by a smaller share than this changes nothing that is looked at; facets of bones
+# have edges, at which the forces themselves need not settle.
+ENERGY_TOLERANCE = 2e-6
 
 
 def _skfem():
@@ -127,21 +130,38 @@ class HexSolid:
         for iteration in range(MOST_ITERATIONS):
             force, matrix = self._assemble(u)
             scale = max(np.abs(force).max(), 1e-9 * self.shear)
-            if not first.any() and np.abs(force[free]).max() < tolerance * scale:
-                return SolidState(u, iteration, float(np.abs(force[free]).max() / scale))
-            step = first.copy()
-            right = -(force + matrix @ first)[free]
-            inner = matrix[free][:, free].tocsc()
-            factor = splu(
-                inner, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-            )
-            step[free] = factor.solve(right)
+            residual = float(np.abs(force[free]).max() / scale)
+            if not first.any() and residual < tolerance:
+                return SolidState(u, iteration, residual)
+            step = self._direction(force, matrix, free, first)
+            if not first.any() and abs(force @ step) < ENERGY_TOLERANCE * self.energy(u):
+                return SolidState(u, iteration, residual)
             u = self._walk(u, step.reshape(-1, 3), force, moving=first.any())
-            first[:] = 0.0
-        residual = float(np.abs(force[free]).max() / scale)
-        if residual < 1e3 * tolerance:
-            return SolidState(u, MOST_ITERATIONS, residual)
+            first = np.zeros_like(first)
         raise SolveError(f"no equilibrium after {MOST_ITERATIONS} iterations, residual {residual:.1e}")
+
+    def _direction(self, force, matrix, free, first):
+        """Newton's step; where the stiffness is not positive, with a share of its diagonal added."""
+        step = first.copy()
+        right = -(force + matrix @ first)[free]
+        inner = matrix[free][:, free].tocsc()
+        added = 0.0
+        for _ in range(8):
+            try:
+                shifted = inner + sparse.diags_array(added * np.abs(inner.diagonal())) if added else inner
+                factor = splu(
+                    shifted.tocsc(),
+                    permc_spec="MMD_AT_PLUS_A",
+                    diag_pivot_thresh=0.0,
+                    options={"SymmetricMode": True},
+                )
+                step[free] = factor.solve(right)
+            except RuntimeError:  # singular
+                step[free] = np.nan
+            if np.isfinite(step).all() and (first.any() or force @ step < 0.0):
+                return step
+            added = max(10 * added, 1e-4)
+        raise SolveError("the stiffness of the bricks is singular, take smaller steps")
 
     def _walk(self, u, step, force, *, moving):
         """Longest of the halved steps that lowers the energy; one that moves held nodes must only stay valid."""
@@ -151,11 +171,11 @@ class HexSolid:
             return u + step
         here, slope = self.energy(u), float(force @ step.ravel())
         share = 1.0
-        for _ in range(12):
+        for _ in range(20):
             if self.energy(u + share * step) <= here + 1e-4 * share * slope + 1e-12 * abs(here):
                 return u + share * step
             share *= 0.5
-        return u + share * step
+        raise SolveError("no step lowers the energy, take smaller steps")
 
     def energy(self, displacement):
         """Elastic and contact energy; infinite where a brick is turned inside out."""
@@ -168,14 +188,15 @@ class HexSolid:
         total = 0.5 * self.shear * (shape * self.weights).sum()
         total += 0.5 * self.bulk * ((mean - 1.0) ** 2 * self.weights.sum(axis=1)).sum()
         if self.obstacles:
-            depth = np.minimum(self._gaps(displacement)[0], 0.0)
+            depth = np.minimum(self.gaps(displacement)[0], 0.0)
             total += 0.5 * self.penalty * (depth**2 * self.side_weights[self.touching]).sum()
         return float(total)
 
     def _gradient(self, displacement):
         return np.eye(3) + np.einsum("eni,eqnj->eqij", displacement[self.nodes], self.slopes, optimize=True)
 
-    def _gaps(self, displacement):
+    def gaps(self, displacement):
+        """Distances (faces, points) and directions (faces, points, 3) of the free surface to the bones."""
         shape, nodes = self.side_shape[self.touching], self.side_nodes[self.touching]
         points = np.einsum("fqn,fni->fqi", shape, (self.rest + displacement)[nodes])
         gap, direction = self.obstacles(points.reshape(-1, 3))
@@ -234,7 +255,7 @@ class HexSolid:
         return factor[..., None, None] * out + pressure[..., None, None] * (square - crossed)
 
     def _contact(self, displacement):
-        gap, direction = self._gaps(displacement)
+        gap, direction = self.gaps(displacement)
         shape = self.side_shape[self.touching]
         depth = np.minimum(gap, 0.0) * self.side_weights[self.touching] * self.penalty
         active = (gap < 0.0) * self.side_weights[self.touching] * self.penalty

@@ -83,12 +83,15 @@ def draw_front(table, path):
 
 
 def _plain_ticks(axes):
-    from matplotlib.ticker import LogFormatter, LogLocator
+    """Plain numbers at round places, also where the range is less than a decade."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axis.set_major_formatter(LogFormatter(labelOnlyBase=False, minor_thresholds=(9, 9)))
-        axis.set_minor_locator(LogLocator(subs=()))
+        low, high = axis.get_view_interval()
+        narrow = high < 8 * low
+        axis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]) if narrow else LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_locator(NullLocator())
 
 
 def _draw_group(axes, rows, quantity, group, colour):

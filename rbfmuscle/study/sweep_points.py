@@ -6,6 +6,7 @@ import platform
 import time
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import nullcontext
 from functools import lru_cache
 from multiprocessing import get_context
 
@@ -15,6 +16,7 @@ from rbfmuscle.study.metrics import ALL, surface_distance
 from rbfmuscle.study.sweep import SweepFolder
 from rbfmuscle.validation import MissingPartError, RBFMuscleError, UsageError
 
+CONNECT_WITHIN = 20  # seconds for a scheduler and its first worker
 # What a point may fail with and leave the others standing.
 POINT_ERRORS = (
     RBFMuscleError,
@@ -254,31 +256,23 @@ class SweepRunner:
     def _side_by_side(self, points, jobs, threads):
         from joblib import Parallel, delayed, parallel_config
 
-        if self.scheduler:
-            self._connect()
-            config = {"backend": "dask"}
-        elif jobs > 1:
+        config = {"backend": "sequential"}
+        if jobs > 1:
             config = {"backend": "loky", "inner_max_num_threads": threads}
-        else:
-            config = {"backend": "sequential"}
-        with parallel_config(**config):
-            parallel = Parallel(
-                n_jobs=-1 if self.scheduler else jobs, return_as="generator_unordered", batch_size=1
-            )
-            tasks = (
-                delayed(measure_point)(
-                    self.runner,
-                    self.scene,
-                    point,
-                    self.folder,
-                    frames=self.frames,
-                    threads=threads,
-                    jobs=jobs,
+        with self._cluster() as client:
+            if client is not None:
+                config = {"backend": "dask", "client": client}
+            with parallel_config(**config):
+                parallel = Parallel(
+                    n_jobs=-1 if client else jobs, return_as="generator_unordered", batch_size=1
                 )
-                for point in points
-            )
-            for _ in parallel(tasks):
-                self._advance()
+                options = {"frames": self.frames, "threads": threads, "jobs": jobs}
+                tasks = (
+                    delayed(measure_point)(self.runner, self.scene, point, self.folder, **options)
+                    for point in points
+                )
+                for _ in parallel(tasks):
+                    self._advance()
 
     def _alone(self, point, threads):
         """A point that was under way when a process died: in a process of its own, so that it shows which."""
@@ -300,7 +294,10 @@ class SweepRunner:
                 (self.folder.points / f"{point.key}.running").unlink(missing_ok=True)
         self._advance()
 
-    def _connect(self):
+    def _cluster(self):
+        """Context of a connection to the scheduler, of None where there is none."""
+        if not self.scheduler:
+            return nullcontext()
         try:
             from distributed import Client
         except ImportError as error:
@@ -308,9 +305,13 @@ class SweepRunner:
                 "Dask is not installed, which --scheduler needs: pip install 'rbfmuscle[cluster]'"
             ) from error
         try:
-            self.client = Client(self.scheduler, timeout=10)
+            client = Client(self.scheduler, timeout=CONNECT_WITHIN)
+            client.wait_for_workers(1, timeout=CONNECT_WITHIN)
         except (OSError, ValueError) as error:
-            raise UsageError(f"no Dask scheduler answers at {self.scheduler!r} ({error})") from None
+            raise UsageError(
+                f"no Dask scheduler with workers answers at {self.scheduler!r} ({error})"
+            ) from None
+        return client
 
     def _advance(self):
         self.done += 1
