@@ -17,6 +17,7 @@ from rbfmuscle.commands.cache import cache_app
 from rbfmuscle.commands.check import check
 from rbfmuscle.commands.new import new
 from rbfmuscle.commands.run import demo, run
+from rbfmuscle.commands.sdf import sdf
 from rbfmuscle.commands.show import export, render
 from rbfmuscle.commands.sweep import sweep
 from rbfmuscle.validation import RBFMuscleError
@@ -26,7 +27,7 @@ INTERRUPTED = 130
 app = App(
     name="rbfmuscle", help="Muscles as implicit RBF surfaces that move with the bones.", version=__version__
 )
-for command in (demo, check, run, sweep, export, render, new):
+for command in (demo, check, run, sweep, export, render, new, sdf):
     app.command(command)
 app.command(cache_app)
 

@@ -1,6 +1,7 @@
 """``rbfmuscle check``: a scene file and its meshes, nothing solved."""
 
 import json
+import logging
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -29,7 +30,7 @@ def check(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", nega
         if muscle.model not in MODEL_NAMES:
             hint = did_you_mean(muscle.model, MODEL_NAMES)
             raise UsageError(f"{scene}: muscle {muscle.name!r}: unknown model {muscle.model!r}, {hint}")
-    findings = loaded.check()
+    findings = [*loaded.check(), *_field_notes(loaded)]
     errors = [finding for finding in findings if finding.level == "error"]
     if as_json:
         shown = [{"level": f.level, "place": f.place, "message": f.message} for f in findings]
@@ -40,6 +41,19 @@ def check(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", nega
             print(finding)
         print("not usable" if errors else "usable", file=sys.stderr)
     return SceneError.exit_code if errors else 0
+
+
+def _field_notes(scene):
+    """What the distance fields of the bones have to say: open meshes, meshes that intersect themselves."""
+    from rbfmuscle.sim.scene_check import Finding
+    from rbfmuscle.sim.sdf import BoneSDF
+
+    logging.getLogger("rbfmuscle.sim.sdf").setLevel(logging.ERROR)  # said below
+    found = []
+    for bone in scene.bones:
+        notes = BoneSDF.from_mesh(bone.mesh, name=bone.name).notes
+        found += [Finding("note", f"bone {bone.name!r}", note) for note in notes]
+    return found
 
 
 def _print_scene(scene):
