@@ -288,22 +288,38 @@ class SweepFolder:
         except (OSError, json.JSONDecodeError):
             raise UsageError(f"{self.directory} is not the folder of a sweep (no plan.json)") from None
 
-    def read(self, key):
-        """A point's result, None where there is none yet."""
+    def read(self, key, *, waiting=False):
+        """A point's result, None where there is none yet; ``waiting`` for one that is not compared yet."""
         try:
-            return json.loads((self.points / f"{key}.json").read_text(encoding="utf-8"))
+            return json.loads(self._result_file(key, waiting).read_text(encoding="utf-8"))
         except FileNotFoundError:
             return None
 
     def write(self, result):
         """Keep a point's result: whole or not at all."""
-        write_json(self.points / f"{result['key']}.json", result)
+        waiting = result["status"] == "waiting"
+        write_json(self._result_file(result["key"], waiting), result)
+        if not waiting:
+            self._result_file(result["key"], True).unlink(missing_ok=True)
+            self.waiting_file(result["key"]).unlink(missing_ok=True)
+
+    def _result_file(self, key, waiting):
+        return self.surfaces / f"{key}.waiting.json" if waiting else self.points / f"{key}.json"
+
+    def is_waiting(self, key):
+        """Whether a point was run and waits for its reference."""
+        return self._result_file(key, True).exists()
 
     def forget(self, key):
         (self.points / f"{key}.json").unlink(missing_ok=True)
 
     def surface_file(self, key):
+        """Surfaces of a reference."""
         return self.surfaces / f"{key}.npz"
+
+    def waiting_file(self, key):
+        """Surfaces of a point that waits for its reference."""
+        return self.surfaces / f"{key}.waiting.npz"
 
 
 def write_json(path, values):

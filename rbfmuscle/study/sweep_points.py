@@ -16,7 +16,7 @@ from rbfmuscle.study.metrics import ALL, surface_distance
 from rbfmuscle.study.sweep import SweepFolder
 from rbfmuscle.validation import MissingPartError, RBFMuscleError, UsageError
 
-CONNECT_WITHIN = 20  # seconds for a scheduler and its first worker
+CONNECT_WITHIN = 20  # seconds for a scheduler and its first two workers
 # What a point may fail with and leave the others standing.
 POINT_ERRORS = (
     RBFMuscleError,
@@ -79,14 +79,53 @@ def measure_point(runner, scene, point, folder, *, frames=None, threads=1, jobs=
     try:
         with _threads(threads):
             run = runner(scene, point.settings, frames)
-            result["values"] = _measure(run, point, folder)
+            result["values"] = _values_of(run)
+            _compare(run, point, folder, result)
     except POINT_ERRORS as error:
-        result["status"] = "failed"
-        result["error"] = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        _fail(result, error)
     result["seconds"] = time.perf_counter() - start
     folder.write(result)
     marker.unlink(missing_ok=True)
     return result
+
+
+def finish_point(point, folder):
+    """Compare a point that was run before its reference was there."""
+    result, waiting = folder.read(point.key, waiting=True), folder.waiting_file(point.key)
+    result["status"] = "done"
+    try:
+        poses, arrays = _kept_surfaces(waiting, 0)
+        _take_error(_shown_of(poses, arrays), point, folder, result)
+    except POINT_ERRORS as error:
+        _fail(result, error)
+    folder.write(result)
+    return result
+
+
+def _fail(result, error):
+    result["status"] = "failed"
+    result["error"] = f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+def _compare(run, point, folder, result):
+    """Keep a reference's surfaces; take another point's distance to them, or keep its own until they are there."""
+    shown = [
+        (_pose_name(frame.coordinates), {n: (s.vertices, s.faces) for n, s in frame.surfaces.items()})
+        for frame in run.frames
+    ]
+    if point.is_reference:
+        # float32 is 1e-7 of a length, far below any error measured against it
+        _keep_surfaces(shown, folder.surface_file(point.key), np.float32)
+    elif folder.surface_file(point.reference).exists() or folder.read(point.reference) is not None:
+        _take_error(shown, point, folder, result)
+    else:
+        _keep_surfaces(shown, folder.waiting_file(point.key), np.float64)
+        result["status"] = "waiting"
+
+
+def _take_error(shown, point, folder, result):
+    rms, worst = _distance_to(shown, folder.surface_file(point.reference))
+    result["values"] = {"error_rms": rms, "error_max": worst, **result["values"]}
 
 
 class _threads:
@@ -110,7 +149,7 @@ class _threads:
         numba.set_num_threads(self.before)
 
 
-def _measure(run, point, folder):
+def _values_of(run):
     values = {}
     for muscle, quantities in run.summary.items():
         for name in WORST:
@@ -125,24 +164,20 @@ def _measure(run, point, folder):
         for frame in run.frames
     ]
     values["time_extract"] = float(np.median(extract[1:] or extract))
-    if point.is_reference:
-        _keep_surfaces(run, folder.surface_file(point.key))
-        return values
-    rms, worst = _distance_to(run, str(folder.surface_file(point.reference)))
-    return {"error_rms": rms, "error_max": worst, **values}
+    return values
 
 
 def _pose_name(coordinates):
     return " ".join(f"{name}={angle:.9f}" for name, angle in sorted(coordinates.items())) or "rest"
 
 
-def _keep_surfaces(run, path):
-    """Surfaces of every frame; float32 is 1e-7 of a length, far below any error measured against them."""
-    arrays = {"poses": np.array([_pose_name(frame.coordinates) for frame in run.frames])}
-    for index, frame in enumerate(run.frames):
-        for name, surface in frame.surfaces.items():
-            arrays[f"v:{index}:{name}"] = surface.vertices.astype(np.float32)
-            arrays[f"f:{index}:{name}"] = surface.faces.astype(np.int32)
+def _keep_surfaces(shown, path, kind):
+    """Surfaces of every frame in one file, written in one move."""
+    arrays = {"poses": np.array([pose for pose, _ in shown])}
+    for index, (_, surfaces) in enumerate(shown):
+        for name, (vertices, faces) in surfaces.items():
+            arrays[f"v:{index}:{name}"] = np.asarray(vertices, dtype=kind)
+            arrays[f"f:{index}:{name}"] = np.asarray(faces, dtype=np.int32)
     fresh = path.with_name(f".{os.getpid()}.{path.name}")
     np.savez_compressed(fresh, **arrays)
     os.replace(fresh, path)
@@ -155,22 +190,32 @@ def _kept_surfaces(path, _modified):
         return poses, {name: file[name] for name in file.files if name != "poses"}
 
 
-def _distance_to(run, path):
+def _shown_of(poses, arrays):
+    """What `_keep_surfaces` was given."""
+    shown = [(pose, {}) for pose in poses]
+    for label, vertices in arrays.items():
+        kind, index, name = label.split(":", 2)
+        if kind == "v":
+            shown[int(index)][1][name] = vertices, arrays[f"f:{index}:{name}"]
+    return shown
+
+
+def _distance_to(shown, path):
     """Surface distance to the reference, root mean square over frames and muscles, and greatest."""
     try:
-        poses, arrays = _kept_surfaces(path, os.stat(path).st_mtime_ns)
+        poses, arrays = _kept_surfaces(path, path.stat().st_mtime_ns)
     except FileNotFoundError:
         raise UsageError(
-            f"the reference {path} is missing: its point failed, or the folder is not shared"
+            f"the reference {path.stem} is missing: its point failed, or the folder is not shared"
         ) from None
     squares, worst = [], 0.0
-    for frame in run.frames:
-        index = poses.get(_pose_name(frame.coordinates))
+    for pose, surfaces in shown:
+        index = poses.get(pose)
         if index is None:
             continue
-        for name, surface in frame.surfaces.items():
+        for name, (vertices, faces) in surfaces.items():
             other = arrays[f"v:{index}:{name}"].astype(float), arrays[f"f:{index}:{name}"].astype(np.int64)
-            rms, most = surface_distance(surface.vertices, surface.faces, *other)
+            rms, most = surface_distance(vertices, faces, *other)
             squares.append(rms**2)
             worst = max(worst, most)
     if not squares:
@@ -200,7 +245,9 @@ class SweepRunner:
         self.runner, self.scene, self.plan, self.frames = runner, scene, plan, frames
         self.folder = SweepFolder(os.path.abspath(directory))
         self.cores = available_cores()
-        self.jobs = jobs or self.cores
+        # The same threads for every point of a sweep, so that times compare. A Dask worker has one.
+        self.jobs = 1 if scheduler else jobs or self.cores
+        self.threads = 1 if scheduler else max(1, self.cores // self.jobs)
         self.scheduler, self.progress = scheduler, progress
         self.done = 0
 
@@ -220,14 +267,20 @@ class SweepRunner:
             found = self.folder.read(point.key)
             if found and found["status"] == "done" and not self.folder.surface_file(point.key).exists():
                 self.folder.forget(point.key)
-        stages = [self._missing(self.plan.references), self._missing(wanted)]
-        self.total = sum(len(stage) for stage in stages)
-        for stage in stages:
-            self._measure(stage)
+        # The references first: who is done before they are there keeps its surfaces, and is compared later.
+        points = self._missing(self.plan.references + wanted)
+        self.total = len(points)
+        self._measure(self._unmeasured(points))
+        late = [p for p in points if self.folder.is_waiting(p.key)]
+        if late:
+            self._side_by_side(delayed_calls(finish_point, ((p, self.folder) for p in late)), advance=False)
         return self.total
 
     def _missing(self, points):
         return [point for point in points if self.folder.read(point.key) is None]
+
+    def _unmeasured(self, points):
+        return [point for point in self._missing(points) if not self.folder.is_waiting(point.key)]
 
     def _forget_failed(self, points):
         for point in points:
@@ -241,42 +294,35 @@ class SweepRunner:
 
         if not points:
             return
-        # The same threads for every point of a sweep, also where few are left, so that times compare.
-        jobs = 1 if self.scheduler else self.jobs
-        threads = max(1, self.cores // jobs) if not self.scheduler else 1
+        options = {"frames": self.frames, "threads": self.threads, "jobs": self.jobs}
+        calls = ((self.runner, self.scene, point, self.folder) for point in points)
         try:
-            self._side_by_side(points, jobs, threads)
+            self._side_by_side(delayed_calls(measure_point, calls, **options))
         except TerminatedWorkerError:
-            left = self._missing(points)
+            left = self._unmeasured(points)
             suspects = [p for p in left if (self.folder.points / f"{p.key}.running").exists()]
             for point in suspects or left:
-                self._alone(point, threads)
-            self._measure(self._missing(left))
+                self._alone(point)
+            self._measure(self._unmeasured(left))
 
-    def _side_by_side(self, points, jobs, threads):
-        from joblib import Parallel, delayed, parallel_config
+    def _side_by_side(self, tasks, *, advance=True):
+        from joblib import Parallel, parallel_config
 
         config = {"backend": "sequential"}
-        if jobs > 1:
-            config = {"backend": "loky", "inner_max_num_threads": threads}
+        if self.jobs > 1:
+            config = {"backend": "loky", "inner_max_num_threads": self.threads}
         with self._cluster() as client:
             if client is not None:
                 config = {"backend": "dask", "client": client}
             with parallel_config(**config):
-                parallel = Parallel(
-                    n_jobs=-1 if client else jobs, return_as="generator_unordered", batch_size=1
-                )
-                options = {"frames": self.frames, "threads": threads, "jobs": jobs}
-                tasks = (
-                    delayed(measure_point)(self.runner, self.scene, point, self.folder, **options)
-                    for point in points
-                )
-                for _ in parallel(tasks):
-                    self._advance()
+                count = -1 if client else self.jobs
+                for _ in Parallel(n_jobs=count, return_as="generator_unordered", batch_size=1)(tasks):
+                    if advance:
+                        self._advance()
 
-    def _alone(self, point, threads):
+    def _alone(self, point):
         """A point that was under way when a process died: in a process of its own, so that it shows which."""
-        kept = {"frames": self.frames, "threads": threads, "jobs": 1}
+        kept = {"frames": self.frames, "threads": self.threads, "jobs": 1}
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
             try:
                 pool.submit(measure_point, self.runner, self.scene, point, self.folder, **kept).result()
@@ -306,10 +352,11 @@ class SweepRunner:
             ) from error
         try:
             client = Client(self.scheduler, timeout=CONNECT_WITHIN)
-            client.wait_for_workers(1, timeout=CONNECT_WITHIN)
+            # With one thread in all, joblib would not send anything away.
+            client.wait_for_workers(2, timeout=CONNECT_WITHIN)
         except (OSError, ValueError) as error:
             raise UsageError(
-                f"no Dask scheduler with workers answers at {self.scheduler!r} ({error})"
+                f"no Dask scheduler with two workers answers at {self.scheduler!r} ({error})"
             ) from None
         return client
 
@@ -317,6 +364,13 @@ class SweepRunner:
         self.done += 1
         if self.progress is not None:
             self.progress(self.done, self.total)
+
+
+def delayed_calls(function, calls, **options):
+    """joblib's tasks for calls with these positional arguments."""
+    from joblib import delayed
+
+    return (delayed(function)(*arguments, **options) for arguments in calls)
 
 
 def available_cores():
