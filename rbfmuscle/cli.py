@@ -20,6 +20,7 @@ from rbfmuscle.commands.run import demo, run
 from rbfmuscle.commands.sdf import sdf
 from rbfmuscle.commands.show import export, render
 from rbfmuscle.commands.sweep import sweep
+from rbfmuscle.commands.view import view
 from rbfmuscle.validation import RBFMuscleError
 
 INTERRUPTED = 130
@@ -27,7 +28,7 @@ INTERRUPTED = 130
 app = App(
     name="rbfmuscle", help="Muscles as implicit RBF surfaces that move with the bones.", version=__version__
 )
-for command in (demo, check, run, sweep, export, render, new, sdf):
+for command in (demo, check, run, sweep, export, render, new, view, sdf):
     app.command(command)
 app.command(cache_app)
 

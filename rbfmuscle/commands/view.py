@@ -1,0 +1,130 @@
+"""``rbfmuscle view``: a window on a scene that is moved by hand, or on a saved run."""
+
+import math
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from rbfmuscle.validation import UsageError
+
+# What each quality changes in a muscle's model table; "as given" changes nothing.
+QUALITIES = {
+    "as given": {},
+    "fast": {"rbf": {"resolution": 32, "samples": 1000}},
+    "fine": {"rbf": {"resolution": 64}},
+}
+PHANTOM = "phantom"
+
+
+def view(
+    scene: Annotated[Path, Parameter(name=["scene", "--scene"])],
+    *,
+    model: str | None = None,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("view"),
+    colour: str = "nothing",
+    at: Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)] = None,
+    screenshot: Path | None = None,
+):
+    """Open a window: a slider for each joint coordinate, or for the frames of a saved run.
+
+    Parameters
+    ----------
+    scene
+        Scene file (TOML), "phantom" for the embedded hip, or the folder of a run.
+    model
+        Model to begin with, in place of the scene's.
+    output
+        Folder for screenshots and exported surfaces.
+    colour
+        nothing, penetration, distance (to the bones), stretch or volume.
+    at
+        COORDINATE=DEGREES to begin at, for instance hip.flexion=60; may be repeated. Of a saved run: frame=N.
+    screenshot
+        Write the window to this PNG as soon as it stands at --at, and close it.
+    """
+    from rbfmuscle.study.window import Window, require_display
+
+    stops = [_parse_stop(text) for text in at or []]
+    require_display()
+    viewer, motion, title = _open_saved(scene) if scene.is_dir() else _open_scene(scene, model)
+    viewer.colour_by(colour)
+    _begin_at(viewer, stops)
+    window = Window(viewer, output, motion=motion, title=title)
+    window.open(until_closed=screenshot is None)
+    if screenshot is not None:
+        while window.tick():
+            pass
+        screenshot.parent.mkdir(parents=True, exist_ok=True)
+        window.plotter.screenshot(screenshot)
+        window.close()
+        print(screenshot)
+
+
+def _parse_stop(text):
+    name, _, value = text.partition("=")
+    try:
+        return name, float(value)
+    except ValueError:
+        raise UsageError(f"--at {text!r} is not COORDINATE=DEGREES, for instance hip.flexion=60") from None
+
+
+def _begin_at(viewer, stops):
+    from rbfmuscle.sim.options import did_you_mean
+
+    for name, value in stops:
+        known = list(viewer.coordinates) if viewer.live else ["frame"]
+        if name not in known:
+            raise UsageError(f"--at: unknown coordinate {name!r}, {did_you_mean(name, known)}")
+        if viewer.live:
+            viewer.set(name, value)
+        else:
+            viewer.scrub(viewer.place_of(value))
+
+
+def _open_saved(folder):
+    from rbfmuscle.study.saved import SavedRun
+    from rbfmuscle.study.viewer import SavedViewer
+
+    return SavedViewer(SavedRun(folder)), None, f"rbfmuscle: {folder}"
+
+
+def _open_scene(path, model):
+    from rbfmuscle.sim.live import LiveSession
+    from rbfmuscle.study.viewer import LiveViewer
+
+    scene = _load(path).with_options(model=model)
+    scene.validate()
+    print(f"rbfmuscle: preparing {scene.name}", file=sys.stderr)
+    models = [scene.muscles[0].model]
+    models += [name for name in ("rbf", "pbd", "xpbd", "arap-volume") if name not in models]
+
+    def build(name, quality):
+        changed = QUALITIES[quality].get(name, {})
+        chosen = scene if name == models[0] else scene.with_options(model=name)
+        settings = {f"model.{key}": value for key, value in changed.items()}
+        return build_models(chosen.with_options(**settings))
+
+    viewer = LiveViewer(LiveSession(scene), build, models, list(QUALITIES))
+    motion = [{k: math.degrees(v) for k, v in frame.items()} for frame in scene.motion.frames]
+    return viewer, motion, f"rbfmuscle: {scene.name}"
+
+
+def build_models(scene):
+    """Models of all muscles of a scene, built side by side."""
+    from rbfmuscle.models import build_model
+
+    with ThreadPoolExecutor() as pool:
+        return list(pool.map(lambda muscle: build_model(muscle, scene), scene.muscles))
+
+
+def _load(path):
+    from rbfmuscle.sim.scene import Scene
+
+    if str(path) == PHANTOM and not path.exists():
+        from rbfmuscle.sim.phantom import phantom_scene
+
+        return phantom_scene()
+    return Scene.load(path)
