@@ -99,28 +99,32 @@ def _beyond(x, y, z, scale, blocks):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _square(n, x, y, z, records):
-    """Squared distance to record n of a point relative to the origin; without branches, as they are a
-    toss-up."""
-    qx, qy, qz = x - records[n, 0], y - records[n, 1], z - records[n, 2]
+    """Squared distance to record n of a point relative to the origin, in single precision; without branches, as they
+    are a toss-up."""
+    zero, one = np.float32(0.0), np.float32(1.0)
+    qx, qy, qz = np.float32(x) - records[n, 0], np.float32(y) - records[n, 1], np.float32(z) - records[n, 2]
     u = qx * records[n, 3] + qy * records[n, 4] + qz * records[n, 5]
     v = qx * records[n, 6] + qy * records[n, 7] + qz * records[n, 8]
     w = qx * records[n, 9] + qy * records[n, 10] + qz * records[n, 11]
     bx, cx, cy = records[n, 12], records[n, 13], records[n, 14]
-    du = u - min(max(u, 0.0), bx)
+    du = u - min(max(u, zero), bx)
     ab = du * du + v * v
     ex, eu = cx - bx, u - bx
-    t = min(max((eu * ex + v * cy) * records[n, 15], 0.0), 1.0)
-    bc = (eu - t * ex) ** 2 + (v - t * cy) ** 2
-    t = min(max((u * cx + v * cy) / (cx * cx + cy * cy), 0.0), 1.0)
-    ca = (u - t * cx) ** 2 + (v - t * cy) ** 2
-    inside = (v >= 0.0) & (eu * cy - v * ex <= 0.0) & (v * cx - u * cy <= 0.0)
-    return w * w + (0.0 if inside else min(min(ab, bc), ca))
+    t = min(max((eu * ex + v * cy) * records[n, 15], zero), one)
+    fu, fv = eu - t * ex, v - t * cy
+    bc = fu * fu + fv * fv
+    t = min(max((u * cx + v * cy) / (cx * cx + cy * cy), zero), one)
+    fu, fv = u - t * cx, v - t * cy
+    ca = fu * fu + fv * fv
+    inside = (v >= zero) & (eu * cy - v * ex <= zero) & (v * cx - u * cy <= zero)
+    # A product, as compilers make a jump of a choice.
+    return w * w + np.float32(not inside) * min(min(ab, bc), ca)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _nearest_listed(x, y, z, entry, far_point, lists, far, records):
     """Nearest of the triangles of a cell: record and squared distance."""
-    best, square = np.int32(-1), np.inf
+    best, square = np.int32(-1), np.float32(np.inf)
     first = np.uint32(entry)
     for m in range(np.uint32(lists[first] & COUNT)):
         # Unsigned, so that no index is tested for counting from the end.
@@ -245,28 +249,6 @@ def _unit_gradient(n, distance, du, dv, dw, least, records):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _query(x, y, z, reach, grid, blocks, cells, lists, corners, far, records, en, vn, vertices, across):
-    """Signed distance, record, and offset in its frame; or a lower bound above ``reach`` and record -1."""
-    entry, cell, far_point = _block_entry(x, y, z, grid[INVERSE], blocks)
-    if entry < 0:
-        entry = cells[-1 - entry, cell]
-    bound = (lists[entry] >> BOUND) * grid[UNIT]
-    if bound > reach:
-        return bound, -1, 0.0, 0.0, 0.0
-    n, square = _nearest_listed(x, y, z, entry, far_point, lists, far, records)
-    du, dv, dw, inside = _offset(n, x, y, z, records)
-    state = lists[entry] >> SIDE & 3
-    if not inside:
-        n = _walk(n, square, x, y, z, records, across)
-        du, dv, dw, inside = _offset(n, x, y, z, records)
-        square = du * du + dv * dv + dw * dw
-    side = 1.0 if state == OUTSIDE else (-1.0 if state == INSIDE else dw)
-    if state == MIXED or (state == CROSSED and not inside):
-        side = _slow_side(x, y, z, entry, n, lists, corners, records, en, vn, vertices)
-    return np.sqrt(square) if side >= 0.0 else -np.sqrt(square), n, du, dv, dw
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _stage(points, pose, reach, grid, blocks, cells, lists, far, records, local, entry, best, square):
     """Nearest record of up to STAGE points; each pass reads what the next one needs.
 
@@ -316,7 +298,9 @@ def _finish(count, local, entry, best, square, offset, lists, corners, records, 
         if not inside:
             m = _walk(m, square[n], x, y, z, records, across)
             du, dv, dw, inside = _offset(m, x, y, z, records)
-            square[n], best[n] = du * du + dv * dv + dw * dw, m
+            best[n] = m
+        # The nearest was found in single precision.
+        square[n] = du * du + dv * dv + dw * dw
         offset[n, 0], offset[n, 1], offset[n, 2] = du, dv, dw
         state = lists[entry[n]] >> SIDE & 3
         side = 1.0 if state == OUTSIDE else (-1.0 if state == INSIDE else dw)
