@@ -208,8 +208,8 @@ def table_text(rows, *, times=True):
 
 def _cell(value):
     if isinstance(value, float):
-        # What is below 1e-12 (a volume error of 1e-16, say) is rounding, and differs with the threads.
-        return "" if math.isnan(value) else f"{round(value, 12):.9g}"
+        # Digits beyond these (a volume error of 1e-16, say) are rounding, and differ with the threads.
+        return "" if math.isnan(value) else f"{round(value, 9):.6g}"
     return int(value) if isinstance(value, bool) else value
 
 
