@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test check bench clean
+.PHONY: demo test check bench docs clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -26,8 +26,14 @@ check: $(STAMP)
 	$(BIN)/python -m pytest -q tests/test_layers.py
 
 bench: $(STAMP)
-	$(BIN)/python -m pytest -m benchmark benchmarks
+	$(BIN)/python -m pip install --quiet -e ".[bench]" || echo "some peers are not to be had; the table says which"
+	$(BIN)/python benchmarks/table.py -o benchmarks/last.json
+
+docs: $(STAMP)
+	$(BIN)/python -c "import furo, myst_parser, sphinx" 2>/dev/null || $(BIN)/python -m pip install --quiet -e ".[docs]"
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo "Open docs/_build/html/index.html"
 
 clean:
-	rm -rf $(VENV) demo_output build *.egg-info .pytest_cache .ruff_cache
+	rm -rf $(VENV) demo_output docs/_build docs/gallery build *.egg-info .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
