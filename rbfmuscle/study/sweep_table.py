@@ -165,8 +165,9 @@ def verdict_text(verdict, units, quantity="error_rms"):
     if verdict.on_front:
         return f"The {what} lies on the front: {figures}."
     if verdict.near:
-        return f"The {what} lies within 10 % of the front (factor {verdict.factor:.2f}): {figures}."
-    text = f"The {what} lies off the front by a factor of {verdict.factor:.2f}: {figures}."
+        text = f"The {what} lies within 10 % of the front (factor {verdict.factor:.2f}): {figures}."
+    else:
+        text = f"The {what} lies off the front by a factor of {verdict.factor:.2f}: {figures}."
     for found, words in (
         (verdict.faster, "Quicker at no greater error"),
         (verdict.better, "Better in no more time"),
