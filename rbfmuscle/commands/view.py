@@ -58,7 +58,7 @@ def view(
         while window.tick():
             pass
         screenshot.parent.mkdir(parents=True, exist_ok=True)
-        window.plotter.screenshot(screenshot)
+        window.write_picture(screenshot)
         window.close()
         print(screenshot)
 
