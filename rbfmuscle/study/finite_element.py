@@ -76,7 +76,9 @@ class HexSolid:
         self.weights, self.nodes = basis.dx, basis.element_dofs.T
         self.facets = mesh.boundary_facets()
         side = skfem.FacetBasis(mesh, element, facets=self.facets, intorder=3)
-        self.side_shape = np.stack([np.broadcast_to(np.asarray(b[0]), side.dx.shape) for b in side.basis], axis=-1)
+        self.side_shape = np.stack(
+            [np.broadcast_to(np.asarray(b[0]), side.dx.shape) for b in side.basis], axis=-1
+        )
         self.side_weights, self.side_nodes = side.dx, side.element_dofs.T
         self.obstacles = ()
 
