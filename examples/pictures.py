@@ -1,0 +1,42 @@
+"""What the example scripts share: where their files go, and pictures of a saved run.
+
+Not an example itself.
+"""
+
+import sys
+from pathlib import Path
+
+from rbfmuscle.study.render import render_run
+from rbfmuscle.validation import MissingPartError
+
+
+def folder(name):
+    """Folder of an example's files: the first argument of the script, else example_output/NAME."""
+    path = Path(sys.argv[1]) if len(sys.argv) > 1 else Path("example_output") / name
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def draw(run, file, *, frame=None, views=("side", "back")):
+    """Picture of a run's frame; where there are no graphics a line says so."""
+    file = Path(file)
+    saved = file.parent / f"run_{file.stem}"
+    run.save(saved, pictures=False)
+    try:
+        render_run(saved, file, frame=frame, views=views)
+    except MissingPartError as error:
+        print(f"{file.name} not drawn: {error}")
+
+
+def plot(file, draw_axes, *, size=(7.0, 3.6)):
+    """Save a plot; ``draw_axes(axes)`` fills it."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=size, layout="constrained")
+    draw_axes(axes)
+    axes.grid(alpha=0.25)
+    figure.savefig(file, dpi=110)
+    plt.close(figure)
