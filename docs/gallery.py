@@ -2,6 +2,7 @@
 
 import ast
 import os
+import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -55,6 +56,7 @@ def _write_page(root, folder, name):
     if page.exists() and page.stat().st_mtime > script.stat().st_mtime:
         return
     pictures = folder / name
+    shutil.rmtree(pictures, ignore_errors=True)
     done = subprocess.run(
         [sys.executable, script.name, str(pictures)], cwd=script.parent, capture_output=True, text=True,
         timeout=_TIMEOUT, env=os.environ | {"PYTHONUNBUFFERED": "1"}, check=False,

@@ -45,9 +45,12 @@ def view(
     screenshot
         Write the window to this PNG as soon as it stands at --at, and close it.
     """
+    from rbfmuscle.study.viewer import COLOURINGS
     from rbfmuscle.study.window import Window, require_display
 
     stops = [_parse_stop(text) for text in at or []]
+    if colour not in COLOURINGS:
+        raise UsageError(f"unknown colouring {colour!r}; known: {', '.join(COLOURINGS)}")
     require_display()
     viewer, motion, title = _open_saved(scene) if scene.is_dir() else _open_scene(scene, model)
     viewer.colour_by(colour)

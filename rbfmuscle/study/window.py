@@ -145,7 +145,7 @@ class Window:
             mapper.lookup_table = self._table(scale)
             mapper.scalar_range = scale[1]
             self.plotter.add_scalar_bar(
-                scale[0], mapper=mapper, vertical=True, position_x=0.92, position_y=0.55, height=0.35,
+                scale[0], mapper=mapper, vertical=True, position_x=0.86, position_y=0.55, height=0.35,
                 width=0.05, color="#333333", title_font_size=13, label_font_size=12, render=False,
             )  # fmt: skip
 
