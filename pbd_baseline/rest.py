@@ -8,7 +8,11 @@ from pbd_baseline.constraints import VolumeConstraint
 from pbd_baseline.fibres import fibre_directions, swelling_room
 from pbd_baseline.topology import Topology, cache_order
 from pbd_baseline.weights import even_weights
+from rbfmuscle.sim.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.validation import SceneError
+
+# Raise it when weights or room are computed in another way: entries of the cache are then not found.
+VERSION = 1
 
 
 @dataclass(frozen=True)
@@ -69,13 +73,10 @@ class Rest:
         holder = np.full(len(vertices), -1)
         for attachment in muscle.attachments:
             holder[place[attachment.vertices]] = bones.index(attachment.bone)
-        weights = even_weights(vertices, faces, [np.flatnonzero(holder == b) for b in range(len(bones))])
         volume = VolumeConstraint(vertices, faces)
         inverse_mass = np.where(holder < 0, 1.0, 0.0)
-        normals = volume.gradient(vertices)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        weights, room = _weights_and_room(vertices, faces, holder, len(bones), volume)
         fibres = fibre_directions(vertices, faces, weights, muscle.fibres)
-        room = swelling_room(vertices, faces, normals, holder >= 0)
         return cls(
             order, vertices, topology, bones, weights, holder, inverse_mass, fibres, room, volume
         )  # fmt: skip
@@ -90,6 +91,21 @@ class Rest:
         length = np.linalg.norm(one - two, axis=1)
         median = np.median(length)
         return np.maximum(length / median, 1e-3)
+
+
+def _weights_and_room(vertices, faces, holder, bones, volume):
+    """What takes nearly all the time of the build, from the cache on disk where it is known."""
+    key = content_key(vertices, faces, ("mesh muscle", VERSION, holder.tolist()))
+    known = load_arrays(key)
+    if known is None or not {"weights", "room"} <= known.keys():
+        normals = volume.gradient(vertices)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        known = {
+            "weights": even_weights(vertices, faces, [np.flatnonzero(holder == b) for b in range(bones)]),
+            "room": swelling_room(vertices, faces, normals, holder >= 0),
+        }
+        store_arrays(key, known)
+    return known["weights"], known["room"]
 
 
 def _sorted_faces(faces):

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 from rbfmuscle.sim import sdf
+from rbfmuscle.sim.cache import cache_clear, cache_list, cache_path
 from rbfmuscle.sim.sdf import BoneSDF
-from rbfmuscle.sim.sdf_cache import cache_clear, cache_list, cache_path
 
 
 @pytest.fixture(autouse=True)

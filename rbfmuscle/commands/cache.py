@@ -1,14 +1,14 @@
-"""``rbfmuscle cache``: distance fields of bones kept on disk."""
+"""``rbfmuscle cache``: what is kept on disk."""
 
 from cyclopts import App
 
-cache_app = App(name="cache", help="Bone distance fields kept on disk.")
+cache_app = App(name="cache", help="Bone distance fields and weights of mesh muscles, kept on disk.")
 
 
 @cache_app.command
 def path():
     """Print the folder of the cache."""
-    from rbfmuscle.sim.sdf_cache import cache_path
+    from rbfmuscle.sim.cache import cache_path
 
     print(cache_path())
 
@@ -16,7 +16,7 @@ def path():
 @cache_app.command(name="list")
 def list_entries():
     """Print the entries of the cache and their sizes."""
-    from rbfmuscle.sim.sdf_cache import cache_list
+    from rbfmuscle.sim.cache import cache_list
 
     for entry in cache_list():
         print(f"{entry['name']}  {entry['bytes'] / 1e6:.1f} MB")
@@ -25,7 +25,7 @@ def list_entries():
 @cache_app.command
 def clear():
     """Remove all entries of the cache."""
-    from rbfmuscle.sim.sdf_cache import cache_clear
+    from rbfmuscle.sim.cache import cache_clear
 
     count, size = cache_clear()
     print(f"{count} entries removed, {size / 1e6:.1f} MB")

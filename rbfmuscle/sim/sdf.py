@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rbfmuscle.sim.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.sim.exact_distance import ExactDistance
 from rbfmuscle.sim.rest_frame import BoneFrame, on_one_line
 from rbfmuscle.sim.sdf_build import build_cells, grid_shape
-from rbfmuscle.sim.sdf_cache import content_key, load_arrays, store_arrays
 from rbfmuscle.sim.sdf_mesh import prepare_bone, winding_test
 from rbfmuscle.sim.sdf_query import BLOCK, FieldData, gradient_loop, value_loop
 from rbfmuscle.sim.threads import in_chunks

@@ -1,4 +1,4 @@
-"""Distance fields kept on disk, named by the content of mesh and options.
+"""Arrays that take long to work out, kept on disk by the content of mesh and options: distance fields, weights.
 
 An entry is an uncompressed archive of arrays, whose checksums are tested on reading. It is written beside
 its place and moved there, so that several processes may build the same field and none reads half of it.
@@ -75,7 +75,7 @@ def load_arrays(key):
         if str(arrays.pop("key")) != key:
             raise ValueError("the entry belongs to another mesh")
     except _DAMAGE as error:
-        log.warning("distance field cache: %s is damaged (%s) and is built again", path, error)
+        log.warning("cache: %s is damaged (%s) and is built again", path, error)
         with contextlib.suppress(OSError):
             path.unlink()
         return None
@@ -96,4 +96,4 @@ def store_arrays(key, arrays):
             Path(name).unlink(missing_ok=True)
             raise
     except OSError as error:
-        log.warning("distance field cache: %s cannot be written (%s); the field is not kept", folder, error)
+        log.warning("cache: %s cannot be written (%s); nothing is kept", folder, error)
