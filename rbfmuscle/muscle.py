@@ -1,6 +1,8 @@
 """RBFMuscle: an implicit RBF surface whose centres follow the bones."""
 
+import math
 import time
+import warnings
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -11,18 +13,31 @@ from rbfmuscle.constraints import ShapeConstraint, VolumeConstraint
 from rbfmuscle.elasticity import ElasticSolver
 from rbfmuscle.implicit.extraction import extract_surface
 from rbfmuscle.implicit.field import RBFField
+from rbfmuscle.implicit.kernels import get_kernel
 from rbfmuscle.implicit.obstacles import ObstaclePoints
-from rbfmuscle.implicit.sampling import sample_surface
+from rbfmuscle.implicit.off_surface import off_surface_points
+from rbfmuscle.implicit.sampling import PLACEMENTS, sample_surface
+from rbfmuscle.implicit.selection import choose_epsilon
 from rbfmuscle.sim.harmonic import blended_motion, harmonic_weights, surface_gradient
 from rbfmuscle.sim.rest_frame import RestFrame
 from rbfmuscle.sim.simulate import ModelSurface
-from rbfmuscle.validation import SceneError
+from rbfmuscle.validation import NumericalWarning, SceneError, SolveError
 
 AREA_A_CENTRE = 212.0  # mm², from which the number of centres follows where the scene names none
 LEAST_CENTRES = 150
 LEAST_ATTACHED = 4
 # With more centres than these a fit to normal derivatives alone errs less for the same time.
 MOST_WITH_ALL_DERIVATIVES = 200
+
+
+# What the settings may be; all others are free.
+RANGES = {
+    "centres": (0, 20000), "samples": (50, 200000), "iterations": (1, 1000), "contacts": (1, 10000),
+    "resolution": (4, 1000), "epsilon": (0.0, math.inf), "stretch_low": (0.01, 1.0),
+    "stretch_high": (1.0, 100.0), "stretch_hold": (0.0, 1.0), "across": (0, 50), "across_weight": (0.0, 1e6),
+    "acceleration": (0, 50),
+}  # fmt: skip
+CHOICES = {"placement": PLACEMENTS, "derivatives": ("auto", "all", "normal")}
 
 
 @dataclass(frozen=True)
@@ -35,7 +50,7 @@ class RBFOptions:
     contacts: int = 24
     resolution: int = 48
     kernel: str = "cubic"
-    epsilon: float = 1.0
+    epsilon: float = 0.0
     stretch_low: float = 0.5
     stretch_high: float = 2.0
     stretch_hold: float = 0.3
@@ -57,7 +72,18 @@ class RBFOptions:
                 )
             if known[key] is not str and (isinstance(value, bool) or not isinstance(value, (int, float))):
                 raise SceneError(f"muscle {muscle!r}: {key} must be a number, got {value!r}")
+            low, high = RANGES.get(key, (-math.inf, math.inf))
+            if known[key] is not str and not low <= value <= high:
+                raise SceneError(f"muscle {muscle!r}: {key} must be {_range(low, high)}, got {value:g}")
+            if key in CHOICES and value not in CHOICES[key]:
+                raise SceneError(
+                    f"muscle {muscle!r}: {key} must be one of {', '.join(CHOICES[key])}, got {value!r}"
+                )
         return cls(**table)
+
+
+def _range(low, high):
+    return f"at least {low:g}" if high == math.inf else f"between {low:g} and {high:g}"
 
 
 def _principal_axes(points):
@@ -118,6 +144,7 @@ class RBFMuscle:
         self.derivatives = self.options.derivatives
         if self.derivatives == "auto":
             self.derivatives = "all" if len(self.rest) <= MOST_WITH_ALL_DERIVATIVES else "normal"
+        self._choose_kernel()
         self.x = self.rest.copy()
         self.level = 0.0
         # Cells along the muscle's own axes are smaller than along the scene's, and turn with the scene.
@@ -126,6 +153,25 @@ class RBFMuscle:
     @staticmethod
     def _default_centres(area, scene):
         return max(LEAST_CENTRES, int(round(area / (AREA_A_CENTRE * scene.length(1.0) ** 2), -1)))
+
+    def _choose_kernel(self):
+        """The kernel, and its shape parameter where the scene leaves it open: by leave-one-out at rest."""
+        self.kernel = get_kernel(self.options.kernel)
+        if not self.kernel.hermite:
+            warnings.warn(
+                f"muscle {self.name!r}: kernel {self.kernel.name!r} is C{self.kernel.smoothness} only; the field is "
+                "fitted to values on and off the surface, with three centres a point, in place of normals",
+                NumericalWarning,
+                stacklevel=4,
+            )
+        self.epsilon = self.options.epsilon or 1.0
+        if self.kernel.has_epsilon and not self.options.epsilon:
+            if self.kernel.hermite:
+                data = {"points": self.rest, "normals": self.rest_normals, "derivatives": self.derivatives}
+            else:
+                points, values = off_surface_points(self.rest, self.rest_normals)
+                data = {"points": points, "values": values}
+            self.epsilon = choose_epsilon(**data, kernel=self.kernel).epsilon
 
     def _attach(self, muscle, frame, faces, centres, samples):
         """Fix the centres on attachment patches, share the bones' motions out; returns the fibre directions."""
@@ -252,10 +298,9 @@ class RBFMuscle:
 
     def field(self):
         """The RBF field through the present centres."""
-        return RBFField.fit_hermite(
-            self.x, self.normals(), kernel=self.options.kernel, epsilon=self.options.epsilon,
-            derivatives=self.derivatives,
-        )  # fmt: skip
+        return RBFField.fit_surface(
+            self.x, self.normals(), kernel=self.kernel, epsilon=self.epsilon, derivatives=self.derivatives
+        )
 
     def surface(self, contacts):
         """Refit the field, cut the bones away and extract the closed surface at the rest volume."""
@@ -268,11 +313,17 @@ class RBFMuscle:
         # Farther than a cell from the bones a lower bound will do: no vertex gets there.
         reach = 1.25 * float(np.ptp(points @ axes.T, axis=0).max()) / self.options.resolution
         cut = _BoneCut(contacts, reach) if contacts.names else None
-        result = extract_surface(
-            field, points=points, resolution=self.options.resolution, cut=cut,
-            volume=self.rest_volume, level=self.level, axes=axes,
-            obstacles=[(self.bone_points[b], contacts.poses[contacts.names[b]]) for b in contacts.reached],
-        )  # fmt: skip
+        obstacles = [(self.bone_points[b], contacts.poses[contacts.names[b]]) for b in contacts.reached]
+        try:
+            result = extract_surface(
+                field, points=points, resolution=self.options.resolution, cut=cut,
+                volume=self.rest_volume, level=self.level, axes=axes, obstacles=obstacles,
+            )  # fmt: skip
+        except ValueError as error:
+            raise SolveError(
+                f"muscle {self.name!r}: no closed surface with kernel "
+                f"{self.options.kernel!r} and {len(self.x)} centres: {error}"
+            ) from error
         self.level = result.level
         return ModelSurface(
             vertices=result.vertices,

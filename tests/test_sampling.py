@@ -9,7 +9,8 @@ import trimesh
 
 from rbfmuscle.implicit.control_mesh import contract_clusters
 from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.sampling import off_surface_points, sample_surface
+from rbfmuscle.implicit.off_surface import off_surface_points
+from rbfmuscle.implicit.sampling import sample_surface
 from rbfmuscle.validation import MeshError
 
 HIP = Path(os.environ.get("RBFMUSCLE_DATA", Path(__file__).parents[2] / "shared" / "data")) / "hip"

@@ -22,13 +22,19 @@ class Residuals:
     ----------
     values : (K,) ndarray
         Predicted minus given value at each left-out centre has this size, in units of the right side.
+    slopes : (K, d) ndarray
+        Of a Hermite fit, the same for its d derivatives; d = 0 for a fit to values.
     gcv : float
         Generalised cross-validation, n |w|^2 / (tr F^-1)^2.
+    averaged : (K, 1 + d) ndarray
+        Values and slopes with the mean of all blocks in place of each centre's own: what GCV is made of.
     condition : float
     """
 
     values: np.ndarray
+    slopes: np.ndarray
     gcv: float
+    averaged: np.ndarray
     condition: float
 
 
@@ -44,7 +50,7 @@ def leave_one_out(basis, right, *, smoothing=0.0):
     Returns
     -------
     Residuals
-        For Hermite fits the value component of the residual of each left-out centre.
+        For Hermite fits each centre is left out with all its conditions.
     """
     count = len(basis.points)
     gamma = basis.gamma
@@ -72,10 +78,11 @@ def leave_one_out(basis, right, *, smoothing=0.0):
 
 def _residuals(blocks, weights, count, condition):
     per_centre = weights.reshape(-1, count).T
-    values = np.linalg.solve(blocks, per_centre[:, :, None])[:, 0, 0]
+    residuals = np.linalg.solve(blocks, per_centre[:, :, None])[:, :, 0]
+    averaged = np.linalg.solve(blocks.mean(axis=0), per_centre.T).T
     trace = np.trace(blocks, axis1=1, axis2=2).sum()
     gcv = weights.size * float(weights @ weights) / trace**2
-    return Residuals(values, gcv, condition)
+    return Residuals(residuals[:, 0], residuals[:, 1:], gcv, averaged, condition)
 
 
 def _from_eigenvectors(basis, right, smoothing):
@@ -116,4 +123,6 @@ def least_squares_residuals(matrix, right, *, smoothing=0.0, cutoff=1e-14):
     residual = right - left @ (damp * (left.T @ right))
     hat = (left * left) @ damp
     gcv = len(right) * float(residual @ residual) / (len(right) - hat.sum()) ** 2
-    return Residuals(residual / (1 - hat), gcv, float(values[0] / max(values[-1], 1e-300)))
+    left_out, averaged = residual / (1 - hat), residual / (1 - hat.mean())
+    condition = float(values[0] / max(values[-1], 1e-300))
+    return Residuals(left_out, np.zeros((len(hat), 0)), gcv, averaged[:, None], condition)

@@ -10,6 +10,7 @@ from rbfmuscle.implicit import assembly
 from rbfmuscle.implicit.evaluation import evaluate
 from rbfmuscle.implicit.fitting import Basis, solve, solve_least_squares
 from rbfmuscle.implicit.kernels import get_kernel
+from rbfmuscle.implicit.off_surface import off_surface_points
 from rbfmuscle.validation import (
     UsageError,
     check_points,
@@ -127,6 +128,33 @@ class RBFField:
         weights, coefficients, condition = solve(basis, right, smoothing=_check_smoothing(smoothing))
         weights = hermite_weights(basis, weights)
         return cls(points, origin, scale, kernel, epsilon, weights, coefficients, basis.powers, condition)
+
+    @classmethod
+    def fit_surface(cls, points, normals, *, kernel="cubic", epsilon=1.0, smoothing=0.0, derivatives="all"):
+        """Fit a surface through points with normals, whatever the kernel.
+
+        A Hermite fit where the kernel is C2. Else a fit to values on the surface and off it (Carr et al. 2001): three
+        centres a point, and normals only as good as finite differences.
+
+        Parameters
+        ----------
+        points : (K, 3) array_like
+        normals : (K, 3) array_like
+        kernel, epsilon, smoothing, derivatives
+            As in `fit_hermite`.
+
+        Returns
+        -------
+        RBFField
+        """
+        kernel = get_kernel(kernel)
+        if kernel.hermite:
+            return cls.fit_hermite(
+                points, normals, kernel=kernel, epsilon=epsilon, smoothing=smoothing, derivatives=derivatives
+            )
+        return cls.fit(
+            *off_surface_points(points, normals), kernel=kernel, epsilon=epsilon, smoothing=smoothing
+        )
 
     @classmethod
     def fit_least_squares(
