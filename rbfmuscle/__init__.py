@@ -22,6 +22,7 @@ _HOME = {
     "SolveError": "rbfmuscle.validation",
     "phantom_scene": "rbfmuscle.sim.phantom",
     "simulate": "rbfmuscle.run",
+    "study_kernels": "rbfmuscle.study.kernel_study",
 }
 
 __all__ = [*_HOME, "__version__"]

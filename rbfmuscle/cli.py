@@ -15,6 +15,7 @@ from cyclopts import App, CycloptsError
 from rbfmuscle import __version__
 from rbfmuscle.commands.cache import cache_app
 from rbfmuscle.commands.check import check
+from rbfmuscle.commands.kernels import kernels
 from rbfmuscle.commands.new import new
 from rbfmuscle.commands.run import demo, run
 from rbfmuscle.commands.sdf import sdf
@@ -28,7 +29,7 @@ INTERRUPTED = 130
 app = App(
     name="rbfmuscle", help="Muscles as implicit RBF surfaces that move with the bones.", version=__version__
 )
-for command in (demo, check, run, sweep, export, render, new, view, sdf):
+for command in (demo, check, run, sweep, export, render, new, view, sdf, kernels):
     app.command(command)
 app.command(cache_app)
 

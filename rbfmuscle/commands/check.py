@@ -48,11 +48,15 @@ def _field_notes(scene):
     from rbfmuscle.sim.scene_check import Finding
     from rbfmuscle.sim.sdf import BoneSDF
 
-    logging.getLogger("rbfmuscle.sim.sdf").setLevel(logging.ERROR)  # said below
-    found = []
-    for bone in scene.bones:
-        notes = BoneSDF.from_mesh(bone.mesh, name=bone.name).notes
-        found += [Finding("note", f"bone {bone.name!r}", note) for note in notes]
+    logger = logging.getLogger("rbfmuscle.sim.sdf")
+    level, found = logger.level, []
+    logger.setLevel(logging.ERROR)  # what it would say is said by the findings
+    try:
+        for bone in scene.bones:
+            notes = BoneSDF.from_mesh(bone.mesh, name=bone.name).notes
+            found += [Finding("note", f"bone {bone.name!r}", note) for note in notes]
+    finally:
+        logger.setLevel(level)
     return found
 
 

@@ -1,0 +1,157 @@
+"""``rbfmuscle kernels``: which kernel, which shape parameter, how many centres."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from rbfmuscle.commands.progress import Progress
+from rbfmuscle.validation import UsageError
+
+
+def kernels(
+    source: str,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    names: Annotated[
+        list[str] | None, Parameter(name="--kernels", negative="", consume_multiple=True)
+    ] = None,
+    centres: Annotated[list[int] | None, Parameter(negative="", consume_multiple=True)] = None,
+    muscle: str | None = None,
+    derivatives: str = "all",
+    placement: str = "greedy",
+    criterion: str = "loo",
+    resolution: int = 64,
+    best: int = 3,
+    frames: str | None = None,
+    units: str = "",
+    pictures: bool = True,
+    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+):
+    """Rank kernels, shape parameters and numbers of centres on one surface; with a scene, run the best.
+
+    Parameters
+    ----------
+    source
+        A mesh (STL, OBJ, PLY, VTK, VTP), a scene file, or ``phantom``.
+    output
+        Folder for kernels.html, kernels.csv, kernels.json and the plots.
+    names
+        Kernels; all by default. Separate by commas or blanks.
+    centres
+        Numbers of centres; 150 and 300 by default.
+    muscle
+        Of a scene; the first by default.
+    derivatives
+        all or normal: what a Hermite fit asks for.
+    placement
+        greedy, adaptive or even.
+    criterion
+        How epsilon is chosen: loo, gcv or condition.
+    resolution
+        Cells along the longest side.
+    best
+        Of a scene, so many of the best also run the motion.
+    frames
+        Of that motion, as A:B:S.
+    units
+        Name of the unit of a mesh, for the text only.
+    pictures
+        Draw the best surfaces.
+    as_json
+        Print JSON and nothing else.
+    """
+    from rbfmuscle.study.kernel_page import write_study
+    from rbfmuscle.study.kernel_study import study_kernels
+
+    if derivatives not in ("all", "normal") or criterion not in ("loo", "gcv", "condition"):
+        raise UsageError("derivatives must be all or normal, criterion loo, gcv or condition; "
+                         f"got {derivatives!r} and {criterion!r}")  # fmt: skip
+    names = [name for text in names or [] for name in text.split(",") if name] or None
+    scene, mesh, title = _surface(source, muscle)
+    with Progress("kernels", what="fit") as bar:
+        study = study_kernels(
+            mesh, kernels=names, centres=centres or (150, 300), derivatives=derivatives, placement=placement,
+            criterion=criterion, resolution=resolution, units=units if scene is None else scene.units, progress=bar,
+        )  # fmt: skip
+    moved = [] if scene is None else _run_best(scene, title, study, best, frames)
+    missing = write_study(study, output, title=f"Kernels for {title}", pictures=pictures)
+    if as_json:
+        print(json.dumps({"rows": study.rows, "motion": moved}, indent=1))
+    else:
+        _print(study, moved, output)
+    if missing is not None:
+        raise missing
+    return 0
+
+
+def _surface(source, muscle):
+    """Scene or None, the mesh to fit, and its name."""
+    from rbfmuscle.sim.meshes import read_mesh
+    from rbfmuscle.sim.phantom import phantom_scene
+    from rbfmuscle.sim.scene import Scene
+
+    if source != "phantom" and Path(source).suffix.lower() != ".toml":
+        return None, read_mesh(source).mesh, Path(source).stem
+    scene = phantom_scene() if source == "phantom" else Scene.load(source)
+    chosen = scene.muscle(muscle) if muscle else scene.muscles[0]
+    return scene, chosen.mesh, chosen.name
+
+
+def _run_best(scene, name, study, best, frames):
+    """Run one muscle's motion with the best settings; a setting that fails says so and stops no other."""
+    from rbfmuscle.run import simulate
+    from rbfmuscle.validation import RBFMuscleError
+
+    moved = []
+    for row in [row for row in study.rows if row["rms"] is not None][:best]:
+        settings = {"model.kernel": row["kernel"], "model.centres": row["centres"]}
+        if row["epsilon"]:
+            settings["model.epsilon"] = row["epsilon"]
+        if row["fit"] != "values":
+            settings["model.derivatives"] = row["fit"]
+        facts = {"kernel": row["kernel"], "centres": row["centres"], "error": ""}
+        alone = scene.with_options(model="rbf", frames=frames, **settings)
+        alone.muscles = [alone.muscle(name)]
+        try:
+            table = simulate(alone).summary[name]
+            for quantity in (
+                "volume_error",
+                "penetration_max",
+                "bone_penetration_max",
+                "components",
+                "time_frame",
+            ):
+                if quantity in table:
+                    facts[quantity] = table[quantity]["median" if quantity == "time_frame" else "worst"]
+        except RBFMuscleError as error:
+            facts["error"] = str(error)
+        moved.append(facts)
+    return moved
+
+
+def _print(study, moved, output):
+    unit = study.units or "unit"
+    print(f"{'kernel':26s} {'centres':>7s} {'eps h':>6s} {'RMS':>8s} {'Hausd.':>8s} {'vol %':>7s} {'sheets':>6s} "
+          f"{'cond.':>8s} {'fit ms':>7s} {'numbers':>7s} {'mesh':>7s}   [{unit}]")  # fmt: skip
+    for row in study.rows:
+        start = f"{row['kernel']:26s} {row['centres']:7d} {_text(row['shape'], 6)} "
+        if row["rms"] is None:
+            print(f"{start} {row['note'][:90]}")
+            continue
+        print(
+            f"{start}{_text(row['rms'], 8)} {_text(row['hausdorff'], 8)} {_text(100 * row['volume_error'], 7)} "
+            f"{row['components']:6d} {row['condition']:8.1e} {_text(1e3 * row['fit_time'], 7)} {row['numbers']:7d} "
+            f"{_text(row['decimated_rms'], 7)}"
+        )
+    for facts in moved:
+        said = facts["error"] or ", ".join(
+            f"{name} {value:.3g}" for name, value in facts.items() if isinstance(value, float)
+        )
+        print(f"in motion, {facts['kernel']} with {facts['centres']} centres: {said}")
+    print(f"page in {output / 'kernels.html'}; to paste:\n\n{study.toml(study.rows[0])}")
+
+
+def _text(value, width):
+    return f"{'':{width}s}" if value is None else f"{value:{width}.3g}"
