@@ -1,18 +1,20 @@
 """Running a scene: in memory with `simulate`, or straight to a folder with `stream_run`."""
 
 import time
+import warnings
 from datetime import UTC, datetime
 
 import numpy as np
 
 from rbfmuscle.models import build_model
-from rbfmuscle.sim.scene_check import check_initial
+from rbfmuscle.sim.lane import Event
+from rbfmuscle.sim.scene_check import bone_collisions, bone_findings, check_initial
 from rbfmuscle.sim.simulate import simulate_frames
 from rbfmuscle.study.metrics import MetricsRecorder
 from rbfmuscle.study.runinfo import Stages, build_info
 from rbfmuscle.study.summary import LIMITS, Summary, default_limit, parse_limits, require_limits
 from rbfmuscle.study.writer import RunWriter
-from rbfmuscle.validation import RBFMuscleError, SolveError, UsageError
+from rbfmuscle.validation import RBFMuscleError, SceneWarning, SolveError, UsageError
 
 
 def simulate(scene, model=None, *, frames=None, progress=None, **settings):
@@ -96,7 +98,9 @@ def stream_run(
     status, message = "interrupted", "interrupted"
     try:
         writer.write_info(course.info(writer.frames, "running"))
+        driven = _bones_driven_together(course)
         for frame in course.frames():
+            frame.events.extend(driven.get(frame.index, []))
             with course.timed("write"):
                 writer.write(frame, course.fresh)
             if progress is not None:
@@ -110,6 +114,18 @@ def stream_run(
         writer.close(course.fresh)
         writer.write_info(course.info(writer.frames))
     return _finish(course, writer, limits, pictures)
+
+
+def _bones_driven_together(course):
+    """Events by frame, for some frames of the motion, and a warning for each pair of bones."""
+    with course.timed("build"):
+        collisions = bone_collisions(course.scene)
+    for finding in bone_findings(collisions, course.scene.units):
+        warnings.warn(f"{finding.place}: {finding.message}", SceneWarning, stacklevel=3)
+    events = {}
+    for frame, first, second, _ in collisions:
+        events.setdefault(frame, []).append(Event(frame, "", f"{first} and {second}", 1, "bones_overlap"))
+    return events
 
 
 def _finish(course, writer, limits, pictures):

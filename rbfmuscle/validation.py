@@ -48,6 +48,10 @@ class MissingPartError(RBFMuscleError, ImportError):
     exit_code = 7
 
 
+class SceneWarning(UserWarning):
+    """A scene asks for something that cannot be had as it stands, as bones driven into each other."""
+
+
 class NumericalWarning(UserWarning):
     """A result is usable but less accurate than asked; the message names the cause and the remedy."""
 

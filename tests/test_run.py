@@ -8,9 +8,10 @@ import pytest
 from blend_model import arm_scene, files_in, use_blend_model
 
 from rbfmuscle.run import simulate, stream_run
+from rbfmuscle.sim.scene import Scene
 from rbfmuscle.study.saved import SavedRun
 from rbfmuscle.study.summary import LIMITS, parse_limits
-from rbfmuscle.validation import LimitExceededError, SceneError, SolveError, UsageError
+from rbfmuscle.validation import LimitExceededError, SceneError, SceneWarning, SolveError, UsageError
 
 
 @pytest.fixture(autouse=True)
@@ -195,3 +196,12 @@ class TestLimits:
     def test_near_name_is_offered(self):
         with pytest.raises(UsageError, match="penetration_max"):
             parse_limits("penetration_mx", arm_scene())
+
+
+def test_bones_driven_into_each_other_are_reported(hip_data, tmp_path):
+    scene = Scene.load(hip_data / "adduction.toml")
+    scene.muscles = [scene.muscle("gluteus_medius")]
+    with pytest.warns(SceneWarning, match="pelvis and femur: the motion drives the bones into each other"):
+        stream_run(scene, tmp_path / "out", frames="0:22", pictures=False)
+    rows = (tmp_path / "out" / "events.csv").read_text().splitlines()
+    assert any(row.split(",")[1:] == ["", "pelvis and femur", "1", "bones_overlap"] for row in rows)

@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 import time
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +9,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from rbfmuscle.commands.progress import Progress
-from rbfmuscle.validation import RBFMuscleError, SceneError
+from rbfmuscle.validation import RBFMuscleError
 
 Output = Annotated[Path, Parameter(name=["--output", "-o"])]
 Json = Annotated[bool, Parameter(name="--json", negative="")]
@@ -90,7 +89,6 @@ def run(
 def _run_scene(scene, output, *, model, frames, settings, fail_on, as_json):
     from rbfmuscle.run import stream_run
 
-    _warn_about_bones(scene)
     start = time.perf_counter()
     done = 0
     with Progress(scene.name) as progress:
@@ -120,17 +118,6 @@ def _run_scene(scene, output, *, model, frames, settings, fail_on, as_json):
         print(json.dumps({"directory": str(output), **info}, indent=1, default=str))
     else:
         _print_summary(info["muscles"], len(info["frames"]), output, time.perf_counter() - start)
-
-
-def _warn_about_bones(scene):
-    """A motion that drives bones into each other runs, and is reported."""
-    from rbfmuscle.sim.scene_check import bone_findings
-
-    try:
-        for finding in bone_findings(scene):
-            print(f"rbfmuscle: {finding}", file=sys.stderr)
-    except SceneError:
-        return  # the motion is wrong, which the run itself reports
 
 
 def _print_summary(muscles, frames, output, seconds):

@@ -22,7 +22,8 @@ class Event:
 
     ``action`` is ``"angle_flag"`` (the angle test spoke), ``"reported"`` (crossed, nothing done),
     ``"rotated"``, ``"halved"`` (the step was), ``"unresolved"`` (crossed, and no correction helped),
-    ``"overlap_kept"`` or ``"overlap_resolved"`` (at rest, before the first frame).
+    ``"overlap_kept"`` or ``"overlap_resolved"`` (at rest, before the first frame), or, with no muscle,
+    ``"bones_overlap"`` (the motion drives two bones into each other).
     """
 
     frame: int

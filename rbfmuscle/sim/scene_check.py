@@ -45,7 +45,7 @@ def check_scene(scene):
             findings.append(Finding("error", scene.name, str(error)))
     findings.extend(_rest_overlaps(scene))
     try:
-        findings.extend(bone_findings(scene))
+        findings.extend(bone_findings(bone_collisions(scene), scene.units))
     except SceneError as error:
         if all(str(error) != finding.message for finding in findings):
             findings.append(Finding("error", scene.name, str(error)))
@@ -186,18 +186,24 @@ def _pair_depths(scene, poses):
     return depths
 
 
-def bone_findings(scene):
-    """Return a warning for each pair of bones that the motion drives into each other."""
+def bone_findings(collisions, units):
+    """Return a warning for each pair of bones that the motion drives into each other.
+
+    Parameters
+    ----------
+    collisions : list
+        From `bone_collisions`.
+    units : str
+    """
     worst = {}
-    for frame, first, second, depth in bone_collisions(scene):
+    for frame, first, second, depth in collisions:
         start, deepest = worst.get((first, second), (frame, 0.0))
         worst[first, second] = (start, max(deepest, depth))
     return [
         Finding(
             "warning",
             f"{first} and {second}",
-            f"the motion drives the bones into each other, from about frame {start}, "
-            f"up to {deepest:.3g} {scene.units}",
+            f"the motion drives the bones into each other, from about frame {start}, up to {deepest:.3g} {units}",
         )
         for (first, second), (start, deepest) in worst.items()
     ]
