@@ -170,8 +170,10 @@ def _trace(field, start, end, tolerance):
         inside = under_way[distance < 0.0]
         first[inside] = np.minimum(first[inside], at[inside])
         last[inside] = at[inside]
-        share = np.where(distance < 0.0, 0.5, STEP_SHARE)
-        stride = np.maximum(share * np.abs(distance), 0.5 * tolerance)
+        # Between two places outside, d and d' from the bone and s apart, no place is deeper than (s - d - d') / 2:
+        # with s = d + tolerance that is less than the tolerance where the second place is not itself that deep.
+        outside = STEP_SHARE * distance + 0.9 * tolerance
+        stride = np.where(distance < 0.0, np.maximum(-0.5 * distance, 0.5 * tolerance), outside)
         at[under_way] = np.minimum(t + stride / np.maximum(length[under_way], 1e-300), 1.0)
         under_way = under_way[t < 1.0]
         if len(under_way) == 0:
