@@ -1,4 +1,4 @@
-"""Collision response of mesh vertices: half-spaces from the contacts, the sum of their ways out."""
+"""Collision response of a mesh: half-spaces from the contacts, the sum of their ways out."""
 
 import numba
 import numpy as np
@@ -8,10 +8,14 @@ TOUCHING = 1e-9
 
 
 class CollisionConstraint:
-    """Keeps vertices out of bones: C = gap + n . (x - x_0) >= 0, linearised where the contacts were asked.
+    """Keeps points of the mesh out of bones: C = gap + n . (x - x_0) >= 0, linearised where the contacts were asked.
+
+    A point is x = sum_k share_k x_k over up to three vertices, and moves them by share_k / sum share^2.
 
     Parameters
     ----------
+    columns, shares : (p, 3) ndarrays
+        Vertices and shares of each contact point; a vertex alone is (i, i, i) and (1, 0, 0).
     reach : float
         Distance within which contacts are looked for [scene unit].
     response : {"sum", "nearest"}
@@ -19,7 +23,8 @@ class CollisionConstraint:
         the authors' earlier papers.
     """
 
-    def __init__(self, *, reach, response="sum"):
+    def __init__(self, columns, shares, *, reach, response="sum"):
+        self.columns, self.shares = columns, shares
         self.reach = float(reach)
         self.nearest_only = response == "nearest"
         self.index, self.gap = np.zeros(0, dtype=np.int64), np.zeros(0)
@@ -28,37 +33,51 @@ class CollisionConstraint:
     def __len__(self):
         return len(self.index)
 
+    def place(self, points):
+        """Contact points (p, 3) of vertices (n, 3)."""
+        out = np.empty((len(self.columns), 3))
+        _place_loop(points, self.columns, self.shares, out)
+        return out
+
     def find(self, contacts, points, *, reach=None):
-        """Ask the contacts of all vertices (n, 3) where they are now; return the greatest depth."""
-        found = contacts.half_spaces(points, self.reach if reach is None else reach)
+        """Ask the contacts where the vertices (n, 3) are now; return the greatest depth."""
+        placed = self.place(points)
+        found = contacts.half_spaces(placed, self.reach if reach is None else reach)
         self.index, self.gap = np.ascontiguousarray(found.index), np.ascontiguousarray(found.gap)
         self.normal = np.ascontiguousarray(found.normal)
-        self.anchor = points[self.index]
+        self.anchor = placed[self.index]
         return max(0.0, -float(self.gap.min(initial=0.0)))
 
     def depth(self, points):
         """Greatest depth of the points in the half-spaces found last."""
         if len(self.index) == 0:
             return 0.0
-        return _depth_loop(points, self.index, self.gap, self.normal, self.anchor, np.empty(len(self.index)))
+        return self._depths(points, np.empty(len(self.index)))
 
     def project(self, points):
         """Push vertices out of the half-spaces, in place; return the greatest violation before."""
         if len(self.index) == 0:
             return 0.0
         depth = np.empty(len(self.index))
-        worst = _depth_loop(points, self.index, self.gap, self.normal, self.anchor, depth)
+        worst = self._depths(points, depth)
         if worst > TOUCHING * self.reach:
             if self.nearest_only:
-                _keep_deepest(self.index, depth, len(points))
-            _push_loop(points, self.index, self.normal, depth)
+                _keep_deepest(self.index, depth, len(self.columns))
+            _push_loop(points, self.columns, self.shares, self.index, self.normal, depth)
         return worst
 
     def clear_way(self, points, direction, step):
         """Take out of ``step * direction``, in place, what would lead into a half-space; say if anything."""
         if len(self.index) == 0 or step == 0.0:
             return False
-        return _clear_loop(points, self.index, self.gap, self.normal, self.anchor, direction, step)
+        return _clear_loop(
+            points, self.columns, self.shares, self.index, self.gap, self.normal, self.anchor, direction, step
+        )
+
+    def _depths(self, points, depth):
+        return _depth_loop(
+            points, self.columns, self.shares, self.index, self.gap, self.normal, self.anchor, depth
+        )
 
 
 def _keep_deepest(index, depth, count):
@@ -68,37 +87,60 @@ def _keep_deepest(index, depth, count):
 
 
 @numba.njit(cache=True, nogil=True)
-def _depth_loop(points, index, gap, normal, anchor, depth):
+def _place_loop(points, columns, shares, out):
+    for p in range(len(columns)):
+        for a in range(3):
+            out[p, a] = 0.0
+            for k in range(3):
+                out[p, a] += shares[p, k] * points[columns[p, k], a]
+
+
+@numba.njit(cache=True, nogil=True)
+def _along(vectors, columns, shares, p, anchor, normal):
+    """n . (sum_k share_k v_k - anchor)."""
+    value = 0.0
+    for a in range(3):
+        at = -anchor[a]
+        for k in range(3):
+            at += shares[p, k] * vectors[columns[p, k], a]
+        value += normal[a] * at
+    return value
+
+
+@numba.njit(cache=True, nogil=True)
+def _depth_loop(points, columns, shares, index, gap, normal, anchor, depth):
     worst = 0.0
     for c in range(len(index)):
-        i = index[c]
-        value = gap[c]
-        for k in range(3):
-            value += normal[c, k] * (points[i, k] - anchor[c, k])
-        depth[c] = max(0.0, -value)
+        depth[c] = max(0.0, -gap[c] - _along(points, columns, shares, index[c], anchor[c], normal[c]))
         worst = max(worst, depth[c])
     return worst
 
 
 @numba.njit(cache=True, nogil=True)
-def _push_loop(points, index, normal, depth):
-    for c in range(len(index)):
-        if depth[c] > 0.0:
-            for k in range(3):
-                points[index[c], k] += depth[c] * normal[c, k]
+def _move(vectors, columns, shares, p, normal, amount):
+    """Move what carries point p so that it moves by ``amount`` along the normal."""
+    square = shares[p, 0] ** 2 + shares[p, 1] ** 2 + shares[p, 2] ** 2
+    for k in range(3):
+        if shares[p, k] > 0.0:
+            for a in range(3):
+                vectors[columns[p, k], a] += amount * shares[p, k] / square * normal[a]
 
 
 @numba.njit(cache=True, nogil=True)
-def _clear_loop(points, index, gap, normal, anchor, direction, step):
-    cleared = False
+def _push_loop(points, columns, shares, index, normal, depth):
     for c in range(len(index)):
-        i = index[c]
-        value, along = gap[c], 0.0
-        for k in range(3):
-            value += normal[c, k] * (points[i, k] - anchor[c, k])
-            along += normal[c, k] * direction[i, k]
+        if depth[c] > 0.0:
+            _move(points, columns, shares, index[c], normal[c], depth[c])
+
+
+@numba.njit(cache=True, nogil=True)
+def _clear_loop(points, columns, shares, index, gap, normal, anchor, direction, step):
+    cleared = False
+    nothing = np.zeros(3)
+    for c in range(len(index)):
+        value = gap[c] + _along(points, columns, shares, index[c], anchor[c], normal[c])
+        along = _along(direction, columns, shares, index[c], nothing, normal[c])
         if step * along < 0.0 and value + 2.0 * step * along < 0.0:
-            for k in range(3):
-                direction[i, k] -= along * normal[c, k]
+            _move(direction, columns, shares, index[c], normal[c], -along)
             cleared = True
     return cleared

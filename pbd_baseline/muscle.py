@@ -46,19 +46,23 @@ class PBDMuscle:
         self.options = PBDOptions.build(options, place=f"muscle {muscle.name!r} model: ")
         self.rest = Rest.from_muscle(muscle)
         self.shape = SHAPES[self.options.method](self.rest, self.options)
-        self.collision = CollisionConstraint(reach=scene.length(REACH), response=self.options.response)
+        columns, shares = _contact_carriers(self.rest, faces_too=self.options.contact == "faces")
+        self.collision = CollisionConstraint(
+            columns, shares, reach=scene.length(REACH), response=self.options.response
+        )
         self.finishing_reach, self.depth = scene.length(FINISHING_REACH), scene.length(DEPTH)
         names = [bone.name for bone in scene.bones]
         numbers = np.array([names.index(bone) for bone in self.rest.bones])
-        self.contact_bone = np.where(self.rest.holder < 0, -1, numbers[self.rest.holder])
+        of_vertex = np.where(self.rest.holder < 0, -1, numbers[self.rest.holder])
+        self.contact_bone = of_vertex[columns].max(axis=1)
         self.points = self.rest.vertices.copy()
         self.before = self.points.copy()
         self.time = 1.0
         self.penetration = 0.0
 
     def contact_points(self):
-        """The vertices (n, 3), in this model's own order."""
-        return self.points
+        """The vertices in this model's own order, then the middles of edges and faces where these are asked for."""
+        return self.points if self.options.contact == "vertices" else self.collision.place(self.points)
 
     def predict(self, before, after):
         """Go along with the bones; held vertices arrive exactly."""
@@ -87,8 +91,13 @@ class PBDMuscle:
 
     def turn(self, which, transform):
         """Move the vertices marked in a bool mask (n,) by a (4, 4) transform; held ones stay."""
-        which = which & (self.rest.holder < 0)
+        which = self._vertices_of(which) & (self.rest.holder < 0)
         self.points[which] = self.points[which] @ transform[:3, :3].T + transform[:3, 3]
+
+    def _vertices_of(self, which):
+        marked = np.zeros(len(self.points), dtype=bool)
+        marked[self.collision.columns[which]] = True
+        return marked
 
     def snapshot(self):
         """Everything that :meth:`restore` needs."""
@@ -145,6 +154,20 @@ class PBDMuscle:
             direction = gradient.copy()
             _scale_loop(direction, self.rest.room)
         volume.restore(self.points, direction, clear_way=self.collision.clear_way)
+
+
+def _contact_carriers(rest, *, faces_too):
+    """Vertices and shares of the contact points: columns and shares (p, 3)."""
+    count = len(rest.vertices)
+    columns, shares = (
+        [np.repeat(np.arange(count)[:, None], 3, axis=1)],
+        [np.tile([1.0, 0.0, 0.0], (count, 1))],
+    )
+    if faces_too:
+        edges, faces = rest.topology.edges, rest.topology.faces
+        columns += [edges[:, [0, 1, 1]], faces]
+        shares += [np.tile([0.5, 0.5, 0.0], (len(edges), 1)), np.full((len(faces), 3), 1.0 / 3.0)]
+    return np.ascontiguousarray(np.concatenate(columns)), np.concatenate(shares)
 
 
 def _relative(before, after):

@@ -22,7 +22,8 @@ class PBDOptions(Table):
     longer than ``soft_length`` medians are softer in inverse proportion (0: none); those shorter or longer
     than ``limits`` times their rest length are hard in any case. ``prediction``: vertices are carried along
     by the bones (see ``pbd_baseline.weights``), or keep their velocity times ``damping`` as the authors' do,
-    or stay (none). ``response`` to several bones: the sum of the ways out, or the longest alone.
+    or stay (none). ``response`` to several bones: the sum of the ways out, or the longest alone. ``contact``: bones are
+    met by the vertices alone, or by the middles of edges and faces too, for ridges that come between vertices.
     """
 
     method: Literal["pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved"] = "pbd"
@@ -39,6 +40,7 @@ class PBDOptions(Table):
     arap_compliance: Positive = 1.0
     arap_reach: Positive = 0.03
     response: Literal["sum", "nearest"] = "sum"
+    contact: Literal["vertices", "faces"] = "vertices"
 
     @property
     def sweeps(self):

@@ -268,10 +268,41 @@ def test_sum_of_ways_out_leaves_two_bones_where_one_does_not():
 
     for response, expected in (("sum", [0.0, 0.0, 0.0]), ("nearest", [0.0, -1.0, 0.0])):
         point = np.array([[-2.0, -1.0, 0.0]])
-        collision = CollisionConstraint(reach=5.0, response=response)
+        collision = CollisionConstraint(
+            np.zeros((1, 3), dtype=int), np.array([[1.0, 0.0, 0.0]]), reach=5.0, response=response
+        )
         collision.find(Corner(), point)
         collision.project(point)
         np.testing.assert_allclose(point[0], expected)
+
+
+def test_the_middle_of_a_face_is_pushed_out_by_its_corners():
+    from pbd_baseline.collision import CollisionConstraint
+
+    class Floor:
+        def half_spaces(self, points, reach):
+            from rbfmuscle.sim.contact import HalfSpaces
+
+            return HalfSpaces(np.array([0]), points[:, 2].copy(), np.array([[0.0, 0.0, 1.0]]), np.array([0]))
+
+    corners = np.array([[0.0, 0.0, 0.5], [3.0, 0.0, -2.0], [0.0, 3.0, -0.6]])
+    collision = CollisionConstraint(np.array([[0, 1, 2]]), np.full((1, 3), 1.0 / 3.0), reach=5.0)
+    assert collision.find(Floor(), corners) == pytest.approx(0.7)
+    collision.project(corners)
+    assert collision.place(corners)[0, 2] == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_allclose(corners[:, 2], [1.2, -1.3, 0.1])
+
+
+@pytest.mark.parametrize("method", ["pbd", "arap-volume"])
+def test_contact_of_faces_leaves_no_middle_of_a_face_in_a_bone(method):
+    scene = build_scene()
+    model = PBDMuscle(scene.muscles[0], scene, method=method, contact="faces")
+    faces, edges = model.rest.topology.faces, model.rest.topology.edges
+    points = model.contact_points()
+    assert len(points) == len(model.points) + len(edges) + len(faces) == len(model.contact_bone)
+    np.testing.assert_allclose(points[-len(faces) :], model.points[faces].mean(axis=1))
+    held = (model.rest.holder >= 0)[faces].any(axis=1)
+    assert (model.contact_bone[-len(faces) :] >= 0).tolist() == held.tolist()
 
 
 def test_unknown_option_is_refused_with_the_nearest_name():
