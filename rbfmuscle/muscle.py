@@ -146,7 +146,7 @@ class RBFMuscle:
             self.derivatives = "all" if len(self.rest) <= MOST_WITH_ALL_DERIVATIVES else "normal"
         self._choose_kernel()
         self.x = self.rest.copy()
-        self.level = 0.0
+        self.level, self._fitted = 0.0, None
         # Cells along the muscle's own axes are smaller than along the scene's, and turn with the scene.
         self.axes = frame.directions(_principal_axes(samples.points))
 
@@ -302,10 +302,21 @@ class RBFMuscle:
             self.x, self.normals(), kernel=self.kernel, epsilon=self.epsilon, derivatives=self.derivatives
         )
 
+    def implicit(self):
+        """``points -> (values, gradients)`` of the field that the next ``surface`` shows, level taken off."""
+        fitted, level = self.field(), self.level
+        self._fitted = fitted
+
+        def evaluate(points):
+            value, gradient = fitted.value_and_gradient(points)
+            return value - level, gradient
+
+        return evaluate
+
     def surface(self, contacts):
         """Refit the field, cut the bones away and extract the closed surface at the rest volume."""
         started = time.perf_counter()
-        field = self.field()
+        field, self._fitted = self._fitted or self.field(), None
         fitted = time.perf_counter()
         points = self.contact_points()
         depth = contacts.depth(points)

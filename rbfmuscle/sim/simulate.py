@@ -252,6 +252,7 @@ def _show(lanes, crew, sliding):
         crew.each(sliding.refresh, lanes)
         for lane, measured in zip(lanes, crew.each(sliding.measure, lanes)):
             lane.measured = measured
+        crew.each(sliding.fit, lanes)
     return crew.each(Lane.show, lanes)
 
 

@@ -25,10 +25,12 @@ class Skin:
     fixed : (n,) ndarray of bool
         Vertices that a bone holds.
     box : (2, 3) ndarray
+    implicit : callable or None
+        ``points -> (values, gradients)`` of the field whose zero set is shown, for models that have one.
     """
 
     def __init__(self, model, reach):
-        self.model = model
+        self.model, self.implicit = model, None
         vertices, faces = model.carried_mesh()
         self.faces = np.ascontiguousarray(faces, dtype=np.int64)
         corner = self.faces.ravel()

@@ -20,7 +20,7 @@ THRESHOLD, STRIP, RELEASE = 2.0, 1.0, 2.0
 # Neighbours are looked for within this distance [mm] of the predicted points.
 SEARCH = 5.0
 # Distance [mm] between the surfaces as solved below which they are cut, and how deep an overlap may be.
-CUT_FROM, CUT_DEPTH = 1.5, 6.0
+CUT_FROM, CUT_DEPTH = 4.0, 6.0
 
 
 class Planes:
@@ -100,7 +100,7 @@ class Link:
         return found
 
     def cut(self, points):
-        """Half the difference of both muscles' distances where they overlap, infinity elsewhere."""
+        """Half the difference of both muscles' distances near where they meet, infinity elsewhere."""
         return self.cut_with_gradient(points)[0]
 
     def cut_with_gradient(self, points):
@@ -110,6 +110,14 @@ class Link:
             return value, gradient
         zone, depth = self.zone, self.limits.cut_depth
         inside = np.all((points > zone[0]) & (points < zone[1]), axis=1)
+        if self.skin.implicit is not None and self.other.implicit is not None:
+            # What is shown is the zero set of the fields: where these are equal both are cut alike.
+            (ours, own), (theirs, normal) = (
+                self.skin.implicit(points[inside]),
+                self.other.implicit(points[inside]),
+            )
+            value[inside], gradient[inside] = 0.5 * (theirs - ours), 0.5 * (normal - own)
+            return value, gradient
         near, theirs, normal, _ = self.other.query(points, inside, depth)
         inside[:] = False
         inside[near] = True
@@ -210,6 +218,12 @@ class Sliding:
         if lane.name in self.skins:
             with lane.timed("sliding"):
                 self.skins[lane.name].refresh()
+
+    def fit(self, lane):
+        """Take over the field that a muscle will be shown by, where it has one."""
+        if self.links[lane.name] and hasattr(lane.model, "implicit"):
+            with lane.timed("surface"):
+                self.skins[lane.name].implicit = lane.model.implicit()
 
     def update(self, lane):
         """New planes for one muscle; its neighbours' skins have been refreshed."""
