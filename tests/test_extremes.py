@@ -7,6 +7,7 @@ import pytest
 
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels import KERNELS
+from rbfmuscle.study.extremes import extremes_matrix, study_extremes, write_extremes
 from rbfmuscle.validation import NumericalWarning
 
 WITH_EPSILON = [name for name, kernel in KERNELS.items() if kernel.has_epsilon]
@@ -52,7 +53,8 @@ def test_conditions_are_met_for_any_epsilon_or_a_warning_says_so(kernel, epsilon
     assert said or residual < 2e-3
     if field is not None:
         assert np.isfinite(field(points)).all()
-        assert said == (field.condition >= 1e13)
+        # A Hermite fit also says when its kernel does not reach from centre to centre.
+        assert said == (field.condition >= 1e13) or (said and hermite and epsilon >= 10.0)
 
 
 @pytest.mark.parametrize("kernel", ["cubic", "thin_plate_spline", "wendland_c2", "matern_52"])
@@ -124,3 +126,26 @@ def test_single_precision_input_is_computed_in_double():
     points = sphere(50).astype(np.float32)
     field = RBFField.fit_hermite(points, points)
     assert np.abs(field(points)).max() < 1e-12 and field(points).dtype == np.float64
+
+
+def test_nothing_is_wrong_without_a_word(tmp_path):
+    rows = study_extremes(kernels=["cubic", "gaussian", "multiquadric", "matern_12", "wendland_c2"])
+    outcomes = {(row["case"], row["kernel"]): row["outcome"] for row in rows}
+    assert "silent" not in outcomes.values()
+    for row in rows:
+        if row["outcome"] == "right":
+            assert row["error"] <= row["bound"]
+        else:
+            assert len(row["said"]) > 20
+    assert outcomes["1e6 from the origin", "cubic"] == "right"
+    assert outcomes["two centres in one place", "cubic"] == "refused"
+    assert outcomes["epsilon h = 1000", "wendland_c2"] == "warned"
+    write_extremes(rows, tmp_path)
+    assert (tmp_path / "extremes.md").read_text() == extremes_matrix(rows)
+    assert (tmp_path / "extremes.csv").read_text().count("\n") >= len(rows)
+
+
+def test_a_kernel_that_does_not_reach_its_neighbours_says_so():
+    points = sphere(200)
+    with pytest.warns(NumericalWarning, match="does not reach from centre to centre.*lower epsilon"):
+        RBFField.fit_hermite(points, points, kernel="wendland_c2", epsilon=10.0)

@@ -96,3 +96,11 @@ def test_command_ranks_prints_and_runs(tmp_path, capsys):
     assert code == 0 and {row["kernel"] for row in found["rows"]} == {"cubic", "quintic"}
     assert found["motion"][0]["components"] == 1 and not found["motion"][0]["error"]
     assert (tmp_path / "k" / "kernels.html").exists()
+
+
+def test_command_tells_the_extremes(tmp_path, capsys):
+    code, out, _ = call(capsys, "kernels", "--extremes", "--kernels", "cubic,linear", "-o", tmp_path)
+    assert code == 0 and "| 1e6 from the origin | 2 | 0 | 0 | 0 |" in out
+    assert (tmp_path / "extremes.csv").exists()
+    code, _, err = call(capsys, "kernels", "-o", tmp_path)
+    assert code == 2 and "which surface" in err

@@ -106,6 +106,7 @@ def test_chosen_epsilon_is_near_the_best_of_a_scan(kernel, criterion):
     assert error(choice.epsilon) < 2 * min(error(e) for e in sound) + 1e-6
 
 
+@pytest.mark.filterwarnings("ignore:kernel .* does not reach")
 def test_held_out_points_choose_for_a_hermite_fit():
     unit = sphere(60)
     held_out = sphere(333)

@@ -11,7 +11,7 @@ from rbfmuscle.validation import UsageError
 
 
 def kernels(
-    source: str,
+    source: str | None = None,
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     names: Annotated[
@@ -27,6 +27,7 @@ def kernels(
     frames: str | None = None,
     units: str = "",
     pictures: bool = True,
+    extremes: Annotated[bool, Parameter(negative="")] = False,
     as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
 ):
     """Rank kernels, shape parameters and numbers of centres on one surface; with a scene, run the best.
@@ -59,6 +60,8 @@ def kernels(
         Name of the unit of a mesh, for the text only.
     pictures
         Draw the best surfaces.
+    extremes
+        In place of a surface: fit an ellipsoid under every extreme, and tell what was right, warned of or refused.
     as_json
         Print JSON and nothing else.
     """
@@ -69,6 +72,10 @@ def kernels(
         raise UsageError("derivatives must be all or normal, criterion loo, gcv or condition; "
                          f"got {derivatives!r} and {criterion!r}")  # fmt: skip
     names = [name for text in names or [] for name in text.split(",") if name] or None
+    if extremes:
+        return _extremes(names, output, as_json)
+    if source is None:
+        raise UsageError("which surface? give a mesh, a scene file or phantom, or --extremes")
     scene, mesh, title = _surface(source, muscle)
     with Progress("kernels", what="fit") as bar:
         study = study_kernels(
@@ -83,6 +90,16 @@ def kernels(
         _print(study, moved, output)
     if missing is not None:
         raise missing
+    return 0
+
+
+def _extremes(names, output, as_json):
+    from rbfmuscle.study.extremes import extremes_matrix, study_extremes, write_extremes
+
+    with Progress("extremes", what="fit") as bar:
+        rows = study_extremes(kernels=names, progress=bar)
+    write_extremes(rows, output)
+    print(json.dumps(rows, indent=1) if as_json else extremes_matrix(rows))
     return 0
 
 

@@ -3,7 +3,10 @@
 f(x) = sum_j a_j phi(|x - c_j|) - B_j . grad phi(x - c_j) + p(x), with B = 0 for a fit to values.
 """
 
+import warnings
+
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from rbfmuscle.implicit import assembly
@@ -12,6 +15,7 @@ from rbfmuscle.implicit.fitting import Basis, solve, solve_least_squares
 from rbfmuscle.implicit.kernels import get_kernel
 from rbfmuscle.implicit.off_surface import off_surface_points
 from rbfmuscle.validation import (
+    NumericalWarning,
     UsageError,
     check_points,
     check_positive,
@@ -127,7 +131,10 @@ class RBFField:
         basis, right, origin, scale = hermite_system(points, normals, kernel, epsilon, derivatives)
         weights, coefficients, condition = solve(basis, right, smoothing=_check_smoothing(smoothing))
         weights = hermite_weights(basis, weights)
-        return cls(points, origin, scale, kernel, epsilon, weights, coefficients, basis.powers, condition)
+        fitted = cls(points, origin, scale, kernel, epsilon, weights, coefficients, basis.powers, condition)
+        if kernel.has_epsilon:
+            _warn_if_narrow(fitted, points, normals)
+        return fitted
 
     @classmethod
     def fit_surface(cls, points, normals, *, kernel="cubic", epsilon=1.0, smoothing=0.0, derivatives="all"):
@@ -152,9 +159,12 @@ class RBFField:
             return cls.fit_hermite(
                 points, normals, kernel=kernel, epsilon=epsilon, smoothing=smoothing, derivatives=derivatives
             )
-        return cls.fit(
+        fitted = cls.fit(
             *off_surface_points(points, normals), kernel=kernel, epsilon=epsilon, smoothing=smoothing
         )
+        if kernel.has_epsilon:
+            _warn_if_narrow(fitted, points, normals)
+        return fitted
 
     @classmethod
     def fit_least_squares(
@@ -293,6 +303,23 @@ def hermite_system(points, normals, kernel, epsilon, derivatives):
     unit = normals / lengths[:, None]
     basis = Basis(scaled, kernel, shape, kernel.degree, kind="normal", normals=unit)
     return basis, np.concatenate([np.zeros(len(points)), lengths]) * scale, origin, scale
+
+
+def _warn_if_narrow(fitted, points, normals):
+    """Warn where the field does not rise outwards between its centres: the kernel does not reach that far."""
+    points, normals = check_points(points), check_vectors(normals, len(points))
+    if len(points) < 20:
+        return  # too few to say what lies between them
+    near = cKDTree(points).query(points, k=6)[1][:, 5]
+    slope = np.einsum("ij,ij->i", fitted.gradient(0.5 * (points + points[near])), normals)
+    if np.median(slope) < 0.5 * np.median(np.linalg.norm(normals, axis=1)):
+        shape = float(np.median(np.atleast_1d(fitted.epsilon)))
+        warnings.warn(
+            f"kernel '{fitted.kernel.name}' with epsilon {shape:.3g} does not reach from centre to centre: the field "
+            "is flat between them and shows no surface; lower epsilon or add centres",
+            NumericalWarning,
+            stacklevel=4,
+        )
 
 
 def hermite_weights(basis, weights):
