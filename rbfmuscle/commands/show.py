@@ -22,7 +22,7 @@ def export(
     directory
         Folder of the run.
     formats
-        pvd, vtp, ply, stl, obj or glb; several may be given.
+        pvd, vtp, ply, stl, obj or glb, or sto for lengths and moment arms; several may be given.
     output
         Folder to write to, DIR/export by default.
     units

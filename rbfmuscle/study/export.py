@@ -1,4 +1,4 @@
-"""Surfaces of a saved run in other formats and units: PVD with VTP, PLY, STL, OBJ, GLB."""
+"""A saved run in other formats and units: surfaces as PVD with VTP, PLY, STL, OBJ, GLB; lengths as STO."""
 
 from pathlib import Path
 
@@ -6,11 +6,13 @@ import numpy as np
 
 from rbfmuscle.study.appearance import BONE_COLOUR, muscle_colours
 from rbfmuscle.study.meshfiles import write_mesh
+from rbfmuscle.study.opensim import export_lengths
 from rbfmuscle.study.saved import SavedRun
 from rbfmuscle.study.vtp import Collection, write_vtp
 from rbfmuscle.validation import SolveError, UsageError
 
 FORMATS = ("pvd", "vtp", "ply", "stl", "obj", "glb")
+TABLES = ("sto",)
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
@@ -22,8 +24,9 @@ def export_run(directory, formats, *, output=None, units=None, frames=None, asci
     directory : path
         Folder of the run.
     formats : str or list of str
-        Of `FORMATS`. ``glb`` gives one file a frame with all muscles and bones as named, coloured nodes; the
-        others one file a muscle (or bone) and frame. ``pvd`` is ``vtp`` and a collection over the frames.
+        Of `FORMATS` and `TABLES`. ``glb`` gives one file a frame with all muscles and bones as named,
+        coloured nodes; the others one file a muscle (or bone) and frame. ``pvd`` is ``vtp`` and a collection
+        over the frames. ``sto`` gives lengths and moment arms for OpenSim and needs no surfaces.
     output : path, optional
         ``DIR/export`` where not given; each format has its own folder there.
     units : {"m", "cm", "mm"}, optional
@@ -48,12 +51,12 @@ def export_run(directory, formats, *, output=None, units=None, frames=None, asci
     saved = SavedRun(directory)
     formats = [formats] if isinstance(formats, str) else list(formats)
     for name in formats:
-        if name not in FORMATS:
-            raise UsageError(f"unknown format {name!r}; known: {', '.join(FORMATS)}")
+        if name not in FORMATS + TABLES:
+            raise UsageError(f"unknown format {name!r}; known: {', '.join(FORMATS + TABLES)}")
     if units is not None and units not in METRES:
         raise UsageError(f"units must be m, cm or mm, got {units!r}")
     chosen = saved.frames[frames] if frames is not None else saved.frames
-    if not saved.has_surfaces() or not chosen:
+    if not chosen or not (saved.has_surfaces() or set(formats) <= set(TABLES)):
         raise UsageError(f"{directory} has no surfaces to export")
     base = Path(output) if output is not None else saved.directory / "export"
     written = []
@@ -61,6 +64,9 @@ def export_run(directory, formats, *, output=None, units=None, frames=None, asci
         for name in formats:
             wanted = units or ("m" if name == "glb" else saved.units)
             factor = METRES[saved.units] / METRES[wanted]
+            if name == "sto":
+                written += export_lengths(saved, base / name, chosen, factor)
+                continue
             act = _export_glb if name == "glb" else _export_meshes
             written += act(saved, base / name, name, chosen, factor, ascii)
     except OSError as error:
