@@ -17,6 +17,7 @@ from rbfmuscle.commands.cache import cache_app
 from rbfmuscle.commands.check import check
 from rbfmuscle.commands.kernels import kernels
 from rbfmuscle.commands.new import new
+from rbfmuscle.commands.plan import plan
 from rbfmuscle.commands.run import demo, run
 from rbfmuscle.commands.sdf import sdf
 from rbfmuscle.commands.show import export, render
@@ -29,7 +30,7 @@ INTERRUPTED = 130
 app = App(
     name="rbfmuscle", help="Muscles as implicit RBF surfaces that move with the bones.", version=__version__
 )
-for command in (demo, check, run, sweep, export, render, new, view, sdf, kernels):
+for command in (demo, check, plan, run, sweep, export, render, new, view, sdf, kernels):
     app.command(command)
 app.command(cache_app)
 
