@@ -236,6 +236,7 @@ class RBFMuscle:
         alone = np.repeat(np.arange(count)[:, None], columns.shape[1], axis=1)
         self.columns = np.concatenate([alone, columns])
         self.shares = np.concatenate([np.eye(1, columns.shape[1]).repeat(count, axis=0), shares])
+        self._attach_hanging()
         self.volume = VolumeConstraint(self.sample_faces, 0.0)
         self.volume.volume = self.volume.evaluate(self.samples)[0]
         self.solver = ElasticSolver(
@@ -243,6 +244,16 @@ class RBFMuscle:
             self.free, self.held,
             iterations=options.iterations, contacts=options.contacts, memory=options.acceleration,
         )  # fmt: skip
+
+    def _attach_hanging(self):
+        """Count contact points that hang for the most part on held centres to the bone that holds these.
+
+        Contact could lift them only by moving the few free centres they hang on a long way.
+        """
+        held = self.shares * (self.fixed_bone >= 0)[self.columns]
+        hanging = np.flatnonzero((held.sum(axis=1) > 0.5) & (self.contact_bone < 0))
+        carrier = self.columns[hanging, held[hanging].argmax(axis=1)]
+        self.contact_bone[hanging] = self.fixed_bone[carrier]
 
     # --- the MuscleModel protocol -------------------------------------------------------------------------
 
