@@ -11,7 +11,8 @@ import numba
 import numpy as np
 
 from rbfmuscle.implicit.band import Band, BandGrid
-from rbfmuscle.implicit.obstacles import CHORD, points_near_cells, push_off_points
+from rbfmuscle.implicit.obstacles import CHORD, points_near_cells
+from rbfmuscle.implicit.projection import Projector
 from rbfmuscle.validation import check_finite, check_points, check_positive
 
 
@@ -141,7 +142,7 @@ def _reach_volume(band, target, level, keep, obstacles):
         if found is None:
             return None
         vertices, faces, near_cut, components, spurious = found
-        projector = _Projector(band.field, band.cut, vertices, spacing, near_cut)
+        projector = Projector(band.field, band.cut, vertices, spacing, near_cut)
         projector.project(level)
         if target is None:
             break
@@ -261,147 +262,6 @@ def _volume_loop(x, faces, out):
         ) / 6.0
 
 
-@numba.njit(cache=True, nogil=True)
-def _volume_and_rate_loop(x, faces, origin, direction):
-    """Enclosed volume, and its rate of change as the vertices move along their directions."""
-    volume, rate = 0.0, 0.0
-    p, d = np.empty((3, 3)), np.empty((3, 3))
-    for f in range(len(faces)):
-        for k in range(3):
-            for a in range(3):
-                p[k, a] = x[faces[f, k], a] - origin[a]
-                d[k, a] = direction[faces[f, k], a]
-        for k in range(3):
-            a, b = (k + 1) % 3, (k + 2) % 3
-            nx = p[a, 1] * p[b, 2] - p[a, 2] * p[b, 1]
-            ny = p[a, 2] * p[b, 0] - p[a, 0] * p[b, 2]
-            nz = p[a, 0] * p[b, 1] - p[a, 1] * p[b, 0]
-            rate += d[k, 0] * nx + d[k, 1] * ny + d[k, 2] * nz
-            if k == 0:
-                volume += p[0, 0] * nx + p[0, 1] * ny + p[0, 2] * nz
-    return volume / 6.0, rate / 6.0
-
-
 def mesh_volume(vertices, faces):
     """Volume enclosed by a closed outward mesh."""
     return float(_volume_terms(vertices - vertices.mean(axis=0), faces).sum())
-
-
-class _Projector:
-    """Vertices on their way to the zero set of max(f - level, -d).
-
-    ``near_cut`` (n,) marks the vertices that may lie on or come to the cut.
-    """
-
-    def __init__(self, field, cut, vertices, spacing, near_cut):
-        self.vertices = vertices
-        self.spacing = spacing
-        self._field = with_gradient(field, 1e-4 * spacing)
-        self._cut_value = cut
-        self._cut = None if cut is None else with_gradient(cut, 1e-4 * spacing)
-        self._near_cut = near_cut
-        self.slope = np.zeros(len(vertices))
-        self._direction = np.zeros_like(vertices)
-
-    def project(self, level, rounds=6):
-        """Newton steps until they are shorter than 1e-4 of a cell."""
-        on_field = np.ones(len(self.vertices), dtype=bool)
-        todo = np.arange(len(self.vertices))
-        for _ in range(rounds):
-            x = self.vertices[todo]
-            f, gradient = self._field(x)
-            step, slope = np.empty_like(x), np.empty(len(x))
-            _newton_loop(f, np.ascontiguousarray(gradient), level, todo, step, slope, self._direction)
-            self.slope[todo] = slope
-            if self._cut_value is not None:
-                self._turn_to_cut(x, todo, (f - level) * slope, step, on_field)
-            # Newton squares the error: what moved by less than 1 % of a cell is there.
-            unsettled = np.empty(len(x), dtype=np.bool_)
-            _step_loop(todo, step, self.spacing, self.vertices, unsettled)
-            todo = todo[unsettled]
-            if len(todo) == 0:
-                break
-        self._direction[~on_field] = 0.0
-        self.slope[~on_field] = 0.0
-
-    def _turn_to_cut(self, x, todo, height, step, on_field):
-        """Replace the steps of vertices that lie on the cut; marks which lie on the field's own surface."""
-        rows = np.flatnonzero(self._near_cut[todo])
-        if len(rows) == 0:
-            return
-        # The slope of a distance is one; it is worked out only where the cut is the surface.
-        on_cut = height[rows] < -self._cut_value(x[rows])
-        on_field[todo[rows]] = ~on_cut
-        rows = rows[on_cut]
-        if len(rows):
-            distance, outward = self._cut(x[rows])
-            size = np.maximum(np.einsum("ij,ij->i", outward, outward), np.finfo(float).tiny)
-            step[rows] = -(distance / size)[:, None] * outward
-
-    def volume_step(self, faces, target):
-        """Change of level that would bring the mesh to the target volume, to first order."""
-        volume, rate = _volume_and_rate_loop(
-            self.vertices, faces, self.vertices.mean(axis=0), self._direction
-        )
-        lack = target - volume
-        if lack == 0.0:
-            return 0.0
-        if not rate > 0:
-            raise ValueError(f"no level gives a volume of {target:g}: the cut leaves no surface of the field")
-        return lack / rate
-
-    def push_off(self, faces, points, grid, tolerance):
-        """Move the vertices around points that came through a triangle; these no longer follow the level."""
-        for _ in range(2):
-            moved = np.flatnonzero(push_off_points(self.vertices, faces, points, grid, tolerance))
-            self._direction[moved] = 0.0
-            self.slope[moved] = 0.0
-            if self._cut_value is None or len(moved) == 0:
-                break
-            # What was pushed off one bone vertex must not end in the bone beside it.
-            inside = moved[self._cut_value(self.vertices[moved]) < 0.0]
-            if len(inside) == 0:
-                break
-            distance, outward = self._cut(self.vertices[inside])
-            size = np.maximum(np.einsum("ij,ij->i", outward, outward), 1e-12)
-            self.vertices[inside] -= (distance / size)[:, None] * outward
-
-    def shift(self, step):
-        """Move the vertices as the level set moves with its level, to first order."""
-        self.vertices = self.vertices + step * self._direction
-
-
-@numba.njit(cache=True, nogil=True)
-def _newton_loop(f, gradient, level, rows, step, slope, direction):
-    """Newton steps onto f = level, 1 / |g|, and the vertices' motions g / |g|^2 for a change of level."""
-    for n in range(len(rows)):
-        square = gradient[n, 0] ** 2 + gradient[n, 1] ** 2 + gradient[n, 2] ** 2
-        square = max(square, 2.3e-308)
-        slope[n] = 1.0 / np.sqrt(square)
-        for a in range(3):
-            direction[rows[n], a] = gradient[n, a] / square
-            step[n, a] = (level - f[n]) * direction[rows[n], a]
-
-
-@numba.njit(cache=True, nogil=True)
-def _step_loop(rows, step, spacing, vertices, unsettled):
-    """Take the steps, none longer than a cell."""
-    for n in range(len(rows)):
-        length = np.sqrt(step[n, 0] ** 2 + step[n, 1] ** 2 + step[n, 2] ** 2)
-        share = min(1.0, spacing / max(length, 1e-300))
-        for a in range(3):
-            vertices[rows[n], a] += share * step[n, a]
-        unsettled[n] = length > 1e-2 * spacing
-
-
-def with_gradient(function, step):
-    """``points -> (values, gradients)`` of a callable: its own, or central differences."""
-    if hasattr(function, "value_and_gradient"):
-        return function.value_and_gradient
-
-    def differences(points):
-        offsets = step * np.vstack([np.eye(3), -np.eye(3)])
-        around = function((points[None] + offsets[:, None]).reshape(-1, 3)).reshape(6, -1)
-        return function(points), ((around[:3] - around[3:]) / (2 * step)).T
-
-    return differences
