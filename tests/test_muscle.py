@@ -149,6 +149,7 @@ def test_any_kernel_drives_a_muscle(kernel):
     assert np.sqrt((near**2).mean()) < 0.8
 
 
+@pytest.mark.filterwarnings("ignore:kernel .* does not reach")
 def test_a_kernel_that_gives_no_surface_is_a_clear_error():
     scene = phantom_scene().with_options(
         **{"model.kernel": "gaussian", "model.epsilon": 1.0, "model.centres": 100}
