@@ -240,15 +240,31 @@ class MuscleRun:
         """
         import trimesh
 
-        count = len(self.run.frames)
-        if not -count <= frame < count:
-            raise UsageError(f"frame {frame} is out of range, the run has {count} frames")
-        surface = self.run.frames[frame].surfaces[self.name]
+        surface = self._frame(frame).surfaces[self.name]
         return trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+
+    def fibres(self, frame=-1):
+        """Fibres in a frame of the run, `FibreLines`: points, lengths and lengths at rest.
+
+        Raises
+        ------
+        UsageError
+            If the frame is out of range, or the scene did not ask for fibres.
+        """
+        found = self._frame(frame).fibres
+        if self.name not in found:
+            raise UsageError("the run has no fibres: set output.fibres = true in the scene")
+        return found[self.name]
 
     def values(self, quantity):
         """Values of a quantity over the frames, (n,) ndarray."""
         return self.run.values(self.name, quantity)
+
+    def _frame(self, frame):
+        count = len(self.run.frames)
+        if not -count <= frame < count:
+            raise UsageError(f"frame {frame} is out of range, the run has {count} frames")
+        return self.run.frames[frame]
 
     def __repr__(self):
         return f"<{self.name!r} in {self.run!r}>"
@@ -268,9 +284,9 @@ class _Course:
         with self.timed("build"):
             check_initial(self.scene)
             self.models = [build_model(muscle, scene) for muscle in scene.muscles]
-            self.recorder = None
-            if scene.output.metrics:
-                self.recorder = MetricsRecorder(scene, {m.name: m.carried_mesh() for m in self.models})
+            carried = {m.name: m.carried_mesh() for m in self.models}
+            self.recorder = MetricsRecorder(scene, carried) if scene.output.metrics else None
+            self.fibres = _fibre_study(scene, carried) if scene.output.fibres else None
 
     def timed(self, part):
         return _Clock(self.times, part)
@@ -285,6 +301,9 @@ class _Course:
             if frame is None:
                 return
             self.stages.add(frame)
+            if self.fibres is not None:
+                with self.timed("fibres"):
+                    frame.fibres = self.fibres.at(frame)
             if self.recorder is not None:
                 with self.timed("metrics"):
                     self._take(self.recorder.add(frame))
@@ -314,6 +333,12 @@ class _Course:
             limits={name: default_limit(name, self.scene) for name in LIMITS},
             options=self.options,
         )
+
+
+def _fibre_study(scene, carried):
+    from rbfmuscle.study.fibre_study import FibreStudy
+
+    return FibreStudy(scene, carried)
 
 
 class _Clock:

@@ -6,7 +6,15 @@ They check themselves, so the same rules hold for a file, for code and for ``--s
 import difflib
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 
 from rbfmuscle.validation import SceneError
@@ -145,13 +153,26 @@ class SurfaceOptions(Table):
     format: Literal["pvd", "vtp", "ply", "stl", "obj", "glb"] = "pvd"
 
 
+class FibreOptions(Table):
+    """``output.fibres``: fibres of every muscle, carried along and written for every frame."""
+
+    count: Annotated[int, Field(ge=1, le=10_000)] = 100
+    segments: Annotated[int, Field(ge=2, le=200)] = 15
+
+
 class OutputOptions(Table):
     """``[output]``: what a run leaves behind."""
 
     surfaces: SurfaceOptions | Literal[False] = SurfaceOptions()
+    fibres: FibreOptions | Literal[False] = False
     metrics: bool = True
     report: bool = True
     preview: bool = True
+
+    @field_validator("fibres", mode="before")
+    @classmethod
+    def _true_means_defaults(cls, value):
+        return {} if value is True else value
 
 
 class RampOptions(Table):

@@ -58,6 +58,8 @@ class Frame:
         frame before.
     wall : float
         Time for all muscles together [s], since the frame before.
+    fibres : dict of str to FibreLines
+        Empty where no fibres were asked for.
     """
 
     index: int
@@ -68,6 +70,7 @@ class Frame:
     events: list
     times: dict
     wall: float
+    fibres: dict = field(default_factory=dict)
 
 
 class MuscleModel(Protocol):

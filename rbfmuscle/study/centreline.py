@@ -71,12 +71,18 @@ def end_groups(muscle, joints):
         ``points`` (k, 3) are the attached vertices at rest.
     """
     vertices = np.asarray(muscle.mesh.vertices, dtype=float)
+    return [
+        [(a.bone, vertices[np.asarray(a.vertices)]) for a in group] for group in split_ends(muscle, joints)
+    ]
+
+
+def split_ends(muscle, joints):
+    """The attachments of the origin and those of the insertion, as `end_groups` tells them apart."""
     children = {joint.child for joint in joints}
     body = [a.bone if a.bone in children else None for a in muscle.attachments]
-    parts = [(a.bone, vertices[np.asarray(a.vertices)]) for a in muscle.attachments]
-    origin = [part for part, owner in zip(parts, body) if owner == body[0]]
-    insertion = [part for part, owner in zip(parts, body) if owner != body[0]]
-    return [origin, insertion] if insertion else [parts[:1], parts[1:]]
+    origin = [a for a, owner in zip(muscle.attachments, body) if owner == body[0]]
+    insertion = [a for a, owner in zip(muscle.attachments, body) if owner != body[0]]
+    return [origin, insertion] if insertion else [muscle.attachments[:1], muscle.attachments[1:]]
 
 
 def slice_operator(vertices, faces, field, levels):

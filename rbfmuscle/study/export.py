@@ -98,10 +98,27 @@ def _export_meshes(saved, folder, name, frames, factor, ascii):
                     write_mesh(folder / file, vertices * factor, faces)
                 entries.append((item, file))
             groups[group].append((frame, entries))
+        if suffix == ".vtp" and saved.has_fibres():
+            groups.setdefault("fibres", []).append(
+                (frame, _export_fibres(saved, folder, frame, factor, ascii))
+            )
     written = [folder / file for steps in groups.values() for _, entries in steps for _, file in entries]
     if name == "pvd":
         written += [_write_collection(folder / f"{group}.pvd", steps) for group, steps in groups.items()]
     return written
+
+
+def _export_fibres(saved, folder, frame, factor, ascii):
+    from rbfmuscle.study.vtp import write_vtp_lines
+
+    entries = []
+    for muscle in saved.muscles:
+        points, cells = saved.fibres(muscle, frame)
+        cells["length"] = cells["length"] * factor
+        file = f"{muscle}_fibres_{frame:04d}.vtp"
+        write_vtp_lines(folder / file, points * factor, cells=cells, ascii=ascii)
+        entries.append((muscle, file))
+    return entries
 
 
 def _write_collection(path, steps):

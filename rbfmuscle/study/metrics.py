@@ -28,12 +28,17 @@ QUANTITIES = {
     "condition": ("1", "condition estimate of the fit"),
     "length": ("length", "centreline from origin to insertion"),
     "moment_arm": ("length", "minus the change of length with the coordinate's angle"),
+    "fibre_length_mean": ("length", "mean length of the fibres"),
+    "fibre_length_std": ("length", "standard deviation of the fibres' lengths"),
+    "fibre_moment_arm_mean": ("length", "mean over the fibres of their moment arms"),
+    "fibre_moment_arm_std": ("length", "standard deviation of the fibres' moment arms"),
     "time_solve": ("s", "prediction, solution and contacts"),
     "time_fit": ("s", "fit of the field"),
     "time_extract": ("s", "extraction of the surface"),
     "time_frame": ("s", "all of the frame; muscle 'all': wall time of all muscles together"),
 }
 ALL = "all"
+FIBRES = "fibres"
 _FROM_MODEL = ("solver_penetration_max", "condition", "time_fit", "time_extract")
 
 # Events whose points stayed beyond a bone; those turned back or halved away are in events.csv only.
@@ -94,6 +99,7 @@ class MetricsRecorder:
             rows += [self._row(frame, coordinate, angle, name, q, v) for q, v in found.items()]
         rows.append(self._row(frame, coordinate, angle, ALL, "time_frame", frame.wall))
         lengths = {name: tracker.length for name, tracker in self.trackers.items()}
+        lengths.update({(FIBRES, name): lines.lengths for name, lines in frame.fibres.items()})
         self._path = [*self._path[-2:], (dict(frame.coordinates), lengths, frame.index)]
         done = self._waiting + (self._arms(len(self._path) - 2) if self._waiting else [])
         self._waiting = rows
@@ -113,6 +119,13 @@ class MetricsRecorder:
             for name, arm in moment_arms([node[:2] for node in self._path], here, muscle):
                 angle = math.degrees(coordinates.get(name, 0.0))
                 rows.append(Row(index, name, angle, muscle, "moment_arm", arm, unit))
+            if (FIBRES, muscle) not in self._path[here][1]:
+                continue
+            for name, arms in moment_arms([node[:2] for node in self._path], here, (FIBRES, muscle)):
+                angle = math.degrees(coordinates.get(name, 0.0))
+                for quantity, value in (("mean", np.mean(arms)), ("std", np.std(arms))):
+                    quantity = f"fibre_moment_arm_{quantity}"
+                    rows.append(Row(index, name, angle, muscle, quantity, float(value), unit))
         return rows
 
     def _row(self, frame, coordinate, angle, muscle, quantity, value):
@@ -163,6 +176,9 @@ class _Tracker:
         self.length = self.length_of(frame)
         if self.line is not None:
             found["length"] = self.length
+        if self.name in frame.fibres:
+            lengths = frame.fibres[self.name].lengths
+            found.update(fibre_length_mean=np.mean(lengths), fibre_length_std=np.std(lengths))
         times = frame.times.get(self.name, {})
         if times:
             found["time_solve"] = times.get("time_predict", 0.0) + times.get("time_solve", 0.0)
@@ -257,7 +273,8 @@ def moment_arms(path, here, muscle):
     Parameters
     ----------
     path : list of (coordinates, lengths)
-        Neighbouring frames in order: angles [radian] by coordinate, lengths [scene unit] by muscle.
+        Neighbouring frames in order: angles [radian] by coordinate, lengths [scene unit] by muscle; a length
+        may be an array, of fibres.
     here : int
         Place in the path.
     muscle : str
@@ -274,7 +291,7 @@ def moment_arms(path, here, muscle):
             continue
         (q0, l0), (q1, l1) = path[k], path[k + 1]
         changed = [n for n in {*q0, *q1} if abs(q1.get(n, 0.0) - q0.get(n, 0.0)) > 1e-9]
-        if len(changed) == 1 and math.isfinite(l0[muscle]) and math.isfinite(l1[muscle]):
+        if len(changed) == 1 and np.isfinite(l0[muscle]).all() and np.isfinite(l1[muscle]).all():
             step = q1.get(changed[0], 0.0) - q0.get(changed[0], 0.0)
             slopes[changed[0]].append((step, (l1[muscle] - l0[muscle]) / step))
     return [(name, -_combine(found)) for name, found in slopes.items()]

@@ -6,6 +6,14 @@ import numpy as np
 
 from rbfmuscle.validation import UsageError
 
+# Quantity: title of its file, for one coordinate.
+_TITLES = {
+    "length": "Length",
+    "moment_arm": "MomentArm_{}",
+    "fibre_length_mean": "FibreLength",
+    "fibre_moment_arm_mean": "FibreMomentArm_{}",
+}
+
 
 def write_sto(path, name, columns):
     """Write an OpenSim storage file.
@@ -37,7 +45,8 @@ def export_lengths(saved, folder, frames, factor):
     ----------
     saved : SavedRun
     folder : pathlib.Path
-        Takes ``Length.sto``, ``MomentArm_COORDINATE.sto`` for each coordinate and ``moment_arms.csv``.
+        Takes ``Length.sto``, ``MomentArm_COORDINATE.sto`` for each coordinate, the same of the fibres' means
+        where there are fibres, and ``moment_arms.csv``.
     frames : list of int
         Frames to write; the frame's number is its time.
     factor : float
@@ -52,11 +61,11 @@ def export_lengths(saved, folder, frames, factor):
     UsageError
         If the run measured no lengths.
     """
-    rows = [row for row in saved.metrics if row.quantity in ("length", "moment_arm")]
+    rows = [row for row in saved.metrics if row.quantity in _TITLES]
     place = {frame: k for k, frame in enumerate(frames)}
     tables = {}
     for row in rows:
-        title = "Length" if row.quantity == "length" else f"MomentArm_{row.coordinate}"
+        title = _TITLES[row.quantity].format(row.coordinate)
         table = tables.setdefault(title, {"time": np.array(frames, dtype=float)})
         values = table.setdefault(row.muscle, np.full(len(frames), np.nan))
         if row.frame in place:

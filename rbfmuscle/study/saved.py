@@ -95,6 +95,24 @@ class SavedRun:
         """Whether there is something to draw."""
         return self.suffix is not None and bool(self.frames)
 
+    def has_fibres(self):
+        """Whether the run wrote fibres."""
+        return bool(self.info["scene"]["output"].get("fibres"))
+
+    def fibres(self, muscle, frame):
+        """Points (count, k, 3) of the fibres of a muscle in a frame, and their ``length`` and ``stretch``.
+
+        Raises
+        ------
+        UsageError
+            If the run wrote none.
+        """
+        from rbfmuscle.study.fibre_files import read_fibres
+
+        if not self.has_fibres():
+            raise UsageError(f"{self.directory} has no fibres: set output.fibres = true in the run's scene")
+        return read_fibres(self.directory / "fibres" / f"{muscle}_{frame:04d}.vtp")
+
     def _file(self, folder, name, frame):
         if self.suffix is None:
             raise UsageError(f"{self.directory} has no surfaces: the run's scene had output.surfaces = false")

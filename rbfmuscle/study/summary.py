@@ -32,8 +32,8 @@ class Summary:
         """Take in rows of metrics."""
         for row in rows:
             quantity = row.quantity
-            if quantity == "moment_arm":
-                quantity = f"moment_arm:{row.coordinate}"
+            if "moment_arm" in quantity:
+                quantity = f"{quantity}:{row.coordinate}"
             self._values[row.muscle][quantity].append((row.frame, row.value))
             self._units[quantity] = row.unit
 

@@ -27,17 +27,48 @@ def write_vtp(path, vertices, faces, *, ascii=False, single=False):
     vertices = np.ascontiguousarray(vertices, dtype=np.float32 if single else np.float64)
     faces = np.ascontiguousarray(faces, dtype=np.int32)
     ends = np.arange(3, 3 * len(faces) + 1, 3, dtype=np.int32)
+    _write_polydata(path, vertices, ("Polys", faces.ravel(), ends), {}, ascii)
+
+
+def write_vtp_lines(path, points, *, cells=None, ascii=False):
+    """Write polylines of equally many points as VTK XML PolyData.
+
+    Parameters
+    ----------
+    path : path
+    points : (count, k, 3) array_like
+    cells : dict of str to (count,) array_like, optional
+        Values of each line.
+    ascii : bool
+        Plain numbers; else compressed base64.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    count, each = points.shape[:2]
+    numbers = np.arange(count * each, dtype=np.int32)
+    ends = each * np.arange(1, count + 1, dtype=np.int32)
+    values = {name: np.ascontiguousarray(value, dtype=np.float64) for name, value in (cells or {}).items()}
+    positions = np.ascontiguousarray(points.reshape(-1, 3))
+    _write_polydata(path, positions, ("Lines", numbers, ends), values, ascii)
+
+
+def _write_polydata(path, points, cells, values, ascii):
+    """Points, one kind of cells as (kind, point numbers, ends), and values of the cells by name."""
+    kind, numbers, ends = cells
+    counts = {name: len(ends) * (name == kind) for name in ("Verts", "Lines", "Strips", "Polys")}
+    numbered = " ".join(f'NumberOf{name}="{count}"' for name, count in counts.items())
     compressor = "" if ascii else ' compressor="vtkZLibDataCompressor"'
+    data = [_array(value, name, ascii) for name, value in values.items()]
     parts = [
         '<?xml version="1.0"?>\n',
         '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt32"',
-        f'{compressor}>\n<PolyData>\n<Piece NumberOfPoints="{len(vertices)}" NumberOfVerts="0" ',
-        f'NumberOfLines="0" NumberOfStrips="0" NumberOfPolys="{len(faces)}">\n<Points>\n',
-        _array(vertices, "Points", ascii, components=3),
-        "</Points>\n<Polys>\n",
-        _array(faces.ravel(), "connectivity", ascii),
+        f'{compressor}>\n<PolyData>\n<Piece NumberOfPoints="{len(points)}" {numbered}>\n<Points>\n',
+        _array(points, "Points", ascii, components=3),
+        f"</Points>\n<{kind}>\n",
+        _array(numbers, "connectivity", ascii),
         _array(ends, "offsets", ascii),
-        "</Polys>\n</Piece>\n</PolyData>\n</VTKFile>\n",
+        f"</{kind}>\n",
+        *(["<CellData>\n", *data, "</CellData>\n"] if data else []),
+        "</Piece>\n</PolyData>\n</VTKFile>\n",
     ]
     Path(path).write_text("".join(parts), encoding="ascii")
 

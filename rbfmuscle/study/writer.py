@@ -16,6 +16,18 @@ METRICS_COLUMNS = ("frame", "coordinate", "angle", "muscle", "quantity", "value"
 EVENTS_COLUMNS = ("frame", "muscle", "bone", "count", "action")
 POSES_COLUMNS = ("frame", "bone", *(f"m{i}{j}" for i in range(4) for j in range(4)))
 
+# Of an earlier run in the same folder.
+_OLD_FILES = (
+    "run.json",
+    "surfaces.pvd",
+    "bones.pvd",
+    "fibres.pvd",
+    "fibre_lengths.csv",
+    "metrics.csv",
+    "report.html",
+    "preview.webp",
+)
+
 
 class RunWriter:
     """Streams frames to a folder; nothing of a frame is kept in memory.
@@ -48,6 +60,7 @@ class RunWriter:
             if output.metrics:
                 self._tables.append(self._table("metrics.csv", METRICS_COLUMNS))
             self._collections = self._open_collections()
+            self._fibres = _fibre_files(self.directory) if output.fibres else None
         except OSError as error:
             raise UsageError(
                 f"cannot write to {self.directory}: {error.strerror}; choose another folder"
@@ -88,6 +101,8 @@ class RunWriter:
                 file.close()
             for collection in self._collections.values():
                 collection.close()
+            if self._fibres is not None:
+                self._fibres.close()
         except OSError as error:
             raise SolveError(f"cannot finish the tables in {self.directory}: {error.strerror}") from None
 
@@ -114,6 +129,8 @@ class RunWriter:
         events.writerows([e.frame, e.muscle, e.bone, e.count, e.action] for e in frame.events)
         poses_file.flush()
         events_file.flush()
+        if self._fibres is not None:
+            self._fibres.write(frame)
         self._add_rows(rows)
 
     def _add_rows(self, rows):
@@ -139,12 +156,12 @@ class RunWriter:
     def _clear(self):
         """Make the folders, without the files of a run that was here before."""
         self.directory.mkdir(parents=True, exist_ok=True)
-        for old in ("run.json", "surfaces.pvd", "bones.pvd", "metrics.csv", "report.html", "preview.webp"):
+        for old in _OLD_FILES:
             (self.directory / old).unlink(missing_ok=True)
-        for folder in ("surfaces", "bones"):
+        for folder in ("surfaces", "bones", "fibres"):
             for file in (self.directory / folder).glob("*_[0-9][0-9][0-9][0-9]*.*"):
                 file.unlink()
-            if self.format is not None:
+            if self.format is not None and folder != "fibres":
                 (self.directory / folder).mkdir(exist_ok=True)
 
     def _table(self, name, columns):
@@ -158,6 +175,12 @@ class RunWriter:
         if self.format != "pvd":
             return {}
         return {name: Collection(self.directory / f"{name}.pvd") for name in ("surfaces", "bones")}
+
+
+def _fibre_files(directory):
+    from rbfmuscle.study.fibre_files import FibreFiles
+
+    return FibreFiles(directory)
 
 
 def write_json(path, data):
