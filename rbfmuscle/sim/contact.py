@@ -179,14 +179,14 @@ class BoneContacts:
         source = np.concatenate([np.full(len(part[0]), part[3], dtype=np.int64) for part in parts])
         return HalfSpaces(index, gap, normal, source)
 
-    def lower_bound(self, points, bone_index):
-        """What is known of the contact points' distances (n,) to a bone without asking its field."""
-        bounds = np.asarray(self.fields[bone_index].bounds, dtype=np.float64)
-        out = np.empty(len(points))
-        _bound_loop(
-            points, self.poses[self.names[bone_index]], bounds, *self._answers(len(points), bone_index), out
-        )
-        return out
+    def known(self, count, bone_index):
+        """Earlier places (count, 3) of the contact points in a bone's coordinates, and distances (count,) there.
+
+        The distances are lower bounds, -infinity where nothing is known; they hold wherever the bone goes.
+        """
+        if bone_index not in self._known or len(self._known[bone_index][1]) != count:
+            self._known[bone_index] = np.zeros((count, 3)), np.full(count, -np.inf)
+        return self._known[bone_index]
 
     def free(self, count):
         """Mask (n,) of the contact points that are attached to no bone."""
@@ -209,17 +209,8 @@ class BoneContacts:
         """Contact points that may be nearer than their ``reach`` to bone b, by its box and by earlier answers."""
         pose, bounds = self.poses[self.names[b]], np.asarray(self.fields[b].bounds, dtype=np.float64)
         found = np.zeros(len(points), dtype=np.int64)
-        count = _near_loop(points, free, pose, bounds, reach, *self._answers(len(points), b), found)
+        count = _near_loop(points, free, pose, bounds, reach, *self.known(len(points), b), found)
         return found[:count]
-
-    def _answers(self, count, b):
-        """Earlier places (count, 3) of the contact points in the bone's coordinates, and their distances there.
-
-        They hold wherever the bone goes.
-        """
-        if b not in self._known or len(self._known[b][1]) != count:
-            self._known[b] = np.zeros((count, 3)), np.full(count, -np.inf)
-        return self._known[b]
 
     def _remember(self, points, near, distance, b):
         _remember_loop(points, self.poses[self.names[b]], near, distance, *self._known[b])
@@ -285,9 +276,3 @@ def _near_loop(points, free, pose, bounds, reach, anchor, bound, found):
             found[count] = i
             count += 1
     return count
-
-
-@numba.njit(cache=True, nogil=True)
-def _bound_loop(points, pose, bounds, anchor, bound, out):
-    for i in range(len(points)):
-        out[i] = _lower_bound(points, i, pose, bounds, anchor, bound)

@@ -18,6 +18,8 @@ RIGHT_ANGLE_AND_HALF = 0.75 * math.pi
 STEP_SHARE = 0.9
 # A path that leaves a bone facing within 90 degrees of where it went in has slid along, not passed through.
 SLIDING_COSINE = 0.0
+# Times that a path is halved to show that it stays clear, before it is traced.
+HALVINGS = 5
 # Rounds of tracing after which what is still under way counts as traced to where it is.
 MAX_ROUNDS = 10_000
 
@@ -80,14 +82,17 @@ def sweep_paths(field, start, end, *, tolerance, angle=RIGHT_ANGLE_AND_HALF):
         nothing = np.zeros(0, dtype=bool)
         return Sweep(index, np.zeros(0), nothing, nothing)
     start, end = start[index], end[index]
-    lowest, first, last = _trace(field, start, end, tolerance)
-    deep = lowest < -tolerance
+    lowest = _halve(field, start, end, distance[index], tolerance)
     through = np.zeros(len(index), dtype=bool)
-    if deep.any():
+    # What halving leaves open.
+    deep = np.flatnonzero(lowest < -tolerance)
+    if len(deep):
+        lowest[deep], first, last = _trace(field, start[deep], end[deep], tolerance)
         way = end[deep] - start[deep]
-        entry = _directions(field, start[deep] + first[deep, None] * way)
-        leave = _directions(field, start[deep] + last[deep, None] * way)
-        through[deep] = np.einsum("ij,ij->i", entry, leave) < SLIDING_COSINE
+        entry = _directions(field, start[deep] + first[:, None] * way)
+        leave = _directions(field, start[deep] + last[:, None] * way)
+        turned = np.einsum("ij,ij->i", entry, leave) < SLIDING_COSINE
+        through[deep] = turned & (lowest[deep] < -tolerance)
     cosine = np.einsum("ij,ij->i", _directions(field, start), _directions(field, end))
     return Sweep(index, lowest, through, cosine < math.cos(angle))
 
@@ -116,9 +121,11 @@ def find_crossings(contacts, start, end, before, after, options, *, tolerance):
     for b in contacts.reached:
         name = contacts.names[b]
         back = np.linalg.inv(before[name]), np.linalg.inv(after[name])
-        bound = contacts.lower_bound(end, b)
-        count, index, first, second = _candidates(start, end, *back, bound, contacts.free(len(end)))
-        if count == 0:
+        bounds = np.asarray(contacts.fields[b].bounds, dtype=np.float64)
+        index, first, second = _candidates(
+            start, end, *back, bounds, *contacts.known(len(end), b), contacts.free(len(end))
+        )
+        if len(index) == 0:
             continue
         sweep = sweep_paths(
             contacts.fields[b], first, second, tolerance=tolerance, angle=math.radians(options.angle)
@@ -157,6 +164,34 @@ def rigid_fit(points, targets):
     return transform
 
 
+def _halve(field, start, end, distance, tolerance):
+    """Smallest distance found along each path by halving it; -infinity where that does not show it clear.
+
+    Between two places s apart, at distances d and d' from the bone, nothing is deeper than (s - d - d') / 2.
+    """
+    length = np.linalg.norm(end - start, axis=1) / STEP_SHARE
+    last = field.distance(end)
+    lowest = np.minimum(distance, last)
+    # Pieces: which path, where they begin (fraction), the distances at their ends.
+    path, at, near, far, size = np.arange(len(start)), np.zeros(len(start)), distance, last, 1.0
+    for halvings in range(HALVINGS + 1):
+        left = near + far - size * length[path] < -2.0 * tolerance
+        path, at, near, far = path[left], at[left], near[left], far[left]
+        if len(path) == 0 or halvings == HALVINGS:
+            break
+        size *= 0.5
+        middle = at + size
+        between = field.distance(start[path] + middle[:, None] * (end[path] - start[path]))
+        np.minimum.at(lowest, path, between)
+        path, at = np.concatenate([path, path]), np.concatenate([at, middle])
+        near, far = np.concatenate([near, between]), np.concatenate([between, far])
+        clear = lowest[path] >= -tolerance
+        path, at, near, far = path[clear], at[clear], near[clear], far[clear]
+    lowest[path] = -np.inf
+    lowest[lowest < -tolerance] = -np.inf
+    return lowest
+
+
 def _trace(field, start, end, tolerance):
     """Smallest distance along each path, and the first and last place (fraction) that was inside."""
     length = np.linalg.norm(end - start, axis=1)
@@ -186,30 +221,43 @@ def _directions(field, points):
     return gradient / np.maximum(np.linalg.norm(gradient, axis=1), 1e-12)[:, None]
 
 
-def _candidates(start, end, back_before, back_after, bound, free):
+def _candidates(start, end, back_before, back_after, bounds, anchor, known, free):
+    """Free points whose paths may touch the bone, and those paths in bone coordinates."""
     first, second = np.empty_like(start), np.empty_like(end)
     index = np.empty(len(start), dtype=np.int64)
-    count = _candidates_loop(start, end, back_before, back_after, bound, free, index, first, second)
-    return count, index[:count], first[:count], second[:count]
+    count = _candidates_loop(
+        start, end, back_before, back_after, bounds, anchor, known, free, index, first, second
+    )
+    return index[:count], first[:count], second[:count]
 
 
 @numba.njit(cache=True, nogil=True)
-def _candidates_loop(start, end, back_before, back_after, bound, free, index, first, second):
-    """Paths, in bone coordinates, of the free points not farther from the bone than their path is long."""
+def _candidates_loop(start, end, back_before, back_after, bounds, anchor, known, free, index, first, second):
+    """Leave out paths that are shorter than what is known of their end's distance to the bone.
+
+    That is the distance to the bone's box, and an earlier answer less the way since, (x + y)^2 <= 2 x^2 + 2 y^2.
+    """
     count = 0
     for i in range(len(start)):
         if not free[i]:
             continue
-        squared = 0.0
+        way, moved, outside = 0.0, 0.0, 0.0
         for k in range(3):
             a, b = back_before[k, 3], back_after[k, 3]
             for j in range(3):
                 a += back_before[k, j] * start[i, j]
                 b += back_after[k, j] * end[i, j]
             first[count, k], second[count, k] = a, b
-            squared += (b - a) ** 2
-        if bound[i] > 0.0 and squared < bound[i] * bound[i]:
+            way += (b - a) ** 2
+            moved += (b - anchor[i, k]) ** 2
+            beyond = max(bounds[0, k] - b, b - bounds[1, k], 0.0)
+            outside += beyond * beyond
+        if way < outside:
             continue
+        if known[i] > 0.0:
+            square = known[i] * known[i]
+            if 2.0 * (way + moved) < square or np.sqrt(way) + np.sqrt(moved) < known[i]:
+                continue
         index[count] = i
         count += 1
     return count
