@@ -20,6 +20,7 @@ _HOME = {
     "Scene": "rbfmuscle.sim.scene",
     "SceneError": "rbfmuscle.validation",
     "SolveError": "rbfmuscle.validation",
+    "compare_models": "rbfmuscle.compare",
     "phantom_scene": "rbfmuscle.sim.phantom",
     "simulate": "rbfmuscle.run",
     "study_kernels": "rbfmuscle.study.kernel_study",

@@ -15,6 +15,7 @@ from cyclopts import App, CycloptsError
 from rbfmuscle import __version__
 from rbfmuscle.commands.cache import cache_app
 from rbfmuscle.commands.check import check
+from rbfmuscle.commands.compare import compare
 from rbfmuscle.commands.kernels import kernels
 from rbfmuscle.commands.new import new
 from rbfmuscle.commands.plan import plan
@@ -30,7 +31,7 @@ INTERRUPTED = 130
 app = App(
     name="rbfmuscle", help="Muscles as implicit RBF surfaces that move with the bones.", version=__version__
 )
-for command in (demo, check, plan, run, sweep, export, render, new, view, sdf, kernels):
+for command in (demo, check, plan, run, compare, sweep, export, render, new, view, sdf, kernels):
     app.command(command)
 app.command(cache_app)
 

@@ -35,13 +35,14 @@ def build_model(muscle, scene, name=None):
         On an unknown name, with the nearest right one.
     """
     name = muscle.model if name is None else name
-    module, class_name, implied = _HOME[_check_name(name)]
-    same_class = _HOME[_check_name(muscle.model)][1] == class_name
+    module, class_name, implied = _HOME[check_model_name(name)]
+    same_class = _HOME[check_model_name(muscle.model)][1] == class_name
     options = {**(muscle.options if same_class else {}), **implied}
     return getattr(importlib.import_module(module), class_name)(muscle, scene, **options)
 
 
-def _check_name(name):
+def check_model_name(name):
+    """Return a model's name, or raise UsageError with the nearest right one."""
     if name in _HOME:
         return name
     near = difflib.get_close_matches(str(name).lower().replace("_", "-"), MODEL_NAMES, n=1, cutoff=0.5)

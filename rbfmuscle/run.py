@@ -59,7 +59,16 @@ def simulate(scene, model=None, *, frames=None, progress=None, **settings):
 
 
 def stream_run(
-    scene, directory, *, model=None, frames=None, settings=None, fail_on=None, pictures=True, progress=None
+    scene,
+    directory,
+    *,
+    model=None,
+    frames=None,
+    settings=None,
+    fail_on=None,
+    pictures=True,
+    progress=None,
+    watch=None,
 ):
     """Run a scene and write it to a folder frame by frame; memory does not grow with the frames.
 
@@ -76,6 +85,8 @@ def stream_run(
         Limits, see `rbfmuscle.study.summary.parse_limits`.
     pictures : bool
         Draw pictures for the report and the preview.
+    watch : callable, optional
+        Called as ``watch(models, None)`` before the motion and ``watch(models, frame)`` with every frame.
 
     Returns
     -------
@@ -99,8 +110,12 @@ def stream_run(
     try:
         writer.write_info(course.info(writer.frames, "running"))
         driven = _bones_driven_together(course)
+        if watch is not None:
+            watch(course.models, None)
         for frame in course.frames():
             frame.events.extend(driven.get(frame.index, []))
+            if watch is not None:
+                watch(course.models, frame)
             with course.timed("write"):
                 writer.write(frame, course.fresh)
             if progress is not None:

@@ -1,6 +1,8 @@
 """What several test files share."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -28,3 +30,12 @@ def hip_scene(hip_data):
     from rbfmuscle.sim.scene import Scene
 
     return Scene.load(hip_data / "flexion.toml")
+
+
+@pytest.fixture(scope="session")
+def graphics():
+    """Skip where VTK cannot draw; asked in a process of its own, which it may end."""
+    code = "import pyvista as p; q = p.Plotter(off_screen=True); q.add_mesh(p.Cube()); q.screenshot(None)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=120, check=False)
+    if done.returncode != 0:
+        pytest.skip("no graphics here")

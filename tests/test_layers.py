@@ -17,6 +17,7 @@ ALLOWED = {
     "pbd_baseline": ("pbd_baseline", "rbfmuscle.sim", "rbfmuscle.validation"),
     "rbfmuscle.commands": (
         "rbfmuscle.commands",
+        "rbfmuscle.compare",
         "rbfmuscle.models",
         "rbfmuscle.run",
         "rbfmuscle.implicit",
@@ -28,6 +29,7 @@ ALLOWED = {
 }
 ALLOWED["rbfmuscle.cli"] = ALLOWED["rbfmuscle.commands"]
 ALLOWED["rbfmuscle.run"] = ALLOWED["rbfmuscle.commands"]
+ALLOWED["rbfmuscle.compare"] = ALLOWED["rbfmuscle.commands"]
 # The model's own files at the top level: they join a field to the simulation.
 MODEL_FILES = (
     "rbfmuscle.muscle",

@@ -3,8 +3,6 @@
 import base64
 import io
 import re
-import subprocess
-import sys
 from html.parser import HTMLParser
 from types import SimpleNamespace
 
@@ -29,15 +27,6 @@ def folder(tmp_path_factory):
         use_blend_model(patch)
         simulate(arm_scene(end=60)).save(place)
     return place
-
-
-@pytest.fixture(scope="module")
-def graphics():
-    """Skip where VTK cannot draw; asked in a process of its own, which it may end."""
-    code = "import pyvista as p; q = p.Plotter(off_screen=True); q.add_mesh(p.Cube()); q.screenshot(None)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=120, check=False)
-    if done.returncode != 0:
-        pytest.skip("no graphics here")
 
 
 class Balance(HTMLParser):

@@ -33,7 +33,7 @@ class Progress:
 
     def __call__(self, done, total):
         if self.bar is not None:
-            self.bar.update(self.task, completed=done, total=total)
+            self.bar.update(self.task, description=self.title, completed=done, total=total)
         elif done == total or time.monotonic() - self.last >= EVERY:
             self.last = time.monotonic()
             print(f"{self.title}: {self.what} {done} of {total}", file=sys.stderr)

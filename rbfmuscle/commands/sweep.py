@@ -9,10 +9,10 @@ from cyclopts import Parameter
 
 from rbfmuscle.commands.progress import Progress
 from rbfmuscle.commands.run import Json, Output
+from rbfmuscle.commands.scenes import load_scene
 from rbfmuscle.validation import SolveError, UsageError
 
 Texts = Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)]
-PHANTOM = "phantom"
 
 
 def sweep(
@@ -100,7 +100,7 @@ def _measure(scene, output, grid, model, frames, reference, jobs, scheduler, par
     from rbfmuscle.study.sweep_points import SweepRunner
 
     axes = parse_grid(grid or [])
-    loaded = _load(scene).with_options(model=model)
+    loaded = load_scene(scene).with_options(model=model)
     chosen = dict(parse_setting(text) for text in reference or [])
     plan = plan_sweep(loaded, axes, frames=frames, reference=chosen)
     with Progress(f"sweep of {loaded.name}", what="point") as progress:
@@ -114,16 +114,6 @@ def _measure(scene, output, grid, model, frames, reference, jobs, scheduler, par
                 f"interrupted; finished points are kept in {output}, the same command goes on"
             ) from None
     return plan, runner.total
-
-
-def _load(scene):
-    from rbfmuscle.sim.scene import Scene
-
-    if scene == PHANTOM and not Path(scene).exists():
-        from rbfmuscle.sim.phantom import phantom_scene
-
-        return phantom_scene()
-    return Scene.load(Path(scene))
 
 
 def _finish_task(plan, measured, output, as_json):

@@ -8,6 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from rbfmuscle.commands.scenes import load_scene
 from rbfmuscle.validation import UsageError
 
 # What each quality changes in a muscle's model table; "as given" changes nothing.
@@ -16,7 +17,6 @@ QUALITIES = {
     "fast": {"rbf": {"resolution": 32, "samples": 1000}},
     "fine": {"rbf": {"resolution": 64}},
 }
-PHANTOM = "phantom"
 
 
 def view(
@@ -98,7 +98,7 @@ def _open_scene(path, model):
     from rbfmuscle.sim.live import LiveSession
     from rbfmuscle.study.viewer import LiveViewer
 
-    scene = _load(path).with_options(model=model)
+    scene = load_scene(path).with_options(model=model)
     scene.validate()
     print(f"rbfmuscle: preparing {scene.name}", file=sys.stderr)
     models = [scene.muscles[0].model]
@@ -121,13 +121,3 @@ def build_models(scene):
 
     with ThreadPoolExecutor() as pool:
         return list(pool.map(lambda muscle: build_model(muscle, scene), scene.muscles))
-
-
-def _load(path):
-    from rbfmuscle.sim.scene import Scene
-
-    if str(path) == PHANTOM and not path.exists():
-        from rbfmuscle.sim.phantom import phantom_scene
-
-        return phantom_scene()
-    return Scene.load(path)

@@ -7,7 +7,7 @@ import numpy as np
 from rbfmuscle.study.appearance import line_colours
 from rbfmuscle.study.metrics import ALL
 
-_STYLE = {
+PLOT_STYLE = {
     "font.size": 9,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -75,7 +75,7 @@ def plot_panels(saved):
 
     axis, label = motion_axis(saved)
     pictures = []
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(PLOT_STYLE):
         for title, quantity, factor, unit, both in PANELS:
             figure = Figure(figsize=(4.6, 2.7), layout="constrained")
             FigureCanvasSVG(figure)

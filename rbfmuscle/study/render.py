@@ -23,6 +23,8 @@ VIEWS = {
 }
 ANIMATIONS = (".webp", ".gif")
 _STRIP = 30
+_PAINT = "paint"
+PAINT_COLOURS = "viridis"
 _BONE_TRIANGLES = 12_000
 _TIMEOUT = 1800
 
@@ -72,7 +74,7 @@ def render_run(directory, output, *, frame=None, views=None, size=(420, 520), se
     )
 
 
-def draw(directory, jobs, seconds=5.0):
+def draw(directory, jobs, seconds=5.0, *, module="rbfmuscle.study.render"):
     """Draw pictures in a child process.
 
     Parameters
@@ -82,13 +84,15 @@ def draw(directory, jobs, seconds=5.0):
         ``file``, ``frames``, ``views``, ``size``; several frames make an animation.
     seconds : float
         Length of an animation.
+    module : str
+        What draws them, run with ``-m``.
 
     Raises
     ------
     MissingPartError
         If the child cannot draw; the message holds its last words.
     """
-    command = [sys.executable, "-m", "rbfmuscle.study.render", str(directory)]
+    command = [sys.executable, "-m", module, str(directory)]
     text = json.dumps({"jobs": jobs, "seconds": seconds})
     try:
         done = subprocess.run(
@@ -105,45 +109,53 @@ def draw(directory, jobs, seconds=5.0):
 
 
 class Stage:
-    """An off-screen window with several views of a scene, each aimed at the muscles' whole path."""
+    """An off-screen window with several panels, each aimed at the muscles' whole path.
 
-    def __init__(self, saved, views, size):
+    Parameters
+    ----------
+    rows : list of list of (SavedRun, str)
+        What each panel shows: a run, and the view of it. Runs of several panels are of one scene.
+    size : (width, height)
+        Of a panel [pixel].
+    paint : callable, optional
+        ``paint(saved, muscle, frame, vertices)`` gives values (n,) from 0 to 1 to colour a muscle by; plain
+        colours where not given.
+    """
+
+    def __init__(self, rows, size, paint=None):
         import pyvista
 
-        self.saved, self.views = saved, views
-        shape = (1, len(views))
-        window = (size[0] * len(views), size[1])
+        self.paint = paint
+        self.panels = [
+            (i, j, saved, view) for i, row in enumerate(rows) for j, (saved, view) in enumerate(row)
+        ]
+        shape = (len(rows), len(rows[0]))
+        window = (size[0] * shape[1], size[1] * shape[0])
         self.plotter = pyvista.Plotter(off_screen=True, shape=shape, border=False, window_size=window)
         self.plotter.set_background(BACKGROUND)
-        self.colours = muscle_colours(saved.muscles)
-        bounds = _path_bounds(saved)
-        self.bones = []
-        for name in saved.bones:
-            mesh = pyvista.make_tri_mesh(*saved.bone(name))
-            if mesh.n_cells > _BONE_TRIANGLES:  # software drawing pays for each of them in every frame
-                mesh = mesh.decimate(1.0 - _BONE_TRIANGLES / mesh.n_cells)
-            mesh = mesh.compute_normals(split_vertices=False, auto_orient_normals=False)
-            self.bones.append((name, [self._add(k, mesh, BONE_COLOUR) for k in range(len(views))]))
+        first = rows[0][0][0]
+        self.first, self.colours = first, muscle_colours(first.muscles)
+        self.bones = [(name, self._add_bone(first.bone(name))) for name in first.bones]
         self.skins = []
-        for k, view in enumerate(views):
-            self.plotter.subplot(0, k)
+        bounds = _path_bounds({id(saved): saved for row in rows for saved, _ in row}.values())
+        for i, j, _, view in self.panels:
+            self.plotter.subplot(i, j)
             self._aim(VIEWS[view][0], bounds, size)
             self.plotter.enable_anti_aliasing("ssaa")
 
     def show(self, frame):
         """Put bones and muscles where they are in a frame, and return the picture (h, w, 3) uint8."""
-        import pyvista
-
         for name, actors in self.bones:
             for actor in actors:
-                actor.user_matrix = self.saved.poses[frame][name]
+                actor.user_matrix = self.first.poses[frame][name]
         for actor in self.skins:
             self.plotter.remove_actor(actor, render=False)
-        self.skins = []
-        for muscle in self.saved.muscles:
-            mesh = pyvista.make_tri_mesh(*self.saved.surface(muscle, frame))
-            mesh = mesh.compute_normals(split_vertices=False, auto_orient_normals=False)
-            self.skins += [self._add(k, mesh, self.colours[muscle]) for k in range(len(self.views))]
+        self.skins, meshes = [], {}
+        for i, j, saved, _ in self.panels:
+            for muscle in saved.muscles:
+                if (id(saved), muscle) not in meshes:
+                    meshes[id(saved), muscle] = self._skin(saved, muscle, frame)
+                self.skins.append(self._add(i, j, meshes[id(saved), muscle], self.colours[muscle]))
         for renderer in self.plotter.renderers:
             renderer.ResetCameraClippingRange()
         self.plotter.render()  # a screenshot alone shows what was drawn last
@@ -152,11 +164,34 @@ class Stage:
     def close(self):
         self.plotter.close()
 
-    def _add(self, column, mesh, colour):
-        self.plotter.subplot(0, column)
+    def _add_bone(self, mesh):
+        import pyvista
+
+        mesh = pyvista.make_tri_mesh(*mesh)
+        if mesh.n_cells > _BONE_TRIANGLES:  # software drawing pays for each of them in every frame
+            mesh = mesh.decimate(1.0 - _BONE_TRIANGLES / mesh.n_cells)
+        mesh = mesh.compute_normals(split_vertices=False, auto_orient_normals=False)
+        return [self._add(i, j, mesh, BONE_COLOUR) for i, j, _, _ in self.panels]
+
+    def _skin(self, saved, muscle, frame):
+        import pyvista
+
+        mesh = pyvista.make_tri_mesh(*saved.surface(muscle, frame))
+        mesh = mesh.compute_normals(split_vertices=False, auto_orient_normals=False)
+        if self.paint is not None:
+            mesh.point_data[_PAINT] = self.paint(saved, muscle, frame, np.asarray(mesh.points))
+        return mesh
+
+    def _add(self, row, column, mesh, colour):
+        self.plotter.subplot(row, column)
+        painted = _PAINT in mesh.point_data
         return self.plotter.add_mesh(
             mesh,
-            color=colour,
+            color=None if painted else colour,
+            scalars=_PAINT if painted else None,
+            cmap=PAINT_COLOURS,
+            clim=(0.0, 1.0),
+            show_scalar_bar=False,
             smooth_shading=True,
             specular=0.25,
             specular_power=18,
@@ -185,10 +220,14 @@ class Stage:
         camera.parallel_scale = 1.04 * max(tall, wide)
 
 
-def _path_bounds(saved):
-    """Box around the muscles in the first, middle and last frame."""
-    frames = sorted({saved.frames[0], saved.frames[len(saved.frames) // 2], saved.frames[-1]})
-    points = [saved.surface(muscle, frame)[0] for frame in frames for muscle in saved.muscles]
+def _path_bounds(runs):
+    """Box around the muscles of all runs in the first, middle and last frame."""
+    points = [
+        saved.surface(muscle, frame)[0]
+        for saved in runs
+        for frame in sorted({saved.frames[0], saved.frames[len(saved.frames) // 2], saved.frames[-1]})
+        for muscle in saved.muscles
+    ]
     return np.array(
         [np.min([p.min(axis=0) for p in points], axis=0), np.max([p.max(axis=0) for p in points], axis=0)]
     )
@@ -201,58 +240,72 @@ def caption(saved, frame):
     return ", ".join([f"frame {frame}", *angles])
 
 
-def labelled(image, text, names, views):
-    """Image with the views' names above, and below a strip with the caption and the muscles' colours."""
+def labelled(image, text, titles, chips):
+    """Image with a title above each column, and below a strip with a caption and what colours mean.
+
+    Parameters
+    ----------
+    image : (h, w, 3) ndarray of uint8
+    text : str
+    titles : list of str
+    chips : dict of str to colour
+    """
     from PIL import Image, ImageDraw, ImageFont
 
     font = ImageFont.load_default(13)
     height, width = image.shape[:2]
-    chips = list(muscle_colours(names).items())
-    sheet = Image.new("RGB", (width, height + _STRIP), BACKGROUND)
+    pen = ImageDraw.Draw(Image.new("RGB", (1, 1)))
+    # Where each word begins: side by side, and in another line where there is no room.
+    x, y, places = 8, height + 7, []
+    for name in [text, *chips]:
+        wide = int(pen.textlength(name, font=font)) + (17 if places else 0)
+        if places and x + wide > width:
+            x, y = 8, y + _STRIP - 8
+        places.append((x, y))
+        x += wide + 20
+    sheet = Image.new("RGB", (width, y - 7 + _STRIP), BACKGROUND)
     sheet.paste(Image.fromarray(image), (0, 0))
     pen = ImageDraw.Draw(sheet)
-    for k, view in enumerate(views):
-        pen.text((k * width // len(views) + 8, 6), f"{view} ({VIEWS[view][1]})", fill="#8a8a8a", font=font)
-    x = 8
-    pen.text((x, height + 7), text, fill="#333333", font=font)
-    x += int(pen.textlength(text, font=font)) + 22
-    for name, colour in chips:
-        wide = int(pen.textlength(name, font=font))
-        if x + wide + 20 > width:
-            break
-        pen.rectangle((x, height + 9, x + 12, height + 21), fill=colour)
-        pen.text((x + 17, height + 7), name, fill="#333333", font=font)
-        x += wide + 36
+    for k, title in enumerate(titles):
+        pen.text((k * width // len(titles) + 8, 6), title, fill="#8a8a8a", font=font)
+    pen.text(places[0], text, fill="#333333", font=font)
+    for (x, y), (name, colour) in zip(places[1:], chips.items()):
+        pen.rectangle((x, y + 2, x + 12, y + 14), fill=colour)
+        pen.text((x + 17, y), name, fill="#333333", font=font)
     return sheet
 
 
 def _draw_job(saved, job, seconds):
+    stage = Stage([[(saved, view) for view in job["views"]]], job["size"])
+    titles = [f"{view} ({VIEWS[view][1]})" for view in job["views"]]
+    chips = muscle_colours(saved.muscles)
+    images = [labelled(stage.show(frame), caption(saved, frame), titles, chips) for frame in job["frames"]]
+    stage.close()
+    save_images(images, job["file"], seconds)
+
+
+def save_images(images, path, seconds):
+    """Save one picture, or several as an animation of so many seconds."""
     from PIL import Image
 
-    stage = Stage(saved, job["views"], job["size"])
-    images = []
-    for frame in job["frames"]:
-        image = labelled(stage.show(frame), caption(saved, frame), saved.muscles, job["views"])
-        if len(job["frames"]) == 1:
-            image.save(job["file"])
-        images.append(image)
-    stage.close()
-    if len(images) > 1:
-        pause = max(20, int(1000 * seconds / len(images)))
-        pauses = [pause] * (len(images) - 1) + [900]
-        kind = {".webp": {"quality": 82, "method": 2}, ".gif": {"optimize": False}}[Path(job["file"]).suffix]
-        if job["file"].endswith(".gif"):
-            images = [image.quantize(128, dither=Image.Dither.NONE) for image in images]
-        images[0].save(job["file"], save_all=True, append_images=images[1:], duration=pauses, loop=0, **kind)
+    if len(images) == 1:
+        images[0].save(path)
+        return
+    pause = max(20, int(1000 * seconds / len(images)))
+    pauses = [pause] * (len(images) - 1) + [900]
+    kind = {".webp": {"quality": 82, "method": 2}, ".gif": {"optimize": False}}[Path(path).suffix]
+    if path.endswith(".gif"):
+        images = [image.quantize(128, dither=Image.Dither.NONE) for image in images]
+    images[0].save(path, save_all=True, append_images=images[1:], duration=pauses, loop=0, **kind)
 
 
-def main(arguments):
-    """The child's part: read the job, draw, leave with 0."""
+def main(arguments, opened=SavedRun, draw_job=_draw_job):
+    """The child's part: read the jobs, open the folder, draw, leave with 0."""
     task = json.loads(sys.stdin.read())
     try:
-        saved = SavedRun(arguments[0])
+        found = opened(arguments[0])
         for job in task["jobs"]:
-            _draw_job(saved, job, task["seconds"])
+            draw_job(found, job, task["seconds"])
     except (RBFMuscleError, OSError) as error:
         print(error, file=sys.stderr)
         return 1

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rbfmuscle.study.appearance import LINE_COLOURS
 from rbfmuscle.study.page import STYLE
-from rbfmuscle.study.plots import _STYLE as PLOT_STYLE
+from rbfmuscle.study.plots import PLOT_STYLE
 from rbfmuscle.study.sweep_table import flat_row, has_length, table_columns
 
 SHOWN_VALUES = (

@@ -1,0 +1,16 @@
+"""The scene that a command is given: a file, or the embedded hip by name."""
+
+from pathlib import Path
+
+PHANTOM = "phantom"
+
+
+def load_scene(scene):
+    """The scene of a file, or the embedded hip for "phantom" where there is no file of that name."""
+    from rbfmuscle.sim.scene import Scene
+
+    if str(scene) == PHANTOM and not Path(scene).exists():
+        from rbfmuscle.sim.phantom import phantom_scene
+
+        return phantom_scene()
+    return Scene.load(Path(scene))

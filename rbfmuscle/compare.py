@@ -1,0 +1,143 @@
+"""Comparing models on one scene: the same motion, contacts and measures for each."""
+
+import time
+from pathlib import Path
+
+from rbfmuscle.models import MODEL_NAMES, build_model, check_model_name
+from rbfmuscle.run import stream_run
+from rbfmuscle.sim.motion import Motion
+from rbfmuscle.sim.options import OutputOptions
+from rbfmuscle.sim.simulate import simulate_frames
+from rbfmuscle.study.comparison import (
+    ModelProbe,
+    add_distances,
+    chosen_poses,
+    measure_run,
+    write_tables,
+)
+from rbfmuscle.study.saved import SavedRun
+from rbfmuscle.validation import SolveError, UsageError
+
+# The motion is repeated with steps this many times as long.
+COARSER = 5
+
+
+def compare_models(
+    scene, directory, models=MODEL_NAMES, *, frames=None, settings=None, pictures=True, progress=None
+):
+    """Run every model on a scene, measure all alike, and write tables, a report and pictures.
+
+    Parameters
+    ----------
+    scene : Scene
+    directory : path
+        Takes ``comparison.json``, ``comparison.csv``, ``report.html``, ``models.webp`` and for each model a
+        folder that holds its run.
+    models : list of str
+        Distances are measured to the first. One that cannot be solved is left out, and named in the tables.
+    frames : slice or str, optional
+        Frames of the motion, a slice or "A:B:S".
+    settings : dict, optional
+        Dotted keys with their values, for all models, or as "MODEL:KEY" for one.
+    pictures : bool
+    progress : callable, optional
+        Called as ``progress(model, done, total)``.
+
+    Returns
+    -------
+    dict
+        What ``comparison.json`` holds.
+
+    Raises
+    ------
+    UsageError
+        On an unknown model or setting.
+    SceneError, MeshError
+        If the scene cannot be simulated.
+    SolveError
+        If no model could be solved.
+    MissingPartError
+        If there are no graphics to draw with; everything else is written.
+    """
+    variants = _variants(scene.with_options(frames=frames), list(models), settings or {})
+    folder = Path(directory)
+    poses = chosen_poses(next(iter(variants.values())))
+    results, failed = {}, {}
+    for name, variant in variants.items():
+        try:
+            results[name] = _measure(name, variant, folder / name, poses, progress)
+        except SolveError as error:
+            failed[name] = str(error)
+    if not results:
+        raise SolveError("; ".join(f"{name}: {reason}" for name, reason in failed.items()))
+    matrix = add_distances(results, folder, poses)
+    table = write_tables(folder, next(iter(variants.values())), results, failed, matrix, poses)
+
+    from rbfmuscle.study.comparison_page import write_page
+
+    missing = write_page(folder, table, pictures=pictures)
+    if missing is not None:
+        raise missing
+    return table
+
+
+def _variants(scene, models, settings):
+    """The scene for each model; every name and setting is checked before anything is run."""
+    if len(models) < 2 or len(set(models)) < len(models):
+        raise UsageError(f"give two or more different models, got {', '.join(models) or 'none'}")
+    for name in models:
+        check_model_name(name)
+    for key in settings:
+        model = key.rpartition(":")[0]
+        if model and model not in models:
+            raise UsageError(f"{key}: model {model!r} is not compared; models: {', '.join(models)}")
+    variants = {}
+    for name in models:
+        mine = {
+            key.rpartition(":")[2]: value
+            for key, value in settings.items()
+            if key.rpartition(":")[0] in ("", name)
+        }
+        variant = scene.with_options(model=name, **mine).validate()
+        variant.output = OutputOptions(report=False, preview=False)
+        variants[name] = variant
+    return variants
+
+
+def _measure(name, scene, folder, poses, progress):
+    """One model: warm up, run and watch, then there and back by coarser steps."""
+    _last_surfaces(_with_frames(scene, scene.motion.frames[:2]))
+    probe = ModelProbe(scene, poses)
+    report = None if progress is None else (lambda done, total: progress(name, done, total))
+    stream_run(scene, folder, pictures=False, progress=report, watch=probe)
+    return measure_run(SavedRun(folder), probe, _there_and_back(scene))
+
+
+def _there_and_back(scene):
+    """Time to build, and surfaces at the last pose and back at the first, by coarser steps."""
+    frames = scene.motion.frames
+    coarse = frames[:-1:COARSER]
+    turn = len(coarse)
+    path = [*coarse, frames[-1], *coarse[::-1]]
+    build, shown = _last_surfaces(_with_frames(scene, path), (turn, 2 * turn))
+    found = {"build": build}
+    if turn:
+        found.update(turn=shown[0], end=shown[1])
+    return found
+
+
+def _last_surfaces(scene, written=None):
+    """Time to build the models, and the surfaces of the frames ``written`` (all where not given)."""
+    start = time.perf_counter()
+    models = [build_model(muscle, scene) for muscle in scene.muscles]
+    build = time.perf_counter() - start
+    shown = []
+    for frame in simulate_frames(scene, models, written=written):
+        shown.append({name: (s.vertices, s.faces) for name, s in frame.surfaces.items()})
+    return build, shown
+
+
+def _with_frames(scene, frames):
+    changed = scene.copy()
+    changed.motion = Motion(frames)
+    return changed
