@@ -8,7 +8,7 @@ from pbd_baseline.constraints import VolumeConstraint
 from pbd_baseline.fibres import fibre_directions, swelling_room
 from pbd_baseline.topology import Topology, cache_order
 from pbd_baseline.weights import even_weights
-from rbfmuscle.sim.cache import content_key, load_arrays, store_arrays
+from rbfmuscle.sim.cache import content_key, has_arrays, load_arrays, store_arrays
 from rbfmuscle.validation import SceneError
 
 # Raise it when weights or room are computed in another way: entries of the cache are then not found.
@@ -64,15 +64,8 @@ class Rest:
         """
         if not muscle.attachments:
             raise SceneError(f"muscle {muscle.name!r} has no attachment, give attach a place on two bones")
-        order = cache_order(np.asarray(muscle.mesh.faces), len(muscle.mesh.vertices))
-        place = np.argsort(order)
-        vertices = np.ascontiguousarray(muscle.mesh.vertices, dtype=np.float64)[order]
-        faces = _sorted_faces(place[np.asarray(muscle.mesh.faces)])
+        order, vertices, faces, bones, holder = _renumbered(muscle)
         topology = Topology.from_mesh(vertices, faces)
-        bones = list(dict.fromkeys(attachment.bone for attachment in muscle.attachments))
-        holder = np.full(len(vertices), -1)
-        for attachment in muscle.attachments:
-            holder[place[attachment.vertices]] = bones.index(attachment.bone)
         volume = VolumeConstraint(vertices, faces)
         inverse_mass = np.where(holder < 0, 1.0, 0.0)
         weights, room = _weights_and_room(vertices, faces, holder, len(bones), volume)
@@ -93,9 +86,32 @@ class Rest:
         return np.maximum(length / median, 1e-3)
 
 
+def weights_are_kept(muscle):
+    """Whether what takes nearly all the time of a muscle's build is in the cache on disk."""
+    _, vertices, faces, _, holder = _renumbered(muscle)
+    return has_arrays(_weights_key(vertices, faces, holder))
+
+
+def _renumbered(muscle):
+    """Order of the vertices, vertices and faces in it, bones that hold the muscle, and who holds each vertex."""
+    order = cache_order(np.asarray(muscle.mesh.faces), len(muscle.mesh.vertices))
+    place = np.argsort(order)
+    vertices = np.ascontiguousarray(muscle.mesh.vertices, dtype=np.float64)[order]
+    faces = _sorted_faces(place[np.asarray(muscle.mesh.faces)])
+    bones = list(dict.fromkeys(attachment.bone for attachment in muscle.attachments))
+    holder = np.full(len(vertices), -1)
+    for attachment in muscle.attachments:
+        holder[place[attachment.vertices]] = bones.index(attachment.bone)
+    return order, vertices, faces, bones, holder
+
+
+def _weights_key(vertices, faces, holder):
+    return content_key(vertices, faces, ("mesh muscle", VERSION, holder.tolist()))
+
+
 def _weights_and_room(vertices, faces, holder, bones, volume):
     """What takes nearly all the time of the build, from the cache on disk where it is known."""
-    key = content_key(vertices, faces, ("mesh muscle", VERSION, holder.tolist()))
+    key = _weights_key(vertices, faces, holder)
     known = load_arrays(key)
     if known is None or not {"weights", "room"} <= known.keys():
         normals = volume.gradient(vertices)

@@ -17,6 +17,9 @@ _HOME = {
 
 MODEL_NAMES = tuple(_HOME)
 
+# What says beforehand how much a model takes, by the module that holds the model.
+_COST = {"rbfmuscle.muscle": "rbfmuscle.cost", "pbd_baseline.muscle": "pbd_baseline.cost"}
+
 
 def build_model(muscle, scene, name=None):
     """Return the model of one muscle of a scene.
@@ -39,6 +42,25 @@ def build_model(muscle, scene, name=None):
     same_class = _HOME[check_model_name(muscle.model)][1] == class_name
     options = {**(muscle.options if same_class else {}), **implied}
     return getattr(importlib.import_module(module), class_name)(muscle, scene, **options)
+
+
+def estimate_model(muscle, scene, rates):
+    """What the model of one muscle will take, without building it.
+
+    Parameters
+    ----------
+    muscle : Muscle
+    scene : Scene
+    rates : dict of str to float
+        From `rbfmuscle.sim.rates.measure_rates`.
+
+    Returns
+    -------
+    MuscleCost
+    """
+    module, _, implied = _HOME[check_model_name(muscle.model)]
+    cost = importlib.import_module(_COST[module])
+    return cost.estimate_muscle(muscle, scene, rates, **{**muscle.options, **implied})
 
 
 def check_model_name(name):

@@ -47,9 +47,12 @@ def test_command_prints_the_plan(hip_data, capsys, arguments):
     assert end.value.code == 0
     text = capsys.readouterr().out
     if arguments:
-        assert {field["bone"] for field in json.loads(text)["fields"]} == {"pelvis", "sacrum", "femur"}
+        made = json.loads(text)
+        assert {field["bone"] for field in made["fields"]} == {"pelvis", "sacrum", "femur"}
+        assert made["memory"]["peak"] > made["memory"]["total"] > 0
+        assert made["time"]["total"] > made["time"]["motion"] > 0
     else:
-        assert "gluteus_maximus: rbf" in text
+        assert "gluteus_maximus: rbf" in text and "expected memory" in text and "expected time" in text
 
 
 def test_without_surfaces_and_metrics_nothing_is_extracted_or_measured(monkeypatch):

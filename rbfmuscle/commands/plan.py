@@ -8,7 +8,7 @@ from cyclopts import Parameter
 
 
 def plan(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False):
-    """List what a run of the scene would build, without building it.
+    """List what a run of the scene would build and take, without building it.
 
     Parameters
     ----------
@@ -17,10 +17,11 @@ def plan(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", negat
     as_json
         Print JSON and nothing else.
     """
+    from rbfmuscle.models import estimate_model
     from rbfmuscle.sim.plan import plan_scene
     from rbfmuscle.sim.scene import Scene
 
-    made = plan_scene(Scene.load(scene))
+    made = plan_scene(Scene.load(scene), estimate_model)
     print(json.dumps(made, indent=1) if as_json else "\n".join(_lines(made)))
 
 
@@ -30,14 +31,38 @@ def _lines(made):
         bones = [pair["bone"] for pair in made["pairs"] if pair["muscle"] == muscle["name"]]
         meets = ", ".join(bones) or "no bone"
         lines.append(
-            f"muscle {muscle['name']}: {muscle['model']}, {muscle['vertices']} vertices, can meet {meets}"
+            f"muscle {muscle['name']}: {muscle['model']}, {muscle['vertices']} vertices, can meet {meets}; "
+            f"{_megabytes(muscle['memory'])}, {muscle['build']:.2g} s to build, "
+            f"{1e3 * muscle['step']:.2g} ms a sub-step, {1e3 * muscle['show']:.2g} ms a surface"
         )
     for field in made["fields"]:
         size = " x ".join(f"{length:.4g}" for length in field["size"])
         lines.append(
             f"field of {field['bone']}: {size} {made['units']}, {field['share']:.0%} of the bone's box, "
-            f"{field['triangles']} triangles"
+            f"{field['triangles']} triangles{_field_size(field)}"
         )
     on = [name for name, used in made["features"].items() if used]
     lines.append(f"switched on: {', '.join(on) or 'nothing'}")
-    return lines
+    return lines + _forecast_lines(made["memory"], made["time"])
+
+
+def _field_size(field):
+    if "memory" not in field:
+        return ""
+    return f"; {_megabytes(field['memory'])}, {'in the cache' if field['kept'] else 'to be built'}"
+
+
+def _forecast_lines(memory, time):
+    frame = ", ".join(f"{name} {1e3 * spent:.3g}" for name, spent in time["frame"].items() if name != "total")
+    build = ", ".join(f"{name} {spent:.2g}" for name, spent in time["build"].items() if name != "total")
+    return [
+        f"expected memory: {_megabytes(memory['total'])} of the scene (fields {_megabytes(memory['fields'])}, "
+        f"muscles {_megabytes(memory['muscles'])}, metrics {_megabytes(memory['metrics'])}), "
+        f"peak of the process {_megabytes(memory['peak'])}",
+        f"expected time: {time['total']:.3g} s without report and pictures; build {time['build']['total']:.2g} s "
+        f"({build}), a frame {1e3 * time['frame']['total']:.3g} ms ({frame})",
+    ]
+
+
+def _megabytes(size):
+    return f"{size / 1e6:.3g} MB"

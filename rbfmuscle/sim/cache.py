@@ -63,6 +63,11 @@ def content_key(vertices, faces, options):
     return digest.hexdigest()[:32]
 
 
+def has_arrays(key):
+    """Whether there is an entry of this name; it may still turn out to be damaged."""
+    return (cache_path() / (key + SUFFIX)).exists()
+
+
 def load_arrays(key):
     """Arrays of an entry by name, or None where there is none; a damaged entry is removed."""
     path = cache_path() / (key + SUFFIX)

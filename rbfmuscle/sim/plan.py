@@ -2,22 +2,26 @@
 
 import numpy as np
 
-from rbfmuscle.sim.reach import Pace, reached_bones, sampled_poses
+from rbfmuscle.sim.reach import Pace, reached_bones, sampled_poses, union_of
 
 
-def plan_scene(scene):
+def plan_scene(scene, estimate=None):
     """Return what a run of the scene would build.
 
     Parameters
     ----------
     scene : Scene
+    estimate : callable, optional
+        ``estimate(muscle, scene, rates)`` gives a muscle's `MuscleCost`. With it memory [bytes] and time [s]
+        are foretold, for this machine as it is now: a tenth of a second of measurements.
 
     Returns
     -------
     dict
         ``pairs``: muscles and bones that can meet. ``fields``: for each bone that any muscle can reach the
         size of the reached box [scene unit] and its share of the bone's own box. ``muscles``: model and size
-        of the input. ``frames``, ``substeps``: of the motion. ``features``: what the scene switches on.
+        of the input. ``frames``, ``substeps``: of the motion. ``features``: what the scene switches on. With
+        ``estimate`` also ``memory``, ``time`` and ``rates``, see `rbfmuscle.sim.forecast`.
 
     Notes
     -----
@@ -26,7 +30,7 @@ def plan_scene(scene):
     """
     regions = reached_bones(scene)
     output = scene.output
-    return {
+    made = {
         "units": scene.units,
         "pairs": [{"muscle": muscle, "bone": bone} for muscle, bone in regions],
         "fields": _fields(scene, regions),
@@ -51,6 +55,33 @@ def plan_scene(scene):
             "preview": bool(output.preview),
         },
     }
+    return made if estimate is None else {**made, **_forecast(scene, made, regions, estimate)}
+
+
+def _forecast(scene, made, regions, estimate):
+    """Memory and time; those of each field and muscle are written into ``made``."""
+    import numba
+
+    from rbfmuscle.sim.forecast import estimate_field, forecast
+    from rbfmuscle.sim.rates import measure_rates, resident_memory
+
+    rates = measure_rates()
+    costs = [estimate(muscle, scene, rates) for muscle in scene.muscles]
+    for muscle, cost in zip(made["muscles"], costs):
+        muscle.update(memory=cost.memory, build=cost.build, step=cost.step, show=cost.show)
+    fields = []
+    meshes = {bone.name: bone.mesh for bone in scene.bones}
+    # Other detectors have fields of other kinds, or none.
+    for field in made["fields"] if scene.contact.detector == "sdf" else []:
+        boxes = [box for (_, name), box in regions.items() if name == field["bone"]]
+        cost = estimate_field(meshes[field["bone"]], union_of(boxes), scene.contact.tolerance)
+        field.update(cells=cost.cells, memory=cost.memory, kept=cost.kept)
+        fields.append(cost)
+    memory, time = forecast(
+        scene, fields, costs, substeps=made["substeps"], rates=rates,
+        resident=resident_memory(), threads=numba.get_num_threads(),
+    )  # fmt: skip
+    return {"memory": memory, "time": time, "rates": rates}
 
 
 def _fields(scene, regions):

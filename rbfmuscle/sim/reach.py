@@ -79,7 +79,7 @@ def build_fields(scene, regions):
             return build_detector(kind, bone.mesh)
         boxes = [box for (_, name), box in regions.items() if name == bone.name]
         options = {} if tolerance is None else {"tolerance": tolerance}
-        return build_detector(kind, bone.mesh, region=_union(boxes), **options)
+        return build_detector(kind, bone.mesh, region=union_of(boxes), **options)
 
     bones = [bone for bone in scene.bones if any(name == bone.name for _, name in regions)]
     if len(bones) < 2:
@@ -189,7 +189,8 @@ def turned_angle(rotation):
     return math.atan2(float(np.linalg.norm(skew)), float(np.trace(rotation)) - 1.0)
 
 
-def _union(boxes):
+def union_of(boxes):
+    """Least box (2, 3) that holds all boxes."""
     return np.array([np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)])
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.sim.cache import content_key, load_arrays, store_arrays
+from rbfmuscle.sim.cache import content_key, has_arrays, load_arrays, store_arrays
 from rbfmuscle.sim.exact_distance import ExactDistance
 from rbfmuscle.sim.rest_frame import BoneFrame, on_one_line
 from rbfmuscle.sim.sdf_build import build_cells, grid_shape
@@ -84,6 +84,12 @@ class BoneSDF:
         """The exact distance to the mesh (:class:`ExactDistance`), built when first asked for."""
         return ExactDistance((self.vertices, self.faces))
 
+    @staticmethod
+    def is_kept(mesh, *, tolerance=None, region=None):
+        """Whether :meth:`from_mesh` would find this field in the cache on disk."""
+        vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
+        return has_arrays(_key(vertices, faces, tolerance, region, MEMORY_LIMIT))
+
     @classmethod
     def from_mesh(
         cls, mesh, *, tolerance=None, region=None, cache=True, memory_limit=MEMORY_LIMIT, name="bone"
@@ -118,8 +124,7 @@ class BoneSDF:
         region = None if region is None else check_points(region, name="region")
         if region is not None and (region.shape != (2, 3) or np.any(region[0] > region[1])):
             raise ValueError(f"region must be (2, 3), least corner first, got {region.tolist()}")
-        box = None if region is None else region.tolist()
-        key = content_key(vertices, faces, (tolerance, box, memory_limit)) if cache else None
+        key = _key(vertices, faces, tolerance, region, memory_limit) if cache else None
         arrays = load_arrays(key) if cache else None
         parts = None if arrays is None else _from_arrays(arrays)
         vertices, faces = check_mesh(vertices, faces, name=name)
@@ -193,6 +198,11 @@ class BoneSDF:
         points, pose = check_points(points), _check_pose(pose)
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         return self.exact.closest_point(local) @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _key(vertices, faces, tolerance, region, memory_limit):
+    box = None if region is None else np.asarray(region).tolist()
+    return content_key(vertices, faces, (tolerance, box, memory_limit))
 
 
 def _check_pose(pose):

@@ -1,0 +1,57 @@
+"""Memory and time that a mesh muscle will take, from its mesh and settings."""
+
+from pbd_baseline.options import PBDOptions
+from pbd_baseline.rest import weights_are_kept
+from rbfmuscle.sim.forecast import MuscleCost
+
+# Of each method: calls and visits for a vertex of one sweep; of the contacts and the volume after the last one.
+SWEEP = {
+    "pbd": (150, 160), "xpbd": (330, 250), "arap-pbd": (450, 500), "arap-volume": (1330, 750),
+    "arap-interleaved": (1030, 600),
+}  # fmt: skip
+FINISH_CALLS, FINISH_VISITS = 1000, 870
+# A sub-step besides: calls, and visits for a contact point in the search for tunnelling.
+PREDICT_CALLS, CROSSING_VISITS = 1100, 200
+# To build: visits for a vertex, and for its weights between the bones where these are not on disk.
+VERTEX_VISITS, WEIGHT_VISITS = 9500, 105_000
+# A surface: visits for a vertex, which is only copied.
+SHOW_VISITS = 30
+# Bytes for a vertex with its edges, faces and constraints; more where a factor is kept; while a frame is made.
+VERTEX_BYTES, FACTOR_BYTES, WORKING_BYTES = 700, 450, 200
+FACTORED = ("arap-volume", "arap-interleaved")
+# Contact points for a vertex of a closed mesh: with the middles of edges and faces 1 + 3 + 2.
+POINTS = {"vertices": 1, "faces": 6}
+
+
+def estimate_muscle(muscle, scene, rates, **options):
+    """What a mesh muscle takes.
+
+    Parameters
+    ----------
+    muscle : Muscle
+    scene : Scene
+    rates : dict of str to float
+        From `rbfmuscle.sim.rates.measure_rates`.
+    **options
+        See `PBDOptions`.
+
+    Returns
+    -------
+    MuscleCost
+    """
+    options = PBDOptions.build(options, place=f"muscle {muscle.name!r} model: ")
+    count, call, visit = len(muscle.mesh.vertices), rates["call"], rates["visit"]
+    calls, visits = SWEEP[options.method]
+    search = CROSSING_VISITS * POINTS[options.contact] * count if scene.detect is not None else 0
+    weights = 0 if weights_are_kept(muscle) else WEIGHT_VISITS
+    factor = FACTOR_BYTES if options.method in FACTORED else 0
+    return MuscleCost(
+        build=visit * count * (VERTEX_VISITS + weights),
+        step=call * (PREDICT_CALLS + FINISH_CALLS + options.sweeps * calls)
+        + visit * (count * (FINISH_VISITS + options.sweeps * visits) + search),
+        show=visit * SHOW_VISITS * count,
+        memory=count * (VERTEX_BYTES + factor),
+        working=WORKING_BYTES * count,
+        carried=count,
+        shown=count,
+    )
