@@ -9,6 +9,7 @@ __version__ = "0.1.0"
 
 _HOME = {
     "BoneSDF": "rbfmuscle.sim.sdf",
+    "FlatField": "rbfmuscle.implicit.flat_limit",
     "LimitExceededError": "rbfmuscle.validation",
     "MeshError": "rbfmuscle.validation",
     "MissingPartError": "rbfmuscle.validation",
