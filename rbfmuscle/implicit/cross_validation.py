@@ -5,13 +5,20 @@ augmented matrix. For a Hermite fit a centre is left out with all its conditions
 a small block solve.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import linalg
 from scipy.linalg import lapack
+from scipy.spatial import cKDTree
 
 from rbfmuscle.implicit import fitting
+from rbfmuscle.validation import UsageError
+
+# Of the spacing: what an error of one in the left-out normal counts. Values alone would choose the narrowest kernel,
+# which knows nothing between its centres, and where nothing is known f is 0, as it should be on the surface.
+SLOPE_SHARE = 0.15
 
 
 @dataclass(frozen=True)
@@ -36,6 +43,14 @@ class Residuals:
     gcv: float
     averaged: np.ndarray
     condition: float
+
+    def score(self, criterion, lever=0.0):
+        """Root mean square of value and lever times slope, left out ("loo") or averaged ("gcv")."""
+        if criterion == "gcv":
+            missed, turned = self.averaged[:, 0], self.averaged[:, 1:]
+        else:
+            missed, turned = self.values, self.slopes
+        return math.sqrt((missed**2).mean() + lever**2 * (turned**2).sum(axis=1).mean())
 
 
 def leave_one_out(basis, right, *, smoothing=0.0):
@@ -116,13 +131,88 @@ def least_squares_residuals(matrix, right, *, smoothing=0.0, cutoff=1e-14):
     -------
     Residuals
     """
-    left, values, _ = linalg.svd(matrix, full_matrices=False)
-    keep = values > cutoff * values[0]
-    damp = values[keep] ** 2 / (values[keep] ** 2 + smoothing)
-    left = left[:, keep]
-    residual = right - left @ (damp * (left.T @ right))
-    hat = (left * left) @ damp
-    gcv = len(right) * float(residual @ residual) / (len(right) - hat.sum()) ** 2
-    left_out, averaged = residual / (1 - hat), residual / (1 - hat.mean())
-    condition = float(values[0] / max(values[-1], 1e-300))
-    return Residuals(left_out, np.zeros((len(hat), 0)), gcv, averaged[:, None], condition)
+    return LeastSquaresPath(matrix, right, cutoff=cutoff).residuals(smoothing)
+
+
+class LeastSquaresPath:
+    """Residuals of a truncated least-squares fit for any Tikhonov term, by one singular value decomposition.
+
+    Parameters
+    ----------
+    matrix, right, cutoff
+        As in `least_squares_residuals`.
+
+    Attributes
+    ----------
+    span : (float, float)
+        Smoothing below which rounding rules and above which nothing is left to fit.
+    lever : float
+        Weight of slopes among the residuals: there are none.
+    """
+
+    lever = 0.0
+
+    def __init__(self, matrix, right, *, cutoff=1e-14):
+        left, values, _ = linalg.svd(matrix, full_matrices=False)
+        keep = values > cutoff * values[0]
+        self._left, self._squares, self._right = left[:, keep], values[keep] ** 2, right
+        self._along = self._left.T @ right
+        self.condition = float(values[0] / max(values[-1], 1e-300))
+        self.span = 1e-28 * self._squares[0], self._squares[0]
+
+    def residuals(self, smoothing):
+        """`Residuals` with a given smoothing."""
+        damp = self._squares / (self._squares + smoothing)
+        residual = self._right - self._left @ (damp * self._along)
+        rest = np.maximum(1 - (self._left * self._left) @ damp, np.finfo(float).eps)
+        mean = rest.mean()
+        gcv = float(residual @ residual) / (len(residual) * mean**2)
+        empty = np.zeros((len(residual), 0))
+        return Residuals(residual / rest, empty, gcv, (residual / mean)[:, None], self.condition)
+
+
+class SmoothingPath:
+    """Residuals of a fit for any smoothing, by one eigen-decomposition.
+
+    With Z a basis of the weights that annihilate polynomials and Z^T A Z = U diag(e) U^T, the block of the augmented
+    inverse that belongs to the weights is V diag(1 / (e + smoothing)) V^T, V = Z U.
+
+    Parameters
+    ----------
+    basis : fitting.Basis
+    right : (size,) ndarray
+
+    Attributes
+    ----------
+    span : (float, float)
+        As in `LeastSquaresPath`.
+    lever : float
+        Weight of slopes among the residuals, 0 for a fit to values.
+    """
+
+    def __init__(self, basis, right):
+        count, size, q = len(basis.points), basis.size, len(basis.powers)
+        if size == q:
+            raise UsageError(
+                f"{size} conditions and {q} polynomial terms leave nothing to smooth; set smoothing to 0"
+            )
+        full = basis.full_matrix()[:size, :size]
+        null = linalg.qr(basis.polynomials.T)[0][:, q:] if q else np.eye(size)
+        values, vectors = linalg.eigh(null.T @ full @ null, driver="evd")
+        self._values, self._vectors = np.maximum(values, 0.0), null @ vectors
+        self._along = self._vectors.T @ right
+        self._parts = self._vectors.T.reshape(len(values), -1, count)
+        self.span = 1e-14 * values[-1], values[-1]
+        self.lever = 0.0
+        if basis.kind != "value" and count > 1:
+            self.lever = SLOPE_SHARE * cKDTree(basis.points).query(basis.points, k=2)[0][:, 1].mean()
+
+    def residuals(self, smoothing):
+        """`Residuals` with a given smoothing above 0."""
+        damp = 1.0 / (self._values + smoothing)
+        weights = self._vectors @ (damp * self._along)
+        rows = range(self._parts.shape[1])
+        damped = self._parts * damp[:, None, None]
+        blocks = [[np.einsum("mk,mk->k", damped[:, a], self._parts[:, b]) for b in rows] for a in rows]
+        condition = float((self._values[-1] + smoothing) / (self._values[0] + smoothing))
+        return _residuals(np.array(blocks).transpose(2, 0, 1), weights, self._parts.shape[2], condition)

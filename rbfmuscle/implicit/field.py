@@ -10,10 +10,12 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from rbfmuscle.implicit import assembly
+from rbfmuscle.implicit.cross_validation import LeastSquaresPath
 from rbfmuscle.implicit.evaluation import evaluate
 from rbfmuscle.implicit.fitting import Basis, solve, solve_least_squares
 from rbfmuscle.implicit.kernels import get_kernel
 from rbfmuscle.implicit.off_surface import off_surface_points
+from rbfmuscle.implicit.regularisation import basis_smoothing, resolve_smoothing
 from rbfmuscle.validation import (
     NumericalWarning,
     UsageError,
@@ -42,13 +44,17 @@ class RBFField:
         Scaled coordinates are (x - origin) / scale.
     condition : float
         Estimate for the matrix that was factored.
+    smoothing : float
+        As given, or as chosen.
     """
 
-    def __init__(self, centres, origin, scale, kernel, epsilon, weights, coefficients, powers, condition):
+    def __init__(
+        self, centres, origin, scale, kernel, epsilon, weights, coefficients, powers, condition, smoothing=0.0
+    ):
         self.centres, self.origin, self.scale = centres, origin, scale
         self.kernel, self.epsilon = kernel, epsilon
         self.weights, self.coefficients, self.powers = weights, coefficients, powers
-        self.condition = condition
+        self.condition, self.smoothing = condition, smoothing
         self._scaled = np.ascontiguousarray(((centres - origin) / scale).T)
         self._rows = np.ascontiguousarray(weights.reshape(len(centres), -1).T)
         shape = epsilon * scale if kernel.has_epsilon else 1.0
@@ -68,8 +74,9 @@ class RBFField:
             Shape parameter [1/scene unit]; without effect on the interpolant of polyharmonic kernels.
         degree : int, optional
             Of the polynomial part, -1 for none; the kernel's least by default.
-        smoothing : float
-            Added to the diagonal, in coordinates scaled to order one; 0 interpolates.
+        smoothing : float or {"gcv", "loo"}
+            Added to the diagonal, in coordinates scaled to order one; 0 interpolates. A criterion chooses it
+            (see `regularisation`), for one eigen-decomposition.
 
         Returns
         -------
@@ -89,8 +96,10 @@ class RBFField:
         origin, scale = frame(points)
         shape = epsilon * scale if kernel.has_epsilon else 1.0
         basis = Basis((points - origin) / scale, kernel, shape, degree)
-        weights, coefficients, condition = solve(basis, values, smoothing=_check_smoothing(smoothing))
-        return cls(points, origin, scale, kernel, epsilon, weights, coefficients, basis.powers, condition)
+        smoothing = basis_smoothing(smoothing, basis, values)
+        weights, coefficients, condition = solve(basis, values, smoothing=smoothing)
+        rest = basis.powers, condition, smoothing
+        return cls(points, origin, scale, kernel, epsilon, weights, coefficients, *rest)
 
     @classmethod
     def fit_hermite(cls, points, normals, *, kernel="cubic", epsilon=1.0, smoothing=0.0, derivatives="all"):
@@ -129,9 +138,10 @@ class RBFField:
         if derivatives not in ("all", "normal"):
             raise UsageError(f"derivatives must be 'all' or 'normal', got {derivatives!r}")
         basis, right, origin, scale = hermite_system(points, normals, kernel, epsilon, derivatives)
-        weights, coefficients, condition = solve(basis, right, smoothing=_check_smoothing(smoothing))
-        weights = hermite_weights(basis, weights)
-        fitted = cls(points, origin, scale, kernel, epsilon, weights, coefficients, basis.powers, condition)
+        smoothing = basis_smoothing(smoothing, basis, right)
+        weights, coefficients, condition = solve(basis, right, smoothing=smoothing)
+        weights, rest = hermite_weights(basis, weights), (basis.powers, condition, smoothing)
+        fitted = cls(points, origin, scale, kernel, epsilon, weights, coefficients, *rest)
         if kernel.has_epsilon:
             _warn_if_narrow(fitted, points, normals)
         return fitted
@@ -180,8 +190,8 @@ class RBFField:
         centres : (K, 3) array_like
         kernel, epsilon, degree
             As in `fit`.
-        smoothing : float
-            Tikhonov: adds smoothing * (sum of squared weights) to the squared residual.
+        smoothing : float or {"gcv", "loo"}
+            Tikhonov: adds smoothing * (sum of squared weights) to the squared residual; or how it is chosen.
         cutoff : float
             Singular values below cutoff times the largest are dropped.
 
@@ -199,11 +209,11 @@ class RBFField:
             )
         origin, scale = frame(centres)
         matrix, powers = collocation(points, centres, kernel, epsilon, degree, origin, scale)
-        solution, condition, _ = solve_least_squares(
-            matrix, values, smoothing=_check_smoothing(smoothing), cutoff=cutoff
-        )
+        smoothing = resolve_smoothing(smoothing, lambda: LeastSquaresPath(matrix, values, cutoff=cutoff))
+        solution, condition, _ = solve_least_squares(matrix, values, smoothing=smoothing, cutoff=cutoff)
         weights, coefficients = solution[: len(centres)], solution[len(centres) :]
-        return cls(centres, origin, scale, kernel, epsilon, weights, coefficients, powers, condition)
+        rest = powers, condition, smoothing
+        return cls(centres, origin, scale, kernel, epsilon, weights, coefficients, *rest)
 
     def __call__(self, points):
         """Field value at (n, 3) points: (n,), negative inside."""
@@ -351,10 +361,3 @@ def _check_degree(kernel, degree, count):
             "degree too high: lower it or add points"
         )
     return degree
-
-
-def _check_smoothing(smoothing):
-    smoothing = float(smoothing)
-    if not (np.isfinite(smoothing) and smoothing >= 0):
-        raise UsageError(f"smoothing must be a number of at least 0, got {smoothing}")
-    return smoothing

@@ -7,10 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.implicit.cross_validation import leave_one_out
-from rbfmuscle.implicit.field import RBFField, frame, hermite_system
+from rbfmuscle.implicit.cross_validation import (
+    SLOPE_SHARE,
+    LeastSquaresPath,
+    SmoothingPath,
+    leave_one_out,
+)
+from rbfmuscle.implicit.field import RBFField, _check_degree, collocation, frame, hermite_system
 from rbfmuscle.implicit.fitting import DOUBTFUL, Basis, solve
 from rbfmuscle.implicit.kernels import get_kernel
+from rbfmuscle.implicit.regularisation import check_criterion, search_smoothing
 from rbfmuscle.validation import (
     NumericalWarning,
     UsageError,
@@ -23,11 +29,6 @@ from rbfmuscle.validation import (
 CRITERIA = ("loo", "gcv", "held_out", "condition")
 _GOLDEN = 0.5 * (math.sqrt(5) - 1)
 _NOISE = 2.0  # an objective computed beyond DOUBTFUL must be this much better to be believed
-
-
-# Of the spacing: what an error of one in the left-out normal counts. Values alone would choose the narrowest kernel,
-# which knows nothing between its centres, and where nothing is known f is 0, as it should be on the surface.
-SLOPE_SHARE = 0.15
 
 
 @dataclass(frozen=True)
@@ -135,6 +136,10 @@ def choose_epsilon(
     UsageError
         For a kernel without epsilon, an unknown criterion, or missing data.
     """
+    if isinstance(smoothing, str):
+        raise UsageError(
+            "epsilon is chosen for a smoothing that is a number; choose the smoothing afterwards"
+        )
     points, kernel = check_points(points), get_kernel(kernel)
     _check_request(kernel, criterion, values, normals, held_out)
     objective = _objective(
@@ -148,6 +153,65 @@ def choose_epsilon(
     tried = np.array(sorted(tried))
     best = tried[_best(tried)]
     return EpsilonChoice(float(best[0]), float(best[1]), float(best[2]), tried)
+
+
+def choose_smoothing(
+    points,
+    *,
+    values=None,
+    normals=None,
+    centres=None,
+    kernel="cubic",
+    epsilon=1.0,
+    degree=None,
+    criterion="gcv",
+    derivatives="all",
+    cutoff=1e-14,
+):
+    """Choose the Tikhonov parameter of a fit along one decomposition, for about the time of ten fits.
+
+    Parameters
+    ----------
+    points : (n, 3) array_like
+    values : (n,) array_like, optional
+    normals : (n, 3) array_like, optional
+        Exactly one of values and normals.
+    centres : (K, 3) array_like, optional
+        Fewer centres than values: the least-squares fit.
+    kernel, epsilon, degree, derivatives, cutoff
+        As in `RBFField.fit`, `RBFField.fit_hermite` and `RBFField.fit_least_squares`.
+    criterion : {"gcv", "loo"}
+        A Hermite fit leaves points out with their normals, and counts them as `choose_epsilon` does.
+
+    Returns
+    -------
+    regularisation.SmoothingChoice
+        Its ``smoothing`` is what the fit takes by that name.
+    """
+    points, kernel, epsilon = (
+        check_points(points),
+        get_kernel(kernel),
+        check_positive(epsilon, name="epsilon"),
+    )
+    if (values is None) == (normals is None) or (centres is not None and values is None):
+        raise UsageError("give either values or normals, and centres only with values")
+    check_criterion(criterion)
+    if normals is not None:
+        normals = check_vectors(normals, len(points))
+        return search_smoothing(
+            SmoothingPath(*hermite_system(points, normals, kernel, epsilon, derivatives)[:2]), criterion
+        )
+    values = check_values(values, len(points))
+    degree = _check_degree(kernel, degree, len(points))
+    if centres is None:
+        origin, scale = frame(points)
+        basis = Basis(
+            (points - origin) / scale, kernel, epsilon * scale if kernel.has_epsilon else 1.0, degree
+        )
+        return search_smoothing(SmoothingPath(basis, values), criterion)
+    centres = check_points(centres, name="centres")
+    matrix, _ = collocation(points, centres, kernel, epsilon, degree, *frame(centres))
+    return search_smoothing(LeastSquaresPath(matrix, values, cutoff=cutoff), criterion)
 
 
 def _check_request(kernel, criterion, values, normals, held_out):
@@ -183,11 +247,7 @@ def _objective(points, values, normals, kernel, criterion, held_out, target, der
 
     def by_residuals(epsilon):
         found = leave_one_out(*system(epsilon), smoothing=smoothing)
-        if criterion == "gcv":
-            missed, turned = found.averaged[:, 0], found.averaged[:, 1:]
-        else:
-            missed, turned = found.values, found.slopes
-        return math.sqrt((missed**2).mean() + lever**2 * (turned**2).sum(axis=1).mean()), found.condition
+        return found.score(criterion, lever), found.condition
 
     def by_held_out(epsilon):
         if normals is not None:
