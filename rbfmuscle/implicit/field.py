@@ -198,6 +198,11 @@ class RBFField:
         Returns
         -------
         RBFField
+
+        Warns
+        -----
+        NumericalWarning
+            Where singular values are dropped; `FlatField.fit_least_squares` needs to drop none.
         """
         points, centres = check_points(points), check_points(centres, name="centres")
         values = check_values(values, len(points))
@@ -210,7 +215,9 @@ class RBFField:
         origin, scale = frame(centres)
         matrix, powers = collocation(points, centres, kernel, epsilon, degree, origin, scale)
         smoothing = resolve_smoothing(smoothing, lambda: LeastSquaresPath(matrix, values, cutoff=cutoff))
-        solution, condition, _ = solve_least_squares(matrix, values, smoothing=smoothing, cutoff=cutoff)
+        solution, condition, rank = solve_least_squares(matrix, values, smoothing=smoothing, cutoff=cutoff)
+        if rank < matrix.shape[1]:
+            _warn_if_truncated(kernel, rank, matrix.shape[1])
         weights, coefficients = solution[: len(centres)], solution[len(centres) :]
         rest = powers, condition, smoothing
         return cls(centres, origin, scale, kernel, epsilon, weights, coefficients, *rest)
@@ -330,6 +337,17 @@ def _warn_if_narrow(fitted, points, normals):
             NumericalWarning,
             stacklevel=4,
         )
+
+
+def _warn_if_truncated(kernel, rank, size):
+    analytic = kernel.smoothness == 99
+    remedy = "raise epsilon or fit with FlatField.fit_least_squares" if analytic else "spread the centres"
+    warnings.warn(
+        f"least-squares fit with kernel '{kernel.name}' leaves {size - rank} of {size} directions out, which rounding "
+        f"has taken; {remedy}",
+        NumericalWarning,
+        stacklevel=3,
+    )
 
 
 def hermite_weights(basis, weights):

@@ -1,0 +1,154 @@
+"""The flat range of the Gaussian: what each way of solving gives as epsilon goes to 0.
+
+    python benchmarks/flat_range.py [--exact]
+
+First table: 80 centres in the unit ball, values of a field like a distance, largest error at 400 other points.
+``truncated`` drops singular values below 1e-14, ``oversampled`` fits 400 samples by a truncated SVD, ``default`` does
+so with the library's default kernel; ``flat`` are the two fits of FlatField; ``exact`` solves with 250 digits (mpmath).
+Second table: a smoother function, where the flat range is the best one.
+"""
+
+import argparse
+import time
+import warnings
+
+import numpy as np
+from scipy import linalg
+
+from rbfmuscle.implicit.field import RBFField, collocation, frame
+from rbfmuscle.implicit.fitting import solve_least_squares
+from rbfmuscle.implicit.flat_limit import FlatField
+from rbfmuscle.implicit.kernels import get_kernel
+from rbfmuscle.validation import NumericalWarning, UsageError
+
+EPSILONS = (1.0, 0.5, 0.2, 0.05, 0.01)
+SMOOTH_EPSILONS = (1.0, 0.5, 0.3, 0.2, 0.1, 0.05, 0.01, 0.0)
+CENTRES, SAMPLES, UNSEEN = 80, 400, 400
+
+
+def ball(rng, count):
+    """Points spread evenly at random in the unit ball: (count, 3)."""
+    points = rng.normal(size=(count, 3))
+    points /= np.linalg.norm(points, axis=1)[:, None]
+    return points * rng.random((count, 1)) ** (1 / 3)
+
+
+def data():
+    """Centres, samples and unseen points, the same each time."""
+    rng = np.random.default_rng(0)
+    centres, unseen = ball(rng, CENTRES), ball(rng, UNSEEN)
+    return centres, ball(rng, SAMPLES), unseen
+
+
+def distance_like(points):
+    """Nearly the distance from a sphere, with a wave on it."""
+    wave = 0.1 * np.sin(3 * points[:, 0]) * np.cos(2 * points[:, 1])
+    return np.sqrt((points**2).sum(axis=1) + 0.05) - 0.6 + wave
+
+
+def smooth(points):
+    """An entire function."""
+    return np.exp(0.5 * points[:, 0]) * np.cos(points[:, 1] + 0.5 * points[:, 2])
+
+
+def errors(target, epsilon):
+    """Largest error of each way at the unseen points, by its name."""
+    centres, samples, unseen = data()
+    values, sampled, expected = target(centres), target(samples), target(unseen)
+    gaussian = get_kernel("gaussian")
+
+    def worst(found):
+        return float(np.abs(found - expected).max())
+
+    out = {"epsilon": epsilon}
+    if epsilon:
+        # both sides in the coordinates that the field itself would use
+        place = frame(centres)
+        matrix, _ = collocation(centres, centres, gaussian, epsilon, -1, *place)
+        rows, _ = collocation(unseen, centres, gaussian, epsilon, -1, *place)
+        out["condition"] = float(np.linalg.cond(matrix))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", linalg.LinAlgWarning)
+            out["direct"] = worst(rows @ linalg.solve(matrix, values))
+        out["truncated"] = worst(rows @ solve_least_squares(matrix, values)[0])
+        field = RBFField.fit_least_squares(samples, sampled, centres, kernel=gaussian, epsilon=epsilon)
+        out["oversampled"] = worst(field(unseen))
+    out["default"] = worst(RBFField.fit_least_squares(samples, sampled, centres)(unseen))
+    try:
+        field = FlatField.fit(centres, values, epsilon=epsilon)
+        out["flat"], out["uncertain"] = worst(field(unseen)), field.error
+        fitted = FlatField.fit_least_squares(samples, sampled, centres, epsilon=epsilon)
+        out["flat oversampled"] = worst(fitted(unseen))
+    except UsageError:  # not flat: the direct solve is sound there
+        out["flat"], out["flat oversampled"] = out["direct"], out["oversampled"]
+    return out
+
+
+def exact_error(target, epsilon):
+    """Largest error at the unseen points of the interpolant computed with 250 digits."""
+    import mpmath
+
+    centres, _, unseen = data()
+    with mpmath.workdps(250):
+        square = mpmath.mpf(epsilon) ** 2
+        centres_, unseen_ = ([[mpmath.mpf(float(c)) for c in p] for p in rows] for rows in (centres, unseen))
+
+        def row(x):
+            return [mpmath.exp(-square * sum((a - b) ** 2 for a, b in zip(x, c))) for c in centres_]
+
+        matrix = mpmath.matrix([row(x) for x in centres_])
+        weights = mpmath.lu_solve(matrix, mpmath.matrix([*map(float, target(centres))]))
+        found = np.array([float(mpmath.fdot(row(x), weights)) for x in unseen_])
+    return float(np.abs(found - target(unseen)).max())
+
+
+def show(rows):
+    """Print rows as a Markdown table."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    print("| " + " | ".join(names) + " |\n|" + "---|" * len(names))
+    for row in rows:
+        cells = (f"{row[name]:.3g}" if name in row else "" for name in names)
+        print("| " + " | ".join(cells) + " |")
+
+
+def fit_times():
+    """Seconds of a direct and of a flat fit, and of evaluating each at the unseen points, least of five."""
+    centres, _, unseen = data()
+    values = smooth(centres)
+    makers = {
+        "direct": lambda: RBFField.fit(centres, values, kernel="gaussian", epsilon=1.0),
+        "flat": lambda: FlatField.fit(centres, values),
+    }
+    rows = []
+    for name, make in makers.items():
+        fits, calls = [], []
+        for _ in range(5):
+            start = time.perf_counter()
+            field = make()
+            middle = time.perf_counter()
+            field(unseen)
+            fits.append(middle - start)
+            calls.append(time.perf_counter() - middle)
+        rows.append(f"{name}: fit {1e3 * min(fits):.3g} ms, {UNSEEN} points {1e3 * min(calls):.3g} ms")
+    return rows
+
+
+def main():
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--exact", action="store_true", help="solve with 250 digits too (half a minute)")
+    options = parser.parse_args()
+    warnings.simplefilter("ignore", NumericalWarning)
+    for target, epsilons in ((distance_like, EPSILONS), (smooth, SMOOTH_EPSILONS)):
+        rows = [errors(target, epsilon) for epsilon in epsilons]
+        for row in rows:
+            if options.exact and row["epsilon"]:
+                row["exact"] = exact_error(target, row["epsilon"])
+        print(f"\n{target.__doc__}\n")
+        show(rows)
+    print("\n" + "\n".join(fit_times()))
+
+
+if __name__ == "__main__":
+    main()
