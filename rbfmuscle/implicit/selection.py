@@ -168,7 +168,7 @@ def choose_smoothing(
     derivatives="all",
     cutoff=1e-14,
 ):
-    """Choose the Tikhonov parameter of a fit along one decomposition, for about the time of ten fits.
+    """Choose the Tikhonov parameter of a fit along one decomposition, for the time of thirty to forty fits.
 
     Parameters
     ----------
