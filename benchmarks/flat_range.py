@@ -1,14 +1,16 @@
 """The flat range of the Gaussian: what each way of solving gives as epsilon goes to 0.
 
-    python benchmarks/flat_range.py [--exact]
+    python benchmarks/flat_range.py [--exact] [--seeds]
 
 First table: 80 centres in the unit ball, values of a field like a distance, largest error at 400 other points.
 ``truncated`` drops singular values below 1e-14, ``oversampled`` fits 400 samples by a truncated SVD, ``default`` does
 so with the library's default kernel; ``flat`` are the two fits of FlatField; ``exact`` solves with 250 digits (mpmath).
-Second table: a smoother function, where the flat range is the best one. Third table: noise, with the smoothing chosen.
+Second table: a smoother function, where the flat range is the best one. Then noise, with the smoothing
+chosen, and what flat fits do with other centres.
 """
 
 import argparse
+import itertools
 import time
 import warnings
 
@@ -33,9 +35,9 @@ def ball(rng, count):
     return points * rng.random((count, 1)) ** (1 / 3)
 
 
-def data():
-    """Centres, samples and unseen points, the same each time."""
-    rng = np.random.default_rng(0)
+def data(seed=0):
+    """Centres, samples and unseen points."""
+    rng = np.random.default_rng(seed)
     centres, unseen = ball(rng, CENTRES), ball(rng, UNSEEN)
     return centres, ball(rng, SAMPLES), unseen
 
@@ -51,9 +53,9 @@ def smooth(points):
     return np.exp(0.5 * points[:, 0]) * np.cos(points[:, 1] + 0.5 * points[:, 2])
 
 
-def errors(target, epsilon):
+def errors(target, epsilon, seed=0):
     """Largest error of each way at the unseen points, by its name."""
-    centres, samples, unseen = data()
+    centres, samples, unseen = data(seed)
     values, sampled, expected = target(centres), target(samples), target(unseen)
     gaussian = get_kernel("gaussian")
 
@@ -132,26 +134,57 @@ def noisy_fits():
             return float(np.sqrt(np.mean((field(unseen) - smooth(unseen)) ** 2))), field.smoothing
 
         yield f"{CENTRES} values, {kernel}", fit_values
-    points, normals = ellipsoid(150)
-    points = points + 0.03 * rng.normal(size=points.shape)
-    for derivatives in ("all", "normal"):
+    exact, normals = ellipsoid(150)
+    moves = rng.normal(size=exact.shape)
+    for size, derivatives in itertools.product((0.0, 0.03, 0.1), ("all", "normal")):
 
-        def fit_surface(smoothing, derivatives=derivatives):
+        def fit_surface(smoothing, derivatives=derivatives, points=exact + size * moves):
             field = RBFField.fit_hermite(points, normals, smoothing=smoothing, derivatives=derivatives)
             value, gradient = field.value_and_gradient(ellipsoid(1000)[0])
             return float(np.sqrt(np.mean((value / np.linalg.norm(gradient, axis=1)) ** 2))), field.smoothing
 
-        yield f"surface of {len(points)}, {derivatives}", fit_surface
+        yield f"surface of {len(exact)}, noise {size}, {derivatives}", fit_surface
 
 
 def noise():
-    """Values with noise of 0.05, points of a surface with noise of 0.03: RMS error by smoothing."""
+    """Values with noise of 0.05, points of a surface with noise: RMS error by smoothing."""
     rows = []
     for name, fit in noisy_fits():
         best, at = min(fit(smoothing) for smoothing in np.geomspace(1e-8, 10, 37))
         (gcv, chosen), (loo, _) = fit("gcv"), fit("loo")
         rows.append({"data": name, "none": fit(0.0)[0], "gcv": gcv, "loo": loo, "best of 37": best})
         rows[-1] |= {"smoothing by gcv": chosen, "best smoothing": at}
+    return rows
+
+
+def other_points(seeds=8):
+    """Other points and functions like a distance: the worst ratio to the oversampled Gaussian."""
+    functions = {
+        "with a wave": distance_like,
+        "smoother": lambda p: np.sqrt((p * p).sum(axis=1) + 0.1) - 0.5,
+        "cone": lambda p: np.linalg.norm(p, axis=1) - 0.6,
+        "ellipsoid": lambda p: np.sqrt((p * p / np.array([0.81, 0.36, 0.16])).sum(axis=1) + 0.02) - 1.0,
+    }
+    rows = []
+    for name, target in functions.items():
+        flat, default = [], []
+        for seed in range(seeds):
+            found = [errors(target, epsilon, seed) for epsilon in EPSILONS]
+            flat += [row["flat oversampled"] / row["oversampled"] for row in found]
+            default.append(found[0]["default"] / min(row["oversampled"] for row in found))
+        rows.append({"function": name, "flat, same epsilon": max(flat), "median": float(np.median(flat))})
+        rows[-1]["default, best epsilon"] = max(default)
+    return rows
+
+
+def growth():
+    """Estimated error of the limit by the number of centres, for the entire function."""
+    kernels = ("gaussian", "inverse_multiquadric", "multiquadric")
+    rows = []
+    for count in (20, 80, 150, 200, 300):
+        centres = ball(np.random.default_rng(1), count)
+        fits = {kernel: FlatField.fit(centres, smooth(centres), kernel=kernel) for kernel in kernels}
+        rows.append({"centres": count} | {kernel: field.error for kernel, field in fits.items()})
     return rows
 
 
@@ -162,6 +195,8 @@ def fit_times():
     makers = {
         "direct": lambda: RBFField.fit(centres, values, kernel="gaussian", epsilon=1.0),
         "flat": lambda: FlatField.fit(centres, values),
+        "smoothed": lambda: RBFField.fit(centres, values, smoothing=0.1),
+        "smoothing chosen": lambda: RBFField.fit(centres, values, smoothing="gcv"),
     }
     rows = []
     for name, make in makers.items():
@@ -182,6 +217,7 @@ def main():
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--exact", action="store_true", help="solve with 250 digits too (half a minute)")
+    parser.add_argument("--seeds", action="store_true", help="other points and functions too (two minutes)")
     options = parser.parse_args()
     warnings.simplefilter("ignore", NumericalWarning)
     for target, epsilons in ((distance_like, EPSILONS), (smooth, SMOOTH_EPSILONS)):
@@ -191,8 +227,9 @@ def main():
                 row["exact"] = exact_error(target, row["epsilon"])
         print(f"\n{target.__doc__}\n")
         show(rows)
-    print(f"\n{noise.__doc__}\n")
-    show(noise())
+    for part in (noise, growth, *([other_points] if options.seeds else [])):
+        print(f"\n{part.__doc__}\n")
+        show(part())
     print("\n" + "\n".join(fit_times()))
 
 

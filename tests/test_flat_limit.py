@@ -135,7 +135,7 @@ def test_unit_and_place_do_not_matter(kernel):
 
 @pytest.mark.parametrize("kernel", ["multiquadric", "inverse_quadratic"])
 def test_a_diverging_limit_is_told_and_that_of_the_gaussian_exists(kernel):
-    """On a plane grid of 5 x 5 only the Gaussian has a limit (Fornberg, Wright & Larsson 2004)."""
+    """The Gaussian always has a limit (Schaback 2005), others diverge on grids (Fornberg, Wright & Larsson 2004)."""
     grid = np.array([(x, y, 0.0) for x in np.linspace(-1, 1, 5) for y in np.linspace(-1, 1, 5)])
     values = smooth(grid)
     with pytest.warns(NumericalWarning, match="no limit exists"):

@@ -8,7 +8,7 @@ from rbfmuscle.implicit.field import RBFField, collocation, frame, hermite_syste
 from rbfmuscle.implicit.fitting import Basis
 from rbfmuscle.implicit.kernels import get_kernel
 from rbfmuscle.implicit.selection import choose_epsilon, choose_smoothing
-from rbfmuscle.validation import UsageError
+from rbfmuscle.validation import NumericalWarning, UsageError
 
 KERNELS = ["cubic", "quintic", "multiquadric", "matern_52", "wendland_c2"]
 
@@ -170,6 +170,20 @@ def test_points_without_noise_are_not_smoothed_for_their_noisy_normals(derivativ
     assert chosen < 1.01 * min(
         surface_error(points, normals, s, derivatives)[0] for s in np.geomspace(1e-6, 1, 13)
     )
+
+
+def test_gcv_smooths_points_that_are_a_third_of_their_spacing_off():
+    points, normals = bumpy_sphere(150, 0.1)
+    points += 0.1 * np.random.default_rng(5).normal(size=points.shape)
+    errors = [surface_error(points, normals, smoothing, "normal")[0] for smoothing in ("gcv", 0.0)]
+    assert errors[0] < 0.8 * errors[1]
+
+
+def test_smoothing_that_leaves_no_surface_is_told():
+    points, _ = bumpy_sphere(60, 0.0)
+    normals = np.random.default_rng(0).normal(size=points.shape)
+    with pytest.warns(NumericalWarning, match="contradict each other"):
+        choose_smoothing(points, normals=normals)
 
 
 def test_data_without_noise_are_hardly_smoothed():

@@ -16,9 +16,9 @@ from scipy.spatial import cKDTree
 from rbfmuscle.implicit import fitting
 from rbfmuscle.validation import UsageError
 
-# Of the spacing: what an error of one in the left-out normal counts. Values alone would choose the narrowest kernel,
-# which knows nothing between its centres, and where nothing is known f is 0, as it should be on the surface.
-SLOPE_SHARE = 0.15
+# Of the spacing: what an error of one in the left-out normal counts when smoothing is chosen. With less, noisy points
+# are best met by smoothing all away, as f = 0 meets them too; with more, the smoothing suits the normals alone.
+_SLOPE_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ class SmoothingPath:
         self.span = 1e-14 * values[-1], values[-1]
         self.lever = 0.0
         if basis.kind != "value" and count > 1:
-            self.lever = SLOPE_SHARE * cKDTree(basis.points).query(basis.points, k=2)[0][:, 1].mean()
+            self.lever = _SLOPE_SHARE * cKDTree(basis.points).query(basis.points, k=2)[0][:, 1].mean()
 
     def residuals(self, smoothing):
         """`Residuals` with a given smoothing above 0."""

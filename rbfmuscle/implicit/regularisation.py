@@ -1,13 +1,14 @@
 """Tikhonov regularisation: how much smoothing noisy or ill-conditioned data ask for."""
 
 import math
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
 from rbfmuscle.implicit.cross_validation import SmoothingPath
-from rbfmuscle.validation import UsageError
+from rbfmuscle.validation import NumericalWarning, UsageError
 
 SMOOTHING_CRITERIA = ("gcv", "loo")
 _PER_DECADE = 4
@@ -44,6 +45,11 @@ def search_smoothing(path, criterion="gcv"):
     Returns
     -------
     SmoothingChoice
+
+    Warns
+    -----
+    NumericalWarning
+        Where nothing but the polynomial would be left of a surface.
     """
     check_criterion(criterion)
 
@@ -59,6 +65,13 @@ def search_smoothing(path, criterion="gcv"):
     tried = np.array(sorted([*tried, (float(found.x), float(found.fun))]))
     tried[:, 0] = 10.0 ** tried[:, 0]
     best = tried[np.argmin(tried[:, 1])]
+    if path.lever and best[0] > 0.1 * path.span[1]:
+        warnings.warn(
+            f"the smoothing chosen by '{criterion}' ({best[0]:.2g}) leaves hardly anything of the surface: points and "
+            "normals contradict each other; use fewer or better ones, or give smoothing as a number",
+            NumericalWarning,
+            stacklevel=2,
+        )
     return SmoothingChoice(float(best[0]), float(best[1]), tried)
 
 

@@ -7,12 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.implicit.cross_validation import (
-    SLOPE_SHARE,
-    LeastSquaresPath,
-    SmoothingPath,
-    leave_one_out,
-)
+from rbfmuscle.implicit.cross_validation import LeastSquaresPath, SmoothingPath, leave_one_out
 from rbfmuscle.implicit.field import RBFField, _check_degree, collocation, frame, hermite_system
 from rbfmuscle.implicit.fitting import DOUBTFUL, Basis, solve
 from rbfmuscle.implicit.kernels import get_kernel
@@ -29,6 +24,11 @@ from rbfmuscle.validation import (
 CRITERIA = ("loo", "gcv", "held_out", "condition")
 _GOLDEN = 0.5 * (math.sqrt(5) - 1)
 _NOISE = 2.0  # an objective computed beyond DOUBTFUL must be this much better to be believed
+
+
+# Of the spacing: what an error of one in the left-out normal counts. Values alone would choose the narrowest kernel,
+# which knows nothing between its centres, and where nothing is known f is 0, as it should be on the surface.
+SLOPE_SHARE = 0.15
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ def choose_smoothing(
     kernel, epsilon, degree, derivatives, cutoff
         As in `RBFField.fit`, `RBFField.fit_hermite` and `RBFField.fit_least_squares`.
     criterion : {"gcv", "loo"}
-        A Hermite fit leaves points out with their normals, and counts them as `choose_epsilon` does.
+        A Hermite fit leaves points out with their normals; one in a normal counts half the spacing.
 
     Returns
     -------
