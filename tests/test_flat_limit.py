@@ -191,11 +191,13 @@ def test_what_cannot_be_is_refused(change, message):
         FlatField.fit(*scattered(20), **change)
 
 
-def test_points_out_of_reach_coinciding_centres_and_too_few_samples_are_refused():
+def test_points_out_of_reach_coinciding_or_too_many_centres_and_too_few_samples_are_refused():
     points, values = scattered(20)
     with pytest.raises(UsageError, match="fit with reach=3"):
         FlatField.fit(points, values)(points * 3 / np.linalg.norm(points, axis=1)[:, None] + 1e-3)
     with pytest.raises(np.linalg.LinAlgError, match="coincide"):
         FlatField.fit(points[[0, 0, 1, 2]], values[:4])
+    with pytest.raises(UsageError, match="at most 600 centres"):
+        FlatField.fit(*scattered(601))
     with pytest.raises(UsageError, match="at least 20 points"):
         FlatField.fit_least_squares(points[:10], values[:10], points)

@@ -33,6 +33,7 @@ _LEAST_RADII = (0.6, 0.5, 0.4)  # of those; few centres are sound far inside
 _SHRINK = (0.95, 0.82, 0.7)  # of the distance to the nearest branch point, on those tried with any other
 _NOISE = 3.0
 _CHUNK = 200_000
+_MOST_CENTRES = 600
 
 
 class System:
@@ -54,6 +55,10 @@ class System:
             )
         if not 1.0 <= reach <= 10.0:
             raise UsageError(f"reach must lie between 1 and 10, got {reach}")
+        if len(points) > _MOST_CENTRES:
+            raise UsageError(
+                f"a flat fit takes at most {_MOST_CENTRES} centres (beyond, none of it is sound), got {len(points)}"
+            )
         degree = _check_degree(kernel, degree, len(points))
         origin, scale = frame(points)
         return cls((points - origin) / scale, kernel, degree, reach), (origin, scale)
