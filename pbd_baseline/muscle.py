@@ -118,10 +118,10 @@ class PBDMuscle:
         vertices[self.rest.order] = self.points
         return vertices, self.rest.order[self.rest.topology.faces]
 
-    def surface(self, contacts):
-        """The mesh itself."""
-        vertices, faces = self.carried_mesh()
-        return ModelSurface(vertices, faces, {"solver_penetration_max": self.penetration})
+    def drawing(self, contacts):
+        """What gives the mesh as it is now."""
+        surface = ModelSurface(*self.carried_mesh(), {"solver_penetration_max": self.penetration})
+        return lambda: surface
 
     def volume(self):
         """Enclosed volume now [unit^3]."""

@@ -287,12 +287,12 @@ class RBFMuscle:
 
     def snapshot(self):
         """State that ``restore`` brings back."""
-        return self.x.copy(), self.shape.quaternion.copy(), self.level, self.solver.snapshot()
+        return self.x.copy(), self.shape.quaternion.copy(), self.solver.snapshot()
 
     def restore(self, state):
         """Return to an earlier ``snapshot``."""
-        x, quaternion, level, solver = state
-        self.x, self.level = x.copy(), level
+        x, quaternion, solver = state
+        self.x = x.copy()
         self.shape.quaternion[:] = quaternion
         self.solver.restore(solver)
         self.shape.localise(self.x)
@@ -309,12 +309,15 @@ class RBFMuscle:
 
     def field(self):
         """The RBF field through the present centres."""
+        return self._fit(self.x, self.normals())
+
+    def _fit(self, centres, normals):
         return RBFField.fit_surface(
-            self.x, self.normals(), kernel=self.kernel, epsilon=self.epsilon, derivatives=self.derivatives
+            centres, normals, kernel=self.kernel, epsilon=self.epsilon, derivatives=self.derivatives
         )
 
     def implicit(self):
-        """``points -> (values, gradients)`` of the field that the next ``surface`` shows, level taken off."""
+        """``points -> (values, gradients)`` of the field that the next `drawing` shows, level taken off."""
         fitted, level = self.field(), self.level
         self._fitted = fitted
 
@@ -324,13 +327,23 @@ class RBFMuscle:
 
         return evaluate
 
-    def surface(self, contacts):
-        """Refit the field, cut the bones away and extract the closed surface at the rest volume."""
+    def drawing(self, contacts):
+        """What refits the field, cuts the bones away and extracts the closed surface at the rest volume."""
+        fitted, self._fitted = self._fitted, None
+        centres, normals, points = self.x.copy(), self.normals(), self.contact_points()
+        depth, obstacles = contacts.depth(points), contacts.frozen()
+
+        def draw():
+            started = time.perf_counter()
+            field = fitted or self._fit(centres, normals)
+            surface = self._extract(field, points, obstacles, time.perf_counter() - started)
+            surface.quantities["solver_penetration_max"] = depth
+            return surface
+
+        return draw
+
+    def _extract(self, field, points, contacts, time_fit):
         started = time.perf_counter()
-        field, self._fitted = self._fitted or self.field(), None
-        fitted = time.perf_counter()
-        points = self.contact_points()
-        depth = contacts.depth(points)
         axes = self.axes @ contacts.poses[self.motion_bones[0]][:3, :3].T
         # Farther than a cell from the bones a lower bound will do: no vertex gets there.
         reach = 1.25 * float(np.ptp(points @ axes.T, axis=0).max()) / self.options.resolution
@@ -347,15 +360,11 @@ class RBFMuscle:
                 f"{self.options.kernel!r} and {len(self.x)} centres: {error}"
             ) from error
         self.level = result.level
-        return ModelSurface(
-            vertices=result.vertices,
-            faces=result.faces,
-            quantities={
-                "solver_penetration_max": depth,
-                "components": result.components,
-                "condition": field.condition,
-                "level": result.level,
-                "time_fit": fitted - started,
-                "time_extract": time.perf_counter() - fitted,
-            },
-        )
+        quantities = {
+            "components": result.components,
+            "condition": field.condition,
+            "level": result.level,
+            "time_fit": time_fit,
+            "time_extract": time.perf_counter() - started,
+        }
+        return ModelSurface(result.vertices, result.faces, quantities)

@@ -54,8 +54,10 @@ class BlendMuscle:
     def carried_mesh(self):
         return self.x.copy(), self.faces
 
-    def surface(self, contacts):
-        return ModelSurface(self.x.copy(), self.faces, {"solver_penetration_max": 0.0, "time_extract": 0.001})
+    def drawing(self, contacts):
+        quantities = {"solver_penetration_max": 0.0, "time_extract": 0.001}
+        surface = ModelSurface(self.x.copy(), self.faces, quantities)
+        return lambda: surface
 
 
 def arm_scene(*, end=20, step=10, units="mm", **output):

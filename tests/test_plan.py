@@ -61,7 +61,7 @@ def test_without_surfaces_and_metrics_nothing_is_extracted_or_measured(monkeypat
     def refuse(*_args, **_settings):
         raise AssertionError("called")
 
-    monkeypatch.setattr(BlendMuscle, "surface", refuse)
+    monkeypatch.setattr(BlendMuscle, "drawing", refuse)
     monkeypatch.setattr("rbfmuscle.run.MetricsRecorder", refuse)
     run = simulate(arm_scene(surfaces=False, metrics=False))
     assert len(run.frames) == 3 and run.metrics == []

@@ -158,8 +158,9 @@ class ToyMuscle:
     def carried_mesh(self):
         return self.x.copy(), self.faces
 
-    def surface(self, contacts):
-        return ModelSurface(self.x.copy(), self.faces, {"solver_penetration_max": 0.0})
+    def drawing(self, contacts):
+        surface = ModelSurface(self.x.copy(), self.faces, {"solver_penetration_max": 0.0})
+        return lambda: surface
 
 
 def ellipsoid(half, centre=(0, 0, 0), *, subdivisions=2):

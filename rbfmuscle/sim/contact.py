@@ -4,6 +4,7 @@ Obstacles are the bones' distance fields, which stay in bone coordinates and are
 scene asks for sliding, the surfaces of neighbouring muscles. Nothing here knows how a muscle is represented.
 """
 
+import copy
 from dataclasses import dataclass
 
 import numba
@@ -74,6 +75,12 @@ class BoneContacts:
         if missing:
             raise ValueError(f"poses lack the bone {missing[0]!r}")
         self.poses = poses
+
+    def frozen(self):
+        """These obstacles as they stand, for questions from another thread while the bones move on."""
+        other = copy.copy(self)
+        other.cuts, other._known = list(self.cuts), {}
+        return other
 
     def allow(self, bone_index, depth):
         """Let each contact point be up to ``depth`` (n,) inside a bone, [scene unit]; zeros take it back."""

@@ -112,12 +112,24 @@ class Lane:
                 "try a smaller substep_angle in [contact]"
             )
 
-    def show(self):
-        """The model's surface, timed, with what was measured beside it."""
+    def drawing(self):
+        """What makes the model's surface of this moment; called once, from any thread, while the lane goes on.
+
+        Returns
+        -------
+        callable
+            Gives the ModelSurface, with what was measured beside it, and the time that it took [s].
+        """
         with self.timed("surface"):
-            surface = self.model.surface(self.contacts)
-        surface.quantities.update(self.measured)
-        return surface
+            draw, measured = self.model.drawing(self.contacts), self.measured
+
+        def timed():
+            start = time.perf_counter()
+            surface = draw()
+            surface.quantities.update(measured)
+            return surface, time.perf_counter() - start
+
+        return timed
 
     def report(self, bone, count, action):
         """Note an event of the present frame; of one kind the most points at one time are kept."""

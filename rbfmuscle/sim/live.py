@@ -93,7 +93,7 @@ class LiveSession:
         scene.motion = _LiveMotion(list(self.limits))
         self._course = scene.motion.frames
         self.here = dict.fromkeys(self.limits, 0.0)
-        self._loop = simulate_frames(scene, self.models, fields=self.fields)
+        self._loop = simulate_frames(scene, self.models, fields=self.fields, ahead=False)
 
     def set(self, name, angle):
         """Give a coordinate a new target [radian], kept within its limits."""

@@ -2,8 +2,8 @@
 
 import itertools
 import time
-from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -57,7 +57,8 @@ class Frame:
         For each muscle ``time_predict``, ``time_solve``, ... and their sum ``time_frame`` [s], since the
         frame before.
     wall : float
-        Time for all muscles together [s], since the frame before.
+        Time for all muscles together [s], since the frame before. Where the next frame is solved while this one
+        is drawn, both are in it; over a motion the sum is what counts.
     fibres : dict of str to FibreLines
         Empty where no fibres were asked for.
     """
@@ -108,21 +109,31 @@ class MuscleModel(Protocol):
     def carried_mesh(self) -> tuple:
         """Vertices and faces of a surface that moves with the material, of constant topology."""
 
-    def surface(self, contacts: BoneContacts) -> ModelSurface:
-        """Surface as it is shown: closed and outward."""
+    def drawing(self, contacts: BoneContacts) -> Callable[[], ModelSurface]:
+        """What makes the surface of this moment, closed and outward; called once, while the model goes on."""
 
 
 class _Crew:
-    """Runs the lanes side by side, each with one thread."""
+    """Runs what can go side by side, each with one thread.
 
-    def __init__(self, count):
+    Parameters
+    ----------
+    lanes : int
+    tasks : int
+        Things that are done at a time; more than lanes where one frame is drawn while the next is solved.
+    """
+
+    def __init__(self, lanes, tasks):
         from threadpoolctl import ThreadpoolController
 
         self.blas = ThreadpoolController()
-        workers = min(count, numba.get_num_threads())
+        threads = numba.get_num_threads()
+        workers = min(tasks, threads)
         self.pool = None
         if workers > 1:
-            self.pool = ThreadPoolExecutor(workers, initializer=numba.set_num_threads, initargs=(1,))
+            # A muscle that is alone draws with every thread that its solver leaves free.
+            each = 1 if lanes > 1 else threads
+            self.pool = ThreadPoolExecutor(workers, initializer=numba.set_num_threads, initargs=(each,))
 
     def one_thread_each(self):
         """Context in which BLAS uses one thread: its workers spin, and take the cores from the loops."""
@@ -143,7 +154,9 @@ class _Crew:
             self.pool.shutdown(wait=True, cancel_futures=True)
 
 
-def simulate_frames(scene, models, *, surfaces=True, written=None, fields=None) -> Iterator[Frame]:
+def simulate_frames(
+    scene, models, *, surfaces=True, written=None, fields=None, ahead=True
+) -> Iterator[Frame]:
     """Run models through a scene's motion, from the rest pose on, and yield its frames one by one.
 
     Whatever ends it early (an interrupt, a ``SolveError``), the frames yielded so far stand.
@@ -159,6 +172,9 @@ def simulate_frames(scene, models, *, surfaces=True, written=None, fields=None) 
         Indices of the frames to yield; all where not given. The others are simulated and not shown.
     fields : dict of str to BoneSDF, optional
         Distance fields of the bones; built for the bones that muscles can reach where not given.
+    ahead : bool
+        Solve a frame while the one before is drawn, where there are threads for both. Models are then a frame
+        ahead of what was yielded. Without, no frame is asked of the motion before it is wanted.
 
     Raises
     ------
@@ -171,9 +187,10 @@ def simulate_frames(scene, models, *, surfaces=True, written=None, fields=None) 
     lanes = [
         Lane(model, contacts, scene) for model, contacts in zip(models, _obstacles(scene, models, fields))
     ]
-    crew = _Crew(len(lanes))
+    ahead = ahead and surfaces and scene.sliding is None
+    crew = _Crew(len(lanes), 2 * len(lanes) if ahead else len(lanes))
     try:
-        yield from _run(scene, lanes, crew, surfaces, written)
+        yield from _run(scene, lanes, crew, surfaces, written, ahead)
     finally:
         crew.close()
 
@@ -188,32 +205,59 @@ def _obstacles(scene, models, fields):
         yield BoneContacts(names, reached, contact_bone=model.contact_bone, margin=margin)
 
 
-def _run(scene, lanes, crew, surfaces, written):
+def _run(scene, lanes, crew, surfaces, written, ahead):
     here = dict.fromkeys(scene.motion.frames[0], 0.0) if scene.motion.frames else {}
-    pace = Pace(scene)
     start = time.perf_counter()
     with crew.one_thread_each():
         crew.each(lambda lane: settle_rest(lane, here), lanes)
         sliding = _sliding(scene, lanes)
     wall = time.perf_counter() - start
+    if ahead and crew.pool is not None:
+        yield from _run_ahead(scene, lanes, crew, written, here, wall)
+    else:
+        yield from _run_in_turn(scene, lanes, crew, sliding, surfaces, written, here, wall)
+
+
+def _run_ahead(scene, lanes, crew, written, here, wall):
+    """Each frame is solved while the one before is drawn, so that no thread waits for another muscle."""
+    pace, frame, draws = Pace(scene), None, []
+    for index, coordinates in enumerate(scene.motion.frames):
+        start = time.perf_counter()
+        show = written is None or index in written
+        stops = [here, *pace.split(here, coordinates)]
+        with crew.one_thread_each():
+            going = [crew.pool.submit(_go_alone, lane, index, stops, show) for lane in lanes]
+            skins = list(crew.pool.map(_call, draws if frame is not None else []))
+            wait(going)
+        wall += time.perf_counter() - start
+        if frame is not None:
+            yield _drawn(frame, skins, wall)
+            frame, wall = None, 0.0
+        draws = [done.result() for done in going]
+        frame = _frame(scene, lanes, index, coordinates) if show else None
+        here = coordinates
+    if frame is not None:
+        start = time.perf_counter()
+        with crew.one_thread_each():
+            skins = list(crew.pool.map(_call, draws))
+        yield _drawn(frame, skins, wall + time.perf_counter() - start)
+
+
+def _run_in_turn(scene, lanes, crew, sliding, surfaces, written, here, wall):
+    """Each frame is solved and drawn before the next one is looked at."""
+    pace = Pace(scene)
     for index, coordinates in enumerate(scene.motion.frames):
         start = time.perf_counter()
         shown = written is None or index in written
-        show = shown and surfaces
         stops = [here, *pace.split(here, coordinates)]
-        if sliding is None and crew.pool is not None:
-            # Nothing waits for another muscle: each goes all the way, and no thread idles in between.
-            with crew.one_thread_each():
-                skins = crew.each(lambda lane: _go_alone(lane, index, stops, show), lanes)  # noqa: B023
-                skins = skins if show else []
-        else:
-            with crew.one_thread_each():
-                _go(lanes, crew, sliding, index, stops)
-            with crew.all_threads():
-                skins = _show(lanes, crew, sliding) if show else []
+        with crew.one_thread_each():
+            draws = _go(lanes, crew, sliding, index, stops, shown and surfaces)
+        frame = _frame(scene, lanes, index, coordinates) if shown else None
+        with crew.all_threads():
+            skins = crew.each(_call, draws)
         wall += time.perf_counter() - start
-        if shown:
-            yield _frame(scene, lanes, index, coordinates, skins, wall)
+        if frame is not None:
+            yield _drawn(frame, skins, wall)
             wall = 0.0
         here = coordinates
 
@@ -228,21 +272,30 @@ def _sliding(scene, lanes):
 
 
 def _go_alone(lane, index, stops, show):
+    """Bring a lane to a frame; what draws it, where it is shown."""
     lane.frame = index
     lane.advance(stops)
-    return lane.show() if show else None
+    return lane.drawing() if show else None
 
 
-def _go(lanes, crew, sliding, index, stops):
+def _go(lanes, crew, sliding, index, stops, show):
+    """Bring all lanes to a frame; what draws them, where it is shown."""
+    if sliding is None:
+        draws = crew.each(lambda lane: _go_alone(lane, index, stops, show), lanes)
+        return draws if show else []
     for lane in lanes:
         lane.frame = index
-    if sliding is None:
-        crew.each(lambda lane: lane.advance(stops), lanes)
-        return
     for before, after in itertools.pairwise(stops):
         crew.each(lambda lane: _begin(lane, sliding, before, after), lanes)  # noqa: B023
         crew.each(sliding.update, lanes)
         crew.each(Lane.finish, lanes)
+    if not show:
+        return []
+    crew.each(sliding.refresh, lanes)
+    for lane, measured in zip(lanes, crew.each(sliding.measure, lanes)):
+        lane.measured = measured
+    crew.each(sliding.fit, lanes)
+    return [lane.drawing() for lane in lanes]
 
 
 def _begin(lane, sliding, before, after):
@@ -250,21 +303,25 @@ def _begin(lane, sliding, before, after):
     sliding.refresh(lane)
 
 
-def _show(lanes, crew, sliding):
-    if sliding is not None:
-        crew.each(sliding.refresh, lanes)
-        for lane, measured in zip(lanes, crew.each(sliding.measure, lanes)):
-            lane.measured = measured
-        crew.each(sliding.fit, lanes)
-    return crew.each(Lane.show, lanes)
+def _call(draw):
+    return draw()
 
 
-def _frame(scene, lanes, index, coordinates, skins, wall):
-    surfaces = {lane.name: skin for lane, skin in zip(lanes, skins)}
+def _frame(scene, lanes, index, coordinates):
+    """The frame as it was solved; `_drawn` adds its surfaces."""
     carried = {lane.name: lane.model.carried_mesh() for lane in lanes}
     times, events = {}, []
     for lane in lanes:
         times[lane.name], happened = lane.collect()
         events.extend(happened)
     poses = bone_poses(scene, coordinates)
-    return Frame(index, dict(coordinates), poses, surfaces, carried, events, times, wall)
+    return Frame(index, dict(coordinates), poses, {}, carried, events, times, 0.0)
+
+
+def _drawn(frame, skins, wall):
+    for name, (surface, seconds) in zip(frame.carried, skins):
+        frame.surfaces[name] = surface
+        for key in ("time_surface", "time_frame"):
+            frame.times[name][key] += seconds
+    frame.wall = wall
+    return frame
