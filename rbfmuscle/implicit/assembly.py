@@ -73,18 +73,8 @@ def _offsets_loop(x, j, scale2, first, d, u):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _ridge_loop(gamma, polynomials, column, first, out):
-    """out += gamma * (P^T P)[first:, column]."""
-    for q in range(polynomials.shape[0]):
-        c = gamma * polynomials[q, column]
-        if c != 0.0:
-            for i in range(out.size):
-                out[i] += c * polynomials[q, first + i]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _value_matrix_loop(x, epsilon, base, parameter, compact, table, gamma, polynomials, out):
-    """out[j, i] = phi(|x_i - x_j|) + gamma P^T P for i >= j; x is (3, n), out the transpose of the matrix."""
+def _value_matrix_loop(x, epsilon, base, parameter, compact, table, out):
+    """out[j, i] = phi(|x_i - x_j|) for i >= j; x is (3, n), out the transpose of the matrix."""
     n = x.shape[1]
     d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((4, n)), np.empty((4, n))
     for j in range(n):
@@ -94,12 +84,11 @@ def _value_matrix_loop(x, epsilon, base, parameter, compact, table, gamma, polyn
         column = out[j][j:]
         for i in range(m):
             column[i] = radial[0, i]
-        _ridge_loop(gamma, polynomials, j, j, column)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _hermite_matrix_loop(x, epsilon, base, parameter, compact, table, gamma, polynomials, out):
-    """Lower triangle of the Hermite matrix plus gamma P^T P; out[column, row] is its transpose.
+def _hermite_matrix_loop(x, epsilon, base, parameter, compact, table, out):
+    """Lower triangle of the Hermite matrix; out[column, row] is its transpose.
 
     Blocks: (value, value) phi; (d/dx_c, value) first * d_c;
     (d/dx_c, d/dx_e) -(first * delta + second * d_c d_e).
@@ -118,7 +107,6 @@ def _hermite_matrix_loop(x, epsilon, base, parameter, compact, table, gamma, pol
             target, dc = column[(c + 1) * n : (c + 2) * n], d[c]
             for i in range(n):
                 target[i] = e2 * first[i] * dc[i]
-        _ridge_loop(gamma, polynomials, j, j, column[j:])
         for e in range(3):
             de = d[e]
             column = out[(e + 1) * n + j]
@@ -128,8 +116,6 @@ def _hermite_matrix_loop(x, epsilon, base, parameter, compact, table, gamma, pol
                 target, dc = column[(c + 1) * n : (c + 2) * n], d[c]
                 for i in range(n):
                     target[i] = -e2 * e2 * second[i] * dc[i] * de[i]
-            start = (e + 1) * n + j
-            _ridge_loop(gamma, polynomials, start, start, column[start:])
 
 
 def normal_polynomials(points, normals, powers):
@@ -139,7 +125,7 @@ def normal_polynomials(points, normals, powers):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _normal_matrix_loop(x, normals, epsilon, base, parameter, compact, table, gamma, polynomials, out):
+def _normal_matrix_loop(x, normals, epsilon, base, parameter, compact, table, out):
     """As `_hermite_matrix_loop`, with the derivative along the unit normal (3, n) alone.
 
     Blocks: (value, value) phi; (normal i, value j) first (d . n_i);
@@ -162,5 +148,3 @@ def _normal_matrix_loop(x, normals, epsilon, base, parameter, compact, table, ga
             both = nx * normals[0, i] + ny * normals[1, i] + nz * normals[2, i]
             value[n + i] = e2 * first[i] * at_i
             slope[n + i] = -e2 * (first[i] * both + e2 * second[i] * at_i * at_j)
-        _ridge_loop(gamma, polynomials, j, j, value[j:])
-        _ridge_loop(gamma, polynomials, n + j, n + j, slope[n + j :])

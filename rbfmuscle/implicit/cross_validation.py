@@ -2,18 +2,20 @@
 
 Rippa (1999): leaving condition k out changes the prediction there by w_k / (F^-1)_kk with F the full
 augmented matrix. For a Hermite fit a centre is left out with all its conditions, and w_k / (F^-1)_kk becomes
-a small block solve.
+a small block solve. The blocks are products of columns of the inverted Cholesky factor, whose inversion takes as many
+operations as the factorisation.
 """
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from scipy import linalg
-from scipy.linalg import lapack
 from scipy.spatial import cKDTree
 
 from rbfmuscle.implicit import fitting
+from rbfmuscle.implicit.lapack import invert_factor
 from rbfmuscle.validation import UsageError
 
 # Of the spacing: what an error of one in the left-out normal counts when smoothing is chosen. With less, noisy points
@@ -67,28 +69,36 @@ def leave_one_out(basis, right, *, smoothing=0.0):
     Residuals
         For Hermite fits each centre is left out with all its conditions.
     """
-    count = len(basis.points)
-    gamma = basis.gamma
-    matrix = basis.matrix(gamma)
-    if smoothing:
-        matrix.ravel(order="K")[:: basis.size + 1] += smoothing
-    norm = fitting._largest(matrix)
-    factor, info = lapack.dpotrf(matrix, lower=1, overwrite_a=1, clean=1)
-    solved = fitting._schur(basis, factor, right, norm) if info == 0 else None
+    factor = fitting.factorise(basis, smoothing)
+    solved = factor.solve(right) if factor is not None else None
     if solved is None or solved[2] > fitting.DOUBTFUL:
         return _from_eigenvectors(basis, right, smoothing)
     weights, _, condition = solved
-    if len(basis.powers):
-        first = lapack.dtrtrs(factor, np.asfortranarray(basis.polynomials.T), lower=1)[0]
-    inverse, _ = lapack.dtrtri(factor, lower=1, overwrite_c=1)
-    rows = inverse.T.reshape(-1, count, basis.size)  # LAPACK's order: rows are contiguous here
-    blocks = np.stack([[np.einsum("km,km->k", a, b) for b in rows] for a in rows]).transpose(2, 0, 1).copy()
-    if len(basis.powers):
-        # F^-1 = M^-1 - (S^-1/2 P M^-1)^T (S^-1/2 P M^-1), S = P M^-1 P^T
-        root = np.linalg.cholesky(first.T @ first)
-        less = linalg.solve_triangular(root, (inverse.T @ first).T, lower=True).reshape(len(root), -1, count)
-        blocks -= np.einsum("qak,qbk->kab", less, less)
+    count = len(basis.points)
+    invert_factor(factor.lower)
+    blocks = np.empty((count, basis.size // count, basis.size // count))
+    _blocks_loop(factor.lower.T, blocks)
+    if len(basis.powers):  # F^-1 = M^-1 - Q Q^T / gamma
+        parts = factor.directions.reshape(-1, count, len(basis.powers))
+        blocks -= np.einsum("akq,bkq->kab", parts, parts) / factor.gamma
     return _residuals(blocks, weights, count, condition)
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _blocks_loop(columns, blocks):
+    """blocks[k] = (G^T G) at the conditions of centre k, with row i of columns the i-th column of the lower G."""
+    count, kinds = blocks.shape[0], blocks.shape[1]
+    for k in range(count):
+        for b in range(kinds):
+            j = b * count + k
+            second = columns[j, j:]
+            for a in range(b + 1):
+                first = columns[a * count + k, j:]
+                total = 0.0
+                for m in range(first.size):
+                    total += first[m] * second[m]
+                blocks[k, a, b] = total
+                blocks[k, b, a] = total
 
 
 def _residuals(blocks, weights, count, condition):

@@ -1,7 +1,7 @@
-"""Cholesky factors by SciPy's own LAPACK, without the interpreter's lock.
+"""Symmetric matrices and their Cholesky factors by SciPy's own BLAS and LAPACK, without the interpreter's lock.
 
-SciPy's Python wrappers of LAPACK hold the lock while they work, so that muscles fitted side by side would wait
-for each other; the same routines called through their published addresses (`scipy.linalg.cython_lapack`) do not.
+SciPy's Python wrappers hold the lock while they work, so that muscles fitted side by side would wait for each other;
+the same routines called through their published addresses (`scipy.linalg.cython_lapack`) do not.
 """
 
 import ctypes
@@ -10,14 +10,16 @@ from functools import lru_cache
 import numpy as np
 
 _INT = ctypes.POINTER(ctypes.c_int)
+_REAL = ctypes.POINTER(ctypes.c_double)
 _CHAR, _ARRAY = ctypes.c_char_p, ctypes.c_void_p
 
 
 @lru_cache(maxsize=8)
 def _routine(name, *types):
-    from scipy.linalg import cython_lapack
+    from scipy.linalg import cython_blas, cython_lapack
 
-    capsule = cython_lapack.__pyx_capi__[name]
+    published = {**cython_blas.__pyx_capi__, **cython_lapack.__pyx_capi__}
+    capsule = published[name]
     api = ctypes.pythonapi
     api.PyCapsule_GetName.restype, api.PyCapsule_GetName.argtypes = ctypes.c_char_p, [ctypes.py_object]
     api.PyCapsule_GetPointer.restype = ctypes.c_void_p
@@ -62,6 +64,64 @@ def solve_cholesky(factor, right):
     routine = _routine("dpotrs", _CHAR, _INT, _INT, _ARRAY, _INT, _ARRAY, _INT, _INT)
     routine(
         b"L", size, columns, factor.ctypes.data, size, right.ctypes.data, size, info
+    )  # fmt: skip
+
+
+def invert_factor(factor):
+    """Replace the lower triangle of a Cholesky factor by that of its inverse.
+
+    Parameters
+    ----------
+    factor : (n, n) ndarray, Fortran order
+        Changed in place; the upper triangle is neither read nor written.
+    """
+    _check(factor)
+    size, info = ctypes.c_int(len(factor)), ctypes.c_int(0)
+    routine = _routine("dtrtri", _CHAR, _CHAR, _INT, _ARRAY, _INT, _INT)
+    routine(b"L", b"N", size, factor.ctypes.data, size, info)
+
+
+def multiply_symmetric(matrix, right):
+    """Product of a symmetric matrix (lower triangle) and a few columns.
+
+    Parameters
+    ----------
+    matrix : (n, n) ndarray, Fortran order
+    right : (n, m) ndarray, Fortran order
+
+    Returns
+    -------
+    (n, m) ndarray, Fortran order
+    """
+    _check(matrix)
+    _check(right)
+    out = np.empty_like(right)
+    size, columns = ctypes.c_int(len(matrix)), ctypes.c_int(right.shape[1])
+    one, zero = ctypes.c_double(1.0), ctypes.c_double(0.0)
+    kinds = (_CHAR, _CHAR, _INT, _INT, _REAL, _ARRAY, _INT, _ARRAY, _INT, _REAL, _ARRAY, _INT)
+    routine = _routine("dsymm", *kinds)
+    routine(
+        b"L", b"L", size, columns, one, matrix.ctypes.data, size, right.ctypes.data, size, zero, out.ctypes.data, size
+    )  # fmt: skip
+    return out
+
+
+def subtract_products(matrix, left, right):
+    """Subtract ``left right^T + right left^T`` from the lower triangle of a symmetric matrix, in place.
+
+    Parameters
+    ----------
+    matrix : (n, n) ndarray, Fortran order
+    left, right : (n, m) ndarray, Fortran order
+    """
+    for array in (matrix, left, right):
+        _check(array)
+    size, columns = ctypes.c_int(len(matrix)), ctypes.c_int(left.shape[1])
+    minus, one = ctypes.c_double(-1.0), ctypes.c_double(1.0)
+    kinds = (_CHAR, _CHAR, _INT, _INT, _REAL, _ARRAY, _INT, _ARRAY, _INT, _REAL, _ARRAY, _INT)
+    routine = _routine("dsyr2k", *kinds)
+    routine(
+        b"L", b"N", size, columns, minus, left.ctypes.data, size, right.ctypes.data, size, one, matrix.ctypes.data, size
     )  # fmt: skip
 
 
