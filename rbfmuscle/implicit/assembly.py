@@ -76,7 +76,7 @@ def _offsets_loop(x, j, scale2, first, d, u):
 def _value_matrix_loop(x, epsilon, base, parameter, compact, table, out):
     """out[j, i] = phi(|x_i - x_j|) for i >= j; x is (3, n), out the transpose of the matrix."""
     n = x.shape[1]
-    d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((4, n)), np.empty((4, n))
+    d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((3, n)), np.empty((4, n))
     for j in range(n):
         m = n - j
         _offsets_loop(x, j, epsilon * epsilon, j, d, u[:m])
@@ -95,7 +95,7 @@ def _hermite_matrix_loop(x, epsilon, base, parameter, compact, table, out):
     """
     n = x.shape[1]
     e2 = epsilon * epsilon
-    d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((4, n)), np.empty((4, n))
+    d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((3, n)), np.empty((4, n))
     for j in range(n):
         _offsets_loop(x, j, e2, 0, d, u)
         _radial_loop(base, parameter, compact, table, 7, u, work, radial)
@@ -133,7 +133,7 @@ def _normal_matrix_loop(x, normals, epsilon, base, parameter, compact, table, ou
     """
     n = x.shape[1]
     e2 = epsilon * epsilon
-    d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((4, n)), np.empty((4, n))
+    d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((3, n)), np.empty((4, n))
     for j in range(n):
         _offsets_loop(x, j, e2, 0, d, u)
         _radial_loop(base, parameter, compact, table, 7, u, work, radial)

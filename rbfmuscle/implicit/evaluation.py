@@ -11,9 +11,13 @@ import numpy as np
 from numba import njit
 
 from rbfmuscle.implicit.radial import _radial_loop
+from rbfmuscle.implicit.values import _add_values_loop
 
 _BLOCK = 256
 _SERIAL = 400_000  # pairs below which starting threads does not pay
+_SORT_FROM = (
+    200  # centres from which sorting the points pays, so that blocks out of a kernel's reach are skipped
+)
 _POOLS = {}
 
 
@@ -30,15 +34,6 @@ def run_in_chunks(loop, count, cost):
     loop(0, edges[1])
     for other in others:
         other.result()
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _cubic_value_loop(p, cx, cy, cz, a, acc):
-    """acc += a r^3."""
-    for i in range(acc.size):
-        dx, dy, dz = p[0, i] - cx, p[1, i] - cy, p[2, i] - cz
-        u = dx * dx + dy * dy + dz * dz
-        acc[i] += a * u * np.sqrt(u)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
@@ -151,17 +146,45 @@ def _add_hessian_loop(a, bx, by, bz, e2, hermite, radial, d, h):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _cubic_block_loop(centres, a, b, hermite, gradient, p, acc, g):
-    """The cubic kernel with epsilon 1, the commonest by far, without intermediate arrays."""
+    """Hermite values, and gradients, of the cubic kernel with epsilon 1, the commonest by far."""
     for j in range(centres.shape[1]):
         cx, cy, cz, w = centres[0, j], centres[1, j], centres[2, j], a[j]
         if hermite and gradient:
             _cubic_hermite_gradient_loop(p, cx, cy, cz, w, b[0, j], b[1, j], b[2, j], acc, g)
         elif hermite:
             _cubic_hermite_value_loop(p, cx, cy, cz, w, b[0, j], b[1, j], b[2, j], acc)
-        elif gradient:
-            _cubic_gradient_loop(p, cx, cy, cz, w, acc, g)
         else:
-            _cubic_value_loop(p, cx, cy, cz, w, acc)
+            _cubic_gradient_loop(p, cx, cy, cz, w, acc, g)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _ball(p):
+    """Centre and radius of a ball around the points (3, n): that of their box."""
+    x, y, z = (
+        0.5 * (p[0].min() + p[0].max()),
+        0.5 * (p[1].min() + p[1].max()),
+        0.5 * (p[2].min() + p[2].max()),
+    )
+    dx, dy, dz = p[0].max() - x, p[1].max() - y, p[2].max() - z
+    return x, y, z, np.sqrt(dx * dx + dy * dy + dz * dz)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _out_of_reach(ball, cx, cy, cz, epsilon):
+    """Whether a kernel that ends at 1 / epsilon is zero in the whole ball."""
+    dx, dy, dz = ball[0] - cx, ball[1] - cy, ball[2] - cz
+    reach = ball[3] + 1.0 / epsilon
+    return dx * dx + dy * dy + dz * dz >= reach * reach
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _value_block_loop(centres, a, epsilon, base, parameter, compact, row, p, acc):
+    """Values alone of a field without Hermite weights."""
+    ball = _ball(p)
+    for j in range(centres.shape[1]):
+        cx, cy, cz, e = centres[0, j], centres[1, j], centres[2, j], epsilon[j]
+        if not (compact and _out_of_reach(ball, cx, cy, cz, e)):
+            _add_values_loop(base, parameter, compact, row, p, cx, cy, cz, e * e, a[j], acc)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -169,13 +192,15 @@ def _general_block_loop(
     centres, a, b, hermite, order, epsilon, base, parameter, compact, table, p, acc, g, h
 ):
     """Any kernel: radial functions into scratch blocks, then their sums. epsilon (K,)."""
-    d, u, work, radial = np.empty_like(p), np.empty_like(acc), np.empty((4, _BLOCK)), np.empty((4, _BLOCK))
+    d, u, work, radial = np.empty_like(p), np.empty_like(acc), np.empty((3, _BLOCK)), np.empty((4, _BLOCK))
     wanted = (2 << (order + hermite)) - 1
+    ball = _ball(p)
     for j in range(centres.shape[1]):
         e2 = epsilon[j] * epsilon[j]
-        _offsets_loop(p, centres[0, j], centres[1, j], centres[2, j], e2, d, u)
-        if compact and u.min() >= 1.0:
+        cx, cy, cz = centres[0, j], centres[1, j], centres[2, j]
+        if compact and _out_of_reach(ball, cx, cy, cz, epsilon[j]):
             continue
+        _offsets_loop(p, cx, cy, cz, e2, d, u)
         _radial_loop(base, parameter, compact, table, wanted, u, work, radial)
         _add_value_loop(a[j], b[0, j], b[1, j], b[2, j], e2, hermite, radial, d, acc)
         if order > 0:
@@ -200,7 +225,9 @@ def _evaluate_loop(
             for c in range(3):
                 p[c, i] = (points[low + min(i, n - 1), c] - origin[c]) / scale
         acc, g, h = np.zeros(_BLOCK), np.zeros((3, _BLOCK)), np.zeros((6, _BLOCK))
-        if cubic and order < 2:
+        if order == 0 and not hermite:
+            _value_block_loop(centres, a, epsilon, base, parameter, compact, table[0], p, acc)
+        elif cubic and order < 2:
             _cubic_block_loop(centres, a, b, hermite, order == 1, p, acc, g)
         else:
             _general_block_loop(
@@ -241,6 +268,12 @@ def evaluate(points, origin, scale, centres, weights, kernel, epsilon, order):
     b = weights[1:] if hermite else np.zeros((3, weights.shape[1]))
     cubic = kernel.name == "cubic" and bool((epsilon == 1.0).all())
     out = np.zeros(((1, 4, 10)[order], len(points)))
+    sort = (
+        kernel.compact and centres.shape[1] >= _SORT_FROM and len(points) > 4 * _BLOCK and epsilon.min() > 2.0
+    )
+    if sort:
+        places = _by_cells(points)
+        points = points[places]
 
     def loop(start, stop):
         _evaluate_loop(
@@ -249,4 +282,17 @@ def evaluate(points, origin, scale, centres, weights, kernel, epsilon, order):
         )  # fmt: skip
 
     run_in_chunks(loop, len(points), len(points) * centres.shape[1])
-    return out
+    if not sort:
+        return out
+    back = np.empty_like(out)
+    back[:, places] = out
+    return back
+
+
+def _by_cells(points):
+    """Order (n,) in which points lie cell by cell of a grid with about one block of points in each."""
+    low, size = points.min(axis=0), np.ptp(points, axis=0)
+    side = max((size.prod() * _BLOCK / len(points)) ** (1 / 3), size.max() / 30)
+    x, y, z = ((points - low) / (side or 1.0)).astype(np.uint16).T
+    # two bytes: NumPy then sorts by counting
+    return np.argsort((x * np.uint16(32) + y) * np.uint16(32) + z, kind="stable")

@@ -227,7 +227,7 @@ class RBFField:
         points = check_points(points)
         out = self._radial(points, 0)[0]
         if len(self.powers):
-            out += self.coefficients @ assembly.monomials((points - self.origin) / self.scale, self.powers)
+            out += self._polynomial((points - self.origin) / self.scale)
         return out
 
     def gradient(self, points):
@@ -241,7 +241,7 @@ class RBFField:
         value, gradient = out[0], out[1:].T
         if len(self.powers):
             scaled = (points - self.origin) / self.scale
-            value += self.coefficients @ assembly.monomials(scaled, self.powers)
+            value += self._polynomial(scaled)
             gradient = gradient + np.einsum(
                 "q,cqn->nc", self.coefficients, assembly.monomial_gradients(scaled, self.powers)
             )
@@ -290,6 +290,10 @@ class RBFField:
                 "q,ceqn->nce", self.coefficients, assembly.monomial_hessians(scaled, self.powers)
             )
         return gradient / self.scale, hessian / self.scale**2
+
+    def _polynomial(self, scaled):
+        # not by BLAS, whose threads go on waiting on the cores that the next evaluation needs
+        return np.einsum("q,qn->n", self.coefficients, assembly.monomials(scaled, self.powers))
 
     def _radial(self, points, order):
         return evaluate(

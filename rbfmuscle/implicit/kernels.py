@@ -98,7 +98,7 @@ class Kernel:
             self.table,
             1 << k,
             flat * flat,
-            np.empty((4, flat.size)),
+            np.empty((3, flat.size)),
             out,
         )
         values = out[k]

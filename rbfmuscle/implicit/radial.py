@@ -18,90 +18,90 @@ _TINY = 2.2250738585072014e-308
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _exp_loop(factor, x, bits, out):
-    """out = exp(factor * x), relative error of the exponential below 3e-16; 0 where factor * x < -708.
+def _exp(x):
+    """exp(x), relative error below 3e-16; 0 where x < -708.
 
-    x, bits (scratch) and out must not overlap, or the loops are not vectorised.
+    x = n log 2 + r with r below 0.35, a polynomial for exp r, and n added to the exponent's bits.
     """
-    whole = bits.view(np.int64)
-    for i in range(x.size):
-        bits[i] = min(max(factor * x[i], -708.0), 709.0) * _LOG2E + _SHIFTER
-    for i in range(x.size):
-        n = bits[i] - _SHIFTER
-        t = min(max(factor * x[i], -708.0), 709.0)
-        r = (t - n * _LN2_HIGH) - n * _LN2_LOW
-        p = 1.0 / 6227020800.0
-        p = p * r + 1.0 / 479001600.0
-        p = p * r + 1.0 / 39916800.0
-        p = p * r + 1.0 / 3628800.0
-        p = p * r + 1.0 / 362880.0
-        p = p * r + 1.0 / 40320.0
-        p = p * r + 1.0 / 5040.0
-        p = p * r + 1.0 / 720.0
-        p = p * r + 1.0 / 120.0
-        p = p * r + 1.0 / 24.0
-        p = p * r + 1.0 / 6.0
-        p = p * r + 0.5
-        p = p * r + 1.0
-        p = p * r + 1.0
-        out[i] = p if factor * x[i] >= -708.0 else 0.0
-    # bits and whole share memory: in one loop they would keep it from being vectorised
-    for i in range(x.size):
-        whole[i] = (whole[i] + 1023) << 52
-    for i in range(x.size):
-        out[i] *= bits[i]
+    t = min(max(x, -708.0), 709.0)
+    whole = np.float64(t * _LOG2E + _SHIFTER)
+    n = whole - _SHIFTER
+    r = (t - n * _LN2_HIGH) - n * _LN2_LOW
+    p = 1.0 / 6227020800.0
+    p = p * r + 1.0 / 479001600.0
+    p = p * r + 1.0 / 39916800.0
+    p = p * r + 1.0 / 3628800.0
+    p = p * r + 1.0 / 362880.0
+    p = p * r + 1.0 / 40320.0
+    p = p * r + 1.0 / 5040.0
+    p = p * r + 1.0 / 720.0
+    p = p * r + 1.0 / 120.0
+    p = p * r + 1.0 / 24.0
+    p = p * r + 1.0 / 6.0
+    p = p * r + 0.5
+    p = p * r + 1.0
+    p = p * r + 1.0
+    power = np.int64((whole.view(np.int64) + np.int64(1023)) << np.int64(52)).view(np.float64)
+    return p * power if x >= -708.0 else 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _log_loop(x, bits, out):
-    """out = log(x) for x > 0, relative error below 4e-16; 0 is taken as the smallest normal number."""
-    whole = bits.view(np.int64)
+def _log(x):
+    """log(x) for x > 0, relative error below 4e-16; 0 is taken as the smallest normal number."""
+    bits = np.float64(max(x, _TINY)).view(np.int64)
+    exponent = np.int64((bits - np.int64(4604544271217802189)) >> np.int64(52))  # mantissa in [0.707, 1.414)
+    m = np.int64(bits - (exponent << np.int64(52))).view(np.float64)
+    f = m - 1.0
+    s = f / (m + 1.0)
+    z = s * s
+    p = 1.0 / 23.0
+    p = p * z + 1.0 / 21.0
+    p = p * z + 1.0 / 19.0
+    p = p * z + 1.0 / 17.0
+    p = p * z + 1.0 / 15.0
+    p = p * z + 1.0 / 13.0
+    p = p * z + 1.0 / 11.0
+    p = p * z + 1.0 / 9.0
+    p = p * z + 1.0 / 7.0
+    p = p * z + 1.0 / 5.0
+    p = p * z + 1.0 / 3.0
+    # log m = 2s + 2s^3 p with 2s = f - s f, so that the leading term is exact
+    return exponent * _LN2_HIGH + (f - s * (f - 2.0 * z * p) + exponent * _LN2_LOW)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _exp_loop(factor, x, out):
+    """out = exp(factor * x)."""
     for i in range(x.size):
-        bits[i] = max(x[i], _TINY)
+        out[i] = _exp(factor * x[i])
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _log_loop(x, out):
+    """out = log(x)."""
     for i in range(x.size):
-        b = whole[i]
-        e = (b - 4604544271217802189) >> 52  # bits of sqrt(1/2): mantissa then lies in [0.707, 1.414)
-        out[i] = e
-        whole[i] = b - (e << 52)
-    for i in range(x.size):
-        m = bits[i]
-        s = (m - 1.0) / (m + 1.0)
-        z = s * s
-        p = 1.0 / 23.0
-        p = p * z + 1.0 / 21.0
-        p = p * z + 1.0 / 19.0
-        p = p * z + 1.0 / 17.0
-        p = p * z + 1.0 / 15.0
-        p = p * z + 1.0 / 13.0
-        p = p * z + 1.0 / 11.0
-        p = p * z + 1.0 / 9.0
-        p = p * z + 1.0 / 7.0
-        p = p * z + 1.0 / 5.0
-        p = p * z + 1.0 / 3.0
-        f = m - 1.0
-        # log m = 2s + 2s^3 p with 2s = f - s f, so that the leading term is exact
-        out[i] = out[i] * _LN2_HIGH + (f - s * (f - 2.0 * z * p) + out[i] * _LN2_LOW)
+        out[i] = _log(x[i])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _base_loop(base, parameter, u, s, b, bits, more):
-    """s = sqrt(u) and b = the kernel's base; bits and more are scratch."""
+def _base_loop(base, parameter, u, s, b, more):
+    """s = sqrt(u) and b = the kernel's base; more is scratch."""
     if base != GAUSS and base != BINOMIAL:  # functions of u alone
         for i in range(u.size):
             s[i] = np.sqrt(u[i])
     if base == EXP:
-        _exp_loop(-1.0, s, bits, b)
+        _exp_loop(-1.0, s, b)
     elif base == GAUSS:
-        _exp_loop(-1.0, u, bits, b)
+        _exp_loop(-1.0, u, b)
     elif base == LOG:
-        _log_loop(u, bits, b)
+        _log_loop(u, b)
         for i in range(u.size):
             b[i] = 0.5 * b[i]
     elif base == BINOMIAL:
-        _binomial_loop(parameter, u, b, bits, more)
+        _binomial_loop(parameter, u, b, more)
     elif base == POWER:
-        _log_loop(u, bits, more)
-        _exp_loop(0.5 * parameter, more, bits, b)
+        _log_loop(u, more)
+        _exp_loop(0.5 * parameter, more, b)
         for i in range(u.size):
             b[i] = b[i] if u[i] > 0.0 else 0.0
     elif base == CUT:
@@ -110,7 +110,7 @@ def _base_loop(base, parameter, u, s, b, bits, more):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _binomial_loop(beta, u, b, bits, more):
+def _binomial_loop(beta, u, b, more):
     """b = (1 + u)**beta, by roots where beta is a half."""
     if beta == 0.5:
         for i in range(u.size):
@@ -127,8 +127,8 @@ def _binomial_loop(beta, u, b, bits, more):
     else:
         for i in range(u.size):
             b[i] = 1.0 + u[i]
-        _log_loop(b, bits, more)
-        _exp_loop(beta, more, bits, b)
+        _log_loop(b, more)
+        _exp_loop(beta, more, b)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
@@ -166,11 +166,11 @@ def _inner_loop(base, row, u, s, b, out):
 def _radial_loop(base, parameter, compact, table, wanted, u, work, out):
     """Fill out[k] (4, n) with the k-th radial function of s**2 = u for every bit k set in wanted.
 
-    work is a (4, n) scratch array. Where a function is infinite at u = 0 a finite value stands in: it is
+    work is a (3, n) scratch array. Where a function is infinite at u = 0 a finite value stands in: it is
     only ever multiplied by components of the zero vector.
     """
-    s, b, bits, more = work[0][: u.size], work[1][: u.size], work[2][: u.size], work[3][: u.size]
-    _base_loop(base, parameter, u, s, b, bits, more)
+    s, b, more = work[0][: u.size], work[1][: u.size], work[2][: u.size]
+    _base_loop(base, parameter, u, s, b, more)
     for k in range(4):
         if not (wanted >> k) & 1:
             continue
