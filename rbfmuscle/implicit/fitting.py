@@ -21,6 +21,8 @@ from scipy.linalg import blas
 from scipy.spatial import cKDTree
 
 from rbfmuscle.implicit import assembly
+from rbfmuscle.implicit.banded import factorise_band
+from rbfmuscle.implicit.condition import PROBES, largest_eigenvalue, probe_vectors
 from rbfmuscle.implicit.lapack import factor_cholesky, multiply_symmetric, solve_cholesky, subtract_products
 from rbfmuscle.validation import NumericalWarning
 
@@ -28,7 +30,6 @@ DOUBTFUL = 1e13
 """Condition above which a fit is reported as doubtful."""
 _CUTOFF = 1e-14
 _DEPENDENT = 1e-9
-_PROBES = 2
 
 
 class Basis:
@@ -116,27 +117,13 @@ def solve(basis, right, *, smoothing=0.0):
     NumericalWarning
         Where the condition makes the result doubtful.
     """
-    factor = factorise(basis, smoothing)
+    factor = factorise_band(basis, smoothing) or factorise(basis, smoothing)
     if factor is not None:
         solution = factor.solve(right)
         if solution[2] < DOUBTFUL:
             return solution
     raise_if_singular(basis)
     return _solve_truncated(basis, right, smoothing)
-
-
-def _largest(matrix):
-    """Largest eigenvalue of a symmetric matrix (lower triangle) by two steps of power iteration."""
-    vector = np.full(len(matrix), 1.0)
-    vector[1::2] -= 1e-3
-    norm = 0.0
-    for _ in range(2):
-        vector /= math.sqrt(vector @ vector)
-        vector = blas.dsymv(1.0, matrix, vector, lower=1)
-        norm = math.sqrt(vector @ vector)
-        if norm == 0.0:  # one centre of a kernel that is 0 there
-            break
-    return norm
 
 
 @dataclass(frozen=True)
@@ -167,9 +154,9 @@ class Factor:
 
     def solve(self, right):
         """Weights (size,), coefficients (q,) and condition |A| |M^-1| for the right side (size,)."""
-        block = np.empty((len(right), 1 + _PROBES), order="F")
+        block = np.empty((len(right), 1 + PROBES), order="F")
         block[:, 0] = self._project(right)
-        block[:, 1:] = self._probes()
+        block[:, 1:] = probe_vectors(np.diagonal(self.lower))
         solve_cholesky(self.lower, block)
         condition = max(1.0, self.norm * math.sqrt((block[:, 1:] ** 2).sum(axis=0).max()))
         weights = self._project(block[:, 0])
@@ -183,14 +170,6 @@ class Factor:
         if not self.directions.shape[1]:
             return vector.copy()
         return vector - self.directions @ (self.directions.T @ vector)
-
-    def _probes(self):
-        """Two probes for the smallest eigenvector: the unit vector of the smallest pivot, and signs."""
-        count = len(self.lower)
-        probes = np.zeros((count, _PROBES))
-        probes[int(np.argmin(np.diagonal(self.lower))), 0] = 1.0
-        probes[:, 1] = np.where((np.arange(count) * 0x9E3779B1) >> 7 & 1, 1.0, -1.0) / math.sqrt(count)
-        return probes
 
 
 def factorise(basis, smoothing=0.0):
@@ -209,7 +188,8 @@ def factorise(basis, smoothing=0.0):
     matrix, size, q = basis.matrix(), basis.size, len(basis.powers)
     if smoothing:
         matrix.ravel(order="K")[:: size + 1] += smoothing
-    norm, gamma = _largest(matrix), 0.0
+    norm = largest_eigenvalue(size, lambda vector: blas.dsymv(1.0, matrix, vector, lower=1))
+    gamma = 0.0
     directions, triangle, products = np.empty((size, 0)), np.empty((0, 0)), np.empty((size, 0))
     if q:
         directions, triangle = linalg.qr(basis.polynomials.T, mode="economic", check_finite=False)
