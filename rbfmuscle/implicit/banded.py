@@ -16,8 +16,8 @@ from scipy.spatial import cKDTree
 from rbfmuscle.implicit.condition import PROBES, largest_eigenvalue, probe_vectors
 
 _FEWEST = 300
-_NEIGHBOURS = {"value": 0.06, "normal": 0.12, "gradient": 0.12}
-"""Neighbours in reach, as a share of the centres, up to which setting up the band pays."""
+_NEIGHBOURS = {"value": 0.04, "normal": 0.08, "gradient": 0.12}
+"""Neighbours in reach, as a share of the centres, up to which a band is faster (`benchmarks/interpolation.py`)."""
 _WIDTH = 0.45
 """The same of the width of the band, in centres."""
 

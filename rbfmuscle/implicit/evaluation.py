@@ -29,9 +29,17 @@ def run_in_chunks(loop, count, cost):
         return
     if threads not in _POOLS:
         _POOLS[threads] = ThreadPoolExecutor(threads - 1, thread_name_prefix="rbf-field")
-    edges = [count * k // threads for k in range(threads + 1)]
-    others = [_POOLS[threads].submit(loop, edges[k], edges[k + 1]) for k in range(1, threads)]
-    loop(0, edges[1])
+    # more parts than threads: one whose core is taken by another, such as a waiting BLAS thread, then does fewer
+    parts = max(threads, min(8 * threads, int(cost // _SERIAL), -(-count // _BLOCK)))
+    edges = [count * k // parts for k in range(parts + 1)]
+    left = iter(range(parts))
+
+    def work():
+        for k in left:
+            loop(edges[k], edges[k + 1])
+
+    others = [_POOLS[threads].submit(work) for _ in range(threads - 1)]
+    work()
     for other in others:
         other.result()
 

@@ -1,0 +1,158 @@
+"""Fits, evaluation, leave-one-out, bands and condition estimates of the fields, as ratios: ``make bench``.
+
+As in `table`, both sides of a row work in one process, in turns, and the least of several rounds counts.
+"""
+
+import argparse
+import json
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import RBFInterpolator
+from scipy.linalg import blas
+from table import ROUNDS, Table, machine
+
+from rbfmuscle.implicit.banded import factorise_band
+from rbfmuscle.implicit.condition import PROBES, largest_eigenvalue, probe_vectors
+from rbfmuscle.implicit.cross_validation import leave_one_out
+from rbfmuscle.implicit.field import RBFField, hermite_system
+from rbfmuscle.implicit.fitting import Basis, factorise, solve
+from rbfmuscle.implicit.kernels import KERNELS
+from rbfmuscle.implicit.lapack import solve_cholesky
+from rbfmuscle.validation import NumericalWarning
+
+SHARED = {"linear": 1.0, "cubic": 1.0, "quintic": 1.0, "thin_plate_spline": 1.0, "multiquadric": 4.0,
+          "inverse_multiquadric": 4.0, "inverse_quadratic": 4.0, "gaussian": 6.0}  # fmt: skip
+COUNTS = (500, 1000, 2000)
+PARTS = ("fit", "evaluate", "loo", "band", "condition")
+
+
+def scattered(count):
+    """Points (count, 3) in a cube and a smooth function there."""
+    points = np.random.default_rng(count).uniform(-1, 1, (count, 3))
+    return points, np.sin(2 * points[:, 0]) + points[:, 1] * points[:, 2]
+
+
+def ellipsoid(count):
+    """Points and normals, evenly over an ellipsoid, in random order."""
+    i = np.random.default_rng(0).permutation(count) + 0.5
+    z, angle = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
+    unit = np.c_[np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z]
+    normals = unit / [0.4, 0.5, 1.0]
+    return unit * [0.4, 0.5, 1.0], normals / np.linalg.norm(normals, axis=1)[:, None]
+
+
+def both_fits(kernel, count):
+    """Our fit and SciPy's, to be called."""
+    points, values = scattered(count)
+    given = {"kernel": kernel, "epsilon": SHARED[kernel], "degree": KERNELS[kernel].degree}
+    return lambda: RBFField.fit(points, values, **given), lambda: RBFInterpolator(points, values, **given)
+
+
+def bench_fit(table):
+    """Fits against SciPy's, after a look at whether they agree."""
+    where = np.random.default_rng(0).uniform(-0.9, 0.9, (500, 3))
+    for count in COUNTS:
+        for kernel in SHARED:
+            ours, theirs = both_fits(kernel, count)
+            apart = np.abs(ours()(where) - theirs()(where)).max()
+            if apart > 1e-8:
+                print(f"{kernel}, {count}: SciPy and we differ by {apart:.1e}")
+            table.add("fit", f"{kernel}, {count}, apart {apart:.0e}", "SciPy RBFInterpolator", ours, theirs)
+
+
+def bench_evaluate(table):
+    """64^3 points, 1000 centres."""
+    where = np.random.default_rng(0).uniform(-1, 1, (64**3, 3))
+    for kernel in ("cubic", "gaussian"):
+        ours, theirs = (make() for make in both_fits(kernel, 1000))
+        table.add("evaluate", f"{kernel}, 1000 centres, 64^3", "SciPy RBFInterpolator",
+                  lambda ours=ours: ours(where), lambda theirs=theirs: theirs(where), apart=True)  # fmt: skip
+
+
+def systems():
+    """Name, basis and right side of the fits that leave-one-out and the condition are measured on."""
+    for kernel, epsilon in (("cubic", 1.0), ("matern_52", 3.0), ("wendland_c4", 1.0)):
+        for count in (500, 1000):
+            points, values = scattered(count)
+            basis = Basis(points, KERNELS[kernel], epsilon, KERNELS[kernel].degree)
+            yield f"{kernel}, {count} values", basis, values
+        for derivatives, counts in (("normal", (300, 600)), ("all", (150, 300))):
+            for count in counts:
+                system = hermite_system(*ellipsoid(count), KERNELS[kernel], epsilon, derivatives)
+                yield f"{kernel}, {count} Hermite, {derivatives}", *system[:2]
+
+
+def bench_loo(table):
+    """Leaving every centre out, against one fit: a ratio of 0.5 is the time of two fits."""
+    for name, basis, right in systems():
+        table.add("loo", name, "one fit", lambda b=basis, r=right: leave_one_out(b, r),
+                  lambda b=basis, r=right: solve(b, r))  # fmt: skip
+
+
+def bench_band(table):
+    """Bands of compact kernels against full matrices, at several shares of centres in reach."""
+    for kind, counts in (
+        ("value", (500, 1000, 2000, 4000)),
+        ("normal", (300, 1000)),
+        ("gradient", (300, 500)),
+    ):
+        for count in counts:
+            points, normals = ellipsoid(count)
+            for share in (0.01, 0.03):
+                apart = np.linalg.norm(points[:: count // 50, None] - points, axis=2)
+                reach = np.quantile(apart, share)
+                basis = Basis(points, KERNELS["wendland_c4"], 1.0 / reach, -1, kind=kind, normals=normals)
+                if factorise_band(basis) is None:
+                    print(f"band: {kind}, {count}, {share:.0%} in reach: left to the full matrix")
+                    continue
+                table.add("band", f"{kind}, {count}, {share:.0%} in reach", "full matrix",
+                          lambda b=basis: factorise_band(b), lambda b=basis: factorise(b))  # fmt: skip
+
+
+def bench_condition(table):
+    """The estimate of the condition against the whole fit: the ratio is its share."""
+    for name, basis, right in systems():
+        whole = share = np.inf
+        for _ in range(3 * ROUNDS):
+            start = time.perf_counter()
+            solve(basis, right)
+            whole = min(whole, time.perf_counter() - start)
+            matrix, factor = basis.matrix(), factorise(basis)
+            start = time.perf_counter()
+            estimate(matrix, factor.lower)
+            share = min(share, time.perf_counter() - start)
+        table.keep("condition", name, "the estimate in it", whole, share)
+
+
+def estimate(matrix, lower):
+    """What a fit does for its condition: two products with the matrix, two solutions with its factor."""
+    largest_eigenvalue(len(matrix), lambda vector: blas.dsymv(1.0, matrix, vector, lower=1))
+    block = np.empty((len(matrix), PROBES), order="F")
+    block[:] = probe_vectors(np.diagonal(lower))
+    solve_cholesky(lower, block)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("-o", "--output", type=Path)
+    parser.add_argument("--part", choices=PARTS, action="append", help="what to measure; all by default")
+    chosen = parser.parse_args()
+    about = machine()
+    print(f"{about['cpu']}, {about['usable_cores']} of {about['cores']} cores, {about['threads']} threads")
+    warnings.simplefilter("ignore", NumericalWarning)
+    table = Table()
+    work = (bench_fit, bench_evaluate, bench_loo, bench_band, bench_condition)
+    for part, bench in zip(PARTS, work):
+        if not chosen.part or part in chosen.part:
+            bench(table)
+    if chosen.output:
+        chosen.output.write_text(
+            json.dumps({"machine": about, "rows": table.rows}, indent=1), encoding="utf-8"
+        )
+
+
+if __name__ == "__main__":
+    main()
