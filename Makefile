@@ -28,6 +28,7 @@ check: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/python -m pip install --quiet -e ".[bench]" || echo "some peers are not to be had; the table says which"
 	$(BIN)/python benchmarks/table.py -o benchmarks/last.json
+	$(BIN)/python benchmarks/interpolation.py
 
 docs: $(STAMP)
 	$(BIN)/python -c "import furo, myst_parser, sphinx" 2>/dev/null || $(BIN)/python -m pip install --quiet -e ".[docs]"

@@ -129,7 +129,7 @@ def bench_fields(table, name, mesh, count):
               lambda: RBFField.fit(points, values, kernel="cubic", degree=1),
               lambda: RBFInterpolator(points, values, kernel="cubic", degree=1))  # fmt: skip
     table.add(name, f"evaluate 20000 points x {2 * count} centres", "SciPy RBFInterpolator",
-              lambda: ours(queries), lambda: scipy(queries))  # fmt: skip
+              lambda: ours(queries), lambda: scipy(queries), apart=True)  # fmt: skip
     bench_extraction(table, name, RBFField.fit_hermite(sample.points, sample.normals), sample)
 
 

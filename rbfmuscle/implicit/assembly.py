@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from rbfmuscle.implicit.radial import _radial_loop
+from rbfmuscle.implicit.values import _add_values_loop
 
 
 def exponents(degree):
@@ -74,16 +75,12 @@ def _offsets_loop(x, j, scale2, first, d, u):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _value_matrix_loop(x, epsilon, base, parameter, compact, table, out):
-    """out[j, i] = phi(|x_i - x_j|) for i >= j; x is (3, n), out the transpose of the matrix."""
-    n = x.shape[1]
-    d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((3, n)), np.empty((4, n))
-    for j in range(n):
-        m = n - j
-        _offsets_loop(x, j, epsilon * epsilon, j, d, u[:m])
-        _radial_loop(base, parameter, compact, table, 1, u[:m], work, radial)
-        column = out[j][j:]
-        for i in range(m):
-            column[i] = radial[0, i]
+    """out[j, i] = phi(|x_i - x_j|), both halves, as whole rows are filled faster; x is (3, n)."""
+    for j in range(x.shape[1]):
+        column = out[j]
+        column[:] = 0.0
+        centre = x[0, j], x[1, j], x[2, j]
+        _add_values_loop(base, parameter, compact, table[0], x, *centre, epsilon * epsilon, 1.0, column)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
