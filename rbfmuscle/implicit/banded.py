@@ -13,9 +13,9 @@ from scipy.linalg import blas, lapack
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.spatial import cKDTree
 
-from rbfmuscle.implicit.condition import PROBES, largest_eigenvalue, probe_vectors
+from rbfmuscle.implicit.condition import largest_eigenvalue, probe
 
-_FEWEST = 300
+_FEWEST = {"value": 800, "normal": 300, "gradient": 300}
 _NEIGHBOURS = {"value": 0.04, "normal": 0.08, "gradient": 0.12}
 """Neighbours in reach, as a share of the centres, up to which a band is faster (`benchmarks/interpolation.py`)."""
 _WIDTH = 0.45
@@ -42,13 +42,13 @@ class BandFactor:
 
     def solve(self, right):
         """Weights (size,), no coefficients (0,), and an estimate of the condition."""
-        block = np.empty((len(right), 1 + PROBES), order="F")
+        block = np.empty((len(right), 2), order="F")
         block[:, 0] = right[self.order]
-        block[:, 1:] = probe_vectors(self.band[0])
+        block[:, 1] = probe(self.band[0])
         block, _ = lapack.dpbtrs(self.band, block, lower=1, overwrite_b=1)
         weights = np.empty(len(right))
         weights[self.order] = block[:, 0]
-        return weights, np.zeros(0), self.norm * math.sqrt((block[:, 1:] ** 2).sum(axis=0).max())
+        return weights, np.zeros(0), self.norm * math.sqrt(block[:, 1] @ block[:, 1])
 
 
 def factorise_band(basis, smoothing=0.0):
@@ -66,7 +66,7 @@ def factorise_band(basis, smoothing=0.0):
         other, or the matrix is not definite in floating-point numbers.
     """
     count = len(basis.points)
-    if not basis.kernel.compact or len(basis.powers) or count < _FEWEST:
+    if not basis.kernel.compact or len(basis.powers) or count < _FEWEST[basis.kind]:
         return None
     tree, reach = cKDTree(basis.points), 1.0 / basis.epsilon
     some = basis.points[:: max(1, count // 20)]

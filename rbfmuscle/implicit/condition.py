@@ -4,8 +4,6 @@ import math
 
 import numpy as np
 
-PROBES = 2
-
 
 def largest_eigenvalue(size, multiply):
     """Largest eigenvalue of a symmetric matrix by two steps of power iteration, a lower bound.
@@ -32,8 +30,8 @@ def largest_eigenvalue(size, multiply):
     return norm
 
 
-def probe_vectors(pivots):
-    """Probes for the smallest eigenvector: the unit vector of the smallest pivot, and signs, (size, PROBES).
+def probe(pivots):
+    """Probe for the smallest eigenvector: random signs, and the unit vector of the smallest pivot.
 
     Parameters
     ----------
@@ -42,11 +40,11 @@ def probe_vectors(pivots):
 
     Returns
     -------
-    (size, PROBES) ndarray
-        Of length one; the longest of the solutions for them is an estimate of 1 / (smallest eigenvalue).
+    (size,) ndarray
+        Of length about one; the length of the solution for it is an estimate of 1 / (smallest eigenvalue).
     """
     size = len(pivots)
-    probes = np.zeros((size, PROBES))
-    probes[int(np.argmin(pivots)), 0] = 1.0
-    probes[:, 1] = np.where((np.arange(size) * 0x9E3779B1) >> 7 & 1, 1.0, -1.0) / math.sqrt(size)
-    return probes
+    signs = np.where((np.arange(size) * 0x9E3779B1) >> 7 & 1, 1.0, -1.0) / math.sqrt(2 * size)
+    weakest = int(np.argmin(pivots))
+    signs[weakest] += math.copysign(math.sqrt(0.5), signs[weakest])
+    return signs

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.implicit import assembly
 from rbfmuscle.implicit.banded import factorise_band
-from rbfmuscle.implicit.condition import PROBES, largest_eigenvalue, probe_vectors
+from rbfmuscle.implicit.condition import largest_eigenvalue, probe
 from rbfmuscle.implicit.lapack import factor_cholesky, multiply_symmetric, solve_cholesky, subtract_products
 from rbfmuscle.validation import NumericalWarning
 
@@ -154,11 +154,11 @@ class Factor:
 
     def solve(self, right):
         """Weights (size,), coefficients (q,) and condition |A| |M^-1| for the right side (size,)."""
-        block = np.empty((len(right), 1 + PROBES), order="F")
+        block = np.empty((len(right), 2), order="F")
         block[:, 0] = self._project(right)
-        block[:, 1:] = probe_vectors(np.diagonal(self.lower))
+        block[:, 1] = probe(np.diagonal(self.lower))
         solve_cholesky(self.lower, block)
-        condition = max(1.0, self.norm * math.sqrt((block[:, 1:] ** 2).sum(axis=0).max()))
+        condition = max(1.0, self.norm * math.sqrt(block[:, 1] @ block[:, 1]))
         weights = self._project(block[:, 0])
         if not self.directions.shape[1]:
             return weights, np.zeros(0), condition
