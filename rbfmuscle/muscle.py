@@ -15,9 +15,9 @@ from rbfmuscle.implicit.extraction import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels import get_kernel
 from rbfmuscle.implicit.obstacles import ObstaclePoints
-from rbfmuscle.implicit.off_surface import off_surface_points
 from rbfmuscle.implicit.sampling import PLACEMENTS, sample_surface
-from rbfmuscle.implicit.selection import choose_epsilon
+from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
+from rbfmuscle.sim.exact_distance import ExactDistance
 from rbfmuscle.sim.harmonic import blended_motion, harmonic_weights, surface_gradient
 from rbfmuscle.sim.rest_frame import RestFrame
 from rbfmuscle.sim.simulate import ModelSurface
@@ -144,7 +144,7 @@ class RBFMuscle:
         self.derivatives = self.options.derivatives
         if self.derivatives == "auto":
             self.derivatives = "all" if len(self.rest) <= MOST_WITH_ALL_DERIVATIVES else "normal"
-        self._choose_kernel()
+        self._choose_kernel(frame, faces, centres, samples)
         self.x = self.rest.copy()
         self.level, self._fitted = 0.0, None
         # Cells along the muscle's own axes are smaller than along the scene's, and turn with the scene.
@@ -154,8 +154,8 @@ class RBFMuscle:
     def _default_centres(area, scene):
         return max(LEAST_CENTRES, int(round(area / (AREA_A_CENTRE * scene.length(1.0) ** 2), -1)))
 
-    def _choose_kernel(self):
-        """The kernel, and its shape parameter where the scene leaves it open: by leave-one-out at rest."""
+    def _choose_kernel(self, frame, faces, centres, samples):
+        """The kernel, and its shape parameter where the scene leaves it open: by the error at the samples at rest."""
         self.kernel = get_kernel(self.options.kernel)
         if not self.kernel.hermite:
             warnings.warn(
@@ -166,12 +166,11 @@ class RBFMuscle:
             )
         self.epsilon = self.options.epsilon or 1.0
         if self.kernel.has_epsilon and not self.options.epsilon:
-            if self.kernel.hermite:
-                data = {"points": self.rest, "normals": self.rest_normals, "derivatives": self.derivatives}
-            else:
-                points, values = off_surface_points(self.rest, self.rest_normals)
-                data = {"points": points, "values": values}
-            self.epsilon = choose_epsilon(**data, kernel=self.kernel).epsilon
+            # In the muscle's own frame, so that a scene that is turned chooses the same.
+            self.epsilon = choose_surface_epsilon(
+                centres.points, centres.normals, kernel=self.kernel, held_out=samples.points,
+                distance=ExactDistance((frame.local, faces)).signed_distance, derivatives=self.derivatives,
+            ).epsilon / frame.size  # fmt: skip
 
     def _attach(self, muscle, frame, faces, centres, samples):
         """Fix the centres on attachment patches, share the bones' motions out; returns the fibre directions."""

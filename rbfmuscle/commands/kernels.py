@@ -21,7 +21,7 @@ def kernels(
     muscle: str | None = None,
     derivatives: str = "all",
     placement: str = "greedy",
-    criterion: str = "loo",
+    criterion: str = "held_out",
     resolution: int = 64,
     best: int = 3,
     frames: str | None = None,
@@ -49,7 +49,7 @@ def kernels(
     placement
         greedy, adaptive or even.
     criterion
-        How epsilon is chosen: loo, gcv or condition.
+        How epsilon is chosen: held_out, loo, gcv or condition.
     resolution
         Cells along the longest side.
     best
@@ -65,11 +65,12 @@ def kernels(
     as_json
         Print JSON and nothing else.
     """
+    from rbfmuscle.implicit.selection import CRITERIA
     from rbfmuscle.study.kernel_page import write_study
     from rbfmuscle.study.kernel_study import study_kernels
 
-    if derivatives not in ("all", "normal") or criterion not in ("loo", "gcv", "condition"):
-        raise UsageError("derivatives must be all or normal, criterion loo, gcv or condition; "
+    if derivatives not in ("all", "normal") or criterion not in CRITERIA:
+        raise UsageError(f"derivatives must be all or normal, criterion {', '.join(CRITERIA)}; "
                          f"got {derivatives!r} and {criterion!r}")  # fmt: skip
     names = [name for text in names or [] for name in text.split(",") if name] or None
     if extremes:

@@ -22,10 +22,18 @@ from rbfmuscle.validation import (
 )
 
 CRITERIA = ("loo", "gcv", "held_out", "condition")
+SPAN = (0.02, 20.0)
+"""Searched range of epsilon, in units of 1 / (mean distance of the centres to the nearest other)."""
 _GOLDEN = 0.5 * (math.sqrt(5) - 1)
-_NOISE = 2.0  # an objective computed beyond DOUBTFUL must be this much better to be believed
+# Beyond DOUBTFUL an objective must be so much better to be believed: residuals are rounding noise there, while an
+# error measured at other points is what it is, and only the slower fit speaks against it.
+_NOISE, _NOISE_HELD_OUT = 2.0, 1.05
 
 
+# Slope of a field, 1 where all is well, below which it is taken to be flat.
+LEAST_SLOPE = 0.3
+# Of all points, so many may lie where the field is flat.
+FLAT_SHARE = 0.02
 # Of the spacing: what an error of one in the left-out normal counts. Values alone would choose the narrowest kernel,
 # which knows nothing between its centres, and where nothing is known f is 0, as it should be on the surface.
 SLOPE_SHARE = 0.15
@@ -99,14 +107,15 @@ def choose_epsilon(
     target=1e10,
     derivatives="all",
     smoothing=0.0,
-    span=(0.02, 20.0),
+    span=SPAN,
     coarse=13,
     refine=8,
 ):
     """Search epsilon for a fit to values or, with normals, for a Hermite fit.
 
-    A log-spaced scan brackets the minimum, golden sections narrow it. Where the condition exceeds 1e13 the
-    objective is rounding noise, so such a value is believed only if it is twice as good as any sound one.
+    A log-spaced scan brackets the minimum, golden sections narrow it. Where the condition exceeds 1e13 the objective
+    is rounding noise: a finer and wider scan takes the sections' place, and such a value is believed only if it is
+    twice as good as any sound one (5 % better for "held_out", which measures).
 
     Parameters
     ----------
@@ -146,12 +155,18 @@ def choose_epsilon(
         points, values, normals, kernel, criterion, held_out, target, derivatives, smoothing
     )
     unit = 1.0 / spacing(points).mean()
+    noise = _NOISE_HELD_OUT if criterion == "held_out" else _NOISE
     tried = [_trial(objective, e * unit) for e in np.geomspace(*span, coarse)]
-    best = _best(tried)
-    low, high = tried[max(best - 1, 0)][0], tried[min(best + 1, coarse - 1)][0]
-    tried += _golden(objective, low, high, refine)
+    best = int(np.argmin(believed(tried, noise)))
+    # Noise has no valley to narrow: there the range is scanned, and a wider one.
+    noisy = tried[best][2] > DOUBTFUL
+    low, high = (tried[min(max(best + side * (1 + noisy), 0), coarse - 1)][0] for side in (-1, 1))
+    if noisy:
+        tried += [_trial(objective, e) for e in np.geomspace(low, high, 2 * refine)]
+    else:
+        tried += _golden(objective, low, high, refine, noise)
     tried = np.array(sorted(tried))
-    best = tried[_best(tried)]
+    best = tried[np.argmin(believed(tried, noise))]
     return EpsilonChoice(float(best[0]), float(best[1]), float(best[2]), tried)
 
 
@@ -214,6 +229,32 @@ def choose_smoothing(
     return search_smoothing(LeastSquaresPath(matrix, values, cutoff=cutoff), criterion)
 
 
+def surface_miss(fitted, points, reach):
+    """Root mean square distance of a field's surface from points that should lie on it, to first order.
+
+    |f| / |grad f|, at most ``reach``. Where the field is flat it knows no surface, though it may be 0: beyond a few
+    such points, as thin rims have, each counts as missed by ``reach``.
+
+    Parameters
+    ----------
+    fitted : RBFField
+        Of slope one near its surface, as a fit to unit normals or distances is.
+    points : (n, 3) array_like
+    reach : float
+        Mean distance of the centres to the nearest other [length].
+
+    Returns
+    -------
+    float
+        [length]
+    """
+    value, gradient = fitted.value_and_gradient(points)
+    slope = np.linalg.norm(gradient, axis=1)
+    missed = np.minimum(np.abs(value) / np.maximum(slope, LEAST_SLOPE), reach)
+    flat = max(float((slope < LEAST_SLOPE).mean()) - FLAT_SHARE, 0.0)
+    return float(np.sqrt((missed**2).mean() + flat * reach**2))
+
+
 def _check_request(kernel, criterion, values, normals, held_out):
     if not kernel.has_epsilon:
         raise UsageError(
@@ -242,8 +283,9 @@ def _objective(points, values, normals, kernel, criterion, held_out, target, der
         origin, scale = frame(points)
         return Basis((points - origin) / scale, kernel, epsilon * scale, kernel.degree), values
 
+    reach = spacing(points).mean()
     # A direction that is wrong by one at a left-out centre misses the surface by a part of the spacing.
-    lever = 0.0 if normals is None else SLOPE_SHARE * spacing(points).mean() / frame(points)[1]
+    lever = 0.0 if normals is None else SLOPE_SHARE * reach / frame(points)[1]
 
     def by_residuals(epsilon):
         found = leave_one_out(*system(epsilon), smoothing=smoothing)
@@ -256,9 +298,7 @@ def _objective(points, values, normals, kernel, criterion, held_out, target, der
             )
         else:
             field = RBFField.fit(points, values, kernel=kernel, epsilon=epsilon, smoothing=smoothing)
-        value, gradient = field.value_and_gradient(held_out)
-        slope = np.maximum(np.linalg.norm(gradient, axis=1), 1e-12)
-        return math.sqrt(((value / slope) ** 2).mean()), field.condition
+        return surface_miss(field, held_out, reach), field.condition
 
     def by_condition(epsilon):
         condition = solve(*system(epsilon), smoothing=smoothing)[2]
@@ -278,22 +318,21 @@ def _trial(objective, epsilon):
     return epsilon, score if math.isfinite(score) else math.inf, condition
 
 
-def _believed(trial):
-    return trial[1] * (_NOISE if trial[2] > DOUBTFUL else 1.0)
+def believed(tried, noise=_NOISE_HELD_OUT):
+    """Objectives (n,) of trials (n, 3), those of a doubtful condition made worse by ``noise``."""
+    tried = np.asarray(tried)
+    return tried[:, 1] * np.where(tried[:, 2] > DOUBTFUL, noise, 1.0)
 
 
-def _best(tried):
-    return int(np.argmin([_believed(trial) for trial in tried]))
-
-
-def _golden(objective, low, high, count):
+def _golden(objective, low, high, count, noise):
     """Golden-section search of the logarithm between low and high."""
     a, b = math.log(low), math.log(high)
     x, y = b - _GOLDEN * (b - a), a + _GOLDEN * (b - a)
     left, right = _trial(objective, math.exp(x)), _trial(objective, math.exp(y))
     tried = [left, right]
     for _ in range(count - 2):
-        if _believed(left) <= _believed(right):
+        worth = believed([left, right], noise)
+        if worth[0] <= worth[1]:
             b, y, right = y, x, left
             x = b - _GOLDEN * (b - a)
             left = _trial(objective, math.exp(x))

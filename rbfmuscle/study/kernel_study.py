@@ -12,9 +12,9 @@ import numpy as np
 from rbfmuscle.implicit.extraction import extract_surface, mesh_volume
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels import KERNELS, get_kernel
-from rbfmuscle.implicit.off_surface import off_surface_points
 from rbfmuscle.implicit.sampling import PLACEMENTS, sample_surface
-from rbfmuscle.implicit.selection import choose_epsilon, spacing
+from rbfmuscle.implicit.selection import spacing, surface_miss
+from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
 from rbfmuscle.study.mesh_distance import MeshDistance
 from rbfmuscle.study.sweep_table import pareto_front
 from rbfmuscle.validation import NumericalWarning, UsageError, check_mesh
@@ -24,8 +24,8 @@ CENTRES = (150, 300)
 SCAN = np.geomspace(0.03, 3.0, 9)
 # Points of the mesh at which errors are measured, and the cells along the longest side.
 JUDGES, RESOLUTION = 20_000, 64
-# Slope of a field, 1 where all is well, below which it is taken to be flat.
-LEAST_SLOPE = 0.3
+# Points of the mesh that choose epsilon.
+HELD_OUT = 2000
 # Points of one timed evaluation, and how often fit and evaluation are timed.
 TIMED, REPEATS = 20_000, 3
 
@@ -70,7 +70,7 @@ class KernelStudy:
 
 def study_kernels(
     mesh, *, kernels=None, centres=CENTRES, derivatives="all", placement="greedy", resolution=RESOLUTION,
-    criterion="loo", scan=True, seed=0, units="", progress=None,
+    criterion="held_out", scan=True, seed=0, units="", progress=None,
 ):  # fmt: skip
     """Fit a surface with many kernels and numbers of centres, and measure each fit.
 
@@ -86,8 +86,8 @@ def study_kernels(
     placement : {"even", "adaptive", "greedy"}
     resolution : int
         Cells along the longest side of the extracted surfaces.
-    criterion : {"loo", "gcv", "condition"}
-        How epsilon is chosen.
+    criterion : {"held_out", "loo", "gcv", "condition"}
+        How epsilon is chosen: by the error at other points of the mesh, or from the centres alone.
     scan : bool
         Also measure a range of epsilons, for the map.
     seed : int
@@ -156,6 +156,8 @@ class _Judge:
         self.vertices, self.faces, self.resolution = vertices, faces, resolution
         self.volume = mesh_volume(vertices, faces)
         self.distance = MeshDistance(vertices, faces)
+        # What chooses is not what judges.
+        self.held_out = sample_surface(vertices, faces, HELD_OUT, seed=seed, placement="even").points
         rng = np.random.default_rng(seed)
         corners = vertices[faces]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -170,17 +172,6 @@ class _Judge:
         back = self.distance.unsigned(vertices)
         rms = float(np.sqrt(0.5 * ((there**2).mean() + (back**2).mean())))
         return rms, float(max(there.max(), back.max())), back
-
-    def missed(self, fitted, spacing):
-        """RMS of |f| / |grad f| at points of the mesh: the error without an extraction.
-
-        Where the field is flat it knows no surface, though it may be 0: such a point counts as missed by the
-        spacing of the centres.
-        """
-        value, gradient = fitted.value_and_gradient(self.points[::10])
-        size = np.linalg.norm(gradient, axis=1)
-        error = np.where(size > LEAST_SLOPE, np.abs(value) / np.maximum(size, LEAST_SLOPE), spacing)
-        return float(np.sqrt((np.minimum(error, spacing) ** 2).mean()))
 
     def decimated(self, numbers):
         """A decimated mesh whose vertices and faces are as many numbers (9 a vertex) as a field's."""
@@ -202,13 +193,11 @@ def _fit(sample, kernel, epsilon, derivatives):
     )
 
 
-def _choose(sample, kernel, derivatives, criterion):
-    if kernel.hermite:
-        data = {"points": sample.points, "normals": sample.normals, "derivatives": derivatives}
-    else:
-        points, values = off_surface_points(sample.points, sample.normals)
-        data = {"points": points, "values": values}
-    return choose_epsilon(**data, kernel=kernel, criterion=criterion).epsilon
+def _choose(judge, sample, kernel, derivatives, criterion):
+    return choose_surface_epsilon(
+        sample.points, sample.normals, kernel=kernel, criterion=criterion, derivatives=derivatives,
+        held_out=judge.held_out, distance=judge.distance.unsigned,
+    ).epsilon  # fmt: skip
 
 
 def _measure(judge, sample, kernel, derivatives, criterion):
@@ -225,7 +214,7 @@ def _measure(judge, sample, kernel, derivatives, criterion):
         warnings.simplefilter("always", NumericalWarning)
         try:
             if kernel.has_epsilon:
-                row["epsilon"] = _choose(sample, kernel, derivatives, criterion)
+                row["epsilon"] = _choose(judge, sample, kernel, derivatives, criterion)
                 row["shape"] = float(row["epsilon"] * spacing(sample.points).mean())
             surface = _fill(row, judge, sample, kernel, derivatives)
         except (ValueError, np.linalg.LinAlgError) as error:
@@ -277,7 +266,7 @@ def _scan(judge, sample, kernel, derivatives):
             warnings.simplefilter("ignore", NumericalWarning)
             try:
                 fitted = _fit(sample, kernel, shape / h, derivatives)
-                error, condition = judge.missed(fitted, h), float(fitted.condition)
+                error, condition = surface_miss(fitted, judge.points[::10], h), float(fitted.condition)
             except np.linalg.LinAlgError:
                 pass
         rows.append(
