@@ -15,6 +15,7 @@ from rbfmuscle.implicit.extraction import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels import get_kernel
 from rbfmuscle.implicit.obstacles import ObstaclePoints
+from rbfmuscle.implicit.refinement import FITTED, fit_sample
 from rbfmuscle.implicit.sampling import PLACEMENTS, sample_surface
 from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
 from rbfmuscle.sim.exact_distance import ExactDistance
@@ -37,7 +38,7 @@ RANGES = {
     "stretch_high": (1.0, 100.0), "stretch_hold": (0.0, 1.0), "across": (0, 50), "across_weight": (0.0, 1e6),
     "acceleration": (0, 50),
 }  # fmt: skip
-CHOICES = {"placement": PLACEMENTS, "derivatives": ("auto", "all", "normal")}
+CHOICES = {"placement": (*PLACEMENTS, FITTED), "derivatives": ("auto", "all", "normal")}
 
 
 @dataclass(frozen=True)
@@ -134,17 +135,21 @@ class RBFMuscle:
         count = self.options.centres or self._default_centres(muscle.mesh.area, scene)
         frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
         seed = self.options.seed
-        centres = sample_surface(frame.local, faces, count, seed=seed, placement=self.options.placement)
+        fitted = self.options.placement == FITTED
+        placement = "greedy" if fitted else self.options.placement
+        centres = sample_surface(frame.local, faces, count, seed=seed, placement=placement)
         samples = sample_surface(frame.local, faces, self.options.samples, seed=seed, placement="even")
+        self.derivatives = self.options.derivatives
+        if self.derivatives == "auto":
+            self.derivatives = "all" if fitted or count <= MOST_WITH_ALL_DERIVATIVES else "normal"
+        self._choose_kernel(frame, faces, centres, samples)
+        if fitted:
+            centres = self._fit_centres(frame, faces, centres)
         self.rest, self.rest_normals = frame.points(centres.points), frame.directions(centres.normals)
         self.samples = frame.points(samples.points)
         self.control_faces, self.sample_faces = centres.control_faces, samples.control_faces
         fibre = self._attach(muscle, frame, faces, centres.points, samples.points)
         self._build_elasticity(centres, samples, fibre)
-        self.derivatives = self.options.derivatives
-        if self.derivatives == "auto":
-            self.derivatives = "all" if len(self.rest) <= MOST_WITH_ALL_DERIVATIVES else "normal"
-        self._choose_kernel(frame, faces, centres, samples)
         self.x = self.rest.copy()
         self.level, self._fitted = 0.0, None
         # Cells along the muscle's own axes are smaller than along the scene's, and turn with the scene.
@@ -171,6 +176,17 @@ class RBFMuscle:
                 centres.points, centres.normals, kernel=self.kernel, held_out=samples.points,
                 distance=ExactDistance((frame.local, faces)).signed_distance, derivatives=self.derivatives,
             ).epsilon / frame.size  # fmt: skip
+
+    def _fit_centres(self, frame, faces, centres):
+        """Centres beside the surface, whose field lies nearer to all of it."""
+        if not self.kernel.hermite or self.derivatives != "all":
+            raise SceneError(
+                f"muscle {self.name!r}: placement {FITTED!r} needs a C2 kernel and derivatives 'all', got "
+                f"{self.kernel.name!r} and {self.derivatives!r}; take placement 'greedy'"
+            )
+        return fit_sample(
+            centres, frame.local, faces, kernel=self.kernel, epsilon=self.epsilon * frame.size, seed=self.options.seed
+        )  # fmt: skip
 
     def _attach(self, muscle, frame, faces, centres, samples):
         """Fix the centres on attachment patches, share the bones' motions out; returns the fibre directions."""

@@ -64,7 +64,21 @@ def test_lines_to_paste_give_the_row(study):
     row = next(row for row in study.rows if row["kernel"] == "matern_52")
     text = study.toml(row)
     assert 'kernel = "matern_52"' in text and f"centres = {row['centres']}" in text
-    assert f"epsilon = {row['epsilon']:.6g}" in text
+    assert f"epsilon = {row['epsilon']:.6g}" in text and 'placement = "fitted"' in text
+    row = next(row for row in study.rows if row["kernel"] == "linear")
+    assert 'placement = "greedy"' in study.toml(row)  # not C2: no Hermite fit to be fitted
+
+
+def test_fitted_centres_halve_the_error_of_greedy_ones(ellipsoid, study):
+    """Bumps that 80 centres cannot follow are met on average."""
+    vertices, faces = np.array(ellipsoid.vertices), np.asarray(ellipsoid.faces)
+    vertices[:, 2] += 0.8 * np.sin(vertices[:, 0] / 2.5) * np.sin(vertices[:, 1] / 2.5)
+    settings = {"kernels": ["cubic"], "centres": [80], "resolution": 48, "scan": False}
+    greedy, fitted = (
+        rm.study_kernels((vertices, faces), placement=placement, **settings).rows[0]
+        for placement in ("greedy", "fitted")
+    )
+    assert fitted["rms"] < 0.8 * greedy["rms"] and fitted["numbers"] == greedy["numbers"] == 560
 
 
 def test_files_hold_the_table(study, tmp_path):

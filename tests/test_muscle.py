@@ -149,6 +149,28 @@ def test_any_kernel_drives_a_muscle(kernel):
     assert np.sqrt((near**2).mean()) < 0.8
 
 
+def test_fitted_centres_lie_beside_the_surface_and_move_like_others(hip):
+    options = {"centres": 150, "resolution": 32}
+    model = RBFMuscle(hip.muscles[0], hip, placement="fitted", **options)
+    greedy = RBFMuscle(hip.muscles[0], hip, placement="greedy", **options)
+    vertices, faces = (np.array(part) for part in (hip.muscles[0].mesh.vertices, hip.muscles[0].mesh.faces))
+    beside = np.sqrt(igl.point_mesh_squared_distance(model.rest, vertices, faces)[0])
+    assert 0.01 < beside.max() < 1.0  # mm, of a spacing of 6
+    error = [np.sqrt((part.field()(vertices) ** 2).mean()) for part in (model, greedy)]
+    assert error[0] < 0.7 * error[1]
+    hip.motion = Motion([{"hip.flexion": np.radians(angle)} for angle in (0.0, 10.0)])
+    *_, frame = simulate_frames(hip, [model])
+    assert frame.surfaces[model.name].quantities["components"] == 1
+
+
+def test_fitted_centres_need_a_hermite_fit_to_all_derivatives(hip):
+    for options in ({"kernel": "matern_12"}, {"derivatives": "normal"}):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with pytest.raises(SceneError, match="placement 'fitted' needs"):
+                RBFMuscle(hip.muscles[0], hip, placement="fitted", **options)
+
+
 @pytest.mark.filterwarnings("ignore:kernel .* does not reach")
 def test_a_kernel_that_gives_no_surface_is_a_clear_error():
     scene = phantom_scene().with_options(

@@ -62,7 +62,7 @@ def test_an_open_zero_set_is_passed_over(plate, kernel):
 
 
 def test_miss_is_the_distance_to_first_order_and_a_flat_field_misses(plate):
-    _, _, distance, centres, held_out = plate
+    _, _, _, centres, held_out = plate
     h = spacing(centres.points).mean()
     field = RBFField.fit_hermite(centres.points, centres.normals)
     found = extract_surface(field, points=centres.points, resolution=96)

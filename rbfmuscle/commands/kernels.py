@@ -20,7 +20,7 @@ def kernels(
     centres: Annotated[list[int] | None, Parameter(negative="", consume_multiple=True)] = None,
     muscle: str | None = None,
     derivatives: str = "all",
-    placement: str = "greedy",
+    placement: str = "fitted",
     criterion: str = "held_out",
     resolution: int = 64,
     best: int = 3,
@@ -47,7 +47,7 @@ def kernels(
     derivatives
         all or normal: what a Hermite fit asks for.
     placement
-        greedy, adaptive or even.
+        fitted, greedy, adaptive or even; fitted centres lie beside the surface and meet all of it best.
     criterion
         How epsilon is chosen: held_out, loo, gcv or condition.
     resolution
@@ -124,7 +124,9 @@ def _run_best(scene, name, study, best, frames):
 
     moved = []
     for row in [row for row in study.rows if row["rms"] is not None][:best]:
-        settings = {"model.kernel": row["kernel"], "model.centres": row["centres"]}
+        settings = {
+            name: row[name.split(".")[1]] for name in ("model.kernel", "model.centres", "model.placement")
+        }
         if row["epsilon"]:
             settings["model.epsilon"] = row["epsilon"]
         if row["fit"] != "values":

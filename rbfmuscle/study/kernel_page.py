@@ -15,7 +15,8 @@ from rbfmuscle.study.page import STYLE
 from rbfmuscle.validation import MissingPartError
 
 COLUMNS = {
-    "kernel": "kernel", "centres": "centres", "fit": "fit", "shape": "epsilon times spacing", "rms": "RMS",
+    "kernel": "kernel", "centres": "centres", "placement": "placement", "fit": "fit",
+    "shape": "epsilon times spacing", "rms": "RMS",
     "hausdorff": "Hausdorff", "normal_error": "normals, degrees", "volume_error": "volume, %",
     "components": "sheets", "condition": "condition", "fit_time": "fit, ms",
     "evaluation_time": "20,000 values, ms", "numbers": "stored numbers", "decimated_rms": "mesh of that size, RMS",
@@ -29,7 +30,7 @@ PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">
 <title>{title}</title><style>{style} tr.front td:first-child{{font-weight:650}} td.text{{text-align:left}}</style>
 </head><body><main><h1>{title}</h1>
-<p class="sub">Each kernel fitted to the same centres, its shape parameter chosen from the centres alone</p>
+<p class="sub">Each kernel with as many centres, its shape parameter chosen by the error at other points of the mesh</p>
 <p>The best: <b>{best}</b>. Distances{units} are measured both ways between the mesh and the extracted surface;
 normals by the field's gradient; the mesh in the last but one column was decimated to as many stored numbers. Kernels in
 bold are on the front of error against time. A volume error is that of the level zero; a muscle's level is moved until

@@ -12,6 +12,7 @@ import numpy as np
 from rbfmuscle.implicit.extraction import extract_surface, mesh_volume
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels import KERNELS, get_kernel
+from rbfmuscle.implicit.refinement import FITTED, fit_sample
 from rbfmuscle.implicit.sampling import PLACEMENTS, sample_surface
 from rbfmuscle.implicit.selection import spacing, surface_miss
 from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
@@ -65,11 +66,12 @@ class KernelStudy:
             lines.append(f"epsilon = {row['epsilon']:.6g}")
         if row["fit"] != "values":
             lines.append(f'derivatives = "{row["fit"]}"')
+        lines.append(f'placement = "{row["placement"]}"')
         return "\n".join(lines)
 
 
 def study_kernels(
-    mesh, *, kernels=None, centres=CENTRES, derivatives="all", placement="greedy", resolution=RESOLUTION,
+    mesh, *, kernels=None, centres=CENTRES, derivatives="all", placement=FITTED, resolution=RESOLUTION,
     criterion="held_out", scan=True, seed=0, units="", progress=None,
 ):  # fmt: skip
     """Fit a surface with many kernels and numbers of centres, and measure each fit.
@@ -83,7 +85,9 @@ def study_kernels(
     centres : sequence of int
     derivatives : {"all", "normal"}
         Of Hermite fits; kernels that are not smooth enough are fitted to values on and off the surface.
-    placement : {"even", "adaptive", "greedy"}
+    placement : {"even", "adaptive", "greedy", "fitted"}
+        Fitted centres lie beside the surface, so that the whole of it is met in the least-squares sense
+        (`fit_centres`); for Hermite fits to all derivatives, greedy ones for the others.
     resolution : int
         Cells along the longest side of the extracted surfaces.
     criterion : {"held_out", "loo", "gcv", "condition"}
@@ -109,17 +113,18 @@ def study_kernels(
     """
     vertices, faces = check_mesh(*((mesh.vertices, mesh.faces) if hasattr(mesh, "faces") else mesh))
     kernels = [get_kernel(name) for name in (kernels or KERNELS)]
-    if placement not in PLACEMENTS:
-        raise UsageError(f"placement must be one of {', '.join(PLACEMENTS)}, got {placement!r}")
+    if placement not in (*PLACEMENTS, FITTED):
+        raise UsageError(f"placement must be one of {', '.join((*PLACEMENTS, FITTED))}, got {placement!r}")
     if min(centres, default=0) < 8:
         raise UsageError(f"centres must be numbers of at least 8, got {list(centres)}")
     judge = _Judge(vertices, faces, resolution, seed)
     study, found = KernelStudy([], units=units), []
     total = len(kernels) * len(centres)
     for count in centres:
-        sample = sample_surface(vertices, faces, int(count), seed=seed, placement=placement)
+        base = "greedy" if placement == FITTED else placement
+        sample = sample_surface(vertices, faces, int(count), seed=seed, placement=base)
         for kernel in kernels:
-            found.append(_measure(judge, sample, kernel, derivatives, criterion))
+            found.append(_measure(judge, sample, kernel, derivatives, criterion, placement))
             if scan and kernel.has_epsilon:
                 study.scan += _scan(judge, sample, kernel, derivatives)
             if progress is not None:
@@ -200,11 +205,13 @@ def _choose(judge, sample, kernel, derivatives, criterion):
     ).epsilon  # fmt: skip
 
 
-def _measure(judge, sample, kernel, derivatives, criterion):
+def _measure(judge, sample, kernel, derivatives, criterion, placement):
     """One row of the table and its surface."""
     count = len(sample.points)
+    if placement == FITTED and not (kernel.hermite and derivatives == "all"):
+        placement = "greedy"
     row = {
-        "kernel": kernel.name, "centres": count, "epsilon": 0.0, "shape": None,
+        "kernel": kernel.name, "centres": count, "placement": placement, "epsilon": 0.0, "shape": None,
         "fit": derivatives if kernel.hermite else "values", "rms": None, "hausdorff": None,
         "normal_error": None, "volume_error": None, "components": None, "spurious": None, "condition": None,
         "fit_time": None, "evaluation_time": None, "numbers": _stored(kernel, derivatives, count),
@@ -216,6 +223,10 @@ def _measure(judge, sample, kernel, derivatives, criterion):
             if kernel.has_epsilon:
                 row["epsilon"] = _choose(judge, sample, kernel, derivatives, criterion)
                 row["shape"] = float(row["epsilon"] * spacing(sample.points).mean())
+            if placement == FITTED:
+                sample = fit_sample(
+                    sample, judge.vertices, judge.faces, kernel=kernel, epsilon=row["epsilon"] or 1.0
+                )
             surface = _fill(row, judge, sample, kernel, derivatives)
         except (ValueError, np.linalg.LinAlgError) as error:
             row["note"], surface = " ".join(str(error).split()), None
