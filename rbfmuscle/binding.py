@@ -70,7 +70,7 @@ def build_clusters(centres, normals, faces, samples, sample_normals, *, across=3
     start, other, weight = [0], [], []
     for i, ring in enumerate(rings):
         far = np.empty(0, dtype=int)
-        if facing[i] >= 0:
+        if facing[i] >= 0 and across > 0:
             near = tree.query(samples[facing[i]], k=min(4 * across, len(centres)))[1]
             near = np.atleast_1d(near)
             agrees = normals[near] @ sample_normals[facing[i]] > 0.0

@@ -129,3 +129,19 @@ def test_opposite_point_of_an_ellipsoid_lies_across_it(ellipsoid):
     top = np.array([[0.0, 0.0, 15.0]])
     found = opposite_points(top, np.array([[0.0, 0.0, 1.0]]), ellipsoid.vertices, ellipsoid.vertex_normals)
     np.testing.assert_allclose(ellipsoid.vertices[found[0]], [0.0, 0.0, -15.0], atol=2.0)
+
+
+def test_clusters_without_centres_across_are_the_rings_alone(ellipsoid):
+    coarse = trimesh.creation.icosphere(subdivisions=2)
+    coarse.apply_scale([60.0, 25.0, 15.0])
+    start, _, weight = build_clusters(
+        coarse.vertices,
+        coarse.vertex_normals,
+        coarse.faces,
+        ellipsoid.vertices,
+        ellipsoid.vertex_normals,
+        across=0,
+    )
+    # Two rings about a vertex of five or six neighbours.
+    assert np.diff(start).min() >= 15 and np.diff(start).max() <= 18
+    assert (weight == 1.0).all()
