@@ -112,7 +112,7 @@ class Tube:
         starts = np.concatenate([[0], np.cumsum([len(ring) for ring in rings])])
         vertices = np.concatenate(rings)
         faces = [
-            _stitch(vertices, np.arange(a, b), np.arange(b, c))
+            stitch(vertices, np.arange(a, b), np.arange(b, c))
             for a, b, c in zip(starts[:-2], starts[1:-1], starts[2:])
         ]
         return vertices, np.concatenate(faces), np.repeat(u, np.diff(starts))
@@ -141,7 +141,7 @@ def _ring(centre, wide, thin, spacing):
     return centre + np.cos(angle)[:, None] * wide + np.sin(angle)[:, None] * thin
 
 
-def _stitch(vertices, lower, upper):
+def stitch(vertices, lower, upper):
     """Triangles between two rings with different numbers of points, always along the shorter diagonal."""
     faces = []
     i = j = 0

@@ -25,9 +25,11 @@ class Centreline:
         Bones that no joint separates count as one.
     vertices, faces : (n, 3) and (m, 3) ndarray
         The carried mesh at rest [scene unit].
+    slices : int
+        Points of the line between its ends.
     """
 
-    def __init__(self, muscle, joints, vertices, faces):
+    def __init__(self, muscle, joints, vertices, faces, *, slices=_SLICES):
         self.ends = end_groups(muscle, joints)
         sides = _sides(muscle, self.ends, vertices)
         field = harmonic_weights(vertices, faces, sides)[:, 1]
@@ -35,7 +37,7 @@ class Centreline:
         fine = slice_operator(vertices, faces, field, levels)
         line = fine @ vertices
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-        even = np.interp(np.linspace(0.0, along[-1], _SLICES), along, levels)
+        even = np.interp(np.linspace(0.0, along[-1], slices), along, levels)
         self.operator = slice_operator(vertices, faces, field, even)
 
     def points(self, vertices, poses):
