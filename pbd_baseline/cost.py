@@ -43,7 +43,7 @@ def estimate_muscle(muscle, scene, rates, **options):
     count, call, visit = len(muscle.mesh.vertices), rates["call"], rates["visit"]
     calls, visits = SWEEP[options.method]
     search = CROSSING_VISITS * POINTS[options.contact] * count if scene.detect is not None else 0
-    weights = 0 if weights_are_kept(muscle) else WEIGHT_VISITS
+    weights = 0 if weights_are_kept(muscle, options.swelling_reach) else WEIGHT_VISITS
     factor = FACTOR_BYTES if options.method in FACTORED else 0
     return MuscleCost(
         build=visit * count * (VERTEX_VISITS + weights),

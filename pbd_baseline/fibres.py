@@ -9,8 +9,6 @@ from rbfmuscle.sim.harmonic import cotangent_laplacian, surface_gradient
 
 # Pieces of polyline that speak for one place.
 NEAREST = 6
-# Thickness and the freedom to swell are smoothed over this share of the muscle's diagonal.
-SMOOTHING_SHARE = 0.04
 
 
 def fibre_directions(vertices, faces, weights, fibres):
@@ -60,7 +58,7 @@ def edge_stiffness(vertices, edges, directions, exponent):
     return np.clip(1.0 - aligned, 0.0, 1.0) ** exponent
 
 
-def swelling_room(vertices, faces, normals, held):
+def swelling_room(vertices, faces, normals, held, share):
     """How far the surface moves at each vertex when the muscle swells: its local half thickness.
 
     A uniform offset would turn thin rims inside out; in proportion to the thickness it is a change of
@@ -71,6 +69,8 @@ def swelling_room(vertices, faces, normals, held):
     vertices, faces, normals : ndarray
     held : (n,) ndarray of bool
         Vertices that do not move.
+    share : float
+        Distance over which the thickness is smoothed, and falls to 0 at held vertices, as a share of the diagonal.
 
     Returns
     -------
@@ -78,7 +78,7 @@ def swelling_room(vertices, faces, normals, held):
         Smooth, [unit of the vertices], 0 at held vertices.
     """
     radius = _inner_balls(vertices, normals)
-    reach = SMOOTHING_SHARE * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    reach = share * float(np.linalg.norm(np.ptp(vertices, axis=0)))
     area = vertex_areas(vertices, faces)
     free = np.flatnonzero(~held)
     room = np.zeros(len(vertices))

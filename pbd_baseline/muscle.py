@@ -44,7 +44,7 @@ class PBDMuscle:
     def __init__(self, muscle, scene, **options):
         self.name = muscle.name
         self.options = PBDOptions.build(options, place=f"muscle {muscle.name!r} model: ")
-        self.rest = Rest.from_muscle(muscle)
+        self.rest = Rest.from_muscle(muscle, swelling_reach=self.options.swelling_reach)
         self.shape = SHAPES[self.options.method](self.rest, self.options)
         columns, shares = _contact_carriers(self.rest, faces_too=self.options.contact == "faces")
         self.collision = CollisionConstraint(

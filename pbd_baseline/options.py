@@ -18,7 +18,8 @@ class PBDOptions(Table):
     ``iterations`` sweeps a solve (0: the method's own number). ``edge`` and ``bending`` are PBD stiffnesses,
     ``edge_compliance`` and ``bending_compliance`` those of XPBD, ``arap_compliance`` of the ARAP constraint,
     all over a time that passes by one for each two degrees of motion. ``arap_reach`` is how far one global
-    step carries, as a share of the muscle's diagonal. ``fibre_exponent`` is a of k = (1 - |cos|)^a; edges
+    step carries, as a share of the muscle's diagonal; ``swelling_reach``, another such share, over which the freedom
+    to swell falls to nothing at held vertices. ``fibre_exponent`` is a of k = (1 - |cos|)^a; edges
     longer than ``soft_length`` medians are softer in inverse proportion (0: none); those shorter or longer
     than ``limits`` times their rest length are hard in any case. ``prediction``: vertices are carried along
     by the bones (see ``pbd_baseline.weights``), or keep their velocity times ``damping`` as the authors' do,
@@ -39,6 +40,7 @@ class PBDOptions(Table):
     bending_compliance: NotNegative = 0.2
     arap_compliance: Positive = 1.0
     arap_reach: Positive = 0.03
+    swelling_reach: Positive = 0.04
     response: Literal["sum", "nearest"] = "sum"
     contact: Literal["vertices", "faces"] = "vertices"
 

@@ -12,7 +12,7 @@ from rbfmuscle.sim.cache import content_key, has_arrays, load_arrays, store_arra
 from rbfmuscle.validation import SceneError
 
 # Raise it when weights or room are computed in another way: entries of the cache are then not found.
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,14 @@ class Rest:
     volume: VolumeConstraint
 
     @classmethod
-    def from_muscle(cls, muscle):
+    def from_muscle(cls, muscle, *, swelling_reach):
         """Measure a muscle of a scene.
+
+        Parameters
+        ----------
+        muscle : Muscle
+        swelling_reach : float
+            See `pbd_baseline.options.PBDOptions`.
 
         Raises
         ------
@@ -68,7 +74,7 @@ class Rest:
         topology = Topology.from_mesh(vertices, faces)
         volume = VolumeConstraint(vertices, faces)
         inverse_mass = np.where(holder < 0, 1.0, 0.0)
-        weights, room = _weights_and_room(vertices, faces, holder, len(bones), volume)
+        weights, room = _weights_and_room(vertices, faces, holder, len(bones), volume, swelling_reach)
         fibres = fibre_directions(vertices, faces, weights, muscle.fibres)
         return cls(
             order, vertices, topology, bones, weights, holder, inverse_mass, fibres, room, volume
@@ -86,10 +92,10 @@ class Rest:
         return np.maximum(length / median, 1e-3)
 
 
-def weights_are_kept(muscle):
+def weights_are_kept(muscle, swelling_reach):
     """Whether what takes nearly all the time of a muscle's build is in the cache on disk."""
     _, vertices, faces, _, holder = _renumbered(muscle)
-    return has_arrays(_weights_key(vertices, faces, holder))
+    return has_arrays(_weights_key(vertices, faces, holder, swelling_reach))
 
 
 def _renumbered(muscle):
@@ -105,20 +111,20 @@ def _renumbered(muscle):
     return order, vertices, faces, bones, holder
 
 
-def _weights_key(vertices, faces, holder):
-    return content_key(vertices, faces, ("mesh muscle", VERSION, holder.tolist()))
+def _weights_key(vertices, faces, holder, swelling_reach):
+    return content_key(vertices, faces, ("mesh muscle", VERSION, swelling_reach, holder.tolist()))
 
 
-def _weights_and_room(vertices, faces, holder, bones, volume):
+def _weights_and_room(vertices, faces, holder, bones, volume, swelling_reach):
     """What takes nearly all the time of the build, from the cache on disk where it is known."""
-    key = _weights_key(vertices, faces, holder)
+    key = _weights_key(vertices, faces, holder, swelling_reach)
     known = load_arrays(key)
     if known is None or not {"weights", "room"} <= known.keys():
         normals = volume.gradient(vertices)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
         known = {
             "weights": even_weights(vertices, faces, [np.flatnonzero(holder == b) for b in range(bones)]),
-            "room": swelling_room(vertices, faces, normals, holder >= 0),
+            "room": swelling_room(vertices, faces, normals, holder >= 0, swelling_reach),
         }
         store_arrays(key, known)
     return known["weights"], known["room"]

@@ -11,6 +11,8 @@ from rbfmuscle.study.metrics import mesh_volume
 SLICES = 64
 # Points of a strip nearer to the bone than this [mm] count as touching it.
 TOUCH = 0.1
+# A sequence that converges more slowly says nothing about its limit.
+LEAST_ORDER = 0.2
 
 
 def section(vertices, faces, point, normal):
@@ -102,7 +104,7 @@ def richardson(sizes, values):
     Returns
     -------
     order, limit : float
-        NaN where the differences do not shrink or change sign: the sequence is not in its asymptotic range.
+        NaN where the differences change sign or hardly shrink: the sequence is not in its asymptotic range.
     """
     h, v = np.asarray(sizes, dtype=float)[-3:], np.asarray(values, dtype=float)[-3:]
     coarse, fine = v[0] - v[1], v[1] - v[2]
@@ -113,7 +115,7 @@ def richardson(sizes, values):
     def ratio(p):
         return (h[0] ** p - h[1] ** p) / (h[1] ** p - h[2] ** p)
 
-    low, high = 1e-3, 20.0
+    low, high = LEAST_ORDER, 20.0
     if not ratio(low) < wanted < ratio(high):
         return math.nan, math.nan
     from scipy.optimize import brentq
