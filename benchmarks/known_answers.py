@@ -139,6 +139,7 @@ def stretched_tables():
     for stretch in STRETCHES:
         for name, levels in (
             ("rbf", rbf_levels(1.5)),
+            ("rbf, greedy placement", rbf_levels(1.5, placement="greedy")[:3]),
             ("pbd", mesh_levels("pbd", meshes)),
             ("pbd with swelling_reach 0.01", mesh_levels("pbd", meshes, lambda h: {"swelling_reach": 0.01})),
             ("xpbd", mesh_levels("xpbd", meshes)),
