@@ -3,7 +3,7 @@
 import time
 from pathlib import Path
 
-from rbfmuscle.models import MODEL_NAMES, build_model, check_model_name
+from rbfmuscle.models import MODEL_NAMES, build_models, check_model_name
 from rbfmuscle.run import stream_run
 from rbfmuscle.sim.motion import Motion
 from rbfmuscle.sim.options import OutputOptions
@@ -129,7 +129,7 @@ def _there_and_back(scene):
 def _last_surfaces(scene, written=None):
     """Time to build the models, and the surfaces of the frames ``written`` (all where not given)."""
     start = time.perf_counter()
-    models = [build_model(muscle, scene) for muscle in scene.muscles]
+    models = build_models(scene)
     build = time.perf_counter() - start
     shown = []
     for frame in simulate_frames(scene, models, written=written):

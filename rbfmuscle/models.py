@@ -2,6 +2,7 @@
 
 import difflib
 import importlib
+from concurrent.futures import ThreadPoolExecutor
 
 from rbfmuscle.validation import UsageError
 
@@ -61,6 +62,14 @@ def estimate_model(muscle, scene, rates):
     module, _, implied = _HOME[check_model_name(muscle.model)]
     cost = importlib.import_module(_COST[module])
     return cost.estimate_muscle(muscle, scene, rates, **{**muscle.options, **implied})
+
+
+def build_models(scene):
+    """Return the models of all muscles of a scene, in their order, built side by side."""
+    import numba
+
+    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+        return list(pool.map(lambda muscle: build_model(muscle, scene), scene.muscles))
 
 
 def check_model_name(name):

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from rbfmuscle.models import build_model
+from rbfmuscle.models import build_models
 from rbfmuscle.sim.lane import Event
 from rbfmuscle.sim.scene_check import bone_collisions, bone_findings, check_initial
 from rbfmuscle.sim.simulate import simulate_frames
@@ -298,7 +298,7 @@ class _Course:
         self.keep_rows, self.rows, self.fresh = keep_rows, [], []
         with self.timed("build"):
             check_initial(self.scene)
-            self.models = [build_model(muscle, scene) for muscle in scene.muscles]
+            self.models = build_models(scene)
             carried = {m.name: m.carried_mesh() for m in self.models}
             self.recorder = MetricsRecorder(scene, carried) if scene.output.metrics else None
             self.fibres = _fibre_study(scene, carried) if scene.output.fibres else None

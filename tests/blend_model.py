@@ -84,7 +84,7 @@ def arm_scene(*, end=20, step=10, units="mm", **output):
 def use_blend_model(monkeypatch, fail_at=None):
     """Let `rbfmuscle.run` build BlendMuscle for every muscle."""
     monkeypatch.setattr(BlendMuscle, "fail_at", fail_at)
-    monkeypatch.setattr("rbfmuscle.run.build_model", BlendMuscle)
+    monkeypatch.setattr("rbfmuscle.models.build_model", BlendMuscle)
 
 
 def files_in(folder):

@@ -192,7 +192,7 @@ class TestFailure:
         def build(muscle, scene):
             return GivesUp(muscle, scene) if muscle.model == "xpbd" else build_model(muscle, scene)
 
-        monkeypatch.setattr("rbfmuscle.run.build_model", build)
+        monkeypatch.setattr("rbfmuscle.models.build_model", build)
         table = compare_models(arm_scene(), tmp_path, ["pbd", "arap-pbd", "xpbd"], pictures=False)
         assert table["models"] == ["pbd", "arap-pbd"] and "planted" in table["failed"]["xpbd"]
         assert "xpbd did not finish" in (tmp_path / "report.html").read_text(encoding="utf-8")

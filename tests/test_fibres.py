@@ -276,8 +276,8 @@ def test_without_fibres_no_code_of_theirs_is_loaded():
     code = (
         "import sys; sys.path.insert(0, 'tests')\n"
         "from blend_model import arm_scene, BlendMuscle\n"
-        "import rbfmuscle.run as r\n"
-        "r.build_model = BlendMuscle\n"
+        "import rbfmuscle.models as m, rbfmuscle.run as r\n"
+        "m.build_model = BlendMuscle\n"
         "r.simulate(arm_scene())\n"
         "print([m for m in sys.modules if 'fibre_' in m or 'mean_value' in m])"
     )

@@ -2,7 +2,6 @@
 
 import math
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated
 
@@ -95,6 +94,7 @@ def _open_saved(folder):
 
 
 def _open_scene(path, model):
+    from rbfmuscle.models import build_models
     from rbfmuscle.sim.live import LiveSession
     from rbfmuscle.study.viewer import LiveViewer
 
@@ -113,11 +113,3 @@ def _open_scene(path, model):
     viewer = LiveViewer(LiveSession(scene), build, models, list(QUALITIES))
     motion = [{k: math.degrees(v) for k, v in frame.items()} for frame in scene.motion.frames]
     return viewer, motion, f"rbfmuscle: {scene.name}"
-
-
-def build_models(scene):
-    """Models of all muscles of a scene, built side by side."""
-    from rbfmuscle.models import build_model
-
-    with ThreadPoolExecutor() as pool:
-        return list(pool.map(lambda muscle: build_model(muscle, scene), scene.muscles))

@@ -11,7 +11,7 @@ from rbfmuscle.study.comparison import COST, FIRST, LAW, MEASURES, MESH, OWN, be
 from rbfmuscle.study.comparison_plots import plot_models
 from rbfmuscle.study.metrics import ALL
 from rbfmuscle.study.page import STYLE
-from rbfmuscle.study.render import draw
+from rbfmuscle.study.render import chosen_frames, draw
 from rbfmuscle.study.saved import SavedRun
 from rbfmuscle.validation import MissingPartError, SolveError
 
@@ -19,7 +19,6 @@ _VIEWS = ["front", "back"]
 _MODULE = "rbfmuscle.study.comparison_pictures"
 # Of all panels beside each other, and the least and greatest of one [pixel].
 _WIDTH, _LEAST, _MOST = 1560, 220, 420
-_MOST_IMAGES = 30  # of the animation
 # Distance maps: from the greatest distance of the models down to what leaves the map its colours.
 _MAP_SHARE = 0.25
 GROUPS = {
@@ -109,8 +108,7 @@ def _jobs(table, folder, work):
         ]
     if table["frames"] > 1:
         moving = {**job, "views": _VIEWS[:1], "file": str((folder / "models.webp").resolve())}
-        frames = SavedRun(folder / models[0]).frames
-        jobs.append({**moving, "frames": frames[:: -(-len(frames) // _MOST_IMAGES)]})
+        jobs.append({**moving, "frames": chosen_frames(SavedRun(folder / models[0]).frames)})
     return jobs
 
 

@@ -21,28 +21,31 @@ def _open(folder):
     return Path(folder)
 
 
-def _draw_job(folder, job, seconds):
+def _draw_job(folder, job, seconds, stages):
     """Draw ``file`` from ``models`` (folders of runs), ``views`` (rows), ``frames`` and ``size``.
 
     With ``limit`` the muscles are coloured by their distance to those of the model ``reference``, up to it.
     """
     runs = {name: SavedRun(folder / name) for name in job["models"]}
     limit, first = job.get("limit"), next(iter(runs.values()))
-    paint = None
-    if limit:
-        reference = SavedRun(folder / job["reference"])
-
-        def paint(saved, muscle, frame, vertices):
-            away = MeshDistance(*reference.surface(muscle, frame)).unsigned(vertices)
-            return np.minimum(away / limit, 1.0)
-
+    key = (*job["models"], *job["views"], *job["size"], limit)
+    if key not in stages:
+        paint = _distance_paint(SavedRun(folder / job["reference"]), limit) if limit else None
+        rows = [[(saved, view) for saved in runs.values()] for view in job["views"]]
+        stages[key] = Stage(rows, job["size"], paint)
     chips = _scale(limit, first.units) if limit else muscle_colours(first.muscles)
-    stage = Stage([[(saved, view) for saved in runs.values()] for view in job["views"]], job["size"], paint)
     images = [
-        labelled(stage.show(frame), caption(first, frame), list(runs), chips) for frame in job["frames"]
+        labelled(stages[key].show(frame), caption(first, frame), list(runs), chips) for frame in job["frames"]
     ]
-    stage.close()
     save_images(images, job["file"], seconds)
+
+
+def _distance_paint(reference, limit):
+    def paint(saved, muscle, frame, vertices):
+        away = MeshDistance(*reference.surface(muscle, frame)).unsigned(vertices)
+        return np.minimum(away / limit, 1.0)
+
+    return paint
 
 
 def _scale(limit, units):

@@ -233,6 +233,12 @@ def _path_bounds(runs):
     )
 
 
+def chosen_frames(frames, most=24):
+    """At most so many of the frames of a motion for an animation, evenly, the last one included."""
+    stride = -(-len(frames) // most)
+    return frames[(len(frames) - 1) % stride :: stride]
+
+
 def caption(saved, frame):
     """Frame number and joint angles, as text."""
     entry = next(entry for entry in saved.info["frames"] if entry["frame"] == frame)
@@ -275,12 +281,14 @@ def labelled(image, text, titles, chips):
     return sheet
 
 
-def _draw_job(saved, job, seconds):
-    stage = Stage([[(saved, view) for view in job["views"]]], job["size"])
+def _draw_job(saved, job, seconds, stages):
+    views = tuple(job["views"])
+    if (views, *job["size"]) not in stages:
+        stages[views, *job["size"]] = Stage([[(saved, view) for view in views]], job["size"])
+    stage = stages[views, *job["size"]]
     titles = [f"{view} ({VIEWS[view][1]})" for view in job["views"]]
     chips = muscle_colours(saved.muscles)
     images = [labelled(stage.show(frame), caption(saved, frame), titles, chips) for frame in job["frames"]]
-    stage.close()
     save_images(images, job["file"], seconds)
 
 
@@ -300,12 +308,17 @@ def save_images(images, path, seconds):
 
 
 def main(arguments, opened=SavedRun, draw_job=_draw_job):
-    """The child's part: read the jobs, open the folder, draw, leave with 0."""
-    task = json.loads(sys.stdin.read())
+    """The child's part: read the jobs, open the folder, draw, leave with 0.
+
+    ``draw_job(found, job, seconds, stages)`` keeps in ``stages`` what later jobs can use again.
+    """
+    task, stages = json.loads(sys.stdin.read()), {}
     try:
         found = opened(arguments[0])
         for job in task["jobs"]:
-            draw_job(found, job, task["seconds"])
+            draw_job(found, job, task["seconds"], stages)
+        for stage in stages.values():
+            stage.close()
     except (RBFMuscleError, OSError) as error:
         print(error, file=sys.stderr)
         return 1

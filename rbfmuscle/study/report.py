@@ -10,7 +10,7 @@ from rbfmuscle.study.appearance import line_colours
 from rbfmuscle.study.metrics import QUANTITIES
 from rbfmuscle.study.page import EXPLANATION, PAGE, STYLE
 from rbfmuscle.study.plots import plot_panels
-from rbfmuscle.study.render import VIEWS, draw
+from rbfmuscle.study.render import VIEWS, chosen_frames, draw
 from rbfmuscle.study.saved import SavedRun
 from rbfmuscle.validation import MissingPartError, SolveError
 
@@ -82,7 +82,11 @@ def _jobs(saved, folder, animation, pictures, preview):
             job = {"file": str(folder / f"{frame:06d}.png"), "frames": [frame], "views": list(VIEWS)}
             jobs.append({**job, "size": _PICTURE_SIZE})
     if preview and len(saved.frames) > 1:
-        job = {"file": str(animation.resolve()), "frames": saved.frames, "views": ["front", "side"]}
+        job = {
+            "file": str(animation.resolve()),
+            "frames": chosen_frames(saved.frames),
+            "views": ["front", "side"],
+        }
         jobs.append({**job, "size": _PREVIEW_SIZE})
     return jobs
 
