@@ -16,7 +16,7 @@ from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels import get_kernel
 from rbfmuscle.implicit.obstacles import ObstaclePoints
 from rbfmuscle.implicit.refinement import FITTED, fit_sample
-from rbfmuscle.implicit.sampling import PLACEMENTS, sample_surface
+from rbfmuscle.implicit.sampling import GREEDY_LARGEST, PLACEMENTS, sample_surface
 from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
 from rbfmuscle.sim.exact_distance import ExactDistance
 from rbfmuscle.sim.harmonic import blended_motion, harmonic_weights, surface_gradient
@@ -137,6 +137,11 @@ class RBFMuscle:
         seed = self.options.seed
         fitted = self.options.placement == FITTED
         placement = "greedy" if fitted else self.options.placement
+        if placement == "greedy" and count > GREEDY_LARGEST:
+            raise SceneError(
+                f"muscle {muscle.name!r}: placement {self.options.placement!r} takes at most {GREEDY_LARGEST} "
+                f"centres, got {count}; take placement 'adaptive'"
+            )
         centres = sample_surface(frame.local, faces, count, seed=seed, placement=placement)
         samples = sample_surface(frame.local, faces, self.options.samples, seed=seed, placement="even")
         self.derivatives = self.options.derivatives

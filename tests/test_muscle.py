@@ -194,3 +194,9 @@ def test_impossible_settings_are_refused(key, value, message):
     scene = phantom_scene()
     with pytest.raises(SceneError, match=message):
         RBFMuscle(scene.muscles[0], scene, **{key: value})
+
+
+def test_more_centres_than_greedy_placement_takes_are_a_scene_error():
+    scene = phantom_scene().with_options(**{"model.centres": 1200})
+    with pytest.raises(SceneError, match=r"at most 1000 centres, got 1200; take placement 'adaptive'"):
+        build_model(scene.muscles[0], scene)

@@ -31,6 +31,7 @@ def documented_tables():
         options.TunnellingOptions: "`[detect]`",
         options.OutputOptions: "`[output]`",
         options.SurfaceOptions: "`[output]`",
+        options.FibreOptions: "`[output]`",
     }
 
 
