@@ -1,10 +1,36 @@
 """How the centres of an RBF muscle hang together and how its surface samples hang on them."""
 
+from dataclasses import asdict
+
 import numpy as np
 import scipy.sparse as sparse
 from scipy.spatial import cKDTree
 
+from rbfmuscle.implicit.sampling import SurfaceSample, sample_surface
+from rbfmuscle.sim.cache import content_key, has_arrays, load_arrays, store_arrays
+
 SHARES = 6  # centres that carry one sample
+SAMPLING = 1  # part of the name under which samples are kept: raise it when they are made in another way
+
+
+def kept_sample(vertices, faces, count, *, seed, placement):
+    """`sample_surface` of a muscle's mesh, kept on disk by content, as greedy placement takes a second."""
+    key = _sample_key(vertices, faces, count, seed, placement)
+    arrays = load_arrays(key)
+    if arrays is not None:
+        return SurfaceSample(**arrays)
+    sample = sample_surface(vertices, faces, count, seed=seed, placement=placement)
+    store_arrays(key, asdict(sample))
+    return sample
+
+
+def has_sample(vertices, faces, count, *, seed, placement):
+    """Whether `kept_sample` has these already."""
+    return has_arrays(_sample_key(vertices, faces, count, seed, placement))
+
+
+def _sample_key(vertices, faces, count, seed, placement):
+    return content_key(vertices, faces, ("surface sample", SAMPLING, count, seed, placement))
 
 
 def two_rings(faces, count):

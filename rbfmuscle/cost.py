@@ -4,17 +4,21 @@ from functools import lru_cache
 
 import numpy as np
 
+from rbfmuscle.binding import has_sample
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels import get_kernel
 from rbfmuscle.implicit.lapack import factor_cholesky
 from rbfmuscle.muscle import MOST_WITH_ALL_DERIVATIVES, RBFMuscle, RBFOptions
 from rbfmuscle.sim.forecast import MuscleCost
 from rbfmuscle.sim.rates import shortest
+from rbfmuscle.sim.rest_frame import RestFrame
 
 # Vertices of the surface on an area of one cell squared; nodes of the grid kept beside them, bytes of each.
 VERTICES_A_CELL, NODE_BYTES, VERTEX_BYTES = 1.5, 10, 400
 # Work to build: visits for a sample, for a vertex of the mesh and more for each centre, a tenth without rounds.
 SAMPLE_VISITS, VERTEX_VISITS, CENTRE_VISITS, ROUNDS = 240_000, 120_000, 240, 10
+# Share of that work which is left where the samples are kept on disk already.
+KEPT = 0.15
 # A sub-step: calls; then of each iteration calls, visits for a centre and for a contact point; the search for
 # tunnelling, visits for a contact point.
 PREDICT_CALLS, ITERATION_CALLS, SOLVE_VISITS, CONTACT_VISITS, CROSSING_VISITS = 1200, 540, 3700, 240, 850
@@ -58,12 +62,19 @@ def estimate_muscle(muscle, scene, rates, **options):
     bones = sum(len(bone.mesh.vertices) for bone in scene.bones)
     rounds = 1.0 if options.placement == "greedy" else 1.0 / ROUNDS
     mesh_visits = len(muscle.mesh.vertices) * (VERTEX_VISITS + CENTRE_VISITS * centres)
+    frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
+    mesh = frame.local, np.asarray(muscle.mesh.faces)
+    sampling, placing = SAMPLE_VISITS * options.samples, rounds * mesh_visits
+    if has_sample(*mesh, options.samples, seed=options.seed, placement="even"):
+        sampling *= KEPT
+    if has_sample(*mesh, centres, seed=options.seed, placement=options.placement):
+        placing *= KEPT
     search = CROSSING_VISITS * points if scene.detect is not None else 0
     iteration = ITERATION_CALLS * call + visit * (SOLVE_VISITS * centres + CONTACT_VISITS * points)
     fit = FIT_CALLS * call + flop * unknowns**3 / 3.0 + pair * ENTRY_PAIRS * unknowns**2
     surface = visit * (BONE_VISITS * bones + SURFACE_VISITS * shown) + pair * SURFACE_PAIRS * shown * centres
     return MuscleCost(
-        build=visit * (SAMPLE_VISITS * options.samples + rounds * mesh_visits),
+        build=visit * (sampling + placing),
         step=PREDICT_CALLS * call + options.iterations * iteration + visit * search,
         show=fit + EXTRACT_CALLS * call + surface,
         memory=8.0 * centres * points + 16.0 * centres**2 + HANGING_BYTES * points + 24.0 * bones,

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.binding import bind_samples, build_clusters
+from rbfmuscle.binding import bind_samples, build_clusters, kept_sample
 from rbfmuscle.constraints import ShapeConstraint, VolumeConstraint
 from rbfmuscle.elasticity import ElasticSolver
 from rbfmuscle.implicit.extraction import extract_surface
@@ -16,7 +16,7 @@ from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels import get_kernel
 from rbfmuscle.implicit.obstacles import ObstaclePoints
 from rbfmuscle.implicit.refinement import FITTED, fit_sample
-from rbfmuscle.implicit.sampling import GREEDY_LARGEST, PLACEMENTS, sample_surface
+from rbfmuscle.implicit.sampling import GREEDY_LARGEST, PLACEMENTS
 from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
 from rbfmuscle.sim.exact_distance import ExactDistance
 from rbfmuscle.sim.harmonic import blended_motion, harmonic_weights, surface_gradient
@@ -142,8 +142,8 @@ class RBFMuscle:
                 f"muscle {muscle.name!r}: placement {self.options.placement!r} takes at most {GREEDY_LARGEST} "
                 f"centres, got {count}; take placement 'adaptive'"
             )
-        centres = sample_surface(frame.local, faces, count, seed=seed, placement=placement)
-        samples = sample_surface(frame.local, faces, self.options.samples, seed=seed, placement="even")
+        centres = kept_sample(frame.local, faces, count, seed=seed, placement=placement)
+        samples = kept_sample(frame.local, faces, self.options.samples, seed=seed, placement="even")
         self.derivatives = self.options.derivatives
         if self.derivatives == "auto":
             self.derivatives = "all" if fitted or count <= MOST_WITH_ALL_DERIVATIVES else "normal"
