@@ -30,6 +30,7 @@ def setup(app):
     """Write the pages of the reference and the gallery before Sphinx looks for them."""
     app.connect("autodoc-process-docstring", escape_bars)
     gallery.write_reference(ROOT, rbfmuscle)
+    gallery.write_scene_reference(ROOT)
     if (ROOT / "examples").is_dir():
         gallery.write_gallery(ROOT)
 

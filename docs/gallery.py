@@ -1,6 +1,9 @@
 """Pages made before Sphinx runs: the gallery from ``examples/``, the reference from the public names."""
 
 import ast
+import dataclasses
+import json
+import math
 import os
 import shutil
 import subprocess
@@ -95,6 +98,86 @@ def write_reference(root, package):
         directive = f".. {kind}:: {value.__module__}.{name}\n{options}"
         lines += [f"## {name}", "", f"```{{eval-rst}}\n{directive}```", ""]
     (folder / "reference.md").write_text("\n".join(lines), encoding="utf-8")
+
+
+def write_scene_reference(root):
+    """Write ``docs/gallery/scene_reference.md``: every table and key of a scene file, from the schema itself.
+
+    Parameters
+    ----------
+    root : pathlib.Path
+    """
+    from pbd_baseline.options import PBDOptions
+    from rbfmuscle.muscle import CHOICES, RANGES, RBFOptions
+    from rbfmuscle.sim.scene_file import SceneFile
+
+    schema, mesh_models = SceneFile.model_json_schema(), PBDOptions.model_json_schema()
+    lines = [
+        "# Scene file: every key",
+        "",
+        "Made from the schema that checks a scene. What the keys mean is under [scene files](../scene_file.md).",
+        "",
+    ]
+    for name, table in [("SceneFile", schema), *schema["$defs"].items(), ("PBDOptions", mesh_models)]:
+        required = set(table.get("required", ()))
+        rows = [
+            (key, _allowed(field), "required" if key in required else _value(field.get("default")))
+            for key, field in table["properties"].items()
+        ]
+        lines += _table(name, table.get("description", ""), rows)
+    rows = [
+        (field.name, _limit({**RANGES, **CHOICES}.get(field.name), field.type), _value(field.default))
+        for field in dataclasses.fields(RBFOptions)
+    ]
+    lines += _table("RBFOptions", RBFOptions.__doc__, rows)
+    (root / "docs" / "gallery" / "scene_reference.md").write_text("\n".join(lines), encoding="utf-8")
+
+
+def _table(name, meaning, rows):
+    text = " ".join(meaning.replace("``", "`").split())
+    body = [f"| `{key}` | {allowed.replace('|', 'or')} | {default} |" for key, allowed, default in rows]
+    return [f"## {name}", "", text, "", "| key | what is allowed | default |", "|---|---|---|", *body, ""]
+
+
+def _allowed(field):
+    """What a field of a JSON schema may hold, in words."""
+    if "$ref" in field:
+        name = field["$ref"].rsplit("/", 1)[-1]
+        return f"table [{name}](#{name.lower()})"
+    if "anyOf" in field:
+        return " or ".join(
+            dict.fromkeys(_allowed(part) for part in field["anyOf"] if part.get("type") != "null")
+        )
+    if "const" in field or "enum" in field:
+        return ", ".join(f"`{value}`" for value in field.get("enum", [field.get("const")]))
+    kind = field.get("type", "any")
+    if kind == "array":
+        return f"list of {_allowed(field.get('items', {}))}"
+    if kind == "object":
+        return f"table of {_allowed(field.get('additionalProperties', {}))}"
+    words = {
+        "minimum": "at least",
+        "maximum": "at most",
+        "exclusiveMinimum": "above",
+        "exclusiveMaximum": "below",
+    }
+    limits = [f"{text} {field[key]:g}" for key, text in words.items() if key in field]
+    return ", ".join([kind, *limits])
+
+
+def _limit(limit, kind):
+    """What a model's setting may be: a range, choices, or its type."""
+    kind = kind if isinstance(kind, str) else getattr(kind, "__name__", str(kind))
+    if limit is None:
+        return kind
+    if isinstance(limit[0], str):
+        return ", ".join(f"`{choice}`" for choice in limit)
+    low, high = limit
+    return f"{kind}, at least {low:g}" + ("" if math.isinf(high) else f", at most {high:g}")
+
+
+def _value(value):
+    return "" if value is None or isinstance(value, (dict, list)) else f"`{json.dumps(value)}`"
 
 
 def pages(root):

@@ -34,6 +34,19 @@ def test_links_and_pictures_lead_to_files(page):
         assert target.startswith("https://") or (page.parent / target).exists(), target
 
 
+def test_scene_reference_holds_every_key_with_its_default(tmp_path):
+    from rbfmuscle.sim.scene_file import SceneFile
+
+    (tmp_path / "docs" / "gallery").mkdir(parents=True)
+    gallery.write_scene_reference(tmp_path)
+    text = (tmp_path / "docs" / "gallery" / "scene_reference.md").read_text(encoding="utf-8")
+    for table in SceneFile.model_json_schema()["$defs"].values():
+        assert all(f"| `{key}` |" in text for key in table["properties"])
+    assert "| `substep_angle` | number, at most 90, above 0 | `2.0` |" in text
+    assert "`greedy`, `fitted` | `\"greedy\"` |" in text
+    assert "| `method` | `pbd`, " in text
+
+
 def test_reference_holds_every_public_name(tmp_path):
     import rbfmuscle
 
