@@ -271,8 +271,9 @@ def centre_tables():
     levels = (150, 300, 600, 1200, 2400)
     for title, across in (
         ("rbf over centres", lambda k: 1.0),
-        # In-plane edges resist alike at any spacing; those across are as long as the muscle is thick and become more.
-        ("rbf over centres, across_weight = 300 / centres", lambda k: 300.0 / k),
+        # In-plane edges resist alike at any spacing; those across are as long as the muscle is thick and become
+        # more. The model lets each count less in return, which this takes back.
+        ("rbf over centres, links across of constant weight", lambda k: k / levels[0]),
     ):
         fine = [
             {**EVEN, "centres": k, "across_weight": across(k), "samples": 6000, "resolution": 64}

@@ -132,7 +132,8 @@ class RBFMuscle:
         self.bone_points = [ObstaclePoints(bone.mesh.vertices) for bone in scene.bones]
         faces = np.asarray(muscle.mesh.faces)
         self.rest_volume = float(muscle.mesh.volume)
-        count = self.options.centres or self._default_centres(muscle.mesh.area, scene)
+        usual = self._default_centres(muscle.mesh.area, scene)
+        count = self.options.centres or usual
         frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
         seed = self.options.seed
         fitted = self.options.placement == FITTED
@@ -154,7 +155,9 @@ class RBFMuscle:
         self.samples = frame.points(samples.points)
         self.control_faces, self.sample_faces = centres.control_faces, samples.control_faces
         fibre = self._attach(muscle, frame, faces, centres.points, samples.points)
-        self._build_elasticity(centres, samples, fibre)
+        # Links through the thickness are one a centre: with more of them each counts less, so that the muscle
+        # resists alike however many centres it has.
+        self._build_elasticity(centres, samples, fibre, self.options.across_weight * usual / count)
         self.x = self.rest.copy()
         self.level, self._fitted = 0.0, None
         # Cells along the muscle's own axes are smaller than along the scene's, and turn with the scene.
@@ -241,11 +244,11 @@ class RBFMuscle:
         direction = np.where(weak[:, None], axis, direction)
         return direction / np.linalg.norm(direction, axis=1, keepdims=True)
 
-    def _build_elasticity(self, centres, samples, fibre):
+    def _build_elasticity(self, centres, samples, fibre, across_weight):
         options = self.options
         start, other, weight = build_clusters(
             centres.points, centres.normals, self.control_faces, samples.points, samples.normals,
-            across=options.across, across_weight=options.across_weight,
+            across=options.across, across_weight=across_weight,
         )  # fmt: skip
         limits = (options.stretch_low, options.stretch_high)
         self.shape = ShapeConstraint(
