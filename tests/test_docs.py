@@ -43,7 +43,7 @@ def test_scene_reference_holds_every_key_with_its_default(tmp_path):
     for table in SceneFile.model_json_schema()["$defs"].values():
         assert all(f"| `{key}` |" in text for key in table["properties"])
     assert "| `substep_angle` | number, at most 90, above 0 | `2.0` |" in text
-    assert "`greedy`, `fitted` | `\"greedy\"` |" in text
+    assert '`greedy`, `fitted` | `"greedy"` |' in text
     assert "| `method` | `pbd`, " in text
 
 

@@ -137,10 +137,17 @@ FINE_RBF = {"name": "rbf", "placement": "even", "centres": 600}
 class TestStretchedBar:
     @pytest.mark.parametrize("stretch", [0.8, 1.2])
     def test_rbf(self, study, stretch):
-        found = study.stretched(stretch, FINE_RBF, 2.0)
+        found = study.stretched(stretch, FINE_RBF, 1.5)
         assert abs(found["radius"]) < 0.01
         assert abs(found["radius_ends"]) < 0.01
-        assert abs(found["path"]) < 0.001
+        assert abs(found["path"]) < 0.003
+
+    def test_rbf_comes_nearer_with_more_centres(self, study):
+        coarse, fine = (
+            study.stretched(1.3, {"name": "rbf", "centres": count}, 2.0)["radius_ends"]
+            for count in (150, 600)
+        )
+        assert abs(fine) < 0.6 * abs(coarse)
 
     def test_arap_volume(self, study):
         found = study.stretched(1.2, {"name": "arap-volume"}, 2.0)
