@@ -11,11 +11,11 @@ from conftest import ROOT
 
 from rbfmuscle.run import simulate, stream_run
 from rbfmuscle.sim.exact_distance import ExactDistance
-from rbfmuscle.sim.fibre_field import FibreField, attachment_points
-from rbfmuscle.sim.fibre_lines import grow_fibres, resampled, spread
-from rbfmuscle.sim.mean_value import mean_value_weights
 from rbfmuscle.study.export import export_run
+from rbfmuscle.study.fibre_field import FibreField, attachment_points
+from rbfmuscle.study.fibre_lines import grow_fibres, resampled, spread
 from rbfmuscle.study.fibre_study import FibreBundle, line_lengths
+from rbfmuscle.study.mean_value import mean_value_weights
 from rbfmuscle.study.saved import SavedRun
 from rbfmuscle.validation import MeshError, SceneError, SolveError, UsageError
 

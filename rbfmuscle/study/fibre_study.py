@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.sim.fibre_lines import grow_fibres
-from rbfmuscle.sim.mean_value import mean_value_weights
 from rbfmuscle.study.centreline import split_ends
+from rbfmuscle.study.fibre_lines import grow_fibres
+from rbfmuscle.study.mean_value import mean_value_weights
 
 
 class FibreLines(NamedTuple):

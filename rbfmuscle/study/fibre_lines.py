@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.sim.fibre_field import FibreField, attachment_points
+from rbfmuscle.study.fibre_field import FibreField, attachment_points
 from rbfmuscle.validation import NumericalWarning, SolveError
 
 # A step of a streamline, how deep it is kept below the surface, and where it has arrived, in cells.
