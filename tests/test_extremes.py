@@ -129,7 +129,7 @@ def test_single_precision_input_is_computed_in_double():
 
 
 def test_nothing_is_wrong_without_a_word(tmp_path):
-    rows = study_extremes(kernels=["cubic", "gaussian", "multiquadric", "matern_12", "wendland_c2"])
+    rows = study_extremes(kernels=["cubic", "inverse_multiquadric", "matern_12", "wendland_c2"])
     outcomes = {(row["case"], row["kernel"]): row["outcome"] for row in rows}
     assert "silent" not in outcomes.values()
     for row in rows:

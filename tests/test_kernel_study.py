@@ -116,5 +116,7 @@ def test_command_tells_the_extremes(tmp_path, capsys):
     code, out, _ = call(capsys, "kernels", "--extremes", "--kernels", "cubic,linear", "-o", tmp_path)
     assert code == 0 and "| 1e6 from the origin | 2 | 0 | 0 | 0 |" in out
     assert (tmp_path / "extremes.csv").exists()
+    code, _, err = call(capsys, "kernels", "phantom", "--centres", "150,some", "-o", tmp_path)
+    assert code == 2 and "--centres must be whole numbers of 4 and more, got '150 some'" in err
     code, _, err = call(capsys, "kernels", "-o", tmp_path)
     assert code == 2 and "which surface" in err

@@ -17,7 +17,7 @@ def kernels(
     names: Annotated[
         list[str] | None, Parameter(name="--kernels", negative="", consume_multiple=True)
     ] = None,
-    centres: Annotated[list[int] | None, Parameter(negative="", consume_multiple=True)] = None,
+    centres: Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)] = None,
     muscle: str | None = None,
     derivatives: str = "all",
     placement: str = "fitted",
@@ -41,7 +41,7 @@ def kernels(
     names
         Kernels; all by default. Separate by commas or blanks.
     centres
-        Numbers of centres; 150 and 300 by default.
+        Numbers of centres; 150 and 300 by default. Separate by commas or blanks.
     muscle
         Of a scene; the first by default.
     derivatives
@@ -72,7 +72,10 @@ def kernels(
     if derivatives not in ("all", "normal") or criterion not in CRITERIA:
         raise UsageError(f"derivatives must be all or normal, criterion {', '.join(CRITERIA)}; "
                          f"got {derivatives!r} and {criterion!r}")  # fmt: skip
-    names = [name for text in names or [] for name in text.split(",") if name] or None
+    names, counts = _split(names), _split(centres)
+    if not all(count.isdecimal() and int(count) >= 4 for count in counts or ()):
+        raise UsageError(f"--centres must be whole numbers of 4 and more, got {' '.join(counts)!r}")
+    counts = [int(count) for count in counts or (150, 300)]
     if extremes:
         return _extremes(names, output, as_json)
     if source is None:
@@ -80,7 +83,7 @@ def kernels(
     scene, mesh, title = _surface(source, muscle)
     with Progress("kernels", what="fit") as bar:
         study = study_kernels(
-            mesh, kernels=names, centres=centres or (150, 300), derivatives=derivatives, placement=placement,
+            mesh, kernels=names, centres=counts, derivatives=derivatives, placement=placement,
             criterion=criterion, resolution=resolution, units=units if scene is None else scene.units, progress=bar,
         )  # fmt: skip
     moved = [] if scene is None else _run_best(scene, title, study, best, frames)
@@ -92,6 +95,11 @@ def kernels(
     if missing is not None:
         raise missing
     return 0
+
+
+def _split(texts):
+    """What stands between commas and blanks; None where nothing does."""
+    return [part for text in texts or [] for part in text.split(",") if part] or None
 
 
 def _extremes(names, output, as_json):
