@@ -250,11 +250,17 @@ def _run_in_turn(scene, lanes, crew, sliding, surfaces, written, here, wall):
         start = time.perf_counter()
         shown = written is None or index in written
         stops = [here, *pace.split(here, coordinates)]
-        with crew.one_thread_each():
-            draws = _go(lanes, crew, sliding, index, stops, shown and surfaces)
+        show = shown and surfaces
+        if show and sliding is None and crew.pool is not None:
+            # Nothing waits for another muscle: each goes all the way, and no thread idles in between.
+            with crew.one_thread_each():
+                skins = crew.each(lambda lane: _go_alone(lane, index, stops, True)(), lanes)  # noqa: B023
+        else:
+            with crew.one_thread_each():
+                draws = _go(lanes, crew, sliding, index, stops, show)
+            with crew.all_threads():
+                skins = crew.each(_call, draws)
         frame = _frame(scene, lanes, index, coordinates) if shown else None
-        with crew.all_threads():
-            skins = crew.each(_call, draws)
         wall += time.perf_counter() - start
         if frame is not None:
             yield _drawn(frame, skins, wall)
