@@ -167,7 +167,7 @@ def _reach_volume(band, target, level, keep, obstacles):
 def _finish(band, projector, faces, target, level, components, spurious, obstacles):
     bones, tolerance = obstacles
     if bones:
-        points = points_near_cells(bones, band.grid, band.state)
+        points = points_near_cells(bones, band.grid, band.state, band.cells)
         points = points[band.field(points) - level < CHORD * band.grid.spacing]
         projector.push_off(faces, points, band.grid, tolerance)
     if target is not None:

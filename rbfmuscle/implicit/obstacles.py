@@ -11,6 +11,8 @@ from rbfmuscle.validation import check_points
 CHORD = 0.35
 # Points in one pack, whose box is tested first, and cells along a side by which points are sorted.
 PACK, SORTING_CELLS = 128, 16
+# Cells along a side of the blocks that are looked at before the cells themselves.
+BLOCK = 4
 
 
 class ObstaclePoints:
@@ -37,7 +39,7 @@ class ObstaclePoints:
         ).reshape(-1, 2, 3)
 
 
-def points_near_cells(obstacles, grid, state):
+def points_near_cells(obstacles, grid, state, cells):
     """Obstacle points in or beside the cells that a band has visited, in world positions.
 
     Parameters
@@ -47,19 +49,24 @@ def points_near_cells(obstacles, grid, state):
     grid : BandGrid
     state : (cells,) ndarray
         1 where a cell was visited.
+    cells : (v,) ndarray
+        Flat numbers of the visited cells.
 
     Returns
     -------
     (m, 3) ndarray
     """
     found = [np.zeros((0, 3))]
+    shape = np.array(grid.shape)
+    blocks = np.zeros(tuple(shape // BLOCK + 1), dtype=np.bool_)
+    _mark_blocks_loop(cells, grid.strides, blocks)
     for obstacle, pose in obstacles:
         points = obstacle.points
         turn = grid.axes @ pose[:3, :3] / grid.spacing
         shift = grid.axes @ (pose[:3, 3] - grid.origin) / grid.spacing
         index = np.empty(len(points), dtype=np.int64)
         count = _near_cells_loop(
-            points, obstacle.boxes, turn, shift, np.array(grid.shape), grid.strides, state, index
+            points, obstacle.boxes, turn, shift, shape, grid.strides, state, blocks, index
         )
         # In the caller's order: pushes follow one another, and a turned scene is sorted in another one.
         near = index[:count][np.argsort(obstacle.order[index[:count]])]
@@ -67,8 +74,20 @@ def points_near_cells(obstacles, grid, state):
     return np.concatenate(found)
 
 
-@numba.njit(cache=True, nogil=True)
-def _near_cells_loop(points, boxes, turn, shift, shape, strides, state, index):
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _mark_blocks_loop(cells, strides, blocks):
+    """Mark the blocks of BLOCK^3 cells that hold a visited cell or touch one."""
+    for cell in cells:
+        i, j, k = cell // strides[0], cell % strides[0] // strides[1], cell % strides[1]
+        for a in range(max(i - 1, 0) // BLOCK, (i + 1) // BLOCK + 1):
+            for b in range(max(j - 1, 0) // BLOCK, (j + 1) // BLOCK + 1):
+                for c in range(max(k - 1, 0) // BLOCK, (k + 1) // BLOCK + 1):
+                    blocks[a, b, c] = True
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _near_cells_loop(points, boxes, turn, shift, shape, strides, state, blocks, index):
+    low, high = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)
     count = 0
     for pack in range(len(boxes)):
         apart = False
@@ -78,32 +97,33 @@ def _near_cells_loop(points, boxes, turn, shift, shape, strides, state, index):
                 middle += 0.5 * turn[a, b] * (boxes[pack, 0, b] + boxes[pack, 1, b])
                 half += 0.5 * abs(turn[a, b]) * (boxes[pack, 1, b] - boxes[pack, 0, b])
             apart |= middle + half < 1.0 or middle - half > shape[a] - 2.0
-        if not apart:
-            last = min((pack + 1) * PACK, len(points))
-            count = _near_points_loop(
-                points, pack * PACK, last, turn, shift, shape, strides, state, index, count
-            )
+            low[a] = int(max(middle - half, 0.0)) // BLOCK
+            high[a] = int(max(min(middle + half, shape[a] - 1.0), 0.0)) // BLOCK
+        if apart or not blocks[low[0] : high[0] + 1, low[1] : high[1] + 1, low[2] : high[2] + 1].any():
+            continue
+        last = min((pack + 1) * PACK, len(points))
+        count = _near_points_loop(
+            points, pack * PACK, last, turn, shift, shape, strides, state, blocks, index, count
+        )
     return count
 
 
-@numba.njit(cache=True, nogil=True)
-def _near_points_loop(points, first, last, turn, shift, shape, strides, state, index, count):
-    low, high = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _near_points_loop(points, first, last, turn, shift, shape, strides, state, blocks, index, count):
     for n in range(first, last):
-        within = True
-        for a in range(3):
-            u = shift[a] + turn[a, 0] * points[n, 0] + turn[a, 1] * points[n, 1] + turn[a, 2] * points[n, 2]
-            if u < 1.0 or u > shape[a] - 2.0:
-                within = False
-                break
-            low[a], high[a] = int(u - CHORD), int(u + CHORD)
-        if not within:
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        u = shift[0] + turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z
+        v = shift[1] + turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z
+        w = shift[2] + turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z
+        if not (1.0 <= u <= shape[0] - 2.0 and 1.0 <= v <= shape[1] - 2.0 and 1.0 <= w <= shape[2] - 2.0):
+            continue
+        if not blocks[int(u) // BLOCK, int(v) // BLOCK, int(w) // BLOCK]:
             continue
         visited = False
-        for i in range(low[0], high[0] + 1):
-            for j in range(low[1], high[1] + 1):
-                for k in range(low[2], high[2] + 1):
-                    visited |= state[i * strides[0] + j * strides[1] + k] == 1
+        for i in range(int(u - CHORD), int(u + CHORD) + 1):
+            for j in range(int(v - CHORD), int(v + CHORD) + 1):
+                for k in range(int(w - CHORD), int(w + CHORD) + 1):
+                    visited |= state[i * strides[0] + j * strides[1] + k * strides[2]] == 1
         if visited:
             index[count] = n
             count += 1
@@ -137,8 +157,8 @@ def push_off_points(vertices, faces, points, grid, tolerance, rounds=4):
     moved = np.zeros(len(vertices), dtype=bool)
     if len(points) == 0:
         return moved
-    start = np.zeros(int(np.prod(grid.shape)) + 1, dtype=np.int64)
-    cell, order = np.empty(len(faces), dtype=np.int64), np.empty(len(faces), dtype=np.int64)
+    start = np.zeros(int(np.prod(grid.shape)) + 1, dtype=np.int32)
+    cell, order = np.empty(len(faces), dtype=np.int32), np.empty(len(faces), dtype=np.int32)
     last = np.array(grid.shape) - 2
     turn = grid.axes / grid.spacing
     middle = np.empty((len(faces), 3))
@@ -155,18 +175,17 @@ def push_off_points(vertices, faces, points, grid, tolerance, rounds=4):
     return moved
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _sort_faces_loop(vertices, faces, turn, origin, last, strides, cell, start, order, middle):
     """Sort triangles by the cell of their middle: those of cell c are order[start[c] : start[c + 1]]."""
-    m = np.empty(3)
     for f in range(len(faces)):
-        for a in range(3):
-            m[a] = -origin[a]
-            for k in range(3):
-                m[a] += vertices[faces[f, k], a] / 3.0
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        x = (vertices[i, 0] + vertices[j, 0] + vertices[k, 0]) / 3.0 - origin[0]
+        y = (vertices[i, 1] + vertices[j, 1] + vertices[k, 1]) / 3.0 - origin[1]
+        z = (vertices[i, 2] + vertices[j, 2] + vertices[k, 2]) / 3.0 - origin[2]
         number = 0
         for a in range(3):
-            u = turn[a, 0] * m[0] + turn[a, 1] * m[1] + turn[a, 2] * m[2]
+            u = turn[a, 0] * x + turn[a, 1] * y + turn[a, 2] * z
             number += min(max(int(np.floor(u)), 0), last[a]) * strides[a]
         cell[f] = number
         start[number + 1] += 1
@@ -177,15 +196,14 @@ def _sort_faces_loop(vertices, faces, turn, origin, last, strides, cell, start, 
         start[cell[f] + 1] -= 1
         n = start[cell[f] + 1]
         order[n] = f
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
         for a in range(3):
-            middle[n, a] = (
-                vertices[faces[f, 0], a] + vertices[faces[f, 1], a] + vertices[faces[f, 2], a]
-            ) / 3.0
+            middle[n, a] = (vertices[i, a] + vertices[j, a] + vertices[k, a]) / 3.0
     start[:-1] = start[1:]
     start[-1] = len(faces)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _push_loop(
     vertices, faces, points, where, order, start, middle, cell, strides, reach, tolerance, moved, touched
 ):  # fmt: skip
@@ -195,51 +213,56 @@ def _push_loop(
     triangles that were pushed.
     """
     number = 0
-    weight, normal = np.empty(3), np.empty(3)
-    best_weight, best_normal = np.empty(3), np.empty(3)
+    normal, weight = np.empty(3), np.empty(3)
     pushed = np.empty(len(points), dtype=np.int64)
-    # A triangle lies in a cell: its middle is less than a cell from any point that is right behind it.
-    far = (1.3 * reach) ** 2
     for p in range(len(points)):
         if where[p] < 0 or not touched[where[p]]:
             continue
-        best, least, signed = -1, reach, -reach
-        for i in range(-1, 2):
-            for j in range(-1, 2):
-                # The three cells along the last axis lie side by side.
-                here = where[p] + i * strides[0] + j * strides[1]
-                first, last = max(here - 1, 0), min(here + 2, len(start) - 1)
-                if last <= first:
-                    continue
-                for n in range(start[first], start[last]):
-                    square = 0.0
-                    for c in range(3):
-                        square += (points[p, c] - middle[n, c]) ** 2
-                    if square > far:
-                        continue
-                    depth = _depth_behind(vertices, faces[order[n]], points[p], weight, normal)
-                    if abs(depth) < least:
-                        best, least = order[n], abs(depth)
-                        best_weight[:] = weight
-                        best_normal[:] = normal
-                        signed = depth
+        best, signed = _nearest_triangle(
+            vertices, faces, points[p], where[p], order, start, middle, strides, reach
+        )
         if signed < -0.1 * reach:
             where[p] = -1
         if signed <= tolerance or signed > CHORD * reach:
             continue
         pushed[number] = cell[best]
         number += 1
-        square = best_weight[0] ** 2 + best_weight[1] ** 2 + best_weight[2] ** 2
+        _weigh(vertices, faces, best, points[p], weight, normal)
+        square = weight[0] ** 2 + weight[1] ** 2 + weight[2] ** 2
         for k in range(3):
             v = faces[best, k]
             moved[v] = True
             for c in range(3):
-                vertices[v, c] -= best_normal[c] * (signed - 0.5 * tolerance) * best_weight[k] / square
+                vertices[v, c] -= normal[c] * (signed - 0.5 * tolerance) * weight[k] / square
     _touch_loop(pushed[:number], strides, touched)
     return number
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _nearest_triangle(vertices, faces, p, where, order, start, middle, strides, reach):
+    """Nearest triangle right above or below p, less than ``reach`` away, and how far p lies behind it."""
+    best, least, signed = -1, reach, -reach
+    # A triangle lies in a cell: its middle is less than a cell from any point that is right behind it.
+    far = (1.3 * reach) ** 2
+    x, y, z = p[0], p[1], p[2]
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            # The three cells along the last axis lie side by side.
+            here = where + i * strides[0] + j * strides[1]
+            first, last = max(here - 1, 0), min(here + 2, len(start) - 1)
+            if last <= first:
+                continue
+            for n in range(start[first], start[last]):
+                dx, dy, dz = x - middle[n, 0], y - middle[n, 1], z - middle[n, 2]
+                if dx * dx + dy * dy + dz * dz > far:
+                    continue
+                depth = _depth_behind(vertices, faces, order[n], x, y, z)
+                if abs(depth) < least:
+                    best, least, signed = order[n], abs(depth), depth
+    return best, signed
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _touch_loop(cells, strides, touched):
     """Mark the cells less than three from any given one: a corner's triangles are one away, their points two."""
     touched[:] = False
@@ -252,22 +275,39 @@ def _touch_loop(cells, strides, touched):
                         touched[near] = True
 
 
-@numba.njit(cache=True, nogil=True)
-def _depth_behind(vertices, face, p, weight, normal):
-    """How far p lies behind a triangle, with its barycentric weights; infinite if beside it."""
-    a, b, c = vertices[face[0]], vertices[face[1]], vertices[face[2]]
-    ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _frame(vertices, faces, f, x, y, z):
+    """Normal of a triangle, its square, the offset of a point from corner A, and twice the areas at B and C.
+
+    The areas are those of the point's shadow in the triangle's plane, times the length of the normal.
+    """
+    a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+    ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
+    ux, uy, uz = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
+    vx, vy, vz = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
     nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-    square = nx * nx + ny * ny + nz * nz
-    if square == 0.0:
+    px, py, pz = x - ax, y - ay, z - az
+    at_b = nx * (py * vz - pz * vy) + ny * (pz * vx - px * vz) + nz * (px * vy - py * vx)
+    at_c = nx * (uy * pz - uz * py) + ny * (uz * px - ux * pz) + nz * (ux * py - uy * px)
+    height = nx * px + ny * py + nz * pz
+    return nx, ny, nz, nx * nx + ny * ny + nz * nz, height, at_b, at_c
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _depth_behind(vertices, faces, f, x, y, z):
+    """How far a point lies behind a triangle; infinite if beside it."""
+    _, _, _, square, height, at_b, at_c = _frame(vertices, faces, f, x, y, z)
+    least = -1e-9 * square
+    if square == 0.0 or at_b < least or at_c < least or square - at_b - at_c < least:
         return np.inf
-    px, py, pz = p[0] - a[0], p[1] - a[1], p[2] - a[2]
-    weight[1] = (nx * (py * vz - pz * vy) + ny * (pz * vx - px * vz) + nz * (px * vy - py * vx)) / square
-    weight[2] = (nx * (uy * pz - uz * py) + ny * (uz * px - ux * pz) + nz * (ux * py - uy * px)) / square
+    return -height / np.sqrt(square)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _weigh(vertices, faces, f, p, weight, normal):
+    """Fill the barycentric weights of a point's shadow in a triangle, and the triangle's unit normal."""
+    nx, ny, nz, square, _, at_b, at_c = _frame(vertices, faces, f, p[0], p[1], p[2])
+    weight[1], weight[2] = at_b / square, at_c / square
     weight[0] = 1.0 - weight[1] - weight[2]
-    if weight[0] < -1e-9 or weight[1] < -1e-9 or weight[2] < -1e-9:
-        return np.inf
     length = np.sqrt(square)
     normal[0], normal[1], normal[2] = nx / length, ny / length, nz / length
-    return -(normal[0] * px + normal[1] * py + normal[2] * pz)
