@@ -200,7 +200,8 @@ def _general_block_loop(
     centres, a, b, hermite, order, epsilon, base, parameter, compact, table, p, acc, g, h
 ):
     """Any kernel: radial functions into scratch blocks, then their sums. epsilon (K,)."""
-    d, u, work, radial = np.empty_like(p), np.empty_like(acc), np.empty((3, _BLOCK)), np.empty((4, _BLOCK))
+    d, u = np.empty_like(p), np.empty_like(acc)
+    work, radial = np.empty((3, u.size)), np.empty((4, u.size))
     wanted = (2 << (order + hermite)) - 1
     ball = _ball(p)
     for j in range(centres.shape[1]):
@@ -218,21 +219,49 @@ def _general_block_loop(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _monomial_loop(p, i, j, k, factor, term, out):
+    """out += factor x^i y^j z^k."""
+    term[:] = factor
+    for axis, power in enumerate((i, j, k)):
+        for _ in range(power):
+            for n in range(term.size):
+                term[n] *= p[axis, n]
+    for n in range(term.size):
+        out[n] += term[n]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _polynomial_loop(coefficients, powers, gradient, p, acc, g):
+    """Adds a polynomial to acc, its gradient to g."""
+    term = np.empty_like(acc)
+    for q in range(len(coefficients)):
+        c, i, j, k = coefficients[q], powers[q, 0], powers[q, 1], powers[q, 2]
+        _monomial_loop(p, i, j, k, c, term, acc)
+        if gradient and i > 0:
+            _monomial_loop(p, i - 1, j, k, c * i, term, g[0])
+        if gradient and j > 0:
+            _monomial_loop(p, i, j - 1, k, c * j, term, g[1])
+        if gradient and k > 0:
+            _monomial_loop(p, i, j, k - 1, c * k, term, g[2])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _evaluate_loop(
     points, origin, scale, centres, a, b, hermite, order, epsilon, base, parameter, compact, table, cubic,
-    start, stop, out
+    coefficients, powers, start, stop, value, gradient, hessian
 ):  # fmt: skip
-    """out[0] value, out[1:4] gradient, out[4:10] Hessian (order 0, 1, 2) at points[start:stop].
+    """Value, gradient and radial part of the Hessian (order 0, 1, 2) at points[start:stop].
 
-    Blocks have a fixed length (the last one repeats its last point), so that all rows are contiguous.
+    The length of a block is a multiple of a cache line (its end repeats the last point), so that all rows are
+    contiguous and filled alike.
     """
-    p = np.empty((3, _BLOCK))
     for low in range(start, stop, _BLOCK):
         n = min(_BLOCK, stop - low)
-        for i in range(_BLOCK):
+        size = (n + 7) // 8 * 8
+        p, acc, g, h = np.empty((3, size)), np.zeros(size), np.zeros((3, size)), np.zeros((6, size))
+        for i in range(size):
             for c in range(3):
                 p[c, i] = (points[low + min(i, n - 1), c] - origin[c]) / scale
-        acc, g, h = np.zeros(_BLOCK), np.zeros((3, _BLOCK)), np.zeros((6, _BLOCK))
         if order == 0 and not hermite:
             _value_block_loop(centres, a, epsilon, base, parameter, compact, table[0], p, acc)
         elif cubic and order < 2:
@@ -241,15 +270,18 @@ def _evaluate_loop(
             _general_block_loop(
                 centres, a, b, hermite, order, epsilon, base, parameter, compact, table, p, acc, g, h
             )
-        out[0, low : low + n] = acc[:n]
+        _polynomial_loop(coefficients, powers, order > 0, p, acc, g)
+        value[low : low + n] = acc[:n]
         if order > 0:
-            out[1:4, low : low + n] = g[:, :n]
+            for i in range(n):
+                for c in range(3):
+                    gradient[low + i, c] = g[c, i] / scale
         if order > 1:
-            out[4:10, low : low + n] = h[:, :n]
+            hessian[:, low : low + n] = h[:, :n]
 
 
-def evaluate(points, origin, scale, centres, weights, kernel, epsilon, order):
-    """Radial part of a field in scaled coordinates.
+def evaluate(points, origin, scale, centres, weights, kernel, epsilon, polynomial, order):
+    """A field, its gradient, and the radial part of its Hessian.
 
     Parameters
     ----------
@@ -264,37 +296,41 @@ def evaluate(points, origin, scale, centres, weights, kernel, epsilon, order):
     kernel : Kernel
     epsilon : (K,) ndarray
         In scaled coordinates.
+    polynomial : pair of (q,) and (q, 3) ndarrays
+        Coefficients and powers of the monomials in scaled coordinates.
     order : int
         0 value, 1 with gradient, 2 with Hessian.
 
     Returns
     -------
-    (1, n), (4, n) or (10, n) ndarray
-        Value, gradient, Hessian (xx, yy, zz, xy, xz, yz), derivatives with respect to scaled coordinates.
+    value : (n,) ndarray
+    gradient : (n, 3) ndarray
+        With respect to points; empty for order 0.
+    hessian : (6, n) ndarray
+        xx, yy, zz, xy, xz, yz, with respect to scaled coordinates, without the polynomial; empty below order 2.
     """
-    hermite = len(weights) == 4
+    hermite, count = len(weights) == 4, len(points)
     b = weights[1:] if hermite else np.zeros((3, weights.shape[1]))
     cubic = kernel.name == "cubic" and bool((epsilon == 1.0).all())
-    out = np.zeros(((1, 4, 10)[order], len(points)))
-    sort = (
-        kernel.compact and centres.shape[1] >= _SORT_FROM and len(points) > 4 * _BLOCK and epsilon.min() > 2.0
-    )
+    value, gradient = np.empty(count), np.empty((count if order > 0 else 0, 3))
+    hessian = np.empty((6, count if order > 1 else 0))
+    sort = kernel.compact and centres.shape[1] >= _SORT_FROM and count > 4 * _BLOCK and epsilon.min() > 2.0
     if sort:
         places = _by_cells(points)
         points = points[places]
 
     def loop(start, stop):
         _evaluate_loop(
-            points, origin, scale, centres, weights[0], b, hermite, order, epsilon,
-            kernel.base, kernel.parameter, kernel.compact, kernel.table, cubic, start, stop, out,
+            points, origin, scale, centres, weights[0], b, hermite, order, epsilon, kernel.base, kernel.parameter,
+            kernel.compact, kernel.table, cubic, *polynomial, start, stop, value, gradient, hessian,
         )  # fmt: skip
 
-    run_in_chunks(loop, len(points), len(points) * centres.shape[1])
+    run_in_chunks(loop, count, count * centres.shape[1])
     if not sort:
-        return out
-    back = np.empty_like(out)
-    back[:, places] = out
-    return back
+        return value, gradient, hessian
+    back = np.empty_like(places)
+    back[places] = np.arange(count)
+    return value[back], gradient[back] if order > 0 else gradient, hessian[:, back] if order > 1 else hessian
 
 
 def _by_cells(points):

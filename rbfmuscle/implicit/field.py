@@ -59,6 +59,7 @@ class RBFField:
         self._rows = np.ascontiguousarray(weights.reshape(len(centres), -1).T)
         shape = epsilon * scale if kernel.has_epsilon else 1.0
         self._shape = np.ascontiguousarray(np.broadcast_to(shape, len(centres)), dtype=float)
+        self._polynomial = np.ascontiguousarray(coefficients, dtype=float), np.ascontiguousarray(powers)
 
     @classmethod
     def fit(cls, points, values, *, kernel="cubic", epsilon=1.0, degree=None, smoothing=0.0):
@@ -224,11 +225,7 @@ class RBFField:
 
     def __call__(self, points):
         """Field value at (n, 3) points: (n,), negative inside."""
-        points = check_points(points)
-        out = self._radial(points, 0)[0]
-        if len(self.powers):
-            out += self._polynomial((points - self.origin) / self.scale)
-        return out
+        return self._evaluate(check_points(points), 0)[0]
 
     def gradient(self, points):
         """Gradient at (n, 3) points: (n, 3)."""
@@ -236,16 +233,7 @@ class RBFField:
 
     def value_and_gradient(self, points):
         """Value (n,) and gradient (n, 3) at (n, 3) points, for little more than the value alone."""
-        points = check_points(points)
-        out = self._radial(points, 1)
-        value, gradient = out[0], out[1:].T
-        if len(self.powers):
-            scaled = (points - self.origin) / self.scale
-            value += self._polynomial(scaled)
-            gradient = gradient + np.einsum(
-                "q,cqn->nc", self.coefficients, assembly.monomial_gradients(scaled, self.powers)
-            )
-        return value, np.ascontiguousarray(gradient / self.scale)
+        return self._evaluate(check_points(points), 1)[:2]
 
     def hessian(self, points):
         """Second derivatives at (n, 3) points: (n, 3, 3) [1/scene unit]."""
@@ -278,27 +266,20 @@ class RBFField:
         return trimesh.Trimesh(result.vertices, result.faces, process=False)
 
     def _derivatives(self, points):
-        out = self._radial(points, 2)
-        gradient, flat = out[1:4].T, out[4:]
+        _, gradient, flat = self._evaluate(points, 2)
         hessian = flat[[0, 3, 4, 3, 1, 5, 4, 5, 2]].T.reshape(-1, 3, 3)
         if len(self.powers):
             scaled = (points - self.origin) / self.scale
-            gradient = gradient + np.einsum(
-                "q,cqn->nc", self.coefficients, assembly.monomial_gradients(scaled, self.powers)
-            )
             hessian = hessian + np.einsum(
                 "q,ceqn->nce", self.coefficients, assembly.monomial_hessians(scaled, self.powers)
             )
-        return gradient / self.scale, hessian / self.scale**2
+        return gradient, hessian / self.scale**2
 
-    def _polynomial(self, scaled):
-        # not by BLAS, whose threads go on waiting on the cores that the next evaluation needs
-        return np.einsum("q,qn->n", self.coefficients, assembly.monomials(scaled, self.powers))
-
-    def _radial(self, points, order):
+    def _evaluate(self, points, order):
         return evaluate(
-            points, self.origin, self.scale, self._scaled, self._rows, self.kernel, self._shape, order
-        )
+            points, self.origin, self.scale, self._scaled, self._rows, self.kernel, self._shape, self._polynomial,
+            order,
+        )  # fmt: skip
 
 
 def frame(points):
