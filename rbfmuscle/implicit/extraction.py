@@ -171,10 +171,9 @@ def _finish(band, projector, faces, target, level, components, spurious, obstacl
         points = points[band.field(points) - level < CHORD * band.grid.spacing]
         projector.push_off(faces, points, band.grid, tolerance)
     if target is not None:
-        for _ in range(3):
-            step = projector.volume_step(faces, target)
-            level += step
-            projector.shift(step)
+        step = projector.volume_step(faces, target, steps=3)
+        level += step
+        projector.shift(step)
     vertices = projector.vertices
     check_finite(vertices, name="extracted vertices")
     return ExtractedSurface(

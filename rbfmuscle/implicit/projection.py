@@ -57,17 +57,24 @@ class Projector:
             size = np.maximum(np.einsum("ij,ij->i", outward, outward), np.finfo(float).tiny)
             step[rows] = -(distance / size)[:, None] * outward
 
-    def volume_step(self, faces, target):
-        """Change of level that would bring the mesh to the target volume, to first order."""
-        volume, rate = _volume_and_rate_loop(
-            self.vertices, faces, self.vertices.mean(axis=0), self._direction
-        )
-        lack = target - volume
-        if lack == 0.0:
-            return 0.0
-        if not rate > 0:
-            raise ValueError(f"no level gives a volume of {target:g}: the cut leaves no surface of the field")
-        return lack / rate
+    def volume_step(self, faces, target, steps=1):
+        """Change of level that brings the mesh to the target volume, its vertices moving along their directions.
+
+        By Newton steps on the volume, a cubic polynomial of the change.
+        """
+        c0, c1, c2, c3 = _volume_terms_loop(self.vertices, faces, self.vertices.mean(axis=0), self._direction)
+        change = 0.0
+        for _ in range(steps):
+            lack = target - (c0 + change * (c1 + change * (c2 + change * c3)))
+            if lack == 0.0:
+                break
+            rate = c1 + change * (2.0 * c2 + change * 3.0 * c3)
+            if not rate > 0:
+                raise ValueError(
+                    f"no level gives a volume of {target:g}: the cut leaves no surface of the field"
+                )
+            change += lack / rate
+        return change
 
     def push_off(self, faces, points, grid, tolerance):
         """Move the vertices around points that came through a triangle; these no longer follow the level."""
@@ -90,7 +97,7 @@ class Projector:
         self.vertices = self.vertices + step * self._direction
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _newton_loop(f, gradient, level, rows, step, slope, direction):
     """Newton steps onto f = level, 1 / |g|, and the vertices' motions g / |g|^2 for a change of level."""
     for n in range(len(rows)):
@@ -102,7 +109,7 @@ def _newton_loop(f, gradient, level, rows, step, slope, direction):
             step[n, a] = (level - f[n]) * direction[rows[n], a]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _step_loop(rows, step, spacing, vertices, unsettled):
     """Take the steps, none longer than a cell."""
     for n in range(len(rows)):
@@ -113,25 +120,30 @@ def _step_loop(rows, step, spacing, vertices, unsettled):
         unsettled[n] = length > 1e-2 * spacing
 
 
-@numba.njit(cache=True, nogil=True)
-def _volume_and_rate_loop(x, faces, origin, direction):
-    """Enclosed volume, and its rate of change as the vertices move along their directions."""
-    volume, rate = 0.0, 0.0
-    p, d = np.empty((3, 3)), np.empty((3, 3))
-    for f in range(len(faces)):
-        for k in range(3):
-            for a in range(3):
-                p[k, a] = x[faces[f, k], a] - origin[a]
-                d[k, a] = direction[faces[f, k], a]
-        for k in range(3):
-            a, b = (k + 1) % 3, (k + 2) % 3
-            nx = p[a, 1] * p[b, 2] - p[a, 2] * p[b, 1]
-            ny = p[a, 2] * p[b, 0] - p[a, 0] * p[b, 2]
-            nz = p[a, 0] * p[b, 1] - p[a, 1] * p[b, 0]
-            rate += d[k, 0] * nx + d[k, 1] * ny + d[k, 2] * nz
-            if k == 0:
-                volume += p[0, 0] * nx + p[0, 1] * ny + p[0, 2] * nz
-    return volume / 6.0, rate / 6.0
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _triple(x, y):
+    """The cross product of the two vectors in x, times y."""
+    (a, b, c), (d, e, f) = x
+    return (b * f - c * e) * y[0] + (c * d - a * f) * y[1] + (a * e - b * d) * y[2]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _volume_terms_loop(x, faces, origin, direction):
+    """Coefficients of the enclosed volume as a cubic polynomial of the way along the directions."""
+    c0, c1, c2, c3 = 0.0, 0.0, 0.0, 0.0
+    for n in range(len(faces)):
+        i, j, k = faces[n, 0], faces[n, 1], faces[n, 2]
+        p = (x[i, 0] - origin[0], x[i, 1] - origin[1], x[i, 2] - origin[2])
+        q = (x[j, 0] - origin[0], x[j, 1] - origin[1], x[j, 2] - origin[2])
+        r = (x[k, 0] - origin[0], x[k, 1] - origin[1], x[k, 2] - origin[2])
+        u = (direction[i, 0], direction[i, 1], direction[i, 2])
+        v = (direction[j, 0], direction[j, 1], direction[j, 2])
+        w = (direction[k, 0], direction[k, 1], direction[k, 2])
+        c0 += _triple((p, q), r)
+        c1 += _triple((p, q), w) + _triple((q, r), u) + _triple((r, p), v)
+        c2 += _triple((u, v), r) + _triple((v, w), p) + _triple((w, u), q)
+        c3 += _triple((u, v), w)
+    return c0 / 6.0, c1 / 6.0, c2 / 6.0, c3 / 6.0
 
 
 def with_gradient(function, step):
