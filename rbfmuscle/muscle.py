@@ -103,8 +103,8 @@ class _BoneCut:
     def __call__(self, points):
         return self.contacts.nearest(points, self.reach)
 
-    def value_and_gradient(self, points):
-        return self.contacts.nearest_with_gradient(points)
+    def value_and_gradient_below(self, points, limit):
+        return self.contacts.nearest_with_gradient(points, limit)
 
 
 class RBFMuscle:

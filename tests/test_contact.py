@@ -104,6 +104,13 @@ def test_nearest_is_the_smallest_over_bones_and_infinite_without():
     distance, gradient = contacts.nearest_with_gradient(points)
     assert np.allclose(distance, expected)
     assert np.allclose(np.linalg.norm(gradient, axis=1), 1.0)
+    limit = np.random.default_rng(2).uniform(0.0, distance.max(), len(points))
+    found, slope = contacts.nearest_with_gradient(points, limit)
+    below = distance < limit
+    assert 0 < below.sum() < len(points)
+    assert np.array_equal(found[below], distance[below])
+    assert np.array_equal(slope[below], gradient[below])
+    assert np.all(found[~below] >= limit[~below])
 
 
 def test_point_with_no_direction_still_gets_one():

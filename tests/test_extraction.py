@@ -150,6 +150,26 @@ def test_cut_leaves_nothing_inside_the_bone():
     assert (np.abs(sphere()(surface.vertices)) < 1e-6).sum() > 1000
 
 
+def test_a_cut_that_answers_only_below_a_limit_gives_the_same_mesh():
+    middle = CENTRE + [45.0, 0, 0]
+    bone = sphere(20.0, middle)
+
+    class Limited:
+        def __call__(self, points):
+            return bone(points)
+
+        def value_and_gradient_below(self, points, limit):
+            value = bone(points)
+            gradient = (points - middle) / np.linalg.norm(points - middle, axis=1)[:, None]
+            value[value >= limit] = np.inf
+            return value, gradient
+
+    plain = extract_surface(sphere(), points=on_sphere(), volume=5e5, cut=bone)
+    surface = extract_surface(sphere(), points=on_sphere(), volume=5e5, cut=Limited())
+    assert np.array_equal(surface.faces, plain.faces)
+    assert np.abs(surface.vertices - plain.vertices).max() < 1e-6 * plain.spacing
+
+
 def test_chords_do_not_cut_across_a_convex_bone():
     ball = trimesh.creation.icosphere(4, radius=15.0).apply_translation(CENTRE + [50.0, 0, 0])
     bone = sphere(15.0, CENTRE + [50.0, 0, 0])

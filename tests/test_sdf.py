@@ -147,6 +147,19 @@ def test_reach_gives_lower_bounds_beyond_it_and_the_same_within(shape):
         assert np.all(found[~near] <= whole[~near] + 1e-6)
 
 
+def test_reach_of_each_point(shape):
+    mesh, field = shape
+    points = np.concatenate([_near(mesh, 2.0, 3000), _near(mesh, 40.0, 3000)])
+    reach = np.random.default_rng(4).uniform(-2.0, 30.0, len(points))
+    whole, slope = field.distance_and_gradient(points)
+    found, gradient = field.distance_and_gradient(points, reach=reach)
+    near = whole <= reach
+    np.testing.assert_array_equal(found[near], whole[near])
+    np.testing.assert_array_equal(gradient[near], slope[near])
+    assert np.all(found[~near] > reach[~near])
+    assert np.all(found <= whole + 1e-6)
+
+
 def test_order_and_threads_do_not_matter(shape):
     mesh, field = shape
     points = _near(mesh, 3.0, 30000)

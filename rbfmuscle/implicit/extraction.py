@@ -65,7 +65,8 @@ def extract_surface(
         Grid cells along the longest side of the points' box.
     cut : callable, optional
         ``(n, 3) -> (n,)`` distances, negative inside what is to be cut away; beyond 1.2 cells any lower
-        bound of more than that will do. ``value_and_gradient`` as above.
+        bound of more than that will do. ``value_and_gradient`` as above, or ``value_and_gradient_below(points, limit)``
+        that need be right only where the value is below its limit.
     volume : float, optional
         Wanted volume of the mesh; the level is then moved from ``level`` until the mesh has it, to 1e-9.
     level : float

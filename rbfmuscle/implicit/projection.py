@@ -16,8 +16,7 @@ class Projector:
         self.vertices = vertices
         self.spacing = spacing
         self._field = with_gradient(field, 1e-4 * spacing)
-        self._cut_value = cut
-        self._cut = None if cut is None else with_gradient(cut, 1e-4 * spacing)
+        self._cut = None if cut is None else with_gradient_below(cut, 1e-4 * spacing)
         self._near_cut = near_cut
         self.slope = np.zeros(len(vertices))
         self._direction = np.zeros_like(vertices)
@@ -32,7 +31,7 @@ class Projector:
             step, slope = np.empty_like(x), np.empty(len(x))
             _newton_loop(f, np.ascontiguousarray(gradient), level, todo, step, slope, self._direction)
             self.slope[todo] = slope
-            if self._cut_value is not None:
+            if self._cut is not None:
                 self._turn_to_cut(x, todo, (f - level) * slope, step, on_field)
             # Newton squares the error: what moved by less than 1 % of a cell is there.
             unsettled = np.empty(len(x), dtype=np.bool_)
@@ -48,14 +47,12 @@ class Projector:
         rows = np.flatnonzero(self._near_cut[todo])
         if len(rows) == 0:
             return
-        # The slope of a distance is one; it is worked out only where the cut is the surface.
-        on_cut = height[rows] < -self._cut_value(x[rows])
+        distance, outward = self._cut(x[rows], -height[rows])
+        on_cut = height[rows] < -distance
         on_field[todo[rows]] = ~on_cut
-        rows = rows[on_cut]
-        if len(rows):
-            distance, outward = self._cut(x[rows])
-            size = np.maximum(np.einsum("ij,ij->i", outward, outward), np.finfo(float).tiny)
-            step[rows] = -(distance / size)[:, None] * outward
+        rows, distance, outward = rows[on_cut], distance[on_cut], outward[on_cut]
+        size = np.maximum(np.einsum("ij,ij->i", outward, outward), np.finfo(float).tiny)
+        step[rows] = -(distance / size)[:, None] * outward
 
     def volume_step(self, faces, target, steps=1):
         """Change of level that brings the mesh to the target volume, its vertices moving along their directions.
@@ -82,15 +79,16 @@ class Projector:
             moved = np.flatnonzero(push_off_points(self.vertices, faces, points, grid, tolerance))
             self._direction[moved] = 0.0
             self.slope[moved] = 0.0
-            if self._cut_value is None or len(moved) == 0:
+            if self._cut is None or len(moved) == 0:
                 break
             # What was pushed off one bone vertex must not end in the bone beside it.
-            inside = moved[self._cut_value(self.vertices[moved]) < 0.0]
-            if len(inside) == 0:
+            distance, outward = self._cut(self.vertices[moved], np.zeros(len(moved)))
+            inside = distance < 0.0
+            if not inside.any():
                 break
-            distance, outward = self._cut(self.vertices[inside])
+            distance, outward = distance[inside], outward[inside]
             size = np.maximum(np.einsum("ij,ij->i", outward, outward), 1e-12)
-            self.vertices[inside] -= (distance / size)[:, None] * outward
+            self.vertices[moved[inside]] -= (distance / size)[:, None] * outward
 
     def shift(self, step):
         """Move the vertices as the level set moves with its level, to first order."""
@@ -157,3 +155,19 @@ def with_gradient(function, step):
         return function(points), ((around[:3] - around[3:]) / (2 * step)).T
 
     return differences
+
+
+def with_gradient_below(function, step):
+    """``(points, limit) -> (values, gradients)`` of a callable, only sure where a value is below its limit (n,)."""
+    if hasattr(function, "value_and_gradient_below"):
+        return function.value_and_gradient_below
+    both = with_gradient(function, step)
+
+    def below(points, limit):
+        value, gradient = function(points), np.zeros_like(points)
+        rows = np.flatnonzero(value < limit)
+        if len(rows):
+            value[rows], gradient[rows] = both(points[rows])
+        return value, gradient
+
+    return below

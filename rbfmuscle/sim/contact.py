@@ -119,11 +119,15 @@ class BoneContacts:
             np.minimum(smallest, neighbour.cut(points), out=smallest)
         return smallest
 
-    def nearest_with_gradient(self, points):
-        """Smallest distance (n,) over bones and neighbours, exact, and its gradient (n, 3), world axes."""
+    def nearest_with_gradient(self, points, limit=np.inf):
+        """Smallest distance (n,) over bones and neighbours, exact, and its gradient (n, 3), world axes.
+
+        Where the smallest distance is beyond ``limit``, a number or (n,), any value beyond it may stand, without
+        a gradient.
+        """
         points = check_points(points)
         smallest, gradient = np.full(len(points), np.inf), np.zeros((len(points), 3))
-        answers = [self._query(points, b) for b in self.reached]
+        answers = [self._query(points, b, limit) for b in self.reached]
         answers += [neighbour.cut_with_gradient(points) for neighbour in self.cuts]
         for distance, direction in answers:
             closer = distance < smallest

@@ -150,17 +150,17 @@ class BoneSDF:
             World coordinates if ``pose`` is given, else bone coordinates.
         pose : (4, 4) array_like, optional
             Bone to world, rigid.
-        reach : float
+        reach : float or (n,) array_like
             Points further away than this may get any lower bound of their distance that is above it: much
             faster.
         """
         points, pose = check_points(points), _check_pose(pose)
-        reach = np.inf if reach is None else float(reach)
         out = np.empty(len(points))
         placed, size = self._frame.placed(pose), self._frame.size
+        reach = _local_reach(reach, len(points), size)
 
         def work(a, b):
-            value_loop(points[a:b], placed, reach / size, out[a:b], self.data)
+            value_loop(points[a:b], placed, reach[a:b], out[a:b], self.data)
 
         in_chunks(len(points), work, least=4096)
         out *= size
@@ -177,12 +177,12 @@ class BoneSDF:
         given.
         """
         points, pose = check_points(points), _check_pose(pose)
-        reach = np.inf if reach is None else float(reach)
         distance, gradient = np.empty(len(points)), np.empty((len(points), 3))
         placed, size = self._frame.placed(pose), self._frame.size
+        reach = _local_reach(reach, len(points), size)
 
         def work(a, b):
-            gradient_loop(points[a:b], placed, reach / size, distance[a:b], gradient[a:b], self.data)
+            gradient_loop(points[a:b], placed, reach[a:b], distance[a:b], gradient[a:b], self.data)
 
         in_chunks(len(points), work, least=4096)
         distance *= size
@@ -212,6 +212,13 @@ def _check_pose(pose):
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise ValueError(f"pose must be a finite (4, 4) transform, got shape {pose.shape}")
     return pose
+
+
+def _local_reach(reach, count, size):
+    """Reach of each point in local units; not below zero, as cells inside the bone have zero for a bound."""
+    if np.ndim(reach) == 0:
+        return np.full(count, max(reach, 0.0) / size)
+    return np.maximum(reach, 0.0) / size
 
 
 class _Parts(NamedTuple):
@@ -303,7 +310,7 @@ def _measure(mesh, data, exact, band, region):
     unit = normal[which] / np.linalg.norm(normal[which], axis=1, keepdims=True)
     points += unit * rng.uniform(-band, band, (PROBES, 1))
     distance = np.empty(len(points))
-    value_loop(points, IDENTITY, np.inf, distance, data)
+    value_loop(points, IDENTITY, np.full(PROBES, np.inf), distance, data)
     difference = np.abs(distance) - np.abs(exact.signed_distance(points))
     return float(np.sqrt(np.mean(difference**2)))
 

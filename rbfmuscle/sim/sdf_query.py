@@ -29,6 +29,8 @@ CELL_FAR = 128
 WALK, NEARER = 8, 1 - 1e-6
 # Points of one stage: their reads of memory overlap instead of waiting for each other.
 STAGE = 64
+# From how many points on it pays to ask first whether all of a stage are out of reach.
+LEAST_TOGETHER = 16
 
 
 class FieldData(NamedTuple):
@@ -248,6 +250,34 @@ def _unit_gradient(n, distance, du, dv, dw, least, records):
     return _world(n, scale * du, scale * dv, 1.0 if lost else scale * dw, records)
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _placed(point, pose, grid):
+    """A point of the world relative to the grid's origin."""
+    p, q, r = point[0] - pose[0, 3], point[1] - pose[1, 3], point[2] - pose[2, 3]
+    x = pose[0, 0] * p + pose[1, 0] * q + pose[2, 0] * r - grid[0]
+    y = pose[0, 1] * p + pose[1, 1] * q + pose[2, 1] * r - grid[1]
+    z = pose[0, 2] * p + pose[1, 2] * q + pose[2, 2] * r - grid[2]
+    return x, y, z
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _common_bound(points, pose, grid, blocks, cells, lists):
+    """Distance from the bone that all of these points have at least, by the bound at the one in their middle."""
+    middle = points[len(points) // 2]
+    square = 0.0
+    for n in range(len(points)):
+        dx, dy, dz = points[n, 0] - middle[0], points[n, 1] - middle[1], points[n, 2] - middle[2]
+        square = max(square, dx * dx + dy * dy + dz * dz)
+    x, y, z = _placed(middle, pose, grid)
+    entry, cell, far_point = _block_entry(x, y, z, grid[INVERSE], blocks)
+    if entry < 0:
+        entry = cells[-1 - entry, cell]
+    bound = (lists[entry] >> BOUND) * grid[UNIT]
+    if far_point:
+        bound = np.sqrt(bound * bound + _beyond(x, y, z, grid[INVERSE], blocks))
+    return bound - np.sqrt(square * (pose[0, 0] ** 2 + pose[1, 0] ** 2 + pose[2, 0] ** 2))
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _stage(points, pose, reach, grid, blocks, cells, lists, far, records, local, entry, best, square):
     """Nearest record of up to STAGE points; each pass reads what the next one needs.
@@ -256,11 +286,14 @@ def _stage(points, pose, reach, grid, blocks, cells, lists, far, records, local,
     and the squared distance (the lower bound where out of reach).
     """
     scale, unit = grid[INVERSE], grid[UNIT]
+    if len(points) >= LEAST_TOGETHER:
+        bound = _common_bound(points, pose, grid, blocks, cells, lists)
+        if bound > reach.max():
+            best[:] = -1
+            square[:] = bound
+            return
     for n in range(len(points)):
-        p, q, r = points[n, 0] - pose[0, 3], points[n, 1] - pose[1, 3], points[n, 2] - pose[2, 3]
-        x = pose[0, 0] * p + pose[1, 0] * q + pose[2, 0] * r - grid[0]
-        y = pose[0, 1] * p + pose[1, 1] * q + pose[2, 1] * r - grid[1]
-        z = pose[0, 2] * p + pose[1, 2] * q + pose[2, 2] * r - grid[2]
+        x, y, z = _placed(points[n], pose, grid)
         local[n, 0], local[n, 1], local[n, 2] = x, y, z
         entry[n], cell, far_point = _block_entry(x, y, z, scale, blocks)
         best[n] = cell | (CELL_FAR if far_point else 0)
@@ -274,7 +307,7 @@ def _stage(points, pose, reach, grid, blocks, cells, lists, far, records, local,
             # The bone lies in the grid, so the way to the grid and the way on from there are at a right angle or more.
             bound = np.sqrt(bound * bound + square[n])
         square[n] = bound
-        if bound > reach:
+        if bound > reach[n]:
             best[n] = -1
         else:
             # Read so that the record is at hand in the next pass.
@@ -318,7 +351,21 @@ def value_loop(points, pose, reach, out, data):
     best = np.empty(STAGE, np.int32)
     for start in range(0, len(points), STAGE):
         some, d = points[start : start + STAGE], out[start : start + STAGE]
-        _stage(some, pose, reach, grid, blocks, cells, lists, far, records, local, entry, best, d)
+        _stage(
+            some,
+            pose,
+            reach[start : start + STAGE],
+            grid,
+            blocks,
+            cells,
+            lists,
+            far,
+            records,
+            local,
+            entry,
+            best,
+            d,
+        )
         _finish(len(some), local, entry, best, d, offset, lists, corners, records, en, vn, vertices, across)
 
 
@@ -331,7 +378,21 @@ def gradient_loop(points, pose, reach, distance, gradient, data):
     least = ROUNDING * grid[UNIT]
     for start in range(0, len(points), STAGE):
         some, d = points[start : start + STAGE], distance[start : start + STAGE]
-        _stage(some, pose, reach, grid, blocks, cells, lists, far, records, local, entry, best, d)
+        _stage(
+            some,
+            pose,
+            reach[start : start + STAGE],
+            grid,
+            blocks,
+            cells,
+            lists,
+            far,
+            records,
+            local,
+            entry,
+            best,
+            d,
+        )
         _finish(len(some), local, entry, best, d, offset, lists, corners, records, en, vn, vertices, across)
         _turn(len(some), pose, least, best, d, offset, records, gradient[start : start + STAGE])
 
