@@ -62,6 +62,8 @@ class BoneContacts:
         self.names = list(names)
         self.fields = list(fields)
         self.reached = [b for b, field in enumerate(self.fields) if field is not None]
+        self._bounds = {b: np.array(self.fields[b].bounds, dtype=np.float64) for b in self.reached}
+        self._middles = {b: bounds.mean(axis=0) for b, bounds in self._bounds.items()}
         self.contact_bone = None if contact_bone is None else np.asarray(contact_bone, dtype=np.int64)
         self.poses = {name: np.eye(4) for name in self.names}
         self.margin = float(margin)
@@ -159,7 +161,7 @@ class BoneContacts:
             if len(near) == 0:
                 continue
             limit = reach[near]
-            distance, direction = self._query(points[near], b, float(limit.max()) + self.margin)
+            distance, direction = self._query(points[near], b, limit + self.margin)
             self._remember(points, near, distance, b)
             distance = distance - self.margin
             if b in self.allowed and len(self.allowed[b]) == len(points):
@@ -211,16 +213,15 @@ class BoneContacts:
         pose = self.poses[self.names[b]]
         distance, gradient = self.fields[b].distance_and_gradient(points, pose=pose, reach=reach)
         # On the medial surface the field has no direction; away from the bone's middle is as good as any.
-        middle = pose[:3, :3] @ self.fields[b].bounds.mean(axis=0) + pose[:3, 3]
+        middle = pose[:3, :3] @ self._middles[b] + pose[:3, 3]
         direction = np.empty_like(gradient)
         _direction_loop(points, gradient, middle, direction)
         return distance, direction
 
     def _near(self, points, free, b, reach):
         """Contact points that may be nearer than their ``reach`` to bone b, by its box and by earlier answers."""
-        pose, bounds = self.poses[self.names[b]], np.asarray(self.fields[b].bounds, dtype=np.float64)
-        found = np.zeros(len(points), dtype=np.int64)
-        count = _near_loop(points, free, pose, bounds, reach, *self.known(len(points), b), found)
+        found, known = np.empty(len(points), dtype=np.int64), self.known(len(points), b)
+        count = _near_loop(points, free, self.poses[self.names[b]], self._bounds[b], reach, *known, found)
         return found[:count]
 
     def _remember(self, points, near, distance, b):

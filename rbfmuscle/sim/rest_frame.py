@@ -1,5 +1,7 @@
 """Coordinates of a rest mesh that stay the same wherever its scene lies."""
 
+from functools import lru_cache
+
 import numpy as np
 
 
@@ -88,6 +90,7 @@ class BoneFrame:
         turn = _principal_axes(frame.local)
         self.origin, self.size, self.axes = frame.origin, frame.size, turn @ frame.axes
         self.local = np.round(frame.local @ turn.T, 8)
+        self._placed = lru_cache(maxsize=16)(self._place)
 
     def box(self, bounds):
         """Local box (2, 3) that holds a box given in bone coordinates."""
@@ -97,7 +100,11 @@ class BoneFrame:
 
     def placed(self, pose):
         """Transform (4, 4) whose transpose takes world points to local units, for a pose of the bone."""
-        out = np.eye(4)
+        # The same pose is asked for many times a frame.
+        return self._placed(pose.tobytes())
+
+    def _place(self, pose):
+        pose, out = np.frombuffer(pose).reshape(4, 4), np.eye(4)
         out[:3, :3] = pose[:3, :3] @ self.axes.T / self.size
         out[:3, 3] = pose[:3, :3] @ self.origin + pose[:3, 3]
         return out
