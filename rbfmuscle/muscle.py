@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from rbfmuscle.binding import bind_samples, build_clusters, kept_sample
 from rbfmuscle.constraints import ShapeConstraint, VolumeConstraint
 from rbfmuscle.elasticity import ElasticSolver
+from rbfmuscle.implicit.band import box_along
 from rbfmuscle.implicit.extraction import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels import get_kernel
@@ -369,7 +370,7 @@ class RBFMuscle:
         started = time.perf_counter()
         axes = self.axes @ contacts.poses[self.motion_bones[0]][:3, :3].T
         # Farther than a cell from the bones a lower bound will do: no vertex gets there.
-        reach = 1.25 * float(np.ptp(points @ axes.T, axis=0).max()) / self.options.resolution
+        reach = 1.25 * float(np.diff(box_along(points, axes), axis=0).max()) / self.options.resolution
         cut = _BoneCut(contacts, reach) if contacts.names else None
         obstacles = [(self.bone_points[b], contacts.poses[contacts.names[b]]) for b in contacts.reached]
         try:

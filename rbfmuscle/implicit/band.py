@@ -23,6 +23,8 @@ from rbfmuscle.validation import check_points
 MAX_NODES = 50_000_000
 # Where both nodes of a vertex's edge are farther than this from the cut, in cells, it stays clear of the cut.
 NEAR_CUT = 1.2
+# Corners of each face of a cell, a bit for each.
+FACE_MASKS = (1 << FACE_CORNERS).sum(axis=1)
 
 
 @dataclass(frozen=True)
@@ -67,14 +69,13 @@ class BandGrid:
         """
         points = check_points(points)
         axes = np.eye(3) if axes is None else np.ascontiguousarray(axes, dtype=np.float64)
-        if axes.shape != (3, 3) or not np.allclose(axes @ axes.T, np.eye(3), atol=1e-6):
+        if axes.shape != (3, 3) or not np.abs(axes @ axes.T - np.eye(3)).max() < 1e-5:
             raise ValueError("axes must be a (3, 3) rotation")
         if int(resolution) < 4 or int(padding) < 1:
             raise ValueError(f"resolution must be >= 4 and padding >= 1, got {resolution} and {padding}")
         if len(points) == 0:
             raise ValueError("points must hold at least one point on the surface")
-        local = points @ axes.T
-        low, high = local.min(axis=0), local.max(axis=0)
+        low, high = box_along(points, axes)
         spacing = float((high - low).max()) / int(resolution)
         if not spacing > 0:
             raise ValueError("points must not all coincide: the grid's size is taken from them")
@@ -99,12 +100,15 @@ class BandGrid:
 
     def nodes(self, flat):
         """World positions of flat node numbers."""
-        return self.positions(np.column_stack(np.unravel_index(flat, self.shape)).astype(np.float64))
+        out = np.empty((len(flat), 3))
+        _nodes_loop(flat, self.strides, self.origin, self.spacing * self.axes, out)
+        return out
 
     def cells(self, points):
         """Flat numbers of the cells that hold points; outside the grid its outermost cells."""
-        last = np.array(self.shape) - 2
-        return np.clip(np.floor(self.coordinates(points)), 0, last).astype(np.int64) @ self.strides
+        out, last = np.empty(len(points), dtype=np.int64), np.array(self.shape) - 2
+        _cells_loop(points, self.origin, self.axes / self.spacing, last, self.strides, out)
+        return out
 
 
 class Band:
@@ -155,8 +159,8 @@ class Band:
             self._evaluate(swept)
             begin, swept = swept, self.cell_count
             self.cell_count = _follow_loop(
-                self._cells, begin, swept, self.grid.strides, self.index, self._f, self._c, level,
-                FACE_CORNERS, self.state,
+                self._cells, begin, swept, self.grid.strides, self.index, self._f, self._c, level, FACE_MASKS,
+                self.state,
             )  # fmt: skip
 
     def widen(self):
@@ -220,7 +224,43 @@ class Band:
         return coordinates, triangles[:n_triangles], is_open, near_cut
 
 
-@numba.njit(cache=True, nogil=True)
+def box_along(points, axes):
+    """Least and greatest coordinates (2, 3) of points along the rows of ``axes``."""
+    out = np.array([[np.inf] * 3, [-np.inf] * 3])
+    _box_loop(points, axes, out)
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _box_loop(points, axes, out):
+    for n in range(len(points)):
+        for a in range(3):
+            u = points[n, 0] * axes[a, 0] + points[n, 1] * axes[a, 1] + points[n, 2] * axes[a, 2]
+            out[0, a] = min(out[0, a], u)
+            out[1, a] = max(out[1, a], u)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _cells_loop(points, origin, turn, last, strides, out):
+    """Flat numbers of the cells that hold points, outside the grid of its outermost cells."""
+    for n in range(len(points)):
+        x, y, z = points[n, 0] - origin[0], points[n, 1] - origin[1], points[n, 2] - origin[2]
+        out[n] = 0
+        for a in range(3):
+            u = np.floor(x * turn[a, 0] + y * turn[a, 1] + z * turn[a, 2])
+            out[n] += int(min(max(u, 0.0), float(last[a]))) * strides[a]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _nodes_loop(flat, strides, origin, edges, out):
+    """World positions of nodes; ``edges`` are the edges of a cell along the grid's axes."""
+    for n in range(len(flat)):
+        i, j, k = flat[n] // strides[0], flat[n] % strides[0] // strides[1], flat[n] % strides[1]
+        for a in range(3):
+            out[n, a] = i * edges[0, a] + j * edges[1, a] + k * edges[2, a] + origin[a]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _place_loop(node, shape, strides, index, c, near, coordinates, is_open, near_cut):
     """Turn shifts from the nodes into grid coordinates; mark vertices on the border and near the cut."""
     for v in range(len(coordinates)):
@@ -239,7 +279,7 @@ def _place_loop(node, shape, strides, index, c, near, coordinates, is_open, near
             is_open[v] |= coordinates[v, a] < 1e-9 or coordinates[v, a] > shape[a] - 1 - 1e-9
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _close_border_loop(state, nx, ny, nz):
     """Mark the node numbers that are no cells (the last of each row), so that no loop enters them."""
     for i in range(nx):
@@ -250,7 +290,7 @@ def _close_border_loop(state, nx, ny, nz):
                     state[(i * ny + j) * nz + k] = 2
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _add_nodes_loop(cells, begin, end, strides, index, flat, count):
     """Number the corners of cells that have no number yet; returns the new count of nodes."""
     for n in range(begin, end):
@@ -263,27 +303,24 @@ def _add_nodes_loop(cells, begin, end, strides, index, flat, count):
     return count
 
 
-@numba.njit(cache=True, nogil=True)
-def _follow_loop(cells, begin, end, strides, index, f, c, level, faces, state):
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _follow_loop(cells, begin, end, strides, index, f, c, level, masks, state):
     """Append the cells behind crossed faces; returns the new count of cells.
 
     A state of 2 beyond the first or last row keeps the walk inside the grid: rows are closed by non-cells.
     """
-    inside = np.empty(8, dtype=np.bool_)
     count = end
     for n in range(begin, end):
-        total = 0
+        inside = 0
         for q in range(8):
             node = index[cells[n] + (q & 1) * strides[0] + (q >> 1 & 1) * strides[1] + (q >> 2) * strides[2]]
-            inside[q] = _combined(f[node], c[node], level) < 0
-            total += inside[q]
-        if total == 0 or total == 8:
+            if _combined(f[node], c[node], level) < 0:
+                inside |= 1 << q
+        if inside == 0 or inside == 255:
             continue
         for k in range(6):
-            signs = 0
-            for s in range(4):
-                signs += inside[faces[k, s]]
-            if signs == 0 or signs == 4:
+            signs = inside & masks[k]
+            if signs == 0 or signs == masks[k]:
                 continue
             near = cells[n] + (strides[k // 2] if k % 2 else -strides[k // 2])
             if 0 <= near < len(state) and state[near] == 0:
@@ -293,7 +330,7 @@ def _follow_loop(cells, begin, end, strides, index, f, c, level, faces, state):
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _widen_loop(cells, end, strides, state):
     """Append all unvisited neighbours of the cells; returns the new count of cells."""
     count = end

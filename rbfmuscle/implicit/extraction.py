@@ -193,9 +193,7 @@ def _closed_sheets(band, level, keep):
     """Vertices, faces, which are near the cut, number of sheets and of those left out; None where open."""
     coordinates, faces, on_border, near_cut = band.march(level)
     label, sheets = _label_sheets_loop(faces, len(coordinates))
-    volume = np.bincount(
-        label[faces[:, 0]], _volume_terms(coordinates - coordinates.mean(axis=0), faces), sheets
-    )
+    volume = _sheet_volumes_loop(coordinates, faces, label, coordinates.mean(axis=0), np.zeros(sheets))
     size = np.bincount(label, minlength=sheets)
     is_open = np.bincount(label, on_border, sheets) > 0
     closed = np.flatnonzero(~is_open)
@@ -206,6 +204,8 @@ def _closed_sheets(band, level, keep):
     else:
         chosen = np.zeros(sheets, dtype=bool)
         chosen[closed[np.argmax(volume[closed])]] = True
+    if chosen.all():
+        return band.grid.positions(coordinates), faces, near_cut, sheets, 0
     used = chosen[label]
     number = np.cumsum(used) - 1
     faces = number[faces[used[faces[:, 0]]]]
@@ -244,24 +244,21 @@ def _label_sheets_loop(faces, size):
     return label, count
 
 
-def _volume_terms(vertices, faces):
-    """Signed volume of the tetrahedron under each triangle, (m,)."""
-    out = np.empty(len(faces))
-    _volume_loop(vertices, faces, out)
-    return out
-
-
-@numba.njit(cache=True, nogil=True)
-def _volume_loop(x, faces, out):
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _sheet_volumes_loop(x, faces, label, origin, out):
+    """Add the signed volumes of the tetrahedra under all triangles to those of their sheets, out."""
     for f in range(len(faces)):
-        i, a, b = faces[f, 0], faces[f, 1], faces[f, 2]
-        out[f] = (
-            x[i, 0] * (x[a, 1] * x[b, 2] - x[a, 2] * x[b, 1])
-            + x[i, 1] * (x[a, 2] * x[b, 0] - x[a, 0] * x[b, 2])
-            + x[i, 2] * (x[a, 0] * x[b, 1] - x[a, 1] * x[b, 0])
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        px, py, pz = x[i, 0] - origin[0], x[i, 1] - origin[1], x[i, 2] - origin[2]
+        qx, qy, qz = x[j, 0] - origin[0], x[j, 1] - origin[1], x[j, 2] - origin[2]
+        rx, ry, rz = x[k, 0] - origin[0], x[k, 1] - origin[1], x[k, 2] - origin[2]
+        out[label[i]] += (
+            px * (qy * rz - qz * ry) + py * (qz * rx - qx * rz) + pz * (qx * ry - qy * rx)
         ) / 6.0
+    return out
 
 
 def mesh_volume(vertices, faces):
     """Volume enclosed by a closed outward mesh."""
-    return float(_volume_terms(vertices - vertices.mean(axis=0), faces).sum())
+    label = np.zeros(len(vertices), dtype=np.int64)
+    return float(_sheet_volumes_loop(vertices, faces, label, vertices.mean(axis=0), np.zeros(1))[0])
