@@ -1,5 +1,6 @@
 """Harmonic weights on a closed mesh: how much of each bone's motion a surface point takes over."""
 
+import numba
 import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
@@ -111,19 +112,31 @@ def blended_motion(points, weights, motions):
     (n, 3) ndarray
     """
     twists = np.array([_twist(motion) for motion in motions])
-    blended = weights @ twists
-    omega, velocity = blended[:, :3], blended[:, 3:]
-    angle = np.linalg.norm(omega, axis=1)
-    small = angle < 1e-6
-    safe = np.where(small, 1.0, angle)
-    # sin a / a, (1 - cos a) / a², (a - sin a) / a³ with their limits
-    first = np.where(small, 1 - angle**2 / 6, np.sin(angle) / safe)[:, None]
-    second = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(angle)) / safe**2)[:, None]
-    third = np.where(small, 1 / 6 - angle**2 / 120, (angle - np.sin(angle)) / safe**3)[:, None]
-    turn = np.cross(omega, points)
-    shift = np.cross(omega, velocity)
-    rotated = points + first * turn + second * np.cross(omega, turn)
-    return rotated + velocity + second * shift + third * np.cross(omega, shift)
+    out = np.empty((len(points), 3))
+    _exponential_loop(np.asarray(points, dtype=np.float64), weights @ twists, out)
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _exponential_loop(points, twists, out):
+    """Move each point by the exponential of its twist (omega, velocity)."""
+    for n in range(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        a, b, c = twists[n, 0], twists[n, 1], twists[n, 2]
+        u, v, w = twists[n, 3], twists[n, 4], twists[n, 5]
+        square = a * a + b * b + c * c
+        angle = np.sqrt(square)
+        if angle < 1e-6:
+            first, second, third = 1 - square / 6, 0.5 - square / 24, 1 / 6 - square / 120
+        else:
+            first, second = np.sin(angle) / angle, (1 - np.cos(angle)) / square
+            third = (angle - np.sin(angle)) / (square * angle)
+        # omega x point and omega x velocity, and omega x these.
+        px, py, pz = b * z - c * y, c * x - a * z, a * y - b * x
+        sx, sy, sz = b * w - c * v, c * u - a * w, a * v - b * u
+        out[n, 0] = x + u + first * px + second * (b * pz - c * py + sx) + third * (b * sz - c * sy)
+        out[n, 1] = y + v + first * py + second * (c * px - a * pz + sy) + third * (c * sx - a * sz)
+        out[n, 2] = z + w + first * pz + second * (a * py - b * px + sz) + third * (a * sy - b * sx)
 
 
 def _twist(motion):
