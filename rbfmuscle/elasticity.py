@@ -11,7 +11,7 @@ REACH_MARGIN = 0.003  # of the muscle's size
 SETTLED = 1e-4  # of the muscle's size: an iteration that moves no centre farther was the last one
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _move_loop(dx, columns, shares, out):
     """Motion of each contact point: Σ_k share_k dx_k."""
     for s in range(len(columns)):
@@ -22,7 +22,7 @@ def _move_loop(dx, columns, shares, out):
             out[s, a] = value
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _gather_loop(gradient, columns, shares, out):
     """Transpose of `_move_loop`: out_k = Σ_s share_sk gradient_s."""
     out[:] = 0.0
@@ -32,7 +32,7 @@ def _gather_loop(gradient, columns, shares, out):
                 out[columns[s, k], a] += shares[s, k] * gradient[s, a]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _carry_all_loop(x, target, rest, points, columns, shares, out):
     """Positions of the contact points: Σ_k share_k (x_k + T_k (X_s - X_k))."""
     for s in range(len(points)):

@@ -213,7 +213,7 @@ def _closed_sheets(band, level, keep):
     return vertices, faces, near_cut[used], sheets, sheets - int(chosen.sum())
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _label_sheets_loop(faces, size):
     """Connected sheets of a triangle mesh: label of each vertex, and their number."""
     parent = np.arange(size)

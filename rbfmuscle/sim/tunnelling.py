@@ -76,13 +76,14 @@ def sweep_paths(field, start, end, *, tolerance, angle=RIGHT_ANGLE_AND_HALF):
     length = np.linalg.norm(end - start, axis=1)
     distance = field.distance(start, reach=float(length.max(initial=0.0)))
     index = np.flatnonzero(distance < length)
-    ends = distance[index] + field.distance(end[index])
-    index = index[ends <= length[index] + tolerance]
+    last = field.distance(end[index])
+    near = distance[index] + last <= length[index] + tolerance
+    index, last = index[near], last[near]
     if len(index) == 0:
         nothing = np.zeros(0, dtype=bool)
         return Sweep(index, np.zeros(0), nothing, nothing)
     start, end = start[index], end[index]
-    lowest = _halve(field, start, end, distance[index], tolerance)
+    lowest = _halve(field, start, end, distance[index], last, tolerance)
     through = np.zeros(len(index), dtype=bool)
     # What halving leaves open.
     deep = np.flatnonzero(lowest < -tolerance)
@@ -164,13 +165,12 @@ def rigid_fit(points, targets):
     return transform
 
 
-def _halve(field, start, end, distance, tolerance):
+def _halve(field, start, end, distance, last, tolerance):
     """Smallest distance found along each path by halving it; -infinity where that does not show it clear.
 
     Between two places s apart, at distances d and d' from the bone, nothing is deeper than (s - d - d') / 2.
     """
     length = np.linalg.norm(end - start, axis=1) / STEP_SHARE
-    last = field.distance(end)
     lowest = np.minimum(distance, last)
     # Pieces: which path, where they begin (fraction), the distances at their ends.
     path, at, near, far, size = np.arange(len(start)), np.zeros(len(start)), distance, last, 1.0
@@ -231,7 +231,7 @@ def _candidates(start, end, back_before, back_after, bounds, anchor, known, free
     return index[:count], first[:count], second[:count]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _candidates_loop(start, end, back_before, back_after, bounds, anchor, known, free, index, first, second):
     """Leave out paths that are shorter than what is known of their end's distance to the bone.
 
