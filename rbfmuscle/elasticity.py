@@ -12,14 +12,20 @@ SETTLED = 1e-4  # of the muscle's size: an iteration that moves no centre farthe
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _move_loop(dx, columns, shares, out):
-    """Motion of each contact point: Σ_k share_k dx_k."""
+def _move_loop(first, second, columns, shares, moved, also):
+    """Motions of each contact point for two motions of the centres: Σ_k share_k dx_k."""
     for s in range(len(columns)):
-        for a in range(3):
-            value = 0.0
-            for k in range(columns.shape[1]):
-                value += shares[s, k] * dx[columns[s, k], a]
-            out[s, a] = value
+        ax, ay, az, bx, by, bz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(columns.shape[1]):
+            j, share = columns[s, k], shares[s, k]
+            ax += share * first[j, 0]
+            ay += share * first[j, 1]
+            az += share * first[j, 2]
+            bx += share * second[j, 0]
+            by += share * second[j, 1]
+            bz += share * second[j, 2]
+        moved[s, 0], moved[s, 1], moved[s, 2] = ax, ay, az
+        also[s, 0], also[s, 1], also[s, 2] = bx, by, bz
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -116,12 +122,11 @@ class ElasticSolver:
         new = x.copy()
         new[self.free] = self.inverse @ (right[self.free] - self.coupling @ x[self.held])
         here, motion, moved = self.carry(x), np.empty_like(self.points), np.empty_like(self.points)
-        _move_loop(new - x, self.columns, self.shares, motion)
         excess, gradient = self.volume.evaluate(here[self.centres :])
         pull, response = np.empty_like(x), np.zeros_like(x)
         _gather_loop(gradient, self.columns[self.centres :], self.shares[self.centres :], pull)
         response[self.free] = self.inverse @ pull[self.free]
-        _move_loop(response, self.columns, self.shares, moved)
+        _move_loop(new - x, response, self.columns, self.shares, motion, moved)
         stiffness = np.vdot(pull, response)
         pressure = -(excess + np.vdot(gradient, motion[self.centres :])) / stiffness
         motion += pressure * moved
