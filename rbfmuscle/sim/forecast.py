@@ -12,7 +12,7 @@ import numpy as np
 from rbfmuscle.sim.motion import bone_poses
 from rbfmuscle.sim.sdf import BAND, CELL_SHARE, LEAST_CELLS, BoneSDF
 from rbfmuscle.sim.sdf_build import CUT, OUTER, grid_shape
-from rbfmuscle.sim.sdf_query import BLOCK
+from rbfmuscle.sim.sdf_cells import BLOCK
 
 # Work: exact distances for a fine cell; visits for a vertex that is written, that a centreline hangs on, of a bone
 # (for each muscle) and of a shown surface that are measured; exact distances for a bone's vertex while it is

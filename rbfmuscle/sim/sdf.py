@@ -15,8 +15,9 @@ from rbfmuscle.sim.cache import content_key, has_arrays, load_arrays, store_arra
 from rbfmuscle.sim.exact_distance import ExactDistance
 from rbfmuscle.sim.rest_frame import BoneFrame, on_one_line
 from rbfmuscle.sim.sdf_build import build_cells, grid_shape
+from rbfmuscle.sim.sdf_cells import BLOCK
 from rbfmuscle.sim.sdf_mesh import prepare_bone, winding_test
-from rbfmuscle.sim.sdf_query import BLOCK, FieldData, gradient_loop, value_loop
+from rbfmuscle.sim.sdf_query import FieldData, gradient_loop, value_loop
 from rbfmuscle.sim.threads import in_chunks
 from rbfmuscle.sim.triangles import FIRST
 from rbfmuscle.validation import MeshError, check_mesh, check_points, check_positive

@@ -11,9 +11,10 @@ import numba
 import numpy as np
 
 from rbfmuscle.sim.exact_distance import STACK, nearest_triangle, record_square, signed_side
+from rbfmuscle.sim.sdf_cells import BLOCK
 from rbfmuscle.sim.sdf_lattice import corner_ids, lattice, mark_corners, mark_loop, small_ids_loop
 from rbfmuscle.sim.sdf_lists import LONGEST, SLACK, folded_list, list_loop
-from rbfmuscle.sim.sdf_query import BLOCK, COUNT
+from rbfmuscle.sim.sdf_query import COUNT
 from rbfmuscle.sim.threads import in_chunks
 from rbfmuscle.sim.triangles import FIRST
 

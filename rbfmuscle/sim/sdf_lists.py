@@ -4,7 +4,8 @@ import numba
 import numpy as np
 
 from rbfmuscle.sim.exact_distance import STACK, nearest_triangle, record_feature, record_square
-from rbfmuscle.sim.sdf_query import BOUND, CROSSED, INSIDE, MIXED, OUTSIDE, SIDE
+from rbfmuscle.sim.sdf_cells import BOUND
+from rbfmuscle.sim.sdf_query import CROSSED, INSIDE, MIXED, OUTSIDE, SIDE
 from rbfmuscle.sim.triangles import CORNER, EDGE, FACE
 
 # Points of a cell, beside its corners, from which a walk over the surface looks for triangles to list.
