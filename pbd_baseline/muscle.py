@@ -41,9 +41,14 @@ class PBDMuscle:
         If the mesh is not a closed, consistently oriented surface.
     """
 
+    @staticmethod
+    def read_options(table, name):
+        """The checked settings of the muscle ``name``; raises SceneError."""
+        return PBDOptions.build(table, place=f"muscle {name!r} model: ")
+
     def __init__(self, muscle, scene, **options):
         self.name = muscle.name
-        self.options = PBDOptions.build(options, place=f"muscle {muscle.name!r} model: ")
+        self.options = self.read_options(options, muscle.name)
         self.rest = Rest.from_muscle(muscle, swelling_reach=self.options.swelling_reach)
         self.shape = SHAPES[self.options.method](self.rest, self.options)
         columns, shares = _contact_carriers(self.rest, faces_too=self.options.contact == "faces")

@@ -4,7 +4,7 @@ import difflib
 import importlib
 from concurrent.futures import ThreadPoolExecutor
 
-from rbfmuscle.validation import UsageError
+from rbfmuscle.validation import SceneError, UsageError
 
 # Name: module, class, options that the name itself stands for.
 _HOME = {
@@ -70,6 +70,27 @@ def build_models(scene):
 
     with ThreadPoolExecutor(numba.get_num_threads()) as pool:
         return list(pool.map(lambda muscle: build_model(muscle, scene), scene.muscles))
+
+
+def check_models(scene):
+    """Check the model and the settings of every muscle of a scene, building nothing.
+
+    Raises
+    ------
+    SceneError
+        Naming the file, the muscle and the nearest right name.
+    """
+    root = f"{scene.path}: " if scene.path else ""
+    for muscle in scene.muscles:
+        try:
+            module, class_name, implied = _HOME[check_model_name(muscle.model)]
+        except UsageError as error:
+            raise SceneError(f"{root}muscle {muscle.name!r}: {error}") from None
+        model = getattr(importlib.import_module(module), class_name)
+        try:
+            model.read_options({**muscle.options, **implied}, muscle.name)
+        except SceneError as error:
+            raise SceneError(f"{root}{error}") from None
 
 
 def check_model_name(name):

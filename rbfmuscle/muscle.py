@@ -21,9 +21,10 @@ from rbfmuscle.implicit.sampling import GREEDY_LARGEST, PLACEMENTS
 from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
 from rbfmuscle.sim.exact_distance import ExactDistance
 from rbfmuscle.sim.harmonic import blended_motion, harmonic_weights, surface_gradient
+from rbfmuscle.sim.options import did_you_mean
 from rbfmuscle.sim.rest_frame import RestFrame
 from rbfmuscle.sim.simulate import ModelSurface
-from rbfmuscle.validation import NumericalWarning, SceneError, SolveError
+from rbfmuscle.validation import NumericalWarning, SceneError, SolveError, UsageError
 
 AREA_A_CENTRE = 212.0  # mm², from which the number of centres follows where the scene names none
 LEAST_CENTRES = 150
@@ -69,9 +70,8 @@ class RBFOptions:
         known = {field.name: field.type for field in fields(cls)}
         for key, value in table.items():
             if key not in known:
-                raise SceneError(
-                    f"muscle {muscle!r}: model rbf has no setting {key!r}; it has {', '.join(known)}"
-                )
+                hint = did_you_mean(key, known)
+                raise SceneError(f"muscle {muscle!r}: model rbf has no setting {key!r}, {hint}")
             if known[key] is not str and (isinstance(value, bool) or not isinstance(value, (int, float))):
                 raise SceneError(f"muscle {muscle!r}: {key} must be a number, got {value!r}")
             low, high = RANGES.get(key, (-math.inf, math.inf))
@@ -81,6 +81,10 @@ class RBFOptions:
                 raise SceneError(
                     f"muscle {muscle!r}: {key} must be one of {', '.join(CHOICES[key])}, got {value!r}"
                 )
+        try:
+            get_kernel(table.get("kernel", cls.kernel))
+        except UsageError as error:
+            raise SceneError(f"muscle {muscle!r}: {error}") from None
         return cls(**table)
 
 
@@ -126,9 +130,14 @@ class RBFMuscle:
         If a setting is unknown or no centre is left free to move.
     """
 
+    @staticmethod
+    def read_options(table, name):
+        """The checked settings of the muscle ``name``; raises SceneError."""
+        return RBFOptions.from_table(table, muscle=name)
+
     def __init__(self, muscle, scene, **options):
         self.name = muscle.name
-        self.options = RBFOptions.from_table(options, muscle=muscle.name)
+        self.options = self.read_options(options, muscle.name)
         self.bones = [bone.name for bone in scene.bones]
         self.bone_points = [ObstaclePoints(bone.mesh.vertices) for bone in scene.bones]
         faces = np.asarray(muscle.mesh.faces)

@@ -167,10 +167,39 @@ class TestErrors:
             (("check", "typo.toml"), 3, "did you mean 'centre'"),
             (("check", "mesh.toml"), 4, "femr.ply: no such mesh file, did you mean 'femur.ply'"),
             (("check", "hip.toml", "--bad"), 2, "--bad"),
-            (("check", "model.toml"), 2, "unknown model 'rbff', did you mean 'rbf'"),
+            (
+                ("check", "model.toml"),
+                3,
+                "model.toml: muscle 'adductor': unknown model 'rbff', did you mean 'rbf'",
+            ),
+            (("run", "model.toml", "-o", "o"), 3, "unknown model 'rbff', did you mean 'rbf'"),
+            (("check", "setting.toml"), 3, "no setting 'centers', did you mean 'centres'"),
+            (("check", "number.toml"), 3, "centres must be between 0 and 20000, got -5"),
+            (("check", "kernel.toml"), 3, "unknown kernel 'cubik', did you mean 'cubic'"),
+            (("check", "mesh_model.toml"), 3, "unknown key 'iteration', did you mean 'iterations'"),
+            (("sweep", "hip.toml", "-o", "o", "--grid", "model.centers=60,70"), 3, "did you mean 'centres'"),
             (("run", "hip.toml", "-o", "o", "--model", "rbff"), 2, "did you mean 'rbf'"),
             (("run", "hip.toml", "-o", "o", "--frames", "a:b"), 2, "A:B:S"),
-            (("run", "hip.toml", "-o", "o", "--set", "contact.initail=keep"), 3, "did you mean 'initial'"),
+            (
+                ("run", "hip.toml", "-o", "o", "--set", "contact.initail=keep"),
+                3,
+                "contact.initail: unknown key 'initail', did you mean 'initial'",
+            ),
+            (
+                ("kernels", "phantom", "-o", "o", "--centres", "100,many"),
+                2,
+                "whole numbers, for instance 150,300",
+            ),
+            (
+                ("check", "metres.toml"),
+                4,
+                "cannot be right; correct the scene's units, or set its scale (0.001",
+            ),
+            (
+                ("check", "bare.toml"),
+                3,
+                "not valid TOML: Invalid value (at line 3, column 9); text stands in quotes",
+            ),
             (("run", "hip.toml", "-o", "o", "--set", "x"), 2, "KEY=VALUE"),
             (("run", "hip.toml", "-o", "o", "--fail-on", "volum_error"), 2, "did you mean 'volume_error'"),
             (("run", "inside.toml", "-o", "o"), 3, "start inside bone 'pelvis'"),
@@ -191,7 +220,16 @@ class TestErrors:
     def write_variants(folder):
         (folder / "typo.toml").write_text(SCENE.replace("centre", "center"))
         (folder / "mesh.toml").write_text(SCENE.replace("femur.ply", "femr.ply"))
+        (folder / "metres.toml").write_text(SCENE.replace('units = "mm"', 'units = "m"'))
+        (folder / "bare.toml").write_text(SCENE.replace('units = "mm"', "units = mm"))
         (folder / "model.toml").write_text(SCENE.replace("attach", 'model = "rbff"\nattach'))
+        for name, model in (
+            ("setting", '{ name = "rbf", centers = 80 }'),
+            ("number", '{ name = "rbf", centres = -5 }'),
+            ("kernel", '{ name = "rbf", kernel = "cubik" }'),
+            ("mesh_model", '{ name = "pbd", iteration = 3 }'),
+        ):
+            (folder / f"{name}.toml").write_text(SCENE.replace("attach", f"model = {model}\nattach"))
         inside = SCENE.replace("adductor_posterior.ply", "small.ply").replace(
             "[output]", "[contact]\n[output]"
         )
@@ -240,6 +278,8 @@ class TestOtherCommands:
         assert code == 0 and str(target) in out
         text = target.read_text()
         assert 'name = "femur_joint"' in text and "GUESS" in text
+        bones = [line.split('"')[1] for line in text.splitlines() if line.startswith("  { bone")]
+        assert bones == ["pelvis", "femur"] * 4  # the origin, on the bone that stands still, comes first
         code, _, err = call(capsys, "new", tmp_path, "--units", "mm", "-o", target)
         assert code == 2 and "--force" in one_line(err)
         assert call(capsys, "check", target)[0] == 0

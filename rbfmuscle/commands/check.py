@@ -8,7 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from rbfmuscle.validation import SceneError, UsageError
+from rbfmuscle.validation import SceneError
 
 
 def check(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False):
@@ -21,15 +21,11 @@ def check(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", nega
     as_json
         Print JSON and nothing else.
     """
-    from rbfmuscle.models import MODEL_NAMES
-    from rbfmuscle.sim.options import did_you_mean
+    from rbfmuscle.models import check_models
     from rbfmuscle.sim.scene import Scene
 
     loaded = Scene.load(scene)
-    for muscle in loaded.muscles:
-        if muscle.model not in MODEL_NAMES:
-            hint = did_you_mean(muscle.model, MODEL_NAMES)
-            raise UsageError(f"{scene}: muscle {muscle.name!r}: unknown model {muscle.model!r}, {hint}")
+    check_models(loaded)
     findings = [*loaded.check(), *_field_notes(loaded)]
     errors = [finding for finding in findings if finding.level == "error"]
     if as_json:

@@ -17,11 +17,13 @@ def plan(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", negat
     as_json
         Print JSON and nothing else.
     """
-    from rbfmuscle.models import estimate_model
+    from rbfmuscle.models import check_models, estimate_model
     from rbfmuscle.sim.plan import plan_scene
     from rbfmuscle.sim.scene import Scene
 
-    made = plan_scene(Scene.load(scene), estimate_model)
+    loaded = Scene.load(scene)
+    check_models(loaded)
+    made = plan_scene(loaded, estimate_model)
     print(json.dumps(made, indent=1) if as_json else "\n".join(_lines(made)))
 
 

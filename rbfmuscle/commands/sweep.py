@@ -95,6 +95,7 @@ def run_point(scene, settings, frames):
 
 
 def _measure(scene, output, grid, model, frames, reference, jobs, scheduler, part, retry):
+    from rbfmuscle.models import check_models
     from rbfmuscle.sim.settings import parse_setting
     from rbfmuscle.study.sweep import parse_grid, plan_sweep
     from rbfmuscle.study.sweep_points import SweepRunner
@@ -103,6 +104,8 @@ def _measure(scene, output, grid, model, frames, reference, jobs, scheduler, par
     loaded = load_scene(scene).with_options(model=model)
     chosen = dict(parse_setting(text) for text in reference or [])
     plan = plan_sweep(loaded, axes, frames=frames, reference=chosen)
+    for point in plan.points:  # a mistyped key is told now, not after the first point
+        check_models(loaded.with_options(**point.settings))
     with Progress(f"sweep of {loaded.name}", what="point") as progress:
         runner = SweepRunner(
             run_point, loaded, plan, output, frames=frames, jobs=jobs, scheduler=scheduler, progress=progress
@@ -137,7 +140,8 @@ def _finish(plan, output, error, as_json):
         for verdict in table["verdicts"]:
             print(verdict["text"])
         print(
-            f"{table['done']} points done, {table['failed']} failed, {table['missing']} missing, in {output}"
+            f"{table['done']} points done, {table['failed']} failed, {table['missing']} missing, "
+            f"in {output}, open {output / 'sweep.html'}"
         )
     bad = [row for row in table["rows"] if row["status"] != "done"]
     if bad:
