@@ -73,7 +73,9 @@ class TestMending:
         assert read.closed and any("holes" in note for note in read.notes)
         cut = mesh.faces[mesh.triangles_center[:, 2] < 8]
         path = write(tmp_path / "large.ply", mesh.vertices, cut)
-        with pytest.raises(MeshError, match=r"large\.ply.*open.*boundary edges"):
+        with pytest.raises(
+            MeshError, match=r"large\.ply.*open.*boundary edges, the widest hole about \(.*\); close"
+        ):
             read_mesh(path)
         assert not read_mesh(path, may_be_open=True).closed
 

@@ -59,7 +59,9 @@ def repair(vertices, faces, *, place, may_be_open=False):
     if not state.closed:
         count = int((_edge_uses(state.faces)[1] == 1).sum())
         if not may_be_open:
-            raise MeshError(f"{place}: the surface is open ({count} boundary edges); close its holes")
+            raise MeshError(
+                f"{place}: the surface is open ({count} boundary edges{_widest_hole(state)}); close its holes"
+            )
         state.notes.append(f"the surface is open ({count} boundary edges)")
     elif not may_be_open:
         _check_one_part(state, place)
@@ -199,6 +201,16 @@ def _fill_holes(state):
         filled += 1
     if filled:
         state.notes.append(f"{filled} small holes closed")
+
+
+def _widest_hole(state):
+    """Words for the place of the hole with the longest rim, "" where no rim is a simple loop."""
+    rims = [state.vertices[rim] for rim in _rims(state.faces)]
+    if not rims:
+        return ""
+    widest = max(rims, key=lambda rim: np.linalg.norm(rim - np.roll(rim, 1, axis=0), axis=1).sum())
+    x, y, z = widest.mean(axis=0)
+    return f", the widest hole about ({x:.4g}, {y:.4g}, {z:.4g})"
 
 
 def _rims(faces):

@@ -69,7 +69,7 @@ def check_size(scene, kind, name, mesh, source):
     if not SMALLEST_MM <= millimetres <= LARGEST_MM:
         raise MeshError(
             f"{kind} {name!r} ({source or 'built in code'}) is {size:.4g} {scene.units} across, which cannot be "
-            f"right; set its scale ({_likely_scale(millimetres)})"
+            f"right; correct the scene's units, or set its scale ({_likely_scale(millimetres)})"
         )
 
 

@@ -100,9 +100,10 @@ def read_scene_file(path):
     except OSError as error:
         raise SceneError(f"{path}: cannot read the scene file: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise SceneError(f"{path}: not a text file in UTF-8") from None
+        raise SceneError(f"{path}: not a text file in UTF-8, give a scene file (.toml)") from None
     except tomllib.TOMLDecodeError as error:
-        raise SceneError(f"{path}: not valid TOML: {error}") from None
+        quotes = "; text stands in quotes" if str(error).startswith("Invalid value") else ""
+        raise SceneError(f"{path}: not valid TOML: {error}{quotes}") from None
     try:
         return SceneFile.model_validate(data)
     except ValidationError as error:

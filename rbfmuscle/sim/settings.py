@@ -50,7 +50,7 @@ def apply_setting(scene, key, value):
         table = getattr(scene, head)
         if table is None:
             table = {"sliding": SlidingOptions, "detect": DetectOptions}[head]()
-        setattr(scene, head, table.changed(rest, value, place=f"{key}: {head}."))
+        setattr(scene, head, table.changed(rest, value, place=f"{key}: "))
     elif head in TABLES:
         raise SceneError(f"{key}: name a key of the table, for instance {head}.KEY=VALUE")
     else:
