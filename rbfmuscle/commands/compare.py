@@ -95,4 +95,4 @@ def _print_table(table, output):
             texts = ("-" if value is None else f"{value:.3g}" for value in cells)
             unit = table["measures"][quantity]["unit"]
             print(f"{quantity:{width}}" + "".join(f"{text:>18}" for text in texts) + f"  {unit}")
-    print(f"{table['frames']} frames, in {output}")
+    print(f"{table['frames']} frames, in {output}, open {output / 'report.html'}")

@@ -78,11 +78,13 @@ def run(
     as_json
         Print JSON and nothing else.
     """
+    from rbfmuscle.models import check_models
     from rbfmuscle.sim.scene import Scene
     from rbfmuscle.sim.settings import parse_setting
 
     changes = dict(parse_setting(text) for text in settings or [])
     loaded = Scene.load(scene)
+    check_models(loaded)
     _run_scene(loaded, output, model=model, frames=frames, settings=changes, fail_on=fail_on, as_json=as_json)
 
 
@@ -117,15 +119,19 @@ def _run_scene(scene, output, *, model, frames, settings, fail_on, as_json):
     if as_json:
         print(json.dumps({"directory": str(output), **info}, indent=1, default=str))
     else:
-        _print_summary(info["muscles"], len(info["frames"]), output, time.perf_counter() - start)
+        _print_summary(info["muscles"], scene.units)
+        report = output / "report.html"
+        there = f"in {output}, open {report}" if report.exists() else f"in {output}"
+        print(f"{len(info['frames'])} frames in {time.perf_counter() - start:.1f} s, {there}")
 
 
-def _print_summary(muscles, frames, output, seconds):
+def _print_summary(muscles, units):
+    """The worst of each muscle over all frames; lengths in the scene's unit."""
     muscles = {name: facts for name, facts in muscles.items() if any(key in facts for key in SHOWN)}
     if muscles:
         width = max(len(name) for name in muscles)
+        print(f"worst over the frames; lengths in {units}")
         print(" ".join([" " * width, *(f"{key:>22}" for key in SHOWN)]))
     for name, facts in muscles.items():
         worst = [abs(facts.get(key, {}).get("worst", math.nan)) for key in SHOWN]
         print(" ".join([f"{name:{width}}", *(f"{value:22.3g}" for value in worst)]))
-    print(f"{frames} frames in {seconds:.1f} s, in {output}")
