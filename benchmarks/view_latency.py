@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rbfmuscle.commands.scenes import load_scene
 from rbfmuscle.commands.view import _open_scene
 from rbfmuscle.study.window import Window
 
@@ -20,7 +21,7 @@ PICTURES = 24
 def main():
     scene = Path(sys.argv[1]) if len(sys.argv) > 1 else Path("phantom")
     for quality in ("as given", "fast"):
-        viewer, motion, title = _open_scene(scene, None)
+        viewer, motion, title = _open_scene(load_scene(scene), None)
         viewer.switch(quality=quality)
         window = Window(viewer, "view", motion=motion, title=title)
         window.open(until_closed=False)

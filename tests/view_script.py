@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from rbfmuscle.commands.scenes import load_scene
 from rbfmuscle.commands.view import _open_saved, _open_scene
+from rbfmuscle.study.saved import SavedRun
 from rbfmuscle.study.window import Window
 
 
@@ -45,7 +47,7 @@ def _ends(bar):
 
 
 def live(folder):
-    viewer, motion, title = _open_scene(Path("phantom"), None)
+    viewer, motion, title = _open_scene(load_scene(Path("phantom")), None)
     window = Window(viewer, folder, motion=motion, title=title)
     window.open(until_closed=False)
     settle(window)
@@ -75,7 +77,7 @@ def live(folder):
 
 
 def saved(folder, run):
-    viewer, motion, title = _open_saved(Path(run))
+    viewer, motion, title = _open_saved(SavedRun(Path(run)))
     window = Window(viewer, folder, motion=motion, title=title)
     window.open(until_closed=False)
     settle(window)

@@ -44,14 +44,17 @@ def view(
     screenshot
         Write the window to this PNG as soon as it stands at --at, and close it.
     """
+    from rbfmuscle.study.saved import SavedRun
     from rbfmuscle.study.viewer import COLOURINGS
     from rbfmuscle.study.window import Window, require_display
 
     stops = [_parse_stop(text) for text in at or []]
     if colour not in COLOURINGS:
         raise UsageError(f"unknown colouring {colour!r}; known: {', '.join(COLOURINGS)}")
+    # A wrong path is told before a display is asked for.
+    opened = SavedRun(scene) if scene.is_dir() else load_scene(scene)
     require_display()
-    viewer, motion, title = _open_saved(scene) if scene.is_dir() else _open_scene(scene, model)
+    viewer, motion, title = _open_saved(opened) if scene.is_dir() else _open_scene(opened, model)
     viewer.colour_by(colour)
     _begin_at(viewer, stops)
     window = Window(viewer, output, motion=motion, title=title)
@@ -86,19 +89,18 @@ def _begin_at(viewer, stops):
             viewer.scrub(viewer.place_of(value))
 
 
-def _open_saved(folder):
-    from rbfmuscle.study.saved import SavedRun
+def _open_saved(run):
     from rbfmuscle.study.viewer import SavedViewer
 
-    return SavedViewer(SavedRun(folder)), None, f"rbfmuscle: {folder}"
+    return SavedViewer(run), None, f"rbfmuscle: {run.directory}"
 
 
-def _open_scene(path, model):
+def _open_scene(loaded, model):
     from rbfmuscle.models import build_models
     from rbfmuscle.sim.live import LiveSession
     from rbfmuscle.study.viewer import LiveViewer
 
-    scene = load_scene(path).with_options(model=model)
+    scene = loaded.with_options(model=model)
     scene.validate()
     print(f"rbfmuscle: preparing {scene.name}", file=sys.stderr)
     models = [scene.muscles[0].model]
