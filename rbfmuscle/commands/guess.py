@@ -144,8 +144,11 @@ def _sort(paths, base):
         part.by_name = False
         (bones if len(bones) < 2 else muscles).append(part)
     if not bones or not muscles:
-        kind = "bone" if not bones else "muscle"
-        raise UsageError(f"{paths[0].parent} holds no {kind}; name the files after what they are")
+        kind, taken = ("bone", muscles) if not bones else ("muscle", bones)
+        raise UsageError(
+            f"{paths[0].parent} holds no {kind} (all are {'muscles' if not bones else 'bones'} by their names or "
+            f"sizes: {', '.join(part.file for part in taken)}); name the files after what they are"
+        )
     for part in muscles:
         if not part.mesh.is_watertight:
             raise MeshError(f"{part.file}: the surface is open; a muscle must be closed")
@@ -198,7 +201,7 @@ def _attach(muscle, bones, root, joints):
     first = ranked[0]
     body = id(first) if id(first) in movers else id(root)
     others = [b for b in ranked[1:] if (id(b) if id(b) in movers else id(root)) != body]
-    chosen = [first, *others[:1]]
+    chosen = sorted([first, *others[:1]], key=lambda bone: id(bone) in movers)  # the origin does not move
     reach = {bone.name: float(np.partition(distances[bone.name], count)[count]) for bone in chosen}
     if len(chosen) == 2:
         _separate(reach, distances)
@@ -253,7 +256,8 @@ def _motion_text(child):
 def _muscle_text(muscle, places, complete):
     mark = "" if muscle.by_name else "   # GUESS: a muscle, by its name or size"
     lines = [
-        f'  {{ bone = "{bone}", near = {np.ceil(reach * 1e4) / 1e4:g} }},   # GUESS' for bone, reach in places
+        f'  {{ bone = "{bone}", near = {np.ceil(reach * 1e4) / 1e4:g} }},   # GUESS: all of it this near to the bone'
+        for bone, reach in places
     ]
     if not complete:
         lines.append('  # a second bone is missing here: { bone = "...", near = ... }')
