@@ -9,10 +9,11 @@ STAMP := $(VENV)/.installed
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet -e ".[dev]"
+	$(BIN)/python -m pip install --quiet --quiet -e ".[dev]"
 	touch $(STAMP)
 
 demo: $(STAMP)
+	@echo "The first run compiles for one to two minutes; later ones start at once."
 	$(BIN)/rbfmuscle demo --model rbf -o demo_output/rbf
 	$(BIN)/rbfmuscle demo --model pbd -o demo_output/pbd
 	@echo "Open demo_output/rbf/report.html and demo_output/pbd/report.html"
