@@ -8,7 +8,8 @@ from rbfmuscle.binding import has_sample
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels import get_kernel
 from rbfmuscle.implicit.lapack import factor_cholesky
-from rbfmuscle.muscle import MOST_WITH_ALL_DERIVATIVES, RBFMuscle, RBFOptions
+from rbfmuscle.muscle import MOST_WITH_ALL_DERIVATIVES, RBFMuscle
+from rbfmuscle.options import RBFOptions
 from rbfmuscle.sim.forecast import MuscleCost
 from rbfmuscle.sim.rates import shortest
 from rbfmuscle.sim.rest_frame import RestFrame

@@ -188,7 +188,7 @@ class TestErrors:
             (
                 ("kernels", "phantom", "-o", "o", "--centres", "100,many"),
                 2,
-                "whole numbers, for instance 150,300",
+                "whole numbers of 4 and more, got",
             ),
             (
                 ("check", "metres.toml"),

@@ -36,6 +36,7 @@ MODEL_FILES = (
     "rbfmuscle.constraints",
     "rbfmuscle.elasticity",
     "rbfmuscle.binding",
+    "rbfmuscle.options",
     "rbfmuscle.implicit",
     "rbfmuscle.sim",
     "rbfmuscle.validation",
