@@ -105,7 +105,9 @@ def _measure(scene, output, grid, model, frames, reference, jobs, scheduler, par
     chosen = dict(parse_setting(text) for text in reference or [])
     plan = plan_sweep(loaded, axes, frames=frames, reference=chosen)
     for point in plan.points:  # a mistyped key is told now, not after the first point
-        check_models(loaded.with_options(**point.settings))
+        changed = loaded.with_options(**point.settings)
+        changed.path = None  # the grid is at fault, not the file
+        check_models(changed)
     with Progress(f"sweep of {loaded.name}", what="point") as progress:
         runner = SweepRunner(
             run_point, loaded, plan, output, frames=frames, jobs=jobs, scheduler=scheduler, progress=progress
