@@ -177,7 +177,11 @@ class TestErrors:
             (("check", "number.toml"), 3, "centres must be between 0 and 20000, got -5"),
             (("check", "kernel.toml"), 3, "unknown kernel 'cubik', did you mean 'cubic'"),
             (("check", "mesh_model.toml"), 3, "unknown key 'iteration', did you mean 'iterations'"),
-            (("sweep", "hip.toml", "-o", "o", "--grid", "model.centers=60,70"), 3, "did you mean 'centres'"),
+            (
+                ("sweep", "hip.toml", "-o", "o", "--grid", "model.centers=60,70"),
+                3,
+                "rbfmuscle: muscle 'adductor': model rbf",
+            ),
             (("run", "hip.toml", "-o", "o", "--model", "rbff"), 2, "did you mean 'rbf'"),
             (("run", "hip.toml", "-o", "o", "--frames", "a:b"), 2, "A:B:S"),
             (
@@ -188,7 +192,7 @@ class TestErrors:
             (
                 ("kernels", "phantom", "-o", "o", "--centres", "100,many"),
                 2,
-                "whole numbers of 4 and more, got",
+                "--centres must be whole numbers of 4 and more",
             ),
             (
                 ("check", "metres.toml"),

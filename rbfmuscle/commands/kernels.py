@@ -178,7 +178,9 @@ def _print(study, moved, output):
             f"{name} {value:.3g}" for name, value in facts.items() if isinstance(value, float)
         )
         print(f"in motion, {facts['kernel']} with {facts['centres']} centres: {said}")
-    print(f"page in {output / 'kernels.html'}; to paste at the end of a [[muscle]]:\n\n{study.toml(study.rows[0])}")
+    print(
+        f"page in {output / 'kernels.html'}; to paste at the end of a [[muscle]]:\n\n{study.toml(study.rows[0])}"
+    )
 
 
 def _text(value, width):
