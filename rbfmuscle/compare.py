@@ -106,7 +106,7 @@ def _variants(scene, models, settings):
 
 def _measure(name, scene, folder, poses, progress):
     """One model: warm up, run and watch, then there and back by coarser steps."""
-    _last_surfaces(_with_frames(scene, scene.motion.frames[:2]))
+    _surfaces(_with_frames(scene, scene.motion.frames[:2]))
     probe = ModelProbe(scene, poses)
     report = None if progress is None else (lambda done, total: progress(name, done, total))
     stream_run(scene, folder, pictures=False, progress=report, watch=probe)
@@ -119,22 +119,23 @@ def _there_and_back(scene):
     coarse = frames[:-1:COARSER]
     turn = len(coarse)
     path = [*coarse, frames[-1], *coarse[::-1]]
-    build, shown = _last_surfaces(_with_frames(scene, path), (turn, 2 * turn))
+    build, shown = _surfaces(_with_frames(scene, path), (turn, 2 * turn))
     found = {"build": build}
     if turn:
         found.update(turn=shown[0], end=shown[1])
     return found
 
 
-def _last_surfaces(scene, written=None):
-    """Time to build the models, and the surfaces of the frames ``written`` (all where not given)."""
+def _surfaces(scene, wanted=()):
+    """Time to build the models, and the surfaces of the frames ``wanted``; all frames are shown, as in the run."""
     start = time.perf_counter()
     models = build_models(scene)
     build = time.perf_counter() - start
-    shown = []
-    for frame in simulate_frames(scene, models, written=written):
-        shown.append({name: (s.vertices, s.faces) for name, s in frame.surfaces.items()})
-    return build, shown
+    kept = {}
+    for frame in simulate_frames(scene, models):
+        if frame.index in wanted:
+            kept[frame.index] = {name: (s.vertices, s.faces) for name, s in frame.surfaces.items()}
+    return build, [kept[index] for index in wanted]
 
 
 def _with_frames(scene, frames):

@@ -3,6 +3,7 @@
 import sys
 from itertools import pairwise
 
+import numba
 import numpy as np
 import pytest
 from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, hinged_scene, joint, muscle, scene, sphere
@@ -204,8 +205,8 @@ def test_leaving_early_ends_the_workers():
     course = simulate_frames(made, parts, fields=fields)
     next(course)
     course.close()
-    # The five sub-steps of frame 1, which was solved while frame 0 was drawn; none of frame 2.
-    assert parts[0].solves == 5
+    # The five sub-steps of frame 1 where it was solved while frame 0 was drawn; none of frame 2.
+    assert parts[0].solves == (5 if numba.get_num_threads() > 1 else 0)
 
 
 def _several(count):
