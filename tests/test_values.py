@@ -47,9 +47,11 @@ def test_values_are_sums_of_the_kernel(kernel, epsilon):
     points = np.vstack([rng.uniform(-1, 1, (1500, 3)), centres])
     weights = rng.normal(size=(1, 250))
     phi = kernel.phi(np.linalg.norm(points[:, None] - centres, axis=2), epsilon)
-    shape = np.full(250, epsilon)
+    shape, nothing = np.full(250, epsilon), (np.zeros(0), np.zeros((0, 3), dtype=np.int64))
     for order in (0, 1):
-        found = evaluate(points, np.zeros(3), 1.0, centres.T.copy(), weights, kernel, shape, order)[0]
+        found = evaluate(points, np.zeros(3), 1.0, centres.T.copy(), weights, kernel, shape, nothing, order)[
+            0
+        ]
         assert np.abs(found - phi @ weights[0]).max() < 1e-14 * (np.abs(phi) @ np.abs(weights[0])).max()
 
 
