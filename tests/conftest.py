@@ -1,5 +1,6 @@
 """What several test files share."""
 
+import importlib
 import os
 import subprocess
 import sys
@@ -39,3 +40,12 @@ def graphics():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=120, check=False)
     if done.returncode != 0:
         pytest.skip("no graphics here")
+
+
+def benchmark_script(name):
+    """The module of a script in ``benchmarks/``."""
+    sys.path.insert(0, str(ROOT / "benchmarks"))
+    try:
+        return importlib.import_module(name)
+    finally:
+        sys.path.remove(str(ROOT / "benchmarks"))

@@ -1,10 +1,10 @@
 """The finite-element solid against known answers, and the models against the reference that it gave."""
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import benchmark_script
 from scipy.optimize import brentq
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -14,12 +14,7 @@ DATA = ROOT / "tests" / "data" / "fe_reference.npz"
 @pytest.fixture(scope="module")
 def study():
     """The script that made the reference."""
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    try:
-        import fe_reference
-    finally:
-        sys.path.remove(str(ROOT / "benchmarks"))
-    return fe_reference
+    return benchmark_script("fe_reference")
 
 
 def block(cells=(3, 3, 4), half=(5.0, 5.0, 20.0), **options):

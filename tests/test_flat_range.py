@@ -1,9 +1,9 @@
 """The table of the flat range: its command, what each way of solving gives, and the library's defaults beside it."""
 
-import sys
 from pathlib import Path
 
 import pytest
+from conftest import benchmark_script
 
 ROOT = Path(__file__).resolve().parent.parent
 # epsilon: condition and largest errors of direct, truncated and oversampled fits as published; the data were not, so
@@ -19,12 +19,7 @@ PUBLISHED = {
 
 @pytest.fixture(scope="module")
 def study():
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    try:
-        import flat_range
-    finally:
-        sys.path.remove(str(ROOT / "benchmarks"))
-    return flat_range
+    return benchmark_script("flat_range")
 
 
 @pytest.fixture(scope="module")

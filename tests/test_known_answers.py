@@ -1,12 +1,12 @@
 """Scenes with answers in closed form, the measures of their errors, and what the models make of them."""
 
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from conftest import benchmark_script
 
 from rbfmuscle.sim.known_scenes import (
     BENT_BAR,
@@ -27,12 +27,7 @@ ROOT = Path(__file__).resolve().parent.parent
 @pytest.fixture(scope="module")
 def study():
     """The script that prints the tables."""
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    try:
-        import known_answers
-    finally:
-        sys.path.remove(str(ROOT / "benchmarks"))
-    return known_answers
+    return benchmark_script("known_answers")
 
 
 def end_pose(scene, bone):

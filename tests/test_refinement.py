@@ -6,8 +6,8 @@ import trimesh
 
 from rbfmuscle.implicit.field import RBFField, hermite_system
 from rbfmuscle.implicit.kernels import get_kernel
-from rbfmuscle.implicit.refinement import _rows, fit_centres, fit_sample, spread_points
-from rbfmuscle.implicit.sampling import sample_surface
+from rbfmuscle.implicit.refinement import _rows, fit_centres, fit_sample
+from rbfmuscle.implicit.sampling import sample_surface, spread_points
 from rbfmuscle.implicit.selection import spacing
 from rbfmuscle.validation import UsageError
 
@@ -27,7 +27,7 @@ def bean():
 def test_fitted_centres_err_less_at_points_they_have_not_seen(bean, kernel, epsilon):
     vertices, faces, plain = bean
     fitted = fit_sample(plain, vertices, faces, kernel=kernel, epsilon=epsilon)
-    unseen = spread_points(vertices, faces, 3000, seed=7)
+    unseen = spread_points(vertices, faces, 3000, seed=7)[0]
 
     def error(sample):
         field = RBFField.fit_hermite(sample.points, sample.normals, kernel=kernel, epsilon=epsilon)
@@ -59,7 +59,7 @@ def test_nothing_moves_where_nothing_is_missed(bean):
 
 def test_units_and_place_do_not_matter(bean):
     vertices, faces, sample = bean
-    where = spread_points(vertices, faces, 1000)
+    where = spread_points(vertices, faces, 1000)[0]
     points, normals = fit_centres(sample.points, sample.normals, where)
     shift = np.array([3.0, -1.0, 2.0])
     there, same = fit_centres(sample.points * 1e-3 + shift, sample.normals, where * 1e-3 + shift)
@@ -75,7 +75,7 @@ def test_a_kernel_without_hermite_fit_is_refused(bean):
 
 def test_spread_points_are_on_the_mesh_and_even():
     mesh = trimesh.creation.box([1.0, 2.0, 3.0])
-    points = spread_points(mesh.vertices, mesh.faces, 2200)
+    points = spread_points(mesh.vertices, mesh.faces, 2200)[0]
     on = np.isclose(np.abs(points), [0.5, 1.0, 1.5])
     assert on.any(axis=1).all()
     # areas of the pairs of faces: 12, 6, 4 of 22

@@ -15,8 +15,9 @@ from scipy.spatial.distance import cdist
 from rbfmuscle.implicit import assembly
 from rbfmuscle.implicit.field import RBFField, hermite_system
 from rbfmuscle.implicit.kernels import get_kernel
+from rbfmuscle.implicit.sampling import spread_points
 from rbfmuscle.implicit.selection import spacing, surface_miss
-from rbfmuscle.validation import UsageError, check_mesh, check_points, check_vectors
+from rbfmuscle.validation import UsageError, check_points, check_vectors
 
 # Name of this placement of centres beside those of `sampling.PLACEMENTS`.
 FITTED = "fitted"
@@ -26,17 +27,6 @@ STIFFNESS = 0.1
 ROUNDS = 2
 SAMPLES = 4000
 _CHUNK = 1000
-
-
-def spread_points(vertices, faces, count, *, seed=0):
-    """Points on a mesh, evenly by area: one at random in each of ``count`` strips of equal area, (count, 3)."""
-    vertices, faces = check_mesh(vertices, faces)
-    rng = np.random.default_rng(seed)
-    corners = vertices[faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    strip = (np.arange(count) + rng.uniform(size=count)) / count
-    which = np.searchsorted(np.cumsum(area) / area.sum(), strip).clip(max=len(faces) - 1)
-    return np.einsum("nk,nkj->nj", rng.dirichlet(np.ones(3), count), corners[which])
 
 
 def fit_sample(sample, vertices, faces, *, kernel="cubic", epsilon=1.0, seed=0):
@@ -56,7 +46,7 @@ def fit_sample(sample, vertices, faces, *, kernel="cubic", epsilon=1.0, seed=0):
     -------
     SurfaceSample
     """
-    where = spread_points(vertices, faces, SAMPLES, seed=seed)
+    where, _ = spread_points(vertices, faces, SAMPLES, seed=seed)
     points, normals = fit_centres(sample.points, sample.normals, where, kernel=kernel, epsilon=epsilon)
     return replace(sample, points=points, normals=normals)
 

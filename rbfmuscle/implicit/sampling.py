@@ -96,6 +96,24 @@ CELL_SHARE = 0.5
 PLACEMENTS = ("even", "adaptive", "greedy")
 
 
+def spread_points(vertices, faces, count, *, seed=0):
+    """Points on a mesh, evenly by area: one at random in each of ``count`` strips of equal area.
+
+    Returns
+    -------
+    points : (count, 3) ndarray
+    face : (count,) ndarray
+        Triangle that holds each.
+    """
+    vertices, faces = check_mesh(vertices, faces)
+    rng = np.random.default_rng(seed)
+    corners = vertices[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    strip = (np.arange(count) + rng.uniform(size=count)) / count
+    which = np.searchsorted(np.cumsum(area) / area.sum(), strip).clip(max=len(faces) - 1)
+    return np.einsum("nk,nkj->nj", rng.dirichlet(np.ones(3), count), corners[which]), which
+
+
 def _gather(vertices, faces, fine, count, labels, control):
     """Points, normals and areas of the cells."""
     third = np.linalg.norm(face_normals(fine.vertices, fine.faces), axis=1) / 3

@@ -17,7 +17,7 @@ from rbfmuscle.sim.rest_frame import BoneFrame, on_one_line
 from rbfmuscle.sim.sdf_build import build_cells, grid_shape
 from rbfmuscle.sim.sdf_cells import BLOCK
 from rbfmuscle.sim.sdf_mesh import prepare_bone, winding_test
-from rbfmuscle.sim.sdf_query import FieldData, gradient_loop, value_loop
+from rbfmuscle.sim.sdf_query import FieldData, query_loop
 from rbfmuscle.sim.threads import in_chunks
 from rbfmuscle.sim.triangles import FIRST
 from rbfmuscle.validation import MeshError, check_mesh, check_points, check_positive
@@ -25,6 +25,7 @@ from rbfmuscle.validation import MeshError, check_mesh, check_points, check_posi
 log = logging.getLogger(__name__)
 
 IDENTITY = np.eye(4)
+NO_GRADIENT = np.empty((0, 3))
 # Fine cells against the mean edge of the mesh, and at least this many along its longest side.
 CELL_SHARE, LEAST_CELLS = 0.6, 40
 # Fine cells cover points nearer than this many of their edges.
@@ -161,7 +162,7 @@ class BoneSDF:
         reach = _local_reach(reach, len(points), size)
 
         def work(a, b):
-            value_loop(points[a:b], placed, reach[a:b], out[a:b], self.data)
+            query_loop(points[a:b], placed, reach[a:b], out[a:b], NO_GRADIENT, self.data)
 
         in_chunks(len(points), work, least=4096)
         out *= size
@@ -183,7 +184,7 @@ class BoneSDF:
         reach = _local_reach(reach, len(points), size)
 
         def work(a, b):
-            gradient_loop(points[a:b], placed, reach[a:b], distance[a:b], gradient[a:b], self.data)
+            query_loop(points[a:b], placed, reach[a:b], distance[a:b], gradient[a:b], self.data)
 
         in_chunks(len(points), work, least=4096)
         distance *= size
@@ -311,7 +312,7 @@ def _measure(mesh, data, exact, band, region):
     unit = normal[which] / np.linalg.norm(normal[which], axis=1, keepdims=True)
     points += unit * rng.uniform(-band, band, (PROBES, 1))
     distance = np.empty(len(points))
-    value_loop(points, IDENTITY, np.full(PROBES, np.inf), distance, data)
+    query_loop(points, IDENTITY, np.full(PROBES, np.inf), distance, NO_GRADIENT, data)
     difference = np.abs(distance) - np.abs(exact.signed_distance(points))
     return float(np.sqrt(np.mean(difference**2)))
 

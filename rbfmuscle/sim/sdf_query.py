@@ -287,57 +287,19 @@ def _finish(count, local, entry, best, square, offset, lists, corners, records, 
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def value_loop(points, pose, reach, out, data):
-    """Distances (n,) of points in world coordinates."""
-    grid, blocks, cells, lists, corners, far, records, en, vn, vertices, across = data
-    local, offset, entry = np.empty((STAGE, 3)), np.empty((STAGE, 3)), np.empty(STAGE, np.int32)
-    best = np.empty(STAGE, np.int32)
-    for start in range(0, len(points), STAGE):
-        some, d = points[start : start + STAGE], out[start : start + STAGE]
-        _stage(
-            some,
-            pose,
-            reach[start : start + STAGE],
-            grid,
-            blocks,
-            cells,
-            lists,
-            far,
-            records,
-            local,
-            entry,
-            best,
-            d,
-        )
-        _finish(len(some), local, entry, best, d, offset, lists, corners, records, en, vn, vertices, across)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def gradient_loop(points, pose, reach, distance, gradient, data):
-    """Distances (n,) and gradients (n, 3), world axes, of points in world coordinates."""
+def query_loop(points, pose, reach, distance, gradient, data):
+    """Distances (n,) and gradients (n, 3), world axes, of points in world coordinates; ``gradient`` may be empty."""
     grid, blocks, cells, lists, corners, far, records, en, vn, vertices, across = data
     local, offset, entry = np.empty((STAGE, 3)), np.empty((STAGE, 3)), np.empty(STAGE, np.int32)
     best = np.empty(STAGE, np.int32)
     least = ROUNDING * grid[UNIT]
     for start in range(0, len(points), STAGE):
-        some, d = points[start : start + STAGE], distance[start : start + STAGE]
-        _stage(
-            some,
-            pose,
-            reach[start : start + STAGE],
-            grid,
-            blocks,
-            cells,
-            lists,
-            far,
-            records,
-            local,
-            entry,
-            best,
-            d,
-        )
+        end = min(start + STAGE, len(points))
+        some, near, d = points[start:end], reach[start:end], distance[start:end]
+        _stage(some, pose, near, grid, blocks, cells, lists, far, records, local, entry, best, d)
         _finish(len(some), local, entry, best, d, offset, lists, corners, records, en, vn, vertices, across)
-        _turn(len(some), pose, least, best, d, offset, records, gradient[start : start + STAGE])
+        if len(gradient) > 0:
+            _turn(len(some), pose, least, best, d, offset, records, gradient[start:end])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

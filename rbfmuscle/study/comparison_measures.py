@@ -5,7 +5,8 @@ import math
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.implicit.sampling import sample_surface
+from rbfmuscle.implicit.clustering import face_normals
+from rbfmuscle.implicit.sampling import sample_surface, spread_points
 from rbfmuscle.study.metrics import edge_lengths, unique_edges
 
 POINTS = 1200  # material points of a muscle
@@ -83,7 +84,10 @@ def curvature_variation(vertices, faces, *, patches=PATCHES, seed=0):
     float
         [1 / scene unit]
     """
-    points, normals = _spread(vertices, np.asarray(faces), patches, seed)
+    # In strips of equal area, so that no region goes without points.
+    points, face = spread_points(vertices, faces, patches, seed=seed)
+    normals = face_normals(vertices, np.asarray(faces))[face]
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     near = cKDTree(points).query(points, k=NEIGHBOURS)[1]
     same_sheet = np.einsum("pkd,pd->pk", normals[near], normals) > 0.3
     # On the rim of a thin plate a point can have too few neighbours on its own sheet for a quadric.
@@ -96,20 +100,6 @@ def curvature_variation(vertices, faces, *, patches=PATCHES, seed=0):
     mean = (weight * curvature[near]).sum(axis=1)
     variance = (weight * (curvature[near] - mean[:, None]) ** 2).sum(axis=1)
     return float(np.sqrt(variance.mean()))
-
-
-def _spread(vertices, faces, count, seed):
-    corner = vertices[faces]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    area = np.linalg.norm(normal, axis=1)
-    generator = np.random.default_rng(seed)
-    # Strata of equal area, so that no region goes without points.
-    place = (np.arange(count) + generator.random(count)) / count * area.sum()
-    chosen = np.minimum(np.searchsorted(np.cumsum(area), place), len(faces) - 1)
-    root, side = np.sqrt(generator.random(count)), generator.random(count)
-    share = np.stack([1 - root, root * (1 - side), root * side], axis=1)
-    points = np.einsum("pk,pkd->pd", share, corner[chosen])
-    return points, normal[chosen] / np.maximum(area[chosen, None], 1e-300)
 
 
 def _mean_curvature(points, normals, near, same_sheet):

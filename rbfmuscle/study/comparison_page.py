@@ -1,19 +1,16 @@
 """The report of a comparison: pictures side by side, distance maps, plots, table; one HTML file."""
 
-import base64
 import html
 import math
-import tempfile
-from pathlib import Path
 
 from rbfmuscle.study.appearance import line_colours
 from rbfmuscle.study.comparison import COST, FIRST, LAW, MEASURES, MESH, OWN, best_models
 from rbfmuscle.study.comparison_plots import plot_models
 from rbfmuscle.study.metrics import ALL
-from rbfmuscle.study.page import STYLE
-from rbfmuscle.study.render import chosen_frames, draw
+from rbfmuscle.study.page import STYLE, embedded_image
+from rbfmuscle.study.render import chosen_frames, draw_pictures
 from rbfmuscle.study.saved import SavedRun
-from rbfmuscle.validation import MissingPartError, SolveError
+from rbfmuscle.validation import SolveError
 
 _VIEWS = ["front", "back"]
 _MODULE = "rbfmuscle.study.comparison_pictures"
@@ -78,14 +75,9 @@ def write_page(folder, table, *, pictures=True):
     SolveError
         If the report cannot be written.
     """
-    missing, images = None, {}
-    with tempfile.TemporaryDirectory() as work:
-        if pictures:
-            try:
-                draw(folder, _jobs(table, folder, Path(work)), module=_MODULE)
-            except MissingPartError as error:
-                missing = error
-        images = {path.stem: path.read_bytes() for path in sorted(Path(work).glob("*.png"))}
+    images, missing = draw_pictures(
+        folder, lambda work: _jobs(table, folder, work) if pictures else [], module=_MODULE
+    )
     moving = folder / "models.webp"
     try:
         page = _page(folder, table, images, moving.read_bytes() if moving.is_file() else None, missing)
@@ -122,10 +114,10 @@ def map_limit(table):
 
 def _page(folder, table, images, moving, missing):
     runs = {name: SavedRun(folder / name) for name in table["models"]}
-    poses = [_image(data, "png", name) for name, data in images.items() if name.startswith("pose")]
-    maps = [_image(data, "png", name) for name, data in images.items() if name.startswith("map")]
+    poses = [embedded_image(data, "png", name) for name, data in images.items() if name.startswith("pose")]
+    maps = [embedded_image(data, "png", name) for name, data in images.items() if name.startswith("map")]
     if moving is not None:
-        poses.insert(0, _image(moving, "webp", "the motion, models beside each other"))
+        poses.insert(0, embedded_image(moving, "webp", "the motion, models beside each other"))
     nothing = f'<p class="note">There are no pictures: {html.escape(str(missing or "switched off"))}.</p>'
     return PAGE.format(
         style=STYLE,
@@ -144,7 +136,7 @@ def _page(folder, table, images, moving, missing):
             for name, colour in line_colours(table["models"]).items()
         ),
         plots="".join(
-            f"<figure>{_image(svg, 'svg+xml', title)}</figure>" for title, svg in plot_models(runs)
+            f"<figure>{embedded_image(svg, 'svg+xml', title)}</figure>" for title, svg in plot_models(runs)
         ),
         explanation=EXPLANATION,
         measures="".join(
@@ -152,10 +144,6 @@ def _page(folder, table, images, moving, missing):
         ),
         footer=html.escape(", ".join(f"{name} {value}" for name, value in table["versions"].items())),
     )
-
-
-def _image(data, kind, text):
-    return f'<img alt="{html.escape(text)}" src="data:image/{kind};base64,{base64.b64encode(data).decode()}">'
 
 
 def _failed(table):

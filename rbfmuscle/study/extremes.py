@@ -22,6 +22,7 @@ SHAPES = (1e-3, 1e-2, 0.1, 1.0, 10.0, 1e3)
 CENTRES = 200
 # Centres of a fit to values on the surface and off it, three a point; with normals as many would be 16,000 unknowns.
 MOST_VALUES = 4002
+OF_VALUES = f"{MOST_VALUES} centres, of values"
 HEADER = ("case", "kernel", "outcome", "error", "bound", "said")
 
 
@@ -90,7 +91,7 @@ def _cases():
     yield "1e6 from the origin", _ellipsoid(CENTRES, shift=1e6), 0.1
     for count in (4, 10, 50, 1000):
         yield f"{count} centres", _ellipsoid(count), {4: 1.0, 10: 1.0, 50: 0.5}.get(count, 0.05)
-    yield f"{MOST_VALUES} centres, of values", _ellipsoid(MOST_VALUES // 3), 0.05
+    yield OF_VALUES, _ellipsoid(MOST_VALUES // 3), 0.05
     for noise in (0.01, 0.1):
         yield f"{100 * noise:g} % noise on normals", _ellipsoid(CENTRES, noise=noise), 0.1
     points, normals, judge = _ellipsoid(CENTRES)
@@ -143,7 +144,7 @@ def _try(case, kernel, sample, shape, *, bound):
         warnings.simplefilter("always", NumericalWarning)
         try:
             apart = spacing(np.unique(np.asarray(points, dtype=float), axis=0)).mean()
-            if len(points) == MOST_VALUES // 3:
+            if case == OF_VALUES:
                 values = off_surface_points(points, normals)
                 field = RBFField.fit(*values, kernel=kernel, epsilon=shape / apart)
             else:

@@ -13,6 +13,7 @@ from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
 from rbfmuscle.sim.exact_distance import ExactDistance
+from rbfmuscle.study.metrics import mesh_volume
 from rbfmuscle.validation import SolveError
 
 # Nodes inside a muscle: 1 to 2.5 mm apart in the muscles of the hip.
@@ -142,9 +143,7 @@ def attachment_points(vertices, faces, attached, spacing):
 
 
 def _spacing(vertices, faces, nodes):
-    a, b, c = np.moveaxis((vertices - vertices.mean(axis=0))[faces], 1, 0)
-    volume = float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
-    return (volume / nodes) ** (1.0 / 3.0)
+    return (mesh_volume(vertices, faces) / nodes) ** (1.0 / 3.0)
 
 
 def _links(distance, spacing):

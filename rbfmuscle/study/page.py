@@ -1,5 +1,8 @@
 """The report's frame: markup, style and the words that explain it."""
 
+import base64
+import html
+
 STYLE = """
 :root{--ink:#26282b;--soft:#6a6f76;--line:#e5e3de;--paper:#fbfaf8;--accent:#a63d38}
 *{box-sizing:border-box}
@@ -62,3 +65,17 @@ PAGE = """<!doctype html>
 <footer>{versions}</footer>
 </main></body></html>
 """
+
+
+def embedded_image(data, kind, text):
+    """An ``img`` element that holds the picture itself.
+
+    Parameters
+    ----------
+    data : bytes
+    kind : str
+        Of image, as in its media type: png, webp, svg+xml.
+    text : str
+        What stands for the picture where it is not shown.
+    """
+    return f'<img alt="{html.escape(text)}" src="data:image/{kind};base64,{base64.b64encode(data).decode()}">'

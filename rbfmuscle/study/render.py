@@ -7,6 +7,7 @@ VTK may end the process where no graphics exist. So everything is saved first, t
 import json
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -106,6 +107,35 @@ def draw(directory, jobs, seconds=5.0, *, module="rbfmuscle.study.render"):
         raise MissingPartError(
             f"no pictures: {reason}; drawing needs OpenGL (a display, or Mesa's libegl1 and libgl1)"
         )
+
+
+def draw_pictures(directory, make_jobs, **how):
+    """Draw pictures to memory.
+
+    Parameters
+    ----------
+    directory : path
+    make_jobs : callable
+        ``make_jobs(folder)`` gives the jobs, whose PNG files go to that folder.
+    **how
+        As for `draw`.
+
+    Returns
+    -------
+    images : dict of str to bytes
+        The PNG files by their stems.
+    missing : MissingPartError or None
+        Why not all are drawn.
+    """
+    missing = None
+    with tempfile.TemporaryDirectory() as folder:
+        jobs = make_jobs(Path(folder))
+        if jobs:
+            try:
+                draw(directory, jobs, **how)
+            except MissingPartError as error:
+                missing = error
+        return {path.stem: path.read_bytes() for path in sorted(Path(folder).glob("*.png"))}, missing
 
 
 class Stage:

@@ -1,18 +1,15 @@
 """The report of a run: one HTML file with pictures, animation, plots and tables; no network needed."""
 
-import base64
 import html
 import math
-import tempfile
-from pathlib import Path
 
 from rbfmuscle.study.appearance import line_colours
 from rbfmuscle.study.metrics import QUANTITIES
-from rbfmuscle.study.page import EXPLANATION, PAGE, STYLE
+from rbfmuscle.study.page import EXPLANATION, PAGE, STYLE, embedded_image
 from rbfmuscle.study.plots import plot_panels
-from rbfmuscle.study.render import VIEWS, chosen_frames, draw
+from rbfmuscle.study.render import VIEWS, chosen_frames, draw_pictures
 from rbfmuscle.study.saved import SavedRun
-from rbfmuscle.validation import MissingPartError, SolveError
+from rbfmuscle.validation import SolveError
 
 _PICTURE_SIZE = (330, 400)
 _PREVIEW_SIZE = (330, 400)
@@ -45,16 +42,10 @@ def write_report(directory, *, report=True, preview=True, pictures=True):
         If the files cannot be written.
     """
     saved = SavedRun(directory)
-    missing, images = None, {}
     animation = saved.directory / "preview.webp"
-    with tempfile.TemporaryDirectory() as folder:
-        jobs = _jobs(saved, Path(folder), animation, report and pictures, preview)
-        if jobs:
-            try:
-                draw(saved.directory, jobs)
-            except MissingPartError as error:
-                missing = error
-        images = {path.stem: path.read_bytes() for path in sorted(Path(folder).glob("*.png"))}
+    images, missing = draw_pictures(
+        saved.directory, lambda folder: _jobs(saved, folder, animation, report and pictures, preview)
+    )
     if report:
         moving = animation.read_bytes() if animation.is_file() else None
         reason = str(missing) if missing else ("" if pictures else "pictures were switched off")
@@ -101,7 +92,7 @@ def _page(saved, images, moving, reason):
         pictures=_pictures(images, moving, reason),
         legend=_legend(saved),
         plots="".join(
-            f"<figure>{_image(data, 'svg+xml', title)}</figure>" for title, data in plot_panels(saved)
+            f"<figure>{embedded_image(data, 'svg+xml', title)}</figure>" for title, data in plot_panels(saved)
         ),
         table=_summary(saved),
         stages=_stages(saved),
@@ -156,15 +147,11 @@ def _pictures(images, moving, reason):
     if not images and moving is None:
         text = html.escape(reason or "this run kept no surfaces")
         return f'<p class="note">There are no pictures: {text}.</p>'
-    parts = [_image(data, "png", f"frame {int(name)}") for name, data in images.items()]
+    parts = [embedded_image(data, "png", f"frame {int(name)}") for name, data in images.items()]
     if moving is not None:
-        parts.insert(0, _image(moving, "webp", "the whole motion"))
+        parts.insert(0, embedded_image(moving, "webp", "the whole motion"))
     note = f'<p class="note">{html.escape(reason)}</p>' if reason else ""
     return note + "".join(f"<figure>{part}</figure>" for part in parts)
-
-
-def _image(data, kind, text):
-    return f'<img alt="{html.escape(text)}" src="data:image/{kind};base64,{base64.b64encode(data).decode()}">'
 
 
 def _legend(saved):
