@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.models import build_model
-from rbfmuscle.sim.scene import Scene
-from rbfmuscle.sim.simulate import simulate_frames
+from rbfmuscle.sim.loop.simulate import simulate_frames
+from rbfmuscle.sim.scene.scene import Scene
 
 MODELS = ("pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
 

@@ -16,8 +16,8 @@ import numpy as np
 
 import rbfmuscle as rm
 from rbfmuscle.models import build_model
-from rbfmuscle.sim.options import SlidingOptions
-from rbfmuscle.sim.simulate import simulate_frames
+from rbfmuscle.sim.loop.simulate import simulate_frames
+from rbfmuscle.sim.scene.options import SlidingOptions
 
 MOTIONS = ("flexion", "extension", "adduction", "internal_rotation", "external_rotation")
 WHOLE = 1000.0

@@ -20,15 +20,15 @@ from pathlib import Path
 
 import numpy as np
 
-from rbfmuscle.implicit.extraction import extract_surface
+from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.kernels import KERNELS
-from rbfmuscle.implicit.sampling import sample_surface
+from rbfmuscle.implicit.kernels.table import KERNELS
+from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import SPAN, spacing, surface_miss
 from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
-from rbfmuscle.muscle import MOST_WITH_ALL_DERIVATIVES
-from rbfmuscle.sim.meshes import read_mesh
-from rbfmuscle.study.mesh_distance import MeshDistance
+from rbfmuscle.model.muscle import MOST_WITH_ALL_DERIVATIVES
+from rbfmuscle.sim.scene.meshes import read_mesh
+from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.validation import NumericalWarning
 
 MUSCLES = ("gluteus_maximus", "gluteus_medius", "iliacus", "adductor_brevis")

@@ -15,11 +15,11 @@ import numpy as np
 
 from rbfmuscle.models import MODEL_NAMES
 from rbfmuscle.run import simulate
-from rbfmuscle.sim.attachments import signed_distances
-from rbfmuscle.sim.motion import bone_poses
-from rbfmuscle.sim.phantom import ATTACHED_ENDS, ATTACHED_WITHIN, MUSCLES, phantom_scene
-from rbfmuscle.sim.sdf import BoneSDF
-from rbfmuscle.study.metrics import mesh_volume, surface_distance
+from rbfmuscle.sim.distance.sdf import BoneSDF
+from rbfmuscle.sim.scene.attachments import signed_distances
+from rbfmuscle.sim.scene.motion import bone_poses
+from rbfmuscle.sim.scene.phantom import ATTACHED_ENDS, ATTACHED_WITHIN, MUSCLES, phantom_scene
+from rbfmuscle.study.measure.metrics import mesh_volume, surface_distance
 from rbfmuscle.validation import SolveError
 
 MUSCLE = "extensor"
@@ -90,7 +90,7 @@ class Course:
     """The solid on its way through the motion."""
 
     def __init__(self, cells):
-        from rbfmuscle.study.finite_element import HexSolid, brick_grid
+        from peers.finite_element import HexSolid, brick_grid
 
         self.scene = phantom_scene(end=max(ANGLES), step=STEP, spacing=SPACING)
         tube = MUSCLES[MUSCLE]

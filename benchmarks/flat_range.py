@@ -18,9 +18,9 @@ import numpy as np
 from scipy import linalg
 
 from rbfmuscle.implicit.field import RBFField, collocation, frame
-from rbfmuscle.implicit.fitting import solve_least_squares
-from rbfmuscle.implicit.flat_limit import FlatField
-from rbfmuscle.implicit.kernels import get_kernel
+from rbfmuscle.implicit.fit.fitting import solve_least_squares
+from rbfmuscle.implicit.fit.flat_limit import FlatField
+from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.validation import NumericalWarning, UsageError
 
 EPSILONS = (1.0, 0.5, 0.2, 0.05, 0.01)

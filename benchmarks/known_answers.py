@@ -15,9 +15,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
-from rbfmuscle.models import build_model
-from rbfmuscle.sim.known_scenes import (
+from peers.known_answers import (
+    bent_bar_errors,
+    centreline,
+    observed_order,
+    path_length,
+    richardson,
+    stretched_bar_errors,
+    wrapped_strip_errors,
+)
+from peers.known_scenes import (
     BENT_BAR,
     DRUM_RADIUS,
     ROUND_BAR,
@@ -27,18 +34,11 @@ from rbfmuscle.sim.known_scenes import (
     wrapped_path,
     wrapped_strip,
 )
-from rbfmuscle.sim.phantom import phantom_scene
-from rbfmuscle.sim.simulate import simulate_frames
-from rbfmuscle.study.known_answers import (
-    bent_bar_errors,
-    centreline,
-    observed_order,
-    path_length,
-    richardson,
-    stretched_bar_errors,
-    wrapped_strip_errors,
-)
-from rbfmuscle.study.metrics import surface_distance
+
+from rbfmuscle.models import build_model
+from rbfmuscle.sim.loop.simulate import simulate_frames
+from rbfmuscle.sim.scene.phantom import phantom_scene
+from rbfmuscle.study.measure.metrics import surface_distance
 
 CENTRES = (150, 300, 600, 1200)
 EVEN = {"name": "rbf", "placement": "even"}
@@ -154,7 +154,7 @@ def stretched_tables():
 
 def solid_table():
     """What the held ends do to a solid: an incompressible bar of bricks, pulled with its end faces held."""
-    from rbfmuscle.study.finite_element import HexSolid, brick_grid
+    from peers.finite_element import HexSolid, brick_grid
 
     print("\n### solid of bricks, stretch 1.3\n\n| bricks | radius_ends | volume |\n|---|---|---|")
     goal, steps, half = STRETCHES[-1], 10, 0.5 * ROUND_BAR.length

@@ -45,7 +45,7 @@ FINE = np.arange(0, 91, 2)
 def run_curves(path, model):
     """Length and moment arm of each muscle over flexion: dict of name to (angles, lengths, arms)."""
     from rbfmuscle.run import simulate
-    from rbfmuscle.sim.scene import Scene
+    from rbfmuscle.sim.scene.scene import Scene
 
     run = simulate(Scene.load(path), model=model)
     found = {}

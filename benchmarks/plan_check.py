@@ -17,8 +17,8 @@ PLAIN = {"output.report": False, "output.preview": False}
 
 
 def load(path, model, settings):
-    from rbfmuscle.sim.phantom import phantom_scene
-    from rbfmuscle.sim.scene import Scene
+    from rbfmuscle.sim.scene.phantom import phantom_scene
+    from rbfmuscle.sim.scene.scene import Scene
 
     scene = phantom_scene(model=model) if path == "-" else Scene.load(path)
     return scene.with_options(model=model, **PLAIN, **settings)
@@ -26,7 +26,7 @@ def load(path, model, settings):
 
 def planned(path, model, settings):
     from rbfmuscle.models import estimate_model
-    from rbfmuscle.sim.plan import plan_scene
+    from rbfmuscle.sim.plan.plan import plan_scene
 
     made = plan_scene(load(path, model, settings), estimate_model)
     return {
@@ -57,7 +57,7 @@ def measured(path, model, settings):
 
 
 def field_memory(scene):
-    from rbfmuscle.sim.reach import build_fields, reached_bones
+    from rbfmuscle.sim.plan.reach import build_fields, reached_bones
 
     return float(sum(field.memory for field in build_fields(scene, reached_bones(scene)).values()))
 

@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from rbfmuscle.implicit.extraction import extract_surface
+from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.sampling import sample_surface
-from rbfmuscle.sim.phantom import phantom_scene
-from rbfmuscle.sim.scene import Scene
-from rbfmuscle.sim.sdf import BoneSDF
+from rbfmuscle.implicit.placement.sampling import sample_surface
+from rbfmuscle.sim.distance.sdf import BoneSDF
+from rbfmuscle.sim.scene.phantom import phantom_scene
+from rbfmuscle.sim.scene.scene import Scene
 
 PEERS = ("scipy", "libigl", "trimesh", "pyPBD", "PyMCubes", "vtk", "scikit-image")
 MODULES = {"libigl": "igl", "PyMCubes": "mcubes", "pyPBD": "pypbd", "scikit-image": "skimage"}
@@ -201,7 +201,7 @@ def _igl_distance(igl, points, vertices, faces):
 def bench_deformation(table, name, scene, muscle):
     """One frame of the mesh muscle against pyPBD's distance constraints and libigl's ARAP iterations."""
     from rbfmuscle.models import build_model
-    from rbfmuscle.sim.live import LiveSession
+    from rbfmuscle.sim.loop.live import LiveSession
 
     alone = scene.copy()
     alone.muscles = [scene.muscle(muscle)]

@@ -108,8 +108,8 @@ def write_scene_reference(root):
     root : pathlib.Path
     """
     from pbd_baseline.options import PBDOptions
-    from rbfmuscle.options import CHOICES, RANGES, RBFOptions
-    from rbfmuscle.sim.scene_file import SceneFile
+    from rbfmuscle.model.options import CHOICES, RANGES, RBFOptions
+    from rbfmuscle.sim.scene.file import SceneFile
 
     schema, mesh_models = SceneFile.model_json_schema(), PBDOptions.model_json_schema()
     lines = [

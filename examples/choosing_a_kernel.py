@@ -12,11 +12,11 @@ import numpy as np
 from pictures import folder, plot
 
 import rbfmuscle as rm
-from rbfmuscle.implicit.extraction import extract_surface
-from rbfmuscle.implicit.kernels import KERNELS
-from rbfmuscle.implicit.sampling import sample_surface
+from rbfmuscle.implicit.extraction.surface import extract_surface
+from rbfmuscle.implicit.kernels.table import KERNELS
+from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import spacing_epsilon
-from rbfmuscle.study.metrics import surface_distance
+from rbfmuscle.study.measure.metrics import surface_distance
 
 out = folder("choosing_a_kernel")
 mesh = rm.phantom_scene().muscle("abductor").mesh

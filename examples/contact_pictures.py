@@ -16,10 +16,10 @@ from PIL import Image
 
 import rbfmuscle as rm
 from rbfmuscle.models import build_model
-from rbfmuscle.sim.contact import BoneContacts
-from rbfmuscle.sim.lane import Lane
-from rbfmuscle.sim.motion import bone_poses
-from rbfmuscle.sim.options import ContactOptions, DetectOptions, SlidingOptions, TunnellingOptions
+from rbfmuscle.sim.loop.contact import BoneContacts
+from rbfmuscle.sim.loop.lane import Lane
+from rbfmuscle.sim.scene.motion import bone_poses
+from rbfmuscle.sim.scene.options import ContactOptions, DetectOptions, SlidingOptions, TunnellingOptions
 
 out = folder("contact_pictures")
 pyvista.OFF_SCREEN = True

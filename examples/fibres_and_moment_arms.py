@@ -9,7 +9,7 @@ import numpy as np
 from pictures import folder, plot
 
 import rbfmuscle as rm
-from rbfmuscle.sim.motion import bone_poses
+from rbfmuscle.sim.scene.motion import bone_poses
 
 out = folder("fibres_and_moment_arms")
 scene = rm.phantom_scene(step=10.0).with_options(**{"output.fibres": {"count": 60, "segments": 15}})

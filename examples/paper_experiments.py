@@ -19,14 +19,14 @@ from pathlib import Path
 import numpy as np
 
 from pbd_baseline.muscle import PBDMuscle
-from rbfmuscle.sim.contact import BoneContacts
-from rbfmuscle.sim.motion import bone_poses
-from rbfmuscle.sim.options import TunnellingOptions
-from rbfmuscle.sim.phantom import phantom_scene
-from rbfmuscle.sim.reach import Pace, build_fields, reached_bones
-from rbfmuscle.sim.scene import Scene
-from rbfmuscle.sim.tunnelling import find_crossings
-from rbfmuscle.study.penetration import BoneProbe, bone_depth, surface_depth
+from rbfmuscle.sim.loop.contact import BoneContacts
+from rbfmuscle.sim.loop.tunnelling import find_crossings
+from rbfmuscle.sim.plan.reach import Pace, build_fields, reached_bones
+from rbfmuscle.sim.scene.motion import bone_poses
+from rbfmuscle.sim.scene.options import TunnellingOptions
+from rbfmuscle.sim.scene.phantom import phantom_scene
+from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.study.measure.penetration import BoneProbe, bone_depth, surface_depth
 
 AS_PRINTED = {
     "method": "pbd",

@@ -6,7 +6,7 @@ Not an example itself.
 import sys
 from pathlib import Path
 
-from rbfmuscle.study.render import render_run
+from rbfmuscle.study.show.render import render_run
 from rbfmuscle.validation import MissingPartError
 
 

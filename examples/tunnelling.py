@@ -12,9 +12,9 @@ from pictures import folder, plot
 
 import rbfmuscle as rm
 from rbfmuscle.models import build_model
-from rbfmuscle.sim.contact import BoneContacts
-from rbfmuscle.sim.lane import Lane
-from rbfmuscle.sim.options import DetectOptions, TunnellingOptions
+from rbfmuscle.sim.loop.contact import BoneContacts
+from rbfmuscle.sim.loop.lane import Lane
+from rbfmuscle.sim.scene.options import DetectOptions, TunnellingOptions
 
 out = folder("tunnelling")
 scene = rm.phantom_scene()

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 
 from pbd_baseline.topology import colour
-from rbfmuscle.sim.harmonic import cotangent_laplacian
+from rbfmuscle.geometry.harmonic import cotangent_laplacian
 
 # Newton steps for the rotations: warm starts need one or two, a turn by 30 degrees at once four.
 ROTATION_STEPS = 8

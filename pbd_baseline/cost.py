@@ -2,7 +2,7 @@
 
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.rest import weights_are_kept
-from rbfmuscle.sim.forecast import MuscleCost
+from rbfmuscle.sim.plan.forecast import MuscleCost
 
 # Of each method: calls and visits for a vertex of one sweep; of the contacts and the volume after the last one.
 SWEEP = {
@@ -31,7 +31,7 @@ def estimate_muscle(muscle, scene, rates, **options):
     muscle : Muscle
     scene : Scene
     rates : dict of str to float
-        From `rbfmuscle.sim.rates.measure_rates`.
+        From `rbfmuscle.sim.plan.rates.measure_rates`.
     **options
         See `PBDOptions`.
 

@@ -5,7 +5,7 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
-from rbfmuscle.sim.harmonic import cotangent_laplacian, surface_gradient
+from rbfmuscle.geometry.harmonic import cotangent_laplacian, surface_gradient
 
 # Pieces of polyline that speak for one place.
 NEAREST = 6

@@ -3,7 +3,7 @@
 import numba
 import numpy as np
 
-from rbfmuscle.sim.harmonic import blended_motion
+from rbfmuscle.geometry.harmonic import blended_motion
 
 
 def carry(points, weights, motions):

@@ -10,7 +10,7 @@ from pbd_baseline.motion import carry
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.rest import Rest
 from pbd_baseline.shapes import SHAPES
-from rbfmuscle.sim.simulate import ModelSurface
+from rbfmuscle.sim.loop.simulate import ModelSurface
 
 # Bones are looked for within this distance [mm] of the vertices as predicted, and as swept.
 REACH = 6.0
@@ -23,7 +23,7 @@ STEP_ANGLE = math.radians(2.0)
 
 
 class PBDMuscle:
-    """A mesh muscle of any of the paper's kinds; implements ``rbfmuscle.sim.simulate.MuscleModel``.
+    """A mesh muscle of any of the paper's kinds; implements ``rbfmuscle.sim.loop.simulate.MuscleModel``.
 
     Parameters
     ----------

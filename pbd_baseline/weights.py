@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
-from rbfmuscle.sim.harmonic import harmonic_weights
+from rbfmuscle.geometry.harmonic import harmonic_weights
 
 POWER = 4.0
 ROUNDS = 8

@@ -8,23 +8,23 @@ import importlib
 __version__ = "0.1.0"
 
 _HOME = {
-    "BoneSDF": "rbfmuscle.sim.sdf",
-    "FlatField": "rbfmuscle.implicit.flat_limit",
+    "BoneSDF": "rbfmuscle.sim.distance.sdf",
+    "FlatField": "rbfmuscle.implicit.fit.flat_limit",
     "LimitExceededError": "rbfmuscle.validation",
     "MeshError": "rbfmuscle.validation",
     "MissingPartError": "rbfmuscle.validation",
     "NumericalWarning": "rbfmuscle.validation",
     "RBFField": "rbfmuscle.implicit.field",
-    "RBFMuscle": "rbfmuscle.muscle",
+    "RBFMuscle": "rbfmuscle.model.muscle",
     "RBFMuscleError": "rbfmuscle.validation",
     "Run": "rbfmuscle.run",
-    "Scene": "rbfmuscle.sim.scene",
+    "Scene": "rbfmuscle.sim.scene.scene",
     "SceneError": "rbfmuscle.validation",
     "SolveError": "rbfmuscle.validation",
     "compare_models": "rbfmuscle.compare",
-    "phantom_scene": "rbfmuscle.sim.phantom",
+    "phantom_scene": "rbfmuscle.sim.scene.phantom",
     "simulate": "rbfmuscle.run",
-    "study_kernels": "rbfmuscle.study.kernel_study",
+    "study_kernels": "rbfmuscle.study.experiment.kernel_study",
 }
 
 __all__ = [*_HOME, "__version__"]

@@ -5,17 +5,17 @@ from pathlib import Path
 
 from rbfmuscle.models import MODEL_NAMES, build_models, check_model_name
 from rbfmuscle.run import stream_run
-from rbfmuscle.sim.motion import Motion
-from rbfmuscle.sim.options import OutputOptions
-from rbfmuscle.sim.simulate import simulate_frames
-from rbfmuscle.study.comparison import (
+from rbfmuscle.sim.loop.simulate import simulate_frames
+from rbfmuscle.sim.scene.motion import Motion
+from rbfmuscle.sim.scene.options import OutputOptions
+from rbfmuscle.study.experiment.comparison import (
     ModelProbe,
     add_distances,
     chosen_poses,
     measure_run,
     write_tables,
 )
-from rbfmuscle.study.saved import SavedRun
+from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.validation import SolveError, UsageError
 
 # The motion is repeated with steps this many times as long.
@@ -73,7 +73,7 @@ def compare_models(
     matrix = add_distances(results, folder, poses)
     table = write_tables(folder, next(iter(variants.values())), results, failed, matrix, poses)
 
-    from rbfmuscle.study.comparison_page import write_page
+    from rbfmuscle.study.show.comparison_page import write_page
 
     missing = write_page(folder, table, pictures=pictures)
     if missing is not None:

@@ -8,7 +8,7 @@ from rbfmuscle.validation import SceneError, UsageError
 
 # Name: module, class, options that the name itself stands for.
 _HOME = {
-    "rbf": ("rbfmuscle.muscle", "RBFMuscle", {}),
+    "rbf": ("rbfmuscle.model.muscle", "RBFMuscle", {}),
     "pbd": ("pbd_baseline.muscle", "PBDMuscle", {"method": "pbd"}),
     "xpbd": ("pbd_baseline.muscle", "PBDMuscle", {"method": "xpbd"}),
     "arap-pbd": ("pbd_baseline.muscle", "PBDMuscle", {"method": "arap-pbd"}),
@@ -19,7 +19,7 @@ _HOME = {
 MODEL_NAMES = tuple(_HOME)
 
 # What says beforehand how much a model takes, by the module that holds the model.
-_COST = {"rbfmuscle.muscle": "rbfmuscle.cost", "pbd_baseline.muscle": "pbd_baseline.cost"}
+_COST = {"rbfmuscle.model.muscle": "rbfmuscle.model.cost", "pbd_baseline.muscle": "pbd_baseline.cost"}
 
 
 def build_model(muscle, scene, name=None):
@@ -53,7 +53,7 @@ def estimate_model(muscle, scene, rates):
     muscle : Muscle
     scene : Scene
     rates : dict of str to float
-        From `rbfmuscle.sim.rates.measure_rates`.
+        From `rbfmuscle.sim.plan.rates.measure_rates`.
 
     Returns
     -------

@@ -7,13 +7,13 @@ from datetime import UTC, datetime
 import numpy as np
 
 from rbfmuscle.models import build_models
-from rbfmuscle.sim.lane import Event
-from rbfmuscle.sim.scene_check import bone_collisions, bone_findings, check_initial
-from rbfmuscle.sim.simulate import simulate_frames
-from rbfmuscle.study.metrics import MetricsRecorder
-from rbfmuscle.study.runinfo import Stages, build_info
-from rbfmuscle.study.summary import LIMITS, Summary, default_limit, parse_limits, require_limits
-from rbfmuscle.study.writer import RunWriter
+from rbfmuscle.sim.loop.lane import Event
+from rbfmuscle.sim.loop.simulate import simulate_frames
+from rbfmuscle.sim.scene.check import bone_collisions, bone_findings, check_initial
+from rbfmuscle.study.files.runinfo import Stages, build_info
+from rbfmuscle.study.files.writer import RunWriter
+from rbfmuscle.study.measure.metrics import MetricsRecorder
+from rbfmuscle.study.measure.summary import LIMITS, Summary, default_limit, parse_limits, require_limits
 from rbfmuscle.validation import RBFMuscleError, SceneWarning, SolveError, UsageError
 
 
@@ -82,7 +82,7 @@ def stream_run(
     settings : dict, optional
         Dotted keys with their values.
     fail_on : str, list of str or dict, optional
-        Limits, see `rbfmuscle.study.summary.parse_limits`.
+        Limits, see `rbfmuscle.study.measure.summary.parse_limits`.
     pictures : bool
         Draw pictures for the report and the preview.
     watch : callable, optional
@@ -149,7 +149,7 @@ def _finish(course, writer, limits, pictures):
     missing = None
     with course.timed("report"):
         if output.report or output.preview:
-            from rbfmuscle.study.report import write_report
+            from rbfmuscle.study.show.report import write_report
 
             missing = write_report(
                 writer.directory, report=output.report, preview=output.preview and pictures, pictures=pictures
@@ -351,7 +351,7 @@ class _Course:
 
 
 def _fibre_study(scene, carried):
-    from rbfmuscle.study.fibre_study import FibreStudy
+    from rbfmuscle.study.measure.fibre_study import FibreStudy
 
     return FibreStudy(scene, carried)
 

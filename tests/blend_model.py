@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from rbfmuscle.sim.harmonic import harmonic_weights
-from rbfmuscle.sim.options import OutputOptions
-from rbfmuscle.sim.scene import Scene
-from rbfmuscle.sim.simulate import ModelSurface
+from rbfmuscle.geometry.harmonic import harmonic_weights
+from rbfmuscle.sim.loop.simulate import ModelSurface
+from rbfmuscle.sim.scene.options import OutputOptions
+from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.validation import SolveError
 
 

@@ -28,7 +28,7 @@ def hip_data():
 @pytest.fixture(scope="session")
 def hip_scene(hip_data):
     """The flexion scene of the real hip, loaded once; copy before changing it."""
-    from rbfmuscle.sim.scene import Scene
+    from rbfmuscle.sim.scene.scene import Scene
 
     return Scene.load(hip_data / "flexion.toml")
 

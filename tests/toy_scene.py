@@ -6,9 +6,9 @@ import numba
 import numpy as np
 import trimesh
 
-from rbfmuscle.sim.motion import Motion
-from rbfmuscle.sim.options import ContactOptions, DetectOptions
-from rbfmuscle.sim.simulate import ModelSurface
+from rbfmuscle.sim.loop.simulate import ModelSurface
+from rbfmuscle.sim.scene.motion import Motion
+from rbfmuscle.sim.scene.options import ContactOptions, DetectOptions
 
 
 class AnalyticBone:

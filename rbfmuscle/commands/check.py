@@ -22,7 +22,7 @@ def check(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", nega
         Print JSON and nothing else.
     """
     from rbfmuscle.models import check_models
-    from rbfmuscle.sim.scene import Scene
+    from rbfmuscle.sim.scene.scene import Scene
 
     loaded = Scene.load(scene)
     check_models(loaded)
@@ -41,10 +41,10 @@ def check(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", nega
 
 def _field_notes(scene):
     """What the distance fields of the bones have to say: open meshes, meshes that intersect themselves."""
-    from rbfmuscle.sim.scene_check import Finding
-    from rbfmuscle.sim.sdf import BoneSDF
+    from rbfmuscle.sim.distance.sdf import BoneSDF
+    from rbfmuscle.sim.scene.check import Finding
 
-    logger = logging.getLogger("rbfmuscle.sim.sdf")
+    logger = logging.getLogger("rbfmuscle.sim.distance.sdf")
     level, found = logger.level, []
     logger.setLevel(logging.ERROR)  # what it would say is said by the findings
     try:

@@ -55,7 +55,7 @@ def compare(
     """
     from rbfmuscle.compare import compare_models
     from rbfmuscle.models import MODEL_NAMES
-    from rbfmuscle.sim.settings import parse_setting
+    from rbfmuscle.sim.scene.settings import parse_setting
 
     names = [name.strip() for name in models.split(",") if name.strip()] if models else list(MODEL_NAMES)
     changes = dict(parse_setting(text) for text in settings or [])

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rbfmuscle.sim.attachments import signed_distances
-from rbfmuscle.sim.meshes import MESH_SUFFIXES, read_mesh
+from rbfmuscle.sim.scene.attachments import signed_distances
+from rbfmuscle.sim.scene.meshes import MESH_SUFFIXES, read_mesh
 from rbfmuscle.validation import MeshError, UsageError
 
 BONE_WORDS = frozenset(

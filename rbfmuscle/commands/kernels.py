@@ -66,8 +66,8 @@ def kernels(
         Print JSON and nothing else.
     """
     from rbfmuscle.implicit.selection import CRITERIA
-    from rbfmuscle.study.kernel_page import write_study
-    from rbfmuscle.study.kernel_study import study_kernels
+    from rbfmuscle.study.experiment.kernel_study import study_kernels
+    from rbfmuscle.study.show.kernel_page import write_study
 
     if derivatives not in ("all", "normal") or criterion not in CRITERIA:
         raise UsageError(f"derivatives must be all or normal, criterion {', '.join(CRITERIA)}; "
@@ -103,7 +103,7 @@ def _split(texts):
 
 
 def _extremes(names, output, as_json):
-    from rbfmuscle.study.extremes import extremes_matrix, study_extremes, write_extremes
+    from rbfmuscle.study.experiment.extremes import extremes_matrix, study_extremes, write_extremes
 
     with Progress("extremes", what="fit") as bar:
         rows = study_extremes(kernels=names, progress=bar)
@@ -114,9 +114,9 @@ def _extremes(names, output, as_json):
 
 def _surface(source, muscle):
     """Scene or None, the mesh to fit, and its name."""
-    from rbfmuscle.sim.meshes import read_mesh
-    from rbfmuscle.sim.phantom import phantom_scene
-    from rbfmuscle.sim.scene import Scene
+    from rbfmuscle.sim.scene.meshes import read_mesh
+    from rbfmuscle.sim.scene.phantom import phantom_scene
+    from rbfmuscle.sim.scene.scene import Scene
 
     if source != "phantom" and Path(source).suffix.lower() != ".toml":
         return None, read_mesh(source).mesh, Path(source).stem

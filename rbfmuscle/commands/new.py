@@ -29,7 +29,7 @@ def new(
         Replace a file that exists.
     """
     from rbfmuscle.commands.guess import guess_scene
-    from rbfmuscle.sim.scene import Scene
+    from rbfmuscle.sim.scene.scene import Scene
 
     output = output or mesh_dir / "scene.toml"
     if output.exists() and not force:

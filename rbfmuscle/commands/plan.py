@@ -18,8 +18,8 @@ def plan(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", negat
         Print JSON and nothing else.
     """
     from rbfmuscle.models import check_models, estimate_model
-    from rbfmuscle.sim.plan import plan_scene
-    from rbfmuscle.sim.scene import Scene
+    from rbfmuscle.sim.plan.plan import plan_scene
+    from rbfmuscle.sim.scene.scene import Scene
 
     loaded = Scene.load(scene)
     check_models(loaded)

@@ -42,7 +42,7 @@ def demo(
     as_json
         Print JSON and nothing else.
     """
-    from rbfmuscle.sim.phantom import phantom_scene
+    from rbfmuscle.sim.scene.phantom import phantom_scene
 
     _run_scene(
         phantom_scene(), output, model=model, frames=frames, settings={}, fail_on=None, as_json=as_json
@@ -79,8 +79,8 @@ def run(
         Print JSON and nothing else.
     """
     from rbfmuscle.models import check_models
-    from rbfmuscle.sim.scene import Scene
-    from rbfmuscle.sim.settings import parse_setting
+    from rbfmuscle.sim.scene.scene import Scene
+    from rbfmuscle.sim.scene.settings import parse_setting
 
     changes = dict(parse_setting(text) for text in settings or [])
     loaded = Scene.load(scene)

@@ -7,10 +7,10 @@ PHANTOM = "phantom"
 
 def load_scene(scene):
     """The scene of a file, or the embedded hip for "phantom" where there is no file of that name."""
-    from rbfmuscle.sim.scene import Scene
+    from rbfmuscle.sim.scene.scene import Scene
 
     if str(scene) == PHANTOM and not Path(scene).exists():
-        from rbfmuscle.sim.phantom import phantom_scene
+        from rbfmuscle.sim.scene.phantom import phantom_scene
 
         return phantom_scene()
     return Scene.load(Path(scene))

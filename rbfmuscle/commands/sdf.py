@@ -36,8 +36,8 @@ def sdf(
     as_json
         Print JSON and nothing else.
     """
-    from rbfmuscle.sim.meshes import read_mesh
-    from rbfmuscle.study.sdf_report import report_lines, sdf_report
+    from rbfmuscle.sim.scene.meshes import read_mesh
+    from rbfmuscle.study.show.sdf_report import report_lines, sdf_report
     from rbfmuscle.validation import UsageError
 
     output = Path(f"{mesh.stem}_sdf.png") if output is None else output

@@ -32,8 +32,8 @@ def export(
     ascii
         VTP as text, as OpenSim reads it.
     """
-    from rbfmuscle.sim.settings import parse_slice
-    from rbfmuscle.study.export import export_run
+    from rbfmuscle.sim.scene.settings import parse_slice
+    from rbfmuscle.study.files.export import export_run
 
     chosen = parse_slice(frames) if frames is not None else None
     written = export_run(directory, formats, output=output, units=units, frames=chosen, ascii=ascii)
@@ -64,7 +64,7 @@ def render(
     seconds
         Length of an animation.
     """
-    from rbfmuscle.study.render import render_run
+    from rbfmuscle.study.show.render import render_run
 
     render_run(directory, output, frame=frame, views=view, seconds=seconds)
     print(output)

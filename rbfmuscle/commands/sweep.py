@@ -66,12 +66,12 @@ def sweep(
     as_json
         Print JSON and nothing else.
     """
-    from rbfmuscle.study.sweep import SweepFolder, check_key, parse_task
-    from rbfmuscle.study.sweep_points import VALUES
+    from rbfmuscle.study.experiment.sweep import SweepFolder, check_key, parse_task
+    from rbfmuscle.study.experiment.sweep_points import VALUES
 
     check_key(error, VALUES)
     if merge:
-        from rbfmuscle.study.sweep_table import merge_sweeps
+        from rbfmuscle.study.experiment.sweep_table import merge_sweeps
 
         if scene or grid or task:
             raise UsageError("--merge takes the folders of a sweep, no scene, grid or task")
@@ -96,9 +96,9 @@ def run_point(scene, settings, frames):
 
 def _measure(scene, output, grid, model, frames, reference, jobs, scheduler, part, retry):
     from rbfmuscle.models import check_models
-    from rbfmuscle.sim.settings import parse_setting
-    from rbfmuscle.study.sweep import parse_grid, plan_sweep
-    from rbfmuscle.study.sweep_points import SweepRunner
+    from rbfmuscle.sim.scene.settings import parse_setting
+    from rbfmuscle.study.experiment.sweep import parse_grid, plan_sweep
+    from rbfmuscle.study.experiment.sweep_points import SweepRunner
 
     axes = parse_grid(grid or [])
     loaded = load_scene(scene).with_options(model=model)
@@ -131,8 +131,8 @@ def _finish_task(plan, measured, output, as_json):
 
 
 def _finish(plan, output, error, as_json):
-    from rbfmuscle.study.sweep_page import write_page
-    from rbfmuscle.study.sweep_table import write_table
+    from rbfmuscle.study.experiment.sweep_table import write_table
+    from rbfmuscle.study.show.sweep_page import write_page
 
     table = write_table(plan, output, quantity=error)
     write_page(table, output)

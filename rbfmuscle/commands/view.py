@@ -44,9 +44,9 @@ def view(
     screenshot
         Write the window to this PNG as soon as it stands at --at, and close it.
     """
-    from rbfmuscle.study.saved import SavedRun
-    from rbfmuscle.study.viewer import COLOURINGS
-    from rbfmuscle.study.window import Window, require_display
+    from rbfmuscle.study.files.saved import SavedRun
+    from rbfmuscle.study.show.viewer import COLOURINGS
+    from rbfmuscle.study.show.window import Window, require_display
 
     stops = [_parse_stop(text) for text in at or []]
     if colour not in COLOURINGS:
@@ -77,7 +77,7 @@ def _parse_stop(text):
 
 
 def _begin_at(viewer, stops):
-    from rbfmuscle.sim.options import did_you_mean
+    from rbfmuscle.sim.scene.options import did_you_mean
 
     for name, value in stops:
         known = list(viewer.coordinates) if viewer.live else ["frame"]
@@ -90,15 +90,15 @@ def _begin_at(viewer, stops):
 
 
 def _open_saved(run):
-    from rbfmuscle.study.viewer import SavedViewer
+    from rbfmuscle.study.show.viewer import SavedViewer
 
     return SavedViewer(run), None, f"rbfmuscle: {run.directory}"
 
 
 def _open_scene(loaded, model):
     from rbfmuscle.models import build_models
-    from rbfmuscle.sim.live import LiveSession
-    from rbfmuscle.study.viewer import LiveViewer
+    from rbfmuscle.sim.loop.live import LiveSession
+    from rbfmuscle.study.show.viewer import LiveViewer
 
     scene = loaded.with_options(model=model)
     scene.validate()

@@ -10,8 +10,8 @@ import numba
 import numpy as np
 from numba import njit
 
-from rbfmuscle.implicit.radial import _radial_loop
-from rbfmuscle.implicit.values import _add_values_loop
+from rbfmuscle.implicit.kernels.radial import _radial_loop
+from rbfmuscle.implicit.kernels.values import _add_values_loop
 
 _BLOCK = 256
 _SERIAL = 400_000  # pairs below which starting threads does not pay

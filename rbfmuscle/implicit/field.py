@@ -9,13 +9,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from rbfmuscle.implicit import assembly
-from rbfmuscle.implicit.cross_validation import LeastSquaresPath
 from rbfmuscle.implicit.evaluation import evaluate
-from rbfmuscle.implicit.fitting import Basis, solve, solve_least_squares
-from rbfmuscle.implicit.kernels import get_kernel
-from rbfmuscle.implicit.off_surface import off_surface_points
-from rbfmuscle.implicit.regularisation import basis_smoothing, resolve_smoothing
+from rbfmuscle.implicit.fit import assembly
+from rbfmuscle.implicit.fit.cross_validation import LeastSquaresPath
+from rbfmuscle.implicit.fit.fitting import Basis, solve, solve_least_squares
+from rbfmuscle.implicit.fit.regularisation import basis_smoothing, resolve_smoothing
+from rbfmuscle.implicit.kernels.table import get_kernel
+from rbfmuscle.implicit.placement.off_surface import off_surface_points
 from rbfmuscle.validation import (
     NumericalWarning,
     UsageError,
@@ -260,7 +260,7 @@ class RBFField:
         """Zero set as a closed outward ``trimesh.Trimesh``; resolution in cells along the longest side."""
         import trimesh
 
-        from rbfmuscle.implicit.extraction import extract_surface
+        from rbfmuscle.implicit.extraction.surface import extract_surface
 
         result = extract_surface(self, points=self.centres, resolution=resolution)
         return trimesh.Trimesh(result.vertices, result.faces, process=False)

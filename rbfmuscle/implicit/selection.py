@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.implicit.cross_validation import LeastSquaresPath, SmoothingPath, leave_one_out
 from rbfmuscle.implicit.field import RBFField, _check_degree, collocation, frame, hermite_system
-from rbfmuscle.implicit.fitting import DOUBTFUL, Basis, solve
-from rbfmuscle.implicit.kernels import get_kernel
-from rbfmuscle.implicit.regularisation import check_criterion, search_smoothing
+from rbfmuscle.implicit.fit.cross_validation import LeastSquaresPath, SmoothingPath, leave_one_out
+from rbfmuscle.implicit.fit.fitting import DOUBTFUL, Basis, solve
+from rbfmuscle.implicit.fit.regularisation import check_criterion, search_smoothing
+from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.validation import (
     NumericalWarning,
     UsageError,

@@ -4,10 +4,10 @@ import warnings
 
 import numpy as np
 
-from rbfmuscle.implicit.extraction import extract_surface
+from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.kernels import get_kernel
-from rbfmuscle.implicit.off_surface import off_surface_points
+from rbfmuscle.implicit.kernels.table import get_kernel
+from rbfmuscle.implicit.placement.off_surface import off_surface_points
 from rbfmuscle.implicit.selection import SPAN, EpsilonChoice, believed, choose_epsilon, spacing
 from rbfmuscle.validation import NumericalWarning
 

@@ -1,0 +1,1 @@
+"""References that only benchmarks and tests use."""

@@ -1,0 +1,1 @@
+"""Arithmetic on arrays that every room may use: triangles, nearest points, weights, frames. A leaf."""

@@ -1,0 +1,352 @@
+"""Exact signed distance to a triangle mesh: a bounding volume tree with angle-weighted pseudonormals.
+
+The tree is a balanced binary heap over triangles in an order that halves them along the longest extent. Its
+shape does not depend on positions, so a deforming mesh is refitted without a rebuild.
+"""
+
+import numba
+import numpy as np
+
+from rbfmuscle.geometry.threads import in_chunks
+from rbfmuscle.geometry.triangles import (
+    BX,
+    CORNER,
+    CX,
+    CY,
+    EDGE,
+    FACE,
+    FIRST,
+    INVERSE_BC,
+    INVERSE_CA,
+    WIDTH,
+    fill_pseudonormals,
+    fill_records,
+    nearest_in_frame,
+    opposite_faces,
+    vertex_faces,
+)
+from rbfmuscle.validation import check_mesh, check_points
+
+# Triangles in a leaf, at most.
+LEAF = 4
+# Deeper than any tree that fits in memory.
+STACK = 64
+
+
+class ExactDistance:
+    """Signed distance, nearest point and nearest face of a closed triangle mesh.
+
+    Parameters
+    ----------
+    mesh : trimesh.Trimesh or pair of (n, 3) vertices and (m, 3) faces
+        Outward faces; vertices are shared by index. The sign is exact where the mesh is closed and
+        consistently oriented, and that of the nearest face elsewhere.
+
+    Raises
+    ------
+    MeshError
+        If the mesh is empty, has non-finite vertices or indices out of range.
+
+    Notes
+    -----
+    About 5 ms to build for 10,000 triangles, 1 ms to refit, and 1 microsecond a point near the surface.
+    """
+
+    def __init__(self, mesh):
+        vertices, faces = (mesh.vertices, mesh.faces) if hasattr(mesh, "faces") else mesh
+        vertices, faces = check_mesh(np.asarray(vertices), np.asarray(faces))
+        self.faces = faces
+        self.order = np.arange(len(faces))
+        depth = max(0, int(np.ceil(np.log2(len(faces) / LEAF))))
+        self.starts = np.zeros((1 << depth) + 1, dtype=np.int64)
+        _order_loop(vertices[faces].mean(axis=1), self.order, depth, self.starts)
+        start, around = vertex_faces(faces, len(vertices))
+        self.across = opposite_faces(faces, start, around)
+        self.records = np.empty((len(faces), WIDTH))
+        self.boxes = np.empty((2 << depth, 6))
+        self.edge_normals = np.empty((len(faces), 3, 3))
+        self.vertex_normals = np.empty((len(vertices), 3))
+        self._fit(vertices)
+
+    def refit(self, vertices):
+        """Take new positions (n, 3) of the same vertices; the tree keeps its shape."""
+        vertices = check_points(vertices, name="vertices")
+        if len(vertices) != len(self.vertices):
+            raise ValueError(f"refit needs the same {len(self.vertices)} vertices, got {len(vertices)}")
+        self._fit(vertices)
+
+    def _fit(self, vertices):
+        self.vertices = vertices
+        fill_records(vertices, self.faces, self.order, self.records)
+        fill_pseudonormals(vertices, self.faces, self.across, self.edge_normals, self.vertex_normals)
+        _box_loop(vertices, self.faces, self.order, self.starts, self.boxes)
+
+    @property
+    def closed(self):
+        """Whether every edge has exactly one face on each side, with consistent orientation."""
+        return bool((self.across >= 0).all())
+
+    @property
+    def tree(self):
+        """The arrays that :func:`nearest_triangle` takes: boxes, starts of the leaves, records."""
+        return self.boxes, self.starts, self.records
+
+    def signed_distance(self, points, *, reach=np.inf):
+        """Signed distance, (n,) [unit of the mesh], negative inside; ``reach`` where the mesh is further.
+
+        Parameters
+        ----------
+        points : (n, 3) array_like
+        reach : float
+            Distances beyond it are not looked for, which is much faster.
+        """
+        return self.nearest(points, reach=reach)[0]
+
+    def closest_point(self, points):
+        """Nearest point on the surface, (n, 3)."""
+        return self.nearest(points)[1]
+
+    def nearest(self, points, *, reach=np.inf):
+        """Signed distance (n,), nearest point (n, 3), nearest face (n,) and the sign's pseudonormal (n, 3).
+
+        Where the mesh is further away than ``reach`` these are ``reach``, the point itself, -1 and zero.
+        """
+        points = check_points(points)
+        if not reach > 0.0:
+            raise ValueError(f"reach must be above zero, got {reach}")
+        count = len(points)
+        distance, closest = np.empty(count), np.empty((count, 3))
+        face, normal = np.empty(count, dtype=np.int64), np.empty((count, 3))
+        normals = (self.edge_normals, self.vertex_normals, self.faces, self.order)
+
+        def work(a, b):
+            out = (distance[a:b], closest[a:b], face[a:b], normal[a:b])
+            _nearest_loop(points[a:b], float(reach), self.tree, normals, out)
+
+        in_chunks(count, work)
+        return distance, closest, face, normal
+
+
+@numba.njit(cache=True, nogil=True)
+def _order_loop(centres, order, depth, starts):
+    """Order triangles so that each node of the heap holds a range, halved along its longest extent."""
+    count = len(order)
+    leaves = 1 << depth
+    for leaf in range(leaves + 1):
+        starts[leaf] = count * leaf // leaves
+    for level in range(depth):
+        step = leaves >> level
+        for node in range(1 << level):
+            low, high = starts[node * step], starts[(node + 1) * step]
+            middle = starts[node * step + step // 2]
+            axis = _longest_axis(centres, order, low, high)
+            _select(centres[:, axis], order, low, high - 1, middle)
+
+
+@numba.njit(cache=True, nogil=True)
+def _longest_axis(centres, order, low, high):
+    longest, axis = -1.0, 0
+    for k in range(3):
+        least, most = np.inf, -np.inf
+        for n in range(low, high):
+            value = centres[order[n], k]
+            least, most = min(least, value), max(most, value)
+        if most - least > longest:
+            longest, axis = most - least, k
+    return axis
+
+
+@numba.njit(cache=True, nogil=True)
+def _select(keys, order, left, right, middle):
+    """Hoare's selection: afterwards no key before ``middle`` is greater than one after it."""
+    while left < right:
+        pivot = keys[order[(left + right) // 2]]
+        i, j = left, right
+        while i <= j:
+            while keys[order[i]] < pivot:
+                i += 1
+            while keys[order[j]] > pivot:
+                j -= 1
+            if i <= j:
+                order[i], order[j] = order[j], order[i]
+                i += 1
+                j -= 1
+        if middle <= j:
+            right = j
+        elif middle >= i:
+            left = i
+        else:
+            return
+
+
+@numba.njit(cache=True, nogil=True)
+def _box_loop(vertices, faces, order, starts, boxes):
+    """Boxes of all nodes, from the leaves up; a leaf without triangles keeps an empty box."""
+    leaves = len(starts) - 1
+    for leaf in range(leaves):
+        box = boxes[leaves + leaf]
+        box[:3], box[3:] = np.inf, -np.inf
+        for n in range(starts[leaf], starts[leaf + 1]):
+            for k in range(3):
+                for j in range(3):
+                    value = vertices[faces[order[n], k], j]
+                    box[j], box[3 + j] = min(box[j], value), max(box[3 + j], value)
+    for node in range(leaves - 1, 0, -1):
+        for j in range(3):
+            boxes[node, j] = min(boxes[2 * node, j], boxes[2 * node + 1, j])
+            boxes[node, 3 + j] = max(boxes[2 * node, 3 + j], boxes[2 * node + 1, 3 + j])
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _box_square(boxes, node, x, y, z):
+    dx = max(boxes[node, 0] - x, x - boxes[node, 3], 0.0)
+    dy = max(boxes[node, 1] - y, y - boxes[node, 4], 0.0)
+    dz = max(boxes[node, 2] - z, z - boxes[node, 5], 0.0)
+    return dx * dx + dy * dy + dz * dz
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def record_square(records, n, x, y, z):
+    """Squared distance from a point to the triangle of record n."""
+    qx, qy, qz = x - records[n, 0], y - records[n, 1], z - records[n, 2]
+    u = qx * records[n, 3] + qy * records[n, 4] + qz * records[n, 5]
+    v = qx * records[n, 6] + qy * records[n, 7] + qz * records[n, 8]
+    w = qx * records[n, 9] + qy * records[n, 10] + qz * records[n, 11]
+    du, dv, _ = nearest_in_frame(
+        records[n, BX], records[n, CX], records[n, CY], records[n, INVERSE_BC], records[n, INVERSE_CA], u, v
+    )
+    return du * du + dv * dv + w * w
+
+
+@numba.njit(cache=True, nogil=True)
+def record_feature(records, n, x, y, z):
+    """Feature of the triangle of record n (FACE, EDGE + k, CORNER + k) that is nearest to a point."""
+    qx, qy, qz = x - records[n, 0], y - records[n, 1], z - records[n, 2]
+    u = qx * records[n, 3] + qy * records[n, 4] + qz * records[n, 5]
+    v = qx * records[n, 6] + qy * records[n, 7] + qz * records[n, 8]
+    bx, cx, cy = records[n, BX], records[n, CX], records[n, CY]
+    return nearest_in_frame(bx, cx, cy, records[n, INVERSE_BC], records[n, INVERSE_CA], u, v)[2]
+
+
+@numba.njit(cache=True, nogil=True)
+def nearest_triangle(boxes, starts, records, order, x, y, z, best, square, slack, nodes, squares):
+    """Record of the triangle nearest to a point, and the squared distance.
+
+    Parameters
+    ----------
+    boxes, starts, records, order
+        The tree, and the face of each record.
+    x, y, z : float
+        The point.
+    best, square : int, float
+        A record known to be as near as this, or -1 and the squared reach.
+    slack : float
+        Of triangles whose squared distances differ by a smaller share, that of the least face number is taken, so
+        that rounding and the order of the questions decide nothing.
+    nodes, squares : (STACK,) arrays of int64 and float64
+        Working space.
+    """
+    leaves = len(starts) - 1
+    top = 0
+    nodes[0], squares[0] = 1, _box_square(boxes, 1, x, y, z)
+    while top >= 0:
+        node = nodes[top]
+        top -= 1
+        if squares[top + 1] > square * (1.0 + slack):
+            continue
+        while node < leaves:
+            left = _box_square(boxes, 2 * node, x, y, z)
+            right = _box_square(boxes, 2 * node + 1, x, y, z)
+            node = 2 * node
+            far, other = right, node + 1
+            if right < left:
+                far, other = left, node
+                node += 1
+            if far <= square * (1.0 + slack):
+                top += 1
+                nodes[top], squares[top] = other, far
+            if min(left, right) > square * (1.0 + slack):
+                break
+        if node < leaves:
+            continue
+        for n in range(starts[node - leaves], starts[node - leaves + 1]):
+            d = record_square(records, n, x, y, z)
+            if d < square * (1.0 - slack):
+                best, square = n, d
+            elif d <= square * (1.0 + slack) and best >= 0 and order[n] < order[best]:
+                best, square = n, min(d, square)
+    return best, square
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest_loop(points, reach, tree, normals, out):
+    boxes, starts, records = tree
+    order = normals[3]
+    distance, closest, face, normal = out
+    nodes, squares = np.empty(STACK, np.int64), np.empty(STACK)
+    best = -1
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        square = reach * reach
+        if best >= 0:
+            # The last answer bounds the next one where points come in order.
+            d = record_square(records, best, x, y, z)
+            if d < square:
+                square = d
+            else:
+                best = -1
+        best, square = nearest_triangle(
+            boxes, starts, records, order, x, y, z, best, square, 0.0, nodes, squares
+        )
+        if best < 0:
+            distance[i], face[i] = reach, -1
+            closest[i] = points[i]
+            normal[i] = 0.0
+            continue
+        face[i] = order[best]
+        side = signed_side(records[best], order[best], points[i], normals, closest[i], normal[i])
+        distance[i] = np.sqrt(square) if side >= 0.0 else -np.sqrt(square)
+
+
+@numba.njit(cache=True, nogil=True)
+def signed_side(record, face, point, normals, closest, normal):
+    """Fill the nearest point of a triangle and its pseudonormal; return the offset's part along it.
+
+    ``normals`` holds the edge normals, the vertex normals, the faces and their order.
+    """
+    edge_normals, vertex_normals, faces, _ = normals
+    feature = _closest_in_record(record, point, closest)
+    _pseudonormal(record, feature, face, edge_normals, vertex_normals, faces, normal)
+    side = 0.0
+    for k in range(3):
+        side += (point[k] - closest[k]) * normal[k]
+    return side
+
+
+@numba.njit(cache=True, nogil=True)
+def _closest_in_record(record, point, closest):
+    """Fill the point of one triangle that is nearest to a point; return its feature."""
+    u, v, w = 0.0, 0.0, 0.0
+    for k in range(3):
+        u += (point[k] - record[k]) * record[3 + k]
+        v += (point[k] - record[k]) * record[6 + k]
+        w += (point[k] - record[k]) * record[9 + k]
+    du, dv, feature = nearest_in_frame(
+        record[BX], record[CX], record[CY], record[INVERSE_BC], record[INVERSE_CA], u, v
+    )
+    for k in range(3):
+        closest[k] = record[k] + (u - du) * record[3 + k] + (v - dv) * record[6 + k]
+    return feature
+
+
+@numba.njit(cache=True, nogil=True)
+def _pseudonormal(record, feature, face, edge_normals, vertex_normals, faces, normal):
+    """Fill the direction that signs the distance to one feature of a face."""
+    first = int(record[FIRST])
+    for k in range(3):
+        if feature == FACE:
+            normal[k] = record[9 + k]
+        elif feature < CORNER:
+            normal[k] = edge_normals[face, (first + feature - EDGE) % 3, k]
+        else:
+            normal[k] = vertex_normals[faces[face, (first + feature - CORNER) % 3], k]

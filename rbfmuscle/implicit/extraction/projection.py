@@ -1,0 +1,173 @@
+"""Vertices of an extracted mesh moved onto the surface itself, and with its level to a wanted volume."""
+
+import numba
+import numpy as np
+
+from rbfmuscle.implicit.extraction.obstacles import push_off_points
+
+
+class Projector:
+    """Vertices on their way to the zero set of max(f - level, -d).
+
+    ``near_cut`` (n,) marks the vertices that may lie on or come to the cut.
+    """
+
+    def __init__(self, field, cut, vertices, spacing, near_cut):
+        self.vertices = vertices
+        self.spacing = spacing
+        self._field = with_gradient(field, 1e-4 * spacing)
+        self._cut = None if cut is None else with_gradient_below(cut, 1e-4 * spacing)
+        self._near_cut = near_cut
+        self.slope = np.zeros(len(vertices))
+        self._direction = np.zeros_like(vertices)
+
+    def project(self, level, rounds=6):
+        """Newton steps until they are shorter than 1e-4 of a cell."""
+        on_field = np.ones(len(self.vertices), dtype=bool)
+        todo = np.arange(len(self.vertices))
+        for _ in range(rounds):
+            x = self.vertices[todo]
+            f, gradient = self._field(x)
+            step, slope = np.empty_like(x), np.empty(len(x))
+            _newton_loop(f, np.ascontiguousarray(gradient), level, todo, step, slope, self._direction)
+            self.slope[todo] = slope
+            if self._cut is not None:
+                self._turn_to_cut(x, todo, (f - level) * slope, step, on_field)
+            # Newton squares the error: what moved by less than 1 % of a cell is there.
+            unsettled = np.empty(len(x), dtype=np.bool_)
+            _step_loop(todo, step, self.spacing, self.vertices, unsettled)
+            todo = todo[unsettled]
+            if len(todo) == 0:
+                break
+        self._direction[~on_field] = 0.0
+        self.slope[~on_field] = 0.0
+
+    def _turn_to_cut(self, x, todo, height, step, on_field):
+        """Replace the steps of vertices that lie on the cut; marks which lie on the field's own surface."""
+        rows = np.flatnonzero(self._near_cut[todo])
+        if len(rows) == 0:
+            return
+        distance, outward = self._cut(x[rows], -height[rows])
+        on_cut = height[rows] < -distance
+        on_field[todo[rows]] = ~on_cut
+        rows, distance, outward = rows[on_cut], distance[on_cut], outward[on_cut]
+        size = np.maximum(np.einsum("ij,ij->i", outward, outward), np.finfo(float).tiny)
+        step[rows] = -(distance / size)[:, None] * outward
+
+    def volume_step(self, faces, target, steps=1):
+        """Change of level that brings the mesh to the target volume, its vertices moving along their directions.
+
+        By Newton steps on the volume, a cubic polynomial of the change.
+        """
+        c0, c1, c2, c3 = _volume_terms_loop(self.vertices, faces, self.vertices.mean(axis=0), self._direction)
+        change = 0.0
+        for _ in range(steps):
+            lack = target - (c0 + change * (c1 + change * (c2 + change * c3)))
+            if lack == 0.0:
+                break
+            rate = c1 + change * (2.0 * c2 + change * 3.0 * c3)
+            if not rate > 0:
+                raise ValueError(
+                    f"no level gives a volume of {target:g}: the cut leaves no surface of the field"
+                )
+            change += lack / rate
+        return change
+
+    def push_off(self, faces, points, grid, tolerance):
+        """Move the vertices around points that came through a triangle; these no longer follow the level."""
+        for _ in range(2):
+            moved = np.flatnonzero(push_off_points(self.vertices, faces, points, grid, tolerance))
+            self._direction[moved] = 0.0
+            self.slope[moved] = 0.0
+            if self._cut is None or len(moved) == 0:
+                break
+            # What was pushed off one bone vertex must not end in the bone beside it.
+            distance, outward = self._cut(self.vertices[moved], np.zeros(len(moved)))
+            inside = distance < 0.0
+            if not inside.any():
+                break
+            distance, outward = distance[inside], outward[inside]
+            size = np.maximum(np.einsum("ij,ij->i", outward, outward), 1e-12)
+            self.vertices[moved[inside]] -= (distance / size)[:, None] * outward
+
+    def shift(self, step):
+        """Move the vertices as the level set moves with its level, to first order."""
+        self.vertices = self.vertices + step * self._direction
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _newton_loop(f, gradient, level, rows, step, slope, direction):
+    """Newton steps onto f = level, 1 / |g|, and the vertices' motions g / |g|^2 for a change of level."""
+    for n in range(len(rows)):
+        square = gradient[n, 0] ** 2 + gradient[n, 1] ** 2 + gradient[n, 2] ** 2
+        square = max(square, 2.3e-308)
+        slope[n] = 1.0 / np.sqrt(square)
+        for a in range(3):
+            direction[rows[n], a] = gradient[n, a] / square
+            step[n, a] = (level - f[n]) * direction[rows[n], a]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _step_loop(rows, step, spacing, vertices, unsettled):
+    """Take the steps, none longer than a cell."""
+    for n in range(len(rows)):
+        length = np.sqrt(step[n, 0] ** 2 + step[n, 1] ** 2 + step[n, 2] ** 2)
+        share = min(1.0, spacing / max(length, 1e-300))
+        for a in range(3):
+            vertices[rows[n], a] += share * step[n, a]
+        unsettled[n] = length > 1e-2 * spacing
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _triple(x, y):
+    """The cross product of the two vectors in x, times y."""
+    (a, b, c), (d, e, f) = x
+    return (b * f - c * e) * y[0] + (c * d - a * f) * y[1] + (a * e - b * d) * y[2]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _volume_terms_loop(x, faces, origin, direction):
+    """Coefficients of the enclosed volume as a cubic polynomial of the way along the directions."""
+    c0, c1, c2, c3 = 0.0, 0.0, 0.0, 0.0
+    for n in range(len(faces)):
+        i, j, k = faces[n, 0], faces[n, 1], faces[n, 2]
+        p = (x[i, 0] - origin[0], x[i, 1] - origin[1], x[i, 2] - origin[2])
+        q = (x[j, 0] - origin[0], x[j, 1] - origin[1], x[j, 2] - origin[2])
+        r = (x[k, 0] - origin[0], x[k, 1] - origin[1], x[k, 2] - origin[2])
+        u = (direction[i, 0], direction[i, 1], direction[i, 2])
+        v = (direction[j, 0], direction[j, 1], direction[j, 2])
+        w = (direction[k, 0], direction[k, 1], direction[k, 2])
+        c0 += _triple((p, q), r)
+        c1 += _triple((p, q), w) + _triple((q, r), u) + _triple((r, p), v)
+        c2 += _triple((u, v), r) + _triple((v, w), p) + _triple((w, u), q)
+        c3 += _triple((u, v), w)
+    return c0 / 6.0, c1 / 6.0, c2 / 6.0, c3 / 6.0
+
+
+def with_gradient(function, step):
+    """``points -> (values, gradients)`` of a callable: its own, or central differences."""
+    if hasattr(function, "value_and_gradient"):
+        return function.value_and_gradient
+
+    def differences(points):
+        offsets = step * np.vstack([np.eye(3), -np.eye(3)])
+        around = function((points[None] + offsets[:, None]).reshape(-1, 3)).reshape(6, -1)
+        return function(points), ((around[:3] - around[3:]) / (2 * step)).T
+
+    return differences
+
+
+def with_gradient_below(function, step):
+    """``(points, limit) -> (values, gradients)`` of a callable, only sure where a value is below its limit (n,)."""
+    if hasattr(function, "value_and_gradient_below"):
+        return function.value_and_gradient_below
+    both = with_gradient(function, step)
+
+    def below(points, limit):
+        value, gradient = function(points), np.zeros_like(points)
+        rows = np.flatnonzero(value < limit)
+        if len(rows):
+            value[rows], gradient[rows] = both(points[rows])
+        return value, gradient
+
+    return below

@@ -1,0 +1,264 @@
+"""From a field to a closed triangle mesh of wanted volume, cut by bones.
+
+The surface is the zero set of F = max(f - s, -d): f the field (negative inside), s the level, d the distance
+to the bones (negative inside them). A band follows it through the grid, marching cubes gives its topology,
+and Newton steps put each vertex onto the zero set itself: all that is left of the grid is the chords.
+"""
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from rbfmuscle.implicit.extraction.band import Band, BandGrid
+from rbfmuscle.implicit.extraction.obstacles import CHORD, points_near_cells
+from rbfmuscle.implicit.extraction.projection import Projector
+from rbfmuscle.validation import check_finite, check_points, check_positive
+
+
+@dataclass(frozen=True)
+class ExtractedSurface:
+    """A closed outward mesh and how it came about.
+
+    Attributes
+    ----------
+    vertices : (n, 3) ndarray
+        World positions [scene unit].
+    faces : (m, 3) ndarray
+    level : float
+        Level s of the field that was extracted.
+    volume : float
+        Enclosed by the mesh [scene unit cubed].
+    components : int
+        Sheets found in the cells that were visited.
+    spurious : int
+        Sheets found but left out, open ones included.
+    spacing : float
+        Edge of a grid cell.
+    evaluations : int
+        Grid nodes at which the field was evaluated.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    level: float
+    volume: float
+    components: int
+    spurious: int
+    spacing: float
+    evaluations: int
+
+
+def extract_surface(
+    field, *, points, resolution=48, cut=None, volume=None, level=0.0, keep="largest", search="band",
+    axes=None, obstacles=None, obstacle_tolerance=None,
+):  # fmt: skip
+    """Extract the zero set of max(field - level, -cut) as a closed mesh.
+
+    Parameters
+    ----------
+    field : callable
+        ``(n, 3) -> (n,)`` values, negative inside. Its method ``value_and_gradient`` is used if it has one.
+    points : (n, 3) array_like
+        Predicted surface points, where the search starts; also give the grid's extent [scene unit].
+    resolution : int
+        Grid cells along the longest side of the points' box.
+    cut : callable, optional
+        ``(n, 3) -> (n,)`` distances, negative inside what is to be cut away; beyond 1.2 cells any lower
+        bound of more than that will do. ``value_and_gradient`` as above, or ``value_and_gradient_below(points, limit)``
+        that need be right only where the value is below its limit.
+    volume : float, optional
+        Wanted volume of the mesh; the level is then moved from ``level`` until the mesh has it, to 1e-9.
+    level : float
+        Level of the field, or the first guess of it.
+    keep : {"largest", "all"}
+        The closed sheet of largest volume, or all of them.
+    search : {"band", "box"}
+        Follow the surface from the points, or visit the whole box (finds every spurious sheet in it).
+    axes : (3, 3) array_like, optional
+        Rotation whose rows are the grid's axes. In a frame that moves with the scene the mesh does too.
+    obstacles : list of pairs of ObstaclePoints and (4, 4) ndarrays, optional
+        Vertices of the bones behind ``cut``, each bone in its own coordinates with its pose: triangles whose
+        chords cut across a convex bone are moved until no vertex is inside the mesh by more than the tolerance.
+    obstacle_tolerance : float, optional
+        By default 1 % of a grid cell [scene unit].
+
+    Returns
+    -------
+    ExtractedSurface
+
+    Raises
+    ------
+    ValueError
+        On bad arguments, NaN in field or cut, an empty level set, or one that is not closed within three
+        times the box of the points; on a volume that no level reaches.
+    """
+    points = check_points(points)
+    level = float(level)
+    check_finite(np.array([level]), name="level")
+    if keep not in ("largest", "all") or search not in ("band", "box"):
+        raise ValueError(f"keep must be largest or all, search band or box, got {keep!r} and {search!r}")
+    target = None if volume is None else check_positive(volume, name="volume")
+    padding = 3
+    while True:
+        grid = BandGrid.around(points, resolution=resolution, padding=padding, axes=axes)
+        band = Band(grid, field, cut)
+        _start(band, points, level, search)
+        tolerance = 0.01 * grid.spacing if obstacle_tolerance is None else float(obstacle_tolerance)
+        surface = _reach_volume(band, target, level, keep, (obstacles or [], tolerance))
+        if surface is not None:
+            return surface
+        if padding >= resolution:
+            raise ValueError(
+                "the level set is open: it leaves three times the box of the points; "
+                "check normals (all outward?), or fit with more centres"
+            )
+        padding = min(4 * padding, int(resolution))
+
+
+def _start(band, points, level, search):
+    """Visit first cells until some are crossed."""
+    if search == "box":
+        band.visit_all()
+    else:
+        band.seed(points)
+    band.grow(level)
+    while not band.crosses(level):
+        if not band.widen():
+            raise ValueError(
+                f"the level set is empty: field - {level:g} has one sign in the whole box of the points; "
+                "check the points' place, the sign of the field and the level"
+            )
+        band.grow(level)
+
+
+def _reach_volume(band, target, level, keep, obstacles):
+    """Mesh at the level that gives the target volume; None where the surface leaves the grid."""
+    spacing = band.grid.spacing
+    for _ in range(20):
+        if target is not None and not band.crosses(level):
+            raise ValueError(f"no level gives a volume of {target:g}: the level set is empty at {level:g}")
+        band.grow(level)
+        found = _closed_sheets(band, level, keep)
+        if found is None:
+            return None
+        vertices, faces, near_cut, components, spurious = found
+        projector = Projector(band.field, band.cut, vertices, spacing, near_cut)
+        projector.project(level)
+        if target is None:
+            break
+        step = projector.volume_step(faces, target)
+        for _ in range(4):
+            # Small steps move the vertices along the gradient; a large one needs another mesh.
+            if np.abs(step * projector.slope).max() > 0.25 * spacing:
+                break
+            level += step
+            projector.shift(step)
+            if np.abs(step * projector.slope).max() < 2e-3 * spacing:
+                return _finish(band, projector, faces, target, level, components, spurious, obstacles)
+            projector.project(level)
+            step = projector.volume_step(faces, target)
+        largest = np.abs(projector.slope).max()
+        level += float(np.clip(step, -spacing / largest, spacing / largest))
+    else:
+        raise ValueError(f"no level gives a volume of {target:g}; is it the volume of the surface fitted?")
+    return _finish(band, projector, faces, target, level, components, spurious, obstacles)
+
+
+def _finish(band, projector, faces, target, level, components, spurious, obstacles):
+    bones, tolerance = obstacles
+    if bones:
+        points = points_near_cells(bones, band.grid, band.state, band.cells)
+        points = points[band.field(points) - level < CHORD * band.grid.spacing]
+        projector.push_off(faces, points, band.grid, tolerance)
+    if target is not None:
+        step = projector.volume_step(faces, target, steps=3)
+        level += step
+        projector.shift(step)
+    vertices = projector.vertices
+    check_finite(vertices, name="extracted vertices")
+    return ExtractedSurface(
+        vertices,
+        faces,
+        level,
+        mesh_volume(vertices, faces),
+        components,
+        spurious,
+        band.grid.spacing,
+        band.node_count,
+    )
+
+
+def _closed_sheets(band, level, keep):
+    """Vertices, faces, which are near the cut, number of sheets and of those left out; None where open."""
+    coordinates, faces, on_border, near_cut = band.march(level)
+    label, sheets = _label_sheets_loop(faces, len(coordinates))
+    volume = _sheet_volumes_loop(coordinates, faces, label, coordinates.mean(axis=0), np.zeros(sheets))
+    size = np.bincount(label, minlength=sheets)
+    is_open = np.bincount(label, on_border, sheets) > 0
+    closed = np.flatnonzero(~is_open)
+    if len(closed) == 0 or (is_open.any() and size[is_open].max() > size[closed].max()):
+        return None
+    if keep == "all":
+        chosen = ~is_open
+    else:
+        chosen = np.zeros(sheets, dtype=bool)
+        chosen[closed[np.argmax(volume[closed])]] = True
+    if chosen.all():
+        return band.grid.positions(coordinates), faces, near_cut, sheets, 0
+    used = chosen[label]
+    number = np.cumsum(used) - 1
+    faces = number[faces[used[faces[:, 0]]]]
+    vertices = band.grid.positions(coordinates[used])
+    return vertices, faces, near_cut[used], sheets, sheets - int(chosen.sum())
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _label_sheets_loop(faces, size):
+    """Connected sheets of a triangle mesh: label of each vertex, and their number."""
+    parent = np.arange(size)
+    for f in range(len(faces)):
+        a = faces[f, 0]
+        while parent[a] != a:
+            parent[a] = parent[parent[a]]
+            a = parent[a]
+        for k in range(1, 3):
+            b = faces[f, k]
+            while parent[b] != b:
+                parent[b] = parent[parent[b]]
+                b = parent[b]
+            if a < b:
+                parent[b] = a
+            elif b < a:
+                parent[a] = b
+                a = b
+    label = np.empty(size, dtype=np.int64)
+    count = 0
+    for v in range(size):
+        # Parents come before their children, so their labels are known.
+        if parent[v] == v:
+            label[v] = count
+            count += 1
+        else:
+            label[v] = label[parent[v]]
+    return label, count
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _sheet_volumes_loop(x, faces, label, origin, out):
+    """Add the signed volumes of the tetrahedra under all triangles to those of their sheets, out."""
+    for f in range(len(faces)):
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        px, py, pz = x[i, 0] - origin[0], x[i, 1] - origin[1], x[i, 2] - origin[2]
+        qx, qy, qz = x[j, 0] - origin[0], x[j, 1] - origin[1], x[j, 2] - origin[2]
+        rx, ry, rz = x[k, 0] - origin[0], x[k, 1] - origin[1], x[k, 2] - origin[2]
+        out[label[i]] += (
+            px * (qy * rz - qz * ry) + py * (qz * rx - qx * rz) + pz * (qx * ry - qy * rx)
+        ) / 6.0
+    return out
+
+
+def mesh_volume(vertices, faces):
+    """Volume enclosed by a closed outward mesh."""
+    label = np.zeros(len(vertices), dtype=np.int64)
+    return float(_sheet_volumes_loop(vertices, faces, label, vertices.mean(axis=0), np.zeros(1))[0])

@@ -1,0 +1,1 @@
+"""From centres and values to weights: systems, factors, conditions, cross-validation."""

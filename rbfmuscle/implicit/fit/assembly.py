@@ -1,0 +1,147 @@
+"""Matrices of RBF systems.
+
+Unknowns of a Hermite fit are grouped: all values, then all x-, y- and z-derivatives (or all normal
+derivatives), so that every column of every block is one contiguous run. Only the lower triangle (Fortran
+order) is filled.
+"""
+
+import numpy as np
+from numba import njit
+
+from rbfmuscle.implicit.kernels.radial import _radial_loop
+from rbfmuscle.implicit.kernels.values import _add_values_loop
+
+
+def exponents(degree):
+    """Exponents (q, 3) of the monomials of total degree up to ``degree``; (0, 3) for degree -1."""
+    rows = [
+        (i, j, total - i - j)
+        for total in range(degree + 1)
+        for i in range(total, -1, -1)
+        for j in range(total - i, -1, -1)
+    ]
+    return np.array(rows, dtype=np.int64).reshape(-1, 3)
+
+
+def monomials(points, powers):
+    """Monomials at points: (q, n)."""
+    out = np.ones((len(powers), len(points)))
+    for row, power in zip(out, powers):
+        for axis in range(3):
+            if power[axis]:
+                row *= points[:, axis] ** power[axis]
+    return out
+
+
+def monomial_gradients(points, powers):
+    """Derivatives of the monomials at points: (3, q, n)."""
+    out = np.zeros((3, len(powers), len(points)))
+    for axis in range(3):
+        lower = powers.copy()
+        lower[:, axis] -= 1
+        some = lower[:, axis] >= 0
+        out[axis, some] = powers[some, axis, None] * monomials(points, lower[some])
+    return out
+
+
+def monomial_hessians(points, powers):
+    """Second derivatives of the monomials at points: (3, 3, q, n)."""
+    out = np.zeros((3, 3, len(powers), len(points)))
+    for axis in range(3):
+        lower = powers.copy()
+        lower[:, axis] -= 1
+        some = lower[:, axis] >= 0
+        out[axis][:, some] = powers[some, axis, None] * monomial_gradients(points, lower[some])
+    return out
+
+
+def hermite_polynomials(points, powers):
+    """Polynomial block (q, 4n): values, then the three derivatives, at each point."""
+    return np.hstack([monomials(points, powers), *monomial_gradients(points, powers)])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _offsets_loop(x, j, scale2, first, d, u):
+    """d (3, m) = x[:, first + i] - x[:, j], u = squared length times scale2."""
+    for i in range(u.size):
+        dx = x[0, first + i] - x[0, j]
+        dy = x[1, first + i] - x[1, j]
+        dz = x[2, first + i] - x[2, j]
+        d[0, i] = dx
+        d[1, i] = dy
+        d[2, i] = dz
+        u[i] = (dx * dx + dy * dy + dz * dz) * scale2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _value_matrix_loop(x, epsilon, base, parameter, compact, table, out):
+    """out[j, i] = phi(|x_i - x_j|), both halves, as whole rows are filled faster; x is (3, n)."""
+    for j in range(x.shape[1]):
+        column = out[j]
+        column[:] = 0.0
+        centre = x[0, j], x[1, j], x[2, j]
+        _add_values_loop(base, parameter, compact, table[0], x, *centre, epsilon * epsilon, 1.0, column)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _hermite_matrix_loop(x, epsilon, base, parameter, compact, table, out):
+    """Lower triangle of the Hermite matrix; out[column, row] is its transpose.
+
+    Blocks: (value, value) phi; (d/dx_c, value) first * d_c;
+    (d/dx_c, d/dx_e) -(first * delta + second * d_c d_e).
+    """
+    n = x.shape[1]
+    e2 = epsilon * epsilon
+    d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((3, n)), np.empty((4, n))
+    for j in range(n):
+        _offsets_loop(x, j, e2, 0, d, u)
+        _radial_loop(base, parameter, compact, table, 7, u, work, radial)
+        phi, first, second = radial[0], radial[1], radial[2]
+        column = out[j]
+        for i in range(j, n):
+            column[i] = phi[i]
+        for c in range(3):
+            target, dc = column[(c + 1) * n : (c + 2) * n], d[c]
+            for i in range(n):
+                target[i] = e2 * first[i] * dc[i]
+        for e in range(3):
+            de = d[e]
+            column = out[(e + 1) * n + j]
+            for i in range(j, n):
+                column[(e + 1) * n + i] = -e2 * (first[i] + e2 * second[i] * de[i] * de[i])
+            for c in range(e + 1, 3):
+                target, dc = column[(c + 1) * n : (c + 2) * n], d[c]
+                for i in range(n):
+                    target[i] = -e2 * e2 * second[i] * dc[i] * de[i]
+
+
+def normal_polynomials(points, normals, powers):
+    """Polynomial block (q, 2n): values, then derivatives along the normals, at each point."""
+    along = np.einsum("cqn,nc->qn", monomial_gradients(points, powers), normals)
+    return np.hstack([monomials(points, powers), along])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _normal_matrix_loop(x, normals, epsilon, base, parameter, compact, table, out):
+    """As `_hermite_matrix_loop`, with the derivative along the unit normal (3, n) alone.
+
+    Blocks: (value, value) phi; (normal i, value j) first (d . n_i);
+    (normal i, normal j) -(first n_i . n_j + second (d . n_i)(d . n_j)).
+    """
+    n = x.shape[1]
+    e2 = epsilon * epsilon
+    d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((3, n)), np.empty((4, n))
+    for j in range(n):
+        _offsets_loop(x, j, e2, 0, d, u)
+        _radial_loop(base, parameter, compact, table, 7, u, work, radial)
+        phi, first, second = radial[0], radial[1], radial[2]
+        value, slope = out[j], out[n + j]
+        nx, ny, nz = normals[0, j], normals[1, j], normals[2, j]
+        for i in range(j, n):
+            value[i] = phi[i]
+        for i in range(n):
+            at_i = d[0, i] * normals[0, i] + d[1, i] * normals[1, i] + d[2, i] * normals[2, i]
+            at_j = d[0, i] * nx + d[1, i] * ny + d[2, i] * nz
+            both = nx * normals[0, i] + ny * normals[1, i] + nz * normals[2, i]
+            value[n + i] = e2 * first[i] * at_i
+            slope[n + i] = -e2 * (first[i] * both + e2 * second[i] * at_i * at_j)

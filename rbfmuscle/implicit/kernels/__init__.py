@@ -1,0 +1,1 @@
+"""The radial kernels: their facts, and the loops that evaluate them."""

@@ -1,0 +1,292 @@
+"""The radial kernels: one table row holds every fact about one kernel.
+
+Every kernel is a function of ``s = epsilon * r``. With ``u = s**2`` the radial functions that gradients,
+Hessians and Hermite fits need are ``2**k d^k phi / du^k``::
+
+    k = 0   phi
+    k = 1   first   phi'/r
+    k = 2   second  (phi'' - phi'/r) / r**2
+    k = 3   third   second'/r
+
+All of them, for all kernels, have the form ``s**j * (base(s) * A(s) + B(s))`` with polynomials A and B of
+degree four at most. A row lists j, A and B for k = 0 ... 3; the loops in ``radial.py`` know the bases and
+no kernel.
+
+Sources: Fasshauer, *Meshfree Approximation Methods with MATLAB* (2007); Wendland (1995); Buhmann (2000);
+SciPy's ``RBFInterpolator`` for names and signs. ``skala_cervenka`` is second-hand: the formula r^2 (r^a - 1)
+was not checked against the original of 2019, and neither was the default exponent.
+"""
+
+import difflib
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from rbfmuscle.implicit.kernels import radial
+from rbfmuscle.validation import UsageError, check_finite
+
+_TERMS = 5
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """One row of the kernel table.
+
+    Attributes
+    ----------
+    name : str
+    id : int
+        Row number in the table.
+    order : int
+        Order m of conditional positive definiteness; polynomials of degree m - 1 must be added.
+    compact : bool
+        Whether phi vanishes for r >= 1/epsilon.
+    smoothness : int
+        phi is C^k at the origin; 99 stands for infinitely often.
+    has_epsilon : bool
+        False where epsilon only rescales the weights (polyharmonic kernels).
+    parameter : float
+        The kernel's own exponent (beta, a), 0 where it has none.
+    """
+
+    name: str
+    id: int
+    order: int
+    compact: bool
+    smoothness: int
+    has_epsilon: bool
+    parameter: float
+    base: int = field(repr=False)
+    table: np.ndarray = field(repr=False, compare=False)
+
+    @property
+    def hermite(self):
+        """Whether phi is smooth enough (C2) for a fit to points and normals."""
+        return self.smoothness >= 2
+
+    @property
+    def degree(self):
+        """Least polynomial degree, -1 for none."""
+        return self.order - 1
+
+    def phi(self, r, epsilon=1.0):
+        """Kernel at distances r (any shape), shape parameter epsilon [1/length]."""
+        return self._radial(r, epsilon, 0)
+
+    def first(self, r, epsilon=1.0):
+        """phi'(r)/r, with its limit at r = 0 (which is infinite for kernels that are not C2)."""
+        return self._radial(r, epsilon, 1)
+
+    def second(self, r, epsilon=1.0):
+        """(phi'' - phi'/r)/r**2, with its limit at r = 0 (infinite for kernels that are not C4)."""
+        return self._radial(r, epsilon, 2)
+
+    def third(self, r, epsilon=1.0):
+        """Derivative of ``second`` divided by r, with its limit at r = 0 (infinite below C6)."""
+        return self._radial(r, epsilon, 3)
+
+    def _radial(self, r, epsilon, k):
+        r = np.asarray(r, dtype=float)
+        check_finite(np.atleast_1d(r), name="r")
+        flat = np.ascontiguousarray(np.abs(r).ravel() * epsilon)
+        out = np.empty((4, flat.size))
+        radial._radial_loop(
+            self.base,
+            self.parameter,
+            self.compact,
+            self.table,
+            1 << k,
+            flat * flat,
+            np.empty((3, flat.size)),
+            out,
+        )
+        values = out[k]
+        values[flat == 0.0] = self._limit(k)
+        return (values * epsilon ** (2 * k)).reshape(r.shape)
+
+    def _limit(self, k):
+        """Value of the k-th radial function at s = 0."""
+        power, inner, outer = self.table[k, 0], self.table[k, 2 : 2 + _TERMS], self.table[k, 2 + _TERMS :]
+        limit = outer[0]
+        if self.base == radial.LOG:
+            limit = -math.inf * inner[0] if inner[0] else limit
+        elif self.base == radial.POWER:
+            power, limit = (power + self.parameter, inner[0]) if not limit else (power, limit)
+        else:
+            limit += inner[0]
+        if power > 0:
+            return 0.0
+        return limit if power == 0 or limit == 0 else math.copysign(math.inf, limit)
+
+
+def _row(power, inner=(), outer=(), extra=0):
+    """One radial function: s**power (base * inner(s) + outer(s)); extra is the base's own exponent."""
+    row = np.zeros(2 + 2 * _TERMS)
+    row[0], row[1] = power, extra
+    row[2 : 2 + len(inner)] = inner
+    row[2 + _TERMS : 2 + _TERMS + len(outer)] = outer
+    return row
+
+
+def _power_rows(k, sign):
+    """Odd polyharmonic sign * s**k."""
+    factors = np.cumprod([sign, k, k - 2, k - 4])
+    return [_row(k - 2 * i, outer=(factors[i],)) for i in range(4)]
+
+
+def _binomial_rows(beta):
+    """sign * (1 + s**2)**beta; the sign makes it conditionally positive definite."""
+    sign = (-1.0) ** max(math.ceil(beta), 0)
+    factors = np.cumprod([sign, 2 * beta, 2 * (beta - 1), 2 * (beta - 2)])
+    return [_row(0, (factors[i],), extra=i) for i in range(4)]
+
+
+def _skala_rows(a):
+    """s**2 (s**a - 1)."""
+    factors = np.cumprod([1.0, 2 + a, a, a - 2])
+    outer = (-1.0, -2.0, 0.0, 0.0)
+    return [_row(2 - 2 * i, (factors[i],), (outer[i],)) for i in range(4)]
+
+
+_E, _U, _T, _L = radial.EXP, radial.GAUSS, radial.CUT, radial.LOG
+_1, _Q, _P = radial.ONE, radial.BINOMIAL, radial.POWER
+
+# name, order m, C^k at 0, compact, has epsilon, own parameter, base, rows for k = 0 ... 3
+_ROWS = [
+    ("linear", 1, 0, False, False, 0.0, _1, _power_rows(1, -1.0)),
+    ("cubic", 2, 2, False, False, 0.0, _1, _power_rows(3, 1.0)),
+    ("quintic", 3, 4, False, False, 0.0, _1, _power_rows(5, -1.0)),
+    ("septic", 4, 6, False, False, 0.0, _1, _power_rows(7, 1.0)),
+    (
+        "thin_plate_spline", 2, 1, False, False, 0.0, _L,
+        [_row(2, (1,)), _row(0, (2,), (1,)), _row(-2, (), (2,)), _row(-4, (), (-4,))],
+    ),
+    (
+        "polyharmonic_4", 3, 3, False, False, 0.0, _L,
+        [_row(4, (-1,)), _row(2, (-4,), (-1,)), _row(0, (-8,), (-6,)), _row(-2, (), (-8,))],
+    ),
+    ("gaussian", 0, 99, False, True, 0.0, _U, [_row(0, (1,)), _row(0, (-2,)), _row(0, (4,)), _row(0, (-8,))]),
+    ("multiquadric", 1, 99, False, True, 0.5, _Q, _binomial_rows),
+    ("inverse_multiquadric", 0, 99, False, True, -0.5, _Q, _binomial_rows),
+    ("inverse_quadratic", 0, 99, False, True, -1.0, _Q, _binomial_rows),
+    ("generalised_multiquadric", 2, 99, False, True, 1.5, _Q, _binomial_rows),
+    (
+        "matern_12", 0, 0, False, True, 0.0, _E,
+        [_row(0, (1,)), _row(-1, (-1,)), _row(-3, (1, 1)), _row(-5, (-3, -3, -1))],
+    ),
+    (
+        "matern_32", 0, 2, False, True, 0.0, _E,
+        [_row(0, (1, 1)), _row(0, (-1,)), _row(-1, (1,)), _row(-3, (-1, -1))],
+    ),
+    (
+        "matern_52", 0, 4, False, True, 0.0, _E,
+        [_row(0, (1, 1, 1 / 3)), _row(0, (-1 / 3, -1 / 3)), _row(0, (1 / 3,)), _row(-1, (-1 / 3,))],
+    ),
+    (
+        "matern_72", 0, 6, False, True, 0.0, _E,
+        [
+            _row(0, (1, 1, 2 / 5, 1 / 15)), _row(0, (-1 / 5, -1 / 5, -1 / 15)),
+            _row(0, (1 / 15, 1 / 15)), _row(0, (-1 / 15,)),
+        ],
+    ),
+    (
+        "wendland_c0", 0, 0, True, True, 0.0, _T,
+        [_row(0, (1,), extra=2), _row(-1, (-2,), extra=1), _row(-3, (), (2,)), _row(-5, (), (-6,))],
+    ),
+    (
+        "wendland_c2", 0, 2, True, True, 0.0, _T,
+        [
+            _row(0, (1, 4), extra=4), _row(0, (-20,), extra=3),
+            _row(-1, (60,), extra=2), _row(-3, (-60, -60), extra=1),
+        ],
+    ),
+    (
+        "wendland_c4", 0, 4, True, True, 0.0, _T,
+        [
+            _row(0, (1, 6, 35 / 3), extra=6), _row(0, (-56 / 3, -280 / 3), extra=5),
+            _row(0, (560,), extra=4), _row(-1, (-2240,), extra=3),
+        ],
+    ),
+    (
+        "wendland_c6", 0, 6, True, True, 0.0, _T,
+        [
+            _row(0, (1, 8, 25, 32), extra=8), _row(0, (-22, -154, -352), extra=7),
+            _row(0, (528, 3168), extra=6), _row(0, (-22176,), extra=5),
+        ],
+    ),
+    (
+        "wendland_51", 0, 2, True, True, 0.0, _T,
+        [
+            _row(0, (1, 5), extra=5), _row(0, (-30,), extra=4),
+            _row(-1, (120,), extra=3), _row(-3, (-120, -240), extra=2),
+        ],
+    ),
+    (
+        "buhmann", 0, 2, True, True, 0.0, _L,
+        [
+            _row(0, (0, 0, 0, 0, 12), (1, 0, -12, 32, -21)), _row(0, (0, 0, 48), (-24, 96, -72)),
+            _row(-1, (0, 96), (96, -96)), _row(-3, (), (-96, 96)),
+        ],
+    ),
+    ("skala_cervenka", 2, 3, False, False, 1.8, _P, _skala_rows),
+]  # fmt: skip
+
+
+def _build():
+    kernels = {}
+    for number, (name, order, smooth, compact, has_epsilon, parameter, base, rows) in enumerate(_ROWS):
+        table = np.array(rows(parameter) if callable(rows) else rows)
+        table.setflags(write=False)
+        kernels[name] = Kernel(name, number, order, compact, smooth, has_epsilon, parameter, base, table)
+    return kernels
+
+
+KERNELS = _build()
+
+_REFUSED = {
+    "wendland_10": "phi_1,0 = (1-s)+ is positive definite in one dimension only",
+    "wendland_11": "phi_1,1 = (1-s)^3+ (3s+1) is positive definite in one dimension only",
+    "wendland_12": "phi_1,2 = (1-s)^5+ (8s^2+5s+1) is positive definite in one dimension only",
+}
+
+
+def get_kernel(name, *, parameter=None):
+    """Look a kernel up by name.
+
+    Parameters
+    ----------
+    name : str or Kernel
+        A key of ``KERNELS``; a Kernel is handed back as it is.
+    parameter : float, optional
+        The exponent of ``generalised_multiquadric`` (beta > 0, no integer) or ``skala_cervenka`` (0 < a < 2).
+
+    Raises
+    ------
+    UsageError
+        For an unknown name (with the nearest right one), a kernel that is not positive definite in three
+        dimensions, or a parameter out of range.
+    """
+    if isinstance(name, Kernel):
+        return name
+    if name in _REFUSED:
+        raise UsageError(f"kernel '{name}' is refused: {_REFUSED[name]}; use wendland_c0, _c2, _c4 or _c6")
+    if name not in KERNELS:
+        near = difflib.get_close_matches(str(name), KERNELS, n=1, cutoff=0.4)
+        hint = f", did you mean '{near[0]}'?" if near else f"; allowed: {', '.join(KERNELS)}"
+        raise UsageError(f"unknown kernel '{name}'{hint}")
+    kernel = KERNELS[name]
+    return kernel if parameter is None else _with_parameter(kernel, float(parameter))
+
+
+def _with_parameter(kernel, value):
+    if kernel.name == "generalised_multiquadric":
+        if not 0 < value < 4 or value == int(value):
+            raise UsageError(f"beta of {kernel.name} must lie in (0, 4) and be no integer, got {value}")
+        return replace(kernel, parameter=value, order=math.ceil(value), table=np.array(_binomial_rows(value)))
+    if kernel.name == "skala_cervenka":
+        if not 0 < value < 2:
+            raise UsageError(f"a of {kernel.name} must lie in (0, 2) (it is singular at 2), got {value}")
+        smooth = 2 if value <= 1 else 3
+        return replace(kernel, parameter=value, smoothness=smooth, table=np.array(_skala_rows(value)))
+    raise UsageError(f"kernel '{kernel.name}' has no parameter of its own, got {value}")

@@ -1,0 +1,1 @@
+"""Where centres lie on a closed mesh."""

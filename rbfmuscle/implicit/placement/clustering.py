@@ -1,0 +1,243 @@
+"""Cells of equal size on a closed mesh: long edges split, farthest points, clustering."""
+
+import heapq
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from rbfmuscle.implicit.placement.control_mesh import contract_clusters
+
+# Least ratio of cell size to edge length: about ten mesh vertices a cell, or cells get ragged.
+FINENESS = 2.5
+
+
+@dataclass(frozen=True)
+class FineMesh:
+    """The input mesh with its long edges split; ``parent`` is the input triangle of each triangle."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    parent: np.ndarray
+
+
+def face_normals(vertices, faces):
+    """Area vectors of triangles: outward, half the parallelogram's area long."""
+    a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
+    return 0.5 * np.cross(b - a, c - a)
+
+
+def vertex_normals(vertices, faces):
+    """Unit normals at vertices, mean of the faces around weighted by area; zero where these cancel."""
+    vectors = np.repeat(face_normals(vertices, faces), 3, axis=0)
+    sums = [np.bincount(faces.ravel(), vectors[:, k], len(vertices)) for k in range(3)]
+    normals = np.stack(sums, axis=1)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1), np.finfo(float).tiny)[:, None]
+
+
+def refine_mesh(vertices, faces, count):
+    area = np.linalg.norm(face_normals(vertices, faces), axis=1).sum()
+    limit = np.sqrt(2 / np.sqrt(3) * area / count) / FINENESS
+    parent = np.arange(len(faces))
+    while True:
+        vertices, faces, parent, done = _split_long_edges(vertices, faces, parent, limit)
+        if done:
+            return FineMesh(vertices, faces, parent)
+
+
+def _split_long_edges(vertices, faces, parent, limit):
+    """Split every edge longer than ``limit`` at its middle, conforming, once."""
+    sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
+    sides = np.sort(sides, axis=1)
+    long = np.linalg.norm(vertices[sides[:, 0]] - vertices[sides[:, 1]], axis=1) > limit
+    if not long.any():
+        return vertices, faces, parent, True
+    keys, inverse = np.unique(sides[long, 0] * len(vertices) + sides[long, 1], return_inverse=True)
+    middle = np.full(len(sides), -1)
+    middle[long] = len(vertices) + inverse
+    ends = np.column_stack([keys // len(vertices), keys % len(vertices)])
+    middle = middle.reshape(-1, 3)
+    number = (middle >= 0).sum(axis=1)
+    pieces, parents = [faces[number == 0]], [parent[number == 0]]
+    for corner in range(3):
+        f, m = np.roll(faces, -corner, axis=1), np.roll(middle, -corner, axis=1)
+        a, b, c, ab, bc, ca = f[:, 0], f[:, 1], f[:, 2], m[:, 0], m[:, 1], m[:, 2]
+        one = (number == 1) & (ab >= 0)
+        two = (number == 2) & (ca < 0)
+        # Of the two ways to halve the quadrilateral left over, the shorter diagonal.
+        centre = 0.5 * (vertices[a] + vertices[b]), 0.5 * (vertices[b] + vertices[c])
+        short = np.linalg.norm(centre[1] - vertices[a], axis=1) < np.linalg.norm(
+            centre[0] - vertices[c], axis=1
+        )
+        for rows, triangles in (
+            (one, ((a, ab, c), (ab, b, c))),
+            (two & short, ((ab, b, bc), (a, ab, bc), (a, bc, c))),
+            (two & ~short, ((ab, b, bc), (a, ab, c), (ab, bc, c))),
+        ):
+            for t in triangles:
+                pieces.append(np.column_stack(t)[rows])
+                parents.append(parent[rows])
+    a, b, c = faces.T
+    ab, bc, ca = middle.T
+    for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)):
+        pieces.append(np.column_stack(t)[number == 3])
+        parents.append(parent[number == 3])
+    vertices = np.vstack([vertices, vertices[ends].mean(axis=1)])
+    return vertices, np.vstack(pieces), np.concatenate(parents), False
+
+
+def cluster_mesh(fine, density, count, seed):
+    """Cells of equal ``density`` times area, and the triangulation dual to them."""
+    area = np.linalg.norm(face_normals(fine.vertices, fine.faces), axis=1)
+    weight = np.bincount(fine.faces.ravel(), np.repeat(area / 3, 3), len(fine.vertices)) * density
+    edges = unique_edges(fine.faces)
+    start, other = _neighbours(edges, len(fine.vertices))
+    tail = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    length = np.linalg.norm(fine.vertices[tail] - fine.vertices[other], axis=1)
+    stretch = np.sqrt(density)
+    length *= 0.5 * (stretch[tail] + stretch[other])
+    used = np.flatnonzero(np.diff(start) > 0)
+    first = used[np.random.default_rng(seed).integers(len(used))]
+    labels = np.full(len(fine.vertices), -1)
+    _farthest_loop(start, other, length, first, count, labels)
+    _equalise_loop(fine.vertices, weight, edges, labels, count, 200)
+    _connect_loop(fine.vertices, weight, start, other, labels, count)
+    return contract_clusters(fine.faces, labels, weight, count)
+
+
+def unique_edges(faces):
+    sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
+    return sides[sides[:, 0] < sides[:, 1]]
+
+
+def _neighbours(edges, size):
+    """Rows of neighbours: those of v are ``other[start[v]:start[v + 1]]``."""
+    tail = np.concatenate([edges[:, 0], edges[:, 1]])
+    head = np.concatenate([edges[:, 1], edges[:, 0]])
+    order = np.argsort(tail, kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(tail, minlength=size))])
+    return start, head[order]
+
+
+@numba.njit(cache=True, nogil=True)
+def _farthest_loop(start, other, length, first, count, labels):
+    """Farthest points by distance along edges; labels become the nearest of them."""
+    distance = np.full(len(start) - 1, np.inf)
+    for v in range(len(distance)):
+        if start[v] == start[v + 1]:
+            distance[v] = -1.0
+    chosen = first
+    for k in range(count):
+        distance[chosen] = 0.0
+        labels[chosen] = k
+        heap = [(0.0, chosen)]
+        while len(heap) > 0:
+            d, v = heapq.heappop(heap)
+            if d > distance[v]:
+                continue
+            for e in range(start[v], start[v + 1]):
+                w = other[e]
+                if d + length[e] < distance[w]:
+                    distance[w] = d + length[e]
+                    labels[w] = k
+                    heapq.heappush(heap, (distance[w], w))
+        chosen = np.argmax(distance)
+
+
+@numba.njit(cache=True, nogil=True)
+def _cell_energy(moment, mass, k, sign, x, w):
+    """Inertia of cell k but for a constant, with a vertex added (sign 1), taken away (-1) or neither."""
+    m = mass[k] + sign * w
+    if m <= 0:
+        return 0.0
+    total = 0.0
+    for c in range(3):
+        total += (moment[k, c] + sign * w * x[c]) ** 2
+    return -total / m
+
+
+@numba.njit(cache=True, nogil=True)
+def _equalise_loop(vertices, weight, edges, labels, count, rounds):
+    """Move vertices between neighbouring cells while that lowers the sum of the cells' inertias."""
+    moment = np.zeros((count, 3))
+    mass = np.zeros(count)
+    members = np.zeros(count, dtype=np.int64)
+    origin = np.zeros(3)
+    for c in range(3):
+        origin[c] = vertices[:, c].mean()
+    for v in range(len(labels)):
+        k = labels[v]
+        if k >= 0:
+            mass[k] += weight[v]
+            members[k] += 1
+            for c in range(3):
+                moment[k, c] += weight[v] * (vertices[v, c] - origin[c])
+    for _ in range(rounds):
+        moved = 0
+        for e in range(len(edges)):
+            for side in range(2):
+                v, k = edges[e, side], labels[edges[e, 1 - side]]
+                old = labels[v]
+                if old == k or members[old] == 1:
+                    continue
+                x = vertices[v] - origin
+                w = weight[v]
+                before = _cell_energy(moment, mass, old, 0.0, x, w) + _cell_energy(moment, mass, k, 0.0, x, w)
+                after = _cell_energy(moment, mass, old, -1.0, x, w) + _cell_energy(moment, mass, k, 1.0, x, w)
+                if after < before - 1e-12 * abs(before):
+                    moved += 1
+                    labels[v] = k
+                    members[old] -= 1
+                    members[k] += 1
+                    mass[old] -= w
+                    mass[k] += w
+                    for c in range(3):
+                        moment[old, c] -= w * x[c]
+                        moment[k, c] += w * x[c]
+        if moved == 0:
+            break
+
+
+@numba.njit(cache=True, nogil=True)
+def _connect_loop(vertices, weight, start, other, labels, count):
+    """Keep the heaviest connected piece of each cell; the rest joins the cells around it."""
+    size = len(labels)
+    piece = np.full(size, -1)
+    stack = np.empty(size, dtype=np.int64)
+    best = np.full(count, -1)
+    heaviest = np.zeros(count)
+    pieces = 0
+    for v in range(size):
+        if piece[v] >= 0 or labels[v] < 0:
+            continue
+        top, total = 1, 0.0
+        stack[0] = v
+        piece[v] = pieces
+        while top > 0:
+            top -= 1
+            u = stack[top]
+            total += weight[u]
+            for e in range(start[u], start[u + 1]):
+                w = other[e]
+                if piece[w] < 0 and labels[w] == labels[v]:
+                    piece[w] = pieces
+                    stack[top] = w
+                    top += 1
+        if total > heaviest[labels[v]] or best[labels[v]] < 0:
+            heaviest[labels[v]] = total
+            best[labels[v]] = pieces
+        pieces += 1
+    loose = 0
+    for v in range(size):
+        if labels[v] >= 0 and piece[v] != best[labels[v]]:
+            labels[v] = -2
+            loose += 1
+    while loose > 0:
+        for v in range(size):
+            if labels[v] != -2:
+                continue
+            for e in range(start[v], start[v + 1]):
+                if labels[other[e]] >= 0:
+                    labels[v] = labels[other[e]]
+                    loose -= 1
+                    break

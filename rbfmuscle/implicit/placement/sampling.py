@@ -1,0 +1,222 @@
+"""Centres on a closed mesh: even cover, normals, areas, and the control triangulation over them."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import numba
+import numpy as np
+
+from rbfmuscle.implicit.placement.clustering import cluster_mesh, face_normals, refine_mesh, vertex_normals
+from rbfmuscle.implicit.placement.control_mesh import opposite_half_edges
+from rbfmuscle.implicit.placement.density import GREEDY_LARGEST, curvature_density, greedy_sample
+from rbfmuscle.validation import check_mesh
+
+
+@dataclass(frozen=True)
+class SurfaceSample:
+    """Points on a closed mesh with what the surface looks like there.
+
+    Attributes
+    ----------
+    points : (K, 3) ndarray
+        Positions on the surface [scene unit].
+    normals : (K, 3) ndarray
+        Unit outward normals.
+    areas : (K,) ndarray
+        Surface area that each point stands for [scene unit squared]; they add up to the mesh's area.
+    face : (K,) ndarray
+        Input triangle that holds each point.
+    barycentric : (K, 3) ndarray
+        Its coordinates in that triangle.
+    vertex : (K,) ndarray
+        The corner of that triangle nearest to the point.
+    control_faces : (m, 3) ndarray
+        Closed, outward, 2-manifold triangulation over the K points.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    areas: np.ndarray
+    face: np.ndarray
+    barycentric: np.ndarray
+    vertex: np.ndarray
+    control_faces: np.ndarray
+
+
+def sample_surface(vertices, faces, count, *, seed=0, placement="adaptive"):
+    """Cover a closed mesh with ``count`` points.
+
+    The mesh is split into ``count`` connected cells of equal size (farthest points by distance along the
+    surface, then clustering as in Valette & Chassery 2004); each cell gives one point. Cells never reach
+    through a thin sheet, as distance and connection are those of the surface.
+
+    Parameters
+    ----------
+    vertices : (n, 3) array_like
+        Vertices of a closed, outward 2-manifold [scene unit].
+    faces : (m, 3) array_like of int
+        Its triangles.
+    count : int
+        Points wanted, at least 4 for each connected component.
+    seed : int
+        Chooses the first point; the rest follows.
+    placement : {"even", "adaptive", "greedy"}
+        Cells of equal size; smaller where the surface bends; smaller where a cubic Hermite fit misses the
+        mesh (the most accurate, at 0.2 to 1 s; up to 1000 points).
+
+    Returns
+    -------
+    SurfaceSample
+
+    Raises
+    ------
+    MeshError
+        If the mesh is not a closed 2-manifold, or its topology needs more points.
+    ValueError
+        If ``count`` or ``placement`` is not allowed.
+    """
+    vertices, faces = check_mesh(vertices, faces)
+    count = int(count)
+    if count < 4:
+        raise ValueError(f"count must be at least 4, got {count}")
+    if placement == "greedy" and count > GREEDY_LARGEST:
+        raise ValueError(f"count must be at most {GREEDY_LARGEST} for placement greedy, got {count}")
+    if placement not in PLACEMENTS:
+        raise ValueError(f"placement must be one of {', '.join(PLACEMENTS)}, got {placement!r}")
+    opposite_half_edges(faces)
+    fine = refine_mesh(vertices, faces, count)
+    if placement == "greedy":
+        return greedy_sample(fine, count, seed, partial(_gather, vertices, faces, fine, count))
+    density = curvature_density(fine, count) if placement == "adaptive" else np.ones(len(fine.vertices))
+    return _gather(vertices, faces, fine, count, *cluster_mesh(fine, density, count, seed))
+
+
+# Weight of the cell's mean normal beside the normal at its point: 0 lets rims bulge, more blunts them.
+CELL_SHARE = 0.5
+PLACEMENTS = ("even", "adaptive", "greedy")
+
+
+def spread_points(vertices, faces, count, *, seed=0):
+    """Points on a mesh, evenly by area: one at random in each of ``count`` strips of equal area.
+
+    Returns
+    -------
+    points : (count, 3) ndarray
+    face : (count,) ndarray
+        Triangle that holds each.
+    """
+    vertices, faces = check_mesh(vertices, faces)
+    rng = np.random.default_rng(seed)
+    corners = vertices[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    strip = (np.arange(count) + rng.uniform(size=count)) / count
+    which = np.searchsorted(np.cumsum(area) / area.sum(), strip).clip(max=len(faces) - 1)
+    return np.einsum("nk,nkj->nj", rng.dirichlet(np.ones(3), count), corners[which]), which
+
+
+def _gather(vertices, faces, fine, count, labels, control):
+    """Points, normals and areas of the cells."""
+    third = np.linalg.norm(face_normals(fine.vertices, fine.faces), axis=1) / 3
+    corner = labels[fine.faces]
+    areas = np.bincount(corner.ravel(), np.repeat(third, 3), count)
+    middle = fine.vertices[fine.faces].mean(axis=1)
+    moments = [np.bincount(corner.ravel(), np.repeat(third * middle[:, k], 3), count) for k in range(3)]
+    centroid = np.stack(moments, axis=1) / np.maximum(areas, np.finfo(float).tiny)[:, None]
+    # The nearest point of the cell itself, not of the mesh: that could lie on the other side of a thin sheet.
+    points, piece, distance = np.zeros((count, 3)), np.zeros(count, dtype=np.int64), np.full(count, np.inf)
+    _nearest_in_cell_loop(fine.vertices, fine.faces, corner, centroid, points, piece, distance)
+    normals = _normals_at(fine, points, piece, corner)
+    face = fine.parent[piece]
+    barycentric = _barycentric(points, vertices[faces[face]])
+    vertex = faces[face, barycentric.argmax(axis=1)]
+    return SurfaceSample(points, normals, areas, face, barycentric, vertex, control)
+
+
+def _normals_at(fine, points, piece, corner):
+    """Normals in triangles ``piece``, drawn towards the mean of each point's cell.
+
+    The mean alone flattens what the field shows between the points; the normal of the point alone makes the
+    field bulge far out where a few points stand on a sharp rim.
+    """
+    corners = fine.faces[piece]
+    weights = _barycentric(points, fine.vertices[corners])
+    here = np.einsum("kc,kcd->kd", weights, vertex_normals(fine.vertices, fine.faces)[corners])
+    vectors = face_normals(fine.vertices, fine.faces)
+    mean = [np.bincount(corner.ravel(), np.repeat(vectors[:, k], 3), len(points)) for k in range(3)]
+    mean = np.stack(mean, axis=1)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1), np.finfo(float).tiny)[:, None]
+    normals = here + CELL_SHARE * mean
+    cancelled = np.linalg.norm(normals, axis=1) < 1e-6
+    normals[cancelled] = vectors[piece[cancelled]]
+    return normals / np.linalg.norm(normals, axis=1)[:, None]
+
+
+def _barycentric(points, corners):
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    normal = np.cross(b - a, c - a)
+    square = np.einsum("ij,ij->i", normal, normal)
+    v = np.einsum("ij,ij->i", np.cross(points - a, c - a), normal) / square
+    w = np.einsum("ij,ij->i", np.cross(b - a, points - a), normal) / square
+    out = np.clip(np.column_stack([1 - v - w, v, w]), 0, 1)
+    return out / out.sum(axis=1)[:, None]
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest_on_triangle(p, a, b, c, out):
+    """Nearest point of a triangle (Ericson 2005, section 5.1.5); returns the squared distance."""
+    ab, ac, ap = b - a, c - a, p - a
+    d1, d2 = np.dot(ab, ap), np.dot(ac, ap)
+    bp, cp = p - b, p - c
+    d3, d4, d5, d6 = np.dot(ab, bp), np.dot(ac, bp), np.dot(ab, cp), np.dot(ac, cp)
+    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+    v, w = 0.0, 0.0
+    if d1 <= 0 and d2 <= 0:
+        pass
+    elif d3 >= 0 and d4 <= d3:
+        v = 1.0
+    elif vc <= 0 and d1 >= 0 and d3 <= 0:
+        v = d1 / (d1 - d3)
+    elif d6 >= 0 and d5 <= d6:
+        w = 1.0
+    elif vb <= 0 and d2 >= 0 and d6 <= 0:
+        w = d2 / (d2 - d6)
+    elif va <= 0 and d4 - d3 >= 0 and d5 - d6 >= 0:
+        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        v = 1.0 - w
+    elif va + vb + vc > 0:
+        v, w = vb / (va + vb + vc), vc / (va + vb + vc)
+    total = 0.0
+    for k in range(3):
+        out[k] = a[k] + v * ab[k] + w * ac[k]
+        total += (p[k] - out[k]) ** 2
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest_in_cell_loop(vertices, faces, corner, target, points, face, distance):
+    """Of the triangles wholly in cell k, the point nearest to target[k]; a cell without one gives a vertex.
+
+    Triangles between cells are left out: at a thin rim two cells would take the same point of one.
+    """
+    q = np.empty(3)
+    for f in range(len(faces)):
+        k = corner[f, 0]
+        if corner[f, 1] != k or corner[f, 2] != k:
+            continue
+        a, b, d = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+        square = _nearest_on_triangle(target[k], a, b, d, q)
+        if square < distance[k]:
+            distance[k] = square
+            face[k] = f
+            points[k] = q
+    whole = np.isfinite(distance)
+    for f in range(len(faces)):
+        for c in range(3):
+            k = corner[f, c]
+            if whole[k]:
+                continue
+            square = np.sum((vertices[faces[f, c]] - target[k]) ** 2)
+            if square < distance[k]:
+                distance[k] = square
+                face[k] = f
+                points[k] = vertices[faces[f, c]]

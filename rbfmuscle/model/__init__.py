@@ -1,0 +1,1 @@
+"""The RBF muscle: joins a field to the simulation."""

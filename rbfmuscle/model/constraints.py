@@ -1,0 +1,394 @@
+"""What holds an RBF muscle together: shape with free fibre stretch, volume, contact.
+
+All act on the K centres. The shape energy is quadratic once its local targets are known; volume and contact are
+projected in the metric of that energy (through the inverse of its matrix), so a correction spreads smoothly over
+the muscle instead of dinting one point.
+"""
+
+import numba
+import numpy as np
+
+CONTACT_SWEEPS = 60
+CONTACT_ROUNDS = 6
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _rotation_loop(m, q):
+    """Turn the unit quaternion q in place towards the rotational part of the 3x3 matrix m (Müller 2016)."""
+    for _ in range(20):
+        w, x, y, z = q[0], q[1], q[2], q[3]
+        r00, r01, r02 = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+        r10, r11, r12 = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+        r20, r21, r22 = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+        # Sum of cross products of the columns of R and of m: the torque that aligns them.
+        ox = r10 * m[2, 0] - r20 * m[1, 0] + r11 * m[2, 1] - r21 * m[1, 1] + r12 * m[2, 2] - r22 * m[1, 2]
+        oy = r20 * m[0, 0] - r00 * m[2, 0] + r21 * m[0, 1] - r01 * m[2, 1] + r22 * m[0, 2] - r02 * m[2, 2]
+        oz = r00 * m[1, 0] - r10 * m[0, 0] + r01 * m[1, 1] - r11 * m[0, 1] + r02 * m[1, 2] - r12 * m[0, 2]
+        trace = (
+            r00 * m[0, 0] + r10 * m[1, 0] + r20 * m[2, 0] + r01 * m[0, 1] + r11 * m[1, 1] + r21 * m[2, 1]
+        ) + (r02 * m[0, 2] + r12 * m[1, 2] + r22 * m[2, 2])
+        scale = 1.0 / (abs(trace) + 1e-12)
+        ox, oy, oz = ox * scale, oy * scale, oz * scale
+        angle = np.sqrt(ox * ox + oy * oy + oz * oz)
+        if angle < 1e-8:
+            break
+        half = 0.125 * angle * angle
+        if angle < 1e-2:
+            # Series that are exact to rounding: the angles are small but for the first of them.
+            s, c = 0.5 - half * (1.0 - 0.1 * half) / 6.0, 1.0 - half * (1.0 - half / 6.0)
+        else:
+            s, c = np.sin(0.5 * angle) / angle, np.cos(0.5 * angle)
+        dx, dy, dz = ox * s, oy * s, oz * s
+        q[0] = c * w - dx * x - dy * y - dz * z
+        q[1] = c * x + dx * w + dy * z - dz * y
+        q[2] = c * y - dx * z + dy * w + dz * x
+        q[3] = c * z + dx * y - dy * x + dz * w
+        norm = 1.0 / np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+        for k in range(4):
+            q[k] *= norm
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _local_loop(x, arm, start, other, inverse, fibre, low, high, hold, q, target, deformation):
+    """Deformation gradient F and target T of each cluster, T = R (t aaᵀ + t^(-1/2) (I - aaᵀ))."""
+    f = np.empty((3, 3))
+    for i in range(len(start) - 1):
+        f[:] = 0.0
+        for e in range(start[i], start[i + 1]):
+            j = other[e]
+            for a in range(3):
+                d = x[j, a] - x[i, a]
+                for b in range(3):
+                    f[a, b] += d * arm[e, b]
+        for a in range(3):
+            for b in range(3):
+                deformation[i, a, b] = (
+                    f[a, 0] * inverse[i, 0, b] + f[a, 1] * inverse[i, 1, b] + f[a, 2] * inverse[i, 2, b]
+                )
+        _rotation_loop(deformation[i], q[i])
+        w, qx, qy, qz = q[i, 0], q[i, 1], q[i, 2], q[i, 3]
+        r = target[i]
+        r[0, 0], r[0, 1], r[0, 2] = (
+            1 - 2 * (qy * qy + qz * qz),
+            2 * (qx * qy - w * qz),
+            2 * (qx * qz + w * qy),
+        )
+        r[1, 0], r[1, 1], r[1, 2] = (
+            2 * (qx * qy + w * qz),
+            1 - 2 * (qx * qx + qz * qz),
+            2 * (qy * qz - w * qx),
+        )
+        r[2, 0], r[2, 1], r[2, 2] = (
+            2 * (qx * qz - w * qy),
+            2 * (qy * qz + w * qx),
+            1 - 2 * (qx * qx + qy * qy),
+        )
+        stretch = 0.0
+        for a in range(3):
+            stretch += (
+                deformation[i, a, 0] * fibre[i, 0]
+                + deformation[i, a, 1] * fibre[i, 1]
+                + deformation[i, a, 2] * fibre[i, 2]
+            ) ** 2
+        stretch = min(max(np.sqrt(stretch), low), high)
+        t = 1.0 + (1.0 - hold) * (stretch - 1.0)
+        s = 1.0 / np.sqrt(t)
+        for a in range(3):
+            along = r[a, 0] * fibre[i, 0] + r[a, 1] * fibre[i, 1] + r[a, 2] * fibre[i, 2]
+            for b in range(3):
+                r[a, b] = s * r[a, b] + (t - s) * along * fibre[i, b]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _right_side_loop(arm, start, other, target, out):
+    """b = Σ over edges (i, j) of w T_i (X_j - X_i), added at j and taken from i."""
+    out[:] = 0.0
+    for i in range(len(start) - 1):
+        t = target[i]
+        for e in range(start[i], start[i + 1]):
+            j = other[e]
+            for a in range(3):
+                v = t[a, 0] * arm[e, 0] + t[a, 1] * arm[e, 1] + t[a, 2] * arm[e, 2]
+                out[j, a] += v
+                out[i, a] -= v
+
+
+class ShapeConstraint:
+    """Keeps each cluster of centres near a rotated copy of itself, stretched along the fibre.
+
+    E(x) = Σ_i Σ_j w_ij |(x_j - x_i) - T_i (X_j - X_i)|²,  T_i = R_i (t aaᵀ + t^(-1/2) (I - aaᵀ)),
+    with R_i the rotation of the cluster's deformation gradient F_i, a its fibre direction at rest and t its
+    fibre stretch |F_i a|, free within ``limits`` but for the share ``hold`` that pulls it back to one. Thickness
+    follows the stretch at constant volume. With T frozen E is quadratic with the matrix ``laplacian`` (as in ARAP,
+    Sorkine & Alexa 2007, or projective dynamics, Bouaziz 2014).
+
+    Parameters
+    ----------
+    rest : (K, 3) ndarray
+        Centres at rest.
+    start, other : CSR neighbour lists of the clusters.
+    weight : (len(other),) ndarray
+        Weight of each directed edge.
+    fibre : (K, 3) ndarray
+        Unit fibre direction at rest.
+    """
+
+    def __init__(self, rest, start, other, weight, fibre, *, limits=(0.5, 2.0), hold=0.1):
+        self.rest, self.start, self.other, self.weight, self.fibre = rest, start, other, weight, fibre
+        self.limits, self.hold = limits, hold
+        count = len(rest)
+        head = np.repeat(np.arange(count), np.diff(start))
+        edge = rest[other] - rest[head]
+        self.arm = weight[:, None] * edge
+        moment = np.zeros((count, 3, 3))
+        np.add.at(moment, head, weight[:, None, None] * edge[:, :, None] * edge[:, None, :])
+        # A nearly flat cluster says nothing across itself: the small multiple keeps F regular there.
+        moment += 1e-6 * np.trace(moment, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        self.inverse = np.linalg.inv(moment)
+        self.laplacian = np.zeros((count, count))
+        np.add.at(self.laplacian, (head, head), weight)
+        np.add.at(self.laplacian, (other, other), weight)
+        np.add.at(self.laplacian, (head, other), -weight)
+        np.add.at(self.laplacian, (other, head), -weight)
+        self.quaternion = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+        self.target = np.tile(np.eye(3), (count, 1, 1))
+        self.deformation = np.tile(np.eye(3), (count, 1, 1))
+        self.right_side = np.zeros_like(rest)
+
+    def localise(self, x):
+        """Update F_i and T_i from the centres and return the right side b of laplacian · x = b, (K, 3)."""
+        low, high = self.limits
+        _local_loop(
+            x, self.arm, self.start, self.other, self.inverse, self.fibre, low, high, self.hold,
+            self.quaternion, self.target, self.deformation,
+        )  # fmt: skip
+        _right_side_loop(self.arm, self.start, self.other, self.target, self.right_side)
+        return self.right_side
+
+    def energy(self, x):
+        """E(x) with the targets of the last ``localise``."""
+        head = np.repeat(np.arange(len(self.rest)), np.diff(self.start))
+        wanted = np.einsum("eab,eb->ea", self.target[head], self.rest[self.other] - self.rest[head])
+        return float(self.weight @ ((x[self.other] - x[head] - wanted) ** 2).sum(axis=1))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _volume_loop(p, faces, gradient):
+    gradient[:] = 0.0
+    volume = 0.0
+    o = p[0]
+    for f in range(len(faces)):
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        ax, ay, az = p[i, 0] - o[0], p[i, 1] - o[1], p[i, 2] - o[2]
+        bx, by, bz = p[j, 0] - o[0], p[j, 1] - o[1], p[j, 2] - o[2]
+        cx, cy, cz = p[k, 0] - o[0], p[k, 1] - o[1], p[k, 2] - o[2]
+        ux, uy, uz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
+        volume += ax * ux + ay * uy + az * uz
+        gradient[i, 0] += ux
+        gradient[i, 1] += uy
+        gradient[i, 2] += uz
+        gradient[j, 0] += cy * az - cz * ay
+        gradient[j, 1] += cz * ax - cx * az
+        gradient[j, 2] += cx * ay - cy * ax
+        gradient[k, 0] += ay * bz - az * by
+        gradient[k, 1] += az * bx - ax * bz
+        gradient[k, 2] += ax * by - ay * bx
+    gradient /= 6.0
+    return volume / 6.0
+
+
+class VolumeConstraint:
+    """C(p) = V(p) - V0 with V = (1/6) Σ a · (b × c) and ∂V/∂a = (1/6) Σ b × c over the faces at a.
+
+    Parameters
+    ----------
+    faces : (m, 3) int ndarray
+        A closed outward surface over the points.
+    volume : float
+        The wanted volume V0.
+    """
+
+    def __init__(self, faces, volume):
+        self.faces, self.volume = faces, volume
+
+    def evaluate(self, points):
+        """Return ``(C, gradient (n, 3))``."""
+        gradient = np.empty_like(points)
+        return _volume_loop(points, self.faces, gradient) - self.volume, gradient
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def solve_contact_forces(gram, need, force, sweeps, tolerance):
+    """Contact forces of the linear complementarity problem force >= 0, gram · force >= need.
+
+    By projected Gauss-Seidel.
+
+    Parameters
+    ----------
+    gram : (c, c) ndarray
+        Motion at contact i for a unit force at contact j; symmetric, positive diagonal.
+    need : (c,) ndarray
+        Motion each contact asks for.
+    force : (c,) ndarray
+        First guess, changed in place to the solution.
+    sweeps : int
+    tolerance : float
+        Stop when no gap moves by more.
+    """
+    for _ in range(sweeps):
+        largest = 0.0
+        for c in range(len(need)):
+            residual = need[c]
+            for d in range(len(need)):
+                residual -= gram[c, d] * force[d]
+            new = max(0.0, force[c] + residual / gram[c, c])
+            largest = max(largest, abs(new - force[c]) * gram[c, c])
+            force[c] = new
+        if largest < tolerance:
+            break
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _deepest(lacking, is_chosen, tolerance, most):
+    """Contacts, not yet chosen, that lack the most motion, deepest first."""
+    found = np.flatnonzero((lacking > tolerance) & ~is_chosen)
+    return found[np.argsort(-lacking[found], kind="mergesort")[:most]]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _gram_loop(index, normal, row, stiffness, influence, columns, shares):
+    """(n_c · n_d) w_cᵀ A⁻¹ w_d - row_c row_d / stiffness: motion at c for a unit force at d, volume kept."""
+    size = len(index)
+    gram = np.empty((size, size))
+    for c in range(size):
+        for d in range(c + 1):
+            value = 0.0
+            for k in range(columns.shape[1]):
+                value += shares[index[c], k] * influence[index[d], columns[index[c], k]]
+            value *= normal[c, 0] * normal[d, 0] + normal[c, 1] * normal[d, 1] + normal[c, 2] * normal[d, 2]
+            value -= row[c] * row[d] / stiffness
+            gram[c, d] = value
+            gram[d, c] = value
+    # A contact on held centres alone cannot be moved: its row is zero.
+    least = 1e-9 * np.abs(np.diag(gram)).max()
+    for c in range(size):
+        gram[c, c] += least
+    return gram
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _push_loop(index, normal, strength, influence, push):
+    """push = A⁻¹ Wᵀ of the forces: motion of all centres."""
+    push[:] = 0.0
+    for c in range(len(index)):
+        if strength[c] == 0.0:
+            continue
+        for k in range(len(push)):
+            for a in range(3):
+                push[k, a] += influence[index[c], k] * strength[c] * normal[c, a]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _lacking_loop(index, normal, row, need, share, push, columns, shares, lacking):
+    """Motion that each contact still asks for after ``push`` and ``share`` of the volume's response."""
+    for c in range(len(index)):
+        value = need[c] + row[c] * share
+        for k in range(columns.shape[1]):
+            j = columns[index[c], k]
+            value -= shares[index[c], k] * (
+                normal[c, 0] * push[j, 0] + normal[c, 1] * push[j, 1] + normal[c, 2] * push[j, 2]
+            )
+        lacking[c] = value
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _contact_loop(
+    index, gap, normal, source, motion, response, stiffness, influence, columns, shares, table,
+    batch, rounds, sweeps, tolerance, push,
+):  # fmt: skip
+    """Fill ``push`` and the forces in ``table``; returns the volume's share that the push takes back."""
+    count = len(index)
+    row, need, force = np.empty(count), np.empty(count), np.empty(count)
+    for c in range(count):
+        i = index[c]
+        row[c], need[c] = 0.0, -gap[c]
+        for a in range(3):
+            row[c] += normal[c, a] * response[i, a]
+            need[c] -= normal[c, a] * motion[i, a]
+        force[c] = table[i, source[c]]
+    table[:] = 0.0
+    push[:] = 0.0
+    lost = 0.0
+    is_chosen = force > 0.0
+    chosen = np.flatnonzero(is_chosen)
+    lacking = need.copy()
+    for _ in range(rounds):
+        added = _deepest(lacking, is_chosen, tolerance, batch)
+        if len(added) == 0 and len(chosen) == 0:
+            break
+        is_chosen[added] = True
+        chosen = np.concatenate((chosen, added))
+        gram = _gram_loop(index[chosen], normal[chosen], row[chosen], stiffness, influence, columns, shares)
+        strength = force[chosen]
+        solve_contact_forces(gram, need[chosen], strength, sweeps, 0.1 * tolerance)
+        force[chosen] = strength
+        _push_loop(index[chosen], normal[chosen], strength, influence, push)
+        lost = 0.0
+        for c in chosen:
+            lost += row[c] * force[c]
+        if len(added) == 0:
+            break
+        _lacking_loop(index, normal, row, need, lost / stiffness, push, columns, shares, lacking)
+    for c in chosen:
+        table[index[c], source[c]] = force[c]
+    return lost
+
+
+class ContactConstraint:
+    """C(x) = gap + n · Δp >= 0 at each contact point, projected through the inverse of the elastic matrix.
+
+    Forces solve a linear complementarity problem on a working set: it starts from the contacts that pushed
+    before and takes in the deepest violations round by round until none is left. Few contacts push at a time,
+    but leaving one out would let the muscle jump between poses.
+
+    Parameters
+    ----------
+    influence : (n, K) ndarray
+        W A⁻¹: motion of the centres for a unit force at each contact point.
+    columns, shares : (n, k) ndarray
+        Sparse rows of W.
+    batch : int
+        Contacts that join the working set in one round.
+    tolerance : float
+        Violation that is left alone [scene unit].
+    """
+
+    def __init__(self, influence, columns, shares, *, batch, tolerance):
+        self.influence, self.columns, self.shares = influence, columns, shares
+        self.batch, self.tolerance = batch, tolerance
+        self.forces = np.zeros((len(influence), 1))
+
+    def project(self, spaces, sources, motion, response, stiffness):
+        """Contact correction of the centres (K, 3), and the volume that it adds by itself.
+
+        Parameters
+        ----------
+        spaces : rbfmuscle.sim.loop.contact.HalfSpaces
+        sources : int
+            Number of obstacles that ``spaces.source`` may name, neighbours counted from the end.
+        motion : (n, 3) ndarray
+            Motion of the contact points without contact.
+        response : (n, 3) ndarray
+            Their motion for a unit pressure.
+        stiffness : float
+            Volume that a unit pressure adds.
+        """
+        if self.forces.shape[1] != sources:
+            self.forces = np.zeros((len(self.influence), sources))
+        push = np.empty((self.influence.shape[1], 3))
+        lost = _contact_loop(
+            spaces.index, spaces.gap, spaces.normal, spaces.source % sources, motion, response, stiffness,
+            self.influence, self.columns, self.shares, self.forces,
+            self.batch, CONTACT_ROUNDS, CONTACT_SWEEPS, self.tolerance, push,
+        )  # fmt: skip
+        return push, lost

@@ -1,0 +1,121 @@
+"""Memory and time that an RBF muscle will take, from its settings alone."""
+
+from functools import lru_cache
+
+import numpy as np
+
+from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.implicit.field import RBFField
+from rbfmuscle.implicit.fit.lapack import factor_cholesky
+from rbfmuscle.implicit.kernels.table import get_kernel
+from rbfmuscle.model.muscle import MOST_WITH_ALL_DERIVATIVES, RBFMuscle
+from rbfmuscle.model.options import RBFOptions
+from rbfmuscle.model.rest import has_sample
+from rbfmuscle.sim.plan.forecast import MuscleCost
+from rbfmuscle.sim.plan.rates import shortest
+
+# Vertices of the surface on an area of one cell squared; nodes of the grid kept beside them, bytes of each.
+VERTICES_A_CELL, NODE_BYTES, VERTEX_BYTES = 1.5, 10, 400
+# Work to build: visits for a sample, for a vertex of the mesh and more for each centre, a tenth without rounds.
+SAMPLE_VISITS, VERTEX_VISITS, CENTRE_VISITS, ROUNDS = 240_000, 120_000, 240, 10
+# Share of that work which is left where the samples are kept on disk already.
+KEPT = 0.15
+# A sub-step: calls; then of each iteration calls, visits for a centre and for a contact point; the search for
+# tunnelling, visits for a contact point.
+PREDICT_CALLS, ITERATION_CALLS, SOLVE_VISITS, CONTACT_VISITS, CROSSING_VISITS = 1200, 540, 3700, 240, 850
+# A surface: calls of the fit and of the extraction, pairs for an entry of the fit's matrix, visits for a bone's
+# vertex and for a vertex of the surface, pairs for a vertex and a centre.
+FIT_CALLS, EXTRACT_CALLS, ENTRY_PAIRS, BONE_VISITS, SURFACE_VISITS, SURFACE_PAIRS = (
+    1000,
+    4300,
+    1.8,
+    200,
+    1200,
+    3.5,
+)
+# Contact points hang on so many centres: an index and a share of eight bytes each.
+HANGING_BYTES = 6 * 16
+
+
+def estimate_muscle(muscle, scene, rates, **options):
+    """What an RBF muscle takes.
+
+    Parameters
+    ----------
+    muscle : Muscle
+    scene : Scene
+    rates : dict of str to float
+        From `rbfmuscle.sim.plan.rates.measure_rates`.
+    **options
+        See `RBFOptions`.
+
+    Returns
+    -------
+    MuscleCost
+    """
+    options = RBFOptions.from_table(options, muscle=muscle.name)
+    centres = options.centres or RBFMuscle._default_centres(muscle.mesh.area, scene)
+    points = centres + options.samples
+    shown, nodes = _surface_size(muscle, options.resolution)
+    unknowns = _unknowns(options, centres)
+    pair, flop = _field_rates(options.kernel)
+    call, visit = rates["call"], rates["visit"]
+    bones = sum(len(bone.mesh.vertices) for bone in scene.bones)
+    rounds = 1.0 if options.placement == "greedy" else 1.0 / ROUNDS
+    mesh_visits = len(muscle.mesh.vertices) * (VERTEX_VISITS + CENTRE_VISITS * centres)
+    frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
+    mesh = frame.local, np.asarray(muscle.mesh.faces)
+    sampling, placing = SAMPLE_VISITS * options.samples, rounds * mesh_visits
+    if has_sample(*mesh, options.samples, seed=options.seed, placement="even"):
+        sampling *= KEPT
+    if has_sample(*mesh, centres, seed=options.seed, placement=options.placement):
+        placing *= KEPT
+    search = CROSSING_VISITS * points if scene.detect is not None else 0
+    iteration = ITERATION_CALLS * call + visit * (SOLVE_VISITS * centres + CONTACT_VISITS * points)
+    fit = FIT_CALLS * call + flop * unknowns**3 / 3.0 + pair * ENTRY_PAIRS * unknowns**2
+    surface = visit * (BONE_VISITS * bones + SURFACE_VISITS * shown) + pair * SURFACE_PAIRS * shown * centres
+    return MuscleCost(
+        build=visit * (sampling + placing),
+        step=PREDICT_CALLS * call + options.iterations * iteration + visit * search,
+        show=fit + EXTRACT_CALLS * call + surface,
+        memory=8.0 * centres * points + 16.0 * centres**2 + HANGING_BYTES * points + 24.0 * bones,
+        working=16.0 * unknowns**2 + NODE_BYTES * nodes + VERTEX_BYTES * shown,
+        carried=options.samples,
+        shown=int(shown),
+    )
+
+
+def _surface_size(muscle, resolution):
+    """Vertices of the extracted surface, and nodes of its grid."""
+    vertices = np.asarray(muscle.mesh.vertices, dtype=float)
+    axes = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
+    extent = np.ptp(vertices @ axes.T, axis=0)
+    cell = extent.max() / resolution
+    return VERTICES_A_CELL * muscle.mesh.area / cell**2, float(np.prod(extent / cell + 7.0))
+
+
+def _unknowns(options, centres):
+    """Order of the matrix that is factored in each frame."""
+    if not get_kernel(options.kernel).hermite:
+        return 3 * centres
+    every = options.derivatives == "all" or (
+        options.derivatives == "auto" and centres <= MOST_WITH_ALL_DERIVATIVES
+    )
+    return (4 if every else 2) * centres
+
+
+@lru_cache(maxsize=8)
+def _field_rates(kernel, count=100, points=1500, size=400):
+    """Seconds for a pair of point and centre, and for an operation of a Cholesky factorisation, measured now."""
+    from threadpoolctl import threadpool_limits
+
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    matrix = np.asfortranarray(np.diag(np.full(size, 2.0)) + 1.0 / size)
+    with threadpool_limits(1, user_api="blas"):
+        field = RBFField.fit_surface(normals, normals, kernel=kernel, epsilon=1.0)
+        there = rng.normal(size=(points, 3))
+        pair = shortest(lambda: field.value_and_gradient(there)) / (points * count)
+        flop = shortest(lambda: factor_cholesky(matrix.copy(order="F"))) / (size**3 / 3.0)
+    return pair, flop

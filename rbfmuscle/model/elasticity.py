@@ -1,0 +1,165 @@
+"""Local and global steps of an RBF muscle, with volume and contact projected inside the iteration."""
+
+import numba
+import numpy as np
+
+from rbfmuscle.geometry.rest_frame import diameter
+from rbfmuscle.model.constraints import ContactConstraint
+
+CONTACT_TOLERANCE = 2e-5  # of the muscle's size: some micrometres
+REACH_MARGIN = 0.003  # of the muscle's size
+SETTLED = 1e-4  # of the muscle's size: an iteration that moves no centre farther was the last one
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _move_loop(first, second, columns, shares, moved, also):
+    """Motions of each contact point for two motions of the centres: Σ_k share_k dx_k."""
+    for s in range(len(columns)):
+        ax, ay, az, bx, by, bz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(columns.shape[1]):
+            j, share = columns[s, k], shares[s, k]
+            ax += share * first[j, 0]
+            ay += share * first[j, 1]
+            az += share * first[j, 2]
+            bx += share * second[j, 0]
+            by += share * second[j, 1]
+            bz += share * second[j, 2]
+        moved[s, 0], moved[s, 1], moved[s, 2] = ax, ay, az
+        also[s, 0], also[s, 1], also[s, 2] = bx, by, bz
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _gather_loop(gradient, columns, shares, out):
+    """Transpose of `_move_loop`: out_k = Σ_s share_sk gradient_s."""
+    out[:] = 0.0
+    for s in range(len(columns)):
+        for k in range(columns.shape[1]):
+            for a in range(3):
+                out[columns[s, k], a] += shares[s, k] * gradient[s, a]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _carry_all_loop(x, target, rest, points, columns, shares, out):
+    """Positions of the contact points: Σ_k share_k (x_k + T_k (X_s - X_k))."""
+    for s in range(len(points)):
+        for a in range(3):
+            out[s, a] = 0.0
+        for k in range(columns.shape[1]):
+            if shares[s, k] == 0.0:
+                continue
+            j = columns[s, k]
+            dx, dy, dz = points[s, 0] - rest[j, 0], points[s, 1] - rest[j, 1], points[s, 2] - rest[j, 2]
+            t = target[j]
+            for a in range(3):
+                out[s, a] += shares[s, k] * (x[j, a] + t[a, 0] * dx + t[a, 1] * dy + t[a, 2] * dz)
+
+
+class ElasticSolver:
+    """Alternates local targets with one dense global solve, accelerated (Anderson), contacts inside.
+
+    Parameters
+    ----------
+    shape : ShapeConstraint
+    volume : VolumeConstraint
+        On the samples.
+    points : (K + S, 3) ndarray
+        Contact points at rest: centres, then samples.
+    columns, shares : (K + S, 6)
+        How the contact points hang on the centres.
+    free, held : int arrays
+        Centres that move, and those that their bones carry.
+    """
+
+    def __init__(self, shape, volume, points, columns, shares, free, held, *, iterations, contacts, memory):
+        self.shape, self.volume, self.points = shape, volume, points
+        self.columns, self.shares = columns, shares
+        self.free, self.held = free, held
+        self.iterations, self.batch, self.memory = iterations, contacts, memory
+        self.centres = len(shape.rest)
+        laplacian = shape.laplacian
+        self.inverse = np.linalg.inv(laplacian[np.ix_(free, free)])
+        self.inverse = 0.5 * (self.inverse + self.inverse.T)
+        self.coupling = laplacian[np.ix_(free, held)]
+        dense = np.zeros((self.centres, len(points)))
+        np.add.at(dense, (columns, np.arange(len(points))[:, None]), shares)
+        influence = np.zeros((self.centres, len(points)))
+        influence[free] = self.inverse @ dense[free]
+        self.scale = diameter(shape.rest)
+        self.contact = ContactConstraint(
+            np.ascontiguousarray(influence.T), columns, shares,
+            batch=contacts, tolerance=CONTACT_TOLERANCE * self.scale,
+        )  # fmt: skip
+
+    def snapshot(self):
+        return self.contact.forces.copy()
+
+    def restore(self, forces):
+        self.contact.forces = forces.copy()
+
+    def carry(self, x):
+        """Contact points at centres x with the present targets, (K + S, 3)."""
+        out = np.empty_like(self.points)
+        _carry_all_loop(x, self.shape.target, self.shape.rest, self.points, self.columns, self.shares, out)
+        return out
+
+    def solve(self, x, contacts):
+        """Return the settled centres, (K, 3)."""
+        x = x.copy()
+        mixer = _Anderson(self.memory)
+        for step in range(self.iterations):
+            new = self._iterate(x, contacts)
+            moved = float(np.sqrt(((new - x) ** 2).sum(axis=1).max()))
+            if step + 1 == self.iterations or moved < SETTLED * self.scale:
+                x = new
+                break
+            x[self.free] = mixer.mix(x[self.free], new[self.free])
+        self.shape.localise(x)
+        return x
+
+    def _iterate(self, x, contacts):
+        """One local step, one global step, and on top of it pressure and contact together."""
+        right = self.shape.localise(x)
+        new = x.copy()
+        new[self.free] = self.inverse @ (right[self.free] - self.coupling @ x[self.held])
+        here, motion, moved = self.carry(x), np.empty_like(self.points), np.empty_like(self.points)
+        excess, gradient = self.volume.evaluate(here[self.centres :])
+        pull, response = np.empty_like(x), np.zeros_like(x)
+        _gather_loop(gradient, self.columns[self.centres :], self.shares[self.centres :], pull)
+        response[self.free] = self.inverse @ pull[self.free]
+        _move_loop(new - x, response, self.columns, self.shares, motion, moved)
+        stiffness = np.vdot(pull, response)
+        pressure = -(excess + np.vdot(gradient, motion[self.centres :])) / stiffness
+        motion += pressure * moved
+        spaces = contacts.half_spaces(
+            here, 1.5 * np.sqrt((motion**2).sum(axis=1)) + REACH_MARGIN * self.scale
+        )
+        sources = max(1, len(contacts.names) + len(contacts.neighbours))
+        push, lost = self.contact.project(spaces, sources, motion, moved, stiffness)
+        return new + push + response * (pressure - lost / stiffness)
+
+
+class _Anderson:
+    """Anderson acceleration of a fixed-point map (Walker & Ni 2011), with plain steps until it has memory."""
+
+    def __init__(self, memory):
+        self.memory = memory
+        self.values, self.residuals = [], []
+
+    def mix(self, x, g):
+        """Next iterate from x and its image g."""
+        if self.memory == 0:
+            return g
+        residual = (g - x).ravel()
+        self.values.append(g.ravel().copy())
+        self.residuals.append(residual)
+        if len(self.values) > self.memory + 1:
+            del self.values[0], self.residuals[0]
+        if len(self.values) == 1:
+            return g
+        df = np.diff(np.array(self.residuals), axis=0)
+        dg = np.diff(np.array(self.values), axis=0)
+        gram = df @ df.T
+        gram[np.diag_indices_from(gram)] *= 1.0 + 1e-8
+        gram[np.diag_indices_from(gram)] += 1e-300
+        share = np.linalg.solve(gram, df @ residual)
+        return (g.ravel() - share @ dg).reshape(g.shape)

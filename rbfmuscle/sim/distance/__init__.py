@@ -1,0 +1,1 @@
+"""Signed distance to a bone, in any pose."""

@@ -1,0 +1,175 @@
+"""Other ways to detect that a point is in a bone, behind the interface of `BoneSDF`, to be compared with it.
+
+They are baselines, correct and small. None is a default.
+"""
+
+import numpy as np
+
+from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.sim.distance.mesh import prepare_bone, winding_test
+from rbfmuscle.validation import UsageError, check_points
+
+# Share of the longest side that a baseline's grid reaches beyond the mesh.
+MARGIN = 0.1
+
+
+class PointDetector:
+    """Distance and gradient in any pose, from ``_local(points)`` in bone coordinates."""
+
+    closed = True
+
+    def distance_and_gradient(self, points, pose=None, reach=np.inf):
+        """Signed distance (n,) and gradient (n, 3), in the axes of ``points``; ``reach`` is not made use
+        of."""
+        points = check_points(points)
+        if pose is None:
+            return self._local(points)
+        pose = np.asarray(pose, dtype=np.float64)
+        distance, gradient = self._local((points - pose[:3, 3]) @ pose[:3, :3])
+        return distance, gradient @ pose[:3, :3].T
+
+    def distance(self, points, pose=None, *, reach=np.inf):
+        """Signed distance (n,) [unit of the mesh], negative inside."""
+        return self.distance_and_gradient(points, pose)[0]
+
+    def gradient(self, points, pose=None):
+        """Gradient of the distance, (n, 3)."""
+        return self.distance_and_gradient(points, pose)[1]
+
+    def direction(self, points, pose=None):
+        """Unit direction (n, 3) in which the distance grows."""
+        gradient = self.gradient(points, pose)
+        return gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-300)
+
+    def closest_point(self, points, pose=None):
+        """Surface point (n, 3) that distance and direction point to."""
+        distance, gradient = self.distance_and_gradient(points, pose)
+        square = np.maximum((gradient * gradient).sum(axis=1), 0.25)
+        return check_points(points) - (distance / square)[:, None] * gradient
+
+
+class TreeDetector(PointDetector):
+    """Every query asks the bounding volume tree for the nearest triangle: exact, and the slowest."""
+
+    def __init__(self, exact):
+        self.exact = exact
+        self.bounds = np.array([exact.vertices.min(axis=0), exact.vertices.max(axis=0)])
+
+    @classmethod
+    def from_mesh(cls, mesh):
+        """Tree of a closed mesh (trimesh.Trimesh or a pair of vertices and faces)."""
+        return cls(ExactDistance(mesh))
+
+    @property
+    def memory(self):
+        """Bytes of the tree and its triangles."""
+        arrays = (self.exact.boxes, self.exact.records, self.exact.edge_normals, self.exact.vertex_normals)
+        return sum(array.nbytes for array in arrays)
+
+    def _local(self, points):
+        distance, closest, _, normal = self.exact.nearest(points)
+        offset = points - closest
+        on_surface = np.abs(distance) <= 1e-12 * np.ptp(self.bounds, axis=0).max()
+        offset[on_surface] = normal[on_surface]
+        scale = np.where(on_surface, np.linalg.norm(offset, axis=1), distance)
+        return distance, offset / scale[:, None]
+
+
+class VoxelDetector(PointDetector):
+    """Voxels inside or outside, as in the paper's first code; depths are counted in voxels.
+
+    Distances are exact to the nearest voxel's centre on the other side, so they err by up to a voxel's
+    diagonal.
+    """
+
+    def __init__(self, inside, origin, edge):
+        from scipy.ndimage import distance_transform_edt
+
+        self.inside, self.origin, self.edge = inside, origin, edge
+        self.bounds = np.array([origin, origin + edge * np.array(inside.shape)])
+        outward = distance_transform_edt(~inside, sampling=edge)
+        inward = distance_transform_edt(inside, sampling=edge)
+        half = 0.5 * float(np.min(edge))
+        self.values = np.where(inside, half - inward, outward - half).astype(np.float32)
+
+    @classmethod
+    def from_mesh(cls, mesh, *, resolution=64):
+        """Voxels along each axis of the mesh's box, widened by a tenth of its longest side."""
+        exact, low, high = grid_of(mesh)
+        edge = (high - low) / resolution
+        axes = [low[k] + edge[k] * (np.arange(resolution) + 0.5) for k in range(3)]
+        return cls(sample_nodes(exact.signed_distance, axes) < 0.0, low, edge)
+
+    @property
+    def memory(self):
+        """Bytes of the voxels."""
+        return self.inside.nbytes + self.values.nbytes
+
+    def _local(self, points):
+        top = np.array(self.inside.shape) - 1
+        cell = np.clip(np.floor((points - self.origin) / self.edge).astype(np.int64), 0, top)
+        gradient = np.empty(points.shape)
+        for axis in range(3):
+            before, after = cell.copy(), cell.copy()
+            before[:, axis] = np.maximum(cell[:, axis] - 1, 0)
+            after[:, axis] = np.minimum(cell[:, axis] + 1, top[axis])
+            run = (after - before)[:, axis] * self.edge[axis]
+            gradient[:, axis] = (self.values[tuple(after.T)] - self.values[tuple(before.T)]) / run
+        beyond = np.maximum(np.maximum(self.bounds[0] - points, points - self.bounds[1]), 0.0)
+        distance = self.values[tuple(cell.T)] + np.linalg.norm(beyond, axis=1)
+        return distance.astype(np.float64), gradient
+
+
+def grid_of(mesh):
+    """Exact distance of a mesh, and the box (low, high) of a baseline's grid around it."""
+    vertices, faces = (mesh.vertices, mesh.faces) if hasattr(mesh, "faces") else mesh
+    bone = prepare_bone(np.asarray(vertices), np.asarray(faces))
+    exact = ExactDistance((bone.vertices, bone.faces))
+    low, high = bone.vertices.min(axis=0), bone.vertices.max(axis=0)
+    margin = MARGIN * (high - low).max()
+    if bone.closed:
+        return exact, low - margin, high + margin
+    return _WoundDistance(exact, winding_test(bone)), low - margin, high + margin
+
+
+class _WoundDistance:
+    """Distance of an open mesh with the sign of its winding number."""
+
+    def __init__(self, exact, inside):
+        self.exact, self.inside = exact, inside
+
+    def signed_distance(self, points):
+        distance = np.abs(self.exact.signed_distance(points))
+        return np.where(self.inside(points), -distance, distance)
+
+
+def sample_nodes(function, axes):
+    """Values of a function at the nodes of a grid given by its three axes."""
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    return function(nodes.reshape(-1, 3)).reshape(nodes.shape[:3])
+
+
+def build_detector(name, mesh, **options):
+    """Detector of a bone by name: ``sdf`` (`BoneSDF`), ``spline``, ``serendipity``, ``voxel`` or ``bvh``.
+
+    Options are those of the detector's ``from_mesh``.
+
+    Raises
+    ------
+    UsageError
+        If there is no detector of that name.
+    """
+    if name == "sdf":
+        from rbfmuscle.sim.distance.sdf import BoneSDF as kind
+    elif name == "spline":
+        from rbfmuscle.sim.distance.spline import SplineField as kind
+    elif name == "serendipity":
+        from rbfmuscle.sim.distance.serendipity import SerendipityField as kind
+    elif name in ("voxel", "bvh"):
+        kind = VoxelDetector if name == "voxel" else TreeDetector
+    else:
+        raise UsageError(f"no detector is called {name!r}; there are {', '.join(DETECTOR_NAMES)}")
+    return kind.from_mesh(mesh, **options)
+
+
+DETECTOR_NAMES = ("sdf", "spline", "serendipity", "voxel", "bvh")

@@ -1,0 +1,124 @@
+"""What a bone's mesh allows: which triangles count, and where the sign of the distance comes from."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rbfmuscle.geometry.triangles import opposite_faces, vertex_faces
+from rbfmuscle.validation import MeshError, check_mesh
+
+# Area below this share of the squared longest edge is rounding.
+LEAST_SHAPE = 1e-12
+
+
+@dataclass
+class BoneMesh:
+    """A bone's mesh as its field takes it.
+
+    Attributes
+    ----------
+    vertices, faces : (n, 3) and (m, 3) ndarray
+    doubtful : (m,) ndarray of bool
+        Faces at a border, whose pseudonormals give no sign.
+    notes : list of str
+        What was found and done, for the log.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    doubtful: np.ndarray
+    notes: list = field(default_factory=list)
+
+    @property
+    def closed(self):
+        """Whether each edge has one face on each side, consistently oriented."""
+        return not self.doubtful.any()
+
+
+def prepare_bone(vertices, faces, *, name="bone"):
+    """Clean arrays for a distance field: no degenerate or duplicate faces, outward as far as that can be
+    told.
+
+    Closed meshes are taken as they are. Of others equal vertices are merged, and patches oriented alike.
+
+    Raises
+    ------
+    MeshError
+        On NaN, indices out of range, an empty mesh, or one whose faces all have no area.
+    """
+    vertices, faces = check_mesh(vertices, faces, name=name)
+    mesh = BoneMesh(vertices, faces, np.zeros(len(faces), dtype=np.bool_))
+    flat = _flat(vertices, faces)
+    if flat.any():
+        _keep(mesh, ~flat, f"{int(flat.sum())} faces without area left out")
+    if len(mesh.faces) == 0:
+        raise MeshError(f"{name} has no face with an area")
+    across = _across(mesh)
+    if (across < 0).any() or flat.any():
+        across = _mend(mesh)
+    if (across < 0).any():
+        border = np.zeros(len(vertices), dtype=np.bool_)
+        border[mesh.faces[(across < 0).any(axis=1)]] = True
+        mesh.doubtful = border[mesh.faces].any(axis=1)
+        count = int((across < 0).sum())
+        mesh.notes.append(f"not closed ({count} open edges): the sign comes from winding numbers")
+    if _volume(mesh) < 0.0:
+        mesh.faces = np.ascontiguousarray(mesh.faces[:, ::-1])
+        mesh.notes.append("faces pointed inward and were turned")
+    return mesh
+
+
+def winding_test(mesh):
+    """``inside(points) -> (n,) bool`` by generalised winding numbers (Barill 2018)."""
+    import igl
+
+    def inside(points):
+        return igl.fast_winding_number(mesh.vertices, mesh.faces, np.ascontiguousarray(points)) > 0.5
+
+    return inside
+
+
+def _flat(vertices, faces):
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    longest = np.maximum.reduce([((q - p) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))])
+    return area <= LEAST_SHAPE * longest
+
+
+def _keep(mesh, which, note):
+    mesh.faces = np.ascontiguousarray(mesh.faces[which])
+    mesh.doubtful = np.zeros(len(mesh.faces), dtype=np.bool_)
+    mesh.notes.append(note)
+
+
+def _across(mesh):
+    return opposite_faces(mesh.faces, *vertex_faces(mesh.faces, len(mesh.vertices)))
+
+
+def _mend(mesh):
+    """Merge equal vertices, drop duplicate faces, orient patches alike; return the faces across."""
+    import igl
+
+    _, first, inverse = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
+    if len(first) < len(mesh.vertices):
+        mesh.faces = np.ascontiguousarray(first[inverse.reshape(-1)][mesh.faces])
+        mesh.notes.append(f"{len(mesh.vertices) - len(first)} repeated vertices merged")
+        flat = _flat(mesh.vertices, mesh.faces)
+        if flat.any():
+            _keep(mesh, ~flat, f"{int(flat.sum())} faces without area left out")
+    _, kept = np.unique(np.sort(mesh.faces, axis=1), axis=0, return_index=True)
+    if len(kept) < len(mesh.faces):
+        _keep(mesh, np.sort(kept), f"{len(mesh.faces) - len(kept)} duplicate faces left out")
+    across = _across(mesh)
+    if (across == -2).any():
+        oriented = np.ascontiguousarray(igl.bfs_orient(mesh.faces)[0])
+        if not np.array_equal(oriented, mesh.faces):
+            mesh.faces = oriented
+            mesh.notes.append("neighbouring faces were oriented alike")
+        across = _across(mesh)
+    return across
+
+
+def _volume(mesh):
+    corners = mesh.vertices[mesh.faces] - mesh.vertices[mesh.faces].mean(axis=(0, 1))
+    return float(np.einsum("ni,ni->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))) / 6.0

@@ -1,0 +1,189 @@
+"""One muscle on its way through the motion: its model, its obstacles, its clock and its events."""
+
+import itertools
+import math
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from rbfmuscle.sim.loop.tunnelling import find_crossings, turn_back
+from rbfmuscle.sim.scene.motion import bone_poses, interpolate
+from rbfmuscle.validation import SolveError
+
+# Depth [mm] below which a path through a bone counts as touching it; above the error of a bone's field.
+TOUCH = 0.1
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something a user should know of: ``count`` points of a muscle at a bone, and what was done.
+
+    ``action`` is ``"angle_flag"`` (the angle test spoke), ``"reported"`` (crossed, nothing done),
+    ``"rotated"``, ``"halved"`` (the step was), ``"unresolved"`` (crossed, and no correction helped),
+    ``"overlap_kept"`` or ``"overlap_resolved"`` (at rest, before the first frame), or, with no muscle,
+    ``"bones_overlap"`` (the motion drives two bones into each other).
+    """
+
+    frame: int
+    muscle: str
+    bone: str
+    count: int
+    action: str
+
+
+class Lane:
+    """Drives one model through sub-steps.
+
+    Parameters
+    ----------
+    model : MuscleModel
+    contacts : BoneContacts
+        Of this muscle alone.
+    scene : Scene
+    """
+
+    def __init__(self, model, contacts, scene):
+        self.model, self.contacts, self.scene = model, contacts, scene
+        self.name = model.name
+        self.detect = scene.detect.tunnelling if scene.detect is not None else None
+        self.tolerance = scene.length(TOUCH)
+        self.times, self.events = {}, {}
+        self.frame = 0
+        self.path, self.saved = None, None
+        self.measured = {}
+
+    @contextmanager
+    def timed(self, stage):
+        """Add the time spent inside to ``time_<stage>``."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            key = f"time_{stage}"
+            self.times[key] = self.times.get(key, 0.0) + time.perf_counter() - start
+
+    def advance(self, stops):
+        """Go through sub-steps: a list of coordinates, the first of which is where the muscle is."""
+        for before, after in itertools.pairwise(stops):
+            self.step(before, after)
+
+    def step(self, before, after):
+        """One sub-step, watched for tunnelling where the scene asks for it."""
+        self.begin(before, after)
+        self.finish()
+
+    def begin(self, before, after):
+        """First half of a sub-step: the bones move, the muscle goes along."""
+        self.path, poses = (before, after), (bone_poses(self.scene, before), bone_poses(self.scene, after))
+        self.saved = None
+        if self.detect is not None:
+            self.saved = self.model.snapshot(), self.model.contact_points().copy(), poses
+        self._predict(poses)
+
+    def finish(self):
+        """Second half: the muscle settles, and what passed through a bone is brought back."""
+        before, after = self.path
+        self.solve(after)
+        if self.saved is not None:
+            state, start, poses = self.saved
+            crossings = self._crossings(start, poses)
+            if crossings:
+                self._correct(state, start, poses, before, after, crossings)
+
+    def solve(self, coordinates):
+        """Solve, and refuse what is not finite.
+
+        Raises
+        ------
+        SolveError
+            Naming muscle, frame and coordinates.
+        """
+        with self.timed("solve"):
+            try:
+                self.model.solve(self.contacts)
+            except (np.linalg.LinAlgError, FloatingPointError) as error:
+                raise SolveError(f"{self._place(coordinates)}: {error}") from error
+        bad = ~np.isfinite(self.model.contact_points()).all(axis=1)
+        if bad.any():
+            raise SolveError(
+                f"{self._place(coordinates)}: {int(bad.sum())} of {len(bad)} positions are not finite; "
+                "try a smaller substep_angle in [contact]"
+            )
+
+    def drawing(self):
+        """What makes the model's surface of this moment; called once, from any thread, while the lane goes on.
+
+        Returns
+        -------
+        callable
+            Gives the ModelSurface, with what was measured beside it, and the time that it took [s].
+        """
+        with self.timed("surface"):
+            draw, measured = self.model.drawing(self.contacts), self.measured
+
+        def timed():
+            start = time.perf_counter()
+            surface = draw()
+            surface.quantities.update(measured)
+            return surface, time.perf_counter() - start
+
+        return timed
+
+    def report(self, bone, count, action):
+        """Note an event of the present frame; of one kind the most points at one time are kept."""
+        key = (self.frame, bone, action)
+        self.events[key] = max(int(count), self.events.get(key, 0))
+
+    def collect(self):
+        """Times and events since the last call."""
+        times = self.times
+        events = [Event(k, self.name, bone, n, action) for (k, bone, action), n in self.events.items()]
+        times["time_frame"] = sum(times.values())
+        self.times, self.events = {}, {}
+        return times, events
+
+    def _predict(self, poses):
+        self.contacts.move(poses[1])
+        with self.timed("predict"):
+            self.model.predict(*poses)
+
+    def _crossings(self, start, poses, *, flag=True):
+        with self.timed("tunnelling"):
+            end = self.model.contact_points()
+            found = find_crossings(self.contacts, start, end, *poses, self.detect, tolerance=self.tolerance)
+        for crossing in found:
+            if flag and crossing.flagged:
+                self.report(self.contacts.names[crossing.bone], crossing.flagged, "angle_flag")
+        return [crossing for crossing in found if len(crossing.index)]
+
+    def _correct(self, state, start, poses, before, after, crossings):
+        """Turn what crossed with the bone and solve again; then halve the step, down to the smallest."""
+        if self.detect.action == "report":
+            self._report_all(crossings, "reported")
+            return
+        self.model.restore(state)
+        self._predict(poses)
+        turn_back(self.model, crossings, start, *poses, self.contacts.names)
+        self.solve(after)
+        remaining = self._crossings(start, poses, flag=False)
+        if not remaining:
+            self._report_all(crossings, "rotated")
+            return
+        angle = max(abs(after.get(k, 0.0) - before.get(k, 0.0)) for k in {*before, *after})
+        if self.detect.action == "rotate" or angle <= 2.0 * math.radians(self.detect.smallest_step):
+            self._report_all(remaining, "unresolved")
+            return
+        self._report_all(remaining, "halved")
+        self.model.restore(state)
+        middle = interpolate(before, after, 0.5)
+        self.advance([before, middle, after])
+
+    def _report_all(self, crossings, action):
+        for crossing in crossings:
+            self.report(self.contacts.names[crossing.bone], len(crossing.index), action)
+
+    def _place(self, coordinates):
+        where = ", ".join(f"{name} = {np.degrees(value):.6g} deg" for name, value in coordinates.items())
+        return f"muscle {self.name!r}, frame {self.frame} ({where or 'rest'})"

@@ -1,0 +1,1 @@
+"""What a scene will build, reach and cost, found without building it."""

@@ -1,0 +1,113 @@
+"""What a scene will build and do, found without building it."""
+
+import numpy as np
+
+from rbfmuscle.sim.plan.reach import Pace, reached_bones, sampled_poses, union_of
+
+
+def plan_scene(scene, estimate=None):
+    """Return what a run of the scene would build.
+
+    Parameters
+    ----------
+    scene : Scene
+    estimate : callable, optional
+        ``estimate(muscle, scene, rates)`` gives a muscle's `MuscleCost`. With it memory [bytes] and time [s]
+        are foretold, for this machine as it is now: a tenth of a second of measurements.
+
+    Returns
+    -------
+    dict
+        ``pairs``: muscles and bones that can meet. ``fields``: for each bone that any muscle can reach the
+        size of the reached box [scene unit] and its share of the bone's own box. ``muscles``: model and size
+        of the input. ``frames``, ``substeps``: of the motion. ``features``: what the scene switches on. With
+        ``estimate`` also ``memory``, ``time`` and ``rates``, see `rbfmuscle.sim.plan.forecast`.
+
+    Notes
+    -----
+    Boxes are those that the run itself takes: a muscle's box carried by the bones that it is attached to, so
+    a pair may be listed that does not come to touch; a pair that is not listed costs nothing.
+    """
+    regions = reached_bones(scene)
+    output = scene.output
+    made = {
+        "units": scene.units,
+        "pairs": [{"muscle": muscle, "bone": bone} for muscle, bone in regions],
+        "fields": _fields(scene, regions),
+        "muscles": [
+            {
+                "name": muscle.name,
+                "model": muscle.model,
+                "vertices": len(muscle.mesh.vertices),
+                "settings": dict(muscle.options),
+            }
+            for muscle in scene.muscles
+        ],
+        "frames": len(scene.motion),
+        "substeps": _substeps(scene),
+        "poses_sampled": len(sampled_poses(scene)),
+        "features": {
+            "sliding": scene.sliding is not None and len(scene.muscles) > 1,
+            "tunnelling": scene.detect is not None and scene.detect.tunnelling is not None,
+            "metrics": bool(output.metrics),
+            "surfaces": bool(output.surfaces),
+            "report": bool(output.report),
+            "preview": bool(output.preview),
+        },
+    }
+    return made if estimate is None else {**made, **_forecast(scene, made, regions, estimate)}
+
+
+def _forecast(scene, made, regions, estimate):
+    """Memory and time; those of each field and muscle are written into ``made``."""
+    import numba
+
+    from rbfmuscle.sim.plan.forecast import estimate_field, forecast
+    from rbfmuscle.sim.plan.rates import measure_rates, resident_memory
+
+    rates = measure_rates()
+    costs = [estimate(muscle, scene, rates) for muscle in scene.muscles]
+    for muscle, cost in zip(made["muscles"], costs):
+        muscle.update(memory=cost.memory, build=cost.build, step=cost.step, show=cost.show)
+    fields = []
+    meshes = {bone.name: bone.mesh for bone in scene.bones}
+    # Other detectors have fields of other kinds, or none.
+    for field in made["fields"] if scene.contact.detector == "sdf" else []:
+        boxes = [box for (_, name), box in regions.items() if name == field["bone"]]
+        cost = estimate_field(meshes[field["bone"]], union_of(boxes), scene.contact.tolerance)
+        field.update(cells=cost.cells, memory=cost.memory, kept=cost.kept)
+        fields.append(cost)
+    memory, time = forecast(
+        scene, fields, costs, substeps=made["substeps"], rates=rates,
+        resident=resident_memory(), threads=numba.get_num_threads(),
+    )  # fmt: skip
+    return {"memory": memory, "time": time, "rates": rates}
+
+
+def _fields(scene, regions):
+    fields = []
+    for bone in scene.bones:
+        boxes = [box for (_, name), box in regions.items() if name == bone.name]
+        if not boxes:
+            continue
+        own = np.asarray(bone.mesh.bounds, dtype=float)
+        low = np.maximum(np.min([box[0] for box in boxes], axis=0), own[0])
+        high = np.minimum(np.max([box[1] for box in boxes], axis=0), own[1])
+        fields.append(
+            {
+                "bone": bone.name,
+                "triangles": len(bone.mesh.faces),
+                "size": (high - low).tolist(),
+                "share": float(np.prod(high - low) / np.prod(own[1] - own[0])),
+            }
+        )
+    return fields
+
+
+def _substeps(scene):
+    """Steps of the solver over the motion, from rest; tunnelling may halve some further."""
+    pace, before, count = Pace(scene), {}, 0
+    for after in scene.motion.frames:
+        count += len(pace.split(before, after))
+        before = after
+    return count

@@ -1,0 +1,152 @@
+"""Which vertices of a muscle are held by which bone."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rbfmuscle.sim.scene.options import NotNegative, Positive, Table, Vector, did_you_mean
+from rbfmuscle.validation import SceneError
+
+
+@dataclass
+class Attachment:
+    """Vertices (n,) of a muscle's mesh that move with a bone."""
+
+    bone: str
+    vertices: np.ndarray
+
+
+class SphereTable(Table):
+    """All vertices of the muscle within a ball."""
+
+    centre: Vector
+    radius: Positive
+
+
+class AttachTable(Table):
+    """A bone, and one of: a file or list of vertex numbers, a distance to the bone, a ball."""
+
+    bone: str
+    vertices: str | list[int] | None = None
+    near: NotNegative | None = None
+    sphere: SphereTable | None = None
+
+
+def resolve_attachments(attach, read, bones, *, muscle):
+    """Return the Attachment list of a muscle.
+
+    Parameters
+    ----------
+    attach : list of Attachment, AttachTable or dict
+    read : ReadMesh
+        The muscle's mesh with the map from the file's vertex numbers.
+    bones : list of Bone
+    muscle : str
+        For messages.
+
+    Raises
+    ------
+    SceneError
+        On an unknown bone, an empty selection, an index out of range, or a vertex held by two bones.
+    """
+    found = []
+    for number, entry in enumerate(attach):
+        place = f"muscle {muscle!r} attach {number + 1}"
+        if isinstance(entry, Attachment):
+            entry = {"bone": entry.bone, "vertices": np.asarray(entry.vertices).tolist()}
+        elif isinstance(entry, dict):
+            entry = {
+                key: value.tolist() if isinstance(value, np.ndarray) else value
+                for key, value in entry.items()
+            }
+        table = entry if isinstance(entry, AttachTable) else AttachTable.build(entry, place=f"{place}: ")
+        bone = next((bone for bone in bones if bone.name == table.bone), None)
+        if bone is None:
+            raise SceneError(
+                f"{place}: unknown bone {table.bone!r}, {did_you_mean(table.bone, [b.name for b in bones])}"
+            )
+        found.append(Attachment(bone.name, np.unique(_select(table, read, bone, place))))
+    _check_overlap(found, muscle)
+    return found
+
+
+def _select(table, read, bone, place):
+    given = [key for key in ("vertices", "near", "sphere") if getattr(table, key) is not None]
+    if len(given) != 1:
+        what = " and ".join(given) if given else "none"
+        raise SceneError(f"{place}: give one of vertices, near and sphere, got {what}")
+    points = np.asarray(read.mesh.vertices)
+    if table.vertices is not None:
+        return _listed_vertices(table.vertices, read, place)
+    if table.sphere is not None:
+        distance = np.linalg.norm(points - table.sphere.centre, axis=1)
+        limit, what = table.sphere.radius, "sphere.radius"
+    else:
+        distance = signed_distances(points, bone.mesh)
+        limit, what = table.near, "near"
+    chosen = np.flatnonzero(distance <= limit)
+    if len(chosen) == 0:
+        raise SceneError(
+            f"{place}: {what} = {limit:g} reaches no vertex of the muscle, "
+            f"the nearest is {distance.min():.4g} away; raise it"
+        )
+    return chosen
+
+
+def signed_distances(points, mesh):
+    """Exact distance of points to a mesh, negative inside (by pseudonormals, or winding numbers if open)."""
+    import igl
+
+    kind = "PSEUDONORMAL" if mesh.is_watertight else "FAST_WINDING_NUMBER"
+    sign = getattr(igl.SignedDistanceType, f"SIGNED_DISTANCE_TYPE_{kind}")
+    vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
+    faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
+    return igl.signed_distance(np.ascontiguousarray(points), vertices, faces, sign)[0]
+
+
+def _listed_vertices(listed, read, place):
+    if isinstance(listed, str):
+        numbers, place = _read_numbers(Path(listed), place), f"{place}: {listed}"
+    else:
+        numbers = np.array(listed, dtype=np.int64)
+    if len(numbers) == 0:
+        raise SceneError(f"{place}: no vertex numbers")
+    wrong = (numbers < 0) | (numbers >= len(read.vertex_map))
+    if wrong.any():
+        raise SceneError(
+            f"{place}: vertex {numbers[wrong][0]} is out of range, "
+            f"the mesh has vertices 0 to {len(read.vertex_map) - 1}"
+        )
+    kept = read.vertex_map[numbers]
+    kept = kept[kept >= 0]
+    if len(kept) == 0:
+        raise SceneError(f"{place}: none of its vertices is part of the mended surface")
+    return kept
+
+
+def _read_numbers(path, place):
+    try:
+        words = path.read_text(encoding="utf-8", errors="replace").split()
+    except OSError as error:
+        raise SceneError(f"{place}: cannot read {path}: {error.strerror}") from None
+    numbers = []
+    for word in words:
+        try:
+            numbers.append(int(word))
+        except ValueError:
+            raise SceneError(f"{place}: {path}: {word!r} is not a vertex number") from None
+    return np.array(numbers, dtype=np.int64)
+
+
+def _check_overlap(found, muscle):
+    for k, first in enumerate(found):
+        for second in found[k + 1 :]:
+            if first.bone == second.bone:
+                continue
+            shared = np.intersect1d(first.vertices, second.vertices)
+            if len(shared):
+                raise SceneError(
+                    f"muscle {muscle!r}: {len(shared)} vertices (first: {shared[0]}) are attached to both "
+                    f"{first.bone!r} and {second.bone!r}, make the attachments smaller"
+                )

@@ -1,0 +1,81 @@
+"""Reading muscle fibres: polylines from JSON, or from VTK and VTP PolyData."""
+
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+
+from rbfmuscle.validation import MeshError, SceneError, check_points
+
+
+def read_fibres(fibres, *, scale=1.0, muscle=""):
+    """Return fibres as a list of (k, 3) arrays in scene units.
+
+    Parameters
+    ----------
+    fibres : path or list of (k, 3) array_like
+        A JSON file holds ``{"polylines": [[[x, y, z], ...], ...]}`` or that list alone.
+    scale : float
+        Factor from the file's unit to the scene's.
+
+    Raises
+    ------
+    SceneError
+        If the file cannot be read or a polyline has fewer than two points.
+    """
+    place = f"muscle {muscle!r} fibres"
+    if isinstance(fibres, (str, Path)):
+        place = f"{place}: {fibres}"
+        fibres = _read_lines(Path(fibres), place)
+    lines = []
+    for number, line in enumerate(fibres):
+        try:
+            points = check_points(line, name=f"polyline {number}")
+        except (ValueError, TypeError) as error:
+            raise SceneError(f"{place}: {error}") from None
+        if len(points) < 2:
+            raise SceneError(
+                f"{place}: polyline {number} has {len(points)} points, a fibre needs two or more"
+            )
+        lines.append(points * scale)
+    if not lines:
+        raise SceneError(f"{place}: no polylines")
+    return lines
+
+
+def _read_lines(path, place):
+    suffix = path.suffix.lower()
+    if suffix in (".vtk", ".vtp"):
+        return _read_polydata_lines(path, place)
+    if suffix != ".json":
+        raise SceneError(f"{place}: fibres are read from .json, .vtk or .vtp")
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SceneError(f"{place}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise SceneError(f"{place}: not JSON ({error})") from None
+    lines = data.get("polylines") if isinstance(data, dict) else data
+    if not isinstance(lines, list):
+        raise SceneError(f"{place}: needs a list 'polylines'")
+    return lines
+
+
+def _read_polydata_lines(path, place):
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    from rbfmuscle.sim.scene.meshes import read_polydata
+
+    if not path.is_file():
+        raise SceneError(f"{place}: no such file")
+    try:
+        data = read_polydata(path)
+    except MeshError as error:
+        raise SceneError(f"{place}: {error}") from None
+    if data.GetNumberOfLines() == 0:
+        return []
+    points = vtk_to_numpy(data.GetPoints().GetData()).astype(np.float64)
+    offsets = vtk_to_numpy(data.GetLines().GetOffsetsArray())
+    numbers = vtk_to_numpy(data.GetLines().GetConnectivityArray())
+    return [points[numbers[a:b]] for a, b in itertools.pairwise(offsets)]

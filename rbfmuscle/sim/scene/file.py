@@ -1,0 +1,243 @@
+"""The scene file: its tables, and the scene that they describe."""
+
+import hashlib
+import tomllib
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field, ValidationError
+
+from rbfmuscle.sim.scene.attachments import AttachTable
+from rbfmuscle.sim.scene.check import check_place, check_size
+from rbfmuscle.sim.scene.meshes import read_mesh
+from rbfmuscle.sim.scene.motion import Motion
+from rbfmuscle.sim.scene.options import (
+    Axis,
+    ContactOptions,
+    DetectOptions,
+    MotionOptions,
+    OutputOptions,
+    Positive,
+    SlidingOptions,
+    Table,
+    Vector,
+    describe_error,
+)
+from rbfmuscle.validation import MeshError, SceneError
+
+
+class SceneTable(Table):
+    """``[scene]``."""
+
+    format: Literal[1]
+    name: str | None = None
+    units: Literal["m", "cm", "mm"]
+
+
+class BoneTable(Table):
+    """``[[bone]]``."""
+
+    name: str
+    mesh: str
+    scale: Positive = 1.0
+
+
+class JointTable(Table):
+    """``[[joint]]``."""
+
+    name: str
+    parent: str
+    child: str
+    centre: Vector
+    axes: dict[str, Axis] = Field(min_length=1)
+
+
+class DefaultsTable(Table):
+    """``[defaults]``: any key of a muscle, for all that do not give it themselves."""
+
+    model: Any = "rbf"
+    scale: Positive = 1.0
+    attach: list[AttachTable] = Field(default_factory=list)
+    fibres: str | None = None
+
+
+class MuscleTable(DefaultsTable):
+    """``[[muscle]]``."""
+
+    name: str
+    mesh: str
+
+
+class SceneFile(Table):
+    """A whole scene file."""
+
+    scene: SceneTable
+    defaults: DefaultsTable = DefaultsTable()
+    bone: list[BoneTable] = Field(default_factory=list)
+    joint: list[JointTable] = Field(default_factory=list)
+    motion: MotionOptions = MotionOptions()
+    muscle: list[MuscleTable] = Field(default_factory=list)
+    contact: ContactOptions = ContactOptions()
+    sliding: SlidingOptions | None = None
+    detect: DetectOptions | None = None
+    output: OutputOptions = OutputOptions()
+
+
+def read_scene_file(path):
+    """Return the checked SceneFile of a TOML file, paths as written.
+
+    Raises
+    ------
+    SceneError
+        Naming the file, the table, the key, the value and what is right.
+    """
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except IsADirectoryError:
+        raise SceneError(f"{path}: is a folder, give a scene file (.toml)") from None
+    except FileNotFoundError:
+        raise SceneError(f"{path}: no such scene file") from None
+    except OSError as error:
+        raise SceneError(f"{path}: cannot read the scene file: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise SceneError(f"{path}: not a text file in UTF-8, give a scene file (.toml)") from None
+    except tomllib.TOMLDecodeError as error:
+        quotes = "; text stands in quotes" if str(error).startswith("Invalid value") else ""
+        raise SceneError(f"{path}: not valid TOML: {error}{quotes}") from None
+    try:
+        return SceneFile.model_validate(data)
+    except ValidationError as error:
+        raise SceneError(
+            describe_error(error, root=str(path), name_row=lambda at: _place(at, data))
+        ) from None
+
+
+def load_scene(cls, path):
+    """Return the scene (of class ``cls``) of a TOML file, its meshes read and checked."""
+    tables = read_scene_file(path)
+    folder = path.parent
+    try:
+        return _build(cls(tables.scene.name or path.stem, units=tables.scene.units), tables, folder, path)
+    except (SceneError, MeshError) as error:
+        raise type(error)(f"{path}: {error}") from None
+
+
+def _build(scene, tables, folder, path):
+    scene.path = path
+    for bone in tables.bone:
+        read = read_mesh(folder / bone.mesh, name=bone.name, scale=bone.scale, may_be_open=True)
+        check_size(scene, "bone", bone.name, read.mesh, read.source)
+        scene.add_bone(bone.name, read)
+    for joint in tables.joint:
+        scene.add_joint(joint.name, joint.parent, joint.child, joint.centre, joint.axes)
+    for muscle in tables.muscle:
+        _add_muscle(scene, muscle, tables.defaults, folder)
+    scene.motion = Motion.from_options(tables.motion, scene.joints, folder=folder)
+    scene.contact = tables.contact
+    scene.sliding = tables.sliding
+    scene.detect = tables.detect
+    scene.output = tables.output
+    return scene.validate()
+
+
+def _add_muscle(scene, muscle, defaults, folder):
+    given = {key: getattr(muscle, key) for key in muscle.model_fields_set}
+    for key in defaults.model_fields_set:
+        given.setdefault(key, getattr(defaults, key))
+    scale = given.get("scale", 1.0)
+    fibres = given.get("fibres")
+    read = read_mesh(folder / muscle.mesh, name=muscle.name, scale=scale)
+    check_size(scene, "muscle", muscle.name, read.mesh, read.source)
+    check_place(scene, muscle.name, read.mesh, read.source)
+    scene.add_muscle(
+        muscle.name,
+        read,
+        attach=[_from_folder(entry, folder) for entry in given.get("attach", [])],
+        model=_merge_model(given.get("model", "rbf"), defaults.model),
+        fibres=str(folder / fibres) if fibres is not None else None,
+        scale=scale,
+    )
+
+
+def _merge_model(model, default):
+    """A model table without a name changes some options of the default model."""
+    if isinstance(model, dict) and "name" not in model:
+        return {**({"name": default} if isinstance(default, str) else default), **model}
+    return model
+
+
+def _from_folder(entry, folder):
+    if isinstance(entry.vertices, str):
+        return entry.model_copy(update={"vertices": str(folder / entry.vertices)})
+    return entry
+
+
+def _place(location, data):
+    """Words for a pydantic location: ("muscle", 1, "attach", 0) -> [[muscle]] 'iliacus' attach 1."""
+    words = []
+    here = data
+    for depth, part in enumerate(location):
+        known = isinstance(here, list) or (isinstance(here, dict) and part in here)
+        if isinstance(part, str) and not known and depth < len(location) - 1:
+            continue  # the name of one of several types that pydantic tried
+        here = here[part] if known and not (isinstance(here, list) and not isinstance(part, int)) else None
+        if isinstance(part, int):
+            name = here.get("name") if isinstance(here, dict) else None
+            words.append(repr(name) if name else str(part + 1))
+        elif depth == 0:
+            words.append(f"[[{part}]]" if isinstance(here, list) else f"[{part}]")
+        else:
+            words.append(part)
+    return " ".join(words)
+
+
+def describe_scene(scene):
+    """Return the scene as plain data for ``run.json``: names, counts, options, sources and hashes."""
+    return {
+        "name": scene.name,
+        "units": scene.units,
+        "file": str(scene.path) if scene.path else None,
+        "bones": [{"name": b.name, **_mesh_facts(b)} for b in scene.bones],
+        "joints": [
+            {
+                "name": j.name,
+                "parent": j.parent,
+                "child": j.child,
+                "centre": j.centre.tolist(),
+                "axes": {key: axis.tolist() for key, axis in j.axes.items()},
+            }
+            for j in scene.joints
+        ],
+        "motion": {
+            **scene.motion.options.model_dump(by_alias=True, exclude_none=True),
+            "frames": len(scene.motion.frames),
+        },
+        "muscles": [_describe_muscle(muscle) for muscle in scene.muscles],
+        "contact": scene.contact.model_dump(),
+        "sliding": scene.sliding.model_dump() if scene.sliding else None,
+        "detect": scene.detect.model_dump() if scene.detect else None,
+        "output": scene.output.model_dump(),
+    }
+
+
+def _describe_muscle(muscle):
+    return {
+        "name": muscle.name,
+        "model": {"name": muscle.model, **muscle.options},
+        "attach": [{"bone": a.bone, "vertices": len(a.vertices)} for a in muscle.attachments],
+        "fibres": len(muscle.fibres) if muscle.fibres else 0,
+        **_mesh_facts(muscle),
+    }
+
+
+def _mesh_facts(item):
+    vertices = np.ascontiguousarray(item.mesh.vertices, dtype=np.float64)
+    faces = np.ascontiguousarray(item.mesh.faces, dtype=np.int64)
+    return {
+        "mesh": item.source,
+        "vertices": len(vertices),
+        "triangles": len(faces),
+        "volume": float(item.mesh.volume),
+        "sha256": hashlib.sha256(vertices.tobytes() + faces.tobytes()).hexdigest(),
+        "mended": list(item.notes),
+    }

@@ -1,0 +1,234 @@
+"""Reading surface meshes: STL, OBJ, PLY, VTK and VTP PolyData, mended where that is safe.
+
+Vertex numbers in files stay usable: a read mesh knows which of its vertices each vertex of the file became.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from rbfmuscle.sim.scene.mesh_repair import repair
+from rbfmuscle.validation import MeshError, check_mesh
+
+MESH_SUFFIXES = (".stl", ".obj", ".ply", ".vtk", ".vtp")
+
+
+@dataclass
+class ReadMesh:
+    """A mesh as read and mended.
+
+    Attributes
+    ----------
+    mesh : trimesh.Trimesh
+        Faces outward, in scene units.
+    vertex_map : (n_file,) ndarray of int
+        The vertex that each vertex of the file became, -1 where it was dropped.
+    notes : list of str
+        What was mended, for the user to read.
+    closed : bool
+    source : str
+        The file.
+    """
+
+    mesh: object
+    vertex_map: np.ndarray
+    notes: list = field(default_factory=list)
+    closed: bool = True
+    source: str = ""
+
+
+def read_mesh(path, *, name=None, scale=1.0, may_be_open=False):
+    """Read a surface mesh and mend what is safe to mend.
+
+    Parameters
+    ----------
+    path : path
+        ``.stl``, ``.obj``, ``.ply``, ``.vtk`` or ``.vtp``; polygons are split into triangles.
+    name : str, optional
+        What messages call the mesh, the file's stem by default.
+    scale : float
+        Factor from the file's unit to the scene's.
+    may_be_open : bool
+        Accept holes that cannot be closed safely (bones), with a note.
+
+    Returns
+    -------
+    ReadMesh
+
+    Raises
+    ------
+    MeshError
+        If the file is missing, unreadable or empty, or the surface cannot be made closed and manifold.
+    """
+    path = Path(path)
+    vertices, faces = _read_arrays(path)
+    read = prepare_mesh(
+        vertices * scale, faces, place=str(path), name=name or path.stem, may_be_open=may_be_open
+    )
+    read.source = str(path)
+    return read
+
+
+def prepare_mesh(vertices, faces, *, place, name, may_be_open=False):
+    """Return the ReadMesh of given arrays, mended like a file's; ``place`` begins each message."""
+    import trimesh
+
+    if not len(vertices) or not len(faces):
+        raise MeshError(f"{place}: the mesh is empty ({len(vertices)} vertices, {len(faces)} triangles)")
+    bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+    used = np.zeros(len(vertices), dtype=bool)
+    used[faces[(faces >= 0) & (faces < len(vertices))]] = True
+    bad = bad[used[bad]]
+    if len(bad):
+        raise MeshError(
+            f"{place}: {len(bad)} vertices are not finite, "
+            f"the first is number {bad[0]} {vertices[bad[0]].tolist()}; export the mesh again"
+        )
+    vertices = np.where(np.isfinite(vertices), vertices, 0.0)
+    try:
+        vertices, faces = check_mesh(vertices, faces, name=name)
+    except MeshError as error:
+        raise MeshError(f"{place}: {error}") from None
+    result = repair(vertices, faces, place=place, may_be_open=may_be_open)
+    mesh = trimesh.Trimesh(result.vertices, result.faces, process=False)
+    return ReadMesh(mesh, result.vertex_map, result.notes, result.closed)
+
+
+def _read_arrays(path):
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise MeshError(
+            f"{path}: {suffix or 'no suffix'} is not a mesh format, use {', '.join(MESH_SUFFIXES)}"
+        )
+    if not path.is_file():
+        raise MeshError(f"{path}: no such mesh file{_neighbours(path)}")
+    try:
+        if path.stat().st_size == 0:
+            raise MeshError(f"{path}: the file is empty")
+        with path.open("rb"):
+            pass
+    except OSError as error:
+        raise MeshError(f"{path}: cannot read the mesh: {error.strerror}") from None
+    if suffix == ".obj":
+        return _read_obj(path)
+    if suffix in (".vtk", ".vtp"):
+        return _read_vtk(path, suffix)
+    return _read_with_trimesh(path, suffix)
+
+
+def _neighbours(path):
+    from rbfmuscle.sim.scene.options import did_you_mean
+
+    if not path.parent.is_dir():
+        return f" (no folder {path.parent})"
+    names = sorted(p.name for p in path.parent.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
+    return ", " + did_you_mean(path.name, names[:50]) if names else " (no meshes in that folder)"
+
+
+def _read_with_trimesh(path, suffix):
+    import struct
+
+    import trimesh
+
+    try:
+        mesh = trimesh.load(path, file_type=suffix[1:], process=False, force="mesh", skip_materials=True)
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError, EOFError, struct.error) as error:
+        raise MeshError(f"{path}: not a readable {suffix[1:].upper()} file ({_short(error)})") from None
+    vertices = np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3)
+    faces = np.asarray(getattr(mesh, "faces", np.zeros((0, 3))), dtype=np.int64).reshape(-1, 3)
+    if suffix == ".stl" and len(faces):  # an STL file repeats each vertex for every triangle
+        vertices, inverse = _unique_rows(vertices)
+        faces = inverse[faces]
+    return vertices, faces
+
+
+def _unique_rows(vertices):
+    """Vertices without repeats in order of first use, and the new number of each old one."""
+    _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    return vertices[first[order]], rank[inverse.ravel()]
+
+
+def _read_obj(path):
+    """Positions and faces only: texture and normal numbers would split vertices and break their numbering."""
+    vertices, faces = [], []
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        parts = line.split("#", 1)[0].split()
+        if not parts:
+            continue
+        try:
+            if parts[0] == "v":
+                vertices.append([float(x) for x in parts[1:4]])
+            elif parts[0] == "f":
+                corners = [int(part.split("/")[0]) for part in parts[1:]]
+                corners = [c - 1 if c > 0 else c + len(vertices) for c in corners]
+                faces.extend([corners[0], corners[k], corners[k + 1]] for k in range(1, len(corners) - 1))
+        except ValueError as error:
+            raise MeshError(f"{path}: line {number} is not readable as OBJ ({_short(error)})") from None
+    if any(len(vertex) != 3 for vertex in vertices):
+        raise MeshError(f"{path}: a vertex has fewer than three coordinates")
+    return np.array(vertices, dtype=np.float64).reshape(-1, 3), np.array(faces, dtype=np.int64).reshape(-1, 3)
+
+
+def _read_vtk(path, suffix):
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkFiltersCore import vtkTriangleFilter
+
+    data = read_polydata(path, suffix)
+    triangles = vtkTriangleFilter()
+    triangles.PassLinesOff()
+    triangles.PassVertsOff()
+    triangles.SetInputData(data)
+    triangles.Update()
+    data = triangles.GetOutput()
+    if data.GetNumberOfPoints() == 0 or data.GetNumberOfPolys() == 0:
+        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+    vertices = vtk_to_numpy(data.GetPoints().GetData()).astype(np.float64)
+    faces = vtk_to_numpy(data.GetPolys().GetConnectivityArray()).astype(np.int64).reshape(-1, 3)
+    return vertices, faces
+
+
+def read_polydata(path, suffix=None):
+    """Return the vtkPolyData of a ``.vtk`` or ``.vtp`` file, or raise MeshError."""
+    from vtkmodules.vtkIOLegacy import vtkPolyDataReader
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
+
+    reader = (
+        vtkXMLPolyDataReader() if (suffix or Path(path).suffix.lower()) == ".vtp" else vtkPolyDataReader()
+    )
+    problems = []
+    for source in (reader, getattr(reader, "GetReader", lambda: None)()):
+        if source is not None:
+            source.AddObserver("ErrorEvent", lambda *args: problems.append(args))
+            source.AddObserver("WarningEvent", lambda *args: None)
+    if isinstance(reader, vtkXMLPolyDataReader):
+        import xml.etree.ElementTree as ElementTree
+
+        _check_vtp_head(path, ElementTree)
+    reader.SetFileName(str(path))
+    if isinstance(reader, vtkPolyDataReader) and not reader.IsFilePolyData():
+        raise MeshError(f"{path}: not a VTK PolyData file")
+    reader.Update()
+    if problems:
+        raise MeshError(f"{path}: not a readable VTK PolyData file")
+    return reader.GetOutput()
+
+
+def _check_vtp_head(path, element_tree):
+    """VTK prints its own lines for a broken XML file: find that out before it does."""
+    head = Path(path).read_bytes()[:2048]
+    if b"<VTKFile" not in head or b"PolyData" not in head:
+        raise MeshError(f"{path}: not a VTK PolyData file")
+    if b"<AppendedData" not in Path(path).read_bytes():
+        try:
+            element_tree.parse(path)
+        except element_tree.ParseError as error:
+            raise MeshError(f"{path}: not a readable VTP file ({error})") from None
+
+
+def _short(error):
+    text = " ".join(str(error).split())
+    return text[:80] if text else type(error).__name__

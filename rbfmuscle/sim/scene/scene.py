@@ -1,0 +1,312 @@
+"""What is simulated: bones, joints, muscles, attachments, motion and settings.
+
+A scene is loaded from a TOML file or built in code; both pass the same checks.
+"""
+
+import copy
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from rbfmuscle.sim.scene.attachments import Attachment, resolve_attachments
+from rbfmuscle.sim.scene.meshes import ReadMesh, prepare_mesh, read_mesh
+from rbfmuscle.sim.scene.motion import Motion, coordinate_names
+from rbfmuscle.sim.scene.objects import Bone, Joint, Muscle
+from rbfmuscle.sim.scene.options import (
+    ContactOptions,
+    MotionOptions,
+    OutputOptions,
+    did_you_mean,
+)
+from rbfmuscle.validation import SceneError, check_points, check_positive
+
+MM_PER_UNIT = {"m": 1000.0, "cm": 10.0, "mm": 1.0}
+
+
+class Scene:
+    """Bones, joints, muscles, a motion and the settings of a simulation.
+
+    Parameters
+    ----------
+    name : str
+    units : {"mm", "cm", "m"}
+        Unit of every length in the scene.
+
+    Attributes
+    ----------
+    bones : list of Bone
+    joints : list of Joint
+    muscles : list of Muscle
+    motion : Motion
+    contact : ContactOptions
+    sliding : SlidingOptions or None
+    detect : DetectOptions or None
+    output : OutputOptions
+    path : pathlib.Path or None
+        The file it was loaded from.
+    """
+
+    def __init__(self, name="scene", *, units="mm"):
+        if units not in MM_PER_UNIT:
+            raise SceneError(f"units must be m, cm or mm, got {units!r}")
+        self.name = name
+        self.units = units
+        self.bones = []
+        self.joints = []
+        self.muscles = []
+        self.motion = Motion()
+        self.contact = ContactOptions()
+        self.sliding = None
+        self.detect = None
+        self.output = OutputOptions()
+        self.path = None
+
+    @classmethod
+    def load(cls, path):
+        """Return the scene of a TOML file; its paths are relative to the file.
+
+        Raises
+        ------
+        SceneError
+            If the file, or a name or value in it, is wrong; the message names it and the remedy.
+        MeshError
+            If a mesh cannot be used.
+        """
+        from rbfmuscle.sim.scene.file import load_scene
+
+        return load_scene(cls, Path(path))
+
+    def length(self, millimetres):
+        """Return a length given in millimetres in the scene's unit."""
+        return millimetres / MM_PER_UNIT[self.units]
+
+    def bone(self, name):
+        """Return the bone of that name, or raise SceneError naming the nearest."""
+        return _find(self.bones, name, "bone")
+
+    def muscle(self, name):
+        """Return the muscle of that name, or raise SceneError naming the nearest."""
+        return _find(self.muscles, name, "muscle")
+
+    def add_bone(self, name, mesh, *, scale=1.0):
+        """Add a bone and return the scene.
+
+        Parameters
+        ----------
+        name : str
+        mesh : path, trimesh.Trimesh, (vertices, faces) or ReadMesh
+            Mended where that is safe; holes are kept, with a note.
+        scale : float
+            Factor from the mesh's unit to the scene's.
+        """
+        _check_new_name(self.bones, name, "bone")
+        read = _as_mesh(mesh, name, scale, may_be_open=True)
+        self.bones.append(Bone(name, read.mesh, read.source, read.closed, read.notes))
+        return self
+
+    def add_joint(self, name, parent, child, centre, axes):
+        """Add a ball joint and return the scene.
+
+        Parameters
+        ----------
+        name, parent, child : str
+            The child bone moves; a bone may be the child of one joint.
+        centre : (3,) array_like
+        axes : dict of str -> (3,) array_like
+            Rotation axis of each coordinate, in any length.
+        """
+        _check_new_name(self.joints, name, "joint")
+        place = f"joint {name!r}"
+        for bone in (parent, child):
+            _find(self.bones, bone, "bone", place=place)
+        if any(joint.child == child for joint in self.joints):
+            raise SceneError(f"{place}: bone {child!r} is already the child of another joint")
+        ancestor = parent
+        parents = {joint.child: joint.parent for joint in self.joints}
+        while ancestor is not None:
+            if ancestor == child:
+                raise SceneError(f"{place}: {child!r} would hang on itself, joints must form a tree")
+            ancestor = parents.get(ancestor)
+        if not axes:
+            raise SceneError(f"{place}: axes needs at least one coordinate")
+        centre = _vector(centre, f"{place}: centre")
+        units = {key: _vector(axis, f"{place}: axis {key!r}", unit=True) for key, axis in axes.items()}
+        self.joints.append(Joint(name, parent, child, centre, units))
+        return self
+
+    def add_muscle(self, name, mesh, *, attach=(), model="rbf", fibres=None, scale=1.0):
+        """Add a muscle and return the scene.
+
+        Parameters
+        ----------
+        name : str
+        mesh : path, trimesh.Trimesh, (vertices, faces) or ReadMesh
+            Closed; mended where that is safe.
+        attach : list of Attachment or dict
+            A dict holds ``bone`` and one of ``vertices`` (indices or a file), ``near`` (distance) and
+            ``sphere`` (``centre``, ``radius``).
+        model : str or dict
+            A model's name, or a table with ``name`` and the model's own options.
+        fibres : path or list of (k, 3) array_like, optional
+        scale : float
+            Factor from the mesh's unit to the scene's; fibres are scaled alike.
+        """
+        from rbfmuscle.sim.scene.fibres import read_fibres
+
+        _check_new_name(self.muscles, name, "muscle")
+        read = _as_mesh(mesh, name, scale, may_be_open=False)
+        model_name, options = split_model(model, place=f"muscle {name!r}")
+        attachments = resolve_attachments(attach, read, self.bones, muscle=name)
+        lines = None if fibres is None else read_fibres(fibres, scale=scale, muscle=name)
+        self.muscles.append(
+            Muscle(name, read.mesh, model_name, options, attachments, lines, read.source, read.notes)
+        )
+        return self
+
+    def set_motion(self, *, folder=None, **options):
+        """Set the motion from the keys of ``[motion]`` (angles in degrees) and return the scene."""
+        table = MotionOptions.build(options, place="[motion] ")
+        self.motion = Motion.from_options(table, self.joints, folder=folder)
+        return self
+
+    def validate(self):
+        """Raise SceneError if the scene cannot be simulated: no bones, no muscles, loose muscles."""
+        for what in ("bones", "muscles"):
+            if not getattr(self, what):
+                raise SceneError(f"scene {self.name!r} has no {what}, add a [[{what[:-1]}]]")
+        known = set(coordinate_names(self.joints))
+        for frame in self.motion.frames:
+            for name in frame:
+                if name not in known:
+                    raise SceneError(
+                        f"[motion]: unknown coordinate {name!r}, {did_you_mean(name, sorted(known))}"
+                    )
+        for muscle in self.muscles:
+            bones = sorted({attachment.bone for attachment in muscle.attachments})
+            if not bones:
+                raise SceneError(
+                    f"muscle {muscle.name!r} has no attachment, give attach a place on two bones"
+                )
+            if len(bones) == 1:
+                raise SceneError(
+                    f"muscle {muscle.name!r} is attached to {bones[0]!r} only, give attach a second bone"
+                )
+        return self
+
+    def check(self):
+        """Return findings about the scene (errors, warnings, notes); nothing is solved.
+
+        Returns
+        -------
+        list of rbfmuscle.sim.scene.check.Finding
+        """
+        from rbfmuscle.sim.scene.check import check_scene
+
+        return check_scene(self)
+
+    def copy(self):
+        """Return a copy whose lists and tables are its own; meshes are shared."""
+        other = copy.copy(self)
+        other.bones = list(self.bones)
+        other.joints = list(self.joints)
+        other.muscles = [replace(muscle, options=dict(muscle.options)) for muscle in self.muscles]
+        return other
+
+    def with_options(self, *, model=None, frames=None, **settings):
+        """Return a copy with another model, other frames or other settings; meshes are shared.
+
+        Parameters
+        ----------
+        model : str or dict, optional
+            For every muscle. Options of another model are dropped.
+        frames : slice or str, optional
+            Which frames of the motion, as a slice or "A:B:S".
+        **settings
+            Dotted keys with their values: ``**{"model.centres": 200, "contact.substep_angle": 1}``.
+            See :func:`rbfmuscle.sim.scene.settings.apply_setting` for all of them.
+        """
+        from rbfmuscle.sim.scene.settings import apply_model, apply_setting, parse_slice
+
+        scene = self.copy()
+        if model is not None:
+            apply_model(scene, model)
+        for key, value in settings.items():
+            apply_setting(scene, key, value)
+        if frames is not None:
+            scene.motion = scene.motion.sliced(parse_slice(frames) if isinstance(frames, str) else frames)
+        return scene
+
+    def resolved(self):
+        """Return the scene as plain data for ``run.json``: names, counts, options, sources and hashes."""
+        from rbfmuscle.sim.scene.file import describe_scene
+
+        return describe_scene(self)
+
+    def __repr__(self):
+        muscles = ", ".join(f"{muscle.name} ({muscle.model})" for muscle in self.muscles) or "no muscles"
+        counts = f"{len(self.bones)} bones, {muscles}, {len(self.motion)} frames"
+        return f"<Scene {self.name!r}, {self.units}: {counts}>"
+
+
+def split_model(model, *, place):
+    """Return (name, options) of a model given as a name or as a table with ``name``."""
+    if isinstance(model, str):
+        return model, {}
+    if isinstance(model, dict):
+        options = dict(model)
+        name = options.pop("name", "rbf")
+        if isinstance(name, str):
+            return name, options
+    raise SceneError(f"{place}: model must be a name or a table with a name, got {model!r}")
+
+
+def _find(items, name, what, *, place=""):
+    for item in items:
+        if item.name == name:
+            return item
+    hint = did_you_mean(name, [item.name for item in items])
+    raise SceneError(f"{place + ': ' if place else ''}unknown {what} {name!r}, {hint}")
+
+
+def _check_new_name(items, name, what):
+    if not isinstance(name, str) or not name or not set(name) <= _NAME_CHARACTERS:
+        raise SceneError(
+            f"{what} name {name!r} may hold letters, digits, '_' and '-' only (it becomes a file name)"
+        )
+    if any(item.name == name for item in items):
+        raise SceneError(f"{what} {name!r} is given twice")
+
+
+_NAME_CHARACTERS = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-")
+
+
+def _vector(values, name, *, unit=False):
+    try:
+        vector = check_points([values], name=name)[0]
+    except (ValueError, TypeError) as error:
+        raise SceneError(f"{name} must be three numbers, got {values!r} ({error})") from None
+    if not unit:
+        return vector
+    size = np.linalg.norm(vector)
+    if size == 0:
+        raise SceneError(f"{name} must not be the zero vector")
+    return vector / size
+
+
+def _as_mesh(mesh, name, scale, *, may_be_open):
+    if isinstance(mesh, ReadMesh):
+        return mesh
+    try:
+        scale = check_positive(scale, name="scale")
+    except (ValueError, TypeError) as error:
+        raise SceneError(f"{name!r}: {error}") from None
+    if isinstance(mesh, (str, Path)):
+        return read_mesh(mesh, name=name, scale=scale, may_be_open=may_be_open)
+    vertices, faces = mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)
+    vertices = np.asarray(vertices, dtype=np.float64) * scale
+    place = f"mesh {name!r}"
+    return prepare_mesh(vertices, np.asarray(faces), place=place, name=name, may_be_open=may_be_open)
+
+
+__all__ = ["Attachment", "Bone", "Joint", "Muscle", "Scene"]

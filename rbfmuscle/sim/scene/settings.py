@@ -1,0 +1,135 @@
+"""Changing a scene by dotted keys: ``--set KEY=VALUE``, grids of a sweep, ``Scene.with_options``."""
+
+import tomllib
+
+from rbfmuscle.sim.scene.motion import Motion
+from rbfmuscle.sim.scene.options import DetectOptions, SlidingOptions, did_you_mean
+from rbfmuscle.validation import SceneError, UsageError
+
+TABLES = ("contact", "sliding", "detect", "output", "motion")
+
+
+def apply_model(scene, model, *, muscles=None):
+    """Give muscles (all by default) another model; options of a different model are dropped."""
+    from rbfmuscle.sim.scene.scene import split_model
+
+    name, options = split_model(model, place="model")
+    for muscle in scene.muscles if muscles is None else muscles:
+        if muscle.model != name:
+            muscle.options = {}
+        muscle.model = name
+        muscle.options.update(options)
+
+
+def apply_setting(scene, key, value):
+    """Set one dotted key of a scene, in place.
+
+    ``model`` or ``model.KEY`` change every muscle, ``muscle.NAME.model`` or ``muscle.NAME.model.KEY`` one;
+    ``contact.KEY``, ``sliding.KEY``, ``detect.KEY`` and ``output.KEY`` change a table (one that the scene
+    lacks is switched on); ``motion.step`` changes the step of every ramp and
+    ``motion.ramp.NAME.COORDINATE.KEY`` one key of one.
+
+    Raises
+    ------
+    SceneError
+        If the key is unknown or the value not allowed.
+    """
+    head, _, rest = key.partition(".")
+    if head == "model":
+        _set_model(scene.muscles, scene, rest, value, key)
+    elif head == "muscle":
+        name, _, rest = rest.partition(".")
+        head, _, rest = rest.partition(".")
+        muscle = scene.muscle(name)
+        if head != "model":
+            raise SceneError(f"{key}: of a muscle only its model can be set (muscle.{name}.model.KEY)")
+        _set_model([muscle], scene, rest, value, key)
+    elif head == "motion":
+        _set_motion(scene, rest, value, key)
+    elif head in TABLES and rest:
+        table = getattr(scene, head)
+        if table is None:
+            table = {"sliding": SlidingOptions, "detect": DetectOptions}[head]()
+        setattr(scene, head, table.changed(rest, value, place=f"{key}: "))
+    elif head in TABLES:
+        raise SceneError(f"{key}: name a key of the table, for instance {head}.KEY=VALUE")
+    else:
+        raise SceneError(f"{key}: unknown setting, {did_you_mean(head, ['model', 'muscle', *TABLES])}")
+
+
+def parse_setting(text):
+    """Return (key, value) of "KEY=VALUE"; the value is read as TOML, else taken as text.
+
+    Raises
+    ------
+    UsageError
+        If there is no "=".
+    """
+    key, found, value = text.partition("=")
+    if not found or not key.strip():
+        raise UsageError(f"{text!r} is not KEY=VALUE, for instance model.centres=200")
+    return key.strip(), parse_value(value.strip())
+
+
+def parse_value(text):
+    """Return the value of a TOML literal (number, true, list, table), or the text itself."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def parse_slice(text):
+    """Return the slice of "A:B:S" (each part may be empty), or of a single frame "A".
+
+    Raises
+    ------
+    UsageError
+        If a part is no whole number or S is zero.
+    """
+    parts = text.split(":")
+    try:
+        numbers = [int(part) if part.strip() else None for part in parts]
+    except ValueError:
+        numbers = []
+    if not 1 <= len(numbers) <= 3 or (len(numbers) == 1 and numbers[0] is None) or numbers[2:] == [0]:
+        raise UsageError(
+            f"frames {text!r} must look like A:B:S (whole numbers, S not 0), for instance 0:46:5"
+        )
+    if len(numbers) == 1:
+        return slice(numbers[0], numbers[0] + 1 or None)
+    return slice(*numbers)
+
+
+def _set_model(muscles, scene, rest, value, key):
+    if not rest:
+        apply_model(scene, value, muscles=muscles)
+        return
+    for muscle in muscles:
+        options = muscle.options = dict(muscle.options)
+        *parents, last = rest.split(".")
+        for parent in parents:
+            inner = options.get(parent, {})
+            if not isinstance(inner, dict):
+                raise SceneError(f"{key}: {parent!r} is not a table")
+            options[parent] = dict(inner)
+            options = options[parent]
+        options[last] = value
+
+
+def _set_motion(scene, rest, value, key):
+    options = scene.motion.options
+    values = options.model_dump(by_alias=True, exclude_unset=True)
+    if rest == "step" and options.ramp is not None:
+        for ramp in values["ramp"].values():
+            ramp["step"] = value
+    elif rest.startswith("ramp.") and rest.count(".") >= 2:
+        name, _, last = rest.removeprefix("ramp.").rpartition(".")
+        ramps = values.setdefault("ramp", {})
+        if name not in ramps:
+            raise SceneError(f"{key}: the motion has no ramp {name!r}, {did_you_mean(name, ramps)}")
+        ramps[name][last] = value
+    else:
+        values[rest] = value
+    table = type(options).build(values, place=f"{key}: motion ")
+    scene.motion = Motion.from_options(table, scene.joints, folder=scene.path.parent if scene.path else None)

@@ -1,0 +1,1 @@
+"""Many runs or fits side by side: comparisons, sweeps, kernels."""

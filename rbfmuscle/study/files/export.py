@@ -1,0 +1,154 @@
+"""A saved run in other formats and units: surfaces as PVD with VTP, PLY, STL, OBJ, GLB; lengths as STO."""
+
+from pathlib import Path
+
+import numpy as np
+
+from rbfmuscle.study.files.meshfiles import write_mesh
+from rbfmuscle.study.files.saved import SavedRun
+from rbfmuscle.study.files.storage import export_lengths
+from rbfmuscle.study.files.vtp import Collection, write_vtp
+from rbfmuscle.study.show.appearance import BONE_COLOUR, muscle_colours
+from rbfmuscle.validation import SolveError, UsageError
+
+FORMATS = ("pvd", "vtp", "ply", "stl", "obj", "glb")
+TABLES = ("sto",)
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+
+
+def export_run(directory, formats, *, output=None, units=None, frames=None, ascii=False):
+    """Write the muscles and bones of a saved run in one or more formats.
+
+    Parameters
+    ----------
+    directory : path
+        Folder of the run.
+    formats : str or list of str
+        Of `FORMATS` and `TABLES`. ``glb`` gives one file a frame with all muscles and bones as named,
+        coloured nodes; the others one file a muscle (or bone) and frame. ``pvd`` is ``vtp`` and a collection
+        over the frames. ``sto`` gives lengths and moment arms for OpenSim and needs no surfaces.
+    output : path, optional
+        ``DIR/export`` where not given; each format has its own folder there.
+    units : {"m", "cm", "mm"}, optional
+        The scene's unit where not given; metres for ``glb``, which knows no other.
+    frames : slice, optional
+        Of the written frames; all where not given.
+    ascii : bool
+        VTP as plain numbers, as OpenSim reads them.
+
+    Returns
+    -------
+    list of pathlib.Path
+        Every file written.
+
+    Raises
+    ------
+    UsageError
+        If the folder holds no run, or a format or unit is unknown.
+    SolveError
+        If a file cannot be written.
+    """
+    saved = SavedRun(directory)
+    formats = [formats] if isinstance(formats, str) else list(formats)
+    for name in formats:
+        if name not in FORMATS + TABLES:
+            raise UsageError(f"unknown format {name!r}; known: {', '.join(FORMATS + TABLES)}")
+    if units is not None and units not in METRES:
+        raise UsageError(f"units must be m, cm or mm, got {units!r}")
+    chosen = saved.frames[frames] if frames is not None else saved.frames
+    if not chosen or not (saved.has_surfaces() or set(formats) <= set(TABLES)):
+        raise UsageError(f"{directory} has no surfaces to export")
+    base = Path(output) if output is not None else saved.directory / "export"
+    written = []
+    try:
+        for name in formats:
+            wanted = units or ("m" if name == "glb" else saved.units)
+            factor = METRES[saved.units] / METRES[wanted]
+            if name == "sto":
+                written += export_lengths(saved, base / name, chosen, factor)
+                continue
+            act = _export_glb if name == "glb" else _export_meshes
+            written += act(saved, base / name, name, chosen, factor, ascii)
+    except OSError as error:
+        raise SolveError(f"cannot write to {base}: {error.strerror}") from None
+    return written
+
+
+def posed(saved, bone, frame):
+    """Vertices of a bone in a frame, from its (vertices, faces) at rest and the poses."""
+    pose = saved.poses[frame][bone[0]]
+    return bone[1] @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _export_meshes(saved, folder, name, frames, factor, ascii):
+    folder.mkdir(parents=True, exist_ok=True)
+    suffix = ".vtp" if name == "pvd" else f".{name}"
+    rest = {bone: saved.bone(bone) for bone in saved.bones}
+    groups = {"surfaces": [], "bones": []}
+    for frame in frames:
+        muscles = [(muscle, *saved.surface(muscle, frame)) for muscle in saved.muscles]
+        bones = [(bone, posed(saved, (bone, rest[bone][0]), frame), rest[bone][1]) for bone in saved.bones]
+        for group, items in (("surfaces", muscles), ("bones", bones)):
+            entries = []
+            for item, vertices, faces in items:
+                file = f"{item}_{frame:04d}{suffix}"
+                if suffix == ".vtp":
+                    write_vtp(folder / file, vertices * factor, faces, ascii=ascii)
+                else:
+                    write_mesh(folder / file, vertices * factor, faces)
+                entries.append((item, file))
+            groups[group].append((frame, entries))
+        if suffix == ".vtp" and saved.has_fibres():
+            groups.setdefault("fibres", []).append(
+                (frame, _export_fibres(saved, folder, frame, factor, ascii))
+            )
+    written = [folder / file for steps in groups.values() for _, entries in steps for _, file in entries]
+    if name == "pvd":
+        written += [_write_collection(folder / f"{group}.pvd", steps) for group, steps in groups.items()]
+    return written
+
+
+def _export_fibres(saved, folder, frame, factor, ascii):
+    from rbfmuscle.study.files.vtp import write_vtp_lines
+
+    entries = []
+    for muscle in saved.muscles:
+        points, cells = saved.fibres(muscle, frame)
+        cells["length"] = cells["length"] * factor
+        file = f"{muscle}_fibres_{frame:04d}.vtp"
+        write_vtp_lines(folder / file, points * factor, cells=cells, ascii=ascii)
+        entries.append((muscle, file))
+    return entries
+
+
+def _write_collection(path, steps):
+    collection = Collection(path)
+    for frame, entries in steps:
+        collection.add(frame, entries)
+    collection.close()
+    return path
+
+
+def _export_glb(saved, folder, _name, frames, factor, _ascii):
+    import trimesh
+
+    folder.mkdir(parents=True, exist_ok=True)
+    rest = {bone: saved.bone(bone) for bone in saved.bones}
+    colours = muscle_colours(saved.muscles)
+    written = []
+    for frame in frames:
+        scene = trimesh.Scene()
+        items = [(m, *saved.surface(m, frame), colours[m]) for m in saved.muscles]
+        items += [(b, posed(saved, (b, rest[b][0]), frame), rest[b][1], BONE_COLOUR) for b in saved.bones]
+        for item, vertices, faces, colour in items:
+            mesh = trimesh.Trimesh(vertices * factor, faces, process=False)
+            rgba = [*(int(colour[k : k + 2], 16) for k in (1, 3, 5)), 255]
+            material = trimesh.visual.material.PBRMaterial(
+                name=item, baseColorFactor=np.array(rgba, np.uint8), metallicFactor=0.0, roughnessFactor=0.6
+            )
+            mesh.visual = trimesh.visual.TextureVisuals(material=material)
+            scene.add_geometry(mesh, geom_name=item, node_name=item)
+        path = folder / f"frame_{frame:04d}.glb"
+        path.write_bytes(scene.export(file_type="glb"))
+        written.append(path)
+    return written

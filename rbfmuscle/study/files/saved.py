@@ -1,0 +1,126 @@
+"""Reading back what a run left in a folder."""
+
+import csv
+import json
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from rbfmuscle.study.files.meshfiles import SUFFIXES, read_mesh
+from rbfmuscle.study.measure.metrics import Row
+from rbfmuscle.validation import UsageError
+
+
+class SavedRun:
+    """A run in a folder; surfaces are read when asked for.
+
+    Parameters
+    ----------
+    directory : path
+
+    Raises
+    ------
+    UsageError
+        If the folder holds no run.
+
+    Attributes
+    ----------
+    info : dict
+        ``run.json``.
+    frames : list of int
+        Frames that were written.
+    muscles, bones : list of str
+    units : str
+    """
+
+    def __init__(self, directory):
+        self.directory = Path(directory)
+        path = self.directory / "run.json"
+        try:
+            self.info = json.loads(path.read_text(encoding="utf-8"))
+            self.frames = [frame["frame"] for frame in self.info["frames"]]
+            self.units = self.info["scene"]["units"]
+            self.muscles = [muscle["name"] for muscle in self.info["scene"]["muscles"]]
+            self.bones = [bone["name"] for bone in self.info["scene"]["bones"]]
+            surfaces = self.info["scene"]["output"]["surfaces"]
+        except OSError:
+            raise UsageError(
+                f"{self.directory} holds no run (no run.json); give the folder of 'run -o'"
+            ) from None
+        except (ValueError, KeyError, TypeError) as error:
+            raise UsageError(
+                f"{path} is not the run.json of a run ({error!r}); run the scene again"
+            ) from None
+        self.suffix = SUFFIXES[surfaces["format"]] if surfaces else None
+
+    @cached_property
+    def metrics(self):
+        """Rows of ``metrics.csv``."""
+        return [
+            Row(int(r[0]), r[1], float(r[2]), r[3], r[4], float(r[5]), r[6])
+            for r in self._table("metrics.csv")
+        ]
+
+    @cached_property
+    def events(self):
+        """Rows of ``events.csv``: frame, muscle, bone, count, action."""
+        return [(int(r[0]), r[1], r[2], int(r[3]), r[4]) for r in self._table("events.csv")]
+
+    @cached_property
+    def poses(self):
+        """Dict of frame to dict of bone to (4, 4) ndarray."""
+        found = {}
+        for row in self._table("poses.csv"):
+            found.setdefault(int(row[0]), {})[row[1]] = np.array(row[2:], dtype=float).reshape(4, 4)
+        return found
+
+    def surface(self, muscle, frame):
+        """Vertices and faces of a muscle in a frame."""
+        return read_mesh(self._file("surfaces", muscle, frame))
+
+    def bone(self, name):
+        """Vertices and faces of a bone at rest."""
+        first = self.frames[0]
+        vertices, faces = read_mesh(self._file("bones", name, first))
+        pose = self.poses[first][name]
+        return (vertices - pose[:3, 3]) @ pose[:3, :3], faces
+
+    def series(self, muscle, quantity):
+        """Frames and values of a quantity of a muscle, as two arrays."""
+        found = [(r.frame, r.value) for r in self.metrics if r.muscle == muscle and r.quantity == quantity]
+        return np.array([f for f, _ in found]), np.array([v for _, v in found], dtype=float)
+
+    def has_surfaces(self):
+        """Whether there is something to draw."""
+        return self.suffix is not None and bool(self.frames)
+
+    def has_fibres(self):
+        """Whether the run wrote fibres."""
+        return bool(self.info["scene"]["output"].get("fibres"))
+
+    def fibres(self, muscle, frame):
+        """Points (count, k, 3) of the fibres of a muscle in a frame, and their ``length`` and ``stretch``.
+
+        Raises
+        ------
+        UsageError
+            If the run wrote none.
+        """
+        from rbfmuscle.study.files.fibre_files import read_fibres
+
+        if not self.has_fibres():
+            raise UsageError(f"{self.directory} has no fibres: set output.fibres = true in the run's scene")
+        return read_fibres(self.directory / "fibres" / f"{muscle}_{frame:04d}.vtp")
+
+    def _file(self, folder, name, frame):
+        if self.suffix is None:
+            raise UsageError(f"{self.directory} has no surfaces: the run's scene had output.surfaces = false")
+        return self.directory / folder / f"{name}_{frame:04d}{self.suffix}"
+
+    def _table(self, name):
+        path = self.directory / name
+        if not path.is_file():
+            return []
+        with open(path, encoding="utf-8", newline="") as file:
+            return list(csv.reader(file))[1:]

@@ -1,0 +1,146 @@
+"""Length of a muscle: a line through the slices of a harmonic field between its origin and its insertion."""
+
+import numpy as np
+import scipy.sparse as sparse
+from scipy.spatial import cKDTree
+
+from rbfmuscle.geometry.harmonic import harmonic_weights
+
+_FINE, _SLICES = 120, 16
+
+
+class Centreline:
+    """The centreline of one muscle on a mesh of constant topology.
+
+    The harmonic field is 0 on the origin and 1 on the insertion. Slices are taken at levels whose centroids
+    lie evenly along the muscle at rest. Each centroid is a fixed linear combination of the vertices, so
+    the line costs one sparse product a frame. Its ends are the centroids of the attached vertices of the
+    input mesh, carried by their bones.
+
+    Parameters
+    ----------
+    muscle : Muscle
+        Input mesh and attachments.
+    joints : list of Joint
+        Bones that no joint separates count as one.
+    vertices, faces : (n, 3) and (m, 3) ndarray
+        The carried mesh at rest [scene unit].
+    slices : int
+        Points of the line between its ends.
+    """
+
+    def __init__(self, muscle, joints, vertices, faces, *, slices=_SLICES):
+        self.ends = end_groups(muscle, joints)
+        sides = _sides(muscle, self.ends, vertices)
+        field = harmonic_weights(vertices, faces, sides)[:, 1]
+        levels = np.linspace(0.0, 1.0, _FINE + 2)[1:-1]
+        fine = slice_operator(vertices, faces, field, levels)
+        line = fine @ vertices
+        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+        even = np.interp(np.linspace(0.0, along[-1], slices), along, levels)
+        self.operator = slice_operator(vertices, faces, field, even)
+
+    def points(self, vertices, poses):
+        """The line now.
+
+        Parameters
+        ----------
+        vertices : (n, 3) ndarray
+            The carried mesh.
+        poses : dict of str to (4, 4) ndarray
+
+        Returns
+        -------
+        (k, 3) ndarray
+        """
+        first, last = (_carried(end, poses) for end in self.ends)
+        return np.vstack([first, self.operator @ vertices, last])
+
+    def length(self, vertices, poses):
+        """Length of the line now [scene unit]."""
+        return float(np.linalg.norm(np.diff(self.points(vertices, poses), axis=0), axis=1).sum())
+
+
+def end_groups(muscle, joints):
+    """Split the attachments into origin and insertion.
+
+    The origin is every attachment on the same rigid body as the first one; the rest is the insertion. Where
+    all are on one body, the first attachment is the origin.
+
+    Returns
+    -------
+    list of two lists of (bone, points)
+        ``points`` (k, 3) are the attached vertices at rest.
+    """
+    vertices = np.asarray(muscle.mesh.vertices, dtype=float)
+    return [
+        [(a.bone, vertices[np.asarray(a.vertices)]) for a in group] for group in split_ends(muscle, joints)
+    ]
+
+
+def split_ends(muscle, joints):
+    """The attachments of the origin and those of the insertion, as `end_groups` tells them apart."""
+    children = {joint.child for joint in joints}
+    body = [a.bone if a.bone in children else None for a in muscle.attachments]
+    origin = [a for a, owner in zip(muscle.attachments, body) if owner == body[0]]
+    insertion = [a for a, owner in zip(muscle.attachments, body) if owner != body[0]]
+    return [origin, insertion] if insertion else [muscle.attachments[:1], muscle.attachments[1:]]
+
+
+def slice_operator(vertices, faces, field, levels):
+    """Sparse matrix that maps vertices to the centroids of the field's isolines.
+
+    Parameters
+    ----------
+    vertices : (n, 3) ndarray
+        Positions whose isoline lengths weigh the centroids.
+    faces : (m, 3) ndarray of int
+    field : (n,) ndarray
+    levels : (k,) array_like
+        Each strictly between the least and the greatest value of the field.
+
+    Returns
+    -------
+    (k, n) scipy.sparse.csr_matrix
+        Rows sum to one.
+    """
+    rows = [_slice_row(vertices, faces, field, level) for level in levels]
+    return sparse.vstack(rows).tocsr()
+
+
+def _slice_row(vertices, faces, field, level):
+    above = field[faces] > level
+    crossed = faces[above.any(axis=1) & ~above.all(axis=1)]
+    above = field[crossed] > level
+    # The corner that is alone on its side: both crossing points lie on its edges.
+    lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
+    row = np.arange(len(crossed))
+    a, b, c = (crossed[row, (lone + k) % 3] for k in range(3))
+    s, t = (level - field[a]) / (field[b] - field[a]), (level - field[a]) / (field[c] - field[a])
+    p = vertices[a] + s[:, None] * (vertices[b] - vertices[a])
+    q = vertices[a] + t[:, None] * (vertices[c] - vertices[a])
+    share = np.linalg.norm(p - q, axis=1)
+    share = share / share.sum() / 2
+    values = np.concatenate([share * (2 - s - t), share * s, share * t])
+    columns = np.concatenate([a, b, c])
+    return sparse.csr_matrix((values, (np.zeros(len(columns), int), columns)), shape=(1, len(vertices)))
+
+
+def _sides(muscle, ends, vertices):
+    """Carried vertices of origin and insertion: those whose nearest input vertex is attached there."""
+    mesh = np.asarray(muscle.mesh.vertices, dtype=float)
+    nearest = cKDTree(mesh).query(vertices)[1]
+    sides = []
+    for end in ends:
+        attached = np.concatenate([points for _, points in end])
+        on_end = cKDTree(attached).query(mesh[nearest])[0] == 0.0
+        if not on_end.any():
+            on_end[cKDTree(vertices).query(attached.mean(axis=0))[1]] = True
+        sides.append(np.flatnonzero(on_end))
+    return [np.setdiff1d(sides[0], sides[1]), sides[1]]
+
+
+def _carried(end, poses):
+    total = sum(len(points) for _, points in end)
+    moved = [points @ poses[bone][:3, :3].T + poses[bone][:3, 3] for bone, points in end]
+    return np.concatenate(moved).sum(axis=0) / total

@@ -1,0 +1,160 @@
+"""Measures that mean the same for every model, whatever its mesh: material points, curvature, bytes held."""
+
+import math
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from rbfmuscle.implicit.placement.clustering import face_normals
+from rbfmuscle.implicit.placement.sampling import sample_surface, spread_points
+from rbfmuscle.study.measure.metrics import edge_lengths, unique_edges
+
+POINTS = 1200  # material points of a muscle
+PATCHES = 5000  # points at which curvature is taken
+NEIGHBOURS = 24
+FEWEST = 8  # of the neighbours, on the same sheet
+
+
+class MaterialProbe:
+    """The same points of a muscle's material in every model.
+
+    Points are spread evenly over the input mesh and bound to the model's carried mesh at rest: to the
+    nearest triangle, by its barycentric coordinates. Edges between neighbouring points are the same for all
+    models, so their strain compares, which the strain of each model's own mesh does not.
+
+    Parameters
+    ----------
+    mesh : trimesh.Trimesh
+        The muscle at rest [scene unit].
+    vertices, faces : (n, 3) and (m, 3) ndarray
+        The model's carried mesh at rest.
+    count : int
+    """
+
+    def __init__(self, mesh, vertices, faces, *, count=POINTS):
+        import igl
+
+        sample = sample_surface(np.asarray(mesh.vertices), np.asarray(mesh.faces), count, placement="even")
+        faces = np.asarray(faces, dtype=np.int64)
+        _, nearest, closest = igl.point_mesh_squared_distance(sample.points, vertices, faces)[:3]
+        self.corners = faces[nearest]
+        a, b, c = (np.ascontiguousarray(vertices[self.corners[:, k]]) for k in range(3))
+        self.shares = np.clip(igl.barycentric_coordinates(closest, a, b, c), 0.0, 1.0)
+        self.edges = unique_edges(sample.control_faces)
+        self.rest = edge_lengths(sample.points, self.edges)
+
+    def points(self, vertices):
+        """Places (count, 3) of the material points for the carried mesh's vertices now."""
+        return np.einsum("pk,pkd->pd", self.shares, vertices[self.corners])
+
+    def strain(self, points, start=None):
+        """Root mean square of the relative change of the edges' lengths.
+
+        Parameters
+        ----------
+        points : (count, 3) ndarray
+        start : (count, 3) ndarray, optional
+            Places that count as unstrained; the input mesh's where not given.
+        """
+        rest = self.rest if start is None else edge_lengths(start, self.edges)
+        used = rest > 0
+        change = edge_lengths(points, self.edges)[used] / rest[used] - 1.0
+        return float(np.sqrt(np.mean(change**2)))
+
+
+def curvature_variation(vertices, faces, *, patches=PATCHES, seed=0):
+    """How unevenly a surface is curved.
+
+    Points are spread over the surface at random, in proportion to its area. At each a quadric is fitted to its
+    nearest neighbours on the same sheet, which gives the mean curvature H there. The variation is the standard
+    deviation of H among neighbours, root mean square over all points: zero on a sphere, a plane and a
+    cylinder. Since all surfaces get the same number of points, the scale is the same for models of one
+    muscle, whatever their meshes.
+
+    Parameters
+    ----------
+    vertices, faces : (n, 3) and (m, 3) ndarray
+        Closed, outward surface.
+    patches : int
+        Number of points.
+    seed : int
+
+    Returns
+    -------
+    float
+        [1 / scene unit]
+    """
+    # In strips of equal area, so that no region goes without points.
+    points, face = spread_points(vertices, faces, patches, seed=seed)
+    normals = face_normals(vertices, np.asarray(faces))[face]
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    near = cKDTree(points).query(points, k=NEIGHBOURS)[1]
+    same_sheet = np.einsum("pkd,pd->pk", normals[near], normals) > 0.3
+    # On the rim of a thin plate a point can have too few neighbours on its own sheet for a quadric.
+    enough = same_sheet.sum(axis=1) >= FEWEST
+    same_sheet &= enough[near]
+    curvature = np.zeros(len(points))
+    curvature[enough] = _mean_curvature(points, normals, near[enough], same_sheet[enough])
+    near, same_sheet = near[enough], same_sheet[enough]
+    weight = same_sheet / same_sheet.sum(axis=1, keepdims=True)
+    mean = (weight * curvature[near]).sum(axis=1)
+    variance = (weight * (curvature[near] - mean[:, None]) ** 2).sum(axis=1)
+    return float(np.sqrt(variance.mean()))
+
+
+def _mean_curvature(points, normals, near, same_sheet):
+    """Mean curvature at each point from the quadric z = h + gu u + gv v + a u^2 + b u v + c v^2."""
+    weight = same_sheet[:, :, None].astype(float)
+    normal = (weight * normals[near]).sum(axis=1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    helper = np.where(np.abs(normal[:, :1]) < 0.6, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    u_axis = np.cross(normal, helper)
+    u_axis /= np.linalg.norm(u_axis, axis=1, keepdims=True)
+    axes = np.stack([u_axis, np.cross(normal, u_axis), normal], axis=2)
+    local = np.einsum("pkd,pde->pke", points[near] - points[near[:, :1]], axes)
+    scale = np.sqrt((weight[..., 0] * (local[..., :2] ** 2).sum(axis=2)).mean(axis=1))[:, None]
+    u, v, z = np.moveaxis(local, 2, 0) / scale
+    columns = weight * np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=2)
+    matrix = np.einsum("pki,pkj->pij", columns, columns) + 1e-9 * NEIGHBOURS * np.eye(6)
+    right = np.einsum("pki,pk->pi", columns, z)
+    _, gu, gv, a, b, c = np.linalg.solve(matrix, right[:, :, None])[..., 0].T
+    top = (1 + gv**2) * 2 * a - 2 * gu * gv * b + (1 + gu**2) * 2 * c
+    return top / (2 * (1 + gu**2 + gv**2) ** 1.5) / scale[:, 0]
+
+
+def array_bytes(thing, *, without=()):
+    """Bytes of all arrays that an object holds, in attributes and containers, each buffer once.
+
+    Parameters
+    ----------
+    thing : object
+    without : sequence of object
+        What these hold does not count.
+    """
+    theirs = _buffers(list(without))
+    return sum(size for key, size in _buffers([thing]).items() if key not in theirs)
+
+
+def _buffers(waiting):
+    """Dict of buffer to its bytes, for all arrays that can be reached."""
+    buffers, seen = {}, set()
+    while waiting:
+        item = waiting.pop()
+        if id(item) in seen or isinstance(item, (str, bytes, int, float, type, type(math))):
+            continue
+        seen.add(id(item))
+        if isinstance(item, np.ndarray):
+            base = item
+            while isinstance(base.base, np.ndarray):
+                base = base.base
+            buffers[id(base)] = base.nbytes
+        elif isinstance(item, dict):
+            waiting.extend(item.values())
+        elif isinstance(item, (list, tuple, set)):
+            waiting.extend(item)
+        elif not callable(item) or hasattr(item, "__dict__"):
+            waiting.extend(vars(item).values() if hasattr(item, "__dict__") else ())
+            slots = getattr(type(item), "__slots__", ())
+            names = [slots] if isinstance(slots, str) else slots
+            waiting.extend(getattr(item, name) for name in names if hasattr(item, name))
+    return buffers

@@ -1,0 +1,305 @@
+"""What is measured of every written frame, in long form."""
+
+import math
+from collections import defaultdict
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sparse
+from scipy.sparse.csgraph import connected_components
+
+from rbfmuscle.study.measure.centreline import Centreline
+from rbfmuscle.study.measure.mesh_distance import MeshDistance
+from rbfmuscle.study.measure.penetration import BoneProbe, bone_depth, surface_depth
+
+# Quantity: kind of unit (volume and length follow the scene's unit), meaning; in the order of the tables.
+QUANTITIES = {
+    "volume": ("volume", "volume enclosed by the surface"),
+    "volume_error": ("1", "volume relative to the input mesh's, minus one"),
+    "penetration_max": ("length", "deepest surface vertex inside a bone, exact distance to the bone mesh"),
+    "penetration_fraction": ("1", "share of surface vertices inside a bone"),
+    "bone_penetration_max": ("length", "deepest bone vertex inside the muscle"),
+    "solver_penetration_max": ("length", "deepest point inside a bone before the bone is cut away"),
+    "components": ("1", "closed pieces of the surface"),
+    "tunnelled": ("1", "points that passed through a bone and were not brought back"),
+    "rest_error_rms": ("length", "distance between extracted surface and input mesh at rest, both ways"),
+    "rest_error_max": ("length", "the same, greatest (Hausdorff)"),
+    "edge_strain_rms": ("1", "relative change of edge lengths of the carried mesh"),
+    "condition": ("1", "condition estimate of the fit"),
+    "length": ("length", "centreline from origin to insertion"),
+    "moment_arm": ("length", "minus the change of length with the coordinate's angle"),
+    "fibre_length_mean": ("length", "mean length of the fibres"),
+    "fibre_length_std": ("length", "standard deviation of the fibres' lengths"),
+    "fibre_moment_arm_mean": ("length", "mean over the fibres of their moment arms"),
+    "fibre_moment_arm_std": ("length", "standard deviation of the fibres' moment arms"),
+    "time_solve": ("s", "prediction, solution and contacts"),
+    "time_fit": ("s", "fit of the field"),
+    "time_extract": ("s", "extraction of the surface"),
+    "time_frame": ("s", "all of the frame; muscle 'all': wall time of all muscles together"),
+}
+ALL = "all"
+FIBRES = "fibres"
+_FROM_MODEL = ("solver_penetration_max", "condition", "time_fit", "time_extract")
+
+# Events whose points stayed beyond a bone; those turned back or halved away are in events.csv only.
+_THROUGH = ("reported", "unresolved")
+
+
+class Row(NamedTuple):
+    """One line of ``metrics.csv``; the angle is in degrees."""
+
+    frame: int
+    coordinate: str
+    angle: float
+    muscle: str
+    quantity: str
+    value: float
+    unit: str
+
+
+class MetricsRecorder:
+    """Measures frames one by one; memory does not grow with surfaces.
+
+    Parameters
+    ----------
+    scene : Scene
+    carried : dict of str to (vertices, faces)
+        Each model's carried mesh at rest, before the motion.
+    """
+
+    def __init__(self, scene, carried):
+        self.units = scene.units
+        self.motion = scene.motion
+        self.probes = [BoneProbe(bone.name, bone.mesh) for bone in scene.bones]
+        self.trackers = {
+            muscle.name: _Tracker(muscle, scene, *carried[muscle.name])
+            for muscle in scene.muscles
+            if muscle.name in carried
+        }
+        self._path = []
+        self._waiting = []
+
+    def add(self, frame):
+        """Measure a frame.
+
+        Parameters
+        ----------
+        frame : Frame
+
+        Returns
+        -------
+        list of Row
+            Rows of the frame before, which is complete once its successor is known (moment arms).
+        """
+        coordinate, angle = self._leading(frame)
+        at_rest = all(np.abs(pose - np.eye(4)).max() < 1e-9 for pose in frame.poses.values())
+        rows = []
+        for name, tracker in self.trackers.items():
+            found = tracker.measure(frame, self.probes, at_rest)
+            rows += [self._row(frame, coordinate, angle, name, q, v) for q, v in found.items()]
+        rows.append(self._row(frame, coordinate, angle, ALL, "time_frame", frame.wall))
+        lengths = {name: tracker.length for name, tracker in self.trackers.items()}
+        lengths.update({(FIBRES, name): lines.lengths for name, lines in frame.fibres.items()})
+        self._path = [*self._path[-2:], (dict(frame.coordinates), lengths, frame.index)]
+        done = self._waiting + (self._arms(len(self._path) - 2) if self._waiting else [])
+        self._waiting = rows
+        return done
+
+    def finish(self):
+        """Rows of the last frame."""
+        done = self._waiting + (self._arms(len(self._path) - 1) if self._waiting else [])
+        self._waiting = []
+        return done
+
+    def _arms(self, here):
+        coordinates, _, index = self._path[here]
+        unit = unit_text("length", self.units)
+        rows = []
+        for muscle in self.trackers:
+            for name, arm in moment_arms([node[:2] for node in self._path], here, muscle):
+                angle = math.degrees(coordinates.get(name, 0.0))
+                rows.append(Row(index, name, angle, muscle, "moment_arm", arm, unit))
+            if (FIBRES, muscle) not in self._path[here][1]:
+                continue
+            for name, arms in moment_arms([node[:2] for node in self._path], here, (FIBRES, muscle)):
+                angle = math.degrees(coordinates.get(name, 0.0))
+                for quantity, value in (("mean", np.mean(arms)), ("std", np.std(arms))):
+                    quantity = f"fibre_moment_arm_{quantity}"
+                    rows.append(Row(index, name, angle, muscle, quantity, float(value), unit))
+        return rows
+
+    def _row(self, frame, coordinate, angle, muscle, quantity, value):
+        unit = unit_text(QUANTITIES[quantity][0], self.units)
+        return Row(frame.index, coordinate, angle, muscle, quantity, float(value), unit)
+
+    def _leading(self, frame):
+        """The coordinate that moved most to reach this frame, and its angle [degree]."""
+        before = self._path[-1][0] if self._path else {}
+        names = self.motion.coordinates or list(frame.coordinates)
+        if not names:
+            return "", 0.0
+        moved = {n: abs(frame.coordinates.get(n, 0.0) - before.get(n, 0.0)) for n in names}
+        name = max(names, key=moved.get) if self._path else names[0]
+        return name, math.degrees(frame.coordinates.get(name, 0.0))
+
+
+class _Tracker:
+    """What has to be kept of one muscle from frame to frame."""
+
+    def __init__(self, muscle, scene, vertices, faces):
+        self.name = muscle.name
+        self.rest_volume = float(muscle.mesh.volume)
+        self.mesh = muscle.mesh
+        self.edges = unique_edges(faces)
+        self.rest_lengths = edge_lengths(vertices, self.edges)
+        has_line = len(muscle.attachments) > 1
+        self.line = Centreline(muscle, scene.joints, vertices, faces) if has_line else None
+        self.length = math.nan
+        self.rest_measured = False
+
+    def length_of(self, frame):
+        if self.line is None:
+            return math.nan
+        return self.line.length(frame.carried[self.name][0], frame.poses)
+
+    def measure(self, frame, probes, at_rest):
+        """Quantities of this muscle in a frame, in the order of `QUANTITIES`."""
+        found = {}
+        if self.name in frame.surfaces:
+            surface = frame.surfaces[self.name]
+            found.update(self._of_surface(surface, frame, probes, at_rest and not self.rest_measured))
+            self.rest_measured = self.rest_measured or at_rest
+            found.update({q: surface.quantities[q] for q in _FROM_MODEL if q in surface.quantities})
+        mine = [event for event in frame.events if event.muscle == self.name]
+        found["tunnelled"] = sum(event.count for event in mine if event.action in _THROUGH)
+        found["edge_strain_rms"] = edge_strain(frame.carried[self.name][0], self.edges, self.rest_lengths)
+        self.length = self.length_of(frame)
+        if self.line is not None:
+            found["length"] = self.length
+        if self.name in frame.fibres:
+            lengths = frame.fibres[self.name].lengths
+            found.update(fibre_length_mean=np.mean(lengths), fibre_length_std=np.std(lengths))
+        times = frame.times.get(self.name, {})
+        if times:
+            found["time_solve"] = times.get("time_predict", 0.0) + times.get("time_solve", 0.0)
+            found["time_frame"] = times["time_frame"]
+        return {quantity: found[quantity] for quantity in QUANTITIES if quantity in found}
+
+    def _of_surface(self, surface, frame, probes, first_rest):
+        vertices, faces = surface.vertices, np.asarray(surface.faces)
+        volume = mesh_volume(vertices, faces)
+        depth = surface_depth(vertices, probes, frame.poses)
+        found = {
+            "volume": volume,
+            "volume_error": volume / self.rest_volume - 1.0,
+            "penetration_max": depth.max(),
+            "penetration_fraction": np.mean(depth > 0.0),
+            "bone_penetration_max": bone_depth(vertices, faces, probes, frame.poses),
+            "components": count_components(len(vertices), faces),
+        }
+        if first_rest:
+            rms, worst = surface_distance(vertices, faces, self.mesh.vertices, self.mesh.faces)
+            found.update(rest_error_rms=rms, rest_error_max=worst)
+        return found
+
+
+def unit_text(kind, units):
+    """Unit of a quantity as written in tables: ``length`` and ``volume`` take the scene's unit."""
+    return {"length": units, "volume": f"{units}^3"}.get(kind, kind)
+
+
+def mesh_volume(vertices, faces):
+    """Volume enclosed by a closed, outward mesh.
+
+    Parameters
+    ----------
+    vertices : (n, 3) ndarray
+        [scene unit]
+    faces : (m, 3) ndarray of int
+
+    Returns
+    -------
+    float
+        [scene unit cubed]. Summed about the mean vertex, so that a far origin costs no digits.
+    """
+    a, b, c = np.moveaxis((vertices - vertices.mean(axis=0))[faces], 1, 0)
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
+
+def count_components(count, faces):
+    """Number of connected pieces among ``count`` vertices; vertices that no face uses do not count."""
+    ends = np.concatenate([faces[:, :2], faces[:, 1:]])
+    graph = sparse.coo_matrix((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    _, label = connected_components(graph, directed=False)
+    return len(np.unique(label[faces[:, 0]]))
+
+
+def unique_edges(faces):
+    """Edges of a triangle mesh, (e, 2), each once."""
+    faces = np.asarray(faces)
+    ends = np.sort(np.concatenate([faces[:, :2], faces[:, 1:], faces[:, ::2]]), axis=1)
+    return np.unique(ends, axis=0)
+
+
+def edge_lengths(vertices, edges):
+    """Length of each edge [scene unit]."""
+    return np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
+
+
+def edge_strain(vertices, edges, rest_lengths):
+    """Root mean square of the relative change of edge lengths."""
+    used = rest_lengths > 0
+    strain = edge_lengths(vertices, edges)[used] / rest_lengths[used] - 1.0
+    return float(np.sqrt(np.mean(strain**2)))
+
+
+def surface_distance(vertices, faces, other_vertices, other_faces):
+    """Distance between two surfaces, both ways, at their vertices.
+
+    Returns
+    -------
+    rms, worst : float
+        Root of the mean of both directions' mean squares, and the greatest distance of either [scene unit].
+    """
+    there = MeshDistance(other_vertices, other_faces).unsigned(vertices)
+    back = MeshDistance(vertices, faces).unsigned(other_vertices)
+    rms = math.sqrt((np.mean(there**2) + np.mean(back**2)) / 2)
+    return rms, float(max(there.max(), back.max()))
+
+
+def moment_arms(path, here, muscle):
+    """Tendon-excursion moment arms -dl/dq at one place of a path.
+
+    Parameters
+    ----------
+    path : list of (coordinates, lengths)
+        Neighbouring frames in order: angles [radian] by coordinate, lengths [scene unit] by muscle; a length
+        may be an array, of fibres.
+    here : int
+        Place in the path.
+    muscle : str
+
+    Returns
+    -------
+    list of (coordinate, arm)
+        [scene unit per radian]. Central where the coordinate goes on in one direction, else one-sided. Two
+        frames between which several coordinates change cannot tell them apart and give none.
+    """
+    slopes = defaultdict(list)
+    for k in (here - 1, here):
+        if not 0 <= k < len(path) - 1:
+            continue
+        (q0, l0), (q1, l1) = path[k], path[k + 1]
+        changed = [n for n in {*q0, *q1} if abs(q1.get(n, 0.0) - q0.get(n, 0.0)) > 1e-9]
+        if len(changed) == 1 and np.isfinite(l0[muscle]).all() and np.isfinite(l1[muscle]).all():
+            step = q1.get(changed[0], 0.0) - q0.get(changed[0], 0.0)
+            slopes[changed[0]].append((step, (l1[muscle] - l0[muscle]) / step))
+    return [(name, -_combine(found)) for name, found in slopes.items()]
+
+
+def _combine(slopes):
+    """Second-order derivative from the slopes on both sides; the earlier one alone at a turning point."""
+    if len(slopes) == 1 or slopes[0][0] * slopes[1][0] < 0:
+        return slopes[0][1]
+    (a, left), (b, right) = slopes
+    return (b * left + a * right) / (a + b)

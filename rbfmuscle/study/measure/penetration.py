@@ -1,0 +1,168 @@
+"""How deep a muscle's surface and the bones are in each other, by exact distance to both meshes."""
+
+import numba
+import numpy as np
+
+from rbfmuscle.study.measure.mesh_distance import MeshDistance
+from rbfmuscle.study.measure.occupancy import OccupancyGrid
+
+
+class BoneProbe:
+    """One bone, prepared once in its own coordinates.
+
+    Parameters
+    ----------
+    name : str
+    mesh : trimesh.Trimesh
+        Faces outward. Holes are allowed; the sign then comes from winding numbers.
+    """
+
+    def __init__(self, name, mesh):
+        self.name = name
+        self.vertices = np.ascontiguousarray(mesh.vertices, dtype=float)
+        self.faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
+        self.bounds = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+        self.closed = bool(mesh.is_watertight)
+        self._distance = self._grid = None
+
+    def depth(self, points):
+        """How deep points lie inside the bone.
+
+        Parameters
+        ----------
+        points : (n, 3) ndarray
+            Bone coordinates [scene unit].
+
+        Returns
+        -------
+        (n,) ndarray
+            Distance to the bone's surface where inside, else 0.
+        """
+        out = np.zeros(len(points))
+        near = np.flatnonzero(np.all((points > self.bounds[0]) & (points < self.bounds[1]), axis=1))
+        if len(near) == 0:
+            return out
+        if self._distance is None:
+            self._distance = MeshDistance(self.vertices, self.faces, closed=self.closed)
+            self._grid = OccupancyGrid(self.vertices, self.faces) if self.closed else None
+        if self._grid is not None:
+            near = near[self._grid.candidates(points[near])]
+        out[near] = self._distance.depth(points[near])
+        return out
+
+
+def bone_coordinates(points, pose):
+    """World points in the rest coordinates of a bone with this (4, 4) pose."""
+    return (points - pose[:3, 3]) @ pose[:3, :3]
+
+
+def surface_depth(vertices, probes, poses):
+    """Depth of surface vertices inside the bones.
+
+    Parameters
+    ----------
+    vertices : (n, 3) ndarray
+        World coordinates [scene unit].
+    probes : list of BoneProbe
+    poses : dict of str to (4, 4) ndarray
+
+    Returns
+    -------
+    (n,) ndarray
+        The greatest depth over all bones; 0 where a vertex is in none.
+    """
+    out = np.zeros(len(vertices))
+    for probe in probes:
+        np.maximum(out, probe.depth(bone_coordinates(vertices, poses[probe.name])), out=out)
+    return out
+
+
+def bone_depth(vertices, faces, probes, poses):
+    """Greatest depth of any bone vertex inside a muscle's closed surface.
+
+    Parameters
+    ----------
+    vertices, faces : (n, 3) and (m, 3) ndarray
+        Closed, outward surface in world coordinates.
+    probes : list of BoneProbe
+    poses : dict of str to (4, 4) ndarray
+
+    Returns
+    -------
+    float
+        [scene unit]; 0 where no bone vertex is inside.
+    """
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    near = []
+    for probe in probes:
+        pose = poses[probe.name]
+        moved = probe.vertices @ pose[:3, :3].T + pose[:3, 3]
+        near.append(moved[np.all((moved > low) & (moved < high), axis=1)])
+    points = np.concatenate(near) if near else np.zeros((0, 3))
+    if len(points) == 0:
+        return 0.0
+    points = points[OccupancyGrid(vertices, faces).candidates(points)]
+    return _depth_nearby(vertices, faces, points) if len(points) else 0.0
+
+
+def _depth_nearby(vertices, faces, points):
+    """Greatest depth of points, from the faces near them; from all faces for points that lie deeper."""
+    corners = vertices[faces]
+    longest = np.sqrt(max(np.square(corners[:, k] - corners[:, k - 1]).sum(axis=1).max() for k in range(3)))
+    reach = max(float(longest), 0.02 * float(np.ptp(vertices, axis=0).max()))
+    kept = faces_near(vertices, faces, points, reach)
+    deepest = 0.0
+    if kept.any():
+        part = MeshDistance(vertices, faces[kept], whole=faces)
+        sure = part.unsigned(points) < reach
+        deepest = part.depth(points[sure]).max(initial=0.0)
+        points = points[~sure]
+    if len(points):
+        deepest = max(deepest, MeshDistance(vertices, faces).depth(points).max())
+    return float(deepest)
+
+
+def faces_near(vertices, faces, points, reach):
+    """Which faces may come nearer than ``reach`` to any of the points.
+
+    Parameters
+    ----------
+    vertices, faces : (n, 3) and (m, 3) ndarray
+    points : (k, 3) ndarray
+    reach : float
+        At least the longest edge [scene unit].
+
+    Returns
+    -------
+    (m,) ndarray of bool
+        Never False for a face that does.
+    """
+    origin = points.min(axis=0) - 3.0 * reach
+    shape = ((points.max(axis=0) - origin) / reach).astype(np.int64) + 4
+    cells = np.zeros(shape, dtype=np.bool_)
+    kept = np.zeros(len(faces), dtype=np.bool_)
+    _near_loop(vertices, faces, points, origin, reach, cells, kept)
+    return kept
+
+
+@numba.njit(cache=True, nogil=True)
+def _near_loop(vertices, faces, points, origin, reach, cells, kept):
+    # A face within reach of a point has its nearest spot at most one cell away and its corners one further.
+    for n in range(len(points)):
+        i = int((points[n, 0] - origin[0]) / reach)
+        j = int((points[n, 1] - origin[1]) / reach)
+        k = int((points[n, 2] - origin[2]) / reach)
+        cells[i, j, k] = True
+    wide = np.zeros_like(cells)
+    for i in range(cells.shape[0]):
+        for j in range(cells.shape[1]):
+            for k in range(cells.shape[2]):
+                if cells[i, j, k]:
+                    wide[max(i - 2, 0) : i + 3, max(j - 2, 0) : j + 3, max(k - 2, 0) : k + 3] = True
+    for f in range(len(faces)):
+        v = vertices[faces[f, 0]]
+        i = int(np.floor((v[0] - origin[0]) / reach))
+        j = int(np.floor((v[1] - origin[1]) / reach))
+        k = int(np.floor((v[2] - origin[2]) / reach))
+        if 0 <= i < cells.shape[0] and 0 <= j < cells.shape[1] and 0 <= k < cells.shape[2]:
+            kept[f] = wide[i, j, k]

@@ -1,0 +1,149 @@
+"""What a run amounts to: least, greatest and mean of each quantity, and the limits that it is held to."""
+
+import difflib
+import math
+from collections import defaultdict
+
+import numpy as np
+
+from rbfmuscle.study.measure.metrics import ALL, QUANTITIES
+from rbfmuscle.validation import LimitExceededError, UsageError
+
+# Quantity: greatest allowed magnitude; lengths in millimetres, converted to the scene's unit.
+LIMITS = {
+    "volume_error": 1e-3,
+    "penetration_max": 0.5,
+    "bone_penetration_max": 0.5,
+    "solver_penetration_max": 3.0,
+    "components": 1.0,
+    "tunnelled": 0.0,
+    "rest_error_rms": 0.6,
+}
+
+
+class Summary:
+    """Collects rows of metrics; keeps numbers only, no surfaces."""
+
+    def __init__(self):
+        self._values = defaultdict(lambda: defaultdict(list))
+        self._units = {}
+
+    def add(self, rows):
+        """Take in rows of metrics."""
+        for row in rows:
+            quantity = row.quantity
+            if "moment_arm" in quantity:
+                quantity = f"{quantity}:{row.coordinate}"
+            self._values[row.muscle][quantity].append((row.frame, row.value))
+            self._units[quantity] = row.unit
+
+    def table(self):
+        """Nested dict: muscle -> quantity -> unit, count, min, max, mean, median, last, worst and its frame.
+
+        ``worst`` is the value of greatest magnitude. A moment arm is named with its coordinate.
+        """
+        return {
+            muscle: {quantity: self._facts(quantity, found) for quantity, found in quantities.items()}
+            for muscle, quantities in self._values.items()
+        }
+
+    def _facts(self, quantity, found):
+        frames = [frame for frame, _ in found]
+        values = np.array([value for _, value in found])
+        finite = values[np.isfinite(values)]
+        facts = {"unit": self._units[quantity], "count": len(values), "last": float(values[-1])}
+        if len(finite):
+            worst = int(np.nanargmax(np.abs(np.where(np.isfinite(values), values, np.nan))))
+            facts |= {
+                "min": float(finite.min()),
+                "max": float(finite.max()),
+                "mean": float(finite.mean()),
+                "median": float(np.median(finite)),
+                "worst": float(values[worst]),
+                "worst_frame": frames[worst],
+            }
+        return facts
+
+
+def parse_limits(limits, scene):
+    """Limits as a dict of quantity to greatest allowed magnitude.
+
+    Parameters
+    ----------
+    limits : str, list of str, dict or None
+        ``"penetration_max=0.5,volume_error"``: a quantity with a value in the unit of ``metrics.csv``, or
+        alone with the limit of `LIMITS`; ``"all"`` for every one of `LIMITS`.
+    scene : Scene
+
+    Raises
+    ------
+    UsageError
+        On an unknown quantity or a value that is no number.
+    """
+    if not limits:
+        return {}
+    if isinstance(limits, dict):
+        parts = [f"{name}={value}" for name, value in limits.items()]
+    else:
+        listed = [limits] if isinstance(limits, str) else limits
+        parts = [part.strip() for text in listed for part in text.split(",") if part.strip()]
+    found = {}
+    for part in parts:
+        if part == "all":
+            found |= {name: default_limit(name, scene) for name in LIMITS}
+            continue
+        name, given, value = part.replace("<=", "=").partition("=")
+        name = name.strip()
+        _check_quantity(name)
+        if given:
+            found[name] = _number(value, part)
+        elif name in LIMITS:
+            found[name] = default_limit(name, scene)
+        else:
+            raise UsageError(f"--fail-on {name}: give a value, for instance {name}=1")
+    return found
+
+
+def default_limit(quantity, scene):
+    """Limit of a quantity in the scene's unit."""
+    is_length = QUANTITIES[quantity][0] == "length"
+    return scene.length(LIMITS[quantity]) if is_length else LIMITS[quantity]
+
+
+def exceeded(table, limits):
+    """List of (muscle, quantity, worst value, limit, frame) beyond the limits; NaN counts as beyond."""
+    found = []
+    for muscle, quantities in table.items():
+        for name, facts in quantities.items():
+            limit = limits.get(name.partition(":")[0])
+            if limit is None or muscle == ALL:
+                continue
+            worst = facts.get("worst", math.nan)
+            if not abs(worst) <= limit:
+                found.append((muscle, name, worst, limit, facts.get("worst_frame")))
+    return found
+
+
+def require_limits(table, limits):
+    """Raise LimitExceededError naming everything beyond the limits."""
+    found = exceeded(table, limits)
+    if found:
+        text = "; ".join(f"{m}: {q} = {v:.4g} > {limit:g} at frame {f}" for m, q, v, limit, f in found)
+        raise LimitExceededError(text)
+
+
+def _check_quantity(name):
+    if name not in QUANTITIES:
+        near = difflib.get_close_matches(name, QUANTITIES, n=1, cutoff=0.5)
+        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(QUANTITIES)}"
+        raise UsageError(f"--fail-on: unknown quantity {name!r}, {hint}")
+
+
+def _number(text, part):
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value) or value < 0:
+        raise UsageError(f"--fail-on {part}: the limit must be a number, zero or more")
+    return value

@@ -1,0 +1,230 @@
+"""The kernel study as files: a table, a page, plots, and pictures of the surfaces with their errors."""
+
+import base64
+import csv
+import html
+import io
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from rbfmuscle.study.show.page import STYLE
+from rbfmuscle.validation import MissingPartError
+
+COLUMNS = {
+    "kernel": "kernel", "centres": "centres", "placement": "placement", "fit": "fit",
+    "shape": "epsilon times spacing", "rms": "RMS",
+    "hausdorff": "Hausdorff", "normal_error": "normals, degrees", "volume_error": "volume, %",
+    "components": "sheets", "condition": "condition", "fit_time": "fit, ms",
+    "evaluation_time": "20,000 values, ms", "numbers": "stored numbers", "decimated_rms": "mesh of that size, RMS",
+    "note": "note",
+}  # fmt: skip
+SCALE = {"volume_error": 100.0, "fit_time": 1e3, "evaluation_time": 1e3}
+# Surfaces that are drawn.
+PICTURES = 6
+
+PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">
+<title>{title}</title><style>{style} tr.front td:first-child{{font-weight:650}} td.text{{text-align:left}}</style>
+</head><body><main><h1>{title}</h1>
+<p class="sub">Each kernel with as many centres, its shape parameter chosen by the error at other points of the mesh</p>
+<p>The best: <b>{best}</b>. Distances{units} are measured both ways between the mesh and the extracted surface;
+normals by the field's gradient; the mesh in the last but one column was decimated to as many stored numbers. Kernels in
+bold are on the front of error against time. A volume error is that of the level zero; a muscle's level is moved until
+its volume is right.</p>
+<h2>What each costs</h2><div class="plots"><figure><img alt="error against time and size" src="{fronts}"></figure>
+</div>{maps}{pictures}
+<h2>All of them</h2><div class="wide"><table><tr>{head}</tr>{body}</table></div>
+<h2>To paste</h2><pre>{toml}</pre>
+</main></body></html>
+"""
+
+
+def write_study(study, directory, *, title="Kernels", pictures=True):
+    """Write ``kernels.csv``, ``kernels.json``, ``kernels.html`` and the plots it holds.
+
+    Parameters
+    ----------
+    study : KernelStudy
+    directory : path
+    title : str
+    pictures : bool
+        Draw the best surfaces too.
+
+    Returns
+    -------
+    MissingPartError or None
+        Where there are no graphics to draw with; everything else is written.
+    """
+    directory = Path(directory)
+    directory.mkdir(parents=True, exist_ok=True)
+    with (directory / "kernels.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, fieldnames=list(study.rows[0]))
+        writer.writeheader()
+        writer.writerows(study.rows)
+    facts = {"title": title, "units": study.units, "rows": study.rows, "scan": study.scan}
+    (directory / "kernels.json").write_text(json.dumps(facts, indent=1), encoding="utf-8")
+    fronts = _save(directory / "fronts.png", _draw_fronts, study)
+    maps = _save(directory / "map.png", _draw_maps, study) if study.scan else None
+    missing, drawn = None, None
+    if pictures:
+        try:
+            drawn = _draw_surfaces(study, directory)
+        except MissingPartError as error:
+            missing = error
+    page = PAGE.format(
+        title=html.escape(title), style=STYLE, best=html.escape(_named(study.rows[0])),
+        units=f" in {study.units}" if study.units else "", fronts=_inline(fronts),
+        maps=_figure("Error and condition over the shape parameter", maps),
+        pictures=_figure("The best surfaces, coloured by their distance to the mesh", drawn),
+        head="".join(f"<th>{html.escape(name)}</th>" for name in COLUMNS.values()),
+        body="".join(_row(row) for row in study.rows), toml=html.escape(study.toml(study.rows[0])),
+    )  # fmt: skip
+    (directory / "kernels.html").write_text(page, encoding="utf-8")
+    return missing
+
+
+def _named(row):
+    return f"{row['kernel']}, {row['centres']} centres"
+
+
+def _save(path, draw, study):
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(layout="constrained")
+    FigureCanvasAgg(figure)
+    draw(study, figure)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=110, format="png")
+    path.write_bytes(buffer.getvalue())
+    return buffer.getvalue()
+
+
+def _inline(data):
+    return f"data:image/png;base64,{base64.b64encode(data).decode()}"
+
+
+def _figure(title, data):
+    if data is None:
+        return ""
+    return f'<h2>{title}</h2><figure><img alt="{title}" src="{_inline(data)}"></figure>'
+
+
+def _row(row):
+    cells = []
+    for name in COLUMNS:
+        value = row[name]
+        if isinstance(value, float):
+            value = f"{value * SCALE.get(name, 1.0):.3g}"
+        kind = ' class="text"' if name == "note" else ""
+        cells.append(f"<td{kind}>{'' if value is None else html.escape(str(value))}</td>")
+    return f"<tr{' class=front' if row['front_time'] else ''}>{''.join(cells)}</tr>"
+
+
+def _draw_fronts(study, figure):
+    good = [row for row in study.rows if row["rms"] is not None]
+    figure.set_size_inches(11, 4.6)
+    left, right = figure.subplots(1, 2, sharey=True)
+    for axes, cost, front in (
+        (left, lambda r: 1e3 * (r["fit_time"] + r["evaluation_time"]), "front_time"),
+        (right, lambda r: r["numbers"], "front_size"),
+    ):
+        for count in sorted({row["centres"] for row in good}):
+            rows = [row for row in good if row["centres"] == count]
+            axes.plot([cost(r) for r in rows], [r["rms"] for r in rows], "o", ms=5, alpha=0.6, mec="none",
+                      label=f"{count} centres")  # fmt: skip
+        best = sorted((cost(r), r["rms"], r["kernel"]) for r in good if r[front])
+        axes.plot([b[0] for b in best], [b[1] for b in best], "-", color="0.3", lw=1.0, zorder=0)
+        for x, y, name in best:
+            axes.annotate(name, (x, y), fontsize=7.5, xytext=(4, 4), textcoords="offset points")
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+    sizes = sorted((n, d["rms"]) for n, d in study.decimated.items())
+    right.plot(
+        [s[0] for s in sizes], [s[1] for s in sizes], "s--", color="#a63d38", ms=4, label="decimated mesh"
+    )
+    left.set(xlabel="fit and 20,000 values [ms]", ylabel=f"RMS error [{study.units or 'unit'}]")
+    right.set_xlabel("stored numbers")
+    right.legend(fontsize=8)
+
+
+def _draw_maps(study, figure):
+    names = list(dict.fromkeys(row["kernel"] for row in study.scan))
+    count = max(row["centres"] for row in study.scan)
+    rows = [row for row in study.scan if row["centres"] == count]
+    shapes = sorted({row["shape"] for row in rows})
+    figure.set_size_inches(11, 1.6 + 0.26 * len(names))
+    for axes, key, label in zip(
+        figure.subplots(1, 2, sharey=True), ("error", "condition"),
+        (f"RMS error [{study.units or 'unit'}]", "condition"), strict=True,
+    ):  # fmt: skip
+        grid = np.full((len(names), len(shapes)), np.nan)
+        for row in rows:
+            if row[key]:
+                grid[names.index(row["kernel"]), shapes.index(row["shape"])] = np.log10(row[key])
+        picture = axes.imshow(grid, aspect="auto", cmap="viridis_r" if key == "error" else "magma_r")
+        axes.set_xticks(range(len(shapes)), [f"{s:.2g}" for s in shapes])
+        axes.set_yticks(range(len(names)), names, fontsize=8)
+        axes.set_xlabel("epsilon times spacing")
+        figure.colorbar(picture, ax=axes, label=f"log10 of {label}, {count} centres")
+
+
+def _draw_surfaces(study, directory):
+    """Draw in a child process: VTK may end the process where no graphics exist."""
+    chosen = [
+        (row, surface) for row, surface in zip(study.rows, study.surfaces, strict=True) if surface is not None
+    ][:PICTURES]
+    if not chosen:
+        return None
+    arrays = {"most": np.array(max(float(np.quantile(s[2], 0.995)) for _, s in chosen))}
+    for k, (row, (vertices, faces, error)) in enumerate(chosen):
+        text = f"{_named(row)}: {row['rms']:.2g} RMS, {row['hausdorff']:.2g} greatest"
+        arrays |= {f"v{k}": vertices, f"f{k}": faces, f"e{k}": error, f"t{k}": np.array(text)}
+    np.savez(directory / "surfaces.npz", **arrays)
+    picture = directory / "surfaces.png"
+    command = [
+        sys.executable,
+        "-m",
+        "rbfmuscle.study.show.kernel_page",
+        str(directory / "surfaces.npz"),
+        str(picture),
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
+    if done.returncode != 0 or not picture.exists():
+        words = [line.strip() for line in done.stderr.splitlines() if line.strip()]
+        reason = words[-1][-160:] if words else f"the drawing process ended with code {done.returncode}"
+        raise MissingPartError(
+            f"no pictures: {reason}; drawing needs OpenGL (a display, or Mesa's libegl1 and libgl1)"
+        )
+    return picture.read_bytes()
+
+
+def main(source, target):
+    """The child's part."""
+    import pyvista
+
+    with np.load(source) as arrays:
+        count = sum(name.startswith("v") for name in arrays.files)
+        columns = min(3, count)
+        rows = -(-count // columns)
+        plotter = pyvista.Plotter(off_screen=True, shape=(rows, columns), border=False,
+                                  window_size=(420 * columns, 460 * rows))  # fmt: skip
+        for k in range(count):
+            plotter.subplot(k // columns, k % columns)
+            mesh = pyvista.make_tri_mesh(arrays[f"v{k}"], arrays[f"f{k}"])
+            mesh["distance"] = arrays[f"e{k}"]
+            plotter.add_mesh(mesh, scalars="distance", cmap="viridis", clim=(0.0, float(arrays["most"])),
+                             smooth_shading=True, show_scalar_bar=k == 0)  # fmt: skip
+            plotter.add_text(str(arrays[f"t{k}"]), font_size=7, color="black")
+            plotter.set_background("white")
+            plotter.view_xz()
+        plotter.screenshot(target)
+        plotter.close()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,120 @@
+"""Plots of a saved run over its motion."""
+
+import io
+
+import numpy as np
+
+from rbfmuscle.study.measure.metrics import ALL
+from rbfmuscle.study.show.appearance import line_colours
+
+PLOT_STYLE = {
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#9a9a9a",
+    "axes.labelcolor": "#444444",
+    "axes.titlesize": 10.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.grid": True,
+    "grid.color": "#ececec",
+    "xtick.color": "#666666",
+    "ytick.color": "#666666",
+    "svg.fonttype": "path",
+    "svg.hashsalt": "rbfmuscle",
+}
+# Title, quantity, factor, unit of the axis (None: the table's), whether the limit is drawn on both sides.
+PANELS = (
+    ("Volume error", "volume_error", 100.0, "%", True),
+    ("Surface inside a bone", "penetration_max", 1.0, None, False),
+    ("Bone inside the muscle", "bone_penetration_max", 1.0, None, False),
+    ("Inside a bone before the cut", "solver_penetration_max", 1.0, None, False),
+    ("Time a frame", "time_frame", 1000.0, "ms", False),
+    ("Edge strain of the carried mesh (RMS)", "edge_strain_rms", 100.0, "%", False),
+    ("Length", "length", 1.0, None, False),
+    ("Moment arm", "moment_arm", 1.0, None, False),
+)
+
+
+def motion_axis(saved):
+    """What the plots run along.
+
+    Returns
+    -------
+    values : dict of int to float
+        Place of each frame on the axis.
+    label : str
+        The only coordinate that moves, in degrees, if it goes one way; else the frame number.
+    """
+    rows = saved.info["frames"]
+    names = sorted({name for row in rows for name in row["coordinates"]})
+    tracks = {name: np.array([row["coordinates"].get(name, 0.0) for row in rows]) for name in names}
+    moving = {name: track for name, track in tracks.items() if np.ptp(track) > 1e-9}
+    if len(moving) == 1:
+        name, track = next(iter(moving.items()))
+        if np.all(np.diff(track) > 0) or np.all(np.diff(track) < 0):
+            return dict(zip(saved.frames, track.tolist())), f"{name} [degree]"
+    return {frame: float(frame) for frame in saved.frames}, "frame"
+
+
+def plot_panels(saved):
+    """Draw every panel that the run has values for.
+
+    Parameters
+    ----------
+    saved : SavedRun
+
+    Returns
+    -------
+    list of (title, bytes)
+        SVG pictures.
+    """
+    import matplotlib
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    axis, label = motion_axis(saved)
+    pictures = []
+    with matplotlib.rc_context(PLOT_STYLE):
+        for title, quantity, factor, unit, both in PANELS:
+            figure = Figure(figsize=(4.6, 2.7), layout="constrained")
+            FigureCanvasSVG(figure)
+            axes = figure.add_subplot()
+            if not _draw_lines(axes, saved, quantity, factor, axis):
+                continue
+            _draw_limit(axes, saved, quantity, factor, both)
+            axes.set_title(title)
+            axes.set_xlabel(label)
+            axes.set_ylabel(unit or saved.units)
+            out = io.BytesIO()
+            figure.savefig(out, format="svg", metadata={"Date": None})
+            pictures.append((title, out.getvalue()))
+    return pictures
+
+
+def _draw_lines(axes, saved, quantity, factor, axis):
+    colours = line_colours(saved.muscles)
+    tracks = [(muscle, saved.series(muscle, quantity), colours[muscle]) for muscle in saved.muscles]
+    if quantity == "time_frame":
+        tracks.append(("all together", saved.series(ALL, quantity), "#222222"))
+    tracks = [(name, *series, colour) for name, series, colour in tracks if len(series[0])]
+    for name, frames, values, colour in tracks:
+        places = [axis[frame] for frame in frames]
+        axes.plot(places, values * factor, color=colour, lw=1.6, label=name, marker="o", ms=2.2)
+    if quantity == "time_frame" and tracks:
+        # The first frame loads and compiles; it would flatten all others.
+        later = factor * np.concatenate([values[1:] for _, _, values, _ in tracks])
+        if len(later):
+            axes.set_ylim(0, 1.15 * later.max())
+    return bool(tracks)
+
+
+def _draw_limit(axes, saved, quantity, factor, both):
+    limit = saved.info.get("limits", {}).get(quantity)
+    if limit is None:
+        return
+    low, high = axes.get_ylim()
+    for value in (limit, -limit) if both else (limit,):
+        axes.axhline(value * factor, color="#c0392b", lw=0.9, ls=(0, (4, 3)), zorder=0)
+    if not both:
+        axes.set_ylim(min(0.0, low), max(high, 1.1 * limit * factor))

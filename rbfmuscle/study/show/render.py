@@ -1,0 +1,359 @@
+"""Pictures and animations of a saved run, drawn in a process of their own.
+
+VTK may end the process where no graphics exist. So everything is saved first, then this module is run as
+``python -m rbfmuscle.study.show.render DIR`` with the job on its standard input.
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from rbfmuscle.study.files.saved import SavedRun
+from rbfmuscle.study.show.appearance import BACKGROUND, BONE_COLOUR, muscle_colours
+from rbfmuscle.validation import MissingPartError, RBFMuscleError, UsageError
+
+# Where the camera stands; z is up, as in the medical axes (left, posterior, superior).
+VIEWS = {
+    "front": ((0.0, -1.0, 0.12), "from -y"),
+    "side": ((-1.0, -0.12, 0.12), "from -x"),
+    "back": ((0.0, 1.0, 0.12), "from +y"),
+}
+ANIMATIONS = (".webp", ".gif")
+_STRIP = 30
+_PAINT = "paint"
+PAINT_COLOURS = "viridis"
+_BONE_TRIANGLES = 12_000
+_TIMEOUT = 1800
+
+
+def render_run(directory, output, *, frame=None, views=None, size=(420, 520), seconds=5.0):
+    """Draw a saved run to a picture or an animation.
+
+    Parameters
+    ----------
+    directory : path
+        Folder of the run.
+    output : path
+        ``.png`` for one frame, ``.gif`` or ``.webp`` for all.
+    frame : int, optional
+        Of a picture; the last one where not given.
+    views : list of str, optional
+        Of `VIEWS`, side by side; all where not given.
+    size : (width, height)
+        Of one view [pixel].
+    seconds : float
+        Length of an animation.
+
+    Raises
+    ------
+    UsageError
+        If the folder holds nothing to draw, or the suffix, frame or view is unknown.
+    MissingPartError
+        If there are no graphics to draw with.
+    """
+    saved, output = SavedRun(directory), Path(output)
+    views = list(views or VIEWS)
+    for view in views:
+        if view not in VIEWS:
+            raise UsageError(f"unknown view {view!r}; known: {', '.join(VIEWS)}")
+    if output.suffix not in (".png", *ANIMATIONS):
+        raise UsageError(f"{output}: the suffix must be .png, .gif or .webp")
+    if not saved.has_surfaces():
+        raise UsageError(f"{directory} has no surfaces to draw")
+    frame = saved.frames[-1] if frame is None else frame
+    if frame not in saved.frames:
+        raise UsageError(
+            f"frame {frame} was not written; the run has {saved.frames[0]} to {saved.frames[-1]}"
+        )
+    frames = [frame] if output.suffix == ".png" else saved.frames
+    draw(
+        directory, [{"file": str(output.resolve()), "frames": frames, "views": views, "size": size}], seconds
+    )
+
+
+def draw(directory, jobs, seconds=5.0, *, module="rbfmuscle.study.show.render"):
+    """Draw pictures in a child process.
+
+    Parameters
+    ----------
+    directory : path
+    jobs : list of dict
+        ``file``, ``frames``, ``views``, ``size``; several frames make an animation.
+    seconds : float
+        Length of an animation.
+    module : str
+        What draws them, run with ``-m``.
+
+    Raises
+    ------
+    MissingPartError
+        If the child cannot draw; the message holds its last words.
+    """
+    command = [sys.executable, "-m", module, str(directory)]
+    text = json.dumps({"jobs": jobs, "seconds": seconds})
+    try:
+        done = subprocess.run(
+            command, input=text, capture_output=True, text=True, timeout=_TIMEOUT, check=False
+        )
+    except subprocess.TimeoutExpired:
+        raise MissingPartError(f"drawing took longer than {_TIMEOUT} s and was stopped") from None
+    if done.returncode != 0:
+        words = [line.strip() for line in done.stderr.splitlines() if line.strip()]
+        reason = words[-1][-160:] if words else f"the drawing process ended with code {done.returncode}"
+        raise MissingPartError(
+            f"no pictures: {reason}; drawing needs OpenGL (a display, or Mesa's libegl1 and libgl1)"
+        )
+
+
+def draw_pictures(directory, make_jobs, **how):
+    """Draw pictures to memory.
+
+    Parameters
+    ----------
+    directory : path
+    make_jobs : callable
+        ``make_jobs(folder)`` gives the jobs, whose PNG files go to that folder.
+    **how
+        As for `draw`.
+
+    Returns
+    -------
+    images : dict of str to bytes
+        The PNG files by their stems.
+    missing : MissingPartError or None
+        Why not all are drawn.
+    """
+    missing = None
+    with tempfile.TemporaryDirectory() as folder:
+        jobs = make_jobs(Path(folder))
+        if jobs:
+            try:
+                draw(directory, jobs, **how)
+            except MissingPartError as error:
+                missing = error
+        return {path.stem: path.read_bytes() for path in sorted(Path(folder).glob("*.png"))}, missing
+
+
+class Stage:
+    """An off-screen window with several panels, each aimed at the muscles' whole path.
+
+    Parameters
+    ----------
+    rows : list of list of (SavedRun, str)
+        What each panel shows: a run, and the view of it. Runs of several panels are of one scene.
+    size : (width, height)
+        Of a panel [pixel].
+    paint : callable, optional
+        ``paint(saved, muscle, frame, vertices)`` gives values (n,) from 0 to 1 to colour a muscle by; plain
+        colours where not given.
+    """
+
+    def __init__(self, rows, size, paint=None):
+        import pyvista
+
+        self.paint = paint
+        self.panels = [
+            (i, j, saved, view) for i, row in enumerate(rows) for j, (saved, view) in enumerate(row)
+        ]
+        shape = (len(rows), len(rows[0]))
+        window = (size[0] * shape[1], size[1] * shape[0])
+        self.plotter = pyvista.Plotter(off_screen=True, shape=shape, border=False, window_size=window)
+        self.plotter.set_background(BACKGROUND)
+        first = rows[0][0][0]
+        self.first, self.colours = first, muscle_colours(first.muscles)
+        self.bones = [(name, self._add_bone(first.bone(name))) for name in first.bones]
+        self.skins = []
+        bounds = _path_bounds({id(saved): saved for row in rows for saved, _ in row}.values())
+        for i, j, _, view in self.panels:
+            self.plotter.subplot(i, j)
+            self._aim(VIEWS[view][0], bounds, size)
+            self.plotter.enable_anti_aliasing("ssaa")
+
+    def show(self, frame):
+        """Put bones and muscles where they are in a frame, and return the picture (h, w, 3) uint8."""
+        for name, actors in self.bones:
+            for actor in actors:
+                actor.user_matrix = self.first.poses[frame][name]
+        for actor in self.skins:
+            self.plotter.remove_actor(actor, render=False)
+        self.skins, meshes = [], {}
+        for i, j, saved, _ in self.panels:
+            for muscle in saved.muscles:
+                if (id(saved), muscle) not in meshes:
+                    meshes[id(saved), muscle] = self._skin(saved, muscle, frame)
+                self.skins.append(self._add(i, j, meshes[id(saved), muscle], self.colours[muscle]))
+        for renderer in self.plotter.renderers:
+            renderer.ResetCameraClippingRange()
+        self.plotter.render()  # a screenshot alone shows what was drawn last
+        return self.plotter.screenshot(return_img=True)
+
+    def close(self):
+        self.plotter.close()
+
+    def _add_bone(self, mesh):
+        import pyvista
+
+        mesh = pyvista.make_tri_mesh(*mesh)
+        if mesh.n_cells > _BONE_TRIANGLES:  # software drawing pays for each of them in every frame
+            mesh = mesh.decimate(1.0 - _BONE_TRIANGLES / mesh.n_cells)
+        mesh = mesh.compute_normals(split_vertices=False, auto_orient_normals=False)
+        return [self._add(i, j, mesh, BONE_COLOUR) for i, j, _, _ in self.panels]
+
+    def _skin(self, saved, muscle, frame):
+        import pyvista
+
+        mesh = pyvista.make_tri_mesh(*saved.surface(muscle, frame))
+        mesh = mesh.compute_normals(split_vertices=False, auto_orient_normals=False)
+        if self.paint is not None:
+            mesh.point_data[_PAINT] = self.paint(saved, muscle, frame, np.asarray(mesh.points))
+        return mesh
+
+    def _add(self, row, column, mesh, colour):
+        self.plotter.subplot(row, column)
+        painted = _PAINT in mesh.point_data
+        return self.plotter.add_mesh(
+            mesh,
+            color=None if painted else colour,
+            scalars=_PAINT if painted else None,
+            cmap=PAINT_COLOURS,
+            clim=(0.0, 1.0),
+            show_scalar_bar=False,
+            smooth_shading=True,
+            specular=0.25,
+            specular_power=18,
+            ambient=0.12,
+            render=False,
+            reset_camera=False,
+        )
+
+    def _aim(self, direction, bounds, size):
+        """Parallel projection that holds the box in this view."""
+        centre = bounds.mean(axis=0)
+        ahead = np.asarray(direction) / np.linalg.norm(direction)
+        right = np.cross([0.0, 0.0, 1.0], ahead)
+        right /= np.linalg.norm(right)
+        up = np.cross(ahead, right)
+        corners = (
+            np.array([[x, y, z] for x in bounds[:, 0] for y in bounds[:, 1] for z in bounds[:, 2]]) - centre
+        )
+        tall = np.ptp(corners @ up) / 2
+        wide = np.ptp(corners @ right) / 2 * size[1] / size[0]
+        camera = self.plotter.camera
+        camera.focal_point = centre
+        camera.position = centre + ahead * 4.0 * np.linalg.norm(bounds[1] - bounds[0])
+        camera.up = up
+        camera.parallel_projection = True
+        camera.parallel_scale = 1.04 * max(tall, wide)
+
+
+def _path_bounds(runs):
+    """Box around the muscles of all runs in the first, middle and last frame."""
+    points = [
+        saved.surface(muscle, frame)[0]
+        for saved in runs
+        for frame in sorted({saved.frames[0], saved.frames[len(saved.frames) // 2], saved.frames[-1]})
+        for muscle in saved.muscles
+    ]
+    return np.array(
+        [np.min([p.min(axis=0) for p in points], axis=0), np.max([p.max(axis=0) for p in points], axis=0)]
+    )
+
+
+def chosen_frames(frames, most=24):
+    """At most so many of the frames of a motion for an animation, evenly, the last one included."""
+    stride = -(-len(frames) // most)
+    return frames[(len(frames) - 1) % stride :: stride]
+
+
+def caption(saved, frame):
+    """Frame number and joint angles, as text."""
+    entry = next(entry for entry in saved.info["frames"] if entry["frame"] == frame)
+    angles = [f"{name} {value:.4g}°" for name, value in entry["coordinates"].items()]
+    return ", ".join([f"frame {frame}", *angles])
+
+
+def labelled(image, text, titles, chips):
+    """Image with a title above each column, and below a strip with a caption and what colours mean.
+
+    Parameters
+    ----------
+    image : (h, w, 3) ndarray of uint8
+    text : str
+    titles : list of str
+    chips : dict of str to colour
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    font = ImageFont.load_default(13)
+    height, width = image.shape[:2]
+    pen = ImageDraw.Draw(Image.new("RGB", (1, 1)))
+    # Where each word begins: side by side, and in another line where there is no room.
+    x, y, places = 8, height + 7, []
+    for name in [text, *chips]:
+        wide = int(pen.textlength(name, font=font)) + (17 if places else 0)
+        if places and x + wide > width:
+            x, y = 8, y + _STRIP - 8
+        places.append((x, y))
+        x += wide + 20
+    sheet = Image.new("RGB", (width, y - 7 + _STRIP), BACKGROUND)
+    sheet.paste(Image.fromarray(image), (0, 0))
+    pen = ImageDraw.Draw(sheet)
+    for k, title in enumerate(titles):
+        pen.text((k * width // len(titles) + 8, 6), title, fill="#8a8a8a", font=font)
+    pen.text(places[0], text, fill="#333333", font=font)
+    for (x, y), (name, colour) in zip(places[1:], chips.items()):
+        pen.rectangle((x, y + 2, x + 12, y + 14), fill=colour)
+        pen.text((x + 17, y), name, fill="#333333", font=font)
+    return sheet
+
+
+def _draw_job(saved, job, seconds, stages):
+    views = tuple(job["views"])
+    if (views, *job["size"]) not in stages:
+        stages[views, *job["size"]] = Stage([[(saved, view) for view in views]], job["size"])
+    stage = stages[views, *job["size"]]
+    titles = [f"{view} ({VIEWS[view][1]})" for view in job["views"]]
+    chips = muscle_colours(saved.muscles)
+    images = [labelled(stage.show(frame), caption(saved, frame), titles, chips) for frame in job["frames"]]
+    save_images(images, job["file"], seconds)
+
+
+def save_images(images, path, seconds):
+    """Save one picture, or several as an animation of so many seconds."""
+    from PIL import Image
+
+    if len(images) == 1:
+        images[0].save(path)
+        return
+    pause = max(20, int(1000 * seconds / len(images)))
+    pauses = [pause] * (len(images) - 1) + [900]
+    kind = {".webp": {"quality": 82, "method": 2}, ".gif": {"optimize": False}}[Path(path).suffix]
+    if path.endswith(".gif"):
+        images = [image.quantize(128, dither=Image.Dither.NONE) for image in images]
+    images[0].save(path, save_all=True, append_images=images[1:], duration=pauses, loop=0, **kind)
+
+
+def main(arguments, opened=SavedRun, draw_job=_draw_job):
+    """The child's part: read the jobs, open the folder, draw, leave with 0.
+
+    ``draw_job(found, job, seconds, stages)`` keeps in ``stages`` what later jobs can use again.
+    """
+    task, stages = json.loads(sys.stdin.read()), {}
+    try:
+        found = opened(arguments[0])
+        for job in task["jobs"]:
+            draw_job(found, job, task["seconds"], stages)
+        for stage in stages.values():
+            stage.close()
+    except (RBFMuscleError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,221 @@
+"""The report of a run: one HTML file with pictures, animation, plots and tables; no network needed."""
+
+import html
+import math
+
+from rbfmuscle.study.files.saved import SavedRun
+from rbfmuscle.study.measure.metrics import QUANTITIES
+from rbfmuscle.study.show.appearance import line_colours
+from rbfmuscle.study.show.page import EXPLANATION, PAGE, STYLE, embedded_image
+from rbfmuscle.study.show.plots import plot_panels
+from rbfmuscle.study.show.render import VIEWS, chosen_frames, draw_pictures
+from rbfmuscle.validation import SolveError
+
+_PICTURE_SIZE = (330, 400)
+_PREVIEW_SIZE = (330, 400)
+_MOST_EVENTS = 60
+# Volume, moment arms and stage times have tables or plots of their own.
+_ELSEWHERE = ("volume", "moment_arm", "time_solve", "time_fit", "time_extract")
+_TABLE = [name for name in QUANTITIES if name not in _ELSEWHERE]
+
+
+def write_report(directory, *, report=True, preview=True, pictures=True):
+    """Write ``report.html`` and ``preview.webp`` for a saved run.
+
+    Parameters
+    ----------
+    directory : path
+        Folder of the run.
+    report, preview : bool
+        Which of both.
+    pictures : bool
+        Draw pictures of the poses; without, the report says that there are none.
+
+    Returns
+    -------
+    MissingPartError or None
+        Why there are no pictures, where drawing failed. The report is written all the same.
+
+    Raises
+    ------
+    SolveError
+        If the files cannot be written.
+    """
+    saved = SavedRun(directory)
+    animation = saved.directory / "preview.webp"
+    images, missing = draw_pictures(
+        saved.directory, lambda folder: _jobs(saved, folder, animation, report and pictures, preview)
+    )
+    if report:
+        moving = animation.read_bytes() if animation.is_file() else None
+        reason = str(missing) if missing else ("" if pictures else "pictures were switched off")
+        try:
+            (saved.directory / "report.html").write_text(
+                _page(saved, images, moving, reason), encoding="utf-8"
+            )
+        except OSError as error:
+            raise SolveError(f"cannot write the report: {error.strerror}") from None
+    return missing
+
+
+def key_frames(saved):
+    """First, middle and last written frame, each once."""
+    middle = saved.frames[len(saved.frames) // 2]
+    return list(dict.fromkeys([saved.frames[0], middle, saved.frames[-1]]))
+
+
+def _jobs(saved, folder, animation, pictures, preview):
+    if not saved.has_surfaces():
+        return []
+    jobs = []
+    if pictures:
+        for frame in key_frames(saved):
+            job = {"file": str(folder / f"{frame:06d}.png"), "frames": [frame], "views": list(VIEWS)}
+            jobs.append({**job, "size": _PICTURE_SIZE})
+    if preview and len(saved.frames) > 1:
+        job = {
+            "file": str(animation.resolve()),
+            "frames": chosen_frames(saved.frames),
+            "views": ["front", "side"],
+        }
+        jobs.append({**job, "size": _PREVIEW_SIZE})
+    return jobs
+
+
+def _page(saved, images, moving, reason):
+    info = saved.info
+    return PAGE.format(
+        style=STYLE,
+        title=html.escape(info["scene"]["name"]),
+        facts=_facts(saved),
+        verdict=_verdict(saved),
+        pictures=_pictures(images, moving, reason),
+        legend=_legend(saved),
+        plots="".join(
+            f"<figure>{embedded_image(data, 'svg+xml', title)}</figure>" for title, data in plot_panels(saved)
+        ),
+        table=_summary(saved),
+        stages=_stages(saved),
+        events=_events(saved),
+        explanation=EXPLANATION,
+        quantities="".join(
+            f"<dt>{name}</dt><dd>{html.escape(meaning)}</dd>" for name, (_, meaning) in QUANTITIES.items()
+        ),
+        versions=html.escape(", ".join(f"{name} {value}" for name, value in info["versions"].items())),
+    )
+
+
+def _facts(saved):
+    info = saved.info
+    models = sorted({muscle["model"]["name"] for muscle in info["scene"]["muscles"]})
+    frame = info.get("frame_time") or {}
+    facts = [
+        ("model", ", ".join(models)),
+        ("muscles", len(saved.muscles)),
+        ("frames", len(saved.frames)),
+        ("time a frame, median", f"{1000 * frame['median']:.0f} ms" if frame.get("median") else "-"),
+        ("whole run", f"{info['times']['wall']:.1f} s"),
+        ("status", info["status"]),
+    ]
+    return "".join(f"<div><b>{html.escape(str(value))}</b><span>{name}</span></div>" for name, value in facts)
+
+
+def _beyond(saved):
+    """Set of (muscle, quantity) beyond the limits in run.json."""
+    found = set()
+    for muscle, quantities in saved.info["muscles"].items():
+        for name, facts in quantities.items():
+            limit = saved.info["limits"].get(name)
+            worst = facts.get("worst")
+            if limit is not None and (worst is None or not abs(worst) <= limit):
+                found.add((muscle, name))
+    return found
+
+
+def _verdict(saved):
+    if saved.info["status"] != "complete":
+        message = html.escape(saved.info["message"] or "")
+        return f'<p class="bad">The run ended early ({saved.info["status"]}): {message}</p>'
+    found = sorted(_beyond(saved))
+    if not found:
+        return '<p class="good">Every muscle stays within every limit in every frame.</p>'
+    listed = ", ".join(f"{muscle}: {name}" for muscle, name in found)
+    return f'<p class="bad">Beyond a limit: {html.escape(listed)}. See the table below.</p>'
+
+
+def _pictures(images, moving, reason):
+    if not images and moving is None:
+        text = html.escape(reason or "this run kept no surfaces")
+        return f'<p class="note">There are no pictures: {text}.</p>'
+    parts = [embedded_image(data, "png", f"frame {int(name)}") for name, data in images.items()]
+    if moving is not None:
+        parts.insert(0, embedded_image(moving, "webp", "the whole motion"))
+    note = f'<p class="note">{html.escape(reason)}</p>' if reason else ""
+    return note + "".join(f"<figure>{part}</figure>" for part in parts)
+
+
+def _legend(saved):
+    chips = "".join(
+        f'<span><i style="background:{colour}"></i>{html.escape(name)}</span>'
+        for name, colour in line_colours(saved.muscles).items()
+    )
+    return f'{chips}<span><i class="limit"></i>limit</span>'
+
+
+def _summary(saved):
+    muscles, beyond = saved.info["muscles"], _beyond(saved)
+    used = [name for name in _TABLE if any(name in found for found in muscles.values())]
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in muscles)
+    rows = []
+    for name in used:
+        limit = saved.info["limits"].get(name)
+        unit = next(found[name]["unit"] for found in muscles.values() if name in found)
+        cells = []
+        for muscle, found in muscles.items():
+            mark = ' class="bad"' if (muscle, name) in beyond else ""
+            cells.append(f"<td{mark}>{_cell(name, found.get(name))}</td>")
+        shown = "" if limit is None else f"≤ {limit:g}"
+        label = name if unit in ("1", "s") else f"{name} <small>{unit}</small>"
+        rows.append(f"<tr><th>{label}</th>{''.join(cells)}<td>{shown}</td></tr>")
+    return f"<table><tr><th></th>{head}<th>limit</th></tr>{''.join(rows)}</table>"
+
+
+def _cell(name, facts):
+    if not facts or facts.get("worst") is None:
+        return "-"
+    if name in ("length", "edge_strain_rms"):
+        return f"{facts['min']:.4g} … {facts['max']:.4g}"
+    if name == "time_frame":
+        return f"{1000 * facts['median']:.3g} ms <small>median</small>"
+    small = f" <small>frame {facts['worst_frame']}</small>" if facts["worst"] else ""
+    return f"{facts['worst']:.3g}{small}"
+
+
+def _stages(saved):
+    stages = saved.info.get("stages") or {}
+    names = list(dict.fromkeys(key for table in stages.values() for key in table))
+    head = "".join(f"<th>{html.escape(name.removeprefix('time_'))}</th>" for name in names)
+    rows = []
+    for muscle, table in stages.items():
+        cells = "".join(f"<td>{_milliseconds(table.get(name))}</td>" for name in names)
+        rows.append(f"<tr><th>{html.escape(muscle)}</th>{cells}</tr>")
+    return f"<table><tr><th></th>{head}</tr>{''.join(rows)}</table>"
+
+
+def _milliseconds(facts):
+    if not facts or facts["median"] is None or not math.isfinite(facts["median"]):
+        return "-"
+    return f"{1000 * facts['median']:.1f} <small>{1000 * facts['p95']:.1f}</small>"
+
+
+def _events(saved):
+    if not saved.events:
+        return '<p class="note">None.</p>'
+    head = "<tr><th>frame</th><th>muscle</th><th>bone</th><th>count</th><th>action</th></tr>"
+    rows = "".join(
+        "<tr>" + "".join(f"<td>{html.escape(str(value))}</td>" for value in event) + "</tr>"
+        for event in saved.events[:_MOST_EVENTS]
+    )
+    left = len(saved.events) - _MOST_EVENTS
+    more = f'<p class="note">and {left} more in events.csv</p>' if left > 0 else ""
+    return f"<table>{head}{rows}</table>{more}"

@@ -1,0 +1,327 @@
+"""The command line as a user meets it: exit codes, one-line errors, clean JSON, nothing lost."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from command_line import call
+
+from rbfmuscle.cli import app
+from rbfmuscle.sim.scene.phantom import phantom_scene
+
+
+@pytest.fixture(scope="module")
+def phantom_folder(tmp_path_factory):
+    """The phantom as files and a scene file with one small, quick muscle."""
+    folder = tmp_path_factory.mktemp("phantom")
+    scene = phantom_scene()
+    for item in [*scene.bones, *scene.muscles]:
+        item.mesh.export(folder / f"{item.name}.ply")
+    muscle = scene.muscle("adductor_posterior")
+    for attachment in muscle.attachments:
+        np.savetxt(folder / f"{attachment.bone}.txt", attachment.vertices, fmt="%d")
+    (folder / "hip.toml").write_text(SCENE)
+    return folder
+
+
+SCENE = """[scene]
+format = 1
+units = "mm"
+[[bone]]
+name = "pelvis"
+mesh = "pelvis.ply"
+[[bone]]
+name = "femur"
+mesh = "femur.ply"
+[[joint]]
+name = "hip"
+parent = "pelvis"
+child = "femur"
+centre = [0, 0, 0]
+axes = { flexion = [-1, 0, 0] }
+[motion]
+ramp = { "hip.flexion" = { from = 0, to = 8, step = 2 } }
+[[muscle]]
+name = "adductor"
+mesh = "adductor_posterior.ply"
+attach = [{ bone = "pelvis", vertices = "pelvis.txt" }, { bone = "femur", vertices = "femur.txt" }]
+[output]
+report = false
+preview = false
+"""
+
+
+def one_line(err):
+    lines = err.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("rbfmuscle: ") and "Traceback" not in err
+    return lines[0]
+
+
+class TestRun:
+    def test_run_leaves_what_is_promised(self, phantom_folder, tmp_path, capsys):
+        code, out, err = call(capsys, "run", phantom_folder / "hip.toml", "-o", tmp_path / "out")
+        assert code == 0 and "adductor" in out and "frame 5 of 5" in err
+        names = {path.name for path in (tmp_path / "out").iterdir()}
+        assert {"run.json", "metrics.csv", "events.csv", "poses.csv", "surfaces.pvd", "bones.pvd"} <= names
+        assert len(list((tmp_path / "out" / "surfaces").iterdir())) == 5
+
+    def test_json_is_all_there_is_on_stdout(self, phantom_folder, tmp_path, capsys):
+        code, out, _ = call(
+            capsys, "run", phantom_folder / "hip.toml", "-o", tmp_path / "o", "--frames", "0:2", "--json",
+            "--set", "model.centres=80", "--set", "contact.initial=keep",
+        )  # fmt: skip
+        info = json.loads(out)
+        assert code == 0 and len(info["frames"]) == 2
+        assert info["scene"]["muscles"][0]["model"] == {"name": "rbf", "centres": 80}
+        assert info["scene"]["contact"]["initial"] == "keep"
+
+    def test_limit_exceeded(self, phantom_folder, tmp_path, capsys):
+        arguments = ("run", phantom_folder / "hip.toml", "-o", tmp_path / "o", "--frames", "0:1", "--fail-on")
+        code, _, err = call(capsys, *arguments, "rest_error_rms=1e-9")
+        assert code == 6 and "rest_error_rms" in err
+        assert (tmp_path / "o" / "run.json").exists()
+        assert call(capsys, *arguments, "volume_error")[0] == 0
+
+    def test_export_of_a_run(self, phantom_folder, tmp_path, capsys):
+        call(capsys, "run", phantom_folder / "hip.toml", "-o", tmp_path / "o", "--frames", "0:1")
+        code, _, _ = call(capsys, "export", tmp_path / "o", "--format", "stl", "obj", "--units", "m")
+        assert code == 0
+        assert (tmp_path / "o" / "export" / "stl" / "adductor_0000.stl").exists()
+        assert call(capsys, "export", tmp_path / "o", "--format", "step")[0] == 2
+
+    @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+    def test_interrupt_keeps_the_frames_so_far(self, end, phantom_folder, tmp_path):
+        text = SCENE.replace("to = 8, step = 2", "to = 90, step = 0.5")
+        (phantom_folder / "long.toml").write_text(text)
+        out = tmp_path / "out"
+        command = [sys.executable, "-c", "from rbfmuscle.cli import main; main()", "run"]
+        process = subprocess.Popen(
+            [*command, str(phantom_folder / "long.toml"), "-o", str(out)], stderr=subprocess.PIPE, text=True
+        )
+        for _ in range(600):
+            if len(list(out.glob("surfaces/*_0003.vtp"))) or process.poll() is not None:
+                break
+            time.sleep(0.1)
+        process.send_signal(end)
+        _, err = process.communicate(timeout=60)
+        assert process.returncode == 130
+        assert "interrupted" in err and "frames are kept" in err and "Traceback" not in err
+        info = json.loads((out / "run.json").read_text())
+        assert info["status"] == "interrupted" and len(info["frames"]) >= 3
+
+    def test_output_that_cannot_be_written(self, phantom_folder, tmp_path, capsys):
+        (tmp_path / "file").write_text("in the way")
+        code, _, err = call(capsys, "run", phantom_folder / "hip.toml", "-o", tmp_path / "file" / "out")
+        assert code == 2 and "cannot write to" in one_line(err)
+
+    @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full to play a full disk")
+    def test_full_disk_is_one_line(self, phantom_folder, tmp_path, capsys, monkeypatch):
+        import errno
+
+        from rbfmuscle.study.files import vtp, writer
+
+        real, count = vtp.write_vtp, [0]
+
+        def full(path, *args, **options):
+            count[0] += 1
+            if count[0] > 4:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            return real(path, *args, **options)
+
+        for module in (vtp, writer):
+            if hasattr(module, "write_vtp"):
+                monkeypatch.setattr(module, "write_vtp", full)
+        monkeypatch.setattr("rbfmuscle.study.files.meshfiles.write_vtp", full, raising=False)
+        code, _, err = call(capsys, "run", phantom_folder / "hip.toml", "-o", tmp_path / "o")
+        assert code == 5 and "No space left" in err and "Traceback" not in err
+        info = json.loads((tmp_path / "o" / "run.json").read_text())
+        assert info["status"] == "failed" and len(info["frames"]) >= 1
+
+
+class TestErrors:
+    @pytest.mark.parametrize(
+        ("arguments", "code", "words"),
+        [
+            (("rum",), 2, "run"),
+            (("run", "hip.toml"), 2, "--output"),
+            (("run", "none.toml", "-o", "o"), 3, "none.toml: no such scene file"),
+            (("check", "typo.toml"), 3, "did you mean 'centre'"),
+            (("check", "mesh.toml"), 4, "femr.ply: no such mesh file, did you mean 'femur.ply'"),
+            (("check", "hip.toml", "--bad"), 2, "--bad"),
+            (
+                ("check", "model.toml"),
+                3,
+                "model.toml: muscle 'adductor': unknown model 'rbff', did you mean 'rbf'",
+            ),
+            (("run", "model.toml", "-o", "o"), 3, "unknown model 'rbff', did you mean 'rbf'"),
+            (("check", "setting.toml"), 3, "no setting 'centers', did you mean 'centres'"),
+            (("check", "number.toml"), 3, "centres must be between 0 and 20000, got -5"),
+            (("check", "kernel.toml"), 3, "unknown kernel 'cubik', did you mean 'cubic'"),
+            (("check", "mesh_model.toml"), 3, "unknown key 'iteration', did you mean 'iterations'"),
+            (
+                ("sweep", "hip.toml", "-o", "o", "--grid", "model.centers=60,70"),
+                3,
+                "rbfmuscle: muscle 'adductor': model rbf",
+            ),
+            (("run", "hip.toml", "-o", "o", "--model", "rbff"), 2, "did you mean 'rbf'"),
+            (("run", "hip.toml", "-o", "o", "--frames", "a:b"), 2, "A:B:S"),
+            (
+                ("run", "hip.toml", "-o", "o", "--set", "contact.initail=keep"),
+                3,
+                "contact.initail: unknown key 'initail', did you mean 'initial'",
+            ),
+            (
+                ("kernels", "phantom", "-o", "o", "--centres", "100,many"),
+                2,
+                "--centres must be whole numbers of 4 and more",
+            ),
+            (
+                ("check", "metres.toml"),
+                4,
+                "cannot be right; correct the scene's units, or set its scale (0.001",
+            ),
+            (
+                ("check", "bare.toml"),
+                3,
+                "not valid TOML: Invalid value (at line 3, column 9); text stands in quotes",
+            ),
+            (("run", "hip.toml", "-o", "o", "--set", "x"), 2, "KEY=VALUE"),
+            (("run", "hip.toml", "-o", "o", "--fail-on", "volum_error"), 2, "did you mean 'volume_error'"),
+            (("run", "inside.toml", "-o", "o"), 3, "start inside bone 'pelvis'"),
+            (("export", "nowhere", "--format", "stl"), 2, "holds no run"),
+            (("render", "nowhere", "-o", "a.png"), 2, "holds no run"),
+            (("new", "nowhere", "--units", "mm"), 2, "is no folder"),
+        ],
+    )
+    def test_code_and_one_line(self, phantom_folder, capsys, monkeypatch, arguments, code, words):
+        monkeypatch.chdir(phantom_folder)
+        self.write_variants(phantom_folder)
+        given, out, err = call(capsys, *arguments)
+        assert given == code
+        assert words in one_line(err)
+        assert out == "" and not (phantom_folder / "o").exists()
+
+    @staticmethod
+    def write_variants(folder):
+        (folder / "typo.toml").write_text(SCENE.replace("centre", "center"))
+        (folder / "mesh.toml").write_text(SCENE.replace("femur.ply", "femr.ply"))
+        (folder / "metres.toml").write_text(SCENE.replace('units = "mm"', 'units = "m"'))
+        (folder / "bare.toml").write_text(SCENE.replace('units = "mm"', "units = mm"))
+        (folder / "model.toml").write_text(SCENE.replace("attach", 'model = "rbff"\nattach'))
+        for name, model in (
+            ("setting", '{ name = "rbf", centers = 80 }'),
+            ("number", '{ name = "rbf", centres = -5 }'),
+            ("kernel", '{ name = "rbf", kernel = "cubik" }'),
+            ("mesh_model", '{ name = "pbd", iteration = 3 }'),
+        ):
+            (folder / f"{name}.toml").write_text(SCENE.replace("attach", f"model = {model}\nattach"))
+        inside = SCENE.replace("adductor_posterior.ply", "small.ply").replace(
+            "[output]", "[contact]\n[output]"
+        )
+        (folder / "inside.toml").write_text(
+            inside.replace('"pelvis.txt"', "[0]").replace('"femur.txt"', "[1]")
+        )
+        import trimesh
+
+        trimesh.creation.icosphere(subdivisions=2, radius=5).apply_translation([14, 12, 40]).export(
+            folder / "small.ply"
+        )
+
+    def test_error_as_json(self, capsys, tmp_path):
+        code, out, err = call(capsys, "check", tmp_path / "none.toml", "--json")
+        assert code == 3
+        assert json.loads(out) == {"error": one_line(err).removeprefix("rbfmuscle: "), "exit_code": 3}
+
+    def test_no_command_shows_help_and_is_wrong_usage(self, capsys):
+        code, out, _ = call(capsys)
+        assert code == 2 and "check" in out
+
+    def test_bug_is_one_line(self, phantom_folder):
+        code = (
+            "import rbfmuscle.sim.scene.scene as s, sys\n"
+            "def load(path): raise ZeroDivisionError('planted')\n"
+            "s.Scene.load = load\n"
+            "from rbfmuscle.cli import main\nmain(['check', 'x.toml'])"
+        )
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        assert done.returncode == 1
+        assert "a bug: ZeroDivisionError: planted" in one_line(done.stderr)
+
+
+class TestOtherCommands:
+    def test_check_tells_what_is_there(self, phantom_folder, capsys):
+        code, out, err = call(capsys, "check", phantom_folder / "hip.toml")
+        assert code == 0 and "muscle adductor: model rbf" in out and err.strip() == "usable"
+        code, out, _ = call(capsys, "check", phantom_folder / "hip.toml", "--json")
+        assert code == 0 and json.loads(out)["scene"]["units"] == "mm"
+
+    def test_new_writes_a_scene_that_checks_out(self, tmp_path, capsys):
+        for mesh in phantom_scene().bones + phantom_scene().muscles:
+            mesh.mesh.export(tmp_path / f"{mesh.name}.stl")
+        target = tmp_path / "guess.toml"
+        code, out, _ = call(capsys, "new", tmp_path, "--units", "mm", "-o", target)
+        assert code == 0 and str(target) in out
+        text = target.read_text()
+        assert 'name = "femur_joint"' in text and "GUESS" in text
+        bones = [line.split('"')[1] for line in text.splitlines() if line.startswith("  { bone")]
+        assert bones == ["pelvis", "femur"] * 4  # the origin, on the bone that stands still, comes first
+        code, _, err = call(capsys, "new", tmp_path, "--units", "mm", "-o", target)
+        assert code == 2 and "--force" in one_line(err)
+        assert call(capsys, "check", target)[0] == 0
+
+    def test_new_on_the_real_hip_finds_the_joint(self, hip_data, tmp_path, capsys):
+        import shutil
+
+        from rbfmuscle.sim.scene.scene import Scene
+
+        for name in ("pelvis", "sacrum", "femur", "gluteus_maximus", "iliacus"):
+            shutil.copy(hip_data / f"{name}.ply", tmp_path)
+        assert call(capsys, "new", tmp_path, "--units", "mm")[0] == 0
+        scene = Scene.load(tmp_path / "scene.toml")
+        assert [bone.name for bone in scene.bones] == ["femur", "pelvis", "sacrum"]
+        assert scene.joints[0].centre == pytest.approx([143.68, 243.295, -432.501], abs=1)
+        assert all({a.bone for a in m.attachments} == {"pelvis", "femur"} for m in scene.muscles)
+
+    def test_every_command_has_help(self, capsys):
+        for name in ("demo", "check", "run", "export", "render", "new", "cache"):
+            assert name in app
+            code, out, _ = call(capsys, name, "--help")
+            assert code == 0 and "Usage" in out
+
+    def test_cache(self, capsys, tmp_path, monkeypatch):
+        monkeypatch.setenv("RBFMUSCLE_CACHE", str(tmp_path))
+        assert call(capsys, "cache", "path") == (0, f"{tmp_path}\n", "")
+        assert call(capsys, "cache", "clear")[1].startswith("0 entries")
+
+
+class TestSDF:
+    def test_measures_a_bone_and_draws_a_slice(self, phantom_folder, tmp_path, capsys):
+        mesh = phantom_folder / "femur.ply"
+        code, out, _ = call(capsys, "sdf", mesh, "-o", tmp_path / "slice.png", "--units", "mm", "--no-cache")
+        assert code == 0 and "mm RMS" in out and "ns" in out
+        assert (tmp_path / "slice.png").read_bytes().startswith(b"\x89PNG")
+        code, out, _ = call(capsys, "sdf", mesh, "-o", tmp_path / "slice.png", "--axis", "z", "--json")
+        report = json.loads(out)
+        assert code == 0 and report["sign_wrong"] < 1e-3 and report["error_rms"] < 0.01
+
+    @pytest.mark.parametrize(
+        ("arguments", "code", "word"),
+        [
+            (["no.ply"], 4, "no such mesh"),
+            (["MESH", "-o", "x.jpg"], 2, ".png"),
+            (["MESH", "--tolerance", "-1"], 2, "positive"),
+            (["MESH", "--axis", "w"], 2, "x, y or z"),
+        ],
+    )
+    def test_bad_input_is_one_line(
+        self, arguments, code, word, phantom_folder, capsys, monkeypatch, tmp_path
+    ):
+        monkeypatch.chdir(tmp_path)
+        mesh = str(phantom_folder / "femur.ply")
+        found, _, err = call(capsys, "sdf", *[mesh if a == "MESH" else a for a in arguments])
+        assert found == code and word in err and err.count("\n") == 1

@@ -1,0 +1,21 @@
+"""Calling the command line inside a test."""
+
+import sys
+import warnings
+
+import pytest
+
+from rbfmuscle.cli import main
+
+
+def call(capsys, *arguments):
+    """Exit code, stdout and stderr of a command."""
+    before = sys.excepthook
+    show = warnings.showwarning
+    try:
+        with pytest.raises(SystemExit) as caught:
+            main([str(argument) for argument in arguments])
+    finally:
+        sys.excepthook, warnings.showwarning = before, show
+    out, err = capsys.readouterr()
+    return caught.value.code, out, err

@@ -1,0 +1,208 @@
+"""The import rules between the rooms, checked on the source."""
+
+import ast
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+LEAVES = ("rbfmuscle.geometry", "rbfmuscle.validation")
+ABOVE = (*LEAVES, "rbfmuscle.implicit", "rbfmuscle.sim", "rbfmuscle.study", "rbfmuscle.__version__")
+# Which of our own modules (by prefix) a room may import; the first matching room counts.
+ALLOWED = {
+    "rbfmuscle.validation": (),
+    "rbfmuscle.geometry": LEAVES,
+    "rbfmuscle.implicit": (*LEAVES, "rbfmuscle.implicit"),
+    "rbfmuscle.sim": (*LEAVES, "rbfmuscle.sim"),
+    "rbfmuscle.opensim": (*LEAVES, "rbfmuscle.sim", "rbfmuscle.opensim"),
+    "rbfmuscle.study": (
+        *LEAVES,
+        "rbfmuscle.implicit",
+        "rbfmuscle.sim",
+        "rbfmuscle.opensim",
+        "rbfmuscle.study",
+    ),
+    "rbfmuscle.model": (*LEAVES, "rbfmuscle.implicit", "rbfmuscle.sim", "rbfmuscle.model"),
+    "pbd_baseline": (*LEAVES, "rbfmuscle.sim", "pbd_baseline"),
+    "rbfmuscle.run": (*ABOVE, "rbfmuscle.models"),
+    "rbfmuscle.compare": (*ABOVE, "rbfmuscle.models", "rbfmuscle.run"),
+    "rbfmuscle.commands": (
+        *ABOVE,
+        "rbfmuscle.opensim",
+        "rbfmuscle.models",
+        "rbfmuscle.run",
+        "rbfmuscle.compare",
+        "rbfmuscle.commands",
+    ),
+}
+ALLOWED["rbfmuscle.cli"] = ALLOWED["rbfmuscle.commands"]
+NAMES_BOTH = "rbfmuscle.models"
+FULLEST_ROOM = 15
+
+
+def module_name(path, root=ROOT):
+    return ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__")
+
+
+def imported_modules(source, module, *, is_package=False):
+    """Every module of ours that a source imports, in functions too, and those named in strings."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                parts = module.split(".")
+                parts = parts[: len(parts) - node.level + is_package]
+                base = ".".join([*parts, *([base] if base else [])])
+            found.add(base)
+            found.update(f"{base}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            text = node.value
+            if text.startswith(("rbfmuscle.", "pbd_baseline.")) and text.replace(".", "").isidentifier():
+                found.add(text)
+    return {name for name in found if name.split(".")[0] in ("rbfmuscle", "pbd_baseline")}
+
+
+def starts_with(name, prefix):
+    return name == prefix or name.startswith(prefix + ".")
+
+
+def wrong_arrows(module, source, *, is_package=False):
+    if module in (NAMES_BOTH, "rbfmuscle"):
+        return []
+    room = next((room for room in ALLOWED if starts_with(module, room)), None)
+    allowed = ALLOWED[room] if room else ()
+    names = imported_modules(source, module, is_package=is_package)
+    names = {name for name in names if name != "rbfmuscle"}  # `from rbfmuscle import x` names x itself too
+    return sorted(name for name in names if not any(starts_with(name, prefix) for prefix in allowed))
+
+
+def sources(root):
+    return sorted([*(root / "rbfmuscle").rglob("*.py"), *(root / "pbd_baseline").rglob("*.py")])
+
+
+def wrong_arrows_of_file(path, root=ROOT):
+    source = path.read_text(encoding="utf-8")
+    return wrong_arrows(module_name(path, root), source, is_package=path.name == "__init__.py")
+
+
+@pytest.mark.parametrize("path", sources(ROOT), ids=lambda path: module_name(path))
+def test_imports_only_what_its_room_may(path):
+    assert wrong_arrows_of_file(path) == []
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("rbfmuscle.implicit.field", "from rbfmuscle.sim.scene.scene import Scene"),
+        ("rbfmuscle.implicit.field", "from ..sim import scene"),
+        ("rbfmuscle.sim.distance.sdf", "def f():\n    import rbfmuscle.implicit.kernels.table"),
+        ("rbfmuscle.sim.loop.simulate", "from rbfmuscle import models"),
+        (
+            "rbfmuscle.sim.loop.simulate",
+            "import importlib\nimportlib.import_module('rbfmuscle.model.muscle')",
+        ),
+        ("rbfmuscle.study.measure.metrics", "from rbfmuscle.model.muscle import RBFMuscle"),
+        ("rbfmuscle.study.measure.metrics", "import pbd_baseline.muscle"),
+        ("rbfmuscle.study.measure.metrics", "from rbfmuscle.run import simulate"),
+        ("pbd_baseline.muscle", "from rbfmuscle.implicit.field import RBFField"),
+        ("pbd_baseline.muscle", "from rbfmuscle.model.muscle import RBFMuscle"),
+        ("rbfmuscle.model.muscle", "from pbd_baseline.muscle import PBDMuscle"),
+        ("rbfmuscle.validation", "from rbfmuscle.sim.scene.scene import Scene"),
+        ("rbfmuscle.cli", "from rbfmuscle.model.muscle import RBFMuscle"),
+        ("rbfmuscle.run", "from rbfmuscle.commands.run import run"),
+        ("rbfmuscle.geometry.triangles", "from rbfmuscle.implicit.field import RBFField"),
+        ("rbfmuscle.commands.run", "import pbd_baseline"),
+    ],
+)
+def test_planted_wrong_arrow_is_found(module, source):
+    assert wrong_arrows(module, source)
+
+
+def test_wrong_arrow_planted_in_a_copy_of_the_tree_is_found(tmp_path):
+    for package in ("rbfmuscle", "pbd_baseline"):
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    assert len(sources(tmp_path)) == len(sources(ROOT))
+    planted = {
+        "rbfmuscle/sim/loop/simulate.py": "\n\ndef late():\n    from ...implicit.field import RBFField\n",
+        "pbd_baseline/__init__.py": "\nimport rbfmuscle.model.muscle\n",
+    }
+    for name, text in planted.items():
+        with (tmp_path / name).open("a", encoding="utf-8") as file:
+            file.write(text)
+    found = {path for path in sources(tmp_path) if wrong_arrows_of_file(path, tmp_path)}
+    assert found == {tmp_path / name for name in planted}
+
+
+def rooms(root=ROOT):
+    """Folder -> its modules, without ``__init__``."""
+    found = {}
+    for path in sources(root):
+        if path.name != "__init__.py":
+            found.setdefault(path.parent.relative_to(root), []).append(path.name)
+    return found
+
+
+@pytest.mark.parametrize(("room", "files"), rooms().items(), ids=lambda value: str(value)[:40])
+def test_no_room_is_too_full(room, files):
+    assert len(files) <= FULLEST_ROOM
+
+
+def cycles(arrows):
+    """Modules that reach themselves by imports at module level, in groups."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    names = sorted(arrows)
+    place = {name: k for k, name in enumerate(names)}
+    ends = [(place[a], place[b]) for a in names for b in arrows[a] if b in place]
+    matrix = coo_matrix((np.ones(len(ends)), np.array(ends).reshape(-1, 2).T), shape=(len(names),) * 2)
+    _, group = connected_components(matrix, directed=True, connection="strong")
+    members = [[names[k] for k in np.flatnonzero(group == g)] for g in range(group.max() + 1)]
+    return [m for m in members if len(m) > 1]
+
+
+def arrows_at_module_level(root=ROOT):
+    arrows = {}
+    for path in sources(root):
+        if path.name == "__init__.py":
+            continue
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        top = ast.Module([node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)], [])
+        module = module_name(path, root)
+        arrows[module] = imported_modules(ast.unparse(top), module) - {module}
+    return arrows
+
+
+def test_no_module_imports_itself_by_others():
+    assert cycles(arrows_at_module_level()) == []
+
+
+def test_planted_cycle_is_found():
+    assert cycles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]]
+
+
+def test_right_arrows_pass():
+    assert wrong_arrows("rbfmuscle.study.show.report", "from rbfmuscle.sim.scene.scene import Scene") == []
+    assert wrong_arrows("rbfmuscle.model.muscle", "from rbfmuscle.implicit.field import RBFField") == []
+    assert (
+        wrong_arrows("rbfmuscle.sim.scene.scene", "from . import motion\nfrom rbfmuscle.validation import x")
+        == []
+    )
+
+
+def test_import_loads_nothing_heavy():
+    import subprocess
+    import sys
+
+    code = (
+        "import sys, rbfmuscle; print([m for m in ('numba', 'pyvista', 'vtk', 'trimesh', 'skimage', 'scipy', "
+        "'pydantic', 'matplotlib') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,186 @@
+"""What every model owes the frame loop: both models, the same tests."""
+
+import numpy as np
+import pytest
+import trimesh
+
+import rbfmuscle as rm
+from rbfmuscle.models import MODEL_NAMES, build_model
+from rbfmuscle.sim.loop.contact import BoneContacts
+from rbfmuscle.sim.loop.simulate import simulate_frames
+from rbfmuscle.sim.scene.motion import Motion, bone_poses, rotation_about
+from rbfmuscle.sim.scene.options import DetectOptions, SlidingOptions, TunnellingOptions
+
+MODELS = ("rbf", "pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
+
+
+def test_every_name_is_tested():
+    assert set(MODELS) == set(MODEL_NAMES)
+
+
+def _spindle(length, radius):
+    """A closed muscle along x."""
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    return trimesh.Trimesh(ball.vertices * [0.5 * length, radius, radius], ball.faces, process=False)
+
+
+def _scene(angles, *, units="mm", muscles=1, overlap=0.0):
+    """An elbow: a fixed ball that a strap runs over, and an arm that turns about the ball's middle."""
+    k = {"mm": 1.0, "m": 1e-3}[units]
+    scene = rm.Scene("elbow", units=units)
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=15.0 * k)
+    arm = trimesh.creation.box(extents=np.array([30.0, 6, 30]) * k)
+    arm.apply_translation(np.array([60.0, 20, 0]) * k)
+    scene.add_bone("trunk", ball)
+    scene.add_bone("arm", arm.subdivide().subdivide())
+    scene.add_joint("hinge", "trunk", "arm", np.zeros(3), {"bend": [0, 0, -1]})
+    for m in range(muscles):
+        mesh = _spindle(100.0 * k, 7.0 * k)
+        mesh.apply_translation(np.array([0.0, 22.5 - overlap, 15.0 * m]) * k)
+        left = np.flatnonzero(mesh.vertices[:, 0] < -40 * k)
+        right = np.flatnonzero(mesh.vertices[:, 0] > 40 * k)
+        attach = [{"bone": "trunk", "vertices": left}, {"bone": "arm", "vertices": right}]
+        scene.add_muscle(f"strap{m}", mesh, attach=attach)
+    scene.motion = Motion([{"hinge.bend": np.radians(a)} for a in angles])
+    return scene
+
+
+def _run(name, scene, **options):
+    parts = [build_model(muscle, scene, name) for muscle in scene.muscles]
+    return list(simulate_frames(scene, parts, **options)), parts
+
+
+def _volume(surface):
+    a, b, c = (surface.vertices[np.asarray(surface.faces)[:, k]] for k in range(3))
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_frames_are_closed_outward_finite_and_clear_of_bones(name):
+    scene = _scene([0, 20, 40])
+    frames, (part,) = _run(name, scene)
+    volume = scene.muscles[0].mesh.volume
+    ball = rm.BoneSDF.from_mesh(scene.bones[0].mesh)
+    for frame in frames:
+        surface = frame.surfaces["strap0"]
+        mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+        assert mesh.is_watertight
+        assert np.isfinite(surface.vertices).all()
+        # The two interleaved steps of this kind leave what each undoes of the other.
+        assert _volume(surface) == pytest.approx(volume, rel=0.05 if name == "arap-interleaved" else 2e-3)
+        assert ball.distance(surface.vertices, frame.poses["trunk"]).min() > -0.5
+        assert surface.quantities["solver_penetration_max"] < 0.5
+        assert frame.carried["strap0"][1].max() < len(frame.carried["strap0"][0])
+    assert len(part.contact_bone) == len(part.contact_points())
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_rest_is_a_rest(name):
+    scene = _scene([0])
+    part = build_model(scene.muscles[0], scene, name)
+    contacts = BoneContacts(["trunk", "arm"], [None, None], contact_bone=part.contact_bone)
+    poses = bone_poses(scene, {})
+    contacts.move(poses)
+    rest = part.contact_points().copy()
+    for _ in range(3):
+        part.predict(poses, poses)
+        part.solve(contacts)
+    # Where nothing moves, nothing may move; half a percent of the length for kinds that settle by sweeps.
+    assert np.abs(part.contact_points() - rest).max() < 0.5
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_restore_brings_a_snapshot_back(name):
+    scene = _scene([0])
+    part = build_model(scene.muscles[0], scene, name)
+    contacts = BoneContacts(["trunk", "arm"], [None, None], contact_bone=part.contact_bone)
+    stops = [bone_poses(scene, {"hinge.bend": np.radians(a)}) for a in (0, 2, 4)]
+
+    def go(before, after):
+        contacts.move(after)
+        part.predict(before, after)
+        part.solve(contacts)
+        return part.contact_points().copy()
+
+    go(stops[0], stops[1])
+    state = part.snapshot()
+    first = go(stops[1], stops[2])
+    part.restore(state)
+    second = go(stops[1], stops[2])
+    part.restore(state)
+    assert np.allclose(first, second, atol=1e-9)
+    assert np.allclose(go(stops[1], stops[2]), first, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_turn_moves_free_points_and_leaves_held_ones(name):
+    scene = _scene([0])
+    part = build_model(scene.muscles[0], scene, name)
+    before = part.contact_points().copy()
+    which = before[:, 2] > 0
+    shift = np.eye(4)
+    shift[:3, 3] = [0, 1.0, 0]
+    part.turn(which, shift)
+    moved = part.contact_points() - before
+    held = part.contact_bone >= 0
+    free = which & ~held
+    assert moved[free, 1].mean() > 0.5
+    # Samples between held and free centres of an RBF muscle go a part of the way.
+    assert np.abs(moved[held & ~which]).mean() < 0.1
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_moving_the_whole_scene_moves_the_result(name):
+    plain, _ = _run(name, _scene([0, 20]), surfaces=False)
+    scene = _scene([0, 20])
+    turn = rotation_about([1, 2, 3], 1.1, np.zeros(3))
+    turn[:3, 3] = [500.0, -300, 200]
+    for thing in [*scene.bones, *scene.muscles]:
+        thing.mesh.apply_transform(turn)
+    for joint in scene.joints:
+        joint.centre = turn[:3, :3] @ joint.centre + turn[:3, 3]
+        joint.axes = {key: turn[:3, :3] @ axis for key, axis in joint.axes.items()}
+    moved, _ = _run(name, scene, surfaces=False)
+    expected = plain[-1].carried["strap0"][0] @ turn[:3, :3].T + turn[:3, 3]
+    # Grids of distance fields lie with the axes: contacts differ by the fields' error, 0.05 mm.
+    assert np.sqrt(((moved[-1].carried["strap0"][0] - expected) ** 2).sum(axis=1).mean()) < 0.1
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_units_do_not_matter(name):
+    millimetres, _ = _run(name, _scene([0, 20]), surfaces=False)
+    metres, _ = _run(name, _scene([0, 20], units="m"), surfaces=False)
+    a, b = millimetres[-1].carried["strap0"][0], 1e3 * metres[-1].carried["strap0"][0]
+    assert np.abs(a - b).max() < 0.05
+
+
+@pytest.mark.parametrize("name", ["rbf", "pbd"])
+def test_one_big_step_leaves_no_point_behind_a_bone(name):
+    scene = _scene([0, 60])
+    scene.detect = DetectOptions(tunnelling=TunnellingOptions())
+    frames, (part,) = _run(name, scene, surfaces=False)
+    assert not [event for frame in frames for event in frame.events if event.action == "unresolved"]
+    free = part.contact_bone < 0
+    ball = rm.BoneSDF.from_mesh(scene.bones[0].mesh)
+    assert ball.distance(part.contact_points()[free]).min() > -0.1
+
+
+@pytest.mark.parametrize("name", ["rbf", "pbd"])
+def test_overlap_at_rest_is_resolved(name):
+    scene = _scene([0], overlap=4.0)
+    frames, (part,) = _run(name, scene)
+    assert {event.action for event in frames[0].events} == {"overlap_resolved"}
+    free = part.contact_bone < 0
+    ball = rm.BoneSDF.from_mesh(scene.bones[0].mesh)
+    assert ball.distance(part.contact_points()[free]).min() > -0.1
+    assert _volume(frames[0].surfaces["strap0"]) == pytest.approx(scene.muscles[0].mesh.volume, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["rbf", "pbd"])
+def test_neighbours_slide(name):
+    scene = _scene([0, 30], muscles=2)
+    scene.sliding = SlidingOptions()
+    frames, _ = _run(name, scene)
+    for surface in frames[-1].surfaces.values():
+        assert surface.quantities["sliding_overlap_max"] < 0.5
+        assert 0.0 < surface.quantities["sliding_gap_max"] < 4.0

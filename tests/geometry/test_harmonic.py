@@ -1,0 +1,144 @@
+"""Harmonic weights, gradients on a surface, and the blend of rigid motions."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from rbfmuscle.geometry.harmonic import (
+    blended_motion,
+    cotangent_laplacian,
+    harmonic_weights,
+    surface_gradient,
+)
+
+LENGTH, RADIUS = 40.0, 5.0
+
+
+def cylinder(*, rows=40, around=24, shear=0.0):
+    """Side of a cylinder along z; ``shear`` turns the rings so that triangles become obtuse."""
+    angle = 2 * np.pi * np.arange(around) / around
+    height = np.linspace(0, LENGTH, rows + 1)
+    turn = angle[None, :] + shear * height[:, None]
+    vertices = np.stack(
+        [RADIUS * np.cos(turn), RADIUS * np.sin(turn), np.broadcast_to(height[:, None], turn.shape)], axis=-1
+    )
+    i, j = np.meshgrid(np.arange(rows), np.arange(around), indexing="ij")
+    a, b = (i * around + j).ravel(), (i * around + (j + 1) % around).ravel()
+    faces = np.concatenate([np.stack([a, b, b + around], 1), np.stack([a, b + around, a + around], 1)])
+    return vertices.reshape(-1, 3), faces, around
+
+
+def pose(seed, *, angle=None, shift=50.0):
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    motion = np.eye(4)
+    turned = rng.uniform(0.1, 3.0) if angle is None else angle
+    motion[:3, :3] = Rotation.from_rotvec(turned * axis).as_matrix()
+    motion[:3, 3] = rng.normal(size=3) * shift
+    return motion
+
+
+def moved(points, motion):
+    return points @ motion[:3, :3].T + motion[:3, 3]
+
+
+class TestWeights:
+    def test_linear_between_the_ends_of_a_cylinder(self):
+        vertices, faces, around = cylinder()
+        ends = [np.arange(around), np.arange(len(vertices) - around, len(vertices))]
+        weights = harmonic_weights(vertices, faces, ends)
+        expected = vertices[:, 2] / LENGTH
+        # Diagonals of the right-angled triangles have cotangent 0 and are raised to a small positive weight.
+        assert weights[:, 1] == pytest.approx(expected, abs=1e-9)
+        assert weights[:, 0] == pytest.approx(1 - expected, abs=1e-9)
+
+    @pytest.mark.parametrize("shear", [0.0, 0.3, 0.8])
+    def test_within_zero_and_one_and_sum_to_one_on_bad_triangles(self, shear):
+        vertices, faces, around = cylinder(shear=shear)
+        groups = [np.arange(5), np.arange(300, 310), np.arange(len(vertices) - around, len(vertices))]
+        weights = harmonic_weights(vertices, faces, groups)
+        assert weights.min() >= 0 and weights.max() <= 1
+        assert weights.sum(axis=1) == pytest.approx(1, abs=1e-12)
+        for k, group in enumerate(groups):
+            assert np.array_equal(weights[group], np.broadcast_to(np.eye(3)[k], (len(group), 3)))
+
+    def test_do_not_depend_on_unit_or_place(self):
+        mesh = trimesh.creation.icosphere(subdivisions=3, radius=20.0)
+        groups = [np.flatnonzero(mesh.vertices[:, 2] > 15), np.flatnonzero(mesh.vertices[:, 2] < -15)]
+        weights = harmonic_weights(mesh.vertices, mesh.faces, groups)
+        away = moved(mesh.vertices * 1e-3, pose(3, shift=10.0))
+        assert harmonic_weights(away, mesh.faces, groups) == pytest.approx(weights, abs=1e-9)
+
+    def test_all_vertices_fixed_and_a_single_group(self):
+        vertices, faces, _ = cylinder(rows=4)
+        half = len(vertices) // 2
+        weights = harmonic_weights(vertices, faces, [np.arange(half), np.arange(half, len(vertices))])
+        assert set(np.unique(weights)) == {0.0, 1.0}
+        assert harmonic_weights(vertices, faces, [np.arange(7)]) == pytest.approx(1)
+
+    def test_laplacian_is_symmetric_with_rows_that_sum_to_zero(self):
+        vertices, faces, _ = cylinder(shear=0.5)
+        laplacian = cotangent_laplacian(vertices, faces)
+        assert abs(laplacian - laplacian.T).max() < 1e-12
+        assert np.abs(laplacian @ np.ones(len(vertices))).max() < 1e-10
+        off = laplacian.copy()
+        off.setdiag(0)
+        assert off.max() <= 0  # the maximum principle
+        assert np.linalg.eigvalsh(laplacian.toarray())[0] > -1e-9
+
+
+class TestGradient:
+    def test_of_a_linear_function_on_a_plane(self):
+        x, y = (values.ravel() for values in np.meshgrid(np.linspace(0, 3, 7), np.linspace(0, 2, 5)))
+        rng = np.random.default_rng(0)
+        from scipy.spatial import Delaunay
+
+        flat = np.stack([x, y], axis=1) + rng.uniform(-0.1, 0.1, size=(len(x), 2))
+        vertices = np.column_stack([flat, np.zeros(len(flat))])
+        gradient = surface_gradient(vertices, Delaunay(flat).simplices, flat @ [2.0, -3.0] + 7)
+        assert gradient == pytest.approx(np.broadcast_to([2.0, -3.0, 0.0], gradient.shape), abs=1e-9)
+
+    def test_along_a_cylinder(self):
+        vertices, faces, _ = cylinder()
+        gradient = surface_gradient(vertices, faces, vertices[:, 2] / LENGTH)
+        assert gradient == pytest.approx(np.broadcast_to([0, 0, 1 / LENGTH], gradient.shape), abs=1e-12)
+
+
+class TestBlend:
+    POINTS = np.random.default_rng(5).normal(size=(30, 3)) * 40
+
+    def weights(self, count):
+        weights = np.random.default_rng(6).uniform(size=(len(self.POINTS), count))
+        return weights / weights.sum(axis=1, keepdims=True)
+
+    @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 1e-4, 1.1e-4, 0.03, 1.0, 3.0, np.pi])
+    def test_shared_motion_is_rigid(self, angle):
+        motion = pose(1, angle=angle)
+        found = blended_motion(self.POINTS, self.weights(3), np.array([motion] * 3))
+        assert found == pytest.approx(moved(self.POINTS, motion), abs=1e-6 if angle == np.pi else 1e-10)
+
+    def test_weight_of_one_gives_the_bone_exactly(self):
+        motions = np.array([pose(seed) for seed in (1, 2, 3)])
+        for k, motion in enumerate(motions):
+            weights = np.broadcast_to(np.eye(3)[k], (len(self.POINTS), 3))
+            found = blended_motion(self.POINTS, weights, motions)
+            assert found == pytest.approx(moved(self.POINTS, motion), abs=1e-10)
+
+    def test_half_of_a_turn_about_a_centre_keeps_the_distance_to_it(self):
+        centre = np.array([10.0, -3.0, 7.0])
+        motion = pose(4, angle=1.4)
+        motion[:3, 3] = centre - motion[:3, :3] @ centre
+        halves = np.full((len(self.POINTS), 2), 0.5)
+        found = blended_motion(self.POINTS, halves, np.array([np.eye(4), motion]))
+        expected = Rotation.from_rotvec(0.5 * Rotation.from_matrix(motion[:3, :3]).as_rotvec())
+        assert found == pytest.approx(expected.apply(self.POINTS - centre) + centre, abs=1e-10)
+
+    def test_does_not_depend_on_the_origin(self):
+        # Moving everything by the same rigid motion changes nothing but the place.
+        motions, weights = np.array([pose(7, angle=0.4), pose(8, angle=0.7)]), self.weights(2)
+        frame = pose(9)
+        inverse = np.linalg.inv(frame)
+        there = blended_motion(moved(self.POINTS, frame), weights, frame @ motions @ inverse)
+        assert there == pytest.approx(moved(blended_motion(self.POINTS, weights, motions), frame), abs=1e-9)

@@ -1,0 +1,205 @@
+"""RBFField: interpolation, derivatives, Hermite fits, errors."""
+
+import numpy as np
+import pytest
+
+from rbfmuscle.implicit.field import RBFField
+from rbfmuscle.implicit.fit.fitting import Basis, solve
+from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
+from rbfmuscle.validation import NumericalWarning, UsageError
+
+HERMITE = [name for name, kernel in KERNELS.items() if kernel.hermite]
+AXES = np.array([40.0, 50.0, 60.0])
+
+
+def fibonacci(count):
+    """Points spread evenly over the unit sphere: (count, 3)."""
+    i = np.arange(count) + 0.5
+    z = 1 - 2 * i / count
+    angle = np.pi * (1 + 5**0.5) * i
+    ring = np.sqrt(1 - z * z)
+    return np.c_[ring * np.cos(angle), ring * np.sin(angle), z]
+
+
+def ellipsoid(count):
+    """Points and outward unit normals of an ellipsoid with half-axes AXES."""
+    unit = fibonacci(count)
+    normals = unit / AXES
+    return unit * AXES + 100.0, normals / np.linalg.norm(normals, axis=1)[:, None]
+
+
+def central_gradient(field, points, step):
+    return np.stack([(field(points + e) - field(points - e)) / (2 * step) for e in step * np.eye(3)], axis=1)
+
+
+@pytest.mark.filterwarnings("ignore::rbfmuscle.validation.NumericalWarning")
+@pytest.mark.parametrize("kernel", HERMITE)
+def test_hermite_fit_meets_points_and_normals(kernel):
+    points, normals = ellipsoid(80)
+    field = RBFField.fit_hermite(points, normals, kernel=kernel, epsilon=1 / 60)
+    value, gradient = field.value_and_gradient(points)
+    bound = 1e-15 * field.condition + 1e-9
+    assert np.abs(value).max() < 60 * bound
+    assert np.abs(gradient - normals).max() < bound
+
+
+@pytest.mark.filterwarnings("ignore::rbfmuscle.validation.NumericalWarning")
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_gradient_is_the_derivative_of_the_value(kernel):
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-50, 50, (60, 3))
+    field = RBFField.fit(points, np.sin(points[:, 0] / 20), kernel=kernel, epsilon=1 / 50)
+    # off the centres: kernels that are only C0 there have no derivative at a centre
+    where = rng.normal(size=(50, 3)) * 30
+    step = 6e-6 * 100
+    expected = central_gradient(field, where, step)
+    gradient = field.gradient(where)
+    rounding = 1e-15 * np.abs(field.weights).max() / step
+    assert np.abs(gradient - expected).max() < 1e-6 * np.abs(gradient).max() + 10 * rounding
+
+
+def test_unknown_kernel_is_answered_with_the_nearest_name():
+    with pytest.raises(UsageError, match="did you mean 'gaussian'"):
+        RBFField.fit(np.eye(3), np.zeros(3), kernel="gausian")
+
+
+def test_rough_kernel_is_refused_for_hermite_fits():
+    points, normals = ellipsoid(20)
+    with pytest.raises(UsageError, match="needs C2"):
+        RBFField.fit_hermite(points, normals, kernel="linear")
+
+
+@pytest.mark.filterwarnings("ignore::rbfmuscle.validation.NumericalWarning")
+@pytest.mark.parametrize("kernel", HERMITE)
+@pytest.mark.parametrize("derivatives", ["all", "normal"])
+def test_hessian_is_the_derivative_of_the_gradient(kernel, derivatives):
+    points, normals = ellipsoid(60)
+    field = RBFField.fit_hermite(points, normals, kernel=kernel, epsilon=1 / 60, derivatives=derivatives)
+    where = 100 + np.random.default_rng(2).normal(size=(20, 3)) * 30
+    h = 6e-4
+    expected = np.stack(
+        [(field.gradient(where + e) - field.gradient(where - e)) / (2 * h) for e in h * np.eye(3)], axis=2
+    )
+    hessian = field.hessian(where)
+    rounding = 1e-12 * np.abs(field.weights).max() / field.scale / h
+    assert np.abs(hessian - expected).max() < 1e-6 * np.abs(hessian).max() + rounding
+    assert np.abs(hessian - hessian.transpose(0, 2, 1)).max() == 0
+
+
+def test_curvatures_of_a_sphere():
+    unit = fibonacci(400)
+    field = RBFField.fit_hermite(unit * 25 + 7, unit, kernel="septic")
+    where = fibonacci(37) * 25 + 7
+    # the fit's own error with 400 centres: its second derivatives are right to about 1e-4
+    assert np.abs(field.mean_curvature(where) * 25 - 1).max() < 1e-3
+    assert np.abs(field.gaussian_curvature(where) * 625 - 1).max() < 2e-3
+
+
+def test_normal_derivatives_alone_give_nearly_the_same_surface():
+    points, normals = ellipsoid(150)
+    field = RBFField.fit_hermite(points, normals, derivatives="normal")
+    value, gradient = field.value_and_gradient(points)
+    assert np.abs(value).max() < 1e-9
+    assert np.abs((gradient * normals).sum(axis=1) - 1).max() < 1e-10
+    where, _ = ellipsoid(1234)
+    whole = RBFField.fit_hermite(points, normals)
+    assert np.sqrt((field(where) ** 2).mean()) < 2 * np.sqrt((whole(where) ** 2).mean())
+
+
+@pytest.mark.parametrize("kind", ["value", "gradient", "normal"])
+@pytest.mark.parametrize("kernel", ["cubic", "quintic", "septic", "polyharmonic_4", "multiquadric"])
+def test_definite_solve_equals_the_augmented_indefinite_one(kernel, kind):
+    # at several radii: on one ellipsoid a quadratic would vanish
+    unit = fibonacci(40)
+    radii = np.linspace(0.4, 1.0, 40)[:, None]
+    kernel = get_kernel(kernel)
+    basis = Basis(radii * unit * [0.5, 0.7, 1.0], kernel, 2.0, kernel.degree, kind=kind, normals=unit)
+    right = np.random.default_rng(3).normal(size=basis.size)
+    weights, coefficients, condition = solve(basis, right)
+    q = len(basis.powers)
+    expected = np.linalg.solve(basis.full_matrix(), np.append(right, np.zeros(q)))
+    bound = 1e-15 * condition * np.abs(expected).max()
+    assert np.abs(np.append(weights, coefficients) - expected).max() < 100 * bound
+
+
+@pytest.mark.parametrize("kernel", ["cubic", "gaussian", "matern_72", "inverse_multiquadric", "wendland_c2"])
+def test_condition_estimate_is_within_a_factor_of_thirty(kernel):
+    points = np.random.default_rng(4).uniform(-0.5, 0.5, (200, 3))
+    kernel = get_kernel(kernel)
+    basis = Basis(points, kernel, 4.0, kernel.degree)
+    _, _, condition = solve(basis, points[:, 0])
+    matrix = basis.full_matrix()[: basis.size, : basis.size]
+    free = np.linalg.qr(basis.polynomials.T, mode="complete")[0][:, len(basis.powers) :]
+    true = np.linalg.norm(matrix, 2) / np.linalg.eigvalsh(free.T @ matrix @ free).min()
+    assert true / 30 < condition < true * 1.01
+
+
+@pytest.mark.parametrize("moved", ["rotated", "scaled", "shifted"])
+def test_field_moves_with_its_points(moved):
+    points, normals = ellipsoid(100)
+    where, _ = ellipsoid(77)
+    where = where + 3.0
+    angle = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
+    turn, factor, shift = {
+        "rotated": (angle, 1.0, 0.0),
+        "scaled": (np.eye(3), 1e-3, 0.0),
+        "shifted": (np.eye(3), 1.0, 1e4),
+    }[moved]
+    before = RBFField.fit_hermite(points, normals)(where)
+    field = RBFField.fit_hermite(points @ turn.T * factor + shift, normals @ turn.T)
+    # a shift by 1e4 rounds the coordinates themselves by 2e-12
+    assert np.abs(field(where @ turn.T * factor + shift) / factor - before).max() < 1e-9
+
+
+def test_smoothing_trades_the_residual_for_smaller_weights():
+    points, _ = ellipsoid(80)
+    noisy = np.random.default_rng(5).normal(size=80)
+    fields = [RBFField.fit(points, noisy, smoothing=s) for s in (0.0, 0.1, 10.0)]
+    residuals = [np.abs(f(points) - noisy).max() for f in fields]
+    sizes = [np.abs(f.weights).max() for f in fields]
+    assert residuals[0] < 1e-10 < residuals[1] < residuals[2]
+    assert sizes[0] > sizes[1] > sizes[2]
+
+
+def test_more_samples_than_centres_are_fitted_by_least_squares():
+    rng = np.random.default_rng(6)
+    points = rng.normal(size=(300, 3))
+    values = 2 + points @ [1.0, 2, 3]
+    field = RBFField.fit_least_squares(points, values, points[:50])
+    assert np.abs(field(points) - values).max() < 1e-9
+
+
+def test_duplicate_centres_are_named():
+    points, normals = ellipsoid(30)
+    points[17] = points[4]
+    with pytest.raises(np.linalg.LinAlgError, match="centres 4 and 17 coincide"):
+        RBFField.fit(points, np.ones(30))
+    with pytest.raises(np.linalg.LinAlgError, match="centres 4 and 17 coincide"):
+        RBFField.fit_hermite(points, normals)
+
+
+def test_coplanar_centres_and_high_degree_are_named():
+    points = np.random.default_rng(7).normal(size=(30, 3)) * [1, 1, 0]
+    with pytest.raises(np.linalg.LinAlgError, match="coplanar"):
+        RBFField.fit(points, points[:, 0])
+    with pytest.raises(np.linalg.LinAlgError, match="collinear"):
+        RBFField.fit(points * [1, 0, 0], points[:, 0])
+    with pytest.raises(np.linalg.LinAlgError, match="degree too high"):
+        RBFField.fit(points[:5], points[:5, 0], degree=2)
+    with pytest.raises(UsageError, match="at least 1"):
+        RBFField.fit(points, points[:, 0], degree=0)
+
+
+def test_flat_kernel_is_reported():
+    points, _ = ellipsoid(100)
+    with pytest.warns(NumericalWarning, match="raise epsilon"):
+        RBFField.fit(points, points[:, 0], kernel="gaussian", epsilon=1 / 300)
+
+
+def test_one_and_four_centres():
+    field = RBFField.fit_hermite([[1.0, 2, 3]], [[0.0, 0, 1]])
+    assert abs(field([[1.0, 2, 5]])[0] - 2) < 1e-9
+    points, normals = ellipsoid(4)
+    assert np.abs(RBFField.fit_hermite(points, normals)(points)).max() < 1e-9
+    with pytest.raises(UsageError, match="at least one point"):
+        RBFField.fit_hermite(np.zeros((0, 3)), np.zeros((0, 3)))

@@ -1,0 +1,160 @@
+"""The kernel table: values, derivatives and definiteness of every row."""
+
+import mpmath as mp
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+
+from rbfmuscle.implicit.fit.assembly import exponents, monomials
+from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
+from rbfmuscle.validation import UsageError
+
+mp.mp.dps = 50
+COMPACT = [name for name, kernel in KERNELS.items() if kernel.compact]
+
+
+def binomial(beta, sign):
+    return lambda s: sign * (1 + s * s) ** mp.mpf(beta)
+
+
+def cut(function):
+    return lambda s: function(s) if s < 1 else mp.mpf(0)
+
+
+# written from the literature, independently of the table
+LITERAL = {
+    "linear": lambda s: -s,
+    "cubic": lambda s: s**3,
+    "quintic": lambda s: -(s**5),
+    "septic": lambda s: s**7,
+    "thin_plate_spline": lambda s: s**2 * mp.log(s),
+    "polyharmonic_4": lambda s: -(s**4) * mp.log(s),
+    "gaussian": lambda s: mp.exp(-s * s),
+    "multiquadric": binomial(0.5, -1),
+    "inverse_multiquadric": binomial(-0.5, 1),
+    "inverse_quadratic": binomial(-1, 1),
+    "generalised_multiquadric": binomial(1.5, 1),
+    "matern_12": lambda s: mp.exp(-s),
+    "matern_32": lambda s: (1 + s) * mp.exp(-s),
+    "matern_52": lambda s: (1 + s + s**2 / 3) * mp.exp(-s),
+    "matern_72": lambda s: (1 + s + 2 * s**2 / 5 + s**3 / 15) * mp.exp(-s),
+    "wendland_c0": cut(lambda s: (1 - s) ** 2),
+    "wendland_c2": cut(lambda s: (1 - s) ** 4 * (4 * s + 1)),
+    "wendland_c4": cut(lambda s: (1 - s) ** 6 * (35 * s**2 + 18 * s + 3) / 3),
+    "wendland_c6": cut(lambda s: (1 - s) ** 8 * (32 * s**3 + 25 * s**2 + 8 * s + 1)),
+    "wendland_51": cut(lambda s: (1 - s) ** 5 * (5 * s + 1)),
+    "buhmann": cut(lambda s: 12 * s**4 * mp.log(s) - 21 * s**4 + 32 * s**3 - 12 * s**2 + 1),
+    "skala_cervenka": lambda s: s**2 * (s ** mp.mpf(1.8) - 1),
+}
+
+
+def literal_radial(name, s, k):
+    """k-th radial function by 50-digit differences of the literal formula."""
+    s = mp.mpf(float(s))
+    d = [mp.diff(LITERAL[name], s, n) if n else LITERAL[name](s) for n in range(k + 1)]
+    if k == 0:
+        return d[0]
+    if k == 1:
+        return d[1] / s
+    if k == 2:
+        return (d[2] - d[1] / s) / s**2
+    return (d[3] - 3 * d[2] / s + 3 * d[1] / s**2) / s**3
+
+
+def test_every_row_has_a_literal_formula():
+    assert set(LITERAL) == set(KERNELS)
+
+
+@pytest.mark.parametrize("k", range(4))
+@pytest.mark.parametrize("name", KERNELS)
+def test_radial_functions_against_fifty_digits(name, k):
+    kernel = KERNELS[name]
+    s = np.array([1e-3, 0.01, 0.1, 0.25, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 1.1, 1.7, 3.0, 6.0, 20.0])
+    values = [kernel.phi, kernel.first, kernel.second, kernel.third][k](s)
+    exact = np.array([float(literal_radial(name, x, k)) for x in s])
+    size = np.abs(exact)
+    if name == "buhmann":  # the four terms cancel towards s = 1, so relative to the value at the centre
+        size = np.maximum(size, np.abs(kernel.table[k]).max())
+    if name == "skala_cervenka":  # difference of two terms, zero near s = 1
+        size = np.maximum(size, 2.0 * s ** (2.0 - 2 * k))
+    if name in ("thin_plate_spline", "polyharmonic_4"):  # sum of a logarithm and a constant, zero in between
+        size = np.maximum(size, np.abs(kernel.table[k]).max() * s ** float(kernel.table[k, 0]))
+    # exp(-s^2): the rounding of s^2 alone costs s^2 eps
+    bound = 1e-14 * np.maximum(1, s * s / 20 if name == "gaussian" else 1)
+    assert (np.abs(values - exact) <= bound * size + 1e-300).all()
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_limits_at_zero_are_exact(name):
+    kernel = KERNELS[name]
+    tiny = 1e-9
+    for k, function in enumerate([kernel.phi, kernel.first, kernel.second, kernel.third]):
+        limit, near = float(function(0.0)), float(literal_radial(name, tiny, k))
+        if np.isfinite(limit):
+            # the next term of the expansion is of order s (log s), its factor at most 1e4
+            assert abs(near - limit) <= 1e-3 * max(1, abs(limit)) or name == "skala_cervenka"
+        else:
+            assert abs(near) > 19 and np.sign(near) == np.sign(limit)
+        assert not np.isnan(limit)
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_epsilon_multiplies_the_distance(name):
+    kernel = KERNELS[name]
+    r = np.array([0.1, 0.4, 2.2])
+    assert np.allclose(kernel.phi(r, 0.5), kernel.phi(0.5 * r), rtol=1e-14)
+    h = 1e-5
+    slope = (kernel.phi(r + h, 0.5) - kernel.phi(r - h, 0.5)) / (2 * h)
+    assert np.allclose(kernel.first(r, 0.5) * r, slope, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", COMPACT)
+def test_compact_kernels_end_at_one_over_epsilon(name):
+    assert KERNELS[name].phi(0.999 / 0.3, 0.3) >= 0
+    assert KERNELS[name].phi([1 / 0.3, 5.0, 1e60], 0.3).tolist() == [0, 0, 0]
+
+
+def least_eigenvalue(kernel, points, degree):
+    """Of the kernel matrix in the null space of the polynomials."""
+    matrix = kernel.phi(cdist(points, points), 1.3)
+    block = monomials(points, exponents(degree))
+    if len(block):
+        basis = np.linalg.qr(block.T, mode="complete")[0][:, len(block) :]
+        matrix = basis.T @ matrix @ basis
+    return np.linalg.eigvalsh(matrix)[0]
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_kernel_is_conditionally_definite_of_its_order(name):
+    points = np.random.default_rng(0).uniform(-1, 1, (40, 3))
+    assert least_eigenvalue(KERNELS[name], points, KERNELS[name].degree) > 0
+
+
+@pytest.mark.parametrize("name", ["cubic", "multiquadric", "skala_cervenka"])
+def test_one_degree_lower_is_not_definite(name):
+    points = np.random.default_rng(0).uniform(-1, 1, (40, 3))
+    assert least_eigenvalue(KERNELS[name], points, KERNELS[name].degree - 1) < 0
+
+
+def test_wendland_functions_of_dimension_one_are_refused():
+    axis = np.arange(6.0)
+    grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    lengths = np.linspace(1, 12, 60)
+    distances = cdist(grid, grid)
+    assert min(np.linalg.eigvalsh(np.maximum(1 - distances / a, 0))[0] for a in lengths) < 0
+    for name in ("wendland_10", "wendland_11", "wendland_12"):
+        with pytest.raises(UsageError, match="one dimension only"):
+            get_kernel(name)
+
+
+def test_exponent_of_a_family_can_be_chosen():
+    kernel = get_kernel("generalised_multiquadric", parameter=2.5)
+    assert kernel.order == 3 and kernel.phi(1.0) == pytest.approx(-(2**2.5), rel=1e-14)
+    assert get_kernel("skala_cervenka", parameter=0.5).smoothness == 2
+    for name, wrong in (("skala_cervenka", 2.0), ("generalised_multiquadric", 2.0), ("cubic", 1.0)):
+        with pytest.raises(UsageError):
+            get_kernel(name, parameter=wrong)
+
+
+def test_rows_are_numbered_in_order():
+    assert [kernel.id for kernel in KERNELS.values()] == list(range(len(KERNELS)))

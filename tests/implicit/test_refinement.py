@@ -1,0 +1,82 @@
+"""Centres and normals fitted to the whole surface."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from rbfmuscle.implicit.field import RBFField, hermite_system
+from rbfmuscle.implicit.kernels.table import get_kernel
+from rbfmuscle.implicit.placement.refinement import _rows, fit_centres, fit_sample
+from rbfmuscle.implicit.placement.sampling import sample_surface, spread_points
+from rbfmuscle.implicit.selection import spacing
+from rbfmuscle.validation import UsageError
+
+
+@pytest.fixture(scope="module")
+def bean():
+    """A bent ellipsoid with bumps that 60 centres cannot follow, and the centres."""
+    mesh = trimesh.creation.icosphere(subdivisions=4).apply_scale([30.0, 18.0, 8.0])
+    v = np.array(mesh.vertices)
+    v[:, 2] += (v[:, 0] / 12.0) ** 2 + 0.6 * np.sin(v[:, 0] / 3.0) * np.sin(v[:, 1] / 3.0)
+    return v, np.asarray(mesh.faces), sample_surface(v, np.asarray(mesh.faces), 60, placement="adaptive")
+
+
+@pytest.mark.parametrize(
+    ("kernel", "epsilon"), [("cubic", 1.0), ("quintic", 1.0), ("inverse_multiquadric", 0.12)]
+)
+def test_fitted_centres_err_less_at_points_they_have_not_seen(bean, kernel, epsilon):
+    vertices, faces, plain = bean
+    fitted = fit_sample(plain, vertices, faces, kernel=kernel, epsilon=epsilon)
+    unseen = spread_points(vertices, faces, 3000, seed=7)[0]
+
+    def error(sample):
+        field = RBFField.fit_hermite(sample.points, sample.normals, kernel=kernel, epsilon=epsilon)
+        return np.sqrt((field(unseen) ** 2).mean())
+
+    assert error(fitted) < 0.8 * error(plain)
+    assert np.linalg.norm(fitted.points - plain.points, axis=1).max() < 0.25 * spacing(plain.points).mean()
+    np.testing.assert_allclose(np.linalg.norm(fitted.normals, axis=1), 1.0, atol=1e-12)
+    assert (fitted.control_faces == plain.control_faces).all()
+
+
+def test_rows_give_the_field(bean):
+    _, _, sample = bean
+    kernel = get_kernel("matern_52")
+    basis, right, origin, scale = hermite_system(sample.points, sample.normals, kernel, 0.1, "all")
+    at = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    solution = np.linalg.solve(basis.full_matrix(), np.append(right, np.zeros(len(basis.powers))))
+    field = RBFField.fit_hermite(sample.points, sample.normals, kernel=kernel, epsilon=0.1)
+    rows = _rows(basis, kernel, 0.1 * scale, at)
+    np.testing.assert_allclose(rows @ solution, field(at * scale + origin), atol=1e-7)
+
+
+def test_nothing_moves_where_nothing_is_missed(bean):
+    _, _, sample = bean
+    points, normals = fit_centres(sample.points, sample.normals, sample.points, rounds=1)
+    np.testing.assert_allclose(points, sample.points, atol=1e-6)
+    np.testing.assert_allclose(normals, sample.normals, atol=1e-6)
+
+
+def test_units_and_place_do_not_matter(bean):
+    vertices, faces, sample = bean
+    where = spread_points(vertices, faces, 1000)[0]
+    points, normals = fit_centres(sample.points, sample.normals, where)
+    shift = np.array([3.0, -1.0, 2.0])
+    there, same = fit_centres(sample.points * 1e-3 + shift, sample.normals, where * 1e-3 + shift)
+    np.testing.assert_allclose((there - shift) * 1e3, points, atol=1e-6)
+    np.testing.assert_allclose(same, normals, atol=1e-6)
+
+
+def test_a_kernel_without_hermite_fit_is_refused(bean):
+    sample = bean[2]
+    with pytest.raises(UsageError, match="no Hermite fit"):
+        fit_centres(sample.points, sample.normals, sample.points, kernel="linear")
+
+
+def test_spread_points_are_on_the_mesh_and_even():
+    mesh = trimesh.creation.box([1.0, 2.0, 3.0])
+    points = spread_points(mesh.vertices, mesh.faces, 2200)[0]
+    on = np.isclose(np.abs(points), [0.5, 1.0, 1.5])
+    assert on.any(axis=1).all()
+    # areas of the pairs of faces: 12, 6, 4 of 22
+    np.testing.assert_allclose(on.sum(axis=0), [1200, 600, 400], atol=12)

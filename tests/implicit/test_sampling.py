@@ -1,0 +1,215 @@
+"""Centres on closed meshes: cover, normals, control triangulation."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from rbfmuscle.implicit.field import RBFField
+from rbfmuscle.implicit.placement.control_mesh import contract_clusters
+from rbfmuscle.implicit.placement.off_surface import off_surface_points
+from rbfmuscle.implicit.placement.sampling import sample_surface
+from rbfmuscle.validation import MeshError
+
+HIP = Path(os.environ.get("RBFMUSCLE_DATA", Path(__file__).parents[3] / "shared" / "data")) / "hip"
+MUSCLES = ("gluteus_maximus", "gluteus_medius", "iliacus", "adductor_brevis")
+needs_hip = pytest.mark.skipif(not HIP.exists(), reason="real hip not present (RBFMUSCLE_DATA)")
+
+
+def plate(thickness=1.0):
+    """A thin closed plate of 60 x 40, both sides 1.0 apart by default."""
+    box = trimesh.creation.box((60.0, 40.0, thickness))
+    return trimesh.Trimesh(*trimesh.remesh.subdivide_loop(box.vertices, box.faces, 0), process=False)
+
+
+SHAPES = {
+    "sphere": lambda: trimesh.creation.icosphere(subdivisions=4, radius=10.0),
+    "ellipsoid": lambda: trimesh.creation.icosphere(subdivisions=4).apply_scale([30.0, 10.0, 5.0]),
+    "torus": lambda: trimesh.creation.torus(20.0, 6.0, major_sections=80, minor_sections=40),
+    "plate": plate,
+    "box of 12 triangles": lambda: trimesh.creation.box((10.0, 20.0, 30.0)),
+    "two spheres": lambda: trimesh.util.concatenate(
+        [trimesh.creation.icosphere(3), trimesh.creation.icosphere(3).apply_translation([5, 0, 0])]
+    ),
+}
+
+
+def check_control(mesh, sample, count):
+    control = trimesh.Trimesh(sample.points, sample.control_faces, process=False)
+    sides = np.sort(control.edges, axis=1)
+    assert (np.unique(sides, axis=0, return_counts=True)[1] == 2).all()
+    assert control.is_winding_consistent
+    assert control.euler_number == mesh.euler_number
+    assert len(np.unique(sample.control_faces)) == count == len(sample.points)
+    # One fan of triangles at every vertex: as many faces as distinct neighbours.
+    valence = np.bincount(np.unique(control.edges, axis=0)[:, 0], minlength=count)
+    np.testing.assert_array_equal(valence, np.bincount(sample.control_faces.ravel(), minlength=count))
+    assert control.volume > 0
+
+
+@pytest.mark.parametrize("count", [60, 300])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_control_triangulation_is_closed_manifold_of_the_same_genus(shape, count):
+    mesh = SHAPES[shape]()
+    sample = sample_surface(mesh.vertices, mesh.faces, count)
+    check_control(mesh, sample, count)
+    assert sample.areas.sum() == pytest.approx(mesh.area, rel=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(sample.normals, axis=1), 1.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_points_lie_on_the_surface_where_their_coordinates_say(shape):
+    mesh = SHAPES[shape]()
+    sample = sample_surface(mesh.vertices, mesh.faces, 100)
+    corners = mesh.vertices[mesh.faces[sample.face]]
+    rebuilt = np.einsum("ic,icd->id", sample.barycentric, corners)
+    np.testing.assert_allclose(rebuilt, sample.points, atol=1e-9 * mesh.scale)
+    assert (mesh.faces[sample.face] == sample.vertex[:, None]).any(axis=1).all()
+
+
+def test_sphere_is_covered_evenly_with_radial_normals():
+    mesh = trimesh.creation.icosphere(subdivisions=5, radius=10.0)
+    sample = sample_surface(mesh.vertices, mesh.faces, 300, placement="even")
+    assert sample.areas.std() / sample.areas.mean() < 0.1
+    gaps = trimesh.proximity.cKDTree(sample.points).query(sample.points, k=2)[0][:, 1]
+    # Hexagonal packing would give 2.2; clusters of mesh vertices come within a third of it.
+    assert gaps.min() > 0.67 * np.sqrt(2 / np.sqrt(3) * mesh.area / 300)
+    radial = sample.points / np.linalg.norm(sample.points, axis=1)[:, None]
+    # A facet of this sphere leans by up to 2 degrees.
+    assert (radial * sample.normals).sum(axis=1).min() > np.cos(np.radians(2))
+
+
+def test_both_sides_of_a_thin_plate_get_their_own_points():
+    mesh = plate(0.05)
+    sample = sample_surface(mesh.vertices, mesh.faces, 300, placement="even")
+    broad = np.abs(sample.normals[:, 2]) > 0.9
+    upper, lower = (
+        sample.points[broad & (sample.points[:, 2] > 0)],
+        sample.points[broad & (sample.points[:, 2] < 0)],
+    )
+    assert 0.8 < len(upper) / len(lower) < 1.25
+    assert len(upper) + len(lower) > 200
+    assert (np.sign(sample.points[broad, 2]) == np.sign(sample.normals[broad, 2])).all()
+
+
+def test_same_seed_same_points_and_another_seed_others():
+    mesh = SHAPES["ellipsoid"]()
+    first, again, other = (sample_surface(mesh.vertices, mesh.faces, 50, seed=s) for s in (1, 1, 2))
+    np.testing.assert_array_equal(first.points, again.points)
+    np.testing.assert_array_equal(first.control_faces, again.control_faces)
+    assert np.abs(first.points - other.points).max() > 0.1
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_unit_does_not_matter(scale):
+    mesh = SHAPES["ellipsoid"]()
+    sample = sample_surface(mesh.vertices, mesh.faces, 80)
+    scaled = sample_surface(mesh.vertices * scale, mesh.faces, 80)
+    np.testing.assert_allclose(scaled.points, sample.points * scale, atol=1e-9 * scale)
+    np.testing.assert_array_equal(scaled.control_faces, sample.control_faces)
+
+
+def test_scrambled_clusters_still_contract_to_a_manifold():
+    mesh = trimesh.creation.torus(20.0, 6.0, major_sections=40, minor_sections=20)
+    labels = np.random.default_rng(3).integers(0, 40, len(mesh.vertices))
+    final, control = contract_clusters(mesh.faces, labels, np.ones(len(labels)), 40)
+    assert set(final) == set(range(40))
+    mesh_of_points = trimesh.Trimesh(mesh.vertices[:40], control, process=False)
+    assert mesh_of_points.is_watertight
+    assert mesh_of_points.euler_number == 0
+
+
+def test_open_mesh_is_refused():
+    mesh = trimesh.creation.icosphere(2)
+    with pytest.raises(MeshError, match="closed"):
+        sample_surface(mesh.vertices, mesh.faces[1:], 20)
+
+
+def test_too_few_points_for_the_topology_are_refused():
+    mesh = SHAPES["torus"]()
+    with pytest.raises(MeshError, match="topology"):
+        sample_surface(mesh.vertices, mesh.faces, 5)
+    with pytest.raises(ValueError, match="at least 4"):
+        sample_surface(mesh.vertices, mesh.faces, 3)
+
+
+@pytest.mark.parametrize("placement", ["adaptive", "greedy"])
+@pytest.mark.parametrize("shape", ["ellipsoid", "torus"])
+def test_other_placements_cover_everything_with_a_manifold(shape, placement):
+    mesh = SHAPES[shape]()
+    sample = sample_surface(mesh.vertices, mesh.faces, 100, placement=placement)
+    check_control(mesh, sample, 100)
+    assert sample.areas.max() < 4 * sample.areas.mean()
+    # No two points may meet, or the fit is singular.
+    gaps = trimesh.proximity.cKDTree(sample.points).query(sample.points, k=2)[0][:, 1]
+    assert gaps.min() > 0.1 * np.sqrt(mesh.area / 100)
+
+
+def test_adapted_placement_puts_points_where_the_surface_bends():
+    mesh = SHAPES["ellipsoid"]()
+    even, adaptive = (
+        sample_surface(mesh.vertices, mesh.faces, 100, placement=p) for p in ("even", "adaptive")
+    )
+    tips = [(np.abs(s.points[:, 0]) > 24).sum() for s in (even, adaptive)]
+    assert tips[1] > 1.3 * tips[0]
+
+
+@needs_hip
+@pytest.mark.parametrize("muscle, count", [("gluteus_maximus", 300), ("iliacus", 150)])
+def test_adapted_placements_halve_the_largest_miss_of_a_fit(muscle, count):
+    mesh = trimesh.load(HIP / f"{muscle}.ply", process=False)
+    misses = []
+    for placement in ("even", "adaptive", "greedy"):
+        sample = sample_surface(mesh.vertices, mesh.faces, count, placement=placement)
+        misses.append(np.abs(RBFField.fit_hermite(sample.points, sample.normals)(mesh.vertices)))
+    rms = [np.sqrt((m**2).mean()) for m in misses]
+    assert rms[1] < rms[0] and rms[2] < rms[1]
+    assert misses[2].max() < 0.8 * misses[0].max()
+
+
+def test_greedy_placement_of_thousands_is_refused():
+    mesh = trimesh.creation.icosphere(2)
+    with pytest.raises(ValueError, match="greedy"):
+        sample_surface(mesh.vertices, mesh.faces, 2000, placement="greedy")
+
+
+def test_unknown_placement_is_refused():
+    mesh = trimesh.creation.icosphere(2)
+    with pytest.raises(ValueError, match="placement"):
+        sample_surface(mesh.vertices, mesh.faces, 20, placement="evn")
+
+
+@needs_hip
+@pytest.mark.parametrize("count", [150, 300, 600, 2000])
+@pytest.mark.parametrize("muscle", MUSCLES)
+def test_real_muscles_get_an_even_cover_and_a_closed_control_mesh(muscle, count):
+    mesh = trimesh.load(HIP / f"{muscle}.ply", process=False)
+    sample = sample_surface(mesh.vertices, mesh.faces, count, placement="even")
+    check_control(mesh, sample, count)
+    assert sample.areas.std() / sample.areas.mean() < 0.25
+    control = trimesh.Trimesh(sample.points, sample.control_faces, process=False)
+    # Chords of a thin muscle cut its volume: 19 % for the iliacus at 150.
+    assert 0.8 < control.volume / mesh.volume < 1.0
+
+
+def test_off_surface_points_stay_nearest_to_their_own_point():
+    mesh = plate(1.0)
+    sample = sample_surface(mesh.vertices, mesh.faces, 400)
+    points, values = off_surface_points(sample.points, sample.normals, distance=5.0)
+    assert len(points) == len(values) == 1200
+    distance, owner = trimesh.proximity.cKDTree(sample.points).query(points)
+    np.testing.assert_allclose(distance, np.abs(values), atol=1e-12)
+    np.testing.assert_array_equal(owner, np.tile(np.arange(400), 3))
+    assert values[400:800].max() == 5.0
+    # Inside, the far side of the plate cuts the step back.
+    broad = np.abs(sample.normals[:, 2]) > 0.99
+    assert np.abs(values[800:][broad]).max() < 5.0
+
+
+def test_off_surface_points_refuse_bad_numbers():
+    with pytest.raises(ValueError, match="distance"):
+        off_surface_points(np.eye(3), np.eye(3), distance=-1.0)
+    with pytest.raises(ValueError, match="safety"):
+        off_surface_points(np.eye(3), np.eye(3), safety=2.0)

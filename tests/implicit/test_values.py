@@ -1,0 +1,66 @@
+"""The vectorised exponential, logarithm and sums of radial functions."""
+
+import mpmath
+import numpy as np
+import pytest
+
+from rbfmuscle.implicit.evaluation import evaluate, run_in_chunks
+from rbfmuscle.implicit.kernels.radial import _exp_loop, _log_loop
+from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
+
+EVERY = [*KERNELS.values(), get_kernel("generalised_multiquadric", parameter=0.7)]
+
+
+def in_units_of_last_place(found, exact):
+    with mpmath.workdps(40):
+        return max(
+            float(abs(mpmath.mpf(f) - e) / mpmath.mpf(np.spacing(abs(f)))) for f, e in zip(found, exact)
+        )
+
+
+def test_exponential_is_right_to_two_units_in_the_last_place():
+    rng = np.random.default_rng(0)
+    x = np.concatenate([rng.uniform(-700, 700, 1500), rng.uniform(-1, 1, 500), [0.0, -1e-300, 1e-17]])
+    out = np.empty_like(x)
+    _exp_loop(1.0, x, out)
+    assert in_units_of_last_place(out, [mpmath.exp(mpmath.mpf(v)) for v in x]) < 2
+    _exp_loop(-1.0, np.array([708.5, 1e5, np.inf]), out[:3])
+    assert not out[:3].any()
+
+
+def test_logarithm_is_right_to_two_units_in_the_last_place():
+    rng = np.random.default_rng(1)
+    x = np.concatenate([np.exp(rng.uniform(-700, 700, 1500)), 1 + rng.uniform(-0.3, 0.4, 500), [1 + 1e-13]])
+    out = np.empty_like(x)
+    _log_loop(x, out)
+    assert in_units_of_last_place(out, [mpmath.log(mpmath.mpf(v)) for v in x]) < 2
+    _log_loop(np.zeros(1), out[:1])
+    assert np.isfinite(out[0])
+
+
+@pytest.mark.parametrize("epsilon", [0.7, 3.0])
+@pytest.mark.parametrize("kernel", EVERY, ids=lambda kernel: f"{kernel.name}-{kernel.parameter}")
+def test_values_are_sums_of_the_kernel(kernel, epsilon):
+    rng = np.random.default_rng(2)
+    centres = rng.uniform(-1, 1, (250, 3))
+    # the centres themselves as well, and a number of points that fills no whole block
+    points = np.vstack([rng.uniform(-1, 1, (1500, 3)), centres])
+    weights = rng.normal(size=(1, 250))
+    phi = kernel.phi(np.linalg.norm(points[:, None] - centres, axis=2), epsilon)
+    shape, nothing = np.full(250, epsilon), (np.zeros(0), np.zeros((0, 3), dtype=np.int64))
+    for order in (0, 1):
+        found = evaluate(points, np.zeros(3), 1.0, centres.T.copy(), weights, kernel, shape, nothing, order)[
+            0
+        ]
+        assert np.abs(found - phi @ weights[0]).max() < 1e-14 * (np.abs(phi) @ np.abs(weights[0])).max()
+
+
+@pytest.mark.parametrize("count", [1, 255, 4097])
+def test_chunks_cover_every_point_once(count):
+    seen = np.zeros(count, dtype=int)
+
+    def add(start, stop):
+        seen[start:stop] += 1
+
+    run_in_chunks(add, count, 1e9)
+    assert (seen == 1).all()

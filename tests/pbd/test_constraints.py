@@ -1,0 +1,209 @@
+"""Known answers of the mesh baseline: connections, colours, constraints, volume."""
+
+import itertools
+
+import numpy as np
+import pytest
+import trimesh
+
+from pbd_baseline.bending import BendingConstraint
+from pbd_baseline.constraints import EdgeConstraint, VolumeConstraint
+from pbd_baseline.factor import SymmetricFactor
+from pbd_baseline.topology import Topology, colour
+from pbd_baseline.weights import even_weights
+from rbfmuscle.geometry.harmonic import cotangent_laplacian, harmonic_weights
+from rbfmuscle.validation import MeshError
+
+
+def ellipsoid(subdivisions=3, axes=(3.0, 2.0, 1.0)):
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
+    return np.array(mesh.vertices) * axes, np.array(mesh.faces, dtype=np.int64)
+
+
+@pytest.fixture
+def body():
+    vertices, faces = ellipsoid()
+    return vertices, faces, Topology.from_mesh(vertices, faces)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(4)
+
+
+def test_each_undirected_edge_is_found_once_with_its_two_wings(body):
+    _, faces, topology = body
+    assert len(topology.edges) == 3 * len(faces) // 2
+    assert len(np.unique(topology.edges, axis=0)) == len(topology.edges)
+    triangles = {tuple(np.roll(f, -int(np.argmin(f)))) for f in faces}
+    for (i, j), (k, m) in zip(topology.edges, topology.wings):
+        for face in ((i, j, k), (j, i, m)):
+            assert tuple(np.roll(face, -int(np.argmin(face)))) in triangles
+
+
+def test_one_rings_agree_with_edges(body):
+    _, _, topology = body
+    for i in range(0, topology.vertex_count, 37):
+        span = slice(topology.ring_start[i], topology.ring_start[i + 1])
+        expected = {int(b if a == i else a) for a, b in topology.edges if i in (a, b)}
+        assert set(topology.ring[span].tolist()) == expected
+        assert all(i in topology.edges[c] for c in topology.ring_edge[span])
+
+
+def test_open_mesh_is_refused():
+    vertices, faces = ellipsoid(1)
+    with pytest.raises(MeshError, match="not a closed"):
+        Topology.from_mesh(vertices, faces[1:])
+
+
+def test_constraints_of_one_colour_share_no_vertex(body):
+    _, _, topology = body
+    members = np.column_stack([topology.edges, topology.wings])
+    order, start = colour(members, topology.vertex_count)
+    assert sorted(order) == list(range(len(members)))
+    for low, high in itertools.pairwise(start):
+        used = members[order[low:high]].ravel()
+        assert len(np.unique(used)) == len(used)
+
+
+def test_order_within_a_colour_changes_nothing(body, rng):
+    vertices, _, topology = body
+    start = vertices + 0.1 * rng.normal(size=vertices.shape)
+    constraint = EdgeConstraint(vertices, topology.edges)
+    one, two, mass = start.copy(), start.copy(), np.ones(len(start))
+    constraint.project(one, mass)
+    for low, high in itertools.pairwise(constraint.colours):
+        constraint.edges[low:high] = constraint.edges[low:high][::-1].copy()
+        constraint.rest[low:high] = constraint.rest[low:high][::-1].copy()
+    constraint.project(two, mass)
+    assert np.array_equal(one, two)
+
+
+def numerical_gradient(value, points, members, step):
+    gradient = np.zeros((len(members), 3))
+    for a, v in enumerate(members):
+        for d in range(3):
+            high, low = points.copy(), points.copy()
+            high[v, d] += step
+            low[v, d] -= step
+            gradient[a, d] = (value(high) - value(low)) / (2 * step)
+    return gradient
+
+
+@pytest.mark.parametrize("number", [0, 100, 500])
+@pytest.mark.parametrize("family", ["edge", "bending"])
+def test_projection_follows_the_gradient(body, rng, family, number):
+    vertices, _, topology = body
+    points = vertices + 0.02 * rng.normal(size=vertices.shape)
+    edge, wing = topology.edges[[number]], topology.wings[[number]]
+    if family == "edge":
+        constraint, members = EdgeConstraint(vertices, edge), edge[0]
+    else:
+        constraint = BendingConstraint(vertices, edge, wing, stiffness=1.0)
+        members = np.concatenate([edge[0], wing[0]])
+    gradient = numerical_gradient(lambda x: constraint.values(x)[0], points, members, 6e-6 * 3.0)
+    moved = points.copy()
+    constraint.project(moved, np.ones(len(points)))
+    expected = -constraint.values(points)[0] * gradient / (gradient**2).sum()
+    # central differences of step 2e-5 on values of order one
+    np.testing.assert_allclose((moved - points)[members], expected, atol=1e-7)
+
+
+def test_dihedral_angle_is_positive_on_a_convex_edge():
+    vertices, faces = ellipsoid(1, axes=(1, 1, 1))
+    topology = Topology.from_mesh(vertices, faces)
+    rest = BendingConstraint(vertices, topology.edges, topology.wings).rest
+    assert (rest[:, 1] > 0).all()
+    np.testing.assert_allclose((rest**2).sum(axis=1), 1.0)
+
+
+def test_collapsed_and_folded_elements_stay_finite(body):
+    vertices, _, topology = body
+    points = vertices * [1.0, 1.0, 0.0]
+    points[topology.edges[7, 0]] = points[topology.edges[7, 1]]
+    for constraint in (
+        EdgeConstraint(vertices, topology.edges),
+        BendingConstraint(vertices, topology.edges, topology.wings),
+    ):
+        constraint.project(points, np.ones(len(points)))
+        assert np.isfinite(points).all()
+
+
+def test_edge_beyond_its_limit_is_hard_whatever_its_stiffness():
+    vertices = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+    edge = np.array([[0, 1]])
+    points = vertices * 3.0
+    EdgeConstraint(vertices, edge, stiffness=0.0, limits=(0.6, 2.2)).project(points, np.ones(2))
+    assert np.linalg.norm(points[1] - points[0]) == pytest.approx(2.2)
+
+
+def test_volume_is_that_of_the_ellipsoid_far_from_the_origin():
+    vertices, faces = ellipsoid(5)
+    volume = VolumeConstraint(vertices, faces).rest
+    assert volume == pytest.approx(4 / 3 * np.pi * 6, rel=2e-3)  # inscribed facets: O(h^2)
+    assert VolumeConstraint(vertices + 1e4, faces).rest == pytest.approx(volume, rel=1e-10)
+
+
+def test_volume_gradient_agrees_with_differences_and_sums_to_nothing(body, rng):
+    vertices, faces, _ = body
+    constraint = VolumeConstraint(vertices, faces)
+    gradient = constraint.gradient(vertices)
+    direction = rng.normal(size=vertices.shape)
+    step = 6e-6 * 3.0
+    slope = (
+        constraint.volume(vertices + step * direction) - constraint.volume(vertices - step * direction)
+    ) / (2 * step)
+    assert (gradient * direction).sum() == pytest.approx(slope, rel=1e-7)
+    np.testing.assert_allclose(gradient.sum(axis=0), 0.0, atol=1e-13)
+    np.testing.assert_allclose(np.cross(vertices, gradient).sum(axis=0), 0.0, atol=1e-12)
+
+
+def test_ellipsoid_volume_converges_as_the_formula_page_says():
+    vertices, faces = ellipsoid(4)
+    constraint = VolumeConstraint(vertices, faces)
+    points, errors = vertices * [1.0, 0.9, 0.9], []
+    for _ in range(4):
+        errors.append(abs(constraint.volume(points) / constraint.rest - 1.0))
+        constraint.project(points, np.ones(len(points)))
+    # 0.19, 1e-2, 4e-5, 3e-10: quadratic; the gradient without its sixth would leave 0.16 after one step
+    assert errors[0] == pytest.approx(0.19)
+    assert errors[1] < 1.5e-2
+    assert errors[2] < 1e-4
+    assert errors[3] < 1e-8
+
+
+def test_restore_meets_the_volume_to_rounding_in_one_step(body, rng):
+    vertices, faces, _ = body
+    constraint = VolumeConstraint(vertices, faces)
+    points = vertices * 0.9 + 0.01 * rng.normal(size=vertices.shape)
+    constraint.restore(points, constraint.gradient(points))
+    assert constraint.volume(points) == pytest.approx(constraint.rest, rel=1e-14)
+
+
+def test_restore_leaves_points_where_the_direction_cannot_help(body):
+    vertices, faces, _ = body
+    constraint = VolumeConstraint(vertices, faces)
+    points = 0.9 * vertices
+    constraint.restore(points, np.ones_like(points))  # a translation changes no volume
+    np.testing.assert_array_equal(points, 0.9 * vertices)
+
+
+def test_factor_agrees_with_a_dense_solve(rng):
+    vertices, faces = ellipsoid(2)
+    matrix = cotangent_laplacian(vertices, faces)[10:, 10:]
+    right = rng.normal(size=(matrix.shape[0], 3))
+    solution = SymmetricFactor(matrix).solve(right)
+    np.testing.assert_allclose(solution, np.linalg.solve(matrix.toarray(), right), rtol=1e-9, atol=1e-10)
+
+
+def test_even_weights_stretch_less_than_harmonic_ones(body):
+    vertices, faces, topology = body
+    groups = [np.flatnonzero(vertices[:, 0] < -2.9), np.flatnonzero(vertices[:, 0] > 2.9)]
+    even, harmonic = even_weights(vertices, faces, groups), harmonic_weights(vertices, faces, groups)
+    i, j = topology.edges.T
+    length = np.linalg.norm(vertices[i] - vertices[j], axis=1)
+    steepest = [np.abs((w[i, 0] - w[j, 0]) / length).max() for w in (even, harmonic)]
+    assert steepest[0] < 0.7 * steepest[1]
+    np.testing.assert_allclose(even.sum(axis=1), 1.0)
+    assert even.min() >= 0.0
+    assert (even[groups[0], 0] == 1.0).all()

@@ -1,0 +1,79 @@
+"""The mesh models in the frame loop: the phantom, and the real hip where it is present."""
+
+import runpy
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rbfmuscle.models import build_model
+from rbfmuscle.sim.loop.simulate import simulate_frames
+from rbfmuscle.sim.scene.phantom import phantom_scene
+
+METHODS = ["pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved"]
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "paper_experiments.py"
+
+
+def run(scene, name):
+    """Yield, frame by frame, the models with edge ratios of each: dict of muscle to (model, ratios)."""
+    models = [build_model(muscle, scene, name) for muscle in scene.muscles]
+    rest = {model.name: edge_lengths(model) for model in models}
+    for _ in simulate_frames(scene, models, surfaces=False):
+        yield {model.name: (model, edge_lengths(model) / rest[model.name]) for model in models}
+
+
+def edge_lengths(model):
+    edges = model.rest.topology.edges
+    points = model.contact_points()
+    return np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_phantom_flexes_with_its_volume_and_out_of_its_bones(name):
+    scene = phantom_scene(model=name, end=90, step=10)
+    for state in run(scene, name):
+        for muscle, (model, _) in state.items():
+            assert np.isfinite(model.contact_points()).all(), muscle
+            assert model.penetration <= 0.5, muscle
+            if name != "arap-interleaved":
+                assert abs(model.volume() / model.rest.volume.rest - 1) <= 1e-3, muscle
+
+
+def test_hip_flexes_within_the_promised_figures(hip_scene):
+    scene = hip_scene.with_options(frames="0:46:1")
+    for state in run(scene, "pbd"):
+        for muscle, (model, ratios) in state.items():
+            assert model.penetration <= 0.5, muscle
+            assert abs(model.volume() / model.rest.volume.rest - 1) <= 1e-3, muscle
+            low, high = np.quantile(ratios, [0.01, 0.99])
+            assert low >= 0.5 and high <= 2.5, (muscle, low, high)
+
+
+@pytest.mark.parametrize("name", ["pbd", "xpbd"])
+def test_hip_stays_finite_at_thirty_degrees_a_step_without_substeps(hip_data, name):
+    from rbfmuscle.sim.scene.scene import Scene
+
+    scene = Scene.load(hip_data / "extension.toml")
+    scene = scene.with_options(**{"motion.step": 30.0, "contact.substep_angle": 30.0})
+    for state in run(scene, name):
+        for muscle, (model, _) in state.items():
+            assert np.isfinite(model.contact_points()).all(), muscle
+
+
+def test_xpbd_on_the_hip_does_not_depend_on_its_iterations(hip_scene):
+    ends = []
+    for iterations in (10, 40):
+        scene = hip_scene.with_options(model={"name": "xpbd", "iterations": iterations})
+        scene.muscles = [scene.muscle("gluteus_medius")]
+        for state in run(scene, "xpbd"):
+            points = state["gluteus_medius"][0].contact_points()
+        ends.append(points.copy())
+    assert np.sqrt(((ends[0] - ends[1]) ** 2).sum(axis=1).mean()) <= 0.5
+
+
+def test_example_with_the_papers_experiments_runs(hip_data, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [str(EXAMPLE), "--muscle", "gluteus_medius"])
+    runpy.run_path(str(EXAMPLE), run_name="__main__")
+    table = capsys.readouterr().out
+    assert table.count("flexion by 2") == 4

@@ -1,0 +1,129 @@
+"""Memory and time foretold: counts against what is then built, and how they add up; speed itself is not tested."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+from rbfmuscle.models import build_model, estimate_model
+from rbfmuscle.sim.distance.sdf import BoneSDF
+from rbfmuscle.sim.plan.forecast import FieldCost, MuscleCost, estimate_field, forecast, side_by_side
+from rbfmuscle.sim.plan.plan import plan_scene
+from rbfmuscle.sim.plan.rates import _bumpy_sphere, measure_rates
+from rbfmuscle.sim.scene.phantom import phantom_scene
+
+RATES = {"call": 1e-6, "visit": 1e-9, "query": 1e-6}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return phantom_scene()
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("RBFMUSCLE_CACHE", str(tmp_path))
+
+
+@pytest.mark.parametrize("part", [1.0, 0.5])
+def test_field_has_the_foretold_cells_and_memory(scene, part):
+    mesh = scene.bones[1].mesh
+    low, high = mesh.bounds
+    box = np.array([[*low[:2], high[2] - part * (high[2] - low[2])], high])
+    cost = estimate_field(mesh, box)
+    assert not cost.kept
+    field = BoneSDF.from_mesh(mesh, region=box)
+    # A tenth: blocks are counted at 4,000 random places.
+    assert cost.cells == pytest.approx(field.fine_cells, rel=0.1)
+    assert cost.memory == pytest.approx(field.memory, rel=0.1)
+    assert estimate_field(mesh, box).kept
+
+
+def test_rbf_muscle_has_the_foretold_surface_and_matrix(scene):
+    from rbfmuscle.model import cost
+
+    muscle = scene.muscles[1]
+    foretold = estimate_model(muscle, scene, RATES)
+    model = build_model(muscle, scene)
+    assert foretold.carried == len(model.carried_mesh()[0])
+    surface = model.field().surface(resolution=model.options.resolution)
+    # A thin muscle's rim takes more vertices than its area tells.
+    assert foretold.shown == pytest.approx(len(surface.vertices), rel=0.35)
+    unknowns = cost._unknowns(model.options, len(model.x))
+    assert unknowns == 4 * len(model.x)
+    assert foretold.memory > model.columns.nbytes + model.shares.nbytes + model.solver.inverse.nbytes
+
+
+def test_more_centres_cells_and_iterations_take_more(scene):
+    from rbfmuscle.model.cost import estimate_muscle
+
+    plain = estimate_muscle(scene.muscles[0], scene, RATES, centres=150)
+    many = estimate_muscle(scene.muscles[0], scene, RATES, centres=600)
+    assert many.show > plain.show and many.memory > 4 * plain.memory and many.build > plain.build
+    fine = estimate_muscle(scene.muscles[0], scene, RATES, centres=150, resolution=96)
+    assert fine.shown == pytest.approx(4 * plain.shown, abs=4) and fine.show > plain.show
+    twice = estimate_muscle(scene.muscles[0], scene, RATES, centres=150, iterations=16)
+    assert plain.step < twice.step < 2 * plain.step
+
+
+def test_mesh_muscle_whose_weights_are_on_disk_is_built_sooner(scene):
+    changed = scene.with_options(model="pbd")
+    muscle = changed.muscles[1]
+    anew = estimate_model(muscle, changed, RATES)
+    assert anew.shown == anew.carried == len(muscle.mesh.vertices)
+    build_model(muscle, changed)
+    assert estimate_model(muscle, changed, RATES).build < 0.2 * anew.build
+
+
+def test_tasks_are_taken_in_order_by_the_first_free_thread():
+    assert side_by_side([3.0, 2.0], 1) == 5.0
+    assert side_by_side([3.0, 2.0, 2.0, 1.0], 2) / side_by_side([4.0, 4.0], 2) == pytest.approx(1.0)
+    assert side_by_side([1.0], 8) == 1.0
+
+
+def test_time_and_memory_add_up(scene):
+    bare = scene.with_options(frames="0:10:1", **{"output.metrics": False, "output.surfaces": False})
+    muscle = MuscleCost(build=2.0, step=0.1, show=0.5, memory=1e6, working=1e5, carried=10, shown=10)
+    memory, time = forecast(
+        bare, [FieldCost(1e6, 4e6, False)], [muscle], substeps=20, rates=RATES, resident=5e7, threads=1
+    )
+    # No surfaces and no metrics: nothing is shown.
+    assert time["frame"] == {"muscles": 0.2, "metrics": 0.0, "write": 0.0, "total": 0.2}
+    assert time["build"]["muscles"] == 2.0 and time["build"]["metrics"] == 0.0
+    assert time["total"] == pytest.approx(time["build"]["total"] + 10 * 0.2)
+    assert (memory["fields"], memory["muscles"], memory["metrics"]) == (4e6, 1e6, 0.0)
+    assert memory["peak"] > memory["total"] + 5e7
+
+
+def test_other_detectors_are_not_foretold(scene):
+    made = plan_scene(scene.with_options(**{"contact.detector": "bvh"}), estimate_model)
+    assert made["memory"]["fields"] == 0.0 and "memory" not in made["fields"][0]
+
+
+def test_rates_are_measured_on_a_closed_outward_mesh():
+    import trimesh
+
+    mesh = trimesh.Trimesh(*_bumpy_sphere(12), process=False)
+    assert mesh.is_watertight and mesh.volume > 0
+    rates = measure_rates()
+    # Wide: an entry of a sparse product is far quicker than an exact distance, whatever the machine.
+    assert 0 < 20 * rates["visit"] < rates["query"] < 1e-3 and 0 < rates["call"] < 1e-3
+
+
+def test_plan_loads_no_graphics_and_builds_nothing():
+    code = (
+        "import sys\n"
+        "from rbfmuscle.models import estimate_model\n"
+        "from rbfmuscle.sim.scene.phantom import phantom_scene\n"
+        "from rbfmuscle.sim.plan.plan import plan_scene\n"
+        "from rbfmuscle.sim.distance.sdf import BoneSDF\n"
+        "BoneSDF.from_mesh = None\n"
+        "plan_scene(phantom_scene(), estimate_model)\n"
+        "print([m for m in sys.modules if m.split('.')[0] in ('vtk', 'vtkmodules', 'pyvista', 'matplotlib')])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=120, check=True
+    )
+    assert done.stdout.strip() == "[]", done.stderr

@@ -1,0 +1,94 @@
+"""`plan` says what the run then does, and what a scene does not ask for is not done."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+from blend_model import BlendMuscle, arm_scene, use_blend_model
+
+from rbfmuscle.cli import main
+from rbfmuscle.run import simulate
+from rbfmuscle.sim.loop import simulate as loop
+from rbfmuscle.sim.plan.plan import plan_scene
+from rbfmuscle.sim.plan.reach import reached_bones
+
+
+def test_plan_names_pairs_fields_and_substeps(monkeypatch):
+    use_blend_model(monkeypatch)
+    scene = arm_scene()
+    made = plan_scene(scene)
+    assert {(pair["muscle"], pair["bone"]) for pair in made["pairs"]} == set(reached_bones(scene))
+    assert all(0 < field["share"] <= 1 for field in made["fields"])
+    steps = []
+    solve = BlendMuscle.predict
+    monkeypatch.setattr(
+        BlendMuscle, "predict", lambda self, *poses: (steps.append(1), solve(self, *poses))[1]
+    )
+    frames = simulate(scene).frames
+    assert (made["frames"], made["substeps"]) == (len(frames), len(steps))
+
+
+def test_bone_out_of_reach_is_in_no_pair():
+    import trimesh
+
+    scene = arm_scene()
+    far = trimesh.creation.box((5, 5, 5))
+    far.apply_translation([0, 500, 0])
+    scene.add_bone("far", far)
+    made = plan_scene(scene)
+    assert "far" not in {pair["bone"] for pair in made["pairs"]} | {field["bone"] for field in made["fields"]}
+
+
+@pytest.mark.parametrize("arguments", [[], ["--json"]])
+def test_command_prints_the_plan(hip_data, capsys, arguments):
+    with pytest.raises(SystemExit) as end:
+        main(["plan", str(hip_data / "gluteus.toml"), *arguments])
+    assert end.value.code == 0
+    text = capsys.readouterr().out
+    if arguments:
+        made = json.loads(text)
+        assert {field["bone"] for field in made["fields"]} == {"pelvis", "sacrum", "femur"}
+        assert made["memory"]["peak"] > made["memory"]["total"] > 0
+        assert made["time"]["total"] > made["time"]["motion"] > 0
+    else:
+        assert "gluteus_maximus: rbf" in text and "expected memory" in text and "expected time" in text
+
+
+def test_without_surfaces_and_metrics_nothing_is_extracted_or_measured(monkeypatch):
+    use_blend_model(monkeypatch)
+
+    def refuse(*_args, **_settings):
+        raise AssertionError("called")
+
+    monkeypatch.setattr(BlendMuscle, "drawing", refuse)
+    monkeypatch.setattr("rbfmuscle.run.MetricsRecorder", refuse)
+    run = simulate(arm_scene(surfaces=False, metrics=False))
+    assert len(run.frames) == 3 and run.metrics == []
+
+
+def test_one_muscle_builds_no_sliding(monkeypatch):
+    use_blend_model(monkeypatch)
+    made = []
+    monkeypatch.setattr(
+        loop, "_sliding", lambda *args, real=loop._sliding: made.append(real(*args)) or made[-1]
+    )
+    simulate(arm_scene())
+    assert made == [None]
+
+
+def test_run_without_pictures_loads_no_vtk(tmp_path):
+    code = (
+        "import sys; sys.path.insert(0, 'tests')\n"
+        "from blend_model import arm_scene, BlendMuscle\n"
+        "import rbfmuscle.run as r\n"
+        "r.build_model = BlendMuscle\n"
+        f"r.simulate(arm_scene()).save({str(tmp_path)!r}, pictures=False)\n"
+        "print([m for m in sys.modules if m.split('.')[0] in ('vtk', 'vtkmodules', 'pyvista', 'matplotlib')])"
+    )
+    from conftest import ROOT
+
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=120, check=True
+    )
+    assert done.stdout.strip() == "[]", done.stderr

@@ -1,0 +1,274 @@
+"""The frame loop: sub-steps, reach, parallel muscles, interrupts, times, laziness."""
+
+import sys
+from itertools import pairwise
+
+import numba
+import numpy as np
+import pytest
+from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, hinged_scene, joint, muscle, scene, sphere
+
+from rbfmuscle import models
+from rbfmuscle.sim.loop.simulate import simulate_frames
+from rbfmuscle.sim.plan.reach import Pace, reached_bones, sampled_poses, turned_angle
+from rbfmuscle.sim.scene.motion import bone_poses
+from rbfmuscle.sim.scene.options import TunnellingOptions
+from rbfmuscle.validation import SolveError, UsageError
+
+
+def _run(angles, **options):
+    made, fields = hinged_scene(angles, **options)
+    model = ToyMuscle(made.muscles[0], made)
+    return list(simulate_frames(made, [model], fields=fields)), model
+
+
+def test_frames_carry_what_they_promise():
+    frames, model = _run([0, 10, 20], tunnelling=TunnellingOptions())
+    assert [frame.index for frame in frames] == [0, 1, 2]
+    assert frames[2].coordinates == {"hinge.bend": np.radians(20)}
+    last = frames[-1]
+    assert np.array_equal(last.surfaces["strap"].vertices, model.x)
+    assert np.array_equal(last.carried["strap"][0], model.x)
+    assert np.allclose(last.poses["trunk"], np.eye(4))
+    times = last.times["strap"]
+    assert set(times) == {"time_predict", "time_solve", "time_tunnelling", "time_surface", "time_frame"}
+    assert times["time_frame"] == pytest.approx(sum(v for k, v in times.items() if k != "time_frame"))
+    assert times["time_frame"] > 0.0
+    assert sum(f.wall for f in frames) >= sum(f.times["strap"].get("time_solve", 0.0) for f in frames)
+
+
+@pytest.mark.parametrize("ahead", [True, False])
+def test_a_failing_frame_leaves_those_before(ahead):
+    """A frame is yielded though the next one, solved while it is drawn, cannot be solved."""
+    made, fields = hinged_scene([0, 10, 20, 30])
+    model = ToyMuscle(made.muscles[0], made)
+    predict = model.predict
+
+    def fails_in_the_third(before, after):
+        if min(np.trace(pose) for pose in after.values()) < 2 + 2 * np.cos(np.radians(15)):
+            raise SolveError("planted")
+        predict(before, after)
+
+    model.predict = fails_in_the_third
+    seen = []
+    with pytest.raises(SolveError, match="planted"):
+        for frame in simulate_frames(made, [model], fields=fields, ahead=ahead):
+            seen.append((frame.index, sorted(frame.surfaces)))
+    assert seen == [(0, ["strap"]), (1, ["strap"])]
+
+
+def test_drawing_beside_the_next_solution_changes_nothing(hip_scene):
+    made = hip_scene.with_options(frames="0:4")
+    made.muscles = made.muscles[-2:]
+    runs = []
+    for ahead in (True, False):
+        built = [models.build_model(m, made) for m in made.muscles]
+        runs.append(list(simulate_frames(made, built, ahead=ahead)))
+    for one, other in zip(*runs):
+        for name in one.surfaces:
+            a, b = one.surfaces[name], other.surfaces[name]
+            assert np.array_equal(a.faces, b.faces)
+            # Factors by one or two threads of BLAS differ in rounding.
+            assert np.abs(a.vertices - b.vertices).max() < 1e-6
+            assert np.array_equal(one.carried[name][0], other.carried[name][0])
+
+
+def test_muscle_stays_out_of_the_bone_it_wraps():
+    made, fields = hinged_scene([0, 40, 80])
+    model = ToyMuscle(made.muscles[0], made)
+    for frame in simulate_frames(made, [model], fields=fields):
+        distance = fields["trunk"].distance(model.x[model.contact_bone < 0], frame.poses["trunk"])
+        assert distance.min() > -0.05
+
+
+def test_first_frame_is_reached_from_the_rest_pose():
+    direct, _ = _run([60])
+    stepped, _ = _run([0, 20, 40, 60])
+    assert direct[0].index == 0
+    # The toy's target does not depend on the path; only contact does.
+    assert np.allclose(
+        direct[-1].surfaces["strap"].vertices, stepped[-1].surfaces["strap"].vertices, atol=0.05
+    )
+
+
+def test_sub_steps_bound_turn_and_travel():
+    made, _ = hinged_scene([0, 45])
+    before, after = made.motion.frames
+    stops = Pace(made).split(before, after)
+    assert stops[-1] == after
+    poses = [bone_poses(made, c)["arm"] for c in (before, *stops)]
+    turns = [turned_angle(b[:3, :3] @ a[:3, :3].T) for a, b in pairwise(poses)]
+    assert max(turns) <= np.radians(2.0) * (1 + 1e-9)
+    diagonal = np.linalg.norm(np.ptp(made.muscles[0].mesh.bounds, axis=0))
+    held = made.muscles[0].mesh.vertices[made.muscles[0].attachments[1].vertices]
+    for a, b in pairwise(poses):
+        moved = np.linalg.norm(held @ (b - a)[:3, :3].T + (b - a)[:3, 3], axis=1)
+        assert moved.max() <= diagonal / 27 * (1 + 1e-9)
+    assert Pace(made).split(after, after) == []
+
+
+def test_sub_steps_end_at_the_same_angles_however_frames_are_spaced():
+    made, _ = hinged_scene([0, 30])
+    start, end = made.motion.frames
+
+    def path(degrees):
+        stops = [start, *({"hinge.bend": np.radians(d)} for d in degrees)]
+        return [s["hinge.bend"] for a, b in pairwise(stops) for s in Pace(made).split(a, b)]
+
+    whole = np.array(path([30]))
+    np.testing.assert_array_equal(path([10, 20, 30]), whole)
+    with_seven = np.array(path([7, 30]))
+    np.testing.assert_allclose(
+        np.setdiff1d(with_seven.round(9), np.radians([7]).round(9)), whole.round(9), rtol=0
+    )
+    back = np.array([s["hinge.bend"] for s in Pace(made).split(end, start)])
+    np.testing.assert_allclose(back[-2::-1], whole[:-1], rtol=0, atol=1e-12)
+
+
+def test_whole_turn_in_one_step_is_split():
+    made, _ = hinged_scene([0, 360])
+    assert len(Pace(made).split(*made.motion.frames)) >= 180
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-7, 0.5, 3.1])
+def test_turned_angle(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    assert turned_angle(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])) == pytest.approx(angle, rel=1e-9)
+
+
+def test_bones_out_of_reach_are_left_out():
+    fields = {"near": sphere(5.0), "far": box((2, 2, 2), (500, 0, 0))}
+    mesh = ellipsoid((10, 3, 3), (0, 0, 9))
+    ends = [attach(mesh, "near", lambda v: v[:, 0] < -8)]
+    made = scene([bone(n, f) for n, f in fields.items()], [], [muscle("m", mesh, ends)], [{}])
+    assert set(reached_bones(made)) == {("m", "near")}
+
+
+def test_swept_region_follows_the_motion():
+    made, fields = hinged_scene([0, 90])
+    fields["post"] = box((2, 2, 2), (0, -30, 0))
+    made.bones.append(bone("post", fields["post"]))
+    assert ("strap", "post") in reached_bones(made)
+    assert len(sampled_poses(made)) > 9
+    made.motion.frames[:] = [{}]
+    assert ("strap", "post") not in reached_bones(made)
+
+
+class _Breaking(ToyMuscle):
+    def solve(self, contacts):
+        super().solve(contacts)
+        if self.solves > 12:
+            self.x = self.x * np.nan
+
+
+class _Interrupting(ToyMuscle):
+    def solve(self, contacts):
+        super().solve(contacts)
+        if self.solves > 12:
+            raise KeyboardInterrupt
+
+
+class _Singular(ToyMuscle):
+    def solve(self, contacts):
+        raise np.linalg.LinAlgError("singular matrix")
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_failing_solve_names_muscle_frame_and_coordinate_and_keeps_the_frames(count):
+    made, fields = hinged_scene([0, 10, 20, 30, 40])
+    parts = [_Breaking(made.muscles[0], made) for _ in range(count)]
+    frames = []
+    with pytest.raises(SolveError, match=r"'strap', frame 3 \(hinge.bend = .*deg\).*not finite"):
+        for frame in simulate_frames(made, parts, fields=fields):
+            frames.append(frame)
+    assert [frame.index for frame in frames] == [0, 1, 2]
+
+
+def test_singular_system_becomes_a_solve_error():
+    made, fields = hinged_scene([0, 10])
+    with pytest.raises(SolveError, match=r"frame 1 .*singular matrix"):
+        list(simulate_frames(made, [_Singular(made.muscles[0], made)], fields=fields))
+
+
+def test_interrupt_keeps_the_frames_so_far():
+    made, fields = hinged_scene([0, 10, 20, 30])
+    frames = []
+    with pytest.raises(KeyboardInterrupt):
+        for frame in simulate_frames(made, [_Interrupting(made.muscles[0], made)], fields=fields):
+            frames.append(frame)
+    assert len(frames) == 3
+
+
+def test_leaving_early_ends_the_workers():
+    made, fields = hinged_scene([0, 10, 20])
+    parts = [ToyMuscle(made.muscles[0], made) for _ in range(2)]
+    course = simulate_frames(made, parts, fields=fields)
+    next(course)
+    course.close()
+    # The five sub-steps of frame 1 where it was solved while frame 0 was drawn; none of frame 2.
+    assert parts[0].solves == (5 if numba.get_num_threads() > 1 else 0)
+
+
+def _several(count):
+    """Muscles of different girth side by side over the same two bones."""
+    fields = {"trunk": sphere(8.0), "arm": box((15, 2, 2), (30, 0, 0))}
+    muscles = []
+    for k in range(count):
+        mesh = ellipsoid((32, 3, 3), (0, 13.5, 8.0 * k - 8.0))
+        ends = [attach(mesh, "trunk", lambda v: v[:, 0] < -24), attach(mesh, "arm", lambda v: v[:, 0] > 24)]
+        muscles.append(muscle(f"m{k}", mesh, ends))
+    joints = [joint("hinge", "trunk", "arm", (0, 0, 0), bend=(0, 0, -1))]
+    frames = [{"hinge.bend": np.radians(a)} for a in (0, 30)]
+    return scene([bone(n, f) for n, f in fields.items()], joints, muscles, frames), fields
+
+
+def test_muscles_in_parallel_give_what_they_give_alone():
+    made, fields = _several(3)
+    together = list(simulate_frames(made, [ToyMuscle(m, made) for m in made.muscles], fields=fields))[-1]
+    for one in made.muscles:
+        alone = list(simulate_frames(made, [ToyMuscle(one, made)], fields=fields))[-1]
+        assert np.array_equal(alone.surfaces[one.name].vertices, together.surfaces[one.name].vertices)
+
+
+def test_models_may_come_as_a_dict_and_frames_be_chosen():
+    made, fields = hinged_scene([0, 10, 20, 30])
+    model = ToyMuscle(made.muscles[0], made)
+    frames = list(simulate_frames(made, {"strap": model}, fields=fields, written={1, 3}))
+    assert [frame.index for frame in frames] == [1, 3]
+
+
+def test_without_surfaces_none_is_extracted():
+    made, fields = hinged_scene([0, 10])
+    model = ToyMuscle(made.muscles[0], made)
+    model.drawing = None
+    frames = list(simulate_frames(made, [model], fields=fields, surfaces=False))
+    assert frames[-1].surfaces == {}
+    assert "time_surface" not in frames[-1].times["strap"]
+
+
+def test_without_tables_no_optional_module_is_loaded():
+    for name in ("rbfmuscle.sim.loop.sliding", "rbfmuscle.sim.loop.skin", "rbfmuscle.sim.distance.sdf"):
+        sys.modules.pop(name, None)
+    frames, _ = _run([0, 10])
+    assert not {"rbfmuscle.sim.loop.sliding", "rbfmuscle.sim.loop.skin", "rbfmuscle.sim.distance.sdf"} & set(
+        sys.modules
+    )
+    assert not {"time_sliding", "time_tunnelling"} & set(frames[-1].times["strap"])
+
+
+def test_scene_without_bones_in_reach_builds_no_field():
+    mesh = ellipsoid((10, 3, 3), (0, 0, 200.0))
+    base = sphere(5.0)
+    made = scene(
+        [bone("base", base)], [], [muscle("m", mesh, [attach(mesh, "base", lambda v: v[:, 0] < -8)])], [{}]
+    )
+    sys.modules.pop("rbfmuscle.sim.distance.sdf", None)
+    list(simulate_frames(made, [ToyMuscle(made.muscles[0], made)]))
+
+
+def test_unknown_model_names_the_nearest_right_one():
+    made, _ = hinged_scene([0])
+    with pytest.raises(UsageError, match="unknown model 'xpdb', did you mean 'xpbd'"):
+        models.build_model(made.muscles[0], made, "xpdb")
+    with pytest.raises(UsageError, match="known: rbf, pbd"):
+        models.build_model(made.muscles[0], made, "finite")

@@ -1,0 +1,241 @@
+"""Neighbouring muscles that slide: skins, virtual edges, and what the frame loop makes of them."""
+
+import igl
+import numpy as np
+import pytest
+import trimesh
+from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, joint, muscle, scene, sphere
+
+from rbfmuscle.sim.loop.simulate import simulate_frames
+from rbfmuscle.sim.loop.skin import Skin
+from rbfmuscle.sim.scene.motion import rotation_about
+from rbfmuscle.sim.scene.options import SlidingOptions
+from rbfmuscle.validation import SceneError
+
+
+class _Mesh:
+    """The part of a model that a skin reads."""
+
+    def __init__(self, mesh):
+        self.vertices, self.faces = np.array(mesh.vertices), np.array(mesh.faces)
+        self.contact_bone = np.full(len(self.vertices), -1)
+
+    def contact_points(self):
+        return self.vertices
+
+    def carried_mesh(self):
+        return self.vertices, self.faces
+
+
+def _ball(radius=10.0):
+    return _Mesh(trimesh.creation.icosphere(subdivisions=3, radius=radius))
+
+
+def test_skin_distance_agrees_with_the_sphere():
+    skin = Skin(_ball(), reach=3.0)
+    points = np.random.default_rng(0).normal(size=(500, 3))
+    points *= np.random.default_rng(1).uniform(8, 14, (500, 1)) / np.linalg.norm(
+        points, axis=1, keepdims=True
+    )
+    exact = np.linalg.norm(points, axis=1) - 10.0
+    index, distance, normal, nearest = skin.query(points, np.ones(500, dtype=bool), 3.0)
+    # The triangles lie up to 0.06 below the sphere.
+    assert np.allclose(distance, exact[index], atol=0.08)
+    assert set(np.flatnonzero(exact < 2.9)) <= set(index)
+    assert (
+        np.einsum("ij,ij->i", normal, points[index] / np.linalg.norm(points[index], axis=1)[:, None]).min()
+        > 0.99
+    )
+    assert np.linalg.norm(skin.vertices[nearest] - points[index], axis=1).max() < 3.0 + 2 * skin.edge
+
+
+def test_skin_follows_the_model_and_asks_only_what_it_is_asked():
+    model = _ball()
+    skin = Skin(model, reach=3.0)
+    turn = rotation_about([1, 2, 3], 1.0, np.array([50.0, 0, 0]))
+    model.vertices = model.vertices @ turn[:3, :3].T + turn[:3, 3]
+    skin.refresh()
+    points = (np.array([[11.0, 0, 0], [0, 9, 0], [0, 0, 12]])) @ turn[:3, :3].T + turn[:3, 3]
+    index, distance, _, _ = skin.query(points, np.array([True, True, False]), 3.0)
+    assert index.tolist() == [0, 1]
+    assert np.allclose(distance, [1, -1], atol=0.08)
+
+
+def test_skin_far_away_or_empty_answers_nothing():
+    skin = Skin(_ball(), reach=3.0)
+    for points in (np.array([[100.0, 0, 0]]), np.zeros((0, 3)), np.array([[0.0, 0, 0]])):
+        assert len(skin.query(points, np.ones(len(points), dtype=bool), 3.0)[0]) == 0
+
+
+def _neighbours(angles, gap=1.0, *, sliding, order=(0, 1), belly=4.0):
+    """Two long muscles side by side; one end of the upper hangs on an arm that turns it into the lower."""
+    fields = {"trunk": sphere(1.0, (0, 0, -60)), "arm": box((1, 1, 1), (60, 0, -40))}
+    muscles = []
+    for k, name in enumerate(("lower", "upper")):
+        mesh = ellipsoid((30, belly, belly), (0, 0, (2 * belly + gap) * k), subdivisions=3)
+        far = "arm" if name == "upper" else "trunk"
+        ends = [attach(mesh, "trunk", lambda v: v[:, 0] < -25), attach(mesh, far, lambda v: v[:, 0] > 25)]
+        muscles.append(muscle(name, mesh, ends))
+    made = scene(
+        [bone(n, f) for n, f in fields.items()],
+        [joint("hinge", "trunk", "arm", (-30, 0, 0), press=(0, 1, 0), lift=(0, -1, 0), roll=(1, 0, 0))],
+        [muscles[k] for k in order],
+        [{f"hinge.{name}": np.radians(a) for name, a in angle.items()} for angle in angles],
+        sliding=sliding,
+    )
+    return made, fields
+
+
+def _run(angles, sliding, **options):
+    made, fields = _neighbours(angles, sliding=sliding, **options)
+    parts = {m.name: ToyMuscle(m, made, sweeps=4, reach=2.0) for m in made.muscles}
+    return list(simulate_frames(made, parts, fields=fields)), parts
+
+
+def _overlap(parts):
+    """Deepest free point of either muscle in the other."""
+    deepest = 0.0
+    for one, two in (("lower", "upper"), ("upper", "lower")):
+        points = parts[one].x[parts[one].contact_bone < 0]
+        distance = igl.signed_distance(points, parts[two].x, parts[two].faces)[0]
+        deepest = max(deepest, -distance.min())
+    return deepest
+
+
+PRESS = [{"press": a} for a in (0, 4)]
+
+
+def test_without_sliding_muscles_overlap():
+    _, parts = _run(PRESS, None)
+    assert _overlap(parts) > 0.25
+
+
+def test_pressed_muscles_do_not_overlap():
+    frames, parts = _run(PRESS, SlidingOptions())
+    assert _overlap(parts) < 0.1
+    assert "time_sliding" in frames[-1].times["upper"]
+
+
+def test_both_give_way():
+    _, parts = _run(PRESS, SlidingOptions())
+    _, alone = _run(PRESS, None)
+    for name in ("lower", "upper"):
+        assert np.linalg.norm(parts[name].x - alone[name].x, axis=1).max() > 0.1
+
+
+def test_linked_points_keep_near_their_neighbour():
+    lift = [{"lift": a} for a in (0, 2, 4, 6)]
+    frames, _ = _run(lift, SlidingOptions(release=50.0))
+    apart, _ = _run(lift, SlidingOptions(threshold=1e-3))
+    assert frames[0].surfaces["upper"].quantities["sliding_gap_max"] < 2.0
+    # Linked at 2 mm, free to 3 mm; curved surfaces and one linearisation a sub-step leave some tenths.
+    assert frames[-1].surfaces["upper"].quantities["sliding_gap_max"] < 4.0
+    assert apart[-1].surfaces["upper"].quantities["sliding_gap_max"] == 0.0
+    held, loose = (f[-1].surfaces["upper"].vertices[:, 2].mean() for f in (frames, apart))
+    assert held < loose - 0.05
+
+
+def test_what_is_pulled_away_hard_is_let_go():
+    lift = [{"lift": a} for a in (0, 10, 20)]
+    frames, parts = _run(lift, SlidingOptions(release=0.01, strip=0.1))
+    _, alone = _run(lift, None)
+    assert frames[-1].surfaces["upper"].quantities["sliding_gap_max"] < 2.2
+    assert np.abs(parts["upper"].x - alone["upper"].x).max() < 1.0
+
+
+def test_neighbours_may_join():
+    meet = [{"press": a} for a in (0, 6)]
+    joined, _ = _run(meet, SlidingOptions(), gap=4.0)
+    alone, _ = _run(meet, SlidingOptions(join=False), gap=4.0)
+    assert joined[0].surfaces["upper"].quantities["sliding_gap_max"] == 0.0
+    assert joined[-1].surfaces["upper"].quantities["sliding_gap_max"] > 0.0
+    assert alone[-1].surfaces["upper"].quantities["sliding_gap_max"] == 0.0
+
+
+def test_sliding_along_the_neighbour_is_free():
+    roll = [{"roll": a} for a in (0, 10, 20)]
+    frames, parts = _run(roll, SlidingOptions())
+    _, alone = _run(roll, None)
+    assert frames[-1].surfaces["upper"].quantities["sliding_speed"] > 0.1
+    moved = np.linalg.norm(parts["upper"].x - alone["upper"].x, axis=1)
+    assert np.sqrt((moved**2).mean()) < 1.0
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_result_does_not_depend_on_order_or_run(order):
+    _, first = _run(PRESS, SlidingOptions())
+    _, again = _run(PRESS, SlidingOptions(), order=order)
+    for name in ("lower", "upper"):
+        assert np.array_equal(first[name].x, again[name].x)
+
+
+def test_mirrored_neighbours_give_mirrored_results():
+    made, fields = _neighbours([{}], sliding=SlidingOptions(), gap=-1.0)
+    parts = {m.name: ToyMuscle(m, made) for m in made.muscles}
+    made.motion.frames[:] = [{}, {"hinge.press": 1e-9}]
+    list(simulate_frames(made, parts, fields=fields))
+    middle = 0.5 * (parts["lower"].rest[:, 2].mean() + parts["upper"].rest[:, 2].mean())
+    mirrored = parts["lower"].x * [1, 1, -1] + [0, 0, 2 * middle]
+    from scipy.spatial import cKDTree
+
+    # Icospheres are symmetric in z; the planes of the two sides are found alike.
+    assert cKDTree(mirrored).query(parts["upper"].x)[0].max() < 0.02
+
+
+def test_cut_is_midway_between_overlapping_muscles():
+    from rbfmuscle.sim.loop.contact import BoneContacts
+    from rbfmuscle.sim.loop.lane import Lane
+    from rbfmuscle.sim.loop.sliding import Sliding
+
+    made, fields = _neighbours([{}], sliding=SlidingOptions(), gap=-2.0)
+    lanes = []
+    for part in [ToyMuscle(m, made) for m in made.muscles]:
+        contacts = BoneContacts(list(fields), list(fields.values()), contact_bone=part.contact_bone)
+        lanes.append(Lane(part, contacts, made))
+    sliding = Sliding(made, lanes)
+    for lane in lanes:
+        sliding.measure(lane)
+    points = np.array([[0, 0, 2.5], [0, 0, 3.0], [0, 0, 3.5], [1, 1, 3.0], [0, 0, -4.0], [0, 30, 0]])
+    lower, upper = (lane.contacts.nearest(points) for lane in lanes)
+    assert np.allclose(lower[:3], [0.5, 0.0, -0.5], atol=0.1)
+    assert np.allclose(lower[:4], -upper[:4], atol=1e-12)
+    assert lower[4] > 4.0
+    step = 1e-5
+    value, gradient = lanes[0].contacts.cuts[0].cut_with_gradient(points[:4])
+    ahead = lanes[0].contacts.cuts[0].cut(points[:4] + [0, 0, step])
+    # Normals are interpolated, distances are to flat triangles.
+    assert np.allclose((ahead - value) / step, gradient[:, 2], atol=0.1)
+
+
+def test_points_near_a_bone_may_be_held_there():
+    fields = {"plate": box((20, 20, 1), (0, 0, -6.0)), "arm": box((1, 1, 1), (60, 0, 20))}
+    mesh = ellipsoid((25, 4, 4), subdivisions=3)
+    ends = [attach(mesh, "plate", lambda v: v[:, 0] < -20), attach(mesh, "arm", lambda v: v[:, 0] > 20)]
+
+    def lifted(sliding):
+        made = scene(
+            [bone(n, f) for n, f in fields.items()],
+            [joint("hinge", "plate", "arm", (-25, 0, 0), lift=(0, -1, 0))],
+            [muscle("strap", mesh, ends)],
+            [{"hinge.lift": np.radians(a)} for a in (0, 6)],
+            sliding=sliding,
+        )
+        part = ToyMuscle(made.muscles[0], made)
+        near = fields["plate"].distance(part.rest) < 2.0
+        list(simulate_frames(made, [part], fields=fields))
+        return fields["plate"].distance(part.x[near & (part.contact_bone < 0)]).max()
+
+    assert lifted(None) > 3.5
+    assert lifted(SlidingOptions(bones=True, release=50.0)) < 3.2
+
+
+def test_pairs_name_who_slides_and_unknown_names_are_refused():
+    _, parts = _run(PRESS, SlidingOptions(pairs=[["lower", "upper"]]))
+    assert _overlap(parts) < 0.1
+    with pytest.raises(SceneError, match="unknown muscle 'uper', known: lower, upper"):
+        _run([{}], SlidingOptions(pairs=[["lower", "uper"]]))
+
+
+def test_pairs_whose_swept_boxes_do_not_meet_cost_nothing():
+    frames, _ = _run([{"press": a} for a in (0, 2)], SlidingOptions(), gap=80.0)
+    assert "sliding_gap_max" not in frames[-1].surfaces["upper"].quantities

@@ -1,0 +1,122 @@
+"""The kernel study on a mesh of known shape, and its command."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from command_line import call
+
+import rbfmuscle as rm
+from rbfmuscle.study.show.kernel_page import write_study
+from rbfmuscle.validation import MeshError, UsageError
+
+
+@pytest.fixture(scope="module")
+def ellipsoid():
+    return trimesh.creation.icosphere(subdivisions=4).apply_scale([40.0, 18.0, 12.0])
+
+
+@pytest.fixture(scope="module")
+def study(ellipsoid):
+    kernels = ["linear", "cubic", "quintic", "gaussian", "wendland_c2", "matern_52"]
+    return rm.study_kernels(ellipsoid, kernels=kernels, centres=[40, 80], resolution=32, units="mm")
+
+
+def test_rows_are_ranked_and_more_centres_err_less(study):
+    good = [row["rms"] for row in study.rows if row["rms"] is not None]
+    assert good == sorted(good) and len(study.rows) == 12
+    error = {(row["kernel"], row["centres"]): row["rms"] for row in study.rows}
+    for kernel in ("linear", "cubic", "quintic", "wendland_c2", "matern_52"):
+        assert error[kernel, 80] < error[kernel, 40]
+    assert error["cubic", 80] < 0.6 * error["linear", 80]
+
+
+def test_numbers_are_those_of_the_surface(study, ellipsoid):
+    for row, surface in zip(study.rows, study.surfaces, strict=True):
+        if surface is None:
+            assert row["rms"] is None and row["note"]
+            continue
+        vertices, faces, _ = surface
+        assert row["components"] >= 1 and 0 < row["rms"] <= row["hausdorff"]
+        volume = trimesh.Trimesh(vertices, faces, process=False).volume
+        assert row["volume_error"] == pytest.approx(volume / ellipsoid.volume - 1.0, abs=1e-9)
+        # The implicit form x^2/a^2 + ... = 1 is met where the row says so.
+        radius = np.sqrt(((vertices / [40.0, 18.0, 12.0]) ** 2).sum(axis=1))
+        assert np.abs(radius - 1.0).max() * 12.0 <= row["hausdorff"] + 0.2
+
+
+def test_fronts_hold_what_nothing_beats(study):
+    good = [row for row in study.rows if row["rms"] is not None]
+    assert good[0]["front_time"]
+    for row in good:
+        beaten = any(o["rms"] < row["rms"] and o["numbers"] <= row["numbers"] for o in good)
+        assert not (row["front_size"] and beaten)
+
+
+def test_map_knows_that_a_kernel_without_reach_knows_no_surface(study):
+    rows = [row for row in study.scan if row["kernel"] == "wendland_c2" and row["centres"] == 80]
+    error = {row["shape"]: row["error"] for row in rows}
+    assert error[max(error)] > 5.0 * error[min(error)]
+
+
+def test_lines_to_paste_give_the_row(study):
+    row = next(row for row in study.rows if row["kernel"] == "matern_52")
+    text = study.toml(row)
+    assert 'kernel = "matern_52"' in text and f"centres = {row['centres']}" in text
+    assert f"epsilon = {row['epsilon']:.6g}" in text and 'placement = "fitted"' in text
+    row = next(row for row in study.rows if row["kernel"] == "linear")
+    assert 'placement = "greedy"' in study.toml(row)  # not C2: no Hermite fit to be fitted
+
+
+def test_fitted_centres_halve_the_error_of_greedy_ones(ellipsoid, study):
+    """Bumps that 80 centres cannot follow are met on average."""
+    vertices, faces = np.array(ellipsoid.vertices), np.asarray(ellipsoid.faces)
+    vertices[:, 2] += 0.8 * np.sin(vertices[:, 0] / 2.5) * np.sin(vertices[:, 1] / 2.5)
+    settings = {"kernels": ["cubic"], "centres": [80], "resolution": 48, "scan": False}
+    greedy, fitted = (
+        rm.study_kernels((vertices, faces), placement=placement, **settings).rows[0]
+        for placement in ("greedy", "fitted")
+    )
+    assert fitted["rms"] < 0.8 * greedy["rms"] and fitted["numbers"] == greedy["numbers"] == 560
+
+
+def test_files_hold_the_table(study, tmp_path):
+    write_study(study, tmp_path, title="An ellipsoid", pictures=False)
+    kept = json.loads((tmp_path / "kernels.json").read_text())
+    assert [row["kernel"] for row in kept["rows"]] == [row["kernel"] for row in study.rows]
+    page = (tmp_path / "kernels.html").read_text()
+    assert "An ellipsoid" in page and "http" not in page.replace("http-equiv", "")
+    assert (tmp_path / "kernels.csv").read_text().count("\n") == len(study.rows) + 1
+    assert (tmp_path / "fronts.png").stat().st_size > 5000
+
+
+def test_wrong_requests_are_answered(ellipsoid):
+    with pytest.raises(UsageError, match="at least 8"):
+        rm.study_kernels(ellipsoid, centres=[4])
+    with pytest.raises(UsageError, match="unknown kernel"):
+        rm.study_kernels(ellipsoid, kernels=["cubics"])
+    with pytest.raises(MeshError):
+        rm.study_kernels((np.full((3, 3), np.nan), np.array([[0, 1, 2]])))
+
+
+def test_command_ranks_prints_and_runs(tmp_path, capsys):
+    code, out, _ = call(
+        capsys, "kernels", "phantom", "--muscle", "adductor_posterior", "--kernels", "cubic,quintic",
+        "--centres", "60", "--resolution", "24", "--best", "1", "--frames", "0:2", "--no-pictures",
+        "-o", tmp_path / "k", "--json",
+    )  # fmt: skip
+    found = json.loads(out)
+    assert code == 0 and {row["kernel"] for row in found["rows"]} == {"cubic", "quintic"}
+    assert found["motion"][0]["components"] == 1 and not found["motion"][0]["error"]
+    assert (tmp_path / "k" / "kernels.html").exists()
+
+
+def test_command_tells_the_extremes(tmp_path, capsys):
+    code, out, _ = call(capsys, "kernels", "--extremes", "--kernels", "cubic,linear", "-o", tmp_path)
+    assert code == 0 and "| 1e6 from the origin | 2 | 0 | 0 | 0 |" in out
+    assert (tmp_path / "extremes.csv").exists()
+    code, _, err = call(capsys, "kernels", "phantom", "--centres", "150,some", "-o", tmp_path)
+    assert code == 2 and "--centres must be whole numbers of 4 and more, got '150 some'" in err
+    code, _, err = call(capsys, "kernels", "-o", tmp_path)
+    assert code == 2 and "which surface" in err
