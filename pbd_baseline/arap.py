@@ -5,10 +5,10 @@ at rest, each R_i the rotation that makes E least (Sorkine and Alexa 2007). With
 gradient of E is its partial derivative with R frozen: grad_i E = sum_j w_ij (e_ij - (R_i + R_j) E_ij / 2).
 """
 
-import numba
 import numpy as np
 
 from pbd_baseline.topology import colour
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.harmonic import cotangent_laplacian
 
 # Newton steps for the rotations: warm starts need one or two, a turn by 30 degrees at once four.
@@ -112,7 +112,7 @@ class ARAPConstraint:
         )
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _matrix(q):
     w, x, y, z = q[0], q[1], q[2], q[3]
     return (
@@ -122,7 +122,7 @@ def _matrix(q):
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _rotate(q, v):
     """Rotate v by a unit quaternion."""
     tx = 2.0 * (q[2] * v[2] - q[3] * v[1])
@@ -135,7 +135,7 @@ def _rotate(q, v):
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _rotation_loop(points, start, ring, ring_edge, edges, rest, weights, quaternions, steps):
     moment = np.empty((3, 3))
     for i in range(len(quaternions)):
@@ -152,7 +152,7 @@ def _rotation_loop(points, start, ring, ring_edge, edges, rest, weights, quatern
                 break
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _turn_towards(moment, q):
     """One Newton step of maximising tr(R^T A) over rotations R; return its squared angle.
 
@@ -187,7 +187,7 @@ def _turn_towards(moment, q):
     return square
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _turn_quaternion(q, x, y, z):
     """q <- q (1, x, y, z), normalised: right to third order, and the fixed point is unchanged."""
     a, b, c, d = q[0], q[1], q[2], q[3]
@@ -200,7 +200,7 @@ def _turn_quaternion(q, x, y, z):
         q[k] /= size
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _energy_loop(points, edges, rest, weights, quaternions):
     total = 0.0
     for c in range(len(edges)):
@@ -212,7 +212,7 @@ def _energy_loop(points, edges, rest, weights, quaternions):
     return 0.25 * total
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _target_loop(edges, rest, weights, quaternions, out):
     for c in range(len(edges)):
         i, j = edges[c, 0], edges[c, 1]
@@ -223,7 +223,7 @@ def _target_loop(edges, rest, weights, quaternions, out):
             out[j, k] -= pull
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _constraint_loop(points, inverse_mass, edges, rest, quaternions, compliance, time, multiplier):
     for c in range(len(edges)):
         i, j = edges[c, 0], edges[c, 1]

@@ -1,9 +1,9 @@
 """Dihedral bending: constraints of one colour are gathered in blocks and projected by vector instructions."""
 
-import numba
 import numpy as np
 
 from pbd_baseline.topology import colour, spread
+from rbfmuscle.compiled.loop import compiled
 
 # A gradient shorter than this share of its natural size belongs to a collapsed element: it has no direction.
 TINY = 1e-12
@@ -71,7 +71,7 @@ class BendingConstraint:
         )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _dihedral_loop(points, members, out):
     """Cosine and sine of the signed dihedral angle, positive on a convex edge."""
     for c in range(len(members)):
@@ -87,7 +87,7 @@ def _dihedral_loop(points, members, out):
         out[c, 1] = -(a * q).sum() * np.sqrt(ee) / size
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _sweep_loop(points, inverse_mass, colours, members, rest, stiffness, compliance, multiplier):
     block = np.empty(ROWS * BLOCK)
     for q in range(len(colours) - 1):
@@ -111,7 +111,7 @@ def _sweep_loop(points, inverse_mass, colours, members, rest, stiffness, complia
                     points[m, d] += block[t + (27 + d) * BLOCK]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _gather(points, inverse_mass, members, c, t, block):
     i, j, k, m = members[c, 0], members[c, 1], members[c, 2], members[c, 3]
     for d in range(3):
@@ -123,7 +123,7 @@ def _gather(points, inverse_mass, members, c, t, block):
     block[t + 11 * BLOCK], block[t + 12 * BLOCK] = inverse_mass[k], inverse_mass[m]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz", "reassoc"})
+@compiled(error_model="numpy", fastmath={"contract", "arcp", "nsz", "reassoc"})
 def _project_block(g, count):
     """grad_k = -gk p, grad_m = -gm q, grad_j = aj p + bj q, grad_i = ai p + bi q; a collapsed face stays."""
     for t in range(count):

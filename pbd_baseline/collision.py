@@ -1,7 +1,8 @@
 """Collision response of a mesh: half-spaces from the contacts, the sum of their ways out."""
 
-import numba
 import numpy as np
+
+from rbfmuscle.compiled.loop import compiled
 
 # A half-space counts as violated below this share of the search reach.
 TOUCHING = 1e-9
@@ -86,7 +87,7 @@ def _keep_deepest(index, depth, count):
     depth[depth < deepest[index]] = 0.0
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _place_loop(points, columns, shares, out):
     for p in range(len(columns)):
         for a in range(3):
@@ -95,7 +96,7 @@ def _place_loop(points, columns, shares, out):
                 out[p, a] += shares[p, k] * points[columns[p, k], a]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _along(vectors, columns, shares, p, anchor, normal):
     """n . (sum_k share_k v_k - anchor)."""
     value = 0.0
@@ -107,7 +108,7 @@ def _along(vectors, columns, shares, p, anchor, normal):
     return value
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _depth_loop(points, columns, shares, index, gap, normal, anchor, depth):
     worst = 0.0
     for c in range(len(index)):
@@ -116,7 +117,7 @@ def _depth_loop(points, columns, shares, index, gap, normal, anchor, depth):
     return worst
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _move(vectors, columns, shares, p, normal, amount):
     """Move what carries point p so that it moves by ``amount`` along the normal."""
     square = shares[p, 0] ** 2 + shares[p, 1] ** 2 + shares[p, 2] ** 2
@@ -126,14 +127,14 @@ def _move(vectors, columns, shares, p, normal, amount):
                 vectors[columns[p, k], a] += amount * shares[p, k] / square * normal[a]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _push_loop(points, columns, shares, index, normal, depth):
     for c in range(len(index)):
         if depth[c] > 0.0:
             _move(points, columns, shares, index[c], normal[c], depth[c])
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _clear_loop(points, columns, shares, index, gap, normal, anchor, direction, step):
     cleared = False
     nothing = np.zeros(3)

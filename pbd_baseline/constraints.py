@@ -6,10 +6,10 @@ is the hard constraint of PBD, and k in [0, 1] its stiffness (Müller 2007). w i
 vertex is held.
 """
 
-import numba
 import numpy as np
 
 from pbd_baseline.topology import colour, spread
+from rbfmuscle.compiled.loop import compiled
 
 # A gradient shorter than this share of its natural size belongs to a collapsed element: it has no direction.
 TINY = 1e-12
@@ -130,7 +130,7 @@ def _cubic_step(coefficients, wanted):
     return s
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _edge_loop(points, inverse_mass, edges, rest, limits, stiffness, compliance, multiplier):
     for c in range(len(edges)):
         i, j = edges[c, 0], edges[c, 1]
@@ -157,7 +157,7 @@ def _edge_loop(points, inverse_mass, edges, rest, limits, stiffness, compliance,
         points[j, 2] -= fj * dz
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _volume_loop(points, faces, origin):
     """Enclosed volume; measured from ``origin`` so that a far translation costs no digits."""
     total = 0.0
@@ -170,7 +170,7 @@ def _volume_loop(points, faces, origin):
     return total / 6.0
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _volume_gradient_loop(points, faces, out):
     """A third of the area vector of each face, summed at its vertices.
 
@@ -187,7 +187,7 @@ def _volume_gradient_loop(points, faces, out):
             out[v, 2] += nz
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _det(a, b, c):
     return (
         a[0] * (b[1] * c[2] - b[2] * c[1])
@@ -196,7 +196,7 @@ def _det(a, b, c):
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _cubic_loop(points, direction, faces):
     """Coefficients of V(x + s d) = c0 + c1 s + c2 s^2 + c3 s^3."""
     c0, c1, c2, c3 = 0.0, 0.0, 0.0, 0.0

@@ -1,8 +1,9 @@
 """A sparse symmetric factor that solves three right sides at once, outside Python's lock."""
 
-import numba
 import numpy as np
 from scipy.sparse.linalg import splu
+
+from rbfmuscle.compiled.loop import compiled
 
 
 class SymmetricFactor:
@@ -46,7 +47,7 @@ class SymmetricFactor:
         return out
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _solve_loop(start, rows, values, inverse_pivots, place, right, work, out):
     count = len(place)
     for i in range(count):

@@ -1,8 +1,8 @@
 """Where vertices go when the bones move: harmonic weights between rigid motions."""
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.harmonic import blended_motion
 
 
@@ -38,7 +38,7 @@ def _screw(motion):
     return axis, angle, foot, along
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _carry_loop(points, weight, axis, angle, foot, shift):
     kx, ky, kz = axis[0], axis[1], axis[2]
     for i in range(len(points)):

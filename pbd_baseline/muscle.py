@@ -2,7 +2,6 @@
 
 import math
 
-import numba
 import numpy as np
 
 from pbd_baseline.collision import CollisionConstraint
@@ -10,6 +9,7 @@ from pbd_baseline.motion import carry
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.rest import Rest
 from pbd_baseline.shapes import SHAPES
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.sim.loop.simulate import ModelSurface
 
 # Bones are looked for within this distance [mm] of the vertices as predicted, and as swept.
@@ -191,7 +191,7 @@ def _largest_angle(motions):
     return largest
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _scale_loop(direction, length):
     """Give each row the length asked for."""
     for i in range(len(direction)):

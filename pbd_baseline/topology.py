@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.validation import MeshError, check_mesh
 
 
@@ -126,7 +126,7 @@ def spread(value, order):
     return np.ascontiguousarray(value[order]) if value.ndim else np.full(len(order), float(value))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _colour_loop(members, taken, colours):
     """Bit q of ``taken[v]`` (63 to a word) says that colour q is used at vertex v."""
     for c in range(len(members)):

@@ -2,10 +2,10 @@
 
 from types import SimpleNamespace
 
-import numba
 import numpy as np
 import trimesh
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.sim.loop.simulate import ModelSurface
 from rbfmuscle.sim.scene.motion import Motion
 from rbfmuscle.sim.scene.options import ContactOptions, DetectOptions
@@ -70,7 +70,7 @@ def box(half, centre=(0, 0, 0)):
     return AnalyticBone(formula, [centre - half, centre + half])
 
 
-@numba.njit(cache=True)
+@compiled
 def press(target, now, inverse, index, gap, normal):
     """Least energy under half-spaces, by projected Gauss-Seidel on their pressures."""
     x, pressure = target.copy(), np.zeros(len(index))

@@ -4,9 +4,9 @@ The tree is a balanced binary heap over triangles in an order that halves them a
 shape does not depend on positions, so a deforming mesh is refitted without a rebuild.
 """
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.geometry.triangles import (
     BX,
@@ -127,7 +127,7 @@ class ExactDistance:
         return distance, closest, face, normal
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _order_loop(centres, order, depth, starts):
     """Order triangles so that each node of the heap holds a range, halved along its longest extent."""
     count = len(order)
@@ -143,7 +143,7 @@ def _order_loop(centres, order, depth, starts):
             _select(centres[:, axis], order, low, high - 1, middle)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _longest_axis(centres, order, low, high):
     longest, axis = -1.0, 0
     for k in range(3):
@@ -156,7 +156,7 @@ def _longest_axis(centres, order, low, high):
     return axis
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _select(keys, order, left, right, middle):
     """Hoare's selection: afterwards no key before ``middle`` is greater than one after it."""
     while left < right:
@@ -179,7 +179,7 @@ def _select(keys, order, left, right, middle):
             return
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _box_loop(vertices, faces, order, starts, boxes):
     """Boxes of all nodes, from the leaves up; a leaf without triangles keeps an empty box."""
     leaves = len(starts) - 1
@@ -197,7 +197,7 @@ def _box_loop(vertices, faces, order, starts, boxes):
             boxes[node, 3 + j] = max(boxes[2 * node, 3 + j], boxes[2 * node + 1, 3 + j])
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@compiled(inline="always")
 def _box_square(boxes, node, x, y, z):
     dx = max(boxes[node, 0] - x, x - boxes[node, 3], 0.0)
     dy = max(boxes[node, 1] - y, y - boxes[node, 4], 0.0)
@@ -205,7 +205,7 @@ def _box_square(boxes, node, x, y, z):
     return dx * dx + dy * dy + dz * dz
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@compiled(inline="always")
 def record_square(records, n, x, y, z):
     """Squared distance from a point to the triangle of record n."""
     qx, qy, qz = x - records[n, 0], y - records[n, 1], z - records[n, 2]
@@ -218,7 +218,7 @@ def record_square(records, n, x, y, z):
     return du * du + dv * dv + w * w
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def record_feature(records, n, x, y, z):
     """Feature of the triangle of record n (FACE, EDGE + k, CORNER + k) that is nearest to a point."""
     qx, qy, qz = x - records[n, 0], y - records[n, 1], z - records[n, 2]
@@ -228,7 +228,7 @@ def record_feature(records, n, x, y, z):
     return nearest_in_frame(bx, cx, cy, records[n, INVERSE_BC], records[n, INVERSE_CA], u, v)[2]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def nearest_triangle(boxes, starts, records, order, x, y, z, best, square, slack, nodes, squares):
     """Record of the triangle nearest to a point, and the squared distance.
 
@@ -278,7 +278,7 @@ def nearest_triangle(boxes, starts, records, order, x, y, z, best, square, slack
     return best, square
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _nearest_loop(points, reach, tree, normals, out):
     boxes, starts, records = tree
     order = normals[3]
@@ -308,7 +308,7 @@ def _nearest_loop(points, reach, tree, normals, out):
         distance[i] = np.sqrt(square) if side >= 0.0 else -np.sqrt(square)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def signed_side(record, face, point, normals, closest, normal):
     """Fill the nearest point of a triangle and its pseudonormal; return the offset's part along it.
 
@@ -323,7 +323,7 @@ def signed_side(record, face, point, normals, closest, normal):
     return side
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _closest_in_record(record, point, closest):
     """Fill the point of one triangle that is nearest to a point; return its feature."""
     u, v, w = 0.0, 0.0, 0.0
@@ -339,7 +339,7 @@ def _closest_in_record(record, point, closest):
     return feature
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _pseudonormal(record, feature, face, edge_normals, vertex_normals, faces, normal):
     """Fill the direction that signs the distance to one feature of a face."""
     first = int(record[FIRST])

@@ -1,10 +1,11 @@
 """Harmonic weights on a closed mesh: how much of each bone's motion a surface point takes over."""
 
-import numba
 import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
+
+from rbfmuscle.compiled.loop import compiled
 
 
 def cotangent_laplacian(vertices, faces):
@@ -117,7 +118,7 @@ def blended_motion(points, weights, motions):
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _exponential_loop(points, twists, out):
     """Move each point by the exponential of its twist (omega, velocity)."""
     for n in range(len(points)):

@@ -1,8 +1,8 @@
 """Mean value coordinates: points inside a closed mesh as weighted means of its vertices."""
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.validation import MeshError, check_mesh, check_points
 
@@ -61,7 +61,7 @@ def mean_value_weights(points, vertices, faces):
     return weights
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _weights_loop(points, vertices, faces, out):
     v = np.empty((3, 3))
     n = np.empty((3, 3))
@@ -92,7 +92,7 @@ def _weights_loop(points, vertices, faces, out):
                 out[p, faces[t, i]] += (mx * n[i, 0] + my * n[i, 1] + mz * n[i, 2]) / det
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _cross(a, b, out):
     out[0] = a[1] * b[2] - a[2] * b[1]
     out[1] = a[2] * b[0] - a[0] * b[2]

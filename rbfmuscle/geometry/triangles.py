@@ -6,8 +6,9 @@ longest edge. The sign comes from angle-weighted pseudonormals (Baerentzen & Aan
 computation using the angle weighted pseudonormal").
 """
 
-import numba
 import numpy as np
+
+from rbfmuscle.compiled.loop import compiled
 
 # Columns of a record: corner A, x-axis, y-axis, normal, then x of B, x and y of C, and 1/|BC|^2, 1/|CA|^2.
 WIDTH = 18
@@ -18,7 +19,7 @@ FIRST = 17
 FACE, EDGE, CORNER = 0, 1, 4
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def fill_records(vertices, faces, order, records):
     """Fill ``records`` (m, WIDTH) with the frames of the triangles ``faces[order]``; zero area is allowed."""
     length = np.empty(3)
@@ -41,7 +42,7 @@ def fill_records(vertices, faces, order, records):
         records[n, FIRST] = first
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _fill_record(corner, record):
     bx, along, cy = 0.0, 0.0, 0.0
     for j in range(3):
@@ -75,7 +76,7 @@ def _fill_record(corner, record):
     record[INVERSE_CA] = 1.0 / ca if ca > 0.0 else 0.0
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _any_normal(record):
     least = 0
     for j in range(1, 3):
@@ -87,7 +88,7 @@ def _any_normal(record):
         record[6 + j] = scale * (unit - record[3 + least] * record[3 + j])
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@compiled(inline="always")
 def nearest_in_frame(bx, cx, cy, inverse_bc, inverse_ca, x, y):
     """In-plane offset from the triangle to (x, y), and the feature nearest to it: ``(dx, dy, feature)``."""
     if y <= 0.0 or cy <= 0.0:
@@ -117,7 +118,7 @@ def nearest_in_frame(bx, cx, cy, inverse_bc, inverse_ca, x, y):
     return dx, dy, feature
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def vertex_faces(faces, count):
     """Faces around each vertex: ``(start, list)``, those of vertex v in ``list[start[v]:start[v + 1]]``."""
     start = np.zeros(count + 2, dtype=np.int64)
@@ -134,7 +135,7 @@ def vertex_faces(faces, count):
     return start[:-1], around
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def opposite_faces(faces, start, around):
     """Face across edge k (corner k to k + 1) of each face, (m, 3).
 
@@ -162,7 +163,7 @@ def opposite_faces(faces, start, around):
     return across
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def fill_pseudonormals(vertices, faces, across, edge_normals, vertex_normals):
     """Fill the directions that sign a distance: ``edge_normals`` (m, 3, 3), ``vertex_normals`` (n, 3).
 

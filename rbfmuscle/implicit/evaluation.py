@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numba
 import numpy as np
-from numba import njit
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.implicit.kernels.radial import _radial_loop
 from rbfmuscle.implicit.kernels.values import _add_values_loop
 
@@ -44,7 +44,7 @@ def run_in_chunks(loop, count, cost):
         other.result()
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@compiled(error_model="numpy", fastmath={"contract"})
 def _cubic_gradient_loop(p, cx, cy, cz, a, acc, g):
     """acc += a r^3, g += 3 a r d."""
     for i in range(acc.size):
@@ -57,7 +57,7 @@ def _cubic_gradient_loop(p, cx, cy, cz, a, acc, g):
         g[2, i] += 3.0 * w * dz
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@compiled(error_model="numpy", fastmath={"contract"})
 def _cubic_hermite_value_loop(p, cx, cy, cz, a, bx, by, bz, acc):
     """acc += a r^3 - 3 r (B . d)."""
     for i in range(acc.size):
@@ -66,7 +66,7 @@ def _cubic_hermite_value_loop(p, cx, cy, cz, a, bx, by, bz, acc):
         acc[i] += np.sqrt(u) * (a * u - 3.0 * (bx * dx + by * dy + bz * dz))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@compiled(error_model="numpy", fastmath={"contract"})
 def _cubic_hermite_gradient_loop(p, cx, cy, cz, a, bx, by, bz, acc, g):
     """Adds 3 a r d - 3 r B - 3/r (B . d) d to g, the value to acc."""
     for i in range(acc.size):
@@ -82,7 +82,7 @@ def _cubic_hermite_gradient_loop(p, cx, cy, cz, a, bx, by, bz, acc, g):
         g[2, i] += radial * dz - r3 * bz
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@compiled(error_model="numpy", fastmath={"contract"})
 def _offsets_loop(p, cx, cy, cz, e2, d, u):
     """d = p - centre, u = e2 |d|^2."""
     for i in range(u.size):
@@ -93,7 +93,7 @@ def _offsets_loop(p, cx, cy, cz, e2, d, u):
         u[i] = e2 * (dx * dx + dy * dy + dz * dz)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@compiled(error_model="numpy", fastmath={"contract"})
 def _add_value_loop(a, bx, by, bz, e2, hermite, radial, d, acc):
     """acc += a phi - first (B . d)."""
     phi, first = radial[0], radial[1]
@@ -105,7 +105,7 @@ def _add_value_loop(a, bx, by, bz, e2, hermite, radial, d, acc):
         acc[i] += a * phi[i] - e2 * first[i] * (bx * d[0, i] + by * d[1, i] + bz * d[2, i])
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@compiled(error_model="numpy", fastmath={"contract"})
 def _add_gradient_loop(a, bx, by, bz, e2, hermite, radial, d, g):
     """g += a first d - first B - second (B . d) d."""
     first, second = radial[1], radial[2]
@@ -126,7 +126,7 @@ def _add_gradient_loop(a, bx, by, bz, e2, hermite, radial, d, g):
         g[2, i] += w * d[2, i] - f * bz
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@compiled(error_model="numpy", fastmath={"contract"})
 def _add_hessian_loop(a, bx, by, bz, e2, hermite, radial, d, h):
     """h (6: xx yy zz xy xz yz) += a (first I + second d d^T) minus, for Hermite weights B,
 
@@ -152,7 +152,7 @@ def _add_hessian_loop(a, bx, by, bz, e2, hermite, radial, d, h):
         h[5, i] += outer * y * z - s * (by * z + bz * y)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _cubic_block_loop(centres, a, b, hermite, gradient, p, acc, g):
     """Hermite values, and gradients, of the cubic kernel with epsilon 1, the commonest by far."""
     for j in range(centres.shape[1]):
@@ -165,7 +165,7 @@ def _cubic_block_loop(centres, a, b, hermite, gradient, p, acc, g):
             _cubic_gradient_loop(p, cx, cy, cz, w, acc, g)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _ball(p):
     """Centre and radius of a ball around the points (3, n): that of their box."""
     x, y, z = (
@@ -177,7 +177,7 @@ def _ball(p):
     return x, y, z, np.sqrt(dx * dx + dy * dy + dz * dz)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _out_of_reach(ball, cx, cy, cz, epsilon):
     """Whether a kernel that ends at 1 / epsilon is zero in the whole ball."""
     dx, dy, dz = ball[0] - cx, ball[1] - cy, ball[2] - cz
@@ -185,7 +185,7 @@ def _out_of_reach(ball, cx, cy, cz, epsilon):
     return dx * dx + dy * dy + dz * dz >= reach * reach
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _value_block_loop(centres, a, epsilon, base, parameter, compact, row, p, acc):
     """Values alone of a field without Hermite weights."""
     ball = _ball(p)
@@ -195,7 +195,7 @@ def _value_block_loop(centres, a, epsilon, base, parameter, compact, row, p, acc
             _add_values_loop(base, parameter, compact, row, p, cx, cy, cz, e * e, a[j], acc)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _general_block_loop(
     centres, a, b, hermite, order, epsilon, base, parameter, compact, table, p, acc, g, h
 ):
@@ -218,7 +218,7 @@ def _general_block_loop(
             _add_hessian_loop(a[j], b[0, j], b[1, j], b[2, j], e2, hermite, radial, d, h)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _monomial_loop(p, i, j, k, factor, term, out):
     """out += factor x^i y^j z^k."""
     term[:] = factor
@@ -230,7 +230,7 @@ def _monomial_loop(p, i, j, k, factor, term, out):
         out[n] += term[n]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _polynomial_loop(coefficients, powers, gradient, p, acc, g):
     """Adds a polynomial to acc, its gradient to g."""
     term = np.empty_like(acc)
@@ -245,7 +245,7 @@ def _polynomial_loop(coefficients, powers, gradient, p, acc, g):
             _monomial_loop(p, i, j, k - 1, c * k, term, g[2])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _evaluate_loop(
     points, origin, scale, centres, a, b, hermite, order, epsilon, base, parameter, compact, table, cubic,
     coefficients, powers, start, stop, value, gradient, hessian

@@ -5,14 +5,15 @@ projected in the metric of that energy (through the inverse of its matrix), so a
 the muscle instead of dinting one point.
 """
 
-import numba
 import numpy as np
+
+from rbfmuscle.compiled.loop import compiled
 
 CONTACT_SWEEPS = 60
 CONTACT_ROUNDS = 6
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _rotation_loop(m, q):
     """Turn the unit quaternion q in place towards the rotational part of the 3x3 matrix m (Müller 2016)."""
     for _ in range(20):
@@ -48,7 +49,7 @@ def _rotation_loop(m, q):
             q[k] *= norm
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _local_loop(x, arm, start, other, inverse, fibre, low, high, hold, q, target, deformation):
     """Deformation gradient F and target T of each cluster, T = R (t aaᵀ + t^(-1/2) (I - aaᵀ))."""
     f = np.empty((3, 3))
@@ -99,7 +100,7 @@ def _local_loop(x, arm, start, other, inverse, fibre, low, high, hold, q, target
                 r[a, b] = s * r[a, b] + (t - s) * along * fibre[i, b]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _right_side_loop(arm, start, other, target, out):
     """b = Σ over edges (i, j) of w T_i (X_j - X_i), added at j and taken from i."""
     out[:] = 0.0
@@ -172,7 +173,7 @@ class ShapeConstraint:
         return float(self.weight @ ((x[self.other] - x[head] - wanted) ** 2).sum(axis=1))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _volume_loop(p, faces, gradient):
     gradient[:] = 0.0
     volume = 0.0
@@ -217,7 +218,7 @@ class VolumeConstraint:
         return _volume_loop(points, self.faces, gradient) - self.volume, gradient
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def solve_contact_forces(gram, need, force, sweeps, tolerance):
     """Contact forces of the linear complementarity problem force >= 0, gram · force >= need.
 
@@ -248,14 +249,14 @@ def solve_contact_forces(gram, need, force, sweeps, tolerance):
             break
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _deepest(lacking, is_chosen, tolerance, most):
     """Contacts, not yet chosen, that lack the most motion, deepest first."""
     found = np.flatnonzero((lacking > tolerance) & ~is_chosen)
     return found[np.argsort(-lacking[found], kind="mergesort")[:most]]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _gram_loop(index, normal, row, stiffness, influence, columns, shares):
     """(n_c · n_d) w_cᵀ A⁻¹ w_d - row_c row_d / stiffness: motion at c for a unit force at d, volume kept."""
     size = len(index)
@@ -276,7 +277,7 @@ def _gram_loop(index, normal, row, stiffness, influence, columns, shares):
     return gram
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _push_loop(index, normal, strength, influence, push):
     """push = A⁻¹ Wᵀ of the forces: motion of all centres."""
     push[:] = 0.0
@@ -288,7 +289,7 @@ def _push_loop(index, normal, strength, influence, push):
                 push[k, a] += influence[index[c], k] * strength[c] * normal[c, a]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _lacking_loop(index, normal, row, need, share, push, columns, shares, lacking):
     """Motion that each contact still asks for after ``push`` and ``share`` of the volume's response."""
     for c in range(len(index)):
@@ -301,7 +302,7 @@ def _lacking_loop(index, normal, row, need, share, push, columns, shares, lackin
         lacking[c] = value
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _contact_loop(
     index, gap, normal, source, motion, response, stiffness, influence, columns, shares, table,
     batch, rounds, sweeps, tolerance, push,

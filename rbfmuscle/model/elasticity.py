@@ -1,8 +1,8 @@
 """Local and global steps of an RBF muscle, with volume and contact projected inside the iteration."""
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.rest_frame import diameter
 from rbfmuscle.model.constraints import ContactConstraint
 
@@ -11,7 +11,7 @@ REACH_MARGIN = 0.003  # of the muscle's size
 SETTLED = 1e-4  # of the muscle's size: an iteration that moves no centre farther was the last one
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _move_loop(first, second, columns, shares, moved, also):
     """Motions of each contact point for two motions of the centres: Σ_k share_k dx_k."""
     for s in range(len(columns)):
@@ -28,7 +28,7 @@ def _move_loop(first, second, columns, shares, moved, also):
         also[s, 0], also[s, 1], also[s, 2] = bx, by, bz
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _gather_loop(gradient, columns, shares, out):
     """Transpose of `_move_loop`: out_k = Σ_s share_sk gradient_s."""
     out[:] = 0.0
@@ -38,7 +38,7 @@ def _gather_loop(gradient, columns, shares, out):
                 out[columns[s, k], a] += shares[s, k] * gradient[s, a]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _carry_all_loop(x, target, rest, points, columns, shares, out):
     """Positions of the contact points: Σ_k share_k (x_k + T_k (X_s - X_k))."""
     for s in range(len(points)):

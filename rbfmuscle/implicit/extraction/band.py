@@ -6,9 +6,9 @@ crosses, so it follows the surface wherever it went, and the field is evaluated 
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.implicit.extraction.marching import (
     EDGE_AXIS,
     EDGE_CORNER,
@@ -231,7 +231,7 @@ def box_along(points, axes):
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _box_loop(points, axes, out):
     for n in range(len(points)):
         for a in range(3):
@@ -240,7 +240,7 @@ def _box_loop(points, axes, out):
             out[1, a] = max(out[1, a], u)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _cells_loop(points, origin, turn, last, strides, out):
     """Flat numbers of the cells that hold points, outside the grid of its outermost cells."""
     for n in range(len(points)):
@@ -251,7 +251,7 @@ def _cells_loop(points, origin, turn, last, strides, out):
             out[n] += int(min(max(u, 0.0), float(last[a]))) * strides[a]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _nodes_loop(flat, strides, origin, edges, out):
     """World positions of nodes; ``edges`` are the edges of a cell along the grid's axes."""
     for n in range(len(flat)):
@@ -260,7 +260,7 @@ def _nodes_loop(flat, strides, origin, edges, out):
             out[n, a] = i * edges[0, a] + j * edges[1, a] + k * edges[2, a] + origin[a]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _place_loop(node, shape, strides, index, c, near, coordinates, is_open, near_cut):
     """Turn shifts from the nodes into grid coordinates; mark vertices on the border and near the cut."""
     for v in range(len(coordinates)):
@@ -279,7 +279,7 @@ def _place_loop(node, shape, strides, index, c, near, coordinates, is_open, near
             is_open[v] |= coordinates[v, a] < 1e-9 or coordinates[v, a] > shape[a] - 1 - 1e-9
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _close_border_loop(state, nx, ny, nz):
     """Mark the node numbers that are no cells (the last of each row), so that no loop enters them."""
     for i in range(nx):
@@ -290,7 +290,7 @@ def _close_border_loop(state, nx, ny, nz):
                     state[(i * ny + j) * nz + k] = 2
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _add_nodes_loop(cells, begin, end, strides, index, flat, count):
     """Number the corners of cells that have no number yet; returns the new count of nodes."""
     for n in range(begin, end):
@@ -303,7 +303,7 @@ def _add_nodes_loop(cells, begin, end, strides, index, flat, count):
     return count
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _follow_loop(cells, begin, end, strides, index, f, c, level, masks, state):
     """Append the cells behind crossed faces; returns the new count of cells.
 
@@ -330,7 +330,7 @@ def _follow_loop(cells, begin, end, strides, index, f, c, level, masks, state):
     return count
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _widen_loop(cells, end, strides, state):
     """Append all unvisited neighbours of the cells; returns the new count of cells."""
     count = end

@@ -9,8 +9,9 @@ and its edge would have four triangles. Each crossed edge then has one ring of c
 
 from functools import lru_cache
 
-import numba
 import numpy as np
+
+from rbfmuscle.compiled.loop import compiled
 
 # Corner c of a cell sits at (c & 1, c >> 1 & 1, c >> 2). Edge e runs from its corner along its axis.
 EDGE_CORNER = np.array([c for axis in range(3) for c in range(8) if not c >> axis & 1])
@@ -112,13 +113,13 @@ def _shares_face(part):
     return len(part) > 2 and bool(_FACES_OF_EDGE[part[0]] & _FACES_OF_EDGE[part[-1]])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _combined(f, c, level):
     """The function whose zero set is extracted: max(f - level, -c)."""
     return max(f - level, -c)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _crossing(f0, f1, c0, c1, level):
     """Where along an edge max(f - level, -c) vanishes, with f and c linear; ends 0 and 1 differ in sign.
 
@@ -137,7 +138,7 @@ def _crossing(f0, f1, c0, c1, level):
     return t if start_inside else 1.0 - t
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _march_loop(
     cells, strides, index, f, c, level, corner, axis, faces4, ambiguous, first, start, table,
     vertex_of, vertex_node, vertex_shift, triangles,
@@ -179,13 +180,13 @@ def _march_loop(
     return n_vertices, n_triangles
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _corner_node(cell, q, strides):
     """Flat number of corner q of a cell."""
     return cell + (q & 1) * strides[0] + (q >> 1 & 1) * strides[1] + (q >> 2) * strides[2]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _entry_of(cell, strides, index, f, c, level, faces4, ambiguous, first, nodes, values):
     """Table entry of a cell, -1 where it is not crossed; its nodes and values go to the last two arrays."""
     case = 0
@@ -208,7 +209,7 @@ def _entry_of(cell, strides, index, f, c, level, faces4, ambiguous, first, nodes
     return first[case] + bits
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _centre_vertex(cell, local, e, rows, corner, vertex_shift, vertex_node):
     """Put the middle vertex of a loop at the mean of the loop."""
     v = local[e]

@@ -2,9 +2,9 @@
 
 from itertools import pairwise
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.validation import check_points
 
 # A chord is never farther from its surface than this share of a cell.
@@ -74,7 +74,7 @@ def points_near_cells(obstacles, grid, state, cells):
     return np.concatenate(found)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _mark_blocks_loop(cells, strides, blocks):
     """Mark the blocks of BLOCK^3 cells that hold a visited cell or touch one."""
     for cell in cells:
@@ -85,7 +85,7 @@ def _mark_blocks_loop(cells, strides, blocks):
                     blocks[a, b, c] = True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _near_cells_loop(points, boxes, turn, shift, shape, strides, state, blocks, index):
     low, high = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)
     count = 0
@@ -108,7 +108,7 @@ def _near_cells_loop(points, boxes, turn, shift, shape, strides, state, blocks, 
     return count
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _near_points_loop(points, first, last, turn, shift, shape, strides, state, blocks, index, count):
     for n in range(first, last):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
@@ -175,7 +175,7 @@ def push_off_points(vertices, faces, points, grid, tolerance, rounds=4):
     return moved
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _sort_faces_loop(vertices, faces, turn, origin, last, strides, cell, start, order, middle):
     """Sort triangles by the cell of their middle: those of cell c are order[start[c] : start[c + 1]]."""
     for f in range(len(faces)):
@@ -203,7 +203,7 @@ def _sort_faces_loop(vertices, faces, turn, origin, last, strides, cell, start, 
     start[-1] = len(faces)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _push_loop(
     vertices, faces, points, where, order, start, middle, cell, strides, reach, tolerance, moved, touched
 ):  # fmt: skip
@@ -238,7 +238,7 @@ def _push_loop(
     return number
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _nearest_triangle(vertices, faces, p, where, order, start, middle, strides, reach):
     """Nearest triangle right above or below p, less than ``reach`` away, and how far p lies behind it."""
     best, least, signed = -1, reach, -reach
@@ -262,7 +262,7 @@ def _nearest_triangle(vertices, faces, p, where, order, start, middle, strides, 
     return best, signed
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _touch_loop(cells, strides, touched):
     """Mark the cells less than three from any given one: a corner's triangles are one away, their points two."""
     touched[:] = False
@@ -275,7 +275,7 @@ def _touch_loop(cells, strides, touched):
                         touched[near] = True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@compiled(error_model="numpy", inline="always")
 def _frame(vertices, faces, f, x, y, z):
     """Normal of a triangle, its square, the offset of a point from corner A, and twice the areas at B and C.
 
@@ -293,7 +293,7 @@ def _frame(vertices, faces, f, x, y, z):
     return nx, ny, nz, nx * nx + ny * ny + nz * nz, height, at_b, at_c
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _depth_behind(vertices, faces, f, x, y, z):
     """How far a point lies behind a triangle; infinite if beside it."""
     _, _, _, square, height, at_b, at_c = _frame(vertices, faces, f, x, y, z)
@@ -303,7 +303,7 @@ def _depth_behind(vertices, faces, f, x, y, z):
     return -height / np.sqrt(square)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _weigh(vertices, faces, f, p, weight, normal):
     """Fill the barycentric weights of a point's shadow in a triangle, and the triangle's unit normal."""
     nx, ny, nz, square, _, at_b, at_c = _frame(vertices, faces, f, p[0], p[1], p[2])

@@ -1,8 +1,8 @@
 """Vertices of an extracted mesh moved onto the surface itself, and with its level to a wanted volume."""
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.implicit.extraction.obstacles import push_off_points
 
 
@@ -95,7 +95,7 @@ class Projector:
         self.vertices = self.vertices + step * self._direction
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _newton_loop(f, gradient, level, rows, step, slope, direction):
     """Newton steps onto f = level, 1 / |g|, and the vertices' motions g / |g|^2 for a change of level."""
     for n in range(len(rows)):
@@ -107,7 +107,7 @@ def _newton_loop(f, gradient, level, rows, step, slope, direction):
             step[n, a] = (level - f[n]) * direction[rows[n], a]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _step_loop(rows, step, spacing, vertices, unsettled):
     """Take the steps, none longer than a cell."""
     for n in range(len(rows)):
@@ -118,14 +118,14 @@ def _step_loop(rows, step, spacing, vertices, unsettled):
         unsettled[n] = length > 1e-2 * spacing
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@compiled(error_model="numpy", inline="always")
 def _triple(x, y):
     """The cross product of the two vectors in x, times y."""
     (a, b, c), (d, e, f) = x
     return (b * f - c * e) * y[0] + (c * d - a * f) * y[1] + (a * e - b * d) * y[2]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _volume_terms_loop(x, faces, origin, direction):
     """Coefficients of the enclosed volume as a cubic polynomial of the way along the directions."""
     c0, c1, c2, c3 = 0.0, 0.0, 0.0, 0.0

@@ -7,9 +7,9 @@ and Newton steps put each vertex onto the zero set itself: all that is left of t
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.implicit.extraction.band import Band, BandGrid
 from rbfmuscle.implicit.extraction.obstacles import CHORD, points_near_cells
 from rbfmuscle.implicit.extraction.projection import Projector
@@ -213,7 +213,7 @@ def _closed_sheets(band, level, keep):
     return vertices, faces, near_cut[used], sheets, sheets - int(chosen.sum())
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _label_sheets_loop(faces, size):
     """Connected sheets of a triangle mesh: label of each vertex, and their number."""
     parent = np.arange(size)
@@ -244,7 +244,7 @@ def _label_sheets_loop(faces, size):
     return label, count
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _sheet_volumes_loop(x, faces, label, origin, out):
     """Add the signed volumes of the tetrahedra under all triangles to those of their sheets, out."""
     for f in range(len(faces)):

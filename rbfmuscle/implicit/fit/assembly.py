@@ -6,8 +6,8 @@ order) is filled.
 """
 
 import numpy as np
-from numba import njit
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.implicit.kernels.radial import _radial_loop
 from rbfmuscle.implicit.kernels.values import _add_values_loop
 
@@ -60,7 +60,7 @@ def hermite_polynomials(points, powers):
     return np.hstack([monomials(points, powers), *monomial_gradients(points, powers)])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _offsets_loop(x, j, scale2, first, d, u):
     """d (3, m) = x[:, first + i] - x[:, j], u = squared length times scale2."""
     for i in range(u.size):
@@ -73,7 +73,7 @@ def _offsets_loop(x, j, scale2, first, d, u):
         u[i] = (dx * dx + dy * dy + dz * dz) * scale2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _value_matrix_loop(x, epsilon, base, parameter, compact, table, out):
     """out[j, i] = phi(|x_i - x_j|), both halves, as whole rows are filled faster; x is (3, n)."""
     for j in range(x.shape[1]):
@@ -83,7 +83,7 @@ def _value_matrix_loop(x, epsilon, base, parameter, compact, table, out):
         _add_values_loop(base, parameter, compact, table[0], x, *centre, epsilon * epsilon, 1.0, column)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _hermite_matrix_loop(x, epsilon, base, parameter, compact, table, out):
     """Lower triangle of the Hermite matrix; out[column, row] is its transpose.
 
@@ -121,7 +121,7 @@ def normal_polynomials(points, normals, powers):
     return np.hstack([monomials(points, powers), along])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _normal_matrix_loop(x, normals, epsilon, base, parameter, compact, table, out):
     """As `_hermite_matrix_loop`, with the derivative along the unit normal (3, n) alone.
 

@@ -10,10 +10,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy import linalg
 from scipy.spatial import cKDTree
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.implicit.fit import fitting
 from rbfmuscle.implicit.fit.lapack import invert_factor
 from rbfmuscle.validation import UsageError
@@ -84,7 +84,7 @@ def leave_one_out(basis, right, *, smoothing=0.0):
     return _residuals(blocks, weights, count, condition)
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+@compiled(fastmath={"reassoc", "contract"})
 def _blocks_loop(columns, blocks):
     """blocks[k] = (G^T G) at the conditions of centre k, with row i of columns the i-th column of the lower G."""
     count, kinds = blocks.shape[0], blocks.shape[1]

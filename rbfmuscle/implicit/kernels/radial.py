@@ -5,7 +5,8 @@ exp and log are written out here because calls into the C library keep a loop fr
 """
 
 import numpy as np
-from numba import njit
+
+from rbfmuscle.compiled.loop import compiled
 
 ONE, EXP, GAUSS, BINOMIAL, CUT, LOG, POWER = range(7)
 """Bases: 1, exp(-s), exp(-s^2), (1+s^2)^beta, (1-s)+, log s, s^a."""
@@ -17,7 +18,7 @@ _SHIFTER = 6755399441055744.0  # 1.5 * 2**52: adding it leaves the rounded integ
 _TINY = 2.2250738585072014e-308
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@compiled(error_model="numpy", fastmath={"contract"})
 def _exp(x):
     """exp(x), relative error below 3e-16; 0 where x < -708.
 
@@ -45,7 +46,7 @@ def _exp(x):
     return p * power if x >= -708.0 else 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@compiled(error_model="numpy", fastmath={"contract"})
 def _log(x):
     """log(x) for x > 0, relative error below 4e-16; 0 is taken as the smallest normal number."""
     bits = np.float64(max(x, _TINY)).view(np.int64)
@@ -69,21 +70,21 @@ def _log(x):
     return exponent * _LN2_HIGH + (f - s * (f - 2.0 * z * p) + exponent * _LN2_LOW)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@compiled(error_model="numpy", fastmath={"contract"})
 def _exp_loop(factor, x, out):
     """out = exp(factor * x)."""
     for i in range(x.size):
         out[i] = _exp(factor * x[i])
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@compiled(error_model="numpy", fastmath={"contract"})
 def _log_loop(x, out):
     """out = log(x)."""
     for i in range(x.size):
         out[i] = _log(x[i])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _base_loop(base, parameter, u, s, b, more):
     """s = sqrt(u) and b = the kernel's base; more is scratch."""
     if base != GAUSS and base != BINOMIAL:  # functions of u alone
@@ -109,7 +110,7 @@ def _base_loop(base, parameter, u, s, b, more):
             b[i] = max(1.0 - s[i], 0.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _binomial_loop(beta, u, b, more):
     """b = (1 + u)**beta, by roots where beta is a half."""
     if beta == 0.5:
@@ -131,7 +132,7 @@ def _binomial_loop(beta, u, b, more):
         _exp_loop(beta, more, b)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@compiled(error_model="numpy", fastmath={"contract"})
 def _inner_loop(base, row, u, s, b, out):
     """out = base * A(s)."""
     a0, a1, a2, a3, a4 = row[2], row[3], row[4], row[5], row[6]
@@ -162,7 +163,7 @@ def _inner_loop(base, row, u, s, b, out):
                 out[i] = out[i] / (1.0 + u[i])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _radial_loop(base, parameter, compact, table, wanted, u, work, out):
     """Fill out[k] (4, n) with the k-th radial function of s**2 = u for every bit k set in wanted.
 
@@ -190,7 +191,7 @@ def _radial_loop(base, parameter, compact, table, wanted, u, work, out):
                 values[i] = values[i] if u[i] < 1.0 else 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _times_power_loop(power, u, s, values):
     """values *= s**power; for a negative power the value at s = 0 becomes 0."""
     if power > 0:

@@ -5,14 +5,14 @@ commonest evaluation, and one loop over the points keeps it in registers.
 """
 
 import numpy as np
-from numba import njit
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.implicit.kernels.radial import BINOMIAL, CUT, EXP, GAUSS, LOG, ONE, _exp, _log
 
-_FAST = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
+_FAST = {"error_model": "numpy", "fastmath": {"contract"}}
 
 
-@njit(**_FAST)
+@compiled(**_FAST)
 def _power(power, s, u):
     """s**power for 0 <= power <= 7, u = s**2; selections, as the power is the same for the whole block."""
     out = s if power & 1 else 1.0
@@ -20,14 +20,14 @@ def _power(power, s, u):
     return out * (u * u) if power & 4 else out
 
 
-@njit(**_FAST)
+@compiled(**_FAST)
 def _gauss_loop(p, cx, cy, cz, e2, a, acc):
     for i in range(acc.size):
         dx, dy, dz = p[0, i] - cx, p[1, i] - cy, p[2, i] - cz
         acc[i] += a * _exp(-e2 * (dx * dx + dy * dy + dz * dz))
 
 
-@njit(**_FAST)
+@compiled(**_FAST)
 def _exponential_loop(p, cx, cy, cz, e2, a, row, acc):
     a0, a1, a2, a3 = a * row[2], a * row[3], a * row[4], a * row[5]
     for i in range(acc.size):
@@ -36,7 +36,7 @@ def _exponential_loop(p, cx, cy, cz, e2, a, row, acc):
         acc[i] += _exp(-s) * (a0 + s * (a1 + s * (a2 + s * a3)))
 
 
-@njit(**_FAST)
+@compiled(**_FAST)
 def _cubic_loop(p, cx, cy, cz, e2, a, acc):
     """The commonest, and twice as fast with its power written out."""
     for i in range(acc.size):
@@ -45,7 +45,7 @@ def _cubic_loop(p, cx, cy, cz, e2, a, acc):
         acc[i] += a * u * np.sqrt(u)
 
 
-@njit(**_FAST)
+@compiled(**_FAST)
 def _odd_power_loop(p, cx, cy, cz, e2, a, row, acc):
     power, c0 = int(row[0]), a * row[7]
     for i in range(acc.size):
@@ -54,7 +54,7 @@ def _odd_power_loop(p, cx, cy, cz, e2, a, row, acc):
         acc[i] += c0 * _power(power, np.sqrt(u), u)
 
 
-@njit(**_FAST)
+@compiled(**_FAST)
 def _logarithm_loop(p, cx, cy, cz, e2, a, compact, row, acc):
     power = int(row[0])
     a0, a4 = 0.5 * row[2], 0.5 * row[6]
@@ -68,7 +68,7 @@ def _logarithm_loop(p, cx, cy, cz, e2, a, compact, row, acc):
         acc[i] += a * (value if u < 1.0 or not compact else 0.0)
 
 
-@njit(**_FAST)
+@compiled(**_FAST)
 def _cut_loop(p, cx, cy, cz, e2, a, row, acc):
     extra = int(row[1])
     a0, a1, a2, a3 = a * row[2], a * row[3], a * row[4], a * row[5]
@@ -83,7 +83,7 @@ def _cut_loop(p, cx, cy, cz, e2, a, row, acc):
         acc[i] += value * (a0 + s * (a1 + s * (a2 + s * a3)))
 
 
-@njit(**_FAST)
+@compiled(**_FAST)
 def _root_loop(p, cx, cy, cz, e2, a, beta, acc):
     """a (1 + u)**beta for beta = 1.5, 0.5, -0.5 and -1."""
     for i in range(acc.size):
@@ -94,14 +94,14 @@ def _root_loop(p, cx, cy, cz, e2, a, beta, acc):
         acc[i] += factor * root if beta > 0.0 else a / root
 
 
-@njit(**_FAST)
+@compiled(**_FAST)
 def _binomial_loop(p, cx, cy, cz, e2, a, beta, acc):
     for i in range(acc.size):
         dx, dy, dz = p[0, i] - cx, p[1, i] - cy, p[2, i] - cz
         acc[i] += a * _exp(beta * _log(1.0 + e2 * (dx * dx + dy * dy + dz * dz)))
 
 
-@njit(**_FAST)
+@compiled(**_FAST)
 def _skala_loop(p, cx, cy, cz, e2, a, exponent, acc):
     """a s^2 (s^exponent - 1)."""
     for i in range(acc.size):
@@ -110,7 +110,7 @@ def _skala_loop(p, cx, cy, cz, e2, a, exponent, acc):
         acc[i] += a * (u * (_exp(0.5 * exponent * _log(u)) - 1.0))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _add_values_loop(base, parameter, compact, row, p, cx, cy, cz, e2, a, acc):
     """acc += a phi(|p - c|) for a block of points p (3, n); row is the kernel's for phi."""
     if base == GAUSS:

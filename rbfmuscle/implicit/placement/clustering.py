@@ -3,9 +3,9 @@
 import heapq
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.implicit.placement.control_mesh import contract_clusters
 
 # Least ratio of cell size to edge length: about ten mesh vertices a cell, or cells get ragged.
@@ -119,7 +119,7 @@ def _neighbours(edges, size):
     return start, head[order]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _farthest_loop(start, other, length, first, count, labels):
     """Farthest points by distance along edges; labels become the nearest of them."""
     distance = np.full(len(start) - 1, np.inf)
@@ -144,7 +144,7 @@ def _farthest_loop(start, other, length, first, count, labels):
         chosen = np.argmax(distance)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _cell_energy(moment, mass, k, sign, x, w):
     """Inertia of cell k but for a constant, with a vertex added (sign 1), taken away (-1) or neither."""
     m = mass[k] + sign * w
@@ -156,7 +156,7 @@ def _cell_energy(moment, mass, k, sign, x, w):
     return -total / m
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _equalise_loop(vertices, weight, edges, labels, count, rounds):
     """Move vertices between neighbouring cells while that lowers the sum of the cells' inertias."""
     moment = np.zeros((count, 3))
@@ -198,7 +198,7 @@ def _equalise_loop(vertices, weight, edges, labels, count, rounds):
             break
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _connect_loop(vertices, weight, start, other, labels, count):
     """Keep the heaviest connected piece of each cell; the rest joins the cells around it."""
     size = len(labels)

@@ -7,9 +7,9 @@ exactly two neighbours; Dey et al. 1999). What cannot be contracted goes to a ne
 is therefore closed, 2-manifold and of the input's genus, whatever the clusters look like.
 """
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.validation import MeshError
 
 
@@ -85,17 +85,17 @@ def opposite_half_edges(faces):
     return twin
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _following(h):
     return h - 2 if h % 3 == 2 else h + 1
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _preceding(h):
     return h + 2 if h % 3 == 0 else h - 1
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _is_contractible(h, tail, twin, mark):
     """Whether the ends of half-edge h share exactly two neighbours (link condition)."""
     a, b = tail[h], tail[twin[h]]
@@ -123,7 +123,7 @@ def _is_contractible(h, tail, twin, mark):
     return common == 2 and a != b
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _contract(h, tail, twin, out, parent, weight):
     """Contract half-edge h = (a -> b): b is merged into a, two faces vanish."""
     a, b = tail[h], tail[twin[h]]
@@ -146,7 +146,7 @@ def _contract(h, tail, twin, out, parent, weight):
     weight[a] += weight[b]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _contract_inside(tail, twin, out, parent, label, weight, mark, live, count):
     """Contract edges inside clusters until none can be; return the number of vertices left."""
     changed = True
@@ -163,7 +163,7 @@ def _contract_inside(tail, twin, out, parent, label, weight, mark, live, count):
     return live
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _contract_one(tail, twin, out, parent, label, weight, mark, main):
     """Contract the lightest left-over piece into a neighbour; any light pair where no such piece can be."""
     best, best_cost = -1, np.inf
@@ -179,7 +179,7 @@ def _contract_one(tail, twin, out, parent, label, weight, mark, main):
     return best >= 0
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _contract_loop(tail, twin, out, parent, label, weight, live, count):
     mark = np.full(len(parent), -1)
     main = np.full(label.max() + 1, -1)
@@ -196,7 +196,7 @@ def _contract_loop(tail, twin, out, parent, label, weight, live, count):
         live -= 1
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _find_roots_loop(parent):
     root = np.empty_like(parent)
     for v in range(len(parent)):

@@ -1,8 +1,8 @@
 """Points beside a surface with their signed distances, for fits to values."""
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.validation import check_points, check_positive, check_vectors
 
 
@@ -51,7 +51,7 @@ def off_surface_points(points, normals, *, distance=None, safety=0.5):
     return where, np.concatenate([np.zeros(len(points)), outside, -inside])
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _touching_ball_loop(points, normals, steps, nearest):
     """Radii of the empty balls that touch each point from outside (row 0) and inside (row 1)."""
     for i in range(len(points)):

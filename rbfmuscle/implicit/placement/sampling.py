@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from functools import partial
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.implicit.placement.clustering import cluster_mesh, face_normals, refine_mesh, vertex_normals
 from rbfmuscle.implicit.placement.control_mesh import opposite_half_edges
 from rbfmuscle.implicit.placement.density import GREEDY_LARGEST, curvature_density, greedy_sample
@@ -161,7 +161,7 @@ def _barycentric(points, corners):
     return out / out.sum(axis=1)[:, None]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _nearest_on_triangle(p, a, b, c, out):
     """Nearest point of a triangle (Ericson 2005, section 5.1.5); returns the squared distance."""
     ab, ac, ap = b - a, c - a, p - a
@@ -192,7 +192,7 @@ def _nearest_on_triangle(p, a, b, c, out):
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _nearest_in_cell_loop(vertices, faces, corner, target, points, face, distance):
     """Of the triangles wholly in cell k, the point nearest to target[k]; a cell without one gives a vertex.
 

@@ -7,9 +7,9 @@ the inner band.
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.exact_distance import STACK, nearest_triangle, record_square, signed_side
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.geometry.triangles import FIRST
@@ -293,7 +293,7 @@ def _far_records(exact, diagonal):
     return np.unique(place[faces])
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _node_loop(points, near, tree, normals, record, distance):
     boxes, starts, records = tree
     nodes, squares, closest, normal = np.empty(STACK, np.int64), np.empty(STACK), np.empty(3), np.empty(3)
@@ -311,7 +311,7 @@ def _node_loop(points, near, tree, normals, record, distance):
         distance[i] = np.sqrt(square) if side >= 0.0 else -np.sqrt(square)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _guess_loop(points, ids, record, records, guess):
     """Distance of each point to the nearest of the triangles of eight corners."""
     for i in range(len(points)):
@@ -322,7 +322,7 @@ def _guess_loop(points, ids, record, records, guess):
         guess[i] = np.sqrt(least)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _active_loop(ids, distance, centre, edge, band, side, active):
     """Mark small cells that may hold a point nearer than ``band``, by bounds from a block's nine samples."""
     small = edge / side
@@ -339,7 +339,7 @@ def _active_loop(ids, distance, centre, edge, band, side, active):
             active[i, cell] = bound - 0.5 * np.sqrt(3.0) * small < band
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _near_loop(blocks, offsets, lists, records, origin, edge, band, side, active):
     """Unmark small cells that a block's triangles show to be out of the band, unless the surface is
     folded."""

@@ -1,7 +1,8 @@
 """Which cell of a bone's distance field a point lies in, and how far from the bone that says it is at least."""
 
-import numba
 import numpy as np
+
+from rbfmuscle.compiled.loop import compiled
 
 # Lower bits of a header below the lower bound of its cell.
 BOUND = 6
@@ -11,7 +12,7 @@ BLOCK = 4
 INVERSE, UNIT = 3, 4
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@compiled(error_model="numpy", inline="always")
 def _block_entry(x, y, z, scale, blocks):
     """Entry of the block that holds a point relative to the origin, the fine cell in it, and whether it is
     far."""
@@ -27,7 +28,7 @@ def _block_entry(x, y, z, scale, blocks):
     return blocks[i, j, k], cell, far
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@compiled(error_model="numpy", inline="always")
 def _beyond(x, y, z, scale, blocks):
     """Squared distance of a point relative to the origin from the grid."""
     nx, ny, nz = blocks.shape
@@ -37,7 +38,7 @@ def _beyond(x, y, z, scale, blocks):
     return dx * dx + dy * dy + dz * dz
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@compiled(error_model="numpy", inline="always")
 def _placed(point, pose, grid):
     """A point of the world relative to the grid's origin."""
     p, q, r = point[0] - pose[0, 3], point[1] - pose[1, 3], point[2] - pose[2, 3]
@@ -47,7 +48,7 @@ def _placed(point, pose, grid):
     return x, y, z
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _common_bound(points, pose, grid, blocks, cells, lists):
     """Distance from the bone that all of these points have at least, by the bound at the one in their middle."""
     middle = points[len(points) // 2]

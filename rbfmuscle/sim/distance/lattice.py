@@ -1,7 +1,8 @@
 """Corners of the cells of a bone's distance field: which there are, and which cells share them."""
 
-import numba
 import numpy as np
+
+from rbfmuscle.compiled.loop import compiled
 
 
 def lattice(shape):
@@ -26,7 +27,7 @@ def corner_ids(low, index):
     return np.ascontiguousarray(np.stack(ids, axis=1))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _slot(block, cell, step, owner, side):
     """Block that owns a corner of a small cell, and the corner's place in it."""
     a = cell // (side * side) + step // 4
@@ -36,7 +37,7 @@ def _slot(block, cell, step, owner, side):
     return home, (a % side * side + b % side) * side + c % side
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def mark_loop(blocks, active, owner, side, number):
     """Put a zero in ``number`` (blocks, side^3) for each corner of an active small cell."""
     for i in range(len(blocks)):
@@ -47,7 +48,7 @@ def mark_loop(blocks, active, owner, side, number):
                     number[home, place] = 0
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def small_ids_loop(blocks, which, cell, owner, side, number, ids):
     """Numbers ``ids`` (n, 8) of the corners of small cells, given by their block and place in it."""
     for i in range(len(which)):

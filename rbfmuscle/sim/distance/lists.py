@@ -1,8 +1,8 @@
 """Lists of a field's cells: which triangles each names, its side and its lower bound."""
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.exact_distance import STACK, nearest_triangle, record_feature, record_square
 from rbfmuscle.geometry.triangles import CORNER, EDGE, FACE
 from rbfmuscle.sim.distance.cells import BOUND
@@ -23,7 +23,7 @@ SLACK = 1e-9
 LOOK_BACK = 6
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def list_loop(low, ids, nodes, centre, edge, unit, mesh, probe, out):
     """Write the list of each cell; return the lengths used and whether all signs agree with the distances."""
     record, distance, doubt = nodes
@@ -61,7 +61,7 @@ def list_loop(low, ids, nodes, centre, edge, unit, mesh, probe, out):
     return used, mixed, sound
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _add(listed, count, n):
     """Append n to the first ``count`` triangles of a list if it is new and has room; return their number."""
     for m in range(count):
@@ -73,7 +73,7 @@ def _add(listed, count, n):
     return count + 1
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def folded_list(records, listed, count):
     """Whether the triangles of a list face different ways."""
     first = listed[0]
@@ -86,7 +86,7 @@ def folded_list(records, listed, count):
     return False
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _probe(listed, count, folded, low, edge, mesh, nodes_left, squares):
     """Add the triangles nearest to points inside the cell.
 
@@ -115,7 +115,7 @@ def _probe(listed, count, folded, low, edge, mesh, nodes_left, squares):
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _walk(best, square, x, y, z, records, across):
     """Triangle at which a walk over neighbours, always to a nearer one, ends."""
     for _ in range(WALK):
@@ -137,7 +137,7 @@ def _walk(best, square, x, y, z, records, across):
     return best
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _same_before(lists, offsets, i, used, size):
     """Offset of a recent list equal to the one at ``used``, or ``used``."""
     for m in range(max(0, i - LOOK_BACK), i):
@@ -149,7 +149,7 @@ def _same_before(lists, offsets, i, used, size):
     return used
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _cell_state(ids, distance, edge):
     """Side of a cell, and a lower bound of the distance in it (zero unless outside)."""
     furthest = 0.0
@@ -164,7 +164,7 @@ def _cell_state(ids, distance, edge):
     return OUTSIDE, furthest - diagonal
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _signs_agree(ids, distance, edge):
     """Whether the surface is near enough wherever the sign changes along an edge of the cell."""
     for k in range(8):
@@ -176,7 +176,7 @@ def _signs_agree(ids, distance, edge):
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _fill_row(low, ids, distance, edge, row):
     for k in range(8):
         row[k] = distance[ids[k]]

@@ -8,9 +8,9 @@ grid those of its border serve.
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.triangles import CORNER, EDGE, FACE, nearest_in_frame
 from rbfmuscle.sim.distance.cells import BOUND, INVERSE, UNIT, _beyond, _block_entry, _common_bound, _placed
 
@@ -70,7 +70,7 @@ class FieldData(NamedTuple):
     across: np.ndarray
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@compiled(error_model="numpy", inline="always")
 def _square(n, x, y, z, records):
     """Squared distance to record n of a point relative to the origin, in single precision; without branches, as they
     are a toss-up."""
@@ -94,7 +94,7 @@ def _square(n, x, y, z, records):
     return w * w + np.float32(not inside) * min(min(ab, bc), ca)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@compiled(error_model="numpy", inline="always")
 def _nearest_listed(x, y, z, entry, far_point, lists, far, records):
     """Nearest of the triangles of a cell: record and squared distance."""
     best, square = np.int32(-1), np.float32(np.inf)
@@ -113,7 +113,7 @@ def _nearest_listed(x, y, z, entry, far_point, lists, far, records):
     return best, square
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _mixed_side(x, y, z, entry, lists, corners):
     """Trilinear interpolation of the signed distances at the corners of the cell."""
     row = lists[entry + 1 + (lists[entry] & COUNT)]
@@ -129,7 +129,7 @@ def _mixed_side(x, y, z, entry, lists, corners):
     return side
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@compiled(error_model="numpy", inline="always")
 def _offset(n, x, y, z, records):
     """Offset of a point from its nearest point of record n, in the record's frame; and whether that is
     inside."""
@@ -146,7 +146,7 @@ def _offset(n, x, y, z, records):
     return du, dv, w, False
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _walk(best, square, x, y, z, records, across):
     """Record at which a walk over neighbours, always to a nearer one, ends.
 
@@ -176,7 +176,7 @@ def _walk(best, square, x, y, z, records, across):
     return best
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@compiled(error_model="numpy", inline="always")
 def _world(n, du, dv, dw, records):
     gx = du * records[n, 3] + dv * records[n, 6] + dw * records[n, 9]
     gy = du * records[n, 4] + dv * records[n, 7] + dw * records[n, 10]
@@ -184,7 +184,7 @@ def _world(n, du, dv, dw, records):
     return gx, gy, gz
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _crossed_side(x, y, z, n, records, edge_normals, vertex_normals, vertices):
     """Projection of the offset from an edge or a corner of record n on its pseudonormal."""
     qx, qy, qz = x - records[n, 0], y - records[n, 1], z - records[n, 2]
@@ -205,7 +205,7 @@ def _crossed_side(x, y, z, n, records, edge_normals, vertex_normals, vertices):
     return gx * vertex_normals[k, 0] + gy * vertex_normals[k, 1] + gz * vertex_normals[k, 2]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _slow_side(x, y, z, entry, n, lists, corners, records, edge_normals, vertex_normals, vertices):
     """Positive outside: where neither the cell nor the side of a face tells."""
     if lists[entry] >> SIDE & 3 == MIXED:
@@ -213,7 +213,7 @@ def _slow_side(x, y, z, entry, n, lists, corners, records, edge_normals, vertex_
     return _crossed_side(x, y, z, n, records, edge_normals, vertex_normals, vertices)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@compiled(error_model="numpy", inline="always")
 def _unit_gradient(n, distance, du, dv, dw, least, records):
     """Gradient of the distance; the normal of the triangle where the offset is lost in rounding."""
     lost = abs(distance) <= least
@@ -221,7 +221,7 @@ def _unit_gradient(n, distance, du, dv, dw, least, records):
     return _world(n, scale * du, scale * dv, 1.0 if lost else scale * dw, records)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _stage(points, pose, reach, grid, blocks, cells, lists, far, records, local, entry, best, square):
     """Nearest record of up to STAGE points; each pass reads what the next one needs.
 
@@ -262,7 +262,7 @@ def _stage(points, pose, reach, grid, blocks, cells, lists, far, records, local,
             best[n], square[n] = _nearest_listed(x, y, z, entry[n], far_point, lists, far, records)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _finish(count, local, entry, best, square, offset, lists, corners, records, en, vn, vertices, across):
     """Turn squared into signed distances, and fill the offsets from the surface in the frames of the
     records."""
@@ -286,7 +286,7 @@ def _finish(count, local, entry, best, square, offset, lists, corners, records, 
         square[n] = d if side >= 0.0 else -d
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def query_loop(points, pose, reach, distance, gradient, data):
     """Distances (n,) and gradients (n, 3), world axes, of points in world coordinates; ``gradient`` may be empty."""
     grid, blocks, cells, lists, corners, far, records, en, vn, vertices, across = data
@@ -302,7 +302,7 @@ def query_loop(points, pose, reach, distance, gradient, data):
             _turn(len(some), pose, least, best, d, offset, records, gradient[start:end])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _turn(count, pose, least, best, distance, offset, records, gradient):
     """Gradients in world axes; zero where the bone is out of reach."""
     for n in range(count):

@@ -3,9 +3,9 @@
 It stands beside `BoneSDF` to be compared with it; nothing uses it by default.
 """
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.sim.distance.detectors import PointDetector, grid_of, sample_nodes
 from rbfmuscle.validation import check_points
 
@@ -55,7 +55,7 @@ class SerendipityField(PointDetector):
         return distance, gradient
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _serendipity_loop(points, low, edge, corners, on_x, on_y, on_z, distance, gradient):
     cell, t, grad = np.empty(3, np.int64), np.empty(3), np.empty(3)
     for n in range(len(points)):
@@ -84,7 +84,7 @@ def _serendipity_loop(points, low, edge, corners, on_x, on_y, on_z, distance, gr
             gradient[n, k] = 2.0 * grad[k] / edge[k]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _corner(t, a, b, c, square, node, grad):
     """Add (1/64)(1 + a x)(1 + b y)(1 + c z)(9 (x^2 + y^2 + z^2) - 19) times the node to the gradient."""
     x, y, z, w = 1.0 + a * t[0], 1.0 + b * t[1], 1.0 + c * t[2], 9.0 * square - 19.0
@@ -95,7 +95,7 @@ def _corner(t, a, b, c, square, node, grad):
     return s * x * y * z * w
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _edge(t, i, j, k, a, b, c, node, grad):
     """Add (9/64)(1 - x^2)(1 + 9 x_i x)(1 + b y)(1 + c z), x_i = a/3, x along axis i, times the node."""
     x = t[i]

@@ -3,9 +3,9 @@
 It stands beside `BoneSDF` to be compared with it; nothing uses it by default.
 """
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.sim.distance.detectors import PointDetector, grid_of, sample_nodes
 from rbfmuscle.validation import check_points
 
@@ -53,7 +53,7 @@ class SplineField(PointDetector):
         return distance, gradient
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _spline_loop(points, origin, spacing, coefficients, distance, gradient):
     weight, slope, base = np.empty((3, 4)), np.empty((3, 4)), np.empty(3, np.int64)
     for n in range(len(points)):
@@ -78,7 +78,7 @@ def _spline_loop(points, origin, spacing, coefficients, distance, gradient):
         gradient[n, 0], gradient[n, 1], gradient[n, 2] = gx, gy, gz
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _weights(t, spacing, weight, slope):
     """Uniform cubic B-spline at t in [0, 1], and its derivative."""
     s = 1.0 - t

@@ -7,9 +7,9 @@ scene asks for sliding, the surfaces of neighbouring muscles. Nothing here knows
 import copy
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.validation import check_points
 
 # Share of a queried distance that later calls rely on: a field is exact near its bone, coarser far away.
@@ -235,7 +235,7 @@ def moved_box(bounds, pose):
     return np.array([middle - reach, middle + reach])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _direction_loop(points, gradient, middle, out):
     """Unit gradients; away from the middle where there is none."""
     for i in range(len(points)):
@@ -253,7 +253,7 @@ def _direction_loop(points, gradient, middle, out):
             out[i, a] /= length
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _remember_loop(points, pose, near, distance, anchor, bound):
     for n in range(len(near)):
         i = near[n]
@@ -264,7 +264,7 @@ def _remember_loop(points, pose, near, distance, anchor, bound):
                 anchor[i, k] += pose[j, k] * (points[i, j] - pose[j, 3])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _lower_bound(points, i, pose, bounds, anchor, bound):
     """Distance that point i has at least: from the bone's box, or an earlier answer less the way since."""
     moved, outside = 0.0, 0.0
@@ -279,7 +279,7 @@ def _lower_bound(points, i, pose, bounds, anchor, bound):
     return max(np.sqrt(outside), known) if outside > 0.0 else known
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _near_loop(points, free, pose, bounds, reach, anchor, bound, found):
     """Fill ``found`` with the free points that may be nearer than ``reach``; return their number."""
     count = 0

@@ -1,8 +1,9 @@
 """A muscle's surface as its neighbours see it: its carried mesh, found through cells that are refilled."""
 
-import numba
 import numpy as np
 from scipy.spatial import cKDTree
+
+from rbfmuscle.compiled.loop import compiled
 
 
 class Skin:
@@ -91,7 +92,7 @@ class Skin:
         return index[near], distance[near], normal[near], nearest[near]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _fill_loop(vertices, origin, cell, shape, first, members):
     """Sort the vertices by cell: those of cell c are members[first[c] : first[c + 1]]."""
     where = np.empty(len(vertices), dtype=np.int64)
@@ -109,7 +110,7 @@ def _fill_loop(vertices, origin, cell, shape, first, members):
         filled[where[v]] += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _nearest_loop(points, which, vertices, box, cell, shape, first, members, bound, index, nearest):
     """Nearest vertex within ``bound``, at most a cell, of each point asked for; return how many have one."""
     count = 0
@@ -141,7 +142,7 @@ def _nearest_loop(points, which, vertices, box, cell, shape, first, members, bou
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _normals_loop(vertices, faces, normals):
     """Area-weighted vertex normals of unit length."""
     for f in range(len(faces)):
@@ -157,7 +158,7 @@ def _normals_loop(vertices, faces, normals):
             normals[v, k] /= max(length, 1e-300)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _distance_loop(points, index, nearest, vertices, normals, faces, start, ring, distance, normal):
     weights, best = np.empty(3), np.empty(3)
     for q in range(len(index)):
@@ -189,13 +190,13 @@ def _distance_loop(points, index, nearest, vertices, normals, faces, start, ring
         distance[q] = np.sqrt(least) if side >= 0.0 else -np.sqrt(least)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _dot(a, b, p, q):
     """(b - a) . (p - q), without temporary arrays."""
     return (b[0] - a[0]) * (p[0] - q[0]) + (b[1] - a[1]) * (p[1] - q[1]) + (b[2] - a[2]) * (p[2] - q[2])
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _closest(p, a, b, c, weights):
     """Barycentric weights of the point of a triangle nearest to p (Ericson 2005, section 5.1.5)."""
     d1, d2 = _dot(a, b, p, a), _dot(a, c, p, a)

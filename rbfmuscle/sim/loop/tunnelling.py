@@ -9,8 +9,9 @@ by sphere tracing (Hart 1996) in the bone's distance field and cannot miss what 
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
+
+from rbfmuscle.compiled.loop import compiled
 
 # 135 degrees, the bound of the angle test.
 RIGHT_ANGLE_AND_HALF = 0.75 * math.pi
@@ -231,7 +232,7 @@ def _candidates(start, end, back_before, back_after, bounds, anchor, known, free
     return index[:count], first[:count], second[:count]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _candidates_loop(start, end, back_before, back_after, bounds, anchor, known, free, index, first, second):
     """Leave out paths that are shorter than what is known of their end's distance to the bone.
 

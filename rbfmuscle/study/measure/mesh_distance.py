@@ -1,8 +1,8 @@
 """Exact signed distance to a closed triangle mesh, by libigl's tree and angle-weighted pseudonormals."""
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.validation import check_mesh, check_points
 
 
@@ -148,7 +148,7 @@ def pseudonormals(vertices, faces):
     return face, np.ascontiguousarray(total[label].reshape(-1, 3, 3)), vertex
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _sign_loop(
     points, nearest, closest, vertices, faces, face_normal, edge_normal, vertex_normal, out, unsure
 ):
@@ -182,7 +182,7 @@ def _sign_loop(
             out[n] = -out[n]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _winding_loop(point, vertices, faces):
     """Winding number of a mesh about one point, by solid angles of triangles (van Oosterom 1983)."""
     total = 0.0

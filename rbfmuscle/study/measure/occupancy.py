@@ -1,8 +1,8 @@
 """A coarse grid that says which points are certainly outside a closed mesh: few then need a distance."""
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.validation import check_mesh, check_points
 
 _UNKNOWN, _SURFACE, _OUTSIDE = 0, 1, 2
@@ -51,7 +51,7 @@ class OccupancyGrid:
         return np.flatnonzero(out)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _mark_loop(vertices, faces, origin, spacing, state):
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
     half = 0.5 * spacing * (1.0 + 1e-9)
@@ -75,7 +75,7 @@ def _mark_loop(vertices, faces, origin, spacing, state):
                         state[i, j, k] = _SURFACE
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _fill_loop(state, stack):
     state[0, 0, 0] = _OUTSIDE
     stack[0, 0], stack[0, 1], stack[0, 2] = 0, 0, 0
@@ -95,7 +95,7 @@ def _fill_loop(state, stack):
                 count += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _lookup_loop(points, origin, spacing, state, out):
     for n in range(len(points)):
         i = int(np.floor((points[n, 0] - origin[0]) / spacing))

@@ -1,8 +1,8 @@
 """How deep a muscle's surface and the bones are in each other, by exact distance to both meshes."""
 
-import numba
 import numpy as np
 
+from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.measure.occupancy import OccupancyGrid
 
@@ -145,7 +145,7 @@ def faces_near(vertices, faces, points, reach):
     return kept
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _near_loop(vertices, faces, points, origin, reach, cells, kept):
     # A face within reach of a point has its nearest spot at most one cell away and its corners one further.
     for n in range(len(points)):

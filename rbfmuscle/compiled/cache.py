@@ -1,0 +1,131 @@
+"""Numba's cache of one loop, with names by content in place of names by file and time."""
+
+import hashlib
+import pickle
+import time
+from functools import cached_property
+
+from numba.core import compiler, event
+from numba.core.caching import _Cache
+from numba.core.serialize import dumps
+
+from rbfmuscle.compiled.fingerprint import loop_digest, machine_digest
+from rbfmuscle.compiled.store import PATIENCE, EntryLock, folders, has_entry, read_entry, write_entry
+
+_POLL = 0.02  # seconds between looks at an entry that another process compiles
+
+
+class LoopCache(_Cache):
+    """What a dispatcher of numba asks for compiled code and hands compiled code to.
+
+    Parameters
+    ----------
+    loop : numba.core.dispatcher.Dispatcher
+    """
+
+    def __init__(self, loop):
+        _listen()
+        self.loop = loop
+        self.enabled = True
+        self.held = {}
+
+    @property
+    def cache_path(self):
+        return str(folders()[0]) if folders() else None
+
+    @cached_property
+    def digest(self):
+        """Content of the loop, read at its first call, when all that it calls is defined."""
+        return loop_digest(self.loop)
+
+    def entry_name(self, arguments, codegen):
+        """Name of the entry for a tuple of numba types."""
+        text = repr((self.digest, machine_digest(codegen), [_type_name(kind) for kind in arguments]))
+        function = self.loop.py_func
+        short = f"{function.__module__.rsplit('.')[-1]}.{function.__qualname__}".replace("<locals>", "in")
+        return f"{short}-{hashlib.sha256(text.encode()).hexdigest()[:24]}"
+
+    def load_overload(self, sig, target_context):
+        if not self.enabled:
+            return None
+        target_context.refresh()
+        arguments = _arguments(sig)
+        name = self.entry_name(arguments, target_context.codegen())
+        found = _load(name, target_context)
+        if found is not None:
+            return found
+        lock = EntryLock(name)
+        end = time.monotonic() + PATIENCE
+        while not lock.try_acquire():
+            if time.monotonic() > end:
+                return None
+            time.sleep(_POLL)
+            if has_entry(name):
+                break
+        found = _load(name, target_context)
+        if found is None:
+            self.held[arguments] = lock
+        else:
+            lock.release()
+        return found
+
+    def save_overload(self, sig, data):
+        arguments = _arguments(sig)
+        try:
+            if self.enabled and folders() and not data.lifted and not data.library.has_dynamic_globals:
+                write_entry(self.entry_name(arguments, data.codegen), dumps(data._reduce()))
+        finally:
+            self.let_go(arguments)
+
+    def let_go(self, arguments):
+        """Free the lock of what was compiled and written, or failed to be."""
+        lock = self.held.pop(tuple(arguments), None)
+        if lock is not None:
+            lock.release()
+
+    def enable(self):
+        self.enabled = True
+
+    def disable(self):
+        self.enabled = False
+
+    def flush(self):
+        """Nothing: an entry is never wrong, only unused."""
+
+
+def _arguments(sig):
+    return tuple(getattr(sig, "args", sig))
+
+
+def _type_name(kind):
+    """A numba type as text, with the home of classes that it names."""
+    home = getattr(kind, "instance_class", None)
+    return f"{kind!r} {home.__module__}" if home is not None else repr(kind)
+
+
+def _load(name, target_context):
+    data = read_entry(name)
+    return compiler.CompileResult._rebuild(target_context, *pickle.loads(data)) if data is not None else None
+
+
+class _Listener(event.Listener):
+    """Frees the lock of a loop that could not be compiled; one that was is written before it is freed."""
+
+    def on_start(self, event):
+        pass
+
+    def on_end(self, event):
+        cache = event.data["dispatcher"]._cache
+        if event.is_failed and isinstance(cache, LoopCache):
+            cache.let_go(event.data["args"])
+
+
+_LISTENER = _Listener()
+_listening = False
+
+
+def _listen():
+    global _listening
+    if not _listening:
+        _listening = True
+        event.register("numba:compile", _LISTENER)
