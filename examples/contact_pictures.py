@@ -17,7 +17,7 @@ from PIL import Image
 import rbfmuscle as rm
 from rbfmuscle.models import build_model
 from rbfmuscle.sim.loop.contact import BoneContacts
-from rbfmuscle.sim.loop.lane import Lane
+from rbfmuscle.sim.loop.stepper import MuscleStepper
 from rbfmuscle.sim.scene.motion import bone_poses
 from rbfmuscle.sim.scene.options import ContactOptions, DetectOptions, SlidingOptions, TunnellingOptions
 
@@ -97,9 +97,9 @@ for action, title in (("report", "tunnelled"), ("substep", "corrected")):
     scene.detect = DetectOptions(tunnelling=TunnellingOptions(action=action))
     model = build_model(muscle, scene, "pbd")
     names = [bone.name for bone in scene.bones]
-    lane = Lane(model, BoneContacts(names, fields, contact_bone=model.contact_bone), scene)
-    lane.step(rest, turned)
-    remaining[action] = {event.action for event in lane.collect()[1]}
+    stepper = MuscleStepper(model, BoneContacts(names, fields, contact_bone=model.contact_bone), scene)
+    stepper.step(rest, turned)
+    remaining[action] = {event.action for event in stepper.collect()[1]}
     panels.append((title, [(*model.carried_mesh(), "#a63d38", 0.75), *bones(scene, turned)]))
 picture("tunnelling", panels, view=(0.55, -0.8, 0.1), zoom=1.3)
 

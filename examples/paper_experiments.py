@@ -20,8 +20,9 @@ import numpy as np
 
 from pbd_baseline.muscle import PBDMuscle
 from rbfmuscle.sim.loop.contact import BoneContacts
+from rbfmuscle.sim.loop.substeps import SubSteps
 from rbfmuscle.sim.loop.tunnelling import find_crossings
-from rbfmuscle.sim.plan.reach import Pace, build_fields, reached_bones
+from rbfmuscle.sim.plan.reach import build_fields, reached_bones
 from rbfmuscle.sim.scene.motion import bone_poses
 from rbfmuscle.sim.scene.options import TunnellingOptions
 from rbfmuscle.sim.scene.phantom import phantom_scene
@@ -85,7 +86,7 @@ class Experiment:
         regions = reached_bones(self.scene)
         fields = build_fields(self.scene, regions)
         self.names = [bone.name for bone in scene.bones]
-        self.pace = Pace(self.scene)
+        self.sub_steps = SubSteps(self.scene)
         self.fields = [fields.get(name) for name in self.names]
         self.probes = [BoneProbe(bone.name, bone.mesh) for bone in scene.bones]
 
@@ -96,7 +97,7 @@ class Experiment:
         record = Record(model, self.probes)
         here = {self.coordinate: 0.0}
         for coordinates in self.scene.motion.frames:
-            stops = self.pace.split(here, coordinates) if substeps else [coordinates]
+            stops = self.sub_steps.split(here, coordinates) if substeps else [coordinates]
             for after in stops:
                 self.step(model, contacts, here, after, record)
                 here = after

@@ -13,7 +13,7 @@ from pictures import folder, plot
 import rbfmuscle as rm
 from rbfmuscle.models import build_model
 from rbfmuscle.sim.loop.contact import BoneContacts
-from rbfmuscle.sim.loop.lane import Lane
+from rbfmuscle.sim.loop.stepper import MuscleStepper
 from rbfmuscle.sim.scene.options import DetectOptions, TunnellingOptions
 
 out = folder("tunnelling")
@@ -28,9 +28,11 @@ def step(action):
     scene.detect = DetectOptions(tunnelling=TunnellingOptions(action=action))
     model = build_model(muscle, scene, "pbd")
     names = list(fields)
-    lane = Lane(model, BoneContacts(names, list(fields.values()), contact_bone=model.contact_bone), scene)
-    lane.step(rest, turned)
-    _, events = lane.collect()
+    stepper = MuscleStepper(
+        model, BoneContacts(names, list(fields.values()), contact_bone=model.contact_bone), scene
+    )
+    stepper.step(rest, turned)
+    _, events = stepper.collect()
     for event in events:
         print(f"{action:8} {event.count:4} points at the {event.bone}: {event.action}")
     return model.contact_points().copy(), {event.action: event.count for event in events}

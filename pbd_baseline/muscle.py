@@ -10,7 +10,7 @@ from pbd_baseline.options import PBDOptions
 from pbd_baseline.rest import Rest
 from pbd_baseline.shapes import SHAPES
 from rbfmuscle.compiled.loop import compiled
-from rbfmuscle.sim.loop.simulate import ModelSurface
+from rbfmuscle.sim.loop.frame import FinishedDrawing, ModelSurface
 
 # Bones are looked for within this distance [mm] of the vertices as predicted, and as swept.
 REACH = 6.0
@@ -23,7 +23,7 @@ STEP_ANGLE = math.radians(2.0)
 
 
 class PBDMuscle:
-    """A mesh muscle of any of the paper's kinds; implements ``rbfmuscle.sim.loop.simulate.MuscleModel``.
+    """A mesh muscle of any of the paper's kinds; implements ``rbfmuscle.sim.loop.frame.MuscleModel``.
 
     Parameters
     ----------
@@ -125,8 +125,9 @@ class PBDMuscle:
 
     def drawing(self, contacts):
         """What gives the mesh as it is now."""
-        surface = ModelSurface(*self.carried_mesh(), {"solver_penetration_max": self.penetration})
-        return lambda: surface
+        return FinishedDrawing(
+            ModelSurface(*self.carried_mesh(), {"solver_penetration_max": self.penetration})
+        )
 
     def volume(self):
         """Enclosed volume now [unit^3]."""

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from rbfmuscle.models import build_models
-from rbfmuscle.sim.loop.lane import Event
+from rbfmuscle.sim.loop.frame import Event
 from rbfmuscle.sim.loop.simulate import simulate_frames
 from rbfmuscle.sim.scene.check import bone_collisions, bone_findings, check_initial
 from rbfmuscle.study.files.runinfo import Stages, build_info

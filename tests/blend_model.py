@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 
 from rbfmuscle.geometry.harmonic import harmonic_weights
-from rbfmuscle.sim.loop.simulate import ModelSurface
+from rbfmuscle.sim.loop.frame import FinishedDrawing, ModelSurface
 from rbfmuscle.sim.scene.options import OutputOptions
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.validation import SolveError
@@ -57,7 +57,7 @@ class BlendMuscle:
     def drawing(self, contacts):
         quantities = {"solver_penetration_max": 0.0, "time_extract": 0.001}
         surface = ModelSurface(self.x.copy(), self.faces, quantities)
-        return lambda: surface
+        return FinishedDrawing(surface)
 
 
 def arm_scene(*, end=20, step=10, units="mm", **output):

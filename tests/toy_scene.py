@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 
 from rbfmuscle.compiled.loop import compiled
-from rbfmuscle.sim.loop.simulate import ModelSurface
+from rbfmuscle.sim.loop.frame import FinishedDrawing, ModelSurface
 from rbfmuscle.sim.scene.motion import Motion
 from rbfmuscle.sim.scene.options import ContactOptions, DetectOptions
 
@@ -160,7 +160,7 @@ class ToyMuscle:
 
     def drawing(self, contacts):
         surface = ModelSurface(self.x.copy(), self.faces, {"solver_penetration_max": 0.0})
-        return lambda: surface
+        return FinishedDrawing(surface)
 
 
 def ellipsoid(half, centre=(0, 0, 0), *, subdivisions=2):

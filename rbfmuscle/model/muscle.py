@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.fields import LevelField
 from rbfmuscle.geometry.harmonic import blended_motion, harmonic_weights, surface_gradient
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.implicit.extraction.band import box_along
@@ -21,7 +22,7 @@ from rbfmuscle.model.constraints import ShapeConstraint, VolumeConstraint
 from rbfmuscle.model.elasticity import ElasticSolver
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.model.rest import bind_samples, build_clusters, kept_sample
-from rbfmuscle.sim.loop.simulate import ModelSurface
+from rbfmuscle.sim.loop.frame import ModelSurface
 from rbfmuscle.validation import NumericalWarning, SceneError, SolveError
 
 AREA_A_CENTRE = 212.0  # mm², from which the number of centres follows where the scene names none
@@ -49,6 +50,37 @@ class _BoneCut:
 
     def value_and_gradient_below(self, points, limit):
         return self.contacts.nearest_with_gradient(points, limit)
+
+
+class _Drawing:
+    """An RBF muscle as it was at one moment: its field, fitted when it is first asked for, and its surface."""
+
+    def __init__(self, muscle, contacts):
+        self._muscle = muscle
+        self._centres, self._normals, self._points = (
+            muscle.x.copy(),
+            muscle.normals(),
+            muscle.contact_points(),
+        )
+        self._depth, self._obstacles = contacts.depth(self._points), contacts.frozen()
+        self._fitted, self._time_fit = None, 0.0
+
+    def field(self):
+        """The field that the surface is drawn by, less the level that the frame before came to."""
+        return LevelField(self._fit(), self._muscle.level)
+
+    def surface(self):
+        """The closed surface at the rest volume, cut by what lay in the way."""
+        surface = self._muscle._extract(self._fit(), self._points, self._obstacles, self._time_fit)
+        surface.quantities["solver_penetration_max"] = self._depth
+        return surface
+
+    def _fit(self):
+        if self._fitted is None:
+            started = time.perf_counter()
+            self._fitted = self._muscle._fit(self._centres, self._normals)
+            self._time_fit = time.perf_counter() - started
+        return self._fitted
 
 
 class RBFMuscle:
@@ -108,7 +140,7 @@ class RBFMuscle:
         # resists alike however many centres it has.
         self._build_elasticity(centres, samples, fibre, self.options.across_weight * usual / count)
         self.x = self.rest.copy()
-        self.level, self._fitted = 0.0, None
+        self.level = 0.0
         # Cells along the muscle's own axes are smaller than along the scene's, and turn with the scene.
         self.axes = frame.directions(_principal_axes(samples.points))
 
@@ -288,31 +320,9 @@ class RBFMuscle:
             centres, normals, kernel=self.kernel, epsilon=self.epsilon, derivatives=self.derivatives
         )
 
-    def implicit(self):
-        """``points -> (values, gradients)`` of the field that the next `drawing` shows, level taken off."""
-        fitted, level = self.field(), self.level
-        self._fitted = fitted
-
-        def evaluate(points):
-            value, gradient = fitted.value_and_gradient(points)
-            return value - level, gradient
-
-        return evaluate
-
     def drawing(self, contacts):
         """What refits the field, cuts the bones away and extracts the closed surface at the rest volume."""
-        fitted, self._fitted = self._fitted, None
-        centres, normals, points = self.x.copy(), self.normals(), self.contact_points()
-        depth, obstacles = contacts.depth(points), contacts.frozen()
-
-        def draw():
-            started = time.perf_counter()
-            field = fitted or self._fit(centres, normals)
-            surface = self._extract(field, points, obstacles, time.perf_counter() - started)
-            surface.quantities["solver_penetration_max"] = depth
-            return surface
-
-        return draw
+        return _Drawing(self, contacts)
 
     def _extract(self, field, points, contacts, time_fit):
         started = time.perf_counter()

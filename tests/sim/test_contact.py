@@ -5,9 +5,9 @@ import pytest
 from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, joint, muscle, scene, sphere
 
 from rbfmuscle.sim.loop.contact import BoneContacts, moved_box
-from rbfmuscle.sim.loop.lane import Lane
 from rbfmuscle.sim.loop.overlap import rest_overlap, settle_rest
 from rbfmuscle.sim.loop.simulate import simulate_frames
+from rbfmuscle.sim.loop.stepper import MuscleStepper
 from rbfmuscle.sim.scene.motion import rotation_about
 from rbfmuscle.validation import SceneError
 
@@ -152,13 +152,13 @@ def _sunk(initial):
     )
     model = ToyMuscle(made.muscles[0], made)
     contacts = BoneContacts(list(fields), list(fields.values()), contact_bone=model.contact_bone)
-    return made, fields, model, Lane(model, contacts, made)
+    return made, fields, model, MuscleStepper(model, contacts, made)
 
 
 def test_error_names_muscle_bone_and_depth():
-    *_, lane = _sunk("error")
+    *_, stepper = _sunk("error")
     with pytest.raises(SceneError, match=r"'belly' overlaps bone 'plate' at rest: \d+ points, 2 mm deep"):
-        settle_rest(lane, {})
+        settle_rest(stepper)
 
 
 def test_keep_lets_the_rest_depth_stand():
@@ -169,12 +169,12 @@ def test_keep_lets_the_rest_depth_stand():
 
 
 def test_kept_overlap_is_no_contact_and_deeper_is():
-    *_, model, lane = _sunk("keep")
-    settle_rest(lane, {})
+    *_, model, stepper = _sunk("keep")
+    settle_rest(stepper)
     points = model.contact_points()
-    assert lane.contacts.half_spaces(points, 0.5).gap.min() >= -1e-12
+    assert stepper.contacts.half_spaces(points, 0.5).gap.min() >= -1e-12
     lower = points - [0, 0, 0.1]
-    assert lane.contacts.half_spaces(lower, 0.5).gap.min() == pytest.approx(-0.1)
+    assert stepper.contacts.half_spaces(lower, 0.5).gap.min() == pytest.approx(-0.1)
 
 
 def test_resolve_brings_everything_out_and_leaves_the_rest_alone():
@@ -189,8 +189,8 @@ def test_resolve_brings_everything_out_and_leaves_the_rest_alone():
 
 
 def test_free_points_alone_count_as_overlap():
-    *_, model, lane = _sunk("keep")
-    depth = rest_overlap(lane.contacts, model.contact_points())[0]
+    *_, model, stepper = _sunk("keep")
+    depth = rest_overlap(stepper.contacts, model.contact_points())[0]
     assert depth.max() == pytest.approx(2.0, abs=1e-9)
     assert not depth[model.contact_bone >= 0].any()
 

@@ -10,7 +10,8 @@ from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, hinged_scene, joi
 
 from rbfmuscle import models
 from rbfmuscle.sim.loop.simulate import simulate_frames
-from rbfmuscle.sim.plan.reach import Pace, reached_bones, sampled_poses, turned_angle
+from rbfmuscle.sim.loop.substeps import SubSteps, turned_angle
+from rbfmuscle.sim.plan.reach import reached_bones, sampled_poses
 from rbfmuscle.sim.scene.motion import bone_poses
 from rbfmuscle.sim.scene.options import TunnellingOptions
 from rbfmuscle.validation import SolveError, UsageError
@@ -94,7 +95,7 @@ def test_first_frame_is_reached_from_the_rest_pose():
 def test_sub_steps_bound_turn_and_travel():
     made, _ = hinged_scene([0, 45])
     before, after = made.motion.frames
-    stops = Pace(made).split(before, after)
+    stops = SubSteps(made).split(before, after)
     assert stops[-1] == after
     poses = [bone_poses(made, c)["arm"] for c in (before, *stops)]
     turns = [turned_angle(b[:3, :3] @ a[:3, :3].T) for a, b in pairwise(poses)]
@@ -104,7 +105,7 @@ def test_sub_steps_bound_turn_and_travel():
     for a, b in pairwise(poses):
         moved = np.linalg.norm(held @ (b - a)[:3, :3].T + (b - a)[:3, 3], axis=1)
         assert moved.max() <= diagonal / 27 * (1 + 1e-9)
-    assert Pace(made).split(after, after) == []
+    assert SubSteps(made).split(after, after) == []
 
 
 def test_sub_steps_end_at_the_same_angles_however_frames_are_spaced():
@@ -113,7 +114,7 @@ def test_sub_steps_end_at_the_same_angles_however_frames_are_spaced():
 
     def path(degrees):
         stops = [start, *({"hinge.bend": np.radians(d)} for d in degrees)]
-        return [s["hinge.bend"] for a, b in pairwise(stops) for s in Pace(made).split(a, b)]
+        return [s["hinge.bend"] for a, b in pairwise(stops) for s in SubSteps(made).split(a, b)]
 
     whole = np.array(path([30]))
     np.testing.assert_array_equal(path([10, 20, 30]), whole)
@@ -121,13 +122,13 @@ def test_sub_steps_end_at_the_same_angles_however_frames_are_spaced():
     np.testing.assert_allclose(
         np.setdiff1d(with_seven.round(9), np.radians([7]).round(9)), whole.round(9), rtol=0
     )
-    back = np.array([s["hinge.bend"] for s in Pace(made).split(end, start)])
+    back = np.array([s["hinge.bend"] for s in SubSteps(made).split(end, start)])
     np.testing.assert_allclose(back[-2::-1], whole[:-1], rtol=0, atol=1e-12)
 
 
 def test_whole_turn_in_one_step_is_split():
     made, _ = hinged_scene([0, 360])
-    assert len(Pace(made).split(*made.motion.frames)) >= 180
+    assert len(SubSteps(made).split(*made.motion.frames)) >= 180
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-7, 0.5, 3.1])
@@ -247,12 +248,18 @@ def test_without_surfaces_none_is_extracted():
 
 
 def test_without_tables_no_optional_module_is_loaded():
-    for name in ("rbfmuscle.sim.loop.sliding", "rbfmuscle.sim.loop.skin", "rbfmuscle.sim.distance.sdf"):
+    for name in (
+        "rbfmuscle.sim.loop.sliding",
+        "rbfmuscle.sim.loop.carried_surface",
+        "rbfmuscle.sim.distance.sdf",
+    ):
         sys.modules.pop(name, None)
     frames, _ = _run([0, 10])
-    assert not {"rbfmuscle.sim.loop.sliding", "rbfmuscle.sim.loop.skin", "rbfmuscle.sim.distance.sdf"} & set(
-        sys.modules
-    )
+    assert not {
+        "rbfmuscle.sim.loop.sliding",
+        "rbfmuscle.sim.loop.carried_surface",
+        "rbfmuscle.sim.distance.sdf",
+    } & set(sys.modules)
     assert not {"time_sliding", "time_tunnelling"} & set(frames[-1].times["strap"])
 
 

@@ -1,4 +1,4 @@
-"""Neighbouring muscles that slide: skins, virtual edges, and what the frame loop makes of them."""
+"""Neighbouring muscles that slide: surfaces, virtual edges, and what the frame loop makes of them."""
 
 import igl
 import numpy as np
@@ -6,15 +6,15 @@ import pytest
 import trimesh
 from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, joint, muscle, scene, sphere
 
+from rbfmuscle.sim.loop.carried_surface import CarriedSurface
 from rbfmuscle.sim.loop.simulate import simulate_frames
-from rbfmuscle.sim.loop.skin import Skin
 from rbfmuscle.sim.scene.motion import rotation_about
 from rbfmuscle.sim.scene.options import SlidingOptions
 from rbfmuscle.validation import SceneError
 
 
 class _Mesh:
-    """The part of a model that a skin reads."""
+    """The part of a model that a surface reads."""
 
     def __init__(self, mesh):
         self.vertices, self.faces = np.array(mesh.vertices), np.array(mesh.faces)
@@ -31,14 +31,14 @@ def _ball(radius=10.0):
     return _Mesh(trimesh.creation.icosphere(subdivisions=3, radius=radius))
 
 
-def test_skin_distance_agrees_with_the_sphere():
-    skin = Skin(_ball(), reach=3.0)
+def test_surface_distance_agrees_with_the_sphere():
+    surface = CarriedSurface(_ball(), reach=3.0)
     points = np.random.default_rng(0).normal(size=(500, 3))
     points *= np.random.default_rng(1).uniform(8, 14, (500, 1)) / np.linalg.norm(
         points, axis=1, keepdims=True
     )
     exact = np.linalg.norm(points, axis=1) - 10.0
-    index, distance, normal, nearest = skin.query(points, np.ones(500, dtype=bool), 3.0)
+    index, distance, normal, nearest = surface.query(points, np.ones(500, dtype=bool), 3.0)
     # The triangles lie up to 0.06 below the sphere.
     assert np.allclose(distance, exact[index], atol=0.08)
     assert set(np.flatnonzero(exact < 2.9)) <= set(index)
@@ -46,25 +46,25 @@ def test_skin_distance_agrees_with_the_sphere():
         np.einsum("ij,ij->i", normal, points[index] / np.linalg.norm(points[index], axis=1)[:, None]).min()
         > 0.99
     )
-    assert np.linalg.norm(skin.vertices[nearest] - points[index], axis=1).max() < 3.0 + 2 * skin.edge
+    assert np.linalg.norm(surface.vertices[nearest] - points[index], axis=1).max() < 3.0 + 2 * surface.edge
 
 
-def test_skin_follows_the_model_and_asks_only_what_it_is_asked():
+def test_surface_follows_the_model_and_asks_only_what_it_is_asked():
     model = _ball()
-    skin = Skin(model, reach=3.0)
+    surface = CarriedSurface(model, reach=3.0)
     turn = rotation_about([1, 2, 3], 1.0, np.array([50.0, 0, 0]))
     model.vertices = model.vertices @ turn[:3, :3].T + turn[:3, 3]
-    skin.refresh()
+    surface.refresh()
     points = (np.array([[11.0, 0, 0], [0, 9, 0], [0, 0, 12]])) @ turn[:3, :3].T + turn[:3, 3]
-    index, distance, _, _ = skin.query(points, np.array([True, True, False]), 3.0)
+    index, distance, _, _ = surface.query(points, np.array([True, True, False]), 3.0)
     assert index.tolist() == [0, 1]
     assert np.allclose(distance, [1, -1], atol=0.08)
 
 
-def test_skin_far_away_or_empty_answers_nothing():
-    skin = Skin(_ball(), reach=3.0)
+def test_surface_far_away_or_empty_answers_nothing():
+    surface = CarriedSurface(_ball(), reach=3.0)
     for points in (np.array([[100.0, 0, 0]]), np.zeros((0, 3)), np.array([[0.0, 0, 0]])):
-        assert len(skin.query(points, np.ones(len(points), dtype=bool), 3.0)[0]) == 0
+        assert len(surface.query(points, np.ones(len(points), dtype=bool), 3.0)[0]) == 0
 
 
 def _neighbours(angles, gap=1.0, *, sliding, order=(0, 1), belly=4.0):
@@ -184,25 +184,25 @@ def test_mirrored_neighbours_give_mirrored_results():
 
 def test_cut_is_midway_between_overlapping_muscles():
     from rbfmuscle.sim.loop.contact import BoneContacts
-    from rbfmuscle.sim.loop.lane import Lane
     from rbfmuscle.sim.loop.sliding import Sliding
+    from rbfmuscle.sim.loop.stepper import MuscleStepper
 
     made, fields = _neighbours([{}], sliding=SlidingOptions(), gap=-2.0)
-    lanes = []
+    steppers = []
     for part in [ToyMuscle(m, made) for m in made.muscles]:
         contacts = BoneContacts(list(fields), list(fields.values()), contact_bone=part.contact_bone)
-        lanes.append(Lane(part, contacts, made))
-    sliding = Sliding(made, lanes)
-    for lane in lanes:
-        sliding.measure(lane)
+        steppers.append(MuscleStepper(part, contacts, made))
+    sliding = Sliding(made, steppers)
+    for stepper in steppers:
+        sliding.measure(stepper)
     points = np.array([[0, 0, 2.5], [0, 0, 3.0], [0, 0, 3.5], [1, 1, 3.0], [0, 0, -4.0], [0, 30, 0]])
-    lower, upper = (lane.contacts.nearest(points) for lane in lanes)
+    lower, upper = (stepper.contacts.nearest(points) for stepper in steppers)
     assert np.allclose(lower[:3], [0.5, 0.0, -0.5], atol=0.1)
     assert np.allclose(lower[:4], -upper[:4], atol=1e-12)
     assert lower[4] > 4.0
     step = 1e-5
-    value, gradient = lanes[0].contacts.cuts[0].cut_with_gradient(points[:4])
-    ahead = lanes[0].contacts.cuts[0].cut(points[:4] + [0, 0, step])
+    value, gradient = steppers[0].contacts.cuts[0].cut_with_gradient(points[:4])
+    ahead = steppers[0].contacts.cuts[0].cut(points[:4] + [0, 0, step])
     # Normals are interpolated, distances are to flat triangles.
     assert np.allclose((ahead - value) / step, gradient[:, 2], atol=0.1)
 

@@ -5,7 +5,7 @@ import pytest
 from toy_scene import ToyMuscle, attach, bone, box, cylinder, ellipsoid, joint, muscle, scene, sphere
 
 from rbfmuscle.sim.loop.contact import BoneContacts
-from rbfmuscle.sim.loop.lane import Lane
+from rbfmuscle.sim.loop.stepper import MuscleStepper
 from rbfmuscle.sim.loop.tunnelling import find_crossings, rigid_fit, sweep_paths
 from rbfmuscle.sim.scene.motion import bone_poses, rotation_about
 from rbfmuscle.sim.scene.options import TunnellingOptions
@@ -156,34 +156,34 @@ def _swing(action, **options):
     model = ToyMuscle(made.muscles[0], made)
     model.reach = 15.0
     contacts = BoneContacts(list(fields), list(fields.values()), contact_bone=model.contact_bone)
-    lane = Lane(model, contacts, made)
+    stepper = MuscleStepper(model, contacts, made)
     start = model.x.copy()
     before, after = {"hinge.turn": 0.0}, {"hinge.turn": np.radians(40)}
-    lane.step(before, after)
+    stepper.step(before, after)
     poses = [bone_poses(made, c) for c in (before, after)]
     crossed = find_crossings(contacts, start, model.x, *poses, TunnellingOptions(), tolerance=0.1)
-    return lane, sum(len(crossing.index) for crossing in crossed)
+    return stepper, sum(len(crossing.index) for crossing in crossed)
 
 
 def test_fast_muscle_tunnels_through_a_plate_when_only_reported():
-    lane, crossed = _swing("report")
-    reported = [event for event in lane.collect()[1] if event.action == "reported"]
+    stepper, crossed = _swing("report")
+    reported = [event for event in stepper.collect()[1] if event.action == "reported"]
     assert crossed > 0
     assert [(event.bone, event.count) for event in reported] == [("plate", crossed)]
 
 
 @pytest.mark.parametrize("action", ["rotate", "substep"])
 def test_correction_leaves_no_point_behind_the_plate(action):
-    lane, crossed = _swing(action)
+    stepper, crossed = _swing(action)
     assert crossed == 0
-    actions = {event.action for event in lane.collect()[1]}
+    actions = {event.action for event in stepper.collect()[1]}
     assert actions & {"rotated", "halved"}
     assert "unresolved" not in actions
 
 
 def test_without_detection_no_tunnelling_code_runs():
-    lane, crossed = _swing(None)
+    stepper, crossed = _swing(None)
     assert crossed > 0
-    times, events = lane.collect()
+    times, events = stepper.collect()
     assert events == []
     assert "time_tunnelling" not in times

@@ -1,41 +1,16 @@
-"""A scene driven by hand: the frame loop over a motion that is not known beforehand."""
+"""A scene driven by hand: the frame loop, asked for frames that are not known beforehand."""
 
 import copy
 import math
 
 import numpy as np
 
-from rbfmuscle.sim.loop.simulate import simulate_frames
+from rbfmuscle.sim.loop.simulate import FrameLoop
 from rbfmuscle.sim.plan.reach import build_fields, reached_bones
 from rbfmuscle.sim.scene.motion import Motion, coordinate_names
 
 # What a coordinate may be turned by where the scene's own motion does not go further [degree].
 FREE_RANGE = 30.0
-
-
-class _Course:
-    """Frames that are asked for one by one: what the frame loop iterates over."""
-
-    def __init__(self, names):
-        self.names, self.next = names, None
-
-    def __getitem__(self, index):
-        return dict.fromkeys(self.names, 0.0)
-
-    def __iter__(self):
-        while True:
-            yield dict(self.next)
-
-    def __len__(self):
-        return 1
-
-
-class _LiveMotion:
-    def __init__(self, names):
-        self.frames, self.coordinates = _Course(names), list(names)
-
-    def __len__(self):
-        return 1
 
 
 class LiveSession:
@@ -63,7 +38,7 @@ class LiveSession:
         self.fields = live_fields(scene) if fields is None else fields
         self.here = dict.fromkeys(self.limits, 0.0)
         self.target = dict(self.here)
-        self.models, self._rest, self._loop, self._course = [], [], None, None
+        self.models, self._rest, self._loop = [], [], None
 
     def use(self, models, rest=None):
         """Start these models from the rest pose; the target stays.
@@ -89,11 +64,7 @@ class LiveSession:
         self.close()
         for model, state in zip(self.models, self._rest):
             model.restore(state)
-        scene = copy.copy(self.scene)
-        scene.motion = _LiveMotion(list(self.limits))
-        self._course = scene.motion.frames
         self.here = dict.fromkeys(self.limits, 0.0)
-        self._loop = simulate_frames(scene, self.models, fields=self.fields, ahead=False)
 
     def set(self, name, angle):
         """Give a coordinate a new target [radian], kept within its limits."""
@@ -125,8 +96,9 @@ class LiveSession:
         farthest = max((abs(self.target[k] - self.here[k]) for k in self.target), default=0.0)
         share = 1.0 if farthest <= stride else stride / farthest
         step = {k: self.here[k] + share * (self.target[k] - self.here[k]) for k in self.target}
-        self._course.next = dict(self.target) if share == 1.0 else step
-        frame = next(self._loop)
+        if self._loop is None:
+            self._loop = FrameLoop(_wide_scene(self.scene), self.models, fields=self.fields)
+        frame = self._loop.advance(dict(self.target) if share == 1.0 else step)
         self.here = dict(frame.coordinates)
         return frame
 
@@ -168,10 +140,15 @@ def live_fields(scene):
     -------
     dict of str to BoneSDF
     """
+    return build_fields(scene, reached_bones(_wide_scene(scene)))
+
+
+def _wide_scene(scene):
+    """The scene with a motion that takes each coordinate to its limits: what muscles can meet by hand."""
     limits = coordinate_limits(scene)
     stops = [{}]
     for name, ends in limits.items():
         stops += [{name: angle} for low in ends for angle in np.linspace(0.0, low, 4)[1:]]
     wide = copy.copy(scene)
     wide.motion = Motion([dict.fromkeys(limits, 0.0) | stop for stop in stops])
-    return build_fields(scene, reached_bones(wide))
+    return wide

@@ -25,8 +25,8 @@ def rest_overlap(contacts, points):
     return overlap
 
 
-def settle_rest(lane, coordinates):
-    """Deal with overlap at rest as the scene's ``[contact] initial`` says; for lanes in their rest pose.
+def settle_rest(stepper):
+    """Deal with overlap at rest as the scene's ``[contact] initial`` says; for a muscle in its rest pose.
 
     ``"resolve"`` lets the bones grow from the muscle's surface to their true size while the model holds its
     shape and volume; the muscle gives way by the least that its own elasticity knows. ``"keep"`` measures
@@ -37,9 +37,9 @@ def settle_rest(lane, coordinates):
     SceneError
         With ``"error"``, naming muscle, bone and depth.
     """
-    contacts, scene = lane.contacts, lane.scene
+    contacts, scene = stepper.contacts, stepper.scene
     least = scene.length(DEPTH)
-    overlap = rest_overlap(contacts, lane.model.contact_points())
+    overlap = rest_overlap(contacts, stepper.model.contact_points())
     overlap = {b: depth for b, depth in overlap.items() if depth.max(initial=0.0) > least}
     if not overlap:
         return
@@ -47,28 +47,28 @@ def settle_rest(lane, coordinates):
         b = max(overlap, key=lambda key: overlap[key].max())
         count, depth = int((overlap[b] > least).sum()), overlap[b].max()
         raise SceneError(
-            f"muscle {lane.name!r} overlaps bone {contacts.names[b]!r} at rest: {count} points, "
+            f"muscle {stepper.name!r} overlaps bone {contacts.names[b]!r} at rest: {count} points, "
             f"{depth:.3g} {scene.units} deep; set [contact] initial to 'resolve' or 'keep'"
         )
     for b, depth in overlap.items():
         contacts.allow(b, depth)
         action = "overlap_kept" if scene.contact.initial == "keep" else "overlap_resolved"
-        lane.report(contacts.names[b], (depth > least).sum(), action)
+        stepper.report(contacts.names[b], (depth > least).sum(), action)
     if scene.contact.initial == "resolve":
-        _resolve(lane, coordinates, overlap)
+        _resolve(stepper, overlap)
 
 
-def _resolve(lane, coordinates, overlap):
-    contacts, model = lane.contacts, lane.model
+def _resolve(stepper, overlap):
+    contacts, model = stepper.contacts, stepper.model
     model.predict(contacts.poses, contacts.poses)
     deepest = max(float(depth.max()) for depth in overlap.values())
-    growths = max(1, math.ceil(deepest / lane.scene.length(GROWTH)))
-    settled = lane.scene.length(SETTLED)
+    growths = max(1, math.ceil(deepest / stepper.scene.length(GROWTH)))
+    settled = stepper.scene.length(SETTLED)
     for k in range(MOST_SOLVES + growths):
         for b, depth in overlap.items():
             contacts.allow(b, depth * max(0.0, 1.0 - (k + 1) / growths))
         before = model.contact_points().copy()
-        lane.solve(coordinates)
+        stepper.solve({})
         moved = np.linalg.norm(model.contact_points() - before, axis=1).max()
         if k + 1 >= growths and moved < settled:
             return

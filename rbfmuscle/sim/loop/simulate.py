@@ -1,161 +1,254 @@
-"""The frame loop: any muscle model against any bones, and what a model must offer to be run by it."""
+"""The frame loop: any muscle model against any bones."""
 
 import itertools
 import time
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass, field
-from typing import Any, Protocol
-
-import numba
-import numpy as np
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, wait
+from contextlib import contextmanager
 
 from rbfmuscle.sim.loop.contact import BoneContacts
-from rbfmuscle.sim.loop.lane import Event, Lane
+from rbfmuscle.sim.loop.frame import Event, FinishedDrawing, Frame, ModelSurface, MuscleModel
 from rbfmuscle.sim.loop.overlap import settle_rest
-from rbfmuscle.sim.plan.reach import Pace, build_fields, reached_bones
+from rbfmuscle.sim.loop.stepper import MuscleStepper, TimedDrawing
+from rbfmuscle.sim.loop.substeps import SubSteps
+from rbfmuscle.sim.loop.workers import Workers
+from rbfmuscle.sim.plan.reach import build_fields, reached_bones
 from rbfmuscle.sim.scene.motion import bone_poses
+from rbfmuscle.sim.scene.scene import Scene
 
-__all__ = ["Event", "Frame", "ModelSurface", "MuscleModel", "simulate_frames"]
-
-
-@dataclass(frozen=True)
-class ModelSurface:
-    """A closed, outward surface and what the model knows about it.
-
-    Attributes
-    ----------
-    vertices : (n, 3) ndarray
-    faces : (m, 3) ndarray of int
-    quantities : dict of str to float
-        For example ``solver_penetration_max``, ``condition``, ``time_fit``, ``time_extract``.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    quantities: dict = field(default_factory=dict)
+__all__ = [
+    "Event",
+    "FinishedDrawing",
+    "Frame",
+    "FrameLoop",
+    "ModelSurface",
+    "MuscleModel",
+    "run_ahead",
+    "simulate_frames",
+]
 
 
-@dataclass
-class Frame:
-    """One written frame.
+class FrameLoop:
+    """Brings muscles along with bones, one frame at a time, from the rest pose on.
 
-    Attributes
-    ----------
-    index : int
-        Place in the scene's motion.
-    coordinates : dict of str to float
-        [radian].
-    poses : dict of str to (4, 4) ndarray
-    surfaces : dict of str to ModelSurface
-        Empty where no surfaces were asked for.
-    carried : dict of str to (vertices, faces)
-        Material surfaces of constant topology.
-    events : list of Event
-        Since the frame written before.
-    times : dict of str to dict
-        For each muscle ``time_predict``, ``time_solve``, ... and their sum ``time_frame`` [s], since the
-        frame before.
-    wall : float
-        Time for all muscles together [s], since the frame before. Where the next frame is solved while this one
-        is drawn, both are in it; over a motion the sum is what counts.
-    fibres : dict of str to FibreLines
-        Empty where no fibres were asked for.
-    """
-
-    index: int
-    coordinates: dict
-    poses: dict
-    surfaces: dict
-    carried: dict
-    events: list
-    times: dict
-    wall: float
-    fibres: dict = field(default_factory=dict)
-
-
-class MuscleModel(Protocol):
-    """What the loop asks of a muscle.
-
-    Attributes
-    ----------
-    name : str
-        The muscle's name.
-    contact_bone : (n,) ndarray of int
-        Index of the bone that a contact point is attached to, -1 where it is free.
-    """
-
-    name: str
-    contact_bone: np.ndarray
-
-    def contact_points(self) -> np.ndarray:
-        """Points (n, 3) that contacts act on, now; number and order never change."""
-
-    def predict(self, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> None:
-        """Go along with the bones from one set of poses to the next."""
-
-    def solve(self, contacts: BoneContacts) -> None:
-        """Settle under the model's own constraints and these contacts."""
-
-    def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
-        """Move the contact points marked in a bool mask (n,) by a (4, 4) transform."""
-
-    def snapshot(self) -> Any:
-        """Everything that :meth:`restore` needs to go back to this moment."""
-
-    def restore(self, state: Any) -> None:
-        """Go back to a snapshot; it can be used again."""
-
-    def carried_mesh(self) -> tuple:
-        """Vertices and faces of a surface that moves with the material, of constant topology."""
-
-    def drawing(self, contacts: BoneContacts) -> Callable[[], ModelSurface]:
-        """What makes the surface of this moment, closed and outward; called once, while the model goes on."""
-
-
-class _Crew:
-    """Runs what can go side by side, each with one thread.
+    Whatever drives it asks for frames by `advance`: a run through the scene's motion, a window whose coordinates
+    are set by hand, a benchmark. What was returned stands, whatever the next frame comes to. Close it, or use it
+    in a ``with`` block: it holds threads.
 
     Parameters
     ----------
-    lanes : int
-    tasks : int
-        Things that are done at a time; more than lanes where one frame is drawn while the next is solved.
+    scene : Scene
+        Its motion is looked at only for which bones and neighbours a muscle can meet.
+    models : sequence of MuscleModel, or mapping of str to MuscleModel
+        In their rest state.
+    fields : mapping of str to BoneSDF, optional
+        Distance fields of the bones; built for the bones that muscles can reach where not given.
+    surfaces : bool
+        Whether frames carry surfaces; without, none is extracted.
+
+    Attributes
+    ----------
+    here : dict of str to float
+        Where the bones are [radian]; empty at rest, before the first frame.
+
+    Raises
+    ------
+    SceneError
+        If muscles overlap bones at rest and the scene's ``initial`` is ``"error"``.
+    SolveError
+        If an overlap at rest cannot be solved.
     """
 
-    def __init__(self, lanes, tasks):
-        from threadpoolctl import ThreadpoolController
+    def __init__(
+        self,
+        scene: Scene,
+        models: Sequence[MuscleModel] | Mapping[str, MuscleModel],
+        *,
+        fields: Mapping[str, object] | None = None,
+        surfaces: bool = True,
+    ) -> None:
+        models = list(models.values()) if isinstance(models, Mapping) else list(models)
+        self.scene, self.surfaces = scene, surfaces
+        self.steppers = [
+            MuscleStepper(model, contacts, scene)
+            for model, contacts in zip(models, _obstacles(scene, models, fields))
+        ]
+        self.here: dict[str, float] = {}
+        self._sub_steps, self._next_index, self._wall = SubSteps(scene), 0, 0.0
+        self.workers = Workers(len(self.steppers))
+        try:
+            with self.clocked(), self.workers.one_thread_each():
+                self.workers.each(settle_rest, self.steppers)
+                self._sliding = _sliding(scene, self.steppers)
+        except BaseException:
+            self.close()
+            raise
 
-        self.blas = ThreadpoolController()
-        threads = numba.get_num_threads()
-        workers = min(tasks, threads)
-        self.pool = None
-        if workers > 1:
-            # A muscle that is alone draws with every thread that its solver leaves free.
-            each = 1 if lanes > 1 else threads
-            self.pool = ThreadPoolExecutor(workers, initializer=numba.set_num_threads, initargs=(each,))
+    @property
+    def can_run_ahead(self) -> bool:
+        """Whether a frame may be solved while the one before is drawn: muscles that slide wait for each other."""
+        return self.surfaces and self._sliding is None and self.workers.threads > 1
 
-    def one_thread_each(self):
-        """Context in which BLAS uses one thread: its workers spin, and take the cores from the loops."""
-        return self.blas.limit(limits=1, user_api="blas")
+    def advance(self, coordinates: Mapping[str, float]) -> Frame:
+        """Go on to a frame and show it.
 
-    def all_threads(self):
-        """Context for work of large matrices: a muscle that is alone takes every thread."""
-        return self.blas.limit(limits=1 if self.pool else numba.get_num_threads(), user_api="blas")
+        Parameters
+        ----------
+        coordinates : mapping of str to float
+            Where the joints shall be [radian]; absent ones are at rest.
 
-    def each(self, act, items):
-        """``[act(item) for item in items]``, in parallel where that pays."""
-        if self.pool is None or len(items) < 2:
-            return [act(item) for item in items]
-        return list(self.pool.map(act, items))
+        Returns
+        -------
+        Frame
 
-    def close(self):
-        if self.pool is not None:
-            self.pool.shutdown(wait=True, cancel_futures=True)
+        Raises
+        ------
+        SolveError
+            If a muscle cannot be solved, naming muscle, frame and coordinates.
+        """
+        with self.clocked():
+            stops = self._path_to(coordinates)
+            if self.surfaces and self._sliding is None and self.workers.parallel:
+                # Nothing waits for another muscle: each goes all the way, and no thread idles in between.
+                with self.workers.one_thread_each():
+                    drawn = self.workers.each(lambda stepper: stepper.go(stops).draw(), self.steppers)
+            else:
+                with self.workers.one_thread_each():
+                    self._solve(stops)
+                    drawings = self._drawings() if self.surfaces else []
+                with self.workers.all_threads():
+                    drawn = self.workers.each(TimedDrawing.draw, drawings)
+            frame = self.collect()
+        return self.finish(frame, drawn)
+
+    def skip(self, coordinates: Mapping[str, float]) -> None:
+        """Go on to a frame and show nothing: its times and events are in the next frame that is shown."""
+        with self.clocked(), self.workers.one_thread_each():
+            self._solve(self._path_to(coordinates))
+
+    def start(self, coordinates: Mapping[str, float]) -> list[Future]:
+        """Set out for a frame: for each muscle what will be its `TimedDrawing`, for `run_ahead`."""
+        stops = self._path_to(coordinates)
+        return self.workers.start(lambda stepper: stepper.go(stops), self.steppers)
+
+    def collect(self) -> Frame:
+        """The frame where the muscles are now, without its surfaces."""
+        carried = {stepper.name: stepper.model.carried_mesh() for stepper in self.steppers}
+        times, events = {}, []
+        for stepper in self.steppers:
+            times[stepper.name], happened = stepper.collect()
+            events.extend(happened)
+        poses = bone_poses(self.scene, self.here)
+        return Frame(self._next_index - 1, dict(self.here), poses, {}, carried, events, times, 0.0)
+
+    def finish(self, frame: Frame, drawn: Iterable[tuple[ModelSurface, float]]) -> Frame:
+        """The frame with its surfaces, and the time since the one before."""
+        for name, (surface, seconds) in zip(frame.carried, drawn):
+            frame.surfaces[name] = surface
+            for key in ("time_surface", "time_frame"):
+                frame.times[name][key] += seconds
+        frame.wall, self._wall = self._wall, 0.0
+        return frame
+
+    @contextmanager
+    def clocked(self) -> Iterator[None]:
+        """Count the time spent inside to the frame that is finished next."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._wall += time.perf_counter() - start
+
+    def close(self) -> None:
+        """End the threads."""
+        self.workers.close()
+
+    def __enter__(self) -> "FrameLoop":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _path_to(self, coordinates: Mapping[str, float]) -> list[dict]:
+        """Coordinates of the sub-steps to the next frame, the first of which is where the muscles are."""
+        # At rest every coordinate is zero, whatever a motion chooses to move.
+        here = self.here or dict.fromkeys(coordinates, 0.0)
+        self.here = dict(coordinates)
+        for stepper in self.steppers:
+            stepper.frame = self._next_index
+        self._next_index += 1
+        return [here, *self._sub_steps.split(here, self.here)]
+
+    def _solve(self, stops: list[dict]) -> None:
+        """Bring all muscles through sub-steps; those that slide take each together."""
+        if self._sliding is None:
+            self.workers.each(lambda stepper: stepper.advance(stops), self.steppers)
+            return
+        for before, after in itertools.pairwise(stops):
+            self.workers.each(lambda stepper: self._begin(stepper, before, after), self.steppers)  # noqa: B023
+            self.workers.each(self._sliding.update, self.steppers)
+            self.workers.each(MuscleStepper.finish, self.steppers)
+
+    def _begin(self, stepper: MuscleStepper, before: dict, after: dict) -> None:
+        stepper.begin(before, after)
+        self._sliding.refresh(stepper)
+
+    def _drawings(self) -> list[TimedDrawing]:
+        """What draws all muscles as they are now."""
+        if self._sliding is not None:
+            self.workers.each(self._sliding.refresh, self.steppers)
+            for stepper, found in zip(self.steppers, self.workers.each(self._sliding.measure, self.steppers)):
+                stepper.measured = found
+        drawings = [stepper.drawing() for stepper in self.steppers]
+        if self._sliding is not None:
+            self.workers.each(self._sliding.show, drawings)
+        return drawings
+
+
+def run_ahead(
+    loop: FrameLoop, path: Iterable[Mapping[str, float]], written: Collection[int] | None = None
+) -> Iterator[Frame]:
+    """Drive a loop so that each frame is solved while the one before is drawn: no thread waits for another muscle.
+
+    Models are then a frame ahead of what was yielded.
+
+    Parameters
+    ----------
+    loop : FrameLoop
+        One that ``can_run_ahead``.
+    path : iterable of dict
+        Coordinates of the frames.
+    written : collection of int, optional
+        Places in the path of the frames to yield; all where not given.
+    """
+    loop.workers.widen(2 * len(loop.steppers))
+    frame, drawings = None, []
+    for place, coordinates in enumerate(path):
+        with loop.clocked(), loop.workers.one_thread_each():
+            going = loop.start(coordinates)
+            drawn = [done.result() for done in loop.workers.start(TimedDrawing.draw, drawings)]
+            wait(going)
+        if frame is not None:
+            yield loop.finish(frame, drawn)
+        frame, drawings = None, [done.result() for done in going]
+        if written is None or place in written:
+            frame = loop.collect()
+        else:
+            drawings = []
+    if frame is not None:
+        with loop.clocked(), loop.workers.one_thread_each():
+            drawn = [done.result() for done in loop.workers.start(TimedDrawing.draw, drawings)]
+        yield loop.finish(frame, drawn)
 
 
 def simulate_frames(
-    scene, models, *, surfaces=True, written=None, fields=None, ahead=True
+    scene: Scene,
+    models: Sequence[MuscleModel] | Mapping[str, MuscleModel],
+    *,
+    surfaces: bool = True,
+    written: Collection[int] | None = None,
+    fields: Mapping[str, object] | None = None,
+    ahead: bool = True,
 ) -> Iterator[Frame]:
     """Run models through a scene's motion, from the rest pose on, and yield its frames one by one.
 
@@ -164,17 +257,12 @@ def simulate_frames(
     Parameters
     ----------
     scene : Scene
-    models : list of MuscleModel, or dict of str to MuscleModel
-        In their rest state.
-    surfaces : bool
-        Whether frames carry surfaces; without, none is extracted.
+    models, surfaces, fields
+        As for `FrameLoop`.
     written : collection of int, optional
         Indices of the frames to yield; all where not given. The others are simulated and not shown.
-    fields : dict of str to BoneSDF, optional
-        Distance fields of the bones; built for the bones that muscles can reach where not given.
     ahead : bool
-        Solve a frame while the one before is drawn, where there are threads for both. Models are then a frame
-        ahead of what was yielded. Without, no frame is asked of the motion before it is wanted.
+        Solve a frame while the one before is drawn, where there are threads for both.
 
     Raises
     ------
@@ -183,16 +271,15 @@ def simulate_frames(
     SceneError
         If muscles overlap bones at rest and the scene's ``initial`` is ``"error"``.
     """
-    models = list(models.values()) if isinstance(models, Mapping) else list(models)
-    lanes = [
-        Lane(model, contacts, scene) for model, contacts in zip(models, _obstacles(scene, models, fields))
-    ]
-    ahead = ahead and surfaces and scene.sliding is None
-    crew = _Crew(len(lanes), 2 * len(lanes) if ahead else len(lanes))
-    try:
-        yield from _run(scene, lanes, crew, surfaces, written, ahead)
-    finally:
-        crew.close()
+    with FrameLoop(scene, models, fields=fields, surfaces=surfaces) as loop:
+        if ahead and loop.can_run_ahead:
+            yield from run_ahead(loop, scene.motion.frames, written)
+            return
+        for index, coordinates in enumerate(scene.motion.frames):
+            if written is None or index in written:
+                yield loop.advance(coordinates)
+            else:
+                loop.skip(coordinates)
 
 
 def _obstacles(scene, models, fields):
@@ -205,129 +292,10 @@ def _obstacles(scene, models, fields):
         yield BoneContacts(names, reached, contact_bone=model.contact_bone, margin=margin)
 
 
-def _run(scene, lanes, crew, surfaces, written, ahead):
-    here = dict.fromkeys(scene.motion.frames[0], 0.0) if scene.motion.frames else {}
-    start = time.perf_counter()
-    with crew.one_thread_each():
-        crew.each(lambda lane: settle_rest(lane, here), lanes)
-        sliding = _sliding(scene, lanes)
-    wall = time.perf_counter() - start
-    if ahead and crew.pool is not None:
-        yield from _run_ahead(scene, lanes, crew, written, here, wall)
-    else:
-        yield from _run_in_turn(scene, lanes, crew, sliding, surfaces, written, here, wall)
-
-
-def _run_ahead(scene, lanes, crew, written, here, wall):
-    """Each frame is solved while the one before is drawn, so that no thread waits for another muscle."""
-    pace, frame, draws = Pace(scene), None, []
-    for index, coordinates in enumerate(scene.motion.frames):
-        start = time.perf_counter()
-        show = written is None or index in written
-        stops = [here, *pace.split(here, coordinates)]
-        with crew.one_thread_each():
-            going = [crew.pool.submit(_go_alone, lane, index, stops, show) for lane in lanes]
-            skins = list(crew.pool.map(_call, draws if frame is not None else []))
-            wait(going)
-        wall += time.perf_counter() - start
-        if frame is not None:
-            yield _drawn(frame, skins, wall)
-            frame, wall = None, 0.0
-        draws = [done.result() for done in going]
-        frame = _frame(scene, lanes, index, coordinates) if show else None
-        here = coordinates
-    if frame is not None:
-        start = time.perf_counter()
-        with crew.one_thread_each():
-            skins = list(crew.pool.map(_call, draws))
-        yield _drawn(frame, skins, wall + time.perf_counter() - start)
-
-
-def _run_in_turn(scene, lanes, crew, sliding, surfaces, written, here, wall):
-    """Each frame is solved and drawn before the next one is looked at."""
-    pace = Pace(scene)
-    for index, coordinates in enumerate(scene.motion.frames):
-        start = time.perf_counter()
-        shown = written is None or index in written
-        stops = [here, *pace.split(here, coordinates)]
-        show = shown and surfaces
-        if show and sliding is None and crew.pool is not None:
-            # Nothing waits for another muscle: each goes all the way, and no thread idles in between.
-            with crew.one_thread_each():
-                skins = crew.each(lambda lane: _go_alone(lane, index, stops, True)(), lanes)  # noqa: B023
-        else:
-            with crew.one_thread_each():
-                draws = _go(lanes, crew, sliding, index, stops, show)
-            with crew.all_threads():
-                skins = crew.each(_call, draws)
-        frame = _frame(scene, lanes, index, coordinates) if shown else None
-        wall += time.perf_counter() - start
-        if frame is not None:
-            yield _drawn(frame, skins, wall)
-            wall = 0.0
-        here = coordinates
-
-
-def _sliding(scene, lanes):
+def _sliding(scene, steppers):
     """The links between muscles, or None where the scene asks for none."""
     if scene.sliding is None:
         return None
     from rbfmuscle.sim.loop.sliding import Sliding
 
-    return Sliding(scene, lanes)
-
-
-def _go_alone(lane, index, stops, show):
-    """Bring a lane to a frame; what draws it, where it is shown."""
-    lane.frame = index
-    lane.advance(stops)
-    return lane.drawing() if show else None
-
-
-def _go(lanes, crew, sliding, index, stops, show):
-    """Bring all lanes to a frame; what draws them, where it is shown."""
-    if sliding is None:
-        draws = crew.each(lambda lane: _go_alone(lane, index, stops, show), lanes)
-        return draws if show else []
-    for lane in lanes:
-        lane.frame = index
-    for before, after in itertools.pairwise(stops):
-        crew.each(lambda lane: _begin(lane, sliding, before, after), lanes)  # noqa: B023
-        crew.each(sliding.update, lanes)
-        crew.each(Lane.finish, lanes)
-    if not show:
-        return []
-    crew.each(sliding.refresh, lanes)
-    for lane, measured in zip(lanes, crew.each(sliding.measure, lanes)):
-        lane.measured = measured
-    crew.each(sliding.fit, lanes)
-    return [lane.drawing() for lane in lanes]
-
-
-def _begin(lane, sliding, before, after):
-    lane.begin(before, after)
-    sliding.refresh(lane)
-
-
-def _call(draw):
-    return draw()
-
-
-def _frame(scene, lanes, index, coordinates):
-    """The frame as it was solved; `_drawn` adds its surfaces."""
-    carried = {lane.name: lane.model.carried_mesh() for lane in lanes}
-    times, events = {}, []
-    for lane in lanes:
-        times[lane.name], happened = lane.collect()
-        events.extend(happened)
-    poses = bone_poses(scene, coordinates)
-    return Frame(index, dict(coordinates), poses, {}, carried, events, times, 0.0)
-
-
-def _drawn(frame, skins, wall):
-    for name, (surface, seconds) in zip(frame.carried, skins):
-        frame.surfaces[name] = surface
-        for key in ("time_surface", "time_frame"):
-            frame.times[name][key] += seconds
-    frame.wall = wall
-    return frame
+    return Sliding(scene, steppers)

@@ -11,7 +11,7 @@ does not depend on the order in which muscles are solved, nor on how many run at
 
 import numpy as np
 
-from rbfmuscle.sim.loop.skin import Skin
+from rbfmuscle.sim.loop.carried_surface import CarriedSurface
 from rbfmuscle.sim.plan.reach import sampled_poses, swept_region
 from rbfmuscle.validation import SceneError
 
@@ -51,17 +51,17 @@ class Link:
 
     Parameters
     ----------
-    lane : Lane
+    stepper : MuscleStepper
         The muscle that is held.
-    skin, other : Skin
+    own, other : CarriedSurface
         Its own surface and the neighbour's.
     limits : SlidingLimits
     """
 
-    def __init__(self, lane, skin, other, limits):
-        self.lane, self.skin, self.other, self.limits = lane, skin, other, limits
+    def __init__(self, stepper, own, other, limits):
+        self.stepper, self.own, self.other, self.limits = stepper, own, other, limits
         self.push, self.pull = Planes(), Planes()
-        self.free = lane.contacts.free(len(lane.model.contact_points()))
+        self.free = stepper.contacts.free(len(stepper.model.contact_points()))
         self.linked = np.zeros(len(self.free), dtype=bool)
         self.before = None
         self.zone = None
@@ -71,7 +71,7 @@ class Link:
     def update(self):
         """Planes from both muscles' predicted states."""
         limits = self.limits
-        points = self.lane.model.contact_points()
+        points = self.stepper.model.contact_points()
         index, distance, normal, nearest = self._near()
         far = np.ones(len(points), dtype=bool)
         far[index] = distance > limits.hold + limits.release
@@ -86,7 +86,7 @@ class Link:
 
     def measure(self):
         """Overlap, widest gap of linked points, and their slip over the neighbour since the last call."""
-        points = self.lane.model.contact_points()
+        points = self.stepper.model.contact_points()
         index, distance, normal, nearest = self._near()
         held = self.linked[index]
         close = distance < self.limits.cut_from
@@ -110,25 +110,25 @@ class Link:
             return value, gradient
         zone, depth = self.zone, self.limits.cut_depth
         inside = np.all((points > zone[0]) & (points < zone[1]), axis=1)
-        if self.skin.implicit is not None and self.other.implicit is not None:
+        if self.own.field is not None and self.other.field is not None:
             # What is shown is the zero set of the fields: where these are equal both are cut alike.
             (ours, own), (theirs, normal) = (
-                self.skin.implicit(points[inside]),
-                self.other.implicit(points[inside]),
+                self.own.field.value_and_gradient(points[inside]),
+                self.other.field.value_and_gradient(points[inside]),
             )
             value[inside], gradient[inside] = 0.5 * (theirs - ours), 0.5 * (normal - own)
             return value, gradient
         near, theirs, normal, _ = self.other.query(points, inside, depth)
         inside[:] = False
         inside[near] = True
-        both, ours, own, _ = self.skin.query(points, inside, depth)
+        both, ours, own, _ = self.own.query(points, inside, depth)
         match = np.searchsorted(near, both)
         value[both] = 0.5 * (theirs[match] - ours)
         gradient[both] = 0.5 * (normal[match] - own)
         return value, gradient
 
     def _near(self):
-        return self.other.query(self.lane.model.contact_points(), self.free, self.limits.search)
+        return self.other.query(self.stepper.model.contact_points(), self.free, self.limits.search)
 
     def _slip(self, points, index, normal, nearest):
         if self.before is None or len(index) == 0:
@@ -142,18 +142,18 @@ class Link:
 class BoneLink:
     """Points near a bone at rest, held near it in the same way; the bone's own contact keeps them out."""
 
-    def __init__(self, lane, bone_index, limits):
-        self.lane, self.bone, self.limits = lane, bone_index, limits
-        points = lane.model.contact_points()
-        distance, _ = lane.contacts.distance_and_direction(points, bone_index)
-        self.linked = lane.contacts.free(len(points)) & (distance < limits.threshold)
+    def __init__(self, stepper, bone_index, limits):
+        self.stepper, self.bone, self.limits = stepper, bone_index, limits
+        points = stepper.model.contact_points()
+        distance, _ = stepper.contacts.distance_and_direction(points, bone_index)
+        self.linked = stepper.contacts.free(len(points)) & (distance < limits.threshold)
         self.pull = Planes()
 
     def update(self):
         """Planes from the predicted state."""
-        limits, points = self.limits, self.lane.model.contact_points()
+        limits, points = self.limits, self.stepper.model.contact_points()
         index = np.flatnonzero(self.linked)
-        distance, normal = self.lane.contacts.distance_and_direction(points[index], self.bone)
+        distance, normal = self.stepper.contacts.distance_and_direction(points[index], self.bone)
         held = distance <= limits.hold + limits.release
         self.linked[index[~held]] = False
         index, distance, normal = index[held], distance[held], normal[held]
@@ -182,7 +182,7 @@ class Sliding:
     ----------
     scene : Scene
         With ``sliding`` options.
-    lanes : list of Lane
+    steppers : list of MuscleStepper
         In their rest state.
 
     Raises
@@ -191,50 +191,53 @@ class Sliding:
         If ``pairs`` names an unknown muscle.
     """
 
-    def __init__(self, scene, lanes):
+    def __init__(self, scene, steppers):
         options = scene.sliding
         limits = SlidingLimits(options, scene)
-        self.links = {lane.name: [] for lane in lanes}
-        self.bone_links = {lane.name: [] for lane in lanes}
-        pairs = _pairs(scene, [lane.name for lane in lanes], limits.search)
+        self.links = {stepper.name: [] for stepper in steppers}
+        self.bone_links = {stepper.name: [] for stepper in steppers}
+        pairs = _pairs(scene, [stepper.name for stepper in steppers], limits.search)
         reach = max(limits.search, limits.cut_depth)
-        self.skins = {
-            lane.name: Skin(lane.model, reach) for lane in lanes if any(lane.name in p for p in pairs)
+        self.surfaces = {
+            stepper.name: CarriedSurface(stepper.model, reach)
+            for stepper in steppers
+            if any(stepper.name in pair for pair in pairs)
         }
-        for lane in lanes:
-            for other in lanes:
-                if frozenset((lane.name, other.name)) in pairs:
-                    link = Link(lane, self.skins[lane.name], self.skins[other.name], limits)
-                    self.links[lane.name].append(link)
-                    lane.contacts.neighbours += [link.push, link.pull]
-                    lane.contacts.cuts.append(link)
+        for stepper in steppers:
+            for other in steppers:
+                if frozenset((stepper.name, other.name)) in pairs:
+                    link = Link(stepper, self.surfaces[stepper.name], self.surfaces[other.name], limits)
+                    self.links[stepper.name].append(link)
+                    stepper.contacts.neighbours += [link.push, link.pull]
+                    stepper.contacts.cuts.append(link)
             if options.bones:
-                held = [BoneLink(lane, b, limits) for b in lane.contacts.reached]
-                self.bone_links[lane.name] = held
-                lane.contacts.neighbours += [link.pull for link in held]
+                held = [BoneLink(stepper, b, limits) for b in stepper.contacts.reached]
+                self.bone_links[stepper.name] = held
+                stepper.contacts.neighbours += [link.pull for link in held]
 
-    def refresh(self, lane):
+    def refresh(self, stepper):
         """Take over a muscle's surface as it is now."""
-        if lane.name in self.skins:
-            with lane.timed("sliding"):
-                self.skins[lane.name].refresh()
+        if stepper.name in self.surfaces:
+            with stepper.timed("sliding"):
+                self.surfaces[stepper.name].refresh()
 
-    def fit(self, lane):
-        """Take over the field that a muscle will be shown by, where it has one."""
-        if self.links[lane.name] and hasattr(lane.model, "implicit"):
-            with lane.timed("surface"):
-                self.skins[lane.name].implicit = lane.model.implicit()
+    def show(self, drawing):
+        """Take over the field that a muscle will be shown by, where it has one; its drawing comes afterwards."""
+        stepper = drawing.stepper
+        if self.links[stepper.name]:
+            with stepper.timed("surface"):
+                self.surfaces[stepper.name].field = drawing.drawing.field()
 
-    def update(self, lane):
-        """New planes for one muscle; its neighbours' skins have been refreshed."""
-        with lane.timed("sliding"):
-            for link in [*self.links[lane.name], *self.bone_links[lane.name]]:
+    def update(self, stepper):
+        """New planes for one muscle; its neighbours' surfaces have been refreshed."""
+        with stepper.timed("sliding"):
+            for link in [*self.links[stepper.name], *self.bone_links[stepper.name]]:
                 link.update()
 
-    def measure(self, lane):
+    def measure(self, stepper):
         """Worst of what a muscle's links say: a dict of quantities, empty without neighbours."""
-        with lane.timed("sliding"):
-            found = [link.measure() for link in self.links[lane.name]]
+        with stepper.timed("sliding"):
+            found = [link.measure() for link in self.links[stepper.name]]
         return {key: max(one[key] for one in found) for key in found[0]} if found else {}
 
 

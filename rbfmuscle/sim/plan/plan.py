@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from rbfmuscle.sim.plan.reach import Pace, reached_bones, sampled_poses, union_of
+from rbfmuscle.sim.loop.substeps import SubSteps
+from rbfmuscle.sim.plan.reach import reached_bones, sampled_poses, union_of
 
 
 def plan_scene(scene, estimate=None):
@@ -106,8 +107,8 @@ def _fields(scene, regions):
 
 def _substeps(scene):
     """Steps of the solver over the motion, from rest; tunnelling may halve some further."""
-    pace, before, count = Pace(scene), {}, 0
+    sub_steps, before, count = SubSteps(scene), {}, 0
     for after in scene.motion.frames:
-        count += len(pace.split(before, after))
+        count += len(sub_steps.split(before, after))
         before = after
     return count

@@ -1,4 +1,4 @@
-"""What a motion can bring together: swept boxes, the fields worth building, the sub-steps needed."""
+"""What a motion can bring together: swept boxes, and the fields worth building."""
 
 import itertools
 import math
@@ -7,17 +7,15 @@ from concurrent.futures import ThreadPoolExecutor
 import numba
 import numpy as np
 
-from rbfmuscle.geometry.rest_frame import RestFrame, diameter
 from rbfmuscle.sim.distance.detectors import build_detector
 from rbfmuscle.sim.loop.contact import moved_box
+from rbfmuscle.sim.loop.substeps import largest_change
 from rbfmuscle.sim.scene.motion import bone_poses, interpolate
 
 # Poses of a motion that a swept box is made of; arcs between them are covered by the padding.
 SAMPLED_POSES = 48
 # Padding of a swept box, as a share of the muscle's diagonal, as a muscle bulges beyond its bones' motions.
 PADDING = 0.1
-# No attached point moves farther against a bone in one sub-step than this share of its muscle's diameter.
-TRAVEL = 1.0 / 27.0
 
 
 def swept_region(muscle, bone_name, poses):
@@ -48,7 +46,7 @@ def sampled_poses(scene):
     stops = [{}, *(frames[k] for k in chosen)]
     poses = [bone_poses(scene, {})]
     for before, after in itertools.pairwise(stops):
-        count = max(1, math.ceil(_largest_change(before, after) / math.radians(10.0)))
+        count = max(1, math.ceil(largest_change(before, after) / math.radians(10.0)))
         poses.extend(bone_poses(scene, interpolate(before, after, (k + 1) / count)) for k in range(count))
     return poses
 
@@ -71,8 +69,7 @@ def build_fields(scene, regions):
 
     The scene's ``[contact] detector`` says of which kind; only the default is built for the reached part alone.
     """
-    kind = getattr(scene.contact, "detector", "sdf")
-    tolerance = getattr(scene.contact, "tolerance", None)
+    kind, tolerance = scene.contact.detector, scene.contact.tolerance
 
     def build(bone):
         if kind != "sdf":
@@ -88,112 +85,6 @@ def build_fields(scene, regions):
         return dict(zip([bone.name for bone in bones], pool.map(build, bones)))
 
 
-class Pace:
-    """How a scene's motion is cut into sub-steps.
-
-    No bone turns by more than the scene's ``substep_angle`` in one, and no attached point moves far against a
-    bone. Where one coordinate moves alone, sub-steps end at multiples of that angle, however the frames are
-    spaced: a muscle that can settle in several ways then comes to a pose by the same path.
-
-    Parameters
-    ----------
-    scene : Scene
-    """
-
-    def __init__(self, scene):
-        self.scene = scene
-        self.limit = math.radians(scene.contact.substep_angle)
-        names = [bone.name for bone in scene.bones]
-        owner, corners, size = [], [], []
-        for muscle in scene.muscles:
-            vertices = np.asarray(muscle.mesh.vertices)
-            frame = RestFrame(vertices)
-            for attachment in muscle.attachments:
-                owner.append(names.index(attachment.bone))
-                corners.append(frame.points(_corners(frame.local[attachment.vertices])))
-                size.append(diameter(vertices))
-        # Of each attachment: its bone, a box about it, and how far that may move in one sub-step.
-        self._owner, self._travel = np.array(owner, dtype=int), TRAVEL * np.array(size)
-        self._corners = np.array(corners).reshape(-1, 8, 3)
-
-    def split(self, before, after):
-        """Coordinates of the sub-steps from one frame to the next, ``before`` left out and ``after`` last.
-
-        Returns
-        -------
-        list of dict
-            Empty where nothing moves.
-        """
-        moving = [k for k in {*before, *after} if before.get(k, 0.0) != after.get(k, 0.0)]
-        if not moving:
-            return []
-        if len(moving) == 1:
-            return [*self._stops_on_grid(before, after, moving[0]), dict(after)]
-        return self._even_stops(before, after)
-
-    def _even_stops(self, before, after):
-        """The fewest equal sub-steps that are short enough."""
-        count = max(1, math.ceil(_largest_change(before, after) / self.limit - 1e-9))
-        while True:
-            stops = [interpolate(before, after, k / count) for k in range(count + 1)]
-            poses = [self._matrices(stop) for stop in stops]
-            excess = max(self._excess(a, b) for a, b in itertools.pairwise(poses))
-            if excess <= 1.0 + 1e-9:
-                return stops[1:]
-            count = max(count + 1, math.ceil(count * min(excess, 4.0)))
-
-    def _stops_on_grid(self, before, after, name):
-        """Stops strictly between two values of the coordinate ``name``, in order."""
-        start, end = before.get(name, 0.0), after.get(name, 0.0)
-        low, high = min(start, end), max(start, end)
-        found = []
-        for cell in range(math.floor(low / self.limit + 1e-9), math.ceil(high / self.limit - 1e-9)):
-            # The whole cell decides how it is split, also where the path takes only a part of it.
-            ends = [{**before, name: self.limit * (cell + k)} for k in range(2)]
-            found.append(ends[0][name])
-            found += [stop[name] for stop in self._even_stops(*ends)]
-        margin = 1e-6 * self.limit
-        inner = []
-        for value in sorted(found):
-            # Ends of neighbouring cells may differ by rounding.
-            if (inner[-1] if inner else low) + margin < value < high - margin:
-                inner.append(value)
-        return [{**before, name: value} for value in (inner if end > start else inner[::-1])]
-
-    def _matrices(self, coordinates):
-        poses = bone_poses(self.scene, coordinates)
-        return np.array([poses[bone.name] for bone in self.scene.bones])
-
-    def _excess(self, old, new):
-        """How far a step between poses (b, 4, 4) goes beyond what one sub-step may do: 1 is just allowed."""
-        turns = new[:, :3, :3] @ old[:, :3, :3].transpose(0, 2, 1)
-        excess = max(turned_angle(turn) for turn in turns) / self.limit
-        # How the bones that carry the corners move, seen from every bone.
-        change = (
-            np.linalg.inv(new)[:, None] @ new[self._owner] - np.linalg.inv(old)[:, None] @ old[self._owner]
-        )
-        moved = np.einsum("bkij,kcj->bkci", change[..., :3, :3], self._corners) + change[..., None, :3, 3]
-        length = np.sqrt((moved**2).sum(axis=-1)).max(axis=(0, 2))
-        return max(excess, float((length / self._travel).max(initial=0.0)))
-
-
-def _largest_change(before, after):
-    return max((abs(after.get(k, 0.0) - before.get(k, 0.0)) for k in {*before, *after}), default=0.0)
-
-
-def turned_angle(rotation):
-    """Angle of a (3, 3) rotation [radian], accurate for small ones too."""
-    skew = np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
-    return math.atan2(float(np.linalg.norm(skew)), float(np.trace(rotation)) - 1.0)
-
-
 def union_of(boxes):
     """Least box (2, 3) that holds all boxes."""
     return np.array([np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)])
-
-
-def _corners(points):
-    low, high = np.min(points, axis=0), np.max(points, axis=0)
-    return np.array([[(low, high)[k >> a & 1][a] for a in range(3)] for k in range(8)])

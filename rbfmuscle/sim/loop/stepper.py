@@ -1,4 +1,4 @@
-"""One muscle on its way through the motion: its model, its obstacles, its clock and its events."""
+"""One muscle on its way through sub-steps: its model, its obstacles, its clock and its events."""
 
 import itertools
 import math
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rbfmuscle.sim.loop.frame import Drawing, Event, ModelSurface
 from rbfmuscle.sim.loop.tunnelling import find_crossings, turn_back
 from rbfmuscle.sim.scene.motion import bone_poses, interpolate
 from rbfmuscle.validation import SolveError
@@ -17,23 +18,29 @@ TOUCH = 0.1
 
 
 @dataclass(frozen=True)
-class Event:
-    """Something a user should know of: ``count`` points of a muscle at a bone, and what was done.
+class TimedDrawing:
+    """A muscle's drawing with what was measured beside it.
 
-    ``action`` is ``"angle_flag"`` (the angle test spoke), ``"reported"`` (crossed, nothing done),
-    ``"rotated"``, ``"halved"`` (the step was), ``"unresolved"`` (crossed, and no correction helped),
-    ``"overlap_kept"`` or ``"overlap_resolved"`` (at rest, before the first frame), or, with no muscle,
-    ``"bones_overlap"`` (the motion drives two bones into each other).
+    Attributes
+    ----------
+    stepper : MuscleStepper
+    drawing : Drawing
+    measured : dict of str to float
     """
 
-    frame: int
-    muscle: str
-    bone: str
-    count: int
-    action: str
+    stepper: "MuscleStepper"
+    drawing: Drawing
+    measured: dict
+
+    def draw(self) -> tuple[ModelSurface, float]:
+        """The surface with what was measured, and the time that it took [s]; from any thread, once."""
+        start = time.perf_counter()
+        surface = self.drawing.surface()
+        surface.quantities.update(self.measured)
+        return surface, time.perf_counter() - start
 
 
-class Lane:
+class MuscleStepper:
     """Drives one model through sub-steps.
 
     Parameters
@@ -112,24 +119,15 @@ class Lane:
                 "try a smaller substep_angle in [contact]"
             )
 
-    def drawing(self):
-        """What makes the model's surface of this moment; called once, from any thread, while the lane goes on.
+    def go(self, stops: list[dict]) -> TimedDrawing:
+        """Go through sub-steps; what draws the muscle there."""
+        self.advance(stops)
+        return self.drawing()
 
-        Returns
-        -------
-        callable
-            Gives the ModelSurface, with what was measured beside it, and the time that it took [s].
-        """
+    def drawing(self) -> TimedDrawing:
+        """What draws the muscle as it is now, while it goes on."""
         with self.timed("surface"):
-            draw, measured = self.model.drawing(self.contacts), self.measured
-
-        def timed():
-            start = time.perf_counter()
-            surface = draw()
-            surface.quantities.update(measured)
-            return surface, time.perf_counter() - start
-
-        return timed
+            return TimedDrawing(self, self.model.drawing(self.contacts), self.measured)
 
     def report(self, bone, count, action):
         """Note an event of the present frame; of one kind the most points at one time are kept."""

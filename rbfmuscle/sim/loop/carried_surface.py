@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 from rbfmuscle.compiled.loop import compiled
 
 
-class Skin:
+class CarriedSurface:
     """Signed distance to a model's carried mesh, for points near it.
 
     The nearest vertex is found through a uniform grid of cells as wide as the reach; the nearest point of the
@@ -26,12 +26,12 @@ class Skin:
     fixed : (n,) ndarray of bool
         Vertices that a bone holds.
     box : (2, 3) ndarray
-    implicit : callable or None
-        ``points -> (values, gradients)`` of the field whose zero set is shown, for models that have one.
+    field : Field or None
+        The field whose zero set is shown, for models that have one.
     """
 
     def __init__(self, model, reach):
-        self.model, self.implicit = model, None
+        self.model, self.field = model, None
         vertices, faces = model.carried_mesh()
         self.faces = np.ascontiguousarray(faces, dtype=np.int64)
         corner = self.faces.ravel()

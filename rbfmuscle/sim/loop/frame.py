@@ -1,0 +1,145 @@
+"""What a frame of a motion holds, and what a muscle must offer to be brought through one."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from rbfmuscle.geometry.fields import Field
+from rbfmuscle.sim.loop.contact import BoneContacts
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something a user should know of: ``count`` points of a muscle at a bone, and what was done.
+
+    ``action`` is ``"angle_flag"`` (the angle test spoke), ``"reported"`` (crossed, nothing done),
+    ``"rotated"``, ``"halved"`` (the step was), ``"unresolved"`` (crossed, and no correction helped),
+    ``"overlap_kept"`` or ``"overlap_resolved"`` (at rest, before the first frame), or, with no muscle,
+    ``"bones_overlap"`` (the motion drives two bones into each other).
+    """
+
+    frame: int
+    muscle: str
+    bone: str
+    count: int
+    action: str
+
+
+@dataclass(frozen=True)
+class ModelSurface:
+    """A closed, outward surface and what the model knows about it.
+
+    Attributes
+    ----------
+    vertices : (n, 3) ndarray
+    faces : (m, 3) ndarray of int
+    quantities : dict of str to float
+        For example ``solver_penetration_max``, ``condition``, ``time_fit``, ``time_extract``.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    quantities: dict = field(default_factory=dict)
+
+
+@dataclass
+class Frame:
+    """One written frame.
+
+    Attributes
+    ----------
+    index : int
+        Place in the scene's motion.
+    coordinates : dict of str to float
+        [radian].
+    poses : dict of str to (4, 4) ndarray
+    surfaces : dict of str to ModelSurface
+        Empty where no surfaces were asked for.
+    carried : dict of str to (vertices, faces)
+        Material surfaces of constant topology.
+    events : list of Event
+        Since the frame written before.
+    times : dict of str to dict
+        For each muscle ``time_predict``, ``time_solve``, ... and their sum ``time_frame`` [s], since the
+        frame before.
+    wall : float
+        Time for all muscles together [s], since the frame before. Where the next frame is solved while this one
+        is drawn, both are in it; over a motion the sum is what counts.
+    fibres : dict of str to FibreLines
+        Empty where no fibres were asked for.
+    """
+
+    index: int
+    coordinates: dict
+    poses: dict
+    surfaces: dict
+    carried: dict
+    events: list
+    times: dict
+    wall: float
+    fibres: dict = field(default_factory=dict)
+
+
+class Drawing(Protocol):
+    """A model as it was at one moment, ready to be drawn while the model goes on."""
+
+    def field(self) -> Field | None:
+        """The field whose zero set will be shown, None for a model that has none."""
+
+    def surface(self) -> ModelSurface:
+        """The surface, closed and outward; asked for once."""
+
+
+@dataclass(frozen=True)
+class FinishedDrawing:
+    """The drawing of a model that has its surface at hand, and no field."""
+
+    finished: ModelSurface
+
+    def field(self) -> None:
+        """None: there is no field."""
+
+    def surface(self) -> ModelSurface:
+        """The surface."""
+        return self.finished
+
+
+class MuscleModel(Protocol):
+    """What the loop asks of a muscle.
+
+    Attributes
+    ----------
+    name : str
+        The muscle's name.
+    contact_bone : (n,) ndarray of int
+        Index of the bone that a contact point is attached to, -1 where it is free.
+    """
+
+    name: str
+    contact_bone: np.ndarray
+
+    def contact_points(self) -> np.ndarray:
+        """Points (n, 3) that contacts act on, now; number and order never change."""
+
+    def predict(self, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> None:
+        """Go along with the bones from one set of poses to the next."""
+
+    def solve(self, contacts: BoneContacts) -> None:
+        """Settle under the model's own constraints and these contacts."""
+
+    def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
+        """Move the contact points marked in a bool mask (n,) by a (4, 4) transform."""
+
+    def snapshot(self) -> Any:
+        """Everything that :meth:`restore` needs to go back to this moment."""
+
+    def restore(self, state: Any) -> None:
+        """Go back to a snapshot; it can be used again."""
+
+    def carried_mesh(self) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices and faces of a surface that moves with the material, of constant topology."""
+
+    def drawing(self, contacts: BoneContacts) -> Drawing:
+        """The model as it is now, for its surface."""

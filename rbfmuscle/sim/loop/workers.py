@@ -1,0 +1,70 @@
+"""Threads for what can go side by side."""
+
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
+from typing import Any
+
+import numba
+
+
+class Workers:
+    """Runs what can go side by side, each with one thread.
+
+    Parameters
+    ----------
+    muscles : int
+
+    Attributes
+    ----------
+    threads : int
+        How many there are for all.
+    """
+
+    def __init__(self, muscles: int) -> None:
+        from threadpoolctl import ThreadpoolController
+
+        self._blas = ThreadpoolController()
+        self._muscles, self.threads = muscles, numba.get_num_threads()
+        self._pool: ThreadPoolExecutor | None = None
+        self.widen(muscles)
+
+    @property
+    def parallel(self) -> bool:
+        """Whether there is more than one thread."""
+        return self._pool is not None
+
+    def widen(self, tasks: int) -> None:
+        """Be ready for so many things at a time: more than muscles where a frame is drawn beside the next."""
+        workers = min(tasks, self.threads)
+        if workers < 2:
+            return
+        self.close()
+        # A muscle that is alone draws with every thread that its solver leaves free.
+        each = 1 if self._muscles > 1 else self.threads
+        self._pool = ThreadPoolExecutor(workers, initializer=numba.set_num_threads, initargs=(each,))
+
+    def one_thread_each(self) -> AbstractContextManager:
+        """Context in which BLAS uses one thread: its workers spin, and take the cores from the loops."""
+        return self._blas.limit(limits=1, user_api="blas")
+
+    def all_threads(self) -> AbstractContextManager:
+        """Context for work of large matrices: a muscle that is alone takes every thread."""
+        return self._blas.limit(limits=1 if self.parallel else self.threads, user_api="blas")
+
+    def start(self, act: Callable[[Any], Any], items: Iterable[Any]) -> list[Future]:
+        """Begin ``act(item)`` for every item; needs more than one thread."""
+        if self._pool is None:
+            raise RuntimeError("there is one thread only: nothing can be started beside it")
+        return [self._pool.submit(act, item) for item in items]
+
+    def each(self, act: Callable[[Any], Any], items: Sequence[Any]) -> list:
+        """``[act(item) for item in items]``, in parallel where that pays."""
+        if self._pool is None or len(items) < 2:
+            return [act(item) for item in items]
+        return list(self._pool.map(act, items))
+
+    def close(self) -> None:
+        """End the threads, without what waits for one."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
