@@ -14,6 +14,7 @@ from PIL import Image
 import rbfmuscle.study.show.render as render
 from rbfmuscle.run import simulate, stream_run
 from rbfmuscle.study.files.saved import SavedRun
+from rbfmuscle.study.measure.summary import within
 from rbfmuscle.study.show.plots import motion_axis, plot_panels
 from rbfmuscle.study.show.report import write_report
 from rbfmuscle.validation import MissingPartError, UsageError
@@ -73,7 +74,8 @@ def test_red_cells_are_those_beyond_their_limits(folder):
     beyond = [
         name
         for name, limit in info["limits"].items()
-        if name in info["muscles"]["biceps"] and abs(info["muscles"]["biceps"][name]["worst"]) > limit
+        if name in info["muscles"]["biceps"]
+        and not within(name, info["muscles"]["biceps"][name]["worst"], limit)
     ]
     assert beyond
     assert text.count('<td class="bad">') == len(beyond)

@@ -20,7 +20,7 @@ class Measure(NamedTuple):
     """A row of the table.
 
     ``against`` says what a value is an error of or against; a value is better the smaller its magnitude, and
-    differences of less than ``floor`` (millimetres for lengths) do not count.
+    differences of less than ``floor`` (millimetres for lengths) do not count. ``ideal`` is the perfect value.
     """
 
     title: str
@@ -28,6 +28,7 @@ class Measure(NamedTuple):
     against: str
     floor: float
     meaning: str
+    ideal: float = 0.0
 
 
 MEASURES = {
@@ -46,6 +47,16 @@ MEASURES = {
         "deepest point of the model, before bones are cut away",
     ),
     "components": Measure("pieces", "1", LAW, 0.0, "connected pieces of the surface, most in any frame"),
+    "euler": Measure(
+        "Euler characteristic", "1", LAW, 0.0, "2 for a sphere, two less for a handle; worst frame", 2.0
+    ),
+    "self_crossing": Measure(
+        "self-crossing", "1", LAW, 0.0, "triangles that cross others of the surface, worst frame"
+    ),
+    "flicker_rms": Measure(
+        "flicker (RMS)", "length", LAW, 0.01, "surface against carried mesh, frame to frame"
+    ),
+    "flicker_max": Measure("flicker (greatest)", "length", LAW, 0.05, "the same, greatest"),
     "tunnelled": Measure("tunnelled points", "1", LAW, 0.0, "points beyond a bone, worst frame"),
     "return_rms": Measure(
         "return error (RMS)", "length", LAW, 0.02, "first pose before and after the motion there and back"
@@ -188,7 +199,11 @@ def _over_muscles(quantity, muscles):
     values = [values[quantity] for values in muscles if values.get(quantity) is not None]
     if not values:
         return None
-    return float(sum(values)) if quantity in _SUMMED else float(max(values, key=abs))
+    return (
+        float(sum(values))
+        if quantity in _SUMMED
+        else float(max(values, key=lambda v: abs(v - MEASURES[quantity].ideal)))
+    )
 
 
 def add_distances(results, folder, poses):
@@ -291,7 +306,11 @@ def measure_unit(kind, units):
 def best_models(results, quantity, units):
     """Models that are as good as the best in a measure: within 5 %, or within what does not count."""
     measure = MEASURES[quantity]
-    values = {name: abs(found[ALL][quantity]) for name, found in results.items() if quantity in found[ALL]}
+    values = {
+        name: abs(found[ALL][quantity] - measure.ideal)
+        for name, found in results.items()
+        if quantity in found[ALL]
+    }
     if measure.against == FIRST or len(values) < 2:
         return []
     scale = {"mm": 1.0, "cm": 0.1, "m": 0.001}[units] if measure.kind == "length" else 1.0

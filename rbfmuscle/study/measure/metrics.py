@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from rbfmuscle.study.measure.centreline import Centreline
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.measure.penetration import BoneProbe, bone_depth, surface_depth
+from rbfmuscle.study.measure.topology import euler_characteristic, self_crossing
 
 # Quantity: kind of unit (volume and length follow the scene's unit), meaning; in the order of the tables.
 QUANTITIES = {
@@ -21,6 +22,14 @@ QUANTITIES = {
     "bone_penetration_max": ("length", "deepest bone vertex inside the muscle"),
     "solver_penetration_max": ("length", "deepest point inside a bone before the bone is cut away"),
     "components": ("1", "closed pieces of the surface"),
+    "euler": ("1", "Euler characteristic of the surface: 2 for a sphere, two less for each handle"),
+    "self_crossing": ("1", "triangles of the surface that cross others of it"),
+    "self_crossing_area": ("1", "their share of the surface's area"),
+    "flicker_rms": (
+        "length",
+        "change, since the frame before, of the way from the carried mesh to the surface",
+    ),
+    "flicker_max": ("length", "the same, greatest"),
     "tunnelled": ("1", "points that passed through a bone and were not brought back"),
     "rest_error_rms": ("length", "distance between extracted surface and input mesh at rest, both ways"),
     "rest_error_max": ("length", "the same, greatest (Hausdorff)"),
@@ -156,6 +165,7 @@ class _Tracker:
         self.line = Centreline(muscle, scene.joints, vertices, faces) if has_line else None
         self.length = math.nan
         self.rest_measured = False
+        self.offset = None
 
     def length_of(self, frame):
         if self.line is None:
@@ -196,11 +206,21 @@ class _Tracker:
             "penetration_fraction": np.mean(depth > 0.0),
             "bone_penetration_max": bone_depth(vertices, faces, probes, frame.poses),
             "components": count_components(len(vertices), faces),
+            "euler": euler_characteristic(faces),
         }
+        found["self_crossing"], found["self_crossing_area"] = self_crossing(vertices, faces)
+        found["flicker_rms"], found["flicker_max"] = self._flicker(surface, frame.carried[self.name][0])
         if first_rest:
             rms, worst = surface_distance(vertices, faces, self.mesh.vertices, self.mesh.faces)
             found.update(rest_error_rms=rms, rest_error_max=worst)
         return found
+
+    def _flicker(self, surface, carried):
+        """Change of the signed distances of the carried mesh's vertices to the surface since the last frame."""
+        before = self.offset
+        self.offset = MeshDistance(surface.vertices, surface.faces).signed(carried)
+        change = self.offset - before if before is not None else np.zeros(1)
+        return float(np.sqrt(np.mean(change**2))), float(np.abs(change).max())
 
 
 def unit_text(kind, units):

@@ -16,9 +16,16 @@ LIMITS = {
     "bone_penetration_max": 0.5,
     "solver_penetration_max": 3.0,
     "components": 1.0,
+    "euler": 2.0,
+    "self_crossing": 0.0,
+    "flicker_rms": 0.1,
+    "flicker_max": 0.5,
     "tunnelled": 0.0,
     "rest_error_rms": 0.6,
 }
+
+# Quantities of which too little is wrong: their limit is the least allowed value.
+LEAST = {"euler"}
 
 
 class Summary:
@@ -40,7 +47,8 @@ class Summary:
     def table(self):
         """Nested dict: muscle -> quantity -> unit, count, min, max, mean, median, last, worst and its frame.
 
-        ``worst`` is the value of greatest magnitude. A moment arm is named with its coordinate.
+        ``worst`` is the value of greatest magnitude, or the least where that is what is limited (`LEAST`). A moment
+        arm is named with its coordinate.
         """
         return {
             muscle: {quantity: self._facts(quantity, found) for quantity, found in quantities.items()}
@@ -53,7 +61,8 @@ class Summary:
         finite = values[np.isfinite(values)]
         facts = {"unit": self._units[quantity], "count": len(values), "last": float(values[-1])}
         if len(finite):
-            worst = int(np.nanargmax(np.abs(np.where(np.isfinite(values), values, np.nan))))
+            sound = np.where(np.isfinite(values), values, np.nan)
+            worst = int(np.nanargmin(sound) if quantity in LEAST else np.nanargmax(np.abs(sound)))
             facts |= {
                 "min": float(finite.min()),
                 "max": float(finite.max()),
@@ -110,6 +119,11 @@ def default_limit(quantity, scene):
     return scene.length(LIMITS[quantity]) if is_length else LIMITS[quantity]
 
 
+def within(quantity: str, worst: float, limit: float) -> bool:
+    """Whether a worst value keeps to a limit, which is the least allowed value for those in `LEAST`; NaN does not."""
+    return worst >= limit if quantity in LEAST else abs(worst) <= limit
+
+
 def exceeded(table, limits):
     """List of (muscle, quantity, worst value, limit, frame) beyond the limits; NaN counts as beyond."""
     found = []
@@ -119,7 +133,7 @@ def exceeded(table, limits):
             if limit is None or muscle == ALL:
                 continue
             worst = facts.get("worst", math.nan)
-            if not abs(worst) <= limit:
+            if not within(name, worst, limit):
                 found.append((muscle, name, worst, limit, facts.get("worst_frame")))
     return found
 
@@ -128,7 +142,10 @@ def require_limits(table, limits):
     """Raise LimitExceededError naming everything beyond the limits."""
     found = exceeded(table, limits)
     if found:
-        text = "; ".join(f"{m}: {q} = {v:.4g} > {limit:g} at frame {f}" for m, q, v, limit, f in found)
+        text = "; ".join(
+            f"{m}: {q} = {v:.4g} {'<' if q in LEAST else '>'} {limit:g} at frame {f}"
+            for m, q, v, limit, f in found
+        )
         raise LimitExceededError(text)
 
 

@@ -5,6 +5,7 @@ import math
 
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.metrics import QUANTITIES
+from rbfmuscle.study.measure.summary import LEAST, within
 from rbfmuscle.study.show.appearance import line_colours
 from rbfmuscle.study.show.page import EXPLANATION, PAGE, STYLE, embedded_image
 from rbfmuscle.study.show.plots import plot_panels
@@ -127,7 +128,7 @@ def _beyond(saved):
         for name, facts in quantities.items():
             limit = saved.info["limits"].get(name)
             worst = facts.get("worst")
-            if limit is not None and (worst is None or not abs(worst) <= limit):
+            if limit is not None and (worst is None or not within(name, worst, limit)):
                 found.add((muscle, name))
     return found
 
@@ -174,7 +175,7 @@ def _summary(saved):
         for muscle, found in muscles.items():
             mark = ' class="bad"' if (muscle, name) in beyond else ""
             cells.append(f"<td{mark}>{_cell(name, found.get(name))}</td>")
-        shown = "" if limit is None else f"≤ {limit:g}"
+        shown = "" if limit is None else f"{'≥' if name in LEAST else '≤'} {limit:g}"
         label = name if unit in ("1", "s") else f"{name} <small>{unit}</small>"
         rows.append(f"<tr><th>{label}</th>{''.join(cells)}<td>{shown}</td></tr>")
     return f"<table><tr><th></th>{head}<th>limit</th></tr>{''.join(rows)}</table>"
