@@ -42,7 +42,7 @@ def study_motions(folder, models, steps):
     for motion, model, step in itertools.product(MOTIONS, models, steps):
         scene = rm.Scene.load(folder / f"{motion}.toml")
         start = time.perf_counter()
-        run = rm.simulate(scene, model=model, **{"motion.step": step})
+        run = rm.simulate(scene, model=model, settings={"motion.step": step})
         print(
             f"{motion:18s} {model:12s} step {step:6g}  frames {len(run.frames):3d}"
             f"  tunnelled {worst(run, 'tunnelled'):3g}  surface in bone {worst(run, 'penetration_max'):5.2f}"

@@ -225,7 +225,7 @@ def distances(model, kept, *, settings=None):
     scene = phantom_scene(end=float(max(kept["angles"])), spacing=SPACING)
     scene.muscles = [scene.muscle(MUSCLE)]
     faces = np.asarray(scene.muscles[0].mesh.faces)
-    run = simulate(scene, model=model, **(settings or {}))
+    run = simulate(scene, model=model, settings=settings)
     volume = scene.muscles[0].mesh.volume
     rows = []
     for frame in run.frames:

@@ -27,7 +27,7 @@ def frames_of(scene, ahead):
 
 
 def measure(path, settings, repeat):
-    scene = Scene.load(path).with_options(**dict(parse_setting(text) for text in settings))
+    scene = Scene.load(path).with_options(dict(parse_setting(text) for text in settings))
     walls = {True: [], False: []}
     for _ in range(repeat):
         for ahead, found in walls.items():

@@ -221,7 +221,7 @@ def flexed(model, *, spacing=3.0, substep=2.0):
     """The phantom's extensor alone at each of ``FLEXIONS``: list of (surface, carried vertices, elongation)."""
     scene = phantom_scene(end=max(FLEXIONS), step=30.0, spacing=spacing, model=model)
     scene.muscles = [scene.muscle(MUSCLE)]
-    scene = scene.with_options(**{"contact.substep_angle": substep})
+    scene = scene.with_options({"contact.substep_angle": substep})
     built = build_model(scene.muscles[0], scene)
     rest, found, lengths = built.carried_mesh(), [], []
     for frame in simulate_frames(scene, [built]):

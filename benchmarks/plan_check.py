@@ -21,7 +21,7 @@ def load(path, model, settings):
     from rbfmuscle.sim.scene.scene import Scene
 
     scene = phantom_scene(model=model) if path == "-" else Scene.load(path)
-    return scene.with_options(model=model, **PLAIN, **settings)
+    return scene.with_options({**PLAIN, **settings}, model=model)
 
 
 def planned(path, model, settings):

@@ -1,9 +1,7 @@
 """Pages made before Sphinx runs: the gallery from ``examples/``, the reference from the public names."""
 
 import ast
-import dataclasses
 import json
-import math
 import os
 import shutil
 import subprocess
@@ -108,28 +106,24 @@ def write_scene_reference(root):
     root : pathlib.Path
     """
     from pbd_baseline.options import PBDOptions
-    from rbfmuscle.model.options import CHOICES, RANGES, RBFOptions
+    from rbfmuscle.model.options import RBFOptions
     from rbfmuscle.sim.scene.file import SceneFile
 
-    schema, mesh_models = SceneFile.model_json_schema(), PBDOptions.model_json_schema()
+    schema = SceneFile.model_json_schema()
+    models = [(options.__name__, options.model_json_schema()) for options in (RBFOptions, PBDOptions)]
     lines = [
         "# Scene file: every key",
         "",
         "Made from the schema that checks a scene. What the keys mean is under [scene files](../scene_file.md).",
         "",
     ]
-    for name, table in [("SceneFile", schema), *schema["$defs"].items(), ("PBDOptions", mesh_models)]:
+    for name, table in [("SceneFile", schema), *schema["$defs"].items(), *models]:
         required = set(table.get("required", ()))
         rows = [
             (key, _allowed(field), "required" if key in required else _value(field.get("default")))
             for key, field in table["properties"].items()
         ]
         lines += _table(name, table.get("description", ""), rows)
-    rows = [
-        (field.name, _limit({**RANGES, **CHOICES}.get(field.name), field.type), _value(field.default))
-        for field in dataclasses.fields(RBFOptions)
-    ]
-    lines += _table("RBFOptions", RBFOptions.__doc__, rows)
     (root / "docs" / "gallery" / "scene_reference.md").write_text("\n".join(lines), encoding="utf-8")
 
 
@@ -163,17 +157,6 @@ def _allowed(field):
     }
     limits = [f"{text} {field[key]:g}" for key, text in words.items() if key in field]
     return ", ".join([kind, *limits])
-
-
-def _limit(limit, kind):
-    """What a model's setting may be: a range, choices, or its type."""
-    kind = kind if isinstance(kind, str) else getattr(kind, "__name__", str(kind))
-    if limit is None:
-        return kind
-    if isinstance(limit[0], str):
-        return ", ".join(f"`{choice}`" for choice in limit)
-    low, high = limit
-    return f"{kind}, at least {low:g}" + ("" if math.isinf(high) else f", at most {high:g}")
 
 
 def _value(value):

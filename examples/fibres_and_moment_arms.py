@@ -12,7 +12,7 @@ import rbfmuscle as rm
 from rbfmuscle.sim.scene.motion import bone_poses
 
 out = folder("fibres_and_moment_arms")
-scene = rm.phantom_scene(step=10.0).with_options(**{"output.fibres": {"count": 60, "segments": 15}})
+scene = rm.phantom_scene(step=10.0).with_options({"output.fibres": {"count": 60, "segments": 15}})
 run = rm.simulate(scene)
 angles = np.array([frame.coordinates["hip.flexion"] for frame in run.frames])
 

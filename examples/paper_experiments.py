@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from pbd_baseline.muscle import PBDMuscle
+from pbd_baseline.options import PBDOptions
 from rbfmuscle.sim.loop.contact import BoneContacts
 from rbfmuscle.sim.loop.substeps import SubSteps
 from rbfmuscle.sim.loop.tunnelling import find_crossings
@@ -92,7 +93,7 @@ class Experiment:
 
     def run(self, options, substeps):
         """Angles of the first penetration and tunnelling, and the worst of everything else."""
-        model = PBDMuscle(self.scene.muscles[0], self.scene, **options)
+        model = PBDMuscle(self.scene.muscles[0], self.scene, PBDOptions(**options))
         contacts = BoneContacts(self.names, self.fields, contact_bone=model.contact_bone)
         record = Record(model, self.probes)
         here = {self.coordinate: 0.0}

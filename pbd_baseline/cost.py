@@ -1,8 +1,12 @@
 """Memory and time that a mesh muscle will take, from its mesh and settings."""
 
+from collections.abc import Mapping
+
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.rest import weights_are_kept
 from rbfmuscle.sim.plan.forecast import MuscleCost
+from rbfmuscle.sim.scene.objects import Muscle
+from rbfmuscle.sim.scene.scene import Scene
 
 # Of each method: calls and visits for a vertex of one sweep; of the contacts and the volume after the last one.
 SWEEP = {
@@ -23,7 +27,9 @@ FACTORED = ("arap-volume", "arap-interleaved")
 POINTS = {"vertices": 1, "faces": 6}
 
 
-def estimate_muscle(muscle, scene, rates, **options):
+def estimate_muscle(
+    muscle: Muscle, scene: Scene, rates: Mapping[str, float], options: PBDOptions
+) -> MuscleCost:
     """What a mesh muscle takes.
 
     Parameters
@@ -32,14 +38,12 @@ def estimate_muscle(muscle, scene, rates, **options):
     scene : Scene
     rates : dict of str to float
         From `rbfmuscle.sim.plan.rates.measure_rates`.
-    **options
-        See `PBDOptions`.
+    options : PBDOptions
 
     Returns
     -------
     MuscleCost
     """
-    options = PBDOptions.build(options, place=f"muscle {muscle.name!r} model: ")
     count, call, visit = len(muscle.mesh.vertices), rates["call"], rates["visit"]
     calls, visits = SWEEP[options.method]
     search = CROSSING_VISITS * POINTS[options.contact] * count if scene.detect is not None else 0

@@ -11,6 +11,8 @@ from pbd_baseline.rest import Rest
 from pbd_baseline.shapes import SHAPES
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.sim.loop.frame import FinishedDrawing, ModelSurface
+from rbfmuscle.sim.scene.objects import Muscle
+from rbfmuscle.sim.scene.scene import Scene
 
 # Bones are looked for within this distance [mm] of the vertices as predicted, and as swept.
 REACH = 6.0
@@ -30,25 +32,20 @@ class PBDMuscle:
     muscle : Muscle
         Mesh, attachments and fibres, from a scene.
     scene : Scene
-    **options
-        See :class:`~pbd_baseline.options.PBDOptions`; ``method`` chooses the kind.
+    options : PBDOptions
+        ``method`` chooses the kind.
 
     Raises
     ------
     SceneError
-        On an unknown option or a muscle that nothing holds.
+        On a muscle that nothing holds.
     MeshError
         If the mesh is not a closed, consistently oriented surface.
     """
 
-    @staticmethod
-    def read_options(table, name):
-        """The checked settings of the muscle ``name``; raises SceneError."""
-        return PBDOptions.build(table, place=f"muscle {name!r} model: ")
-
-    def __init__(self, muscle, scene, **options):
+    def __init__(self, muscle: Muscle, scene: Scene, options: PBDOptions | None = None) -> None:
         self.name = muscle.name
-        self.options = self.read_options(options, muscle.name)
+        self.options = options or PBDOptions()
         self.rest = Rest.from_muscle(muscle, swelling_reach=self.options.swelling_reach)
         self.shape = SHAPES[self.options.method](self.rest, self.options)
         columns, shares = _contact_carriers(self.rest, faces_too=self.options.contact == "faces")

@@ -4,12 +4,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from rbfmuscle.sim.scene.options import NotNegative, Positive, Table
+from rbfmuscle.sim.scene.options import NotNegative, Positive, Share, Table
 
 # Sweeps a solve: the authors' three for PBD; sub-steps of one sweep for XPBD.
 ITERATIONS = {"pbd": 3, "xpbd": 10, "arap-pbd": 10, "arap-volume": 6, "arap-interleaved": 6}
-
-Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class PBDOptions(Table):

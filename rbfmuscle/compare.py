@@ -3,11 +3,12 @@
 import time
 from pathlib import Path
 
-from rbfmuscle.models import MODEL_NAMES, build_models, check_model_name
+from rbfmuscle.models import MODEL_NAMES, build_models, check_model_name, configure_scene
 from rbfmuscle.run import stream_run
 from rbfmuscle.sim.loop.simulate import simulate_frames
 from rbfmuscle.sim.scene.motion import Motion
 from rbfmuscle.sim.scene.options import OutputOptions
+from rbfmuscle.sim.scene.settings import chooses_model
 from rbfmuscle.study.experiment.comparison import (
     ModelProbe,
     add_distances,
@@ -38,7 +39,8 @@ def compare_models(
     frames : slice or str, optional
         Frames of the motion, a slice or "A:B:S".
     settings : dict, optional
-        Dotted keys with their values, for all models, or as "MODEL:KEY" for one.
+        Dotted keys with their values, for all models, or as "MODEL:KEY" for one. A whole ``model`` here is what
+        the scene file might have said: its own settings count where that model's turn comes.
     pictures : bool
     progress : callable, optional
         Called as ``progress(model, done, total)``.
@@ -59,7 +61,7 @@ def compare_models(
     MissingPartError
         If there are no graphics to draw with; everything else is written.
     """
-    variants = _variants(scene.with_options(frames=frames), list(models), settings or {})
+    variants = _variants(configure_scene(scene, frames=frames), list(models), settings or {})
     folder = Path(directory)
     poses = chosen_poses(next(iter(variants.values())))
     results, failed = {}, {}
@@ -98,7 +100,11 @@ def _variants(scene, models, settings):
             for key, value in settings.items()
             if key.rpartition(":")[0] in ("", name)
         }
-        variant = scene.with_options(model=name, **mine).validate()
+        # As in the scene file, a model given for all is the model whose settings these are; each then takes its turn.
+        whole = {key: value for key, value in mine.items() if chooses_model(key)}
+        own = {key: value for key, value in mine.items() if not chooses_model(key)}
+        variant = configure_scene(scene, whole).with_options(model=name)
+        variant = configure_scene(variant, own).validate()
         variant.output = OutputOptions(report=False, preview=False)
         variants[name] = variant
     return variants

@@ -1,28 +1,41 @@
 """Model name -> model, loaded on demand: the only file that names both models."""
 
-import difflib
 import importlib
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
 
+from rbfmuscle.sim.loop.frame import MuscleModel
+from rbfmuscle.sim.plan.forecast import MuscleCost
+from rbfmuscle.sim.scene.objects import Muscle
+from rbfmuscle.sim.scene.options import Table, did_you_mean
+from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.validation import SceneError, UsageError
 
-# Name: module, class, options that the name itself stands for.
+
+class _Home(NamedTuple):
+    """Where a model lives: its package, the names in it, and the options that its own name stands for."""
+
+    package: str
+    muscle: str
+    options: str
+    implied: dict
+
+
+_RBF = "rbfmuscle.model", "RBFMuscle", "RBFOptions"
+_PBD = "pbd_baseline", "PBDMuscle", "PBDOptions"
 _HOME = {
-    "rbf": ("rbfmuscle.model.muscle", "RBFMuscle", {}),
-    "pbd": ("pbd_baseline.muscle", "PBDMuscle", {"method": "pbd"}),
-    "xpbd": ("pbd_baseline.muscle", "PBDMuscle", {"method": "xpbd"}),
-    "arap-pbd": ("pbd_baseline.muscle", "PBDMuscle", {"method": "arap-pbd"}),
-    "arap-volume": ("pbd_baseline.muscle", "PBDMuscle", {"method": "arap-volume"}),
-    "arap-interleaved": ("pbd_baseline.muscle", "PBDMuscle", {"method": "arap-interleaved"}),
+    "rbf": _Home(*_RBF, {}),
+    **{
+        name: _Home(*_PBD, {"method": name})
+        for name in ("pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
+    },
 }
 
 MODEL_NAMES = tuple(_HOME)
 
-# What says beforehand how much a model takes, by the module that holds the model.
-_COST = {"rbfmuscle.model.muscle": "rbfmuscle.model.cost", "pbd_baseline.muscle": "pbd_baseline.cost"}
 
-
-def build_model(muscle, scene, name=None):
+def build_model(muscle: Muscle, scene: Scene, name: str | None = None) -> MuscleModel:
     """Return the model of one muscle of a scene.
 
     Parameters
@@ -37,15 +50,17 @@ def build_model(muscle, scene, name=None):
     ------
     UsageError
         On an unknown name, with the nearest right one.
+    SceneError
+        If a setting is unknown or impossible.
     """
     name = muscle.model if name is None else name
-    module, class_name, implied = _HOME[check_model_name(name)]
-    same_class = _HOME[check_model_name(muscle.model)][1] == class_name
-    options = {**(muscle.options if same_class else {}), **implied}
-    return getattr(importlib.import_module(module), class_name)(muscle, scene, **options)
+    home = _HOME[check_model_name(name)]
+    same_class = _HOME[check_model_name(muscle.model)].muscle == home.muscle
+    options = _read_options(muscle, home, muscle.options if same_class else {})
+    return _part(home, "muscle", home.muscle)(muscle, scene, options)
 
 
-def estimate_model(muscle, scene, rates):
+def estimate_model(muscle: Muscle, scene: Scene, rates: Mapping[str, float]) -> MuscleCost:
     """What the model of one muscle will take, without building it.
 
     Parameters
@@ -59,12 +74,12 @@ def estimate_model(muscle, scene, rates):
     -------
     MuscleCost
     """
-    module, _, implied = _HOME[check_model_name(muscle.model)]
-    cost = importlib.import_module(_COST[module])
-    return cost.estimate_muscle(muscle, scene, rates, **{**muscle.options, **implied})
+    home = _HOME[check_model_name(muscle.model)]
+    options = _read_options(muscle, home, muscle.options)
+    return _part(home, "cost", "estimate_muscle")(muscle, scene, rates, options)
 
 
-def build_models(scene):
+def build_models(scene: Scene) -> list[MuscleModel]:
     """Return the models of all muscles of a scene, in their order, built side by side."""
     import numba
 
@@ -72,7 +87,38 @@ def build_models(scene):
         return list(pool.map(lambda muscle: build_model(muscle, scene), scene.muscles))
 
 
-def check_models(scene):
+def configure_scene(
+    scene: Scene,
+    settings: Mapping[str, Any] | None = None,
+    *,
+    model: str | dict | None = None,
+    frames: slice | str | None = None,
+) -> Scene:
+    """Return a scene with other settings, checked to the last key of every muscle's model; nothing is built.
+
+    Parameters
+    ----------
+    scene, settings, model, frames
+        As for `Scene.with_options`.
+
+    Raises
+    ------
+    SceneError
+        If the scene itself names an unknown model, or an unknown or impossible setting of one.
+    UsageError
+        If the settings do.
+    """
+    check_models(scene)
+    changed = scene.with_options(settings, model=model, frames=frames)
+    for muscle in changed.muscles:
+        try:
+            _check_muscle(muscle)
+        except SceneError as error:
+            raise UsageError(str(error)) from None
+    return changed
+
+
+def check_models(scene: Scene) -> None:
     """Check the model and the settings of every muscle of a scene, building nothing.
 
     Raises
@@ -83,20 +129,35 @@ def check_models(scene):
     root = f"{scene.path}: " if scene.path else ""
     for muscle in scene.muscles:
         try:
-            module, class_name, implied = _HOME[check_model_name(muscle.model)]
+            _check_muscle(muscle)
         except UsageError as error:
             raise SceneError(f"{root}muscle {muscle.name!r}: {error}") from None
-        model = getattr(importlib.import_module(module), class_name)
-        try:
-            model.read_options({**muscle.options, **implied}, muscle.name)
         except SceneError as error:
             raise SceneError(f"{root}{error}") from None
 
 
-def check_model_name(name):
+def check_model_name(name: str) -> str:
     """Return a model's name, or raise UsageError with the nearest right one."""
     if name in _HOME:
         return name
-    near = difflib.get_close_matches(str(name).lower().replace("_", "-"), MODEL_NAMES, n=1, cutoff=0.5)
-    hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(MODEL_NAMES)}"
+    hint = did_you_mean(str(name).lower().replace("_", "-"), MODEL_NAMES)
     raise UsageError(f"unknown model {name!r}, {hint}")
+
+
+def _check_muscle(muscle):
+    _read_options(muscle, _HOME[check_model_name(muscle.model)], muscle.options)
+
+
+def _read_options(muscle: Muscle, home: _Home, table: Mapping[str, Any]) -> Table:
+    """The checked settings of a muscle's model."""
+    for key in home.implied:
+        if key in table:
+            raise SceneError(
+                f"muscle {muscle.name!r}: model: {key} follows from the model's name; known: {', '.join(MODEL_NAMES)}"
+            )
+    schema = _part(home, "options", home.options)
+    return schema.build({**table, **home.implied}, place=f"muscle {muscle.name!r}: model: ")
+
+
+def _part(home, file, name):
+    return getattr(importlib.import_module(f"{home.package}.{file}"), name)

@@ -1,23 +1,38 @@
-"""Running a scene: in memory with `simulate`, or straight to a folder with `stream_run`."""
+"""Running a scene: in memory with `simulate`, or straight to a folder with `stream_run`.
+
+Both are one run, a generator of frames, and differ in the sink that takes them.
+"""
 
 import time
 import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
+from typing import Any
 
 import numpy as np
 
-from rbfmuscle.models import build_models
-from rbfmuscle.sim.loop.frame import Event
+from rbfmuscle.models import build_models, configure_scene
+from rbfmuscle.sim.loop.frame import Event, Frame
 from rbfmuscle.sim.loop.simulate import simulate_frames
 from rbfmuscle.sim.scene.check import bone_collisions, bone_findings, check_initial
-from rbfmuscle.study.files.runinfo import Stages, build_info
+from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.study.files.runinfo import Stages, build_info, frame_facts
+from rbfmuscle.study.files.sinks import MemorySink, Sink
 from rbfmuscle.study.files.writer import RunWriter
-from rbfmuscle.study.measure.metrics import MetricsRecorder
+from rbfmuscle.study.measure.metrics import MetricsRecorder, Row
 from rbfmuscle.study.measure.summary import LIMITS, Summary, default_limit, parse_limits, require_limits
 from rbfmuscle.validation import RBFMuscleError, SceneWarning, SolveError, UsageError
 
 
-def simulate(scene, model=None, *, frames=None, progress=None, **settings):
+def simulate(
+    scene: Scene,
+    model: str | dict | None = None,
+    *,
+    settings: Mapping[str, Any] | None = None,
+    frames: slice | str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> "Run":
     """Run a scene through its motion and keep every frame in memory.
 
     Parameters
@@ -25,12 +40,12 @@ def simulate(scene, model=None, *, frames=None, progress=None, **settings):
     scene : Scene
     model : str or dict, optional
         For every muscle; the scene's own choice where not given.
+    settings : mapping, optional
+        Dotted keys with their values, as for `Scene.with_options`: ``{"model.centres": 200}``.
     frames : slice or str, optional
         Frames of the motion, a slice or "A:B:S".
     progress : callable, optional
         Called as ``progress(done, total)`` after each frame.
-    **settings
-        Dotted keys as for `Scene.with_options`: ``**{"model.centres": 200}``.
 
     Returns
     -------
@@ -40,36 +55,33 @@ def simulate(scene, model=None, *, frames=None, progress=None, **settings):
     ------
     SceneError, MeshError
         If the scene cannot be simulated.
+    UsageError
+        If a setting is unknown or impossible.
     SolveError
         If a frame cannot be solved; its ``run`` attribute holds the frames so far.
     """
-    course = _Course(scene.with_options(model=model, frames=frames, **settings), keep_rows=True)
-    run = Run(course)
+    recording, memory = _record(scene, model, settings, frames), MemorySink()
+    run = Run(recording, memory)
     try:
-        for frame in course.frames():
-            run.frames.append(frame)
-            if progress is not None:
-                progress(len(run.frames), len(course.scene.motion))
+        recording.feed(memory, progress=progress)
     except SolveError as error:
         error.run = run
-        course.close("failed", str(error))
         raise
-    course.close("complete")
     return run
 
 
 def stream_run(
-    scene,
-    directory,
+    scene: Scene,
+    directory: Any,
     *,
-    model=None,
-    frames=None,
-    settings=None,
-    fail_on=None,
-    pictures=True,
-    progress=None,
-    watch=None,
-):
+    model: str | dict | None = None,
+    settings: Mapping[str, Any] | None = None,
+    frames: slice | str | None = None,
+    fail_on: str | Sequence[str] | dict | None = None,
+    pictures: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+    watch: Callable[[list, Frame | None], None] | None = None,
+) -> dict:
     """Run a scene and write it to a folder frame by frame; memory does not grow with the frames.
 
     Parameters
@@ -77,10 +89,8 @@ def stream_run(
     scene : Scene
         Its ``output`` table says what is written.
     directory : path
-    model, frames, progress
+    model, settings, frames, progress
         As for `simulate`.
-    settings : dict, optional
-        Dotted keys with their values.
     fail_on : str, list of str or dict, optional
         Limits, see `rbfmuscle.study.measure.summary.parse_limits`.
     pictures : bool
@@ -95,6 +105,8 @@ def stream_run(
 
     Raises
     ------
+    UsageError
+        If a setting is unknown or impossible, or the folder cannot be written to.
     SolveError
         If a frame cannot be solved or written; frames so far are kept.
     LimitExceededError
@@ -102,61 +114,38 @@ def stream_run(
     MissingPartError
         If there are no graphics to draw with; everything else is written.
     """
-    scene = scene.with_options(model=model, frames=frames, **(settings or {}))
+    scene = configure_scene(scene, settings, model=model, frames=frames)
     limits = parse_limits(fail_on, scene)
-    course = _Course(scene, options={"model": model, "frames": str(frames or ""), "settings": settings or {}})
+    recording = Recording(scene, options=_asked(model, settings, frames))
     writer = RunWriter(directory, scene)
-    status, message = "interrupted", "interrupted"
-    try:
-        writer.write_info(course.info(writer.frames, "running"))
-        driven = _bones_driven_together(course)
-        if watch is not None:
-            watch(course.models, None)
-        for frame in course.frames():
-            frame.events.extend(driven.get(frame.index, []))
-            if watch is not None:
-                watch(course.models, frame)
-            with course.timed("write"):
-                writer.write(frame, course.fresh)
-            if progress is not None:
-                progress(len(writer.frames), len(scene.motion))
-        status, message = "complete", ""
-    except RBFMuscleError as error:
-        status, message = "failed", str(error)
-        raise
-    finally:
-        course.close(status, message)
-        writer.close(course.fresh)
-        writer.write_info(course.info(writer.frames))
-    return _finish(course, writer, limits, pictures)
+    recording.feed(writer, progress=progress, watch=watch)
+    return _finish(recording, writer, limits, pictures)
 
 
-def _bones_driven_together(course):
-    """Events by frame, for some frames of the motion, and a warning for each pair of bones."""
-    with course.timed("build"):
-        collisions = bone_collisions(course.scene)
-    for finding in bone_findings(collisions, course.scene.units):
-        warnings.warn(f"{finding.place}: {finding.message}", SceneWarning, stacklevel=3)
-    events = {}
-    for frame, first, second, _ in collisions:
-        events.setdefault(frame, []).append(Event(frame, "", f"{first} and {second}", 1, "bones_overlap"))
-    return events
+def _record(scene, model, settings, frames):
+    options = _asked(model, settings, frames)
+    return Recording(configure_scene(scene, settings, model=model, frames=frames), options=options)
 
 
-def _finish(course, writer, limits, pictures):
+def _asked(model, settings, frames):
+    """What the caller asked for, as ``run.json`` tells it."""
+    return {"model": model, "frames": str(frames or ""), "settings": dict(settings or {})}
+
+
+def _finish(recording, writer, limits, pictures):
     """Report and pictures, then the limits: a missing part must not hide a broken limit."""
-    output = course.scene.output
+    output = recording.scene.output
     missing = None
-    with course.timed("report"):
+    with recording.timed("report"):
         if output.report or output.preview:
             from rbfmuscle.study.show.report import write_report
 
             missing = write_report(
                 writer.directory, report=output.report, preview=output.preview and pictures, pictures=pictures
             )
-    info = course.info(writer.frames)
+    info = recording.info()
     writer.write_info(info)
-    require_limits(course.summary.table(), limits)
+    require_limits(recording.summary.table(), limits)
     if missing is not None:
         raise missing
     return info
@@ -175,38 +164,41 @@ class Run:
     events : list of Event
     """
 
-    def __init__(self, course):
-        self._course = course
-        self.scene = course.scene
-        self.frames = []
+    def __init__(self, recording: "Recording", memory: MemorySink) -> None:
+        self._recording, self._memory = recording, memory
+        self.scene = recording.scene
 
     @property
-    def metrics(self):
-        return self._course.rows
+    def frames(self) -> list[Frame]:
+        return self._memory.frames
 
     @property
-    def events(self):
+    def metrics(self) -> list[Row]:
+        return self._memory.rows
+
+    @property
+    def events(self) -> list[Event]:
         return [event for frame in self.frames for event in frame.events]
 
     @property
-    def summary(self):
+    def summary(self) -> dict:
         """Nested dict: muscle -> quantity -> min, max, mean, median, worst."""
-        return self._course.summary.table()
+        return self._recording.summary.table()
 
-    def __getitem__(self, muscle):
+    def __getitem__(self, muscle: str) -> "MuscleRun":
         """The `MuscleRun` of a muscle."""
         return MuscleRun(self, self.scene.muscle(muscle).name)
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator["MuscleRun"]:
         """All muscles."""
         return (MuscleRun(self, muscle.name) for muscle in self.scene.muscles)
 
-    def values(self, muscle, quantity):
+    def values(self, muscle: str, quantity: str) -> np.ndarray:
         """Values of a quantity over the frames, (n,) ndarray."""
         found = [r.value for r in self.metrics if r.muscle == muscle and r.quantity == quantity]
         return np.array(found)
 
-    def save(self, directory, *, pictures=True):
+    def save(self, directory: Any, *, pictures: bool = True) -> None:
         """Write what `stream_run` would have written.
 
         Parameters
@@ -223,24 +215,22 @@ class Run:
             If there are no graphics to draw with; everything else is written.
         """
         writer = RunWriter(directory, self.scene)
-        for frame in self.frames:
-            writer.write(frame)
-        writer.close(self.metrics)
-        writer.write_info(self._course.info(writer.frames))
-        _finish(self._course, writer, {}, pictures)
+        self._memory.replay(writer)
+        writer.write_info(self._recording.info())
+        _finish(self._recording, writer, {}, pictures)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<Run of {self.scene.name!r}: {len(self.frames)} frames>"
 
 
 class MuscleRun:
     """One muscle of a run."""
 
-    def __init__(self, run, name):
+    def __init__(self, run: Run, name: str) -> None:
         self.run = run
         self.name = name
 
-    def surface(self, frame=-1):
+    def surface(self, frame: int = -1) -> Any:
         """Surface in a frame of the run.
 
         Parameters
@@ -258,7 +248,7 @@ class MuscleRun:
         surface = self._frame(frame).surfaces[self.name]
         return trimesh.Trimesh(surface.vertices, surface.faces, process=False)
 
-    def fibres(self, frame=-1):
+    def fibres(self, frame: int = -1) -> Any:
         """Fibres in a frame of the run, `FibreLines`: points, lengths and lengths at rest.
 
         Raises
@@ -271,7 +261,7 @@ class MuscleRun:
             raise UsageError("the run has no fibres: set output.fibres = true in the scene")
         return found[self.name]
 
-    def values(self, quantity):
+    def values(self, quantity: str) -> np.ndarray:
         """Values of a quantity over the frames, (n,) ndarray."""
         return self.run.values(self.name, quantity)
 
@@ -281,60 +271,100 @@ class MuscleRun:
             raise UsageError(f"frame {frame} is out of range, the run has {count} frames")
         return self.run.frames[frame]
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<{self.name!r} in {self.run!r}>"
 
 
-class _Course:
-    """A scene on its way through its motion: models, measurements, clocks."""
+class Recording:
+    """One run of a scene: its models through the frame loop, measured and clocked, into a sink.
 
-    def __init__(self, scene, *, options=None, keep_rows=False):
+    Parameters
+    ----------
+    scene : Scene
+        As it shall be run.
+    options : dict, optional
+        What the caller asked for, for ``run.json``.
+    """
+
+    def __init__(self, scene: Scene, *, options: dict | None = None) -> None:
         self.started, self._start = datetime.now(UTC), time.perf_counter()
         self.scene = scene.validate()
         self.options = options or {}
-        self.times = {}
+        self.times: dict[str, float] = {}
         self.status, self.message = "running", ""
         self.summary, self.stages = Summary(), Stages()
-        self.keep_rows, self.rows, self.fresh = keep_rows, [], []
+        self.written: list[dict] = []
         with self.timed("build"):
             check_initial(self.scene)
             self.models = build_models(scene)
             carried = {m.name: m.carried_mesh() for m in self.models}
             self.recorder = MetricsRecorder(scene, carried) if scene.output.metrics else None
             self.fibres = _fibre_study(scene, carried) if scene.output.fibres else None
+            self._driven = _bones_driven_together(scene)
 
-    def timed(self, part):
-        return _Clock(self.times, part)
+    @contextmanager
+    def timed(self, part: str) -> Iterator[None]:
+        """Add the time spent inside to one entry of ``times`` [s]."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.times[part] = self.times.get(part, 0.0) + time.perf_counter() - start
 
-    def frames(self):
-        """Yield the frames; `fresh` then holds the rows of metrics that became complete."""
+    def feed(
+        self,
+        sink: Sink,
+        *,
+        progress: Callable[[int, int], None] | None = None,
+        watch: Callable[[list, Frame | None], None] | None = None,
+    ) -> None:
+        """Run the whole motion into a sink, which is closed whatever ends it."""
+        self.status, self.message = "interrupted", "interrupted"
+        try:
+            sink.write_info(self.info("running"))
+            if watch is not None:
+                watch(self.models, None)
+            for frame, rows in self.frames():
+                if watch is not None:
+                    watch(self.models, frame)
+                with self.timed("write"):
+                    sink.write(frame, rows)
+                self.written.append(frame_facts(frame))
+                if progress is not None:
+                    progress(len(self.written), len(self.scene.motion))
+            self.status, self.message = "complete", ""
+        except RBFMuscleError as error:
+            self.status, self.message = "failed", str(error)
+            raise
+        finally:
+            rows = self.recorder.finish() if self.recorder is not None else []
+            self.summary.add(rows)
+            sink.close(rows)
+            sink.write_info(self.info())
+
+    def frames(self) -> Iterator[tuple[Frame, list[Row]]]:
+        """The frames as they are solved, each with the rows of metrics that became complete with it."""
         wanted = bool(self.scene.output.surfaces) or self.recorder is not None
-        course = iter(simulate_frames(self.scene, self.models, surfaces=wanted))
+        frames = simulate_frames(self.scene, self.models, surfaces=wanted)
         while True:
             with self.timed("simulate"):
-                frame = next(course, None)
+                frame = next(frames, None)
             if frame is None:
                 return
+            frame.events.extend(self._driven.get(frame.index, []))
             self.stages.add(frame)
             if self.fibres is not None:
                 with self.timed("fibres"):
                     frame.fibres = self.fibres.at(frame)
+            rows = []
             if self.recorder is not None:
                 with self.timed("metrics"):
-                    self._take(self.recorder.add(frame))
-            yield frame
+                    rows = self.recorder.add(frame)
+                    self.summary.add(rows)
+            yield frame, rows
 
-    def close(self, status, message=""):
-        self.status, self.message = status, message
-        self._take(self.recorder.finish() if self.recorder is not None else [])
-
-    def _take(self, rows):
-        self.fresh = rows
-        if self.keep_rows:
-            self.rows += rows
-        self.summary.add(rows)
-
-    def info(self, frames, status=None):
+    def info(self, status: str | None = None) -> dict:
+        """What ``run.json`` holds by now."""
         self.times["wall"] = time.perf_counter() - self._start
         return build_info(
             self.scene,
@@ -343,28 +373,25 @@ class _Course:
             message=self.message,
             times=dict(self.times),
             stages=self.stages,
-            frames=frames,
+            frames=self.written,
             summary=self.summary.table(),
             limits={name: default_limit(name, self.scene) for name in LIMITS},
             options=self.options,
         )
 
 
+def _bones_driven_together(scene):
+    """Events by frame, for some frames of the motion, and a warning for each pair of bones."""
+    collisions = bone_collisions(scene)
+    for finding in bone_findings(collisions, scene.units):
+        warnings.warn(f"{finding.place}: {finding.message}", SceneWarning, stacklevel=4)
+    events = {}
+    for frame, first, second, _ in collisions:
+        events.setdefault(frame, []).append(Event(frame, "", f"{first} and {second}", 1, "bones_overlap"))
+    return events
+
+
 def _fibre_study(scene, carried):
     from rbfmuscle.study.measure.fibre_study import FibreStudy
 
     return FibreStudy(scene, carried)
-
-
-class _Clock:
-    """Adds the time spent inside to one entry of a table [s]."""
-
-    def __init__(self, times, part):
-        self.times, self.part = times, part
-
-    def __enter__(self):
-        self.start = time.perf_counter()
-
-    def __exit__(self, *error):
-        spent = time.perf_counter() - self.start
-        self.times[self.part] = self.times.get(self.part, 0.0) + spent

@@ -157,7 +157,7 @@ def stretched_bar(stretch, *, bar=ROUND_BAR, spacing=2.0, frames=1, model="rbf")
     angle = math.degrees(math.asin((stretch - 1.0) * bar.length / far))
     scene.set_motion(ramp={"far.pull": {"to": angle, "step": abs(angle) / frames}})
     step = math.degrees(bar.length / STEPS_A_LENGTH / far)
-    return scene.with_options(**{"contact.substep_angle": step})
+    return scene.with_options({"contact.substep_angle": step})
 
 
 def bent_bar(angle, *, bar=BENT_BAR, spacing=2.0, step=2.0, model="rbf"):

@@ -140,7 +140,7 @@ def _run_best(scene, name, study, best, frames):
         if row["fit"] != "values":
             settings["model.derivatives"] = row["fit"]
         facts = {"kernel": row["kernel"], "centres": row["centres"], "error": ""}
-        alone = scene.with_options(model="rbf", frames=frames, **settings)
+        alone = scene.with_options(settings, model="rbf", frames=frames)
         alone.muscles = [alone.muscle(name)]
         try:
             table = simulate(alone).summary[name]

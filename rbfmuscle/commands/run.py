@@ -78,14 +78,19 @@ def run(
     as_json
         Print JSON and nothing else.
     """
-    from rbfmuscle.models import check_models
     from rbfmuscle.sim.scene.scene import Scene
     from rbfmuscle.sim.scene.settings import parse_setting
 
     changes = dict(parse_setting(text) for text in settings or [])
-    loaded = Scene.load(scene)
-    check_models(loaded)
-    _run_scene(loaded, output, model=model, frames=frames, settings=changes, fail_on=fail_on, as_json=as_json)
+    _run_scene(
+        Scene.load(scene),
+        output,
+        model=model,
+        frames=frames,
+        settings=changes,
+        fail_on=fail_on,
+        as_json=as_json,
+    )
 
 
 def _run_scene(scene, output, *, model, frames, settings, fail_on, as_json):

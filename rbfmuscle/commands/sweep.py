@@ -91,23 +91,21 @@ def run_point(scene, settings, frames):
     """One run of a sweep, in memory; module-level, so that it can be sent to other processes."""
     from rbfmuscle.run import simulate
 
-    return simulate(scene, frames=frames, **settings)
+    return simulate(scene, settings=settings, frames=frames)
 
 
 def _measure(scene, output, grid, model, frames, reference, jobs, scheduler, part, retry):
-    from rbfmuscle.models import check_models
+    from rbfmuscle.models import configure_scene
     from rbfmuscle.sim.scene.settings import parse_setting
     from rbfmuscle.study.experiment.sweep import parse_grid, plan_sweep
     from rbfmuscle.study.experiment.sweep_points import SweepRunner
 
     axes = parse_grid(grid or [])
-    loaded = load_scene(scene).with_options(model=model)
+    loaded = configure_scene(load_scene(scene), model=model)
     chosen = dict(parse_setting(text) for text in reference or [])
     plan = plan_sweep(loaded, axes, frames=frames, reference=chosen)
     for point in plan.points:  # a mistyped key is told now, not after the first point
-        changed = loaded.with_options(**point.settings)
-        changed.path = None  # the grid is at fault, not the file
-        check_models(changed)
+        configure_scene(loaded, point.settings)
     with Progress(f"sweep of {loaded.name}", what="point") as progress:
         runner = SweepRunner(
             run_point, loaded, plan, output, frames=frames, jobs=jobs, scheduler=scheduler, progress=progress

@@ -96,11 +96,11 @@ def _open_saved(run):
 
 
 def _open_scene(loaded, model):
-    from rbfmuscle.models import build_models
+    from rbfmuscle.models import build_models, configure_scene
     from rbfmuscle.sim.loop.live import LiveSession
     from rbfmuscle.study.show.viewer import LiveViewer
 
-    scene = loaded.with_options(model=model)
+    scene = configure_scene(loaded, model=model)
     scene.validate()
     print(f"rbfmuscle: preparing {scene.name}", file=sys.stderr)
     models = [scene.muscles[0].model]
@@ -110,7 +110,7 @@ def _open_scene(loaded, model):
         changed = QUALITIES[quality].get(name, {})
         chosen = scene if name == models[0] else scene.with_options(model=name)
         settings = {f"model.{key}": value for key, value in changed.items()}
-        return build_models(chosen.with_options(**settings))
+        return build_models(chosen.with_options(settings))
 
     viewer = LiveViewer(LiveSession(scene), build, models, list(QUALITIES))
     motion = [{k: math.degrees(v) for k, v in frame.items()} for frame in scene.motion.frames]

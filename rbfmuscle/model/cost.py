@@ -1,5 +1,6 @@
 """Memory and time that an RBF muscle will take, from its settings alone."""
 
+from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
@@ -13,6 +14,8 @@ from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.model.rest import has_sample
 from rbfmuscle.sim.plan.forecast import MuscleCost
 from rbfmuscle.sim.plan.rates import shortest
+from rbfmuscle.sim.scene.objects import Muscle
+from rbfmuscle.sim.scene.scene import Scene
 
 # Vertices of the surface on an area of one cell squared; nodes of the grid kept beside them, bytes of each.
 VERTICES_A_CELL, NODE_BYTES, VERTEX_BYTES = 1.5, 10, 400
@@ -37,7 +40,9 @@ FIT_CALLS, EXTRACT_CALLS, ENTRY_PAIRS, BONE_VISITS, SURFACE_VISITS, SURFACE_PAIR
 HANGING_BYTES = 6 * 16
 
 
-def estimate_muscle(muscle, scene, rates, **options):
+def estimate_muscle(
+    muscle: Muscle, scene: Scene, rates: Mapping[str, float], options: RBFOptions
+) -> MuscleCost:
     """What an RBF muscle takes.
 
     Parameters
@@ -46,14 +51,12 @@ def estimate_muscle(muscle, scene, rates, **options):
     scene : Scene
     rates : dict of str to float
         From `rbfmuscle.sim.plan.rates.measure_rates`.
-    **options
-        See `RBFOptions`.
+    options : RBFOptions
 
     Returns
     -------
     MuscleCost
     """
-    options = RBFOptions.from_table(options, muscle=muscle.name)
     centres = options.centres or RBFMuscle._default_centres(muscle.mesh.area, scene)
     points = centres + options.samples
     shown, nodes = _surface_size(muscle, options.resolution)

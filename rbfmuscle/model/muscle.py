@@ -23,6 +23,8 @@ from rbfmuscle.model.elasticity import ElasticSolver
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.model.rest import bind_samples, build_clusters, kept_sample
 from rbfmuscle.sim.loop.frame import ModelSurface
+from rbfmuscle.sim.scene.objects import Muscle
+from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.validation import NumericalWarning, SceneError, SolveError
 
 AREA_A_CENTRE = 212.0  # mm², from which the number of centres follows where the scene names none
@@ -92,23 +94,17 @@ class RBFMuscle:
         Rest mesh, attachments and fibres.
     scene : rbfmuscle.sim.scene.scene.Scene
         Gives units and the names of the bones.
-    **options
-        See `RBFOptions`.
+    options : RBFOptions
 
     Raises
     ------
     SceneError
-        If a setting is unknown or no centre is left free to move.
+        If the placement cannot be had or no centre is left free to move.
     """
 
-    @staticmethod
-    def read_options(table, name):
-        """The checked settings of the muscle ``name``; raises SceneError."""
-        return RBFOptions.from_table(table, muscle=name)
-
-    def __init__(self, muscle, scene, **options):
+    def __init__(self, muscle: Muscle, scene: Scene, options: RBFOptions | None = None) -> None:
         self.name = muscle.name
-        self.options = self.read_options(options, muscle.name)
+        self.options = options or RBFOptions()
         self.bones = [bone.name for bone in scene.bones]
         self.bone_points = [ObstaclePoints(bone.mesh.vertices) for bone in scene.bones]
         faces = np.asarray(muscle.mesh.faces)

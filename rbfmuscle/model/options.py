@@ -1,68 +1,48 @@
 """Settings of an RBF muscle, and what they may be."""
 
-import math
-from dataclasses import dataclass, fields
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
 
 from rbfmuscle.implicit.kernels.table import get_kernel
-from rbfmuscle.implicit.placement.refinement import FITTED
-from rbfmuscle.implicit.placement.sampling import PLACEMENTS
-from rbfmuscle.sim.scene.options import did_you_mean
-from rbfmuscle.validation import SceneError, UsageError
-
-# What the settings may be; all others are free.
-RANGES = {
-    "centres": (0, 20000), "samples": (50, 200000), "iterations": (1, 1000), "contacts": (1, 10000),
-    "resolution": (4, 1000), "epsilon": (0.0, math.inf), "stretch_low": (0.01, 1.0),
-    "stretch_high": (1.0, 100.0), "stretch_hold": (0.0, 1.0), "across": (0, 50), "across_weight": (0.0, 1e6),
-    "acceleration": (0, 50),
-}  # fmt: skip
-CHOICES = {"placement": (*PLACEMENTS, FITTED), "derivatives": ("auto", "all", "normal")}
+from rbfmuscle.sim.scene.options import NotNegative, Share, Table
+from rbfmuscle.validation import UsageError
 
 
-@dataclass(frozen=True)
-class RBFOptions:
-    """Settings of an RBF muscle; each is a key of the muscle's model table in the scene file."""
+def _known_kernel(name: str) -> str:
+    try:
+        get_kernel(name)
+    except UsageError as error:
+        raise PydanticCustomError("unknown_key", "{reason}", {"reason": str(error)}) from None
+    return name
 
-    centres: int = 0
-    samples: int = 2000
-    iterations: int = 8
-    contacts: int = 24
-    resolution: int = 48
-    kernel: str = "cubic"
-    epsilon: float = 0.0
-    stretch_low: float = 0.5
-    stretch_high: float = 2.0
-    stretch_hold: float = 0.3
-    across: int = 3
-    across_weight: float = 1.0
-    acceleration: int = 5
-    placement: str = "greedy"
-    derivatives: str = "auto"
+
+class RBFOptions(Table):
+    """``[muscle.model]`` of an RBF muscle.
+
+    ``centres`` follow from the muscle's area where none are given, and ``epsilon`` (a kernel's shape parameter)
+    from the error at rest. ``samples`` of the surface meet the bones; ``contacts`` of them join in one round.
+    ``iterations`` a solve, ``acceleration`` of them remembered (Anderson). The fibre stretch is free from
+    ``stretch_low`` to ``stretch_high`` but for the share ``stretch_hold`` that pulls it back to one; ``across``
+    links a centre go through the thickness, each counting ``across_weight``. ``resolution`` is the number of cells
+    along the longest side at extraction. ``placement`` of the centres, and ``derivatives`` that the fit meets there;
+    ``seed`` of what is drawn by chance.
+    """
+
+    centres: Annotated[int, Field(ge=0, le=20_000)] = 0
+    samples: Annotated[int, Field(ge=50, le=200_000)] = 2000
+    iterations: Annotated[int, Field(ge=1, le=1000)] = 8
+    contacts: Annotated[int, Field(ge=1, le=10_000)] = 24
+    resolution: Annotated[int, Field(ge=4, le=1000)] = 48
+    kernel: Annotated[str, AfterValidator(_known_kernel)] = "cubic"
+    epsilon: NotNegative = 0.0
+    stretch_low: Annotated[float, Field(ge=0.01, le=1.0)] = 0.5
+    stretch_high: Annotated[float, Field(ge=1.0, le=100.0)] = 2.0
+    stretch_hold: Share = 0.3
+    across: Annotated[int, Field(ge=0, le=50)] = 3
+    across_weight: Annotated[float, Field(ge=0.0, le=1e6)] = 1.0
+    acceleration: Annotated[int, Field(ge=0, le=50)] = 5
+    placement: Literal["even", "adaptive", "greedy", "fitted"] = "greedy"
+    derivatives: Literal["auto", "all", "normal"] = "auto"
     seed: int = 0
-
-    @classmethod
-    def from_table(cls, table, *, muscle):
-        """Build from a scene's model table; raises SceneError naming an unknown or impossible key."""
-        known = {field.name: field.type for field in fields(cls)}
-        for key, value in table.items():
-            if key not in known:
-                hint = did_you_mean(key, known)
-                raise SceneError(f"muscle {muscle!r}: model rbf has no setting {key!r}, {hint}")
-            if known[key] is not str and (isinstance(value, bool) or not isinstance(value, (int, float))):
-                raise SceneError(f"muscle {muscle!r}: {key} must be a number, got {value!r}")
-            low, high = RANGES.get(key, (-math.inf, math.inf))
-            if known[key] is not str and not low <= value <= high:
-                raise SceneError(f"muscle {muscle!r}: {key} must be {_range(low, high)}, got {value:g}")
-            if key in CHOICES and value not in CHOICES[key]:
-                raise SceneError(
-                    f"muscle {muscle!r}: {key} must be one of {', '.join(CHOICES[key])}, got {value!r}"
-                )
-        try:
-            get_kernel(table.get("kernel", cls.kernel))
-        except UsageError as error:
-            raise SceneError(f"muscle {muscle!r}: {error}") from None
-        return cls(**table)
-
-
-def _range(low, high):
-    return f"at least {low:g}" if high == math.inf else f"between {low:g} and {high:g}"

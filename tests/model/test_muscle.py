@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
 from rbfmuscle.model.muscle import RBFMuscle
+from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.models import build_model
 from rbfmuscle.sim.loop.simulate import simulate_frames
 from rbfmuscle.sim.scene.motion import Motion
@@ -118,10 +119,12 @@ def test_the_unit_of_the_scene_does_not_matter(scale, units):
 
 
 def test_unknown_settings_are_refused_by_name(hip):
-    with pytest.raises(SceneError, match=r"adductor_brevis.*no setting 'centers'"):
-        RBFMuscle(hip.muscles[0], hip, centers=10)
-    with pytest.raises(SceneError, match="iterations must be a number"):
-        RBFMuscle(hip.muscles[0], hip, iterations="many")
+    hip.muscles[0].options = {"centers": 10}
+    with pytest.raises(SceneError, match=r"adductor_brevis.*unknown key 'centers', did you mean 'centres'"):
+        build_model(hip.muscles[0], hip, "rbf")
+    hip.muscles[0].options = {"iterations": "many"}
+    with pytest.raises(SceneError, match="iterations: input should be a valid integer, got 'many'"):
+        build_model(hip.muscles[0], hip, "rbf")
 
 
 @pytest.mark.parametrize("kernel", [k for k in KERNELS if k != "gaussian"])
@@ -151,8 +154,8 @@ def test_any_kernel_drives_a_muscle(kernel):
 
 def test_fitted_centres_lie_beside_the_surface_and_move_like_others(hip):
     options = {"centres": 150, "resolution": 32}
-    model = RBFMuscle(hip.muscles[0], hip, placement="fitted", **options)
-    greedy = RBFMuscle(hip.muscles[0], hip, placement="greedy", **options)
+    model = RBFMuscle(hip.muscles[0], hip, RBFOptions(placement="fitted", **options))
+    greedy = RBFMuscle(hip.muscles[0], hip, RBFOptions(placement="greedy", **options))
     vertices, faces = (np.array(part) for part in (hip.muscles[0].mesh.vertices, hip.muscles[0].mesh.faces))
     beside = np.sqrt(igl.point_mesh_squared_distance(model.rest, vertices, faces)[0])
     assert 0.01 < beside.max() < 1.0  # mm, of a spacing of 6
@@ -168,7 +171,7 @@ def test_fitted_centres_need_a_hermite_fit_to_all_derivatives(hip):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             with pytest.raises(SceneError, match="placement 'fitted' needs"):
-                RBFMuscle(hip.muscles[0], hip, placement="fitted", **options)
+                RBFMuscle(hip.muscles[0], hip, RBFOptions(placement="fitted", **options))
 
 
 @pytest.mark.filterwarnings("ignore:kernel .* does not reach")
@@ -185,18 +188,20 @@ def test_a_kernel_that_gives_no_surface_is_a_clear_error():
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("stretch_hold", 5.0, "between 0 and 1"),
-        ("centres", -3, "between 0 and 20000"),
-        ("derivatives", "some", "one of auto, all, normal"),
+        ("stretch_hold", 5.0, "less than or equal to 1, got 5.0"),
+        ("centres", -3, "greater than or equal to 0, got -3"),
+        ("centres", 150.5, "a valid integer, got 150.5"),
+        ("derivatives", "some", "'auto', 'all' or 'normal', got 'some'"),
+        ("kernel", "cubik", "unknown kernel 'cubik', did you mean 'cubic'"),
+        ("epsilon", float("inf"), "finite number"),
     ],
 )
 def test_impossible_settings_are_refused(key, value, message):
-    scene = phantom_scene()
     with pytest.raises(SceneError, match=message):
-        RBFMuscle(scene.muscles[0], scene, **{key: value})
+        RBFOptions.build({key: value}, place="model: ")
 
 
 def test_more_centres_than_greedy_placement_takes_are_a_scene_error():
-    scene = phantom_scene().with_options(**{"model.centres": 1200})
+    scene = phantom_scene().with_options({"model.centres": 1200})
     with pytest.raises(SceneError, match=r"at most 1000 centres, got 1200; take placement 'adaptive'"):
         build_model(scene.muscles[0], scene)

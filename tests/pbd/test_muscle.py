@@ -6,6 +6,7 @@ import trimesh
 
 from pbd_baseline.arap import ARAP
 from pbd_baseline.muscle import PBDMuscle
+from pbd_baseline.options import PBDOptions
 from pbd_baseline.topology import Topology
 from rbfmuscle.sim.distance.sdf import BoneSDF
 from rbfmuscle.sim.loop.contact import BoneContacts
@@ -46,7 +47,7 @@ class Rig:
         self.transform = np.eye(4) if transform is None else transform
         self.scene = build_scene(transform, scale)
         self.scale = scale
-        self.model = PBDMuscle(self.scene.muscles[0], self.scene, **options)
+        self.model = PBDMuscle(self.scene.muscles[0], self.scene, PBDOptions(**options))
         names = [bone.name for bone in self.scene.bones]
         fields = [BoneSDF.from_mesh(bone.mesh, cache=False) for bone in self.scene.bones]
         self.contacts = BoneContacts(names, fields, contact_bone=self.model.contact_bone)
@@ -296,7 +297,7 @@ def test_the_middle_of_a_face_is_pushed_out_by_its_corners():
 @pytest.mark.parametrize("method", ["pbd", "arap-volume"])
 def test_contact_of_faces_leaves_no_middle_of_a_face_in_a_bone(method):
     scene = build_scene()
-    model = PBDMuscle(scene.muscles[0], scene, method=method, contact="faces")
+    model = PBDMuscle(scene.muscles[0], scene, PBDOptions(method=method, contact="faces"))
     faces, edges = model.rest.topology.faces, model.rest.topology.edges
     points = model.contact_points()
     assert len(points) == len(model.points) + len(edges) + len(faces) == len(model.contact_bone)
@@ -306,9 +307,8 @@ def test_contact_of_faces_leaves_no_middle_of_a_face_in_a_bone(method):
 
 
 def test_unknown_option_is_refused_with_the_nearest_name():
-    scene = build_scene()
     with pytest.raises(SceneError, match="iterations"):
-        PBDMuscle(scene.muscles[0], scene, iteration=5)
+        PBDOptions.build({"iteration": 5}, place="model: ")
 
 
 def test_muscle_that_nothing_holds_is_refused():

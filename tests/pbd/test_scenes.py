@@ -55,7 +55,7 @@ def test_hip_stays_finite_at_thirty_degrees_a_step_without_substeps(hip_data, na
     from rbfmuscle.sim.scene.scene import Scene
 
     scene = Scene.load(hip_data / "extension.toml")
-    scene = scene.with_options(**{"motion.step": 30.0, "contact.substep_angle": 30.0})
+    scene = scene.with_options({"motion.step": 30.0, "contact.substep_angle": 30.0})
     for state in run(scene, name):
         for muscle, (model, _) in state.items():
             assert np.isfinite(model.contact_points()).all(), muscle

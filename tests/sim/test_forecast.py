@@ -58,13 +58,14 @@ def test_rbf_muscle_has_the_foretold_surface_and_matrix(scene):
 
 def test_more_centres_cells_and_iterations_take_more(scene):
     from rbfmuscle.model.cost import estimate_muscle
+    from rbfmuscle.model.options import RBFOptions
 
-    plain = estimate_muscle(scene.muscles[0], scene, RATES, centres=150)
-    many = estimate_muscle(scene.muscles[0], scene, RATES, centres=600)
+    plain = estimate_muscle(scene.muscles[0], scene, RATES, RBFOptions(centres=150))
+    many = estimate_muscle(scene.muscles[0], scene, RATES, RBFOptions(centres=600))
     assert many.show > plain.show and many.memory > 4 * plain.memory and many.build > plain.build
-    fine = estimate_muscle(scene.muscles[0], scene, RATES, centres=150, resolution=96)
+    fine = estimate_muscle(scene.muscles[0], scene, RATES, RBFOptions(centres=150, resolution=96))
     assert fine.shown == pytest.approx(4 * plain.shown, abs=4) and fine.show > plain.show
-    twice = estimate_muscle(scene.muscles[0], scene, RATES, centres=150, iterations=16)
+    twice = estimate_muscle(scene.muscles[0], scene, RATES, RBFOptions(centres=150, iterations=16))
     assert plain.step < twice.step < 2 * plain.step
 
 
@@ -84,7 +85,7 @@ def test_tasks_are_taken_in_order_by_the_first_free_thread():
 
 
 def test_time_and_memory_add_up(scene):
-    bare = scene.with_options(frames="0:10:1", **{"output.metrics": False, "output.surfaces": False})
+    bare = scene.with_options({"output.metrics": False, "output.surfaces": False}, frames="0:10:1")
     muscle = MuscleCost(build=2.0, step=0.1, show=0.5, memory=1e6, working=1e5, carried=10, shown=10)
     memory, time = forecast(
         bare, [FieldCost(1e6, 4e6, False)], [muscle], substeps=20, rates=RATES, resident=5e7, threads=1
@@ -98,7 +99,7 @@ def test_time_and_memory_add_up(scene):
 
 
 def test_other_detectors_are_not_foretold(scene):
-    made = plan_scene(scene.with_options(**{"contact.detector": "bvh"}), estimate_model)
+    made = plan_scene(scene.with_options({"contact.detector": "bvh"}), estimate_model)
     assert made["memory"]["fields"] == 0.0 and "memory" not in made["fields"][0]
 
 

@@ -8,7 +8,7 @@ import trimesh
 
 from rbfmuscle.sim.scene.motion import bone_poses, interpolate, rotation_about
 from rbfmuscle.sim.scene.scene import Scene
-from rbfmuscle.validation import SceneError
+from rbfmuscle.validation import SceneError, UsageError
 
 BOX = trimesh.creation.box((10, 10, 10))
 
@@ -69,7 +69,7 @@ class TestFrames:
         scene = chain().set_motion(ramp={"one.turn": {"to": 40, "step": 10}})
         assert degrees(scene.with_options(frames="1::2"), "one.turn") == pytest.approx([10, 30])
         assert len(scene.with_options(frames="-1").motion) == 1
-        with pytest.raises(SceneError, match="none of the 5 frames"):
+        with pytest.raises(UsageError, match="none of the 5 frames"):
             scene.with_options(frames="7:9")
 
 

@@ -258,10 +258,10 @@ class TestRun:
     def test_options(self):
         scene = arm_scene()
         assert scene.output.fibres is False
-        changed = scene.with_options(**{"output.fibres": True, "output.fibres.count": 30})
+        changed = scene.with_options({"output.fibres": True, "output.fibres.count": 30})
         assert (changed.output.fibres.count, changed.output.fibres.segments) == (30, 15)
         with pytest.raises(SceneError, match="count"):
-            scene.with_options(**{"output.fibres.count": 0})
+            scene.with_options({"output.fibres.count": 0})
         with pytest.raises(UsageError, match=r"output\.fibres"):
             simulate_one_frame()["biceps"].fibres()
 
@@ -288,7 +288,7 @@ def test_without_fibres_no_code_of_theirs_is_loaded():
 @pytest.mark.parametrize("model", ["rbf", "pbd"])
 def test_fibres_stay_in_the_muscles_of_the_hip(hip_scene, model):
     """From rest to 90 degrees of flexion, all but a few points of both models' fibres lie inside the surface."""
-    run = simulate(hip_scene, model=model, frames="0:46:45", **{"output.fibres": True})
+    run = simulate(hip_scene, model=model, settings={"output.fibres": True}, frames="0:46:45")
     for muscle in run:
         for k, share in ((0, 0.01), (1, 0.1)):
             surface, lines = muscle.surface(k), muscle.fibres(k)

@@ -95,7 +95,7 @@ def test_arms_of_the_real_hip_have_the_right_signs_and_sum(hip_scene):
         "iliacus": (1, 1),
         "adductor_brevis": (1, -1),
     }
-    made = simulate(hip_scene, frames="0:46:3", **{"output.surfaces": False})
+    made = simulate(hip_scene, settings={"output.surfaces": False}, frames="0:46:3")
     angle = np.array([frame.coordinates["hip.flexion"] for frame in made.frames])
     for muscle, signs in wanted.items():
         length, arm = made.values(muscle, "length"), made.values(muscle, "moment_arm")

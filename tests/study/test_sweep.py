@@ -23,7 +23,7 @@ from rbfmuscle.study.experiment.sweep_table import (
     write_table,
 )
 from rbfmuscle.study.show.sweep_page import write_page
-from rbfmuscle.validation import SceneError, UsageError
+from rbfmuscle.validation import UsageError
 
 GRID = ["model.centres=40,60", "model.resolution=16,24"]
 FRAMES = "0:3"
@@ -98,7 +98,7 @@ class TestGrid:
             parse_grid(texts)
 
     def test_wrong_key_fails_before_anything_runs(self):
-        with pytest.raises(SceneError, match="substep_angle"):
+        with pytest.raises(UsageError, match="substep_angle"):
             plan_of(rbf_scene(), ["contact.substep_angel=1,2"])
 
     def test_key_depends_on_scene_and_settings_not_on_their_order(self):

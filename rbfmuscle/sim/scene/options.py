@@ -22,6 +22,7 @@ from rbfmuscle.validation import SceneError
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1)]
 Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 
 

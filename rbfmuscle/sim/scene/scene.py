@@ -4,8 +4,10 @@ A scene is loaded from a TOML file or built in code; both pass the same checks.
 """
 
 import copy
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -213,28 +215,38 @@ class Scene:
         other.muscles = [replace(muscle, options=dict(muscle.options)) for muscle in self.muscles]
         return other
 
-    def with_options(self, *, model=None, frames=None, **settings):
-        """Return a copy with another model, other frames or other settings; meshes are shared.
+    def with_options(
+        self,
+        settings: Mapping[str, Any] | None = None,
+        *,
+        model: str | dict | None = None,
+        frames: slice | str | None = None,
+    ) -> "Scene":
+        """Return a copy with other settings, another model or other frames; meshes are shared.
 
         Parameters
         ----------
+        settings : mapping, optional
+            Dotted keys with their values: ``{"model.centres": 200, "contact.substep_angle": 1}``.
+            See :func:`rbfmuscle.sim.scene.settings.apply_settings` for all of them.
         model : str or dict, optional
             For every muscle. Options of another model are dropped.
         frames : slice or str, optional
             Which frames of the motion, as a slice or "A:B:S".
-        **settings
-            Dotted keys with their values: ``**{"model.centres": 200, "contact.substep_angle": 1}``.
-            See :func:`rbfmuscle.sim.scene.settings.apply_setting` for all of them.
+
+        Raises
+        ------
+        UsageError
+            If a key is unknown, with the nearest right one, or a value is not allowed.
         """
-        from rbfmuscle.sim.scene.settings import apply_model, apply_setting, parse_slice
+        from rbfmuscle.sim.scene.settings import apply_model, apply_settings, choose_frames
 
         scene = self.copy()
         if model is not None:
             apply_model(scene, model)
-        for key, value in settings.items():
-            apply_setting(scene, key, value)
+        apply_settings(scene, settings or {})
         if frames is not None:
-            scene.motion = scene.motion.sliced(parse_slice(frames) if isinstance(frames, str) else frames)
+            choose_frames(scene, frames)
         return scene
 
     def resolved(self):

@@ -1,10 +1,17 @@
 """Changing a scene by dotted keys: ``--set KEY=VALUE``, grids of a sweep, ``Scene.with_options``."""
 
 import tomllib
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from rbfmuscle.sim.scene.motion import Motion
 from rbfmuscle.sim.scene.options import DetectOptions, SlidingOptions, did_you_mean
 from rbfmuscle.validation import SceneError, UsageError
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.scene.scene import Scene
 
 TABLES = ("contact", "sliding", "detect", "output", "motion")
 
@@ -21,19 +28,53 @@ def apply_model(scene, model, *, muscles=None):
         muscle.options.update(options)
 
 
-def apply_setting(scene, key, value):
-    """Set one dotted key of a scene, in place.
+def apply_settings(scene: "Scene", settings: Mapping[str, Any]) -> None:
+    """Set dotted keys of a scene, in place.
 
     ``model`` or ``model.KEY`` change every muscle, ``muscle.NAME.model`` or ``muscle.NAME.model.KEY`` one;
     ``contact.KEY``, ``sliding.KEY``, ``detect.KEY`` and ``output.KEY`` change a table (one that the scene
     lacks is switched on); ``motion.step`` changes the step of every ramp and
-    ``motion.ramp.NAME.COORDINATE.KEY`` one key of one.
+    ``motion.ramp.NAME.COORDINATE.KEY`` one key of one. Whole models come first, whatever the order, as another
+    model drops the settings of the one before.
+
+    Parameters
+    ----------
+    scene : Scene
+    settings : mapping of str to value
 
     Raises
     ------
-    SceneError
-        If the key is unknown or the value not allowed.
+    UsageError
+        If a key is unknown, with the nearest right one, or a value is not allowed.
     """
+    for key in sorted(settings, key=lambda key: not chooses_model(key)):
+        value = settings[key]
+        try:
+            _apply(scene, key, value.item() if isinstance(value, np.generic) else value)
+        except SceneError as error:
+            raise UsageError(str(error)) from None
+
+
+def chooses_model(key: str) -> bool:
+    """Whether a dotted key gives muscles another model as a whole."""
+    return key == "model" or (key.startswith("muscle.") and key.endswith(".model"))
+
+
+def choose_frames(scene: "Scene", frames: slice | str) -> None:
+    """Keep some frames of a scene's motion, in place: a slice or "A:B:S".
+
+    Raises
+    ------
+    UsageError
+        If there is none of them.
+    """
+    try:
+        scene.motion = scene.motion.sliced(parse_slice(frames) if isinstance(frames, str) else frames)
+    except SceneError as error:
+        raise UsageError(str(error)) from None
+
+
+def _apply(scene, key, value):
     head, _, rest = key.partition(".")
     if head == "model":
         _set_model(scene.muscles, scene, rest, value, key)

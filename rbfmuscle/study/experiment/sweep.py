@@ -164,7 +164,7 @@ def plan_sweep(scene, grid, *, frames=None, reference=None):
 
     Raises
     ------
-    SceneError
+    UsageError
         If a key or value of the grid is not one that the scene takes.
     """
     reference = dict(reference or {})
@@ -186,7 +186,7 @@ def plan_sweep(scene, grid, *, frames=None, reference=None):
     if "model" in reference and len(references) > 1:
         references = _one(references, points)
     for point in [*references.values(), *points.values()]:
-        scene.with_options(frames=frames, **point.settings)
+        scene.with_options(point.settings, frames=frames)
     chosen = list(references.values()) + [p for k, p in points.items() if k not in references]
     facts = {
         "scene": scene.name,

@@ -2,6 +2,7 @@
 
 import hashlib
 import importlib.metadata
+import math
 import os
 import platform
 from collections import defaultdict
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import rbfmuscle
+from rbfmuscle.sim.loop.frame import Frame
 
 FORMAT = 1
 _PACKAGES = ("numpy", "scipy", "numba", "scikit-image", "trimesh", "pyvista", "vtk", "libigl")
@@ -59,6 +61,15 @@ def build_info(scene, *, started, status, message, times, stages, frames, summar
         "muscles": {name: facts for name, facts in summary.items() if name != "all"},
         "frame_time": summary.get("all", {}).get("time_frame"),
         "frames": frames,
+    }
+
+
+def frame_facts(frame: Frame) -> dict:
+    """What ``run.json`` says of a written frame; coordinates in degrees."""
+    return {
+        "frame": frame.index,
+        "coordinates": {name: math.degrees(value) for name, value in frame.coordinates.items()},
+        "wall": frame.wall,
     }
 
 

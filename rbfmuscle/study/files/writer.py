@@ -48,7 +48,7 @@ class RunWriter:
     def __init__(self, directory, scene):
         self.directory = Path(directory)
         self.scene = scene
-        self.frames = []
+        self.count = 0
         output = scene.output
         self.format = output.surfaces.format if output.surfaces else None
         try:
@@ -83,15 +83,9 @@ class RunWriter:
         try:
             self._write(frame, rows)
         except OSError as error:
-            kept = f"{len(self.frames)} frames are kept in {self.directory}"
+            kept = f"{self.count} frames are kept in {self.directory}"
             raise SolveError(f"cannot write frame {frame.index}: {error.strerror}; {kept}") from None
-        self.frames.append(
-            {
-                "frame": frame.index,
-                "coordinates": {name: math.degrees(value) for name, value in frame.coordinates.items()},
-                "wall": frame.wall,
-            }
-        )
+        self.count += 1
 
     def close(self, rows=()):
         """Write the last rows of metrics and close all files."""

@@ -1,0 +1,210 @@
+"""``--set``: every key that the schemas document, from the command line into the run."""
+
+import json
+
+import numpy as np
+import pytest
+from blend_model import arm_scene
+from command_line import call
+
+from pbd_baseline.options import PBDOptions
+from rbfmuscle.model.options import RBFOptions
+from rbfmuscle.models import MODEL_NAMES
+from rbfmuscle.sim.scene import options
+
+# A value for every key, other than its default; model settings of quick muscles.
+TABLES = {
+    "contact": (
+        options.ContactOptions,
+        {"initial": "keep", "detector": "bvh", "tolerance": 0.1, "substep_angle": 4.0, "margin": 0.05},
+    ),
+    "sliding": (
+        options.SlidingOptions,
+        {
+            "threshold": 1.5, "strip": 0.5, "release": 1.0, "bones": True, "pairs": [["biceps", "brachialis"]],
+            "join": False, "cut": False,
+        },
+    ),
+    "detect.tunnelling": (
+        options.TunnellingOptions,
+        {"angle": 120.0, "action": "report", "swept": False, "smallest_step": 0.5},
+    ),
+    "output.surfaces": (options.SurfaceOptions, {"format": "stl"}),
+    "output.fibres": (options.FibreOptions, {"count": 8, "segments": 4}),
+    "output": (
+        options.OutputOptions,
+        {
+            "surfaces": {"format": "ply"}, "fibres": {"count": 8, "segments": 4}, "metrics": False,
+            "report": False, "preview": False,
+        },
+    ),
+}  # fmt: skip
+MODELS = {
+    "rbf": (
+        RBFOptions,
+        {
+            "centres": 60, "samples": 300, "iterations": 3, "contacts": 12, "resolution": 16, "kernel": "quintic",
+            "epsilon": 0.02, "stretch_low": 0.6, "stretch_high": 1.8, "stretch_hold": 0.2, "across": 2,
+            "across_weight": 0.5, "acceleration": 0, "placement": "even", "derivatives": "all", "seed": 3,
+        },
+    ),
+    "pbd": (
+        PBDOptions,
+        {
+            "iterations": 2, "prediction": "velocity", "damping": 0.9, "fibre_exponent": 1.0, "limits": [0.7, 2.0],
+            "soft_length": 0.2, "edge": 0.9, "bending": 0.8, "edge_compliance": 0.1, "bending_compliance": 0.1,
+            "arap_compliance": 0.5, "arap_reach": 0.05, "swelling_reach": 0.05, "response": "nearest",
+            "contact": "faces",
+        },
+    ),
+}  # fmt: skip
+QUICK = {"centres": 60, "samples": 200, "resolution": 12}
+# The name of the model decides it, so it is no key of the scene's.
+IMPLIED = {"method"}
+
+SETTINGS = [
+    (f"{table}.{key}", value) for table, (_, values) in TABLES.items() for key, value in values.items()
+]
+MODEL_SETTINGS = [(name, key, value) for name, (_, values) in MODELS.items() for key, value in values.items()]
+OTHERS = [
+    ("model", "xpbd", ["xpbd", "xpbd"]),
+    ("model", {"name": "pbd", "iterations": 2}, ["pbd", "pbd"]),
+    ("muscle.biceps.model", "arap-volume", ["arap-volume", "rbf"]),
+    ("muscle.brachialis.model.centres", 80, ["rbf", "rbf"]),
+    ("motion.step", 3.0, ["rbf", "rbf"]),
+    ("motion.ramp.elbow.flexion.to", 4.0, ["rbf", "rbf"]),
+    ("motion.ramp.elbow.flexion.from", 1.0, ["rbf", "rbf"]),
+    ("motion.ramp.elbow.flexion.step", 1.0, ["rbf", "rbf"]),
+]
+
+
+@pytest.fixture(scope="module")
+def scene_file(tmp_path_factory):
+    """Two small muscles beside each other over one hinge, as files."""
+    folder = tmp_path_factory.mktemp("arm")
+    scene = arm_scene(end=6, step=2)
+    for bone in scene.bones:
+        bone.mesh.export(folder / f"{bone.name}.ply")
+    egg = scene.muscles[0].mesh
+    for name, shift in (("biceps", -5.5), ("brachialis", 5.5)):
+        mesh = egg.copy()
+        mesh.apply_translation([0, shift, 0])
+        mesh.export(folder / f"{name}.ply")
+    for attachment in scene.muscles[0].attachments:
+        np.savetxt(folder / f"{attachment.bone}.txt", attachment.vertices, fmt="%d")
+    (folder / "arm.toml").write_text(SCENE)
+    return folder / "arm.toml"
+
+
+SCENE = """[scene]
+format = 1
+units = "mm"
+[[bone]]
+name = "upper"
+mesh = "upper.ply"
+[[bone]]
+name = "fore"
+mesh = "fore.ply"
+[[joint]]
+name = "elbow"
+parent = "upper"
+child = "fore"
+centre = [0, 0, 0]
+axes = { flexion = [0, -1, 0] }
+[motion]
+ramp = { "elbow.flexion" = { from = 0, to = 6, step = 2 } }
+[defaults]
+model = { name = "rbf", centres = 60, samples = 200, resolution = 12 }
+attach = [{ bone = "upper", vertices = "upper.txt" }, { bone = "fore", vertices = "fore.txt" }]
+[[muscle]]
+name = "biceps"
+mesh = "biceps.ply"
+[[muscle]]
+name = "brachialis"
+mesh = "brachialis.ply"
+[output]
+report = false
+preview = false
+"""
+
+
+def run(capsys, scene_file, folder, *settings, model=None):
+    """Facts in ``run.json`` after two frames; settings are (key, value)."""
+    texts = [f"{key}={value if isinstance(value, str) else toml(value)}" for key, value in settings]
+    arguments = [part for text in texts for part in ("--set", text)] + (["--model", model] if model else [])
+    code, _, err = call(capsys, "run", scene_file, "-o", folder, "--frames", "0:2", *arguments)
+    assert code == 0, err
+    info = json.loads((folder / "run.json").read_text())
+    assert len(info["frames"]) == 2
+    return info
+
+
+def toml(value):
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {toml(item)}" for key, item in value.items()) + " }"
+    return json.dumps(value)
+
+
+@pytest.mark.parametrize(("table", "values"), [*TABLES.values(), *MODELS.values()], ids=[*TABLES, *MODELS])
+def test_every_documented_key_has_a_value_here(table, values):
+    fields = {name: field for name, field in table.model_fields.items() if name not in IMPLIED}
+    assert set(values) == set(fields)
+    same = [k for k, v in values.items() if v == fields[k].get_default(call_default_factory=True)]
+    assert same == []
+
+
+@pytest.mark.parametrize(("key", "value"), SETTINGS, ids=[key for key, _ in SETTINGS])
+@pytest.mark.filterwarnings("ignore::rbfmuscle.validation.NumericalWarning")
+def test_key_of_a_table_reaches_the_run(scene_file, tmp_path, capsys, key, value):
+    found = run(capsys, scene_file, tmp_path, (key, value), model="pbd")["scene"]
+    for part in key.split("."):
+        found = found[part]
+    assert found == value
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "value"), MODEL_SETTINGS, ids=[f"{name}-{key}" for name, key, _ in MODEL_SETTINGS]
+)
+@pytest.mark.filterwarnings("ignore::rbfmuscle.validation.NumericalWarning")
+def test_key_of_a_model_reaches_the_run(scene_file, tmp_path, capsys, name, key, value):
+    info = run(capsys, scene_file, tmp_path, (f"model.{key}", value), model=name)
+    for muscle in info["scene"]["muscles"]:
+        assert muscle["model"]["name"] == name and muscle["model"][key] == value
+
+
+@pytest.mark.parametrize(("key", "value", "models"), OTHERS, ids=[str(case[:2]) for case in OTHERS])
+def test_models_and_motion_are_set(scene_file, tmp_path, capsys, key, value, models):
+    info = run(capsys, scene_file, tmp_path, (key, value))
+    assert [muscle["model"]["name"] for muscle in info["scene"]["muscles"]] == models
+    if key.endswith("centres"):
+        assert [m["model"]["centres"] for m in info["scene"]["muscles"]] == [60, 80]
+    if key.startswith("motion"):
+        ramp = info["scene"]["motion"]["ramp"]["elbow.flexion"]
+        assert ramp[key.rsplit(".", 1)[-1]] == value
+
+
+def test_a_whole_model_comes_before_its_settings_whatever_the_order(scene_file, tmp_path, capsys):
+    info = run(capsys, scene_file, tmp_path, ("model.iterations", 2), ("model", "xpbd"))
+    assert {json.dumps(m["model"]) for m in info["scene"]["muscles"]} == {'{"name": "xpbd", "iterations": 2}'}
+
+
+@pytest.mark.filterwarnings("ignore::rbfmuscle.validation.SceneWarning")
+def test_compare_takes_a_whole_model_as_the_file_would_give_it(scene_file, tmp_path, capsys):
+    code, _, err = call(
+        capsys, "compare", scene_file, "-o", tmp_path, "--models", "pbd,xpbd", "--no-pictures", "--frames",
+        "0:2", "--set", 'model={name = "xpbd", iterations = 4}', "--set", "pbd:model.edge=0.9",
+    )  # fmt: skip
+    assert code == 0, err
+    found = {
+        name: json.loads((tmp_path / name / "run.json").read_text())["scene"]["muscles"][0]["model"]
+        for name in ("pbd", "xpbd")
+    }
+    assert found == {"pbd": {"name": "pbd", "edge": 0.9}, "xpbd": {"name": "xpbd", "iterations": 4}}
+
+
+def test_the_name_of_a_model_decides_its_method(scene_file, tmp_path, capsys):
+    code, _, err = call(
+        capsys, "run", scene_file, "-o", tmp_path, "--model", "pbd", "--set", "model.method=xpbd"
+    )
+    assert code == 2 and "method follows from the model's name" in err
+    assert all(name in err for name in MODEL_NAMES)
