@@ -329,7 +329,7 @@ class Recording:
                     watch(self.models, frame)
                 with self.timed("write"):
                     sink.write(frame, rows)
-                self.written.append(frame_facts(frame))
+                self.written.append(frame_facts(self.scene, frame))
                 if progress is not None:
                     progress(len(self.written), len(self.scene.motion))
             self.status, self.message = "complete", ""
@@ -385,6 +385,8 @@ def _bones_driven_together(scene):
     collisions = bone_collisions(scene)
     for finding in bone_findings(collisions, scene.units):
         warnings.warn(f"{finding.place}: {finding.message}", SceneWarning, stacklevel=4)
+    for note in scene.motion.notes:
+        warnings.warn(f"motion: {note}", SceneWarning, stacklevel=4)
     events = {}
     for frame, first, second, _ in collisions:
         events.setdefault(frame, []).append(Event(frame, "", f"{first} and {second}", 1, "bones_overlap"))

@@ -7,6 +7,7 @@ import trimesh
 
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.sim.loop.frame import FinishedDrawing, ModelSurface
+from rbfmuscle.sim.scene.joint_tables import JointTable
 from rbfmuscle.sim.scene.motion import Motion
 from rbfmuscle.sim.scene.options import ContactOptions, DetectOptions
 
@@ -181,8 +182,9 @@ def bone(name, field):
 
 
 def joint(name, parent, child, centre, **axes):
-    axes = {key: np.asarray(axis, dtype=float) for key, axis in axes.items()}
-    return SimpleNamespace(name=name, parent=parent, child=child, centre=np.asarray(centre, float), axes=axes)
+    axes = {key: list(map(float, axis)) for key, axis in axes.items()}
+    row = {"name": name, "parent": parent, "child": child, "centre": list(map(float, centre)), "axes": axes}
+    return JointTable.build(row, place="toy ").joint()
 
 
 def muscle(name, mesh, attachments, **options):
@@ -199,6 +201,8 @@ def scene(bones, joints, muscles, frames, *, initial="keep", sliding=None, tunne
         length=lambda mm: mm,
         bones=bones,
         joints=joints,
+        couplings=[],
+        links=[],
         muscles=muscles,
         motion=Motion(frames),
         contact=ContactOptions(initial=initial, substep_angle=substep),

@@ -24,7 +24,7 @@ def check(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", nega
     from rbfmuscle.models import check_models
     from rbfmuscle.sim.scene.scene import Scene
 
-    loaded = Scene.load(scene)
+    loaded = Scene.load(scene, skeleton=True)
     check_models(loaded)
     findings = [*loaded.check(), *_field_notes(loaded)]
     errors = [finding for finding in findings if finding.level == "error"]
@@ -61,7 +61,9 @@ def _print_scene(scene):
     for bone in scene.bones:
         print(f"  bone {bone.name}: {len(bone.mesh.vertices)} vertices, {len(bone.mesh.faces)} triangles")
     for joint in scene.joints:
-        print(f"  joint {joint.name}: {joint.parent} to {joint.child}, {', '.join(joint.axes)}")
+        print(
+            f"  joint {joint.name}: {joint.parent} to {joint.child}, {', '.join(joint.coordinates) or joint.kind}"
+        )
     for muscle in scene.muscles:
         held = ", ".join(f"{len(a.vertices)} on {a.bone}" for a in muscle.attachments)
         volume = muscle.mesh.volume / scene.length(10.0) ** 3

@@ -1,6 +1,5 @@
 """``rbfmuscle view``: a window on a scene that is moved by hand, or on a saved run."""
 
-import math
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -98,6 +97,7 @@ def _open_saved(run):
 def _open_scene(loaded, model):
     from rbfmuscle.models import build_models, configure_scene
     from rbfmuscle.sim.loop.live import LiveSession
+    from rbfmuscle.sim.scene.motion import shown_value
     from rbfmuscle.study.show.viewer import LiveViewer
 
     scene = configure_scene(loaded, model=model)
@@ -113,5 +113,6 @@ def _open_scene(loaded, model):
         return build_models(chosen.with_options(settings))
 
     viewer = LiveViewer(LiveSession(scene), build, models, list(QUALITIES))
-    motion = [{k: math.degrees(v) for k, v in frame.items()} for frame in scene.motion.frames]
+    free = viewer.coordinates
+    motion = [{k: shown_value(scene, k, v) for k, v in q.items() if k in free} for q in scene.motion.frames]
     return viewer, motion, f"rbfmuscle: {scene.name}"

@@ -7,7 +7,7 @@ from typing import Literal, get_args, get_origin
 
 import pytest
 
-from rbfmuscle.sim.scene import attachments, options
+from rbfmuscle.sim.scene import attachments, joint_tables, options
 from rbfmuscle.sim.scene import file as scene_file
 
 TEXT = (Path(__file__).parents[2] / "docs" / "scene_file.md").read_text(encoding="utf-8")
@@ -19,7 +19,12 @@ def documented_tables():
     return {
         scene_file.SceneTable: "`[scene]`",
         scene_file.BoneTable: "`[[bone]]`",
-        scene_file.JointTable: "`[[joint]]`",
+        joint_tables.JointTable: "`[[joint]]`",
+        joint_tables.CoordinateTable: "`[[joint]]`",
+        joint_tables.AxisTable: "`[[joint]]`",
+        joint_tables.FunctionTable: "`[[joint]]`",
+        joint_tables.PointsTable: "`[[joint]]`",
+        joint_tables.CouplingTable: "`[[coupling]]`",
         options.MotionOptions: "`[motion]`",
         options.RampOptions: "`[motion]`",
         scene_file.MuscleTable: "`[[muscle]]`, `[defaults]`",

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from rbfmuscle.sim.joints.joint import Coordinate
 from rbfmuscle.sim.loop.simulate import Event, Frame, ModelSurface
 from rbfmuscle.sim.scene.motion import Motion
 from rbfmuscle.study.measure.centreline import Centreline, slice_operator
@@ -212,7 +213,8 @@ def rod_muscle(mesh, length=100.0):
     return SimpleNamespace(name="rod", mesh=mesh, attachments=attachments)
 
 
-JOINTS = [SimpleNamespace(name="joint", parent="trunk", child="limb")]
+BEND = {"bend": Coordinate()}
+JOINTS = [SimpleNamespace(name="joint", parent="trunk", child="limb", coordinates=BEND)]
 
 
 class TestLength:
@@ -293,7 +295,12 @@ class TestRecorder:
         bones[1].mesh.apply_translation([500, 0, 0])
         frames = [{"joint.bend": a} for a in (0.0, 0.1, 0.2)]
         return SimpleNamespace(
-            units="cm", motion=Motion(frames), bones=bones, joints=JOINTS, muscles=[rod_muscle(mesh)]
+            units="cm",
+            motion=Motion(frames),
+            bones=bones,
+            couplings=[],
+            joints=JOINTS,
+            muscles=[rod_muscle(mesh)],
         )
 
     def frame(self, scene, index):

@@ -5,9 +5,10 @@ import math
 
 import numpy as np
 
+from rbfmuscle.sim.joints.skeleton import all_coordinates
 from rbfmuscle.sim.loop.simulate import FrameLoop
 from rbfmuscle.sim.plan.reach import build_fields, reached_bones
-from rbfmuscle.sim.scene.motion import Motion, coordinate_names
+from rbfmuscle.sim.scene.motion import Motion
 
 # What a coordinate may be turned by where the scene's own motion does not go further [degree].
 FREE_RANGE = 30.0
@@ -36,8 +37,8 @@ class LiveSession:
         self.scene = scene
         self.limits = coordinate_limits(scene)
         self.fields = live_fields(scene) if fields is None else fields
-        self.here = dict.fromkeys(self.limits, 0.0)
-        self.target = dict(self.here)
+        self.rest = _rest(scene, self.limits)
+        self.here, self.target = dict(self.rest), dict(self.rest)
         self.models, self._rest, self._loop = [], [], None
 
     def use(self, models, rest=None):
@@ -64,7 +65,7 @@ class LiveSession:
         self.close()
         for model, state in zip(self.models, self._rest):
             model.restore(state)
-        self.here = dict.fromkeys(self.limits, 0.0)
+        self.here = dict(self.rest)
 
     def set(self, name, angle):
         """Give a coordinate a new target [radian], kept within its limits."""
@@ -110,7 +111,9 @@ class LiveSession:
 
 
 def coordinate_limits(scene):
-    """What each coordinate may be set to by hand: the motion's own range and 30 degrees both ways.
+    """What each coordinate may be set to by hand: its range, or the motion's own and 30 degrees both ways.
+
+    A coordinate that follows others or is locked cannot be set. A length without a range may go 30 mm both ways.
 
     Parameters
     ----------
@@ -121,12 +124,24 @@ def coordinate_limits(scene):
     dict of str to (float, float)
         [radian]
     """
-    free = math.radians(FREE_RANGE)
+    followers = {coupling.coordinate for coupling in scene.couplings}
     limits = {}
-    for name in coordinate_names(scene.joints):
-        values = [frame.get(name, 0.0) for frame in scene.motion.frames]
-        limits[name] = (min([-free, *values]), max([free, *values]))
+    for name, facts in all_coordinates(scene.joints).items():
+        if name in followers or facts.locked:
+            continue
+        free = scene.length(FREE_RANGE) if facts.motion == "translation" else math.radians(FREE_RANGE)
+        values = [frame.get(name, facts.rest) for frame in scene.motion.frames]
+        low, high = min([facts.rest - free, *values]), max([facts.rest + free, *values])
+        if facts.range is not None and facts.range[0] < facts.range[1]:
+            least, most = (min(facts.range[0], facts.rest), max(facts.range[1], facts.rest))
+            low, high = max(low, least), min(high, most)
+        limits[name] = (low, high)
     return limits
+
+
+def _rest(scene, names):
+    facts = all_coordinates(scene.joints)
+    return {name: facts[name].rest for name in names}
 
 
 def live_fields(scene):
@@ -146,9 +161,9 @@ def live_fields(scene):
 def _wide_scene(scene):
     """The scene with a motion that takes each coordinate to its limits: what muscles can meet by hand."""
     limits = coordinate_limits(scene)
-    stops = [{}]
+    rest, stops = _rest(scene, limits), [{}]
     for name, ends in limits.items():
-        stops += [{name: angle} for low in ends for angle in np.linspace(0.0, low, 4)[1:]]
+        stops += [{name: value} for end in ends for value in np.linspace(rest[name], end, 4)[1:]]
     wide = copy.copy(scene)
-    wide.motion = Motion([dict.fromkeys(limits, 0.0) | stop for stop in stops])
+    wide.motion = Motion([rest | stop for stop in stops])
     return wide

@@ -13,7 +13,7 @@ from rbfmuscle.sim.loop.stepper import MuscleStepper, TimedDrawing
 from rbfmuscle.sim.loop.substeps import SubSteps
 from rbfmuscle.sim.loop.workers import Workers
 from rbfmuscle.sim.plan.reach import build_fields, reached_bones
-from rbfmuscle.sim.scene.motion import bone_poses
+from rbfmuscle.sim.scene.motion import bone_poses, completed, rest_coordinates
 from rbfmuscle.sim.scene.scene import Scene
 
 __all__ = [
@@ -171,9 +171,9 @@ class FrameLoop:
 
     def _path_to(self, coordinates: Mapping[str, float]) -> list[dict]:
         """Coordinates of the sub-steps to the next frame, the first of which is where the muscles are."""
-        # At rest every coordinate is zero, whatever a motion chooses to move.
-        here = self.here or dict.fromkeys(coordinates, 0.0)
-        self.here = dict(coordinates)
+        # Whatever a motion chooses to move starts at rest, which for most coordinates is zero.
+        here = self.here or dict.fromkeys(coordinates, 0.0) | rest_coordinates(self.scene)
+        self.here = completed(self.scene, coordinates)
         for stepper in self.steppers:
             stepper.frame = self._next_index
         self._next_index += 1

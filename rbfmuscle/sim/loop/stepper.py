@@ -10,7 +10,7 @@ import numpy as np
 
 from rbfmuscle.sim.loop.frame import Drawing, Event, ModelSurface
 from rbfmuscle.sim.loop.tunnelling import find_crossings, turn_back
-from rbfmuscle.sim.scene.motion import bone_poses, interpolate
+from rbfmuscle.sim.scene.motion import bone_poses, interpolate, shown_value, step_angle, unit_sign
 from rbfmuscle.validation import SolveError
 
 # Depth [mm] below which a path through a bone counts as touching it; above the error of a bone's field.
@@ -169,7 +169,7 @@ class MuscleStepper:
         if not remaining:
             self._report_all(crossings, "rotated")
             return
-        angle = max(abs(after.get(k, 0.0) - before.get(k, 0.0)) for k in {*before, *after})
+        angle = step_angle(self.scene, before, after)
         if self.detect.action == "rotate" or angle <= 2.0 * math.radians(self.detect.smallest_step):
             self._report_all(remaining, "unresolved")
             return
@@ -183,5 +183,9 @@ class MuscleStepper:
             self.report(self.contacts.names[crossing.bone], len(crossing.index), action)
 
     def _place(self, coordinates):
-        where = ", ".join(f"{name} = {np.degrees(value):.6g} deg" for name, value in coordinates.items())
+        scene = self.scene
+        where = ", ".join(
+            f"{name} = {shown_value(scene, name, value):.6g}{unit_sign(scene, name).replace('°', ' deg')}"
+            for name, value in coordinates.items()
+        )
         return f"muscle {self.name!r}, frame {self.frame} ({where or 'rest'})"

@@ -6,10 +6,16 @@ import math
 import numpy as np
 
 from rbfmuscle.geometry.rest_frame import RestFrame, diameter
-from rbfmuscle.sim.scene.motion import bone_poses, interpolate
+from rbfmuscle.sim.joints.skeleton import all_coordinates
+from rbfmuscle.sim.scene.motion import bone_poses, completed, interpolate, step_angle, turned_angle
 
 # No attached point moves farther against a bone in one sub-step than this share of its muscle's diameter.
 TRAVEL = 1.0 / 27.0
+# Pieces in which a path is followed to see how far it turns the bones.
+PIECES = 8
+
+
+__all__ = ["SubSteps", "path_angle", "turned_angle"]
 
 
 class SubSteps:
@@ -27,6 +33,7 @@ class SubSteps:
     def __init__(self, scene):
         self.scene = scene
         self.limit = math.radians(scene.contact.substep_angle)
+        self._facts = all_coordinates(scene.joints)
         names = [bone.name for bone in scene.bones]
         owner, corners, size = [], [], []
         for muscle in scene.muscles:
@@ -48,16 +55,17 @@ class SubSteps:
         list of dict
             Empty where nothing moves.
         """
+        before, after = completed(self.scene, before), completed(self.scene, after)
         moving = [k for k in {*before, *after} if before.get(k, 0.0) != after.get(k, 0.0)]
         if not moving:
             return []
-        if len(moving) == 1:
+        if len(moving) == 1 and self._facts[moving[0]].motion == "rotation":
             return [*self._stops_on_grid(before, after, moving[0]), dict(after)]
         return self._even_stops(before, after)
 
     def _even_stops(self, before, after):
         """The fewest equal sub-steps that are short enough."""
-        count = max(1, math.ceil(largest_change(before, after) / self.limit - 1e-9))
+        count = max(1, math.ceil(path_angle(self.scene, before, after) / self.limit - 1e-9))
         while True:
             stops = [interpolate(before, after, k / count) for k in range(count + 1)]
             poses = [self._matrices(stop) for stop in stops]
@@ -101,17 +109,18 @@ class SubSteps:
         return max(excess, float((length / self._travel).max(initial=0.0)))
 
 
-def largest_change(before, after):
-    """Largest change of any coordinate between two frames [radian]."""
-    return max((abs(after.get(k, 0.0) - before.get(k, 0.0)) for k in {*before, *after}), default=0.0)
+def path_angle(scene, before, after):
+    """How far the bones turn from one set of coordinates to another [radian].
 
-
-def turned_angle(rotation):
-    """Angle of a (3, 3) rotation [radian], accurate for small ones too."""
-    skew = np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
-    return math.atan2(float(np.linalg.norm(skew)), float(np.trace(rotation)) - 1.0)
+    Angles count as they are given; where other coordinates move too, the path is followed in a few pieces.
+    """
+    facts = all_coordinates(scene.joints)
+    changes = {k: abs(after.get(k, 0.0) - before.get(k, 0.0)) for k in {*before, *after}}
+    angle = max((change for k, change in changes.items() if facts[k].motion == "rotation"), default=0.0)
+    if not any(change for k, change in changes.items() if facts[k].motion != "rotation"):
+        return angle
+    stops = [interpolate(before, after, k / PIECES) for k in range(PIECES + 1)]
+    return max(angle, sum(step_angle(scene, a, b, shifts=False) for a, b in itertools.pairwise(stops)))
 
 
 def _corners(points):

@@ -9,8 +9,8 @@ import numpy as np
 
 from rbfmuscle.sim.distance.detectors import build_detector
 from rbfmuscle.sim.loop.contact import moved_box
-from rbfmuscle.sim.loop.substeps import largest_change
-from rbfmuscle.sim.scene.motion import bone_poses, interpolate
+from rbfmuscle.sim.loop.substeps import path_angle
+from rbfmuscle.sim.scene.motion import bone_poses, completed, interpolate, rest_coordinates
 
 # Poses of a motion that a swept box is made of; arcs between them are covered by the padding.
 SAMPLED_POSES = 48
@@ -43,10 +43,10 @@ def sampled_poses(scene):
     """Poses along the scene's motion, the rest pose first, thinned to a bounded number."""
     frames = scene.motion.frames
     chosen = sorted({round(k) for k in np.linspace(0, len(frames) - 1, min(len(frames), SAMPLED_POSES))})
-    stops = [{}, *(frames[k] for k in chosen)]
+    stops = [rest_coordinates(scene), *(completed(scene, frames[k]) for k in chosen)]
     poses = [bone_poses(scene, {})]
     for before, after in itertools.pairwise(stops):
-        count = max(1, math.ceil(largest_change(before, after) / math.radians(10.0)))
+        count = max(1, math.ceil(path_angle(scene, before, after) / math.radians(10.0)))
         poses.extend(bone_poses(scene, interpolate(before, after, (k + 1) / count)) for k in range(count))
     return poses
 

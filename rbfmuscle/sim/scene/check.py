@@ -43,6 +43,7 @@ def check_scene(scene):
             test()
         except RBFMuscleError as error:
             findings.append(Finding("error", scene.name, str(error)))
+    findings.extend(Finding("warning", "motion", note) for note in scene.motion.notes)
     findings.extend(_rest_overlaps(scene))
     try:
         findings.extend(bone_findings(bone_collisions(scene), scene.units))

@@ -9,10 +9,16 @@ from pydantic import Field, ValidationError
 
 from rbfmuscle.sim.scene.attachments import AttachTable
 from rbfmuscle.sim.scene.check import check_place, check_size
+from rbfmuscle.sim.scene.joint_tables import (
+    CouplingTable,
+    JointTable,
+    coupling_row,
+    joint_row,
+    make_coupling,
+)
 from rbfmuscle.sim.scene.meshes import read_mesh
-from rbfmuscle.sim.scene.motion import Motion
+from rbfmuscle.sim.scene.motion import coordinate_names, unit_sign
 from rbfmuscle.sim.scene.options import (
-    Axis,
     ContactOptions,
     DetectOptions,
     MotionOptions,
@@ -20,7 +26,6 @@ from rbfmuscle.sim.scene.options import (
     Positive,
     SlidingOptions,
     Table,
-    Vector,
     describe_error,
 )
 from rbfmuscle.validation import MeshError, SceneError
@@ -38,18 +43,8 @@ class BoneTable(Table):
     """``[[bone]]``."""
 
     name: str
-    mesh: str
+    mesh: str | None = None
     scale: Positive = 1.0
-
-
-class JointTable(Table):
-    """``[[joint]]``."""
-
-    name: str
-    parent: str
-    child: str
-    centre: Vector
-    axes: dict[str, Axis] = Field(min_length=1)
 
 
 class DefaultsTable(Table):
@@ -75,6 +70,7 @@ class SceneFile(Table):
     defaults: DefaultsTable = DefaultsTable()
     bone: list[BoneTable] = Field(default_factory=list)
     joint: list[JointTable] = Field(default_factory=list)
+    coupling: list[CouplingTable] = Field(default_factory=list)
     motion: MotionOptions = MotionOptions()
     muscle: list[MuscleTable] = Field(default_factory=list)
     contact: ContactOptions = ContactOptions()
@@ -112,32 +108,39 @@ def read_scene_file(path):
         ) from None
 
 
-def load_scene(cls, path):
-    """Return the scene (of class ``cls``) of a TOML file, its meshes read and checked."""
+def load_scene(cls, path, *, skeleton=False):
+    """Return the scene (of class ``cls``) of a TOML file, its meshes read and checked; see `Scene.load`."""
     tables = read_scene_file(path)
     folder = path.parent
     try:
-        return _build(cls(tables.scene.name or path.stem, units=tables.scene.units), tables, folder, path)
+        return _build(
+            cls(tables.scene.name or path.stem, units=tables.scene.units), tables, folder, path, skeleton
+        )
     except (SceneError, MeshError) as error:
         raise type(error)(f"{path}: {error}") from None
 
 
-def _build(scene, tables, folder, path):
+def _build(scene, tables, folder, path, skeleton):
     scene.path = path
     for bone in tables.bone:
+        if bone.mesh is None:
+            scene.add_link(bone.name)
+            continue
         read = read_mesh(folder / bone.mesh, name=bone.name, scale=bone.scale, may_be_open=True)
         check_size(scene, "bone", bone.name, read.mesh, read.source)
         scene.add_bone(bone.name, read)
     for joint in tables.joint:
-        scene.add_joint(joint.name, joint.parent, joint.child, joint.centre, joint.axes)
+        scene.place_joint(joint.joint())
+    for coupling in tables.coupling:
+        scene.place_coupling(make_coupling(coupling, scene.joints))
     for muscle in tables.muscle:
         _add_muscle(scene, muscle, tables.defaults, folder)
-    scene.motion = Motion.from_options(tables.motion, scene.joints, folder=folder)
+    scene.motion = scene.motion_from(tables.motion, folder=folder)
     scene.contact = tables.contact
     scene.sliding = tables.sliding
     scene.detect = tables.detect
     scene.output = tables.output
-    return scene.validate()
+    return scene if skeleton and not tables.muscle else scene.validate()
 
 
 def _add_muscle(scene, muscle, defaults, folder):
@@ -198,16 +201,14 @@ def describe_scene(scene):
         "units": scene.units,
         "file": str(scene.path) if scene.path else None,
         "bones": [{"name": b.name, **_mesh_facts(b)} for b in scene.bones],
-        "joints": [
-            {
-                "name": j.name,
-                "parent": j.parent,
-                "child": j.child,
-                "centre": j.centre.tolist(),
-                "axes": {key: axis.tolist() for key, axis in j.axes.items()},
-            }
-            for j in scene.joints
-        ],
+        "links": list(scene.links),
+        "joints": [joint_row(joint) for joint in scene.joints],
+        "couplings": [coupling_row(coupling, scene.joints) for coupling in scene.couplings],
+        "coordinate_units": {
+            name: unit_sign(scene, name)
+            for name in coordinate_names(scene.joints)
+            if unit_sign(scene, name) != "°"
+        },
         "motion": {
             **scene.motion.options.model_dump(by_alias=True, exclude_none=True),
             "frames": len(scene.motion.frames),

@@ -62,7 +62,7 @@ def read_mesh(path, *, name=None, scale=1.0, may_be_open=False):
         If the file is missing, unreadable or empty, or the surface cannot be made closed and manifold.
     """
     path = Path(path)
-    vertices, faces = _read_arrays(path)
+    vertices, faces = read_arrays(path)
     read = prepare_mesh(
         vertices * scale, faces, place=str(path), name=name or path.stem, may_be_open=may_be_open
     )
@@ -95,7 +95,8 @@ def prepare_mesh(vertices, faces, *, place, name, may_be_open=False):
     return ReadMesh(mesh, result.vertex_map, result.notes, result.closed)
 
 
-def _read_arrays(path):
+def read_arrays(path):
+    """Return vertices (n, 3) and triangles (m, 3) of a mesh file as they stand, or raise MeshError."""
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise MeshError(

@@ -6,29 +6,47 @@ from pathlib import Path
 
 import numpy as np
 
+from rbfmuscle.sim.joints.joint import rotation_about
+from rbfmuscle.sim.joints.skeleton import (
+    all_coordinates,
+    beyond_range,
+    joint_poses,
+    joint_values,
+    rest_values,
+)
+from rbfmuscle.sim.scene.joint_tables import FACTORS, full_name
+from rbfmuscle.sim.scene.motion_file import read_motion_file
 from rbfmuscle.sim.scene.options import MotionOptions, did_you_mean
 from rbfmuscle.validation import SceneError
+
+__all__ = ["Motion", "bone_poses", "coordinate_names", "interpolate", "rotation_about"]
 
 MAX_FRAMES = 100_000
 
 
 class Motion:
-    """The frames of a motion, each a dict of "joint.coordinate" -> angle [radian].
+    """The frames of a motion, each a dict of "joint.coordinate" -> value [radian or scene unit].
 
     Parameters
     ----------
     frames : list of dict
-        One dict a written frame; a coordinate that is absent stays at rest (0).
+        One dict a written frame; a coordinate that is absent stays at rest.
     options : MotionOptions, optional
         What the frames were made from.
+    times : list of float, optional
+        Time of each frame [s], where a motion file gives it.
+    notes : list of str
+        What a user should know: coordinates that leave their range, columns that were not used.
     """
 
-    def __init__(self, frames=None, *, options=None):
+    def __init__(self, frames=None, *, options=None, times=None, notes=()):
         self.frames = [dict(frame) for frame in frames] if frames is not None else [{}]
         self.options = options or MotionOptions()
+        self.times = None if times is None else list(times)
+        self.notes = list(notes)
 
     @classmethod
-    def from_options(cls, options, joints, *, folder=None):
+    def from_options(cls, options, joints, *, couplings=(), metre=1000.0, folder=None):
         """Return the motion that ``[motion]`` asks for.
 
         Parameters
@@ -36,6 +54,10 @@ class Motion:
         options : MotionOptions
         joints : list of Joint
             Their coordinates are the names that may be used.
+        couplings : list of Coupling
+            Coordinates that follow others cannot be asked for.
+        metre : float
+            Scene units in a metre: OpenSim files are in metres.
         folder : path, optional
             What a relative ``file`` is relative to.
 
@@ -44,17 +66,30 @@ class Motion:
         SceneError
             If a coordinate is unknown, the motion has too many frames, or its file cannot be read.
         """
-        known = coordinate_names(joints)
+        known, times, notes = coordinate_names(joints), None, []
+        facts = all_coordinates(joints)
+        followers = {coupling.coordinate for coupling in couplings}
         if options.ramp is not None:
-            frames = _ramp_frames({_known(name, known): ramp for name, ramp in options.ramp.items()})
+            ramps = {full_name(n, known, place="[motion]"): ramp for n, ramp in options.ramp.items()}
+            frames = _ramp_frames(ramps, facts)
         elif options.waypoints is not None:
-            stops = [{_known(name, known): v for name, v in stop.items()} for stop in options.waypoints]
-            frames = _waypoint_frames(stops, options.step)
+            stops = [
+                {full_name(n, known, place="[motion]"): v for n, v in s.items()} for s in options.waypoints
+            ]
+            frames = _waypoint_frames(stops, options.step, facts)
         elif options.file is not None:
-            frames = _file_frames(Path(folder or ".") / options.file, known)
+            path = Path(folder or ".") / options.file
+            frames, times, notes = read_motion_file(
+                path, facts, followers, metre=metre, degrees=options.degrees, most=MAX_FRAMES
+            )
         else:
             frames = [{}]
-        return cls(frames, options=options)
+        if options.file is None:
+            _refuse_followers(frames, followers, facts)
+        frames = [_honoured(frame, facts, followers) for frame in frames]
+        notes += _range_notes(frames, joints)
+        frames = [{name: facts[name].honoured(value) for name, value in frame.items()} for frame in frames]
+        return cls(frames, options=options, times=times, notes=notes)
 
     @property
     def coordinates(self):
@@ -70,7 +105,8 @@ class Motion:
             raise SceneError(
                 f"frames {_slice_text(frames)} selects none of the {len(self.frames)} frames of the motion"
             )
-        return Motion(chosen, options=self.options)
+        times = None if self.times is None else self.times[frames]
+        return Motion(chosen, options=self.options, times=times, notes=self.notes)
 
     def __len__(self):
         return len(self.frames)
@@ -78,7 +114,19 @@ class Motion:
 
 def coordinate_names(joints):
     """Return every "joint.coordinate" of the joints, in order."""
-    return [f"{joint.name}.{name}" for joint in joints for name in joint.axes]
+    return list(all_coordinates(joints))
+
+
+def rest_coordinates(scene):
+    """Return the coordinates whose rest value is not zero, by full name [radian or scene unit]."""
+    if not any(facts.rest for joint in scene.joints for facts in joint.coordinates.values()):
+        return {}
+    return {name: value for name, value in rest_values(scene.joints, scene.couplings).items() if value}
+
+
+def completed(scene, coordinates):
+    """Return coordinates with those that are absent at rest added, where rest is not zero."""
+    return {**rest_coordinates(scene), **coordinates}
 
 
 def interpolate(before, after, t):
@@ -95,92 +143,139 @@ def interpolate(before, after, t):
     return {name: (1 - t) * before.get(name, 0.0) + t * after.get(name, 0.0) for name in names}
 
 
-def rotation_about(axis, angle, centre):
-    """Return the (4, 4) rotation by ``angle`` [radian] about an axis through ``centre`` (Rodrigues)."""
-    x, y, z = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    pose = np.eye(4)
-    pose[:3, :3] += math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
-    pose[:3, 3] = centre - pose[:3, :3] @ centre
-    return pose
-
-
 def bone_poses(scene, coordinates):
     """Return the pose of every bone: rest bone coordinates -> world.
 
-    A joint turns its child, and all that hangs on it, about the joint's centre; several coordinates of one
-    joint are a product of rotations in the order in which the joint lists its axes. A bone without a joint
-    is fixed.
+    A joint moves its child, and all that hangs on it, against its parent. At the coordinates at which the
+    scene's meshes are (``rest``), every pose is the identity. A bone without a joint is fixed.
 
     Parameters
     ----------
     scene : Scene
     coordinates : dict of str -> float
-        "joint.coordinate" -> angle [radian]; absent ones are 0.
+        "joint.coordinate" -> value [radian or scene unit]; absent ones are at rest.
 
     Returns
     -------
     dict of str -> (4, 4) ndarray
     """
-    joint_of = {joint.child: joint for joint in scene.joints}
-    known = set(coordinate_names(scene.joints))
+    known = all_coordinates(scene.joints)
     for name in coordinates:
         if name not in known:
             raise SceneError(f"unknown coordinate {name!r}, {did_you_mean(name, sorted(known))}")
-    poses = {}
-    for bone in scene.bones:
-        chain = []
-        name = bone.name
-        while name in joint_of and name not in poses:
-            chain.append(joint_of[name])
-            name = chain[-1].parent
-        pose = poses.setdefault(name, np.eye(4))
-        for joint in reversed(chain):
-            pose = pose @ _joint_transform(joint, coordinates)
-            poses[joint.child] = pose
-    return {bone.name: poses[bone.name] for bone in scene.bones}
+    return joint_poses([bone.name for bone in scene.bones], scene.joints, scene.couplings, coordinates)
 
 
-def _joint_transform(joint, coordinates):
-    transform = np.eye(4)
-    for name, axis in joint.axes.items():
-        angle = coordinates.get(f"{joint.name}.{name}", 0.0)
-        if angle:
-            transform = transform @ rotation_about(axis, angle, joint.centre)
-    return transform
+# Lever [mm] at which a shift of a joint is counted as a turn.
+SHIFT_LEVER = 50.0
 
 
-def _known(name, known):
-    """Return the full coordinate name; a bare coordinate may stand for the only joint that has it."""
-    if name in known:
-        return name
-    owners = [full for full in known if full.split(".", 1)[1] == name]
-    if len(owners) == 1:
-        return owners[0]
-    raise SceneError(f"[motion]: unknown coordinate {name!r}, {did_you_mean(name, known)}")
+def step_angle(scene, before, after, *, shifts=True):
+    """Return the largest turn of a bone against its parent between two sets of coordinates [radian].
+
+    With ``shifts``, a shift counts as the turn that moves a place 50 mm from its axis as far.
+    """
+    first, second = (joint_values(scene.joints, scene.couplings, q) for q in (before, after))
+    lever, largest = scene.length(SHIFT_LEVER), 0.0
+    for joint in scene.joints:
+        if first[joint.name] == second[joint.name]:
+            continue
+        rest = joint_values(scene.joints, scene.couplings, {})[joint.name]
+        motion = joint.motion(second[joint.name], rest) @ np.linalg.inv(joint.motion(first[joint.name], rest))
+        largest = max(largest, turned_angle(motion[:3, :3]))
+        if shifts and joint.translations:
+            shift = motion[:3, :3] @ joint.centre + motion[:3, 3] - joint.centre
+            largest = max(largest, float(np.linalg.norm(shift)) / lever)
+    return largest
 
 
-def _ramp_frames(ramps):
+def turned_angle(rotation):
+    """Angle of a (3, 3) rotation [radian], accurate for small ones too."""
+    skew = np.array(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
+    return math.atan2(float(np.linalg.norm(skew)), float(np.trace(rotation)) - 1.0)
+
+
+def shown_value(scene, name, value):
+    """Return a coordinate's value as files and tables show it: degrees, or scene units as it is."""
+    facts = all_coordinates(scene.joints).get(name)
+    return math.degrees(value) if facts is None or facts.motion == "rotation" else value
+
+
+def inner_value(scene, name, value):
+    """Return a coordinate's value [radian or scene unit] from what files and tables show."""
+    facts = all_coordinates(scene.joints).get(name)
+    return math.radians(value) if facts is None or facts.motion == "rotation" else value
+
+
+def unit_sign(scene, name):
+    """Return what follows a coordinate's value in text: the sign for degrees, the scene's unit, or nothing."""
+    facts = all_coordinates(scene.joints).get(name)
+    return {"translation": f" {scene.units}", "coupled": ""}.get(facts.motion if facts else "", "°")
+
+
+def _refuse_followers(frames, followers, facts):
+    for name in dict.fromkeys(name for frame in frames for name in frame):
+        if name in followers:
+            raise SceneError(f"[motion]: {name!r} follows other coordinates by a coupling, move those")
+        if facts[name].locked and any(
+            abs(frame.get(name, facts[name].rest) - facts[name].rest) > 1e-9 for frame in frames
+        ):
+            raise SceneError(f"[motion]: {name!r} is locked, unlock it in its joint or leave it out")
+
+
+def _honoured(frame, facts, followers):
+    """The frame with coordinates that it does not mention where their default says, without those that follow."""
+    unsaid = {n: c.resting for n, c in facts.items() if n not in frame and n not in followers and c.resting}
+    return {**unsaid, **{name: value for name, value in frame.items() if name not in followers}}
+
+
+def _range_notes(frames, joints):
+    facts, worst, count = all_coordinates(joints), {}, {}
+    for frame in frames:
+        for name, excess in beyond_range(frame, joints).items():
+            worst[name], count[name] = max(worst.get(name, 0.0), excess), count.get(name, 0) + 1
+    notes = []
+    for name, excess in worst.items():
+        low, high = (end / FACTORS[facts[name].motion] for end in facts[name].range)
+        what = "is cut to" if facts[name].clamped else "leaves"
+        excess /= FACTORS[facts[name].motion]
+        notes.append(
+            f"coordinate {name!r} {what} its range {low:.6g} to {high:.6g} in {count[name]} of {len(frames)} frames, "
+            f"by up to {excess:.3g}"
+        )
+    return notes
+
+
+def _ramp_frames(ramps, facts):
     """All coordinates go together; the one that needs most steps sets the pace, its last may be short."""
-    pace = max((abs(ramp.end - ramp.start) / ramp.step for ramp in ramps.values()), default=0.0)
+    start = {n: _start(ramp.start, facts[n]) for n, ramp in ramps.items()}
+    pace = max((abs(ramp.end - start[n]) / ramp.step for n, ramp in ramps.items()), default=0.0)
     return [
-        {name: math.radians(r.start + t * (r.end - r.start)) for name, r in ramps.items()}
+        {n: (start[n] + t * (r.end - start[n])) * FACTORS[facts[n].motion] for n, r in ramps.items()}
         for t in _marks(pace)
     ]
 
 
-def _waypoint_frames(stops, step):
+def _start(value, facts):
+    """A ramp that says no start begins at the coordinate's default."""
+    return facts.resting / FACTORS[facts.motion] if value is None else value
+
+
+def _waypoint_frames(stops, step, facts):
     names = list(dict.fromkeys(name for stop in stops for name in stop))
     table = np.array([[stop.get(name, np.nan) for name in names] for stop in stops])
-    for column in range(len(names)):  # what a waypoint does not mention stays where it was
-        held = 0.0
+    for column, name in enumerate(names):  # what a waypoint does not mention stays where it was
+        held = _start(None, facts[name])
         for row in range(len(stops)):
             held = table[row, column] = held if np.isnan(table[row, column]) else table[row, column]
     rows = [table[0]]
     for before, after in itertools.pairwise(table):
         pace = np.abs(after - before).max() / step
         rows.extend(before + t * (after - before) for t in _marks(pace)[1:])
-    return [dict(zip(names, np.radians(row).tolist())) for row in rows]
+    factors = np.array([FACTORS[facts[name].motion] for name in names])
+    return [dict(zip(names, (row * factors).tolist())) for row in rows]
 
 
 def _marks(pace):
@@ -191,56 +286,6 @@ def _marks(pace):
         return [0.0]
     count = math.ceil(pace - 1e-9)
     return [*(k / pace for k in range(count)), 1.0]
-
-
-def _file_frames(path, known):
-    """Read an OpenSim motion (.mot or .sto): a header up to ``endheader``, column names, rows."""
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError as error:
-        raise SceneError(f"[motion]: cannot read {path}: {error.strerror}") from None
-    ends = [row for row, line in enumerate(lines) if line.strip().lower() == "endheader"]
-    if not ends or len(lines) < ends[0] + 3:
-        raise SceneError(
-            f"[motion]: {path} is no OpenSim motion: no 'endheader' line with columns and rows after it"
-        )
-    header = dict(line.lower().replace(" ", "").split("=", 1) for line in lines[: ends[0]] if "=" in line)
-    factor = 1.0 if header.get("indegrees", "no") in ("no", "false", "0") else math.pi / 180
-    labels = lines[ends[0] + 1].split()
-    used = {column: name for column, label in enumerate(labels) if (name := _match(label, known))}
-    if not used:
-        raise SceneError(
-            f"[motion]: {path} has none of the scene's coordinates ({', '.join(known) or 'no joints'})"
-        )
-    rows = [line.split() for line in lines[ends[0] + 2 :] if line.strip()]
-    if len(rows) > MAX_FRAMES:
-        raise SceneError(f"[motion]: {path} has {len(rows)} rows, more than {MAX_FRAMES}")
-    return [_file_row(row, used, factor, len(labels), f"{path} row {k + 1}") for k, row in enumerate(rows)]
-
-
-def _file_row(row, used, factor, width, place):
-    if len(row) != width:
-        raise SceneError(f"[motion]: {place} has {len(row)} values, the header names {width}")
-    try:
-        values = {name: float(row[column]) * factor for column, name in used.items()}
-    except ValueError as error:
-        raise SceneError(f"[motion]: {place}: {error}") from None
-    for name, value in values.items():
-        if not math.isfinite(value):
-            raise SceneError(f"[motion]: {place}: {name} is {value}")
-    return values
-
-
-def _match(label, known):
-    """A column is ``joint.coordinate``, ``coordinate`` alone or ``.../joint/coordinate/value``."""
-    parts = label.removesuffix("/value").split("/")
-    for name in (label, ".".join(parts[-2:]), parts[-1]):
-        if name in known:
-            return name
-        owners = [full for full in known if full.split(".", 1)[1] == name]
-        if len(owners) == 1:
-            return owners[0]
-    return None
 
 
 def _slice_text(frames):

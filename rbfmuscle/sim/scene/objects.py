@@ -2,7 +2,9 @@
 
 from dataclasses import dataclass, field
 
-import numpy as np
+from rbfmuscle.sim.joints.joint import Joint
+
+__all__ = ["Bone", "Joint", "Muscle"]
 
 
 @dataclass
@@ -14,21 +16,6 @@ class Bone:
     source: str = ""
     closed: bool = True
     notes: list = field(default_factory=list)
-
-
-@dataclass
-class Joint:
-    """Turns ``child`` (and all that hangs on it) against ``parent`` about ``centre`` (3,).
-
-    ``axes`` maps a coordinate's name to its unit axis (3,), in the rest pose; several coordinates are
-    a product of rotations in that order.
-    """
-
-    name: str
-    parent: str
-    child: str
-    centre: np.ndarray
-    axes: dict
 
 
 @dataclass

@@ -177,9 +177,9 @@ class OutputOptions(Table):
 
 
 class RampOptions(Table):
-    """One coordinate from one angle to another [degree]."""
+    """One coordinate from one value to another [degree or scene unit]."""
 
-    start: Finite = Field(alias="from", default=0.0)
+    start: Finite | None = Field(alias="from", default=None)
     end: Finite = Field(alias="to")
     step: Positive
 
@@ -191,6 +191,7 @@ class MotionOptions(Table):
     waypoints: Annotated[list[dict[str, Finite]], Field(min_length=1)] | None = None
     step: Positive | None = None
     file: str | None = None
+    degrees: bool | None = None
 
     @model_validator(mode="after")
     def _check_one_source(self):
@@ -201,4 +202,6 @@ class MotionOptions(Table):
             raise ValueError("waypoints need a step (degrees between frames)")
         if self.step is not None and self.waypoints is None:
             raise ValueError("step belongs to waypoints; a ramp has its own step")
+        if self.degrees is not None and self.file is None:
+            raise ValueError("degrees belongs to a file; ramps and waypoints are in degrees")
         return self

@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from rbfmuscle.sim.joints.skeleton import ordered
 from rbfmuscle.sim.scene.attachments import Attachment, resolve_attachments
+from rbfmuscle.sim.scene.joint_tables import CouplingTable, JointTable, make_coupling
 from rbfmuscle.sim.scene.meshes import ReadMesh, prepare_mesh, read_mesh
 from rbfmuscle.sim.scene.motion import Motion, coordinate_names
 from rbfmuscle.sim.scene.objects import Bone, Joint, Muscle
@@ -23,6 +25,8 @@ from rbfmuscle.sim.scene.options import (
 )
 from rbfmuscle.validation import SceneError, check_points, check_positive
 
+# What reads files of other programs as scenes, by suffix; the room that can do it enters itself here.
+IMPORTERS = {}
 MM_PER_UNIT = {"m": 1000.0, "cm": 10.0, "mm": 1.0}
 
 
@@ -39,6 +43,10 @@ class Scene:
     ----------
     bones : list of Bone
     joints : list of Joint
+    couplings : list of Coupling
+        Coordinates that follow others.
+    links : list of str
+        Bones without a mesh: they carry joints, and nothing meets them.
     muscles : list of Muscle
     motion : Motion
     contact : ContactOptions
@@ -56,6 +64,8 @@ class Scene:
         self.units = units
         self.bones = []
         self.joints = []
+        self.couplings = []
+        self.links = []
         self.muscles = []
         self.motion = Motion()
         self.contact = ContactOptions()
@@ -65,8 +75,14 @@ class Scene:
         self.path = None
 
     @classmethod
-    def load(cls, path):
+    def load(cls, path, *, skeleton=False):
         """Return the scene of a TOML file; its paths are relative to the file.
+
+        Parameters
+        ----------
+        path : path
+        skeleton : bool
+            A scene without muscles will do; it can be looked over, not run.
 
         Raises
         ------
@@ -77,7 +93,28 @@ class Scene:
         """
         from rbfmuscle.sim.scene.file import load_scene
 
-        return load_scene(cls, Path(path))
+        return load_scene(cls, Path(path), skeleton=skeleton)
+
+    @classmethod
+    def from_osim(cls, path, **options):
+        """Return a scene with the bones and joints of an OpenSim model; muscles are still to be added.
+
+        Parameters
+        ----------
+        path : path
+            An ``.osim`` file.
+        **options
+            ``units`` ("m"), ``geometry`` (folders with meshes), ``bodies`` (which to take): see
+            `rbfmuscle.opensim.scene.import_osim`, which also returns what was not taken.
+
+        Raises
+        ------
+        SceneError
+            If the model cannot be read, or has a joint that the table of joints lacks.
+        """
+        if "osim" not in IMPORTERS:
+            raise SceneError("nothing here reads .osim files; import rbfmuscle.opensim first")
+        return IMPORTERS["osim"](path, **options)
 
     def length(self, millimetres):
         """Return a length given in millimetres in the scene's unit."""
@@ -102,13 +139,24 @@ class Scene:
         scale : float
             Factor from the mesh's unit to the scene's.
         """
-        _check_new_name(self.bones, name, "bone")
+        self._check_new_bone(name)
         read = _as_mesh(mesh, name, scale, may_be_open=True)
         self.bones.append(Bone(name, read.mesh, read.source, read.closed, read.notes))
         return self
 
-    def add_joint(self, name, parent, child, centre, axes):
-        """Add a ball joint and return the scene.
+    def _check_new_bone(self, name):
+        _check_new_name(self.bones, name, "bone")
+        if name in self.links:
+            raise SceneError(f"bone {name!r} is given twice")
+
+    def add_link(self, name):
+        """Add a bone without a mesh, which carries joints only, and return the scene."""
+        self._check_new_bone(name)
+        self.links.append(name)
+        return self
+
+    def add_joint(self, name, parent, child, centre=None, axes=None, **keys):
+        """Add a joint, a ball where no ``type`` is given, and return the scene.
 
         Parameters
         ----------
@@ -116,25 +164,56 @@ class Scene:
             The child bone moves; a bone may be the child of one joint.
         centre : (3,) array_like
         axes : dict of str -> (3,) array_like
-            Rotation axis of each coordinate, in any length.
+            Axis of each coordinate, in any length.
+        **keys
+            Any other key of ``[[joint]]`` [degree, scene unit]: ``type``, ``orientation``, ``coordinates``, ...
         """
-        _check_new_name(self.joints, name, "joint")
         place = f"joint {name!r}"
-        for bone in (parent, child):
-            _find(self.bones, bone, "bone", place=place)
-        if any(joint.child == child for joint in self.joints):
+        row = {"name": name, "parent": parent, "child": child, **keys}
+        if centre is not None:
+            row["centre"] = _vector(centre, f"{place}: centre").tolist()
+        if axes:
+            row["axes"] = {
+                k: _vector(axis, f"{place}: axis {k!r}", unit=True).tolist() for k, axis in axes.items()
+            }
+        return self.place_joint(JointTable.build(row, place=f"{place}: ").joint())
+
+    def place_joint(self, joint):
+        """Add a `Joint` and return the scene; bones and joints form a tree."""
+        _check_new_name(self.joints, joint.name, "joint")
+        place, child = f"joint {joint.name!r}", joint.child
+        for bone in (joint.parent, child):
+            if bone not in self.links:
+                _find(self.bones, bone, "bone", place=place)
+        if any(other.child == child for other in self.joints):
             raise SceneError(f"{place}: bone {child!r} is already the child of another joint")
-        ancestor = parent
-        parents = {joint.child: joint.parent for joint in self.joints}
+        ancestor = joint.parent
+        parents = {other.child: other.parent for other in self.joints}
         while ancestor is not None:
             if ancestor == child:
                 raise SceneError(f"{place}: {child!r} would hang on itself, joints must form a tree")
             ancestor = parents.get(ancestor)
-        if not axes:
-            raise SceneError(f"{place}: axes needs at least one coordinate")
-        centre = _vector(centre, f"{place}: centre")
-        units = {key: _vector(axis, f"{place}: axis {key!r}", unit=True) for key, axis in axes.items()}
-        self.joints.append(Joint(name, parent, child, centre, units))
+        self.joints.append(joint)
+        return self
+
+    def add_coupling(self, coordinate, of, **function):
+        """Let a coordinate follow others by a function, as in ``[[coupling]]``, and return the scene.
+
+        Parameters
+        ----------
+        coordinate : str
+        of : list of str
+        **function
+            One of ``constant``, ``linear``, ``polynomial``, ``piecewise``, ``spline``, ``natural_spline``, and
+            ``scale`` [degree, scene unit].
+        """
+        row = {"coordinate": coordinate, "of": list(of), **function}
+        table = CouplingTable.build(row, place=f"coupling of {coordinate!r}: ")
+        return self.place_coupling(make_coupling(table, self.joints))
+
+    def place_coupling(self, coupling):
+        """Add a `Coupling` and return the scene."""
+        self.couplings = ordered([*self.couplings, coupling])
         return self
 
     def add_muscle(self, name, mesh, *, attach=(), model="rbf", fibres=None, scale=1.0):
@@ -169,8 +248,14 @@ class Scene:
     def set_motion(self, *, folder=None, **options):
         """Set the motion from the keys of ``[motion]`` (angles in degrees) and return the scene."""
         table = MotionOptions.build(options, place="[motion] ")
-        self.motion = Motion.from_options(table, self.joints, folder=folder)
+        self.motion = self.motion_from(table, folder=folder)
         return self
+
+    def motion_from(self, table, *, folder=None):
+        """Return the motion that a `MotionOptions` asks of this scene's joints."""
+        return Motion.from_options(
+            table, self.joints, couplings=self.couplings, metre=self.length(1000.0), folder=folder
+        )
 
     def validate(self):
         """Raise SceneError if the scene cannot be simulated: no bones, no muscles, loose muscles."""
@@ -212,6 +297,8 @@ class Scene:
         other = copy.copy(self)
         other.bones = list(self.bones)
         other.joints = list(self.joints)
+        other.couplings = list(self.couplings)
+        other.links = list(self.links)
         other.muscles = [replace(muscle, options=dict(muscle.options)) for muscle in self.muscles]
         return other
 

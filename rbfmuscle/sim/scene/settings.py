@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rbfmuscle.sim.scene.motion import Motion
 from rbfmuscle.sim.scene.options import DetectOptions, SlidingOptions, did_you_mean
 from rbfmuscle.validation import SceneError, UsageError
 
@@ -173,4 +172,4 @@ def _set_motion(scene, rest, value, key):
     else:
         values[rest] = value
     table = type(options).build(values, place=f"{key}: motion ")
-    scene.motion = Motion.from_options(table, scene.joints, folder=scene.path.parent if scene.path else None)
+    scene.motion = scene.motion_from(table, folder=scene.path.parent if scene.path else None)

@@ -2,7 +2,6 @@
 
 import hashlib
 import importlib.metadata
-import math
 import os
 import platform
 from collections import defaultdict
@@ -13,6 +12,8 @@ import numpy as np
 
 import rbfmuscle
 from rbfmuscle.sim.loop.frame import Frame
+from rbfmuscle.sim.scene.motion import shown_value
+from rbfmuscle.sim.scene.scene import Scene
 
 FORMAT = 1
 _PACKAGES = ("numpy", "scipy", "numba", "scikit-image", "trimesh", "pyvista", "vtk", "libigl")
@@ -64,11 +65,13 @@ def build_info(scene, *, started, status, message, times, stages, frames, summar
     }
 
 
-def frame_facts(frame: Frame) -> dict:
-    """What ``run.json`` says of a written frame; coordinates in degrees."""
+def frame_facts(scene: Scene, frame: Frame) -> dict:
+    """What ``run.json`` says of a written frame; coordinates in degrees, those of shifts in scene units."""
+    times = scene.motion.times
     return {
         "frame": frame.index,
-        "coordinates": {name: math.degrees(value) for name, value in frame.coordinates.items()},
+        **({} if times is None else {"time": times[frame.index]}),
+        "coordinates": {name: shown_value(scene, name, value) for name, value in frame.coordinates.items()},
         "wall": frame.wall,
     }
 

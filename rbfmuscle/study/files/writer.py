@@ -114,8 +114,10 @@ class RunWriter:
             entries.append((name, file))
         bones = self._write_bones(frame) if self.format is not None else []
         if self._collections:
-            self._collections["bones"].add(frame.index, bones)
-            self._collections["surfaces"].add(frame.index, entries)
+            times = self.scene.motion.times
+            step = frame.index if times is None else times[frame.index]
+            self._collections["bones"].add(step, bones)
+            self._collections["surfaces"].add(step, entries)
         (poses, poses_file), (events, events_file) = self._tables[:2]
         poses.writerows(
             [frame.index, bone, *(repr(float(x)) for x in pose.ravel())] for bone, pose in frame.poses.items()

@@ -8,6 +8,7 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components
 
+from rbfmuscle.sim.scene.motion import shown_value
 from rbfmuscle.study.measure.centreline import Centreline
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.measure.penetration import BoneProbe, bone_depth, surface_depth
@@ -41,6 +42,7 @@ QUANTITIES = {
     "fibre_length_std": ("length", "standard deviation of the fibres' lengths"),
     "fibre_moment_arm_mean": ("length", "mean over the fibres of their moment arms"),
     "fibre_moment_arm_std": ("length", "standard deviation of the fibres' moment arms"),
+    "time": ("s", "time of the frame in the motion file; muscle 'all'"),
     "time_solve": ("s", "prediction, solution and contacts"),
     "time_fit": ("s", "fit of the field"),
     "time_extract": ("s", "extraction of the surface"),
@@ -55,7 +57,7 @@ _THROUGH = ("reported", "unresolved")
 
 
 class Row(NamedTuple):
-    """One line of ``metrics.csv``; the angle is in degrees."""
+    """One line of ``metrics.csv``; the angle is in degrees, the value of a translation in scene units."""
 
     frame: int
     coordinate: str
@@ -77,7 +79,7 @@ class MetricsRecorder:
     """
 
     def __init__(self, scene, carried):
-        self.units = scene.units
+        self.scene, self.units = scene, scene.units
         self.motion = scene.motion
         self.probes = [BoneProbe(bone.name, bone.mesh) for bone in scene.bones]
         self.trackers = {
@@ -106,6 +108,9 @@ class MetricsRecorder:
         for name, tracker in self.trackers.items():
             found = tracker.measure(frame, self.probes, at_rest)
             rows += [self._row(frame, coordinate, angle, name, q, v) for q, v in found.items()]
+        if self.motion.times is not None:
+            now = self.motion.times[frame.index]
+            rows.append(self._row(frame, coordinate, angle, ALL, "time", now))
         rows.append(self._row(frame, coordinate, angle, ALL, "time_frame", frame.wall))
         lengths = {name: tracker.length for name, tracker in self.trackers.items()}
         lengths.update({(FIBRES, name): lines.lengths for name, lines in frame.fibres.items()})
@@ -126,12 +131,12 @@ class MetricsRecorder:
         rows = []
         for muscle in self.trackers:
             for name, arm in moment_arms([node[:2] for node in self._path], here, muscle):
-                angle = math.degrees(coordinates.get(name, 0.0))
+                angle = shown_value(self.scene, name, coordinates.get(name, 0.0))
                 rows.append(Row(index, name, angle, muscle, "moment_arm", arm, unit))
             if (FIBRES, muscle) not in self._path[here][1]:
                 continue
             for name, arms in moment_arms([node[:2] for node in self._path], here, (FIBRES, muscle)):
-                angle = math.degrees(coordinates.get(name, 0.0))
+                angle = shown_value(self.scene, name, coordinates.get(name, 0.0))
                 for quantity, value in (("mean", np.mean(arms)), ("std", np.std(arms))):
                     quantity = f"fibre_moment_arm_{quantity}"
                     rows.append(Row(index, name, angle, muscle, quantity, float(value), unit))
@@ -149,7 +154,7 @@ class MetricsRecorder:
             return "", 0.0
         moved = {n: abs(frame.coordinates.get(n, 0.0) - before.get(n, 0.0)) for n in names}
         name = max(names, key=moved.get) if self._path else names[0]
-        return name, math.degrees(frame.coordinates.get(name, 0.0))
+        return name, shown_value(self.scene, name, frame.coordinates.get(name, 0.0))
 
 
 class _Tracker:

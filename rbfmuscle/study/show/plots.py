@@ -52,8 +52,9 @@ def motion_axis(saved):
     moving = {name: track for name, track in tracks.items() if np.ptp(track) > 1e-9}
     if len(moving) == 1:
         name, track = next(iter(moving.items()))
+        unit = saved.info.get("scene", {}).get("coordinate_units", {}).get(name, "degree").strip() or "1"
         if np.all(np.diff(track) > 0) or np.all(np.diff(track) < 0):
-            return dict(zip(saved.frames, track.tolist())), f"{name} [degree]"
+            return dict(zip(saved.frames, track.tolist())), f"{name} [{unit}]"
     return {frame: float(frame) for frame in saved.frames}, "frame"
 
 

@@ -27,6 +27,8 @@ _STRIP = 30
 _PAINT = "paint"
 PAINT_COLOURS = "viridis"
 _BONE_TRIANGLES = 12_000
+# Coordinates that a caption names at most.
+MOST_SHOWN = 4
 _TIMEOUT = 1800
 
 
@@ -272,8 +274,27 @@ def chosen_frames(frames, most=24):
 def caption(saved, frame):
     """Frame number and joint angles, as text."""
     entry = next(entry for entry in saved.info["frames"] if entry["frame"] == frame)
-    angles = [f"{name} {value:.4g}°" for name, value in entry["coordinates"].items()]
-    return ", ".join([f"frame {frame}", *angles])
+    clock = [f"{entry['time']:.4g} s"] if "time" in entry else []
+    return ", ".join([f"frame {frame}", *clock, *coordinate_texts(saved.info, entry)])
+
+
+def coordinate_texts(info, entry):
+    """A frame's coordinates as text, each with its unit; of many, those that the motion moves most.
+
+    Parameters
+    ----------
+    info : dict
+        What ``run.json`` holds.
+    entry : dict
+        Of its ``frames``.
+    """
+    values = entry["coordinates"]
+    if len(values) > MOST_SHOWN:
+        tracks = {n: [row["coordinates"].get(n, 0.0) for row in info["frames"]] for n in values}
+        spans = {n: max(track) - min(track) for n, track in tracks.items()}
+        values = {n: values[n] for n in sorted(values, key=lambda n: -spans[n])[:MOST_SHOWN]}
+    units = info["scene"].get("coordinate_units", {})
+    return [f"{name} {value:.4g}{units.get(name, '°')}" for name, value in values.items()]
 
 
 def labelled(image, text, titles, chips):

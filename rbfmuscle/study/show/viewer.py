@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from rbfmuscle.sim.scene.motion import inner_value, shown_value
 from rbfmuscle.study.files.meshfiles import write_mesh
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.measure.metrics import edge_lengths, mesh_volume, unique_edges
 from rbfmuscle.study.measure.penetration import BoneProbe, bone_coordinates, surface_depth
+from rbfmuscle.study.show.render import coordinate_texts
 from rbfmuscle.validation import SolveError, UsageError
 
 # Colouring: name, what the bar says, limits ("length" ones in mm), colour map.
@@ -203,21 +205,21 @@ class LiveViewer(Viewer):
 
     @property
     def coordinates(self):
-        """Name, limits and target of each coordinate [degree]."""
-        target = self.session.target
+        """Name, limits and target of each coordinate [degree or scene unit]."""
+        target, scene = self.session.target, self.session.scene
         return {
-            name: (math.degrees(low), math.degrees(high), math.degrees(target[name]))
+            name: tuple(shown_value(scene, name, value) for value in (low, high, target[name]))
             for name, (low, high) in self.session.limits.items()
         }
 
     def set(self, name, degrees):
         """Move a slider."""
-        self.session.set(name, math.radians(degrees))
+        self.session.set(name, inner_value(self.session.scene, name, degrees))
 
     def rest(self):
-        """All sliders to zero."""
-        for name in self.session.target:
-            self.session.set(name, 0.0)
+        """All sliders to where the meshes are."""
+        for name, value in self.session.rest.items():
+            self.session.set(name, value)
 
     def colour_by(self, name):
         super().colour_by(name)
@@ -250,7 +252,10 @@ class LiveViewer(Viewer):
 
     def label(self):
         """Where the bones are, for file names."""
-        return "_".join(f"{k.split('.')[-1]}{math.degrees(v):+.0f}" for k, v in self.session.here.items())
+        return "_".join(
+            f"{k.split('.')[-1]}{shown_value(self.session.scene, k, v):+.0f}"
+            for k, v in self.session.here.items()
+        )
 
     def _view(self, frame):
         view = View(frame.poses, {n: (s.vertices, s.faces) for n, s in frame.surfaces.items()})
@@ -337,7 +342,7 @@ class SavedViewer(Viewer):
         frame = self.saved.frames[self.place]
         view = View(self.saved.poses[frame], {n: self._surface(n, frame) for n in self.muscles})
         entry = next(entry for entry in self.saved.info["frames"] if entry["frame"] == frame)
-        angles = ", ".join(f"{k} {v:.4g}°" for k, v in entry["coordinates"].items())
+        angles = ", ".join(coordinate_texts(self.saved.info, entry))
         view.lines.append(f"frame {frame}: {angles}")
         for name, (vertices, faces) in view.surfaces.items():
             error = self._metrics.get((frame, name, "volume_error"), math.nan)

@@ -1,0 +1,101 @@
+"""Writing a scene to a folder: a TOML file that a person can read, and the meshes that it names."""
+
+from pathlib import Path
+
+import numpy as np
+
+from rbfmuscle.sim.scene.joint_tables import coupling_row, joint_row
+from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.validation import UsageError
+
+BONES = "bones"
+
+
+def number(value: float) -> str:
+    """Return a number as text, to 13 digits: more than any judge of a pose can tell."""
+    text = f"{value:.13g}"
+    return "0" if text == "-0" else text
+
+
+def value_text(value: object) -> str:
+    """Return a value as TOML on one line."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, (int, float)):
+        return number(float(value)) if isinstance(value, float) else str(value)
+    if isinstance(value, str):
+        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+        return '"' + "".join(c if c.isprintable() else " " for c in escaped) + '"'
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{_key(k)} = {value_text(v)}" for k, v in value.items()) + " }"
+    return "[" + ", ".join(value_text(item) for item in value) + "]"
+
+
+def _key(key):
+    bare = key.replace("_", "").replace("-", "")
+    return key if bare.isascii() and bare.isalnum() else value_text(key)
+
+
+def joint_text(row: dict) -> str:
+    """Return a joint's table as TOML."""
+    lines = ["[[joint]]"]
+    for key, value in row.items():
+        if key in ("rotations", "translations"):
+            lines.append(f"{key} = [")
+            lines += [f"  {value_text(axis)}," for axis in value]
+            lines.append("]")
+        elif key != "coordinates":
+            lines.append(f"{key} = {value_text(value)}")
+    for name, facts in row.get("coordinates", {}).items():
+        lines.append(f"coordinates.{_key(name)} = {value_text(facts)}")
+    return "\n".join(lines) + "\n"
+
+
+def table_text(head: str, row: dict) -> str:
+    """Return a plain table as TOML."""
+    return "\n".join([head, *(f"{key} = {value_text(value)}" for key, value in row.items())]) + "\n"
+
+
+def skeleton_text(scene: Scene, head: str, meshes: dict[str, str]) -> str:
+    """Return the scene file of a skeleton: bones, joints and couplings.
+
+    Parameters
+    ----------
+    head : str
+        Comment lines that begin the file.
+    meshes : dict of str to str
+        File of every bone's mesh, relative to the scene file.
+    """
+    parts = [head, table_text("[scene]", {"format": 1, "name": scene.name, "units": scene.units})]
+    for bone in scene.bones:
+        parts.append(table_text("[[bone]]", {"name": bone.name, "mesh": meshes[bone.name]}))
+    for link in scene.links:
+        parts.append(f'[[bone]]   # no mesh: it carries joints only\nname = "{link}"\n')
+    parts += [joint_text(joint_row(joint)) for joint in scene.joints]
+    parts += [table_text("[[coupling]]", coupling_row(c, scene.joints)) for c in scene.couplings]
+    return "\n".join(parts)
+
+
+def write_meshes(scene: Scene, directory: Path) -> dict[str, str]:
+    """Write every bone's mesh as PLY (float64) and return the files, relative to the folder."""
+    folder = directory / BONES
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for bone in scene.bones:
+            write_ply(folder / f"{bone.name}.ply", bone.mesh.vertices, bone.mesh.faces)
+    except OSError as error:
+        raise UsageError(f"cannot write to {folder}: {error.strerror}; choose another --output") from None
+    return {bone.name: f"{BONES}/{bone.name}.ply" for bone in scene.bones}
+
+
+def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Write a triangle mesh as binary PLY with positions in float64, so that nothing is rounded."""
+    vertices = np.ascontiguousarray(vertices, dtype="<f8")
+    table = np.empty(len(faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+    table["count"], table["corners"] = 3, faces
+    head = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
+        "property double x\nproperty double y\nproperty double z\n"
+        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    path.write_bytes(head.encode() + vertices.tobytes() + table.tobytes())
