@@ -4,8 +4,6 @@ import itertools
 import json
 from pathlib import Path
 
-import numpy as np
-
 from rbfmuscle.validation import MeshError, SceneError, check_points
 
 
@@ -63,9 +61,7 @@ def _read_lines(path, place):
 
 
 def _read_polydata_lines(path, place):
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
-    from rbfmuscle.sim.scene.meshes import read_polydata
+    from rbfmuscle.sim.formats.polydata import read_polydata
 
     if not path.is_file():
         raise SceneError(f"{place}: no such file")
@@ -73,9 +69,5 @@ def _read_polydata_lines(path, place):
         data = read_polydata(path)
     except MeshError as error:
         raise SceneError(f"{place}: {error}") from None
-    if data.GetNumberOfLines() == 0:
-        return []
-    points = vtk_to_numpy(data.GetPoints().GetData()).astype(np.float64)
-    offsets = vtk_to_numpy(data.GetLines().GetOffsetsArray())
-    numbers = vtk_to_numpy(data.GetLines().GetConnectivityArray())
-    return [points[numbers[a:b]] for a, b in itertools.pairwise(offsets)]
+    ends, numbers = data.lines
+    return [data.points[numbers[a:b]] for a, b in itertools.pairwise([0, *ends.tolist()])]

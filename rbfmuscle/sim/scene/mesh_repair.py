@@ -10,6 +10,12 @@ from rbfmuscle.validation import MeshError
 
 MERGE_TOLERANCE = 1e-7  # of the diagonal: float32 files repeat vertices to about this
 HOLE_LIMIT = 0.1  # of the diagonal: a longer rim (of more than four edges) is not closed by guesswork
+COLLAPSE_TOLERANCE = 1e-9  # of the diagonal: ends of an edge that are one point
+LEAST_COMPACTNESS = 1e-6  # volume over area^1.5; a ball has 0.094, a sheet 200 x 200 x 0.05 mm 2.4e-5
+TWISTED_NOTED = 0.005  # of the area
+MOST_TWISTED = 0.3  # of the area: of more it cannot be said what is inside
+WINDING_SAMPLES = 1500  # triangles asked; before and behind them by a small share of their size:
+WINDING_STEP = 1e-3
 CRUMB_LIMIT = 0.01  # of the largest part's area: smaller loose parts are dropped
 
 
@@ -54,6 +60,7 @@ def repair(vertices, faces, *, place, may_be_open=False):
     if not _is_closed(state.faces):
         _check_manifold(state.faces, place)
         _fill_holes(state)
+    _collapse_points(state)
     _orient(state, place)
     state.closed = _is_closed(state.faces)
     if not state.closed:
@@ -65,6 +72,9 @@ def repair(vertices, faces, *, place, may_be_open=False):
         state.notes.append(f"the surface is open ({count} boundary edges)")
     elif not may_be_open:
         _check_one_part(state, place)
+        wrong = check_volume(state.vertices, state.faces, place=place)
+        if wrong > TWISTED_NOTED:
+            state.notes.append(f"the surface passes through itself over {100 * wrong:.2g} % of its area")
     return state
 
 
@@ -115,6 +125,77 @@ def _merge_equal(state):
         state.faces = merged[state.faces]
         state.vertex_map = merged[state.vertex_map]
         _drop_degenerate(state)
+
+
+def _collapse_points(state):
+    """Contract edges without length of a closed surface, where it stays closed: their triangles have no normal."""
+    if not _is_closed(state.faces):
+        return
+    tolerance = COLLAPSE_TOLERANCE * np.linalg.norm(np.ptp(state.vertices, axis=0))
+    sides = state.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    short = sides[np.linalg.norm(np.diff(state.vertices[sides], axis=1)[:, 0], axis=1) <= tolerance]
+    if not len(short):
+        return
+    count = len(state.vertices)
+    graph = coo_matrix((np.ones(len(short)), short.T), shape=(count, count))
+    _, label = connected_components(graph, directed=False)
+    _, first = np.unique(label, return_index=True)
+    merged = first[label]
+    faces = merged[state.faces]
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    _, back, uses = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
+    faces = faces[uses[back.ravel()] == 1]  # triangles that came to lie back to back enclose nothing
+    if len(faces) < 4 or not _is_closed(faces):
+        return
+    state.notes.append(f"{len(state.faces) - len(faces)} triangles without extent dropped")
+    state.faces, state.vertex_map = faces, np.where(state.vertex_map < 0, -1, merged[state.vertex_map])
+    _drop_unused(state)
+
+
+def check_volume(vertices: np.ndarray, faces: np.ndarray, *, place: str) -> float:
+    """Raise MeshError unless a closed surface (n, 3), (m, 3) encloses a volume, once, over most of its area.
+
+    A flat or twisted surface may be closed and consistently oriented, and still have no inside. Returned is the
+    share of its area that does not bound the inside.
+    """
+    a, b, c = (vertices - vertices.mean(axis=0))[faces].transpose(1, 0, 2)
+    volume = float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
+    area = float(_areas(vertices, faces).sum())
+    if not volume > LEAST_COMPACTNESS * area**1.5:
+        raise MeshError(
+            f"{place}: the surface encloses no volume ({volume:.3g}, of an area of {area:.3g}): it is flat or "
+            "twisted through itself; export the mesh again"
+        )
+    wrong = twisted_share(vertices, faces)
+    if wrong > MOST_TWISTED:
+        raise MeshError(
+            f"{place}: the surface passes through itself, {100 * wrong:.0f} % of it does not bound its inside, so its "
+            f"volume ({volume:.4g}) means nothing; repair it, for instance by remeshing"
+        )
+    return wrong
+
+
+def twisted_share(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Share of the area of a closed surface that has not its inside (winding number 1) behind it, outside before it.
+
+    Measured just before and behind some thousand triangles, large ones first.
+    """
+    import igl
+
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    normals = np.cross(b - a, c - a)
+    length = np.linalg.norm(normals, axis=1)
+    chosen = np.argsort(-length, kind="stable")[:WINDING_SAMPLES]
+    chosen = chosen[length[chosen] > 0]
+    middle, unit = (a + b + c)[chosen] / 3.0, normals[chosen] / length[chosen, None]
+    step = WINDING_STEP * np.sqrt(length[chosen])[:, None]
+    asked = np.ascontiguousarray(np.concatenate([middle + step * unit, middle - step * unit]))
+    winding = igl.fast_winding_number(
+        np.ascontiguousarray(vertices, dtype=np.float64), np.ascontiguousarray(faces, dtype=np.int64), asked
+    )
+    before, behind = winding[: len(chosen)], winding[len(chosen) :]
+    wrong = (np.abs(before) > 0.4) | (np.abs(behind - 1.0) > 0.4)
+    return float(length[chosen][wrong].sum() / length[chosen].sum())
 
 
 def _drop_fins(state):

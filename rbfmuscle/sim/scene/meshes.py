@@ -11,6 +11,8 @@ import numpy as np
 from rbfmuscle.sim.scene.mesh_repair import repair
 from rbfmuscle.validation import MeshError, check_mesh
 
+# In any unit: beyond it, squares of squares of lengths leave the range in which volumes are exact.
+LARGEST_COORDINATE = 1e12
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".vtk", ".vtp")
 
 
@@ -85,7 +87,14 @@ def prepare_mesh(vertices, faces, *, place, name, may_be_open=False):
             f"{place}: {len(bad)} vertices are not finite, "
             f"the first is number {bad[0]} {vertices[bad[0]].tolist()}; export the mesh again"
         )
-    vertices = np.where(np.isfinite(vertices), vertices, 0.0)
+    far = used & (np.abs(np.where(used[:, None], vertices, 0.0)) > LARGEST_COORDINATE).any(axis=1)
+    if far.any():
+        first = int(np.flatnonzero(far)[0])
+        raise MeshError(
+            f"{place}: {int(far.sum())} vertices are further away than {LARGEST_COORDINATE:g}, the first is number "
+            f"{first} {vertices[first].tolist()}; the file is damaged or its scale is wrong, export the mesh again"
+        )
+    vertices = np.where(used[:, None], vertices, 0.0)
     try:
         vertices, faces = check_mesh(vertices, faces, name=name)
     except MeshError as error:
@@ -175,59 +184,10 @@ def _read_obj(path):
 
 
 def _read_vtk(path, suffix):
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkFiltersCore import vtkTriangleFilter
+    from rbfmuscle.sim.formats.polydata import read_polydata, triangles_of
 
     data = read_polydata(path, suffix)
-    triangles = vtkTriangleFilter()
-    triangles.PassLinesOff()
-    triangles.PassVertsOff()
-    triangles.SetInputData(data)
-    triangles.Update()
-    data = triangles.GetOutput()
-    if data.GetNumberOfPoints() == 0 or data.GetNumberOfPolys() == 0:
-        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
-    vertices = vtk_to_numpy(data.GetPoints().GetData()).astype(np.float64)
-    faces = vtk_to_numpy(data.GetPolys().GetConnectivityArray()).astype(np.int64).reshape(-1, 3)
-    return vertices, faces
-
-
-def read_polydata(path, suffix=None):
-    """Return the vtkPolyData of a ``.vtk`` or ``.vtp`` file, or raise MeshError."""
-    from vtkmodules.vtkIOLegacy import vtkPolyDataReader
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
-
-    reader = (
-        vtkXMLPolyDataReader() if (suffix or Path(path).suffix.lower()) == ".vtp" else vtkPolyDataReader()
-    )
-    problems = []
-    for source in (reader, getattr(reader, "GetReader", lambda: None)()):
-        if source is not None:
-            source.AddObserver("ErrorEvent", lambda *args: problems.append(args))
-            source.AddObserver("WarningEvent", lambda *args: None)
-    if isinstance(reader, vtkXMLPolyDataReader):
-        import xml.etree.ElementTree as ElementTree
-
-        _check_vtp_head(path, ElementTree)
-    reader.SetFileName(str(path))
-    if isinstance(reader, vtkPolyDataReader) and not reader.IsFilePolyData():
-        raise MeshError(f"{path}: not a VTK PolyData file")
-    reader.Update()
-    if problems:
-        raise MeshError(f"{path}: not a readable VTK PolyData file")
-    return reader.GetOutput()
-
-
-def _check_vtp_head(path, element_tree):
-    """VTK prints its own lines for a broken XML file: find that out before it does."""
-    head = Path(path).read_bytes()[:2048]
-    if b"<VTKFile" not in head or b"PolyData" not in head:
-        raise MeshError(f"{path}: not a VTK PolyData file")
-    if b"<AppendedData" not in Path(path).read_bytes():
-        try:
-            element_tree.parse(path)
-        except element_tree.ParseError as error:
-            raise MeshError(f"{path}: not a readable VTP file ({error})") from None
+    return data.points, triangles_of(data)
 
 
 def _short(error):
