@@ -3,6 +3,8 @@
 The one module that every room may import; it imports nothing of ours.
 """
 
+import os
+
 import numpy as np
 
 
@@ -56,6 +58,26 @@ class NumericalWarning(UserWarning):
     """A result is usable but less accurate than asked; the message names the cause and the remedy."""
 
 
+LONGEST_SHOWN = 80
+
+
+def shown(value: object) -> str:
+    """Return a value as a message shows it, cut where it is long."""
+    try:
+        text = value if isinstance(value, str) else repr(value)
+    except (ValueError, RecursionError):  # numbers of thousands of digits have no decimal form
+        text = f"a {type(value).__name__} too long to show"
+    return text if len(text) <= LONGEST_SHOWN else f"{text[: LONGEST_SHOWN - 15]} ... {text[-10:]}"
+
+
+def is_file(path: str | os.PathLike) -> bool:
+    """Whether a path is a regular file: no folder, pipe or device, and a name that the system takes."""
+    try:
+        return os.path.isfile(path)
+    except (OSError, ValueError):
+        return False
+
+
 def check_points(points, *, name="points"):
     """Return points as a finite, C-contiguous (n, 3) float64 array.
 
@@ -70,11 +92,19 @@ def check_points(points, *, name="points"):
     ValueError
         On any other shape, or on NaN or infinity.
     """
-    points = np.ascontiguousarray(points, dtype=np.float64)
+    points = _as_floats(points, name)
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"{name} must have shape (n, 3), got {points.shape}")
     check_finite(points, name=name)
     return points
+
+
+def _as_floats(values, name):
+    try:
+        return np.ascontiguousarray(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        reason = " ".join(str(error).split())[:100]
+        raise ValueError(f"{name} must be an array of numbers ({reason})") from None
 
 
 def check_vectors(vectors, count, *, name="normals"):
@@ -87,7 +117,7 @@ def check_vectors(vectors, count, *, name="normals"):
 
 def check_values(values, count, *, name="values"):
     """Return (count,) finite float64 values, one for each point."""
-    values = np.ascontiguousarray(values, dtype=np.float64)
+    values = _as_floats(values, name)
     if values.shape != (count,):
         raise ValueError(f"{name} must have shape ({count},), got {values.shape}")
     check_finite(values, name=name)

@@ -7,7 +7,15 @@ import numpy as np
 
 from rbfmuscle.geometry.rest_frame import RestFrame, diameter
 from rbfmuscle.sim.joints.skeleton import all_coordinates
-from rbfmuscle.sim.scene.motion import bone_poses, completed, interpolate, step_angle, turned_angle
+from rbfmuscle.sim.scene.motion import (
+    bone_poses,
+    completed,
+    interpolate,
+    rest_coordinates,
+    step_angle,
+    turned_angle,
+)
+from rbfmuscle.validation import SceneError
 
 # No attached point moves farther against a bone in one sub-step than this share of its muscle's diameter.
 TRAVEL = 1.0 / 27.0
@@ -34,6 +42,7 @@ class SubSteps:
         self.scene = scene
         self.limit = math.radians(scene.contact.substep_angle)
         self._facts = all_coordinates(scene.joints)
+        self.most = scene.motion.options.max_substeps
         names = [bone.name for bone in scene.bones]
         owner, corners, size = [], [], []
         for muscle in scene.muscles:
@@ -67,12 +76,28 @@ class SubSteps:
         """The fewest equal sub-steps that are short enough."""
         count = max(1, math.ceil(path_angle(self.scene, before, after) / self.limit - 1e-9))
         while True:
+            if count > self.most:
+                raise SceneError(
+                    f"[motion]: one frame takes more than {self.most} sub-steps; make its step or the angles smaller, "
+                    "or raise motion.max_substeps"
+                )
             stops = [interpolate(before, after, k / count) for k in range(count + 1)]
             poses = [self._matrices(stop) for stop in stops]
             excess = max(self._excess(a, b) for a, b in itertools.pairwise(poses))
             if excess <= 1.0 + 1e-9:
                 return stops[1:]
             count = max(count + 1, math.ceil(count * min(excess, 4.0)))
+
+    def rate_of(self, name: str) -> float:
+        """About how many sub-steps a change of one coordinate takes, a radian or a scene unit of it."""
+        turns = self._facts[name].motion == "rotation"
+        probe = self.limit if turns else self.scene.length(1.0)
+        rest = rest_coordinates(self.scene)
+        moved = {**rest, name: rest.get(name, 0.0) + probe}
+        excess = self._excess(self._matrices(rest), self._matrices(moved))
+        if not math.isfinite(excess):
+            return math.inf
+        return max(1.0 if turns else 0.0, excess) / probe
 
     def _stops_on_grid(self, before, after, name):
         """Stops strictly between two values of the coordinate ``name``, in order."""
@@ -107,6 +132,44 @@ class SubSteps:
         moved = np.einsum("bkij,kcj->bkci", change[..., :3, :3], self._corners) + change[..., None, :3, 3]
         length = np.sqrt((moved**2).sum(axis=-1)).max(axis=(0, 2))
         return max(excess, float((length / self._travel).max(initial=0.0)))
+
+
+def check_substeps(scene) -> None:
+    """Refuse a motion of more sub-steps than ``motion.max_substeps``, before anything grows with their number.
+
+    Raises
+    ------
+    SceneError
+        With the number, the coordinate that takes most of it, and the key that raises the limit.
+    """
+    by_name = estimate_substeps(scene)
+    name = max(by_name, key=by_name.get, default="")
+    limit = scene.motion.options.max_substeps
+    if by_name and not by_name[name] <= limit:
+        raise SceneError(
+            f"[motion]: {name!r} takes about {by_name[name]:.3g} sub-steps, more than {limit} (its way is long, "
+            f"contact.substep_angle = {scene.contact.substep_angle:g} is small, or muscles lie far from the joint's "
+            "centre); correct these, or raise motion.max_substeps"
+        )
+
+
+def estimate_substeps(scene) -> dict[str, float]:
+    """Return about how many sub-steps each coordinate of a motion takes by itself, from rest on.
+
+    Found from one probe a coordinate: how far a small change of it, from rest, moves what is attached.
+    """
+    cut, frames, rest = SubSteps(scene), scene.motion.frames, rest_coordinates(scene)
+    found = {}
+    for name in sorted({name for frame in frames for name in frame}):
+        start = rest.get(name, 0.0)
+        path = np.array([start, *(frame.get(name, start) for frame in frames)])
+        with np.errstate(all="ignore"):
+            change = np.abs(np.diff(path))
+            steps = np.ceil(change * cut.rate_of(name) - 1e-9)
+            total = float(steps[change > 0].sum())
+        # Not a number, where numbers overflow, is more than any limit.
+        found[name] = total if math.isfinite(total) else math.inf
+    return found
 
 
 def path_angle(scene, before, after):

@@ -9,7 +9,7 @@ import numpy as np
 
 from rbfmuscle.sim.distance.detectors import build_detector
 from rbfmuscle.sim.loop.contact import moved_box
-from rbfmuscle.sim.loop.substeps import path_angle
+from rbfmuscle.sim.loop.substeps import check_substeps, path_angle
 from rbfmuscle.sim.scene.motion import bone_poses, completed, interpolate, rest_coordinates
 
 # Poses of a motion that a swept box is made of; arcs between them are covered by the padding.
@@ -53,6 +53,7 @@ def sampled_poses(scene):
 
 def reached_bones(scene):
     """Region of each bone that each muscle can reach: dict of (muscle name, bone name) to (2, 3) box."""
+    check_substeps(scene)
     poses = sampled_poses(scene)
     regions = {}
     for muscle in scene.muscles:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.sim.scene.options import NotNegative, Positive, Table, Vector, did_you_mean
-from rbfmuscle.validation import SceneError
+from rbfmuscle.validation import SceneError, is_file, shown
 
 
 @dataclass
@@ -109,7 +109,7 @@ def _listed_vertices(listed, read, place):
     if isinstance(listed, str):
         numbers, place = _read_numbers(Path(listed), place), f"{place}: {listed}"
     else:
-        numbers = np.array(listed, dtype=np.int64)
+        numbers = _whole_numbers(listed, place)
     if len(numbers) == 0:
         raise SceneError(f"{place}: no vertex numbers")
     wrong = (numbers < 0) | (numbers >= len(read.vertex_map))
@@ -126,6 +126,8 @@ def _listed_vertices(listed, read, place):
 
 
 def _read_numbers(path, place):
+    if not is_file(path):
+        raise SceneError(f"{place}: cannot read {shown(str(path))}: no such file")
     try:
         words = path.read_text(encoding="utf-8", errors="replace").split()
     except OSError as error:
@@ -135,8 +137,16 @@ def _read_numbers(path, place):
         try:
             numbers.append(int(word))
         except ValueError:
-            raise SceneError(f"{place}: {path}: {word!r} is not a vertex number") from None
-    return np.array(numbers, dtype=np.int64)
+            raise SceneError(f"{place}: {path}: {shown(repr(word))} is not a vertex number") from None
+    return _whole_numbers(numbers, f"{place}: {path}")
+
+
+def _whole_numbers(numbers, place):
+    try:
+        return np.array(numbers, dtype=np.int64)
+    except OverflowError:
+        largest = max(numbers, key=abs)
+        raise SceneError(f"{place}: vertex {shown(largest)} is out of range") from None
 
 
 def _check_overlap(found, muscle):

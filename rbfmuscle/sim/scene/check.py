@@ -12,6 +12,7 @@ from rbfmuscle.validation import MeshError, RBFMuscleError, SceneError
 SMALLEST_MM = 2.0  # across: the bones of a mouse
 LARGEST_MM = 3000.0  # across: a person with arms raised
 FAR_AWAY = 1.0  # a muscle further from the bones than this many diagonals of their box is in another frame
+FARTHEST_CENTRE = 1000.0  # the same for the centre of a joint: a nearly straight path has one far away
 MOTION_SAMPLES = 10
 COUNTED_DEPTH_MM = 0.05  # bones that touch by less are not reported
 
@@ -38,7 +39,9 @@ def check_scene(scene):
         for b in scene.bones
         if not b.closed
     )
-    for test in (scene.validate, lambda: check_extents(scene)):
+    from rbfmuscle.sim.loop.substeps import check_substeps
+
+    for test in (scene.validate, lambda: check_extents(scene), lambda: check_substeps(scene)):
         try:
             test()
         except RBFMuscleError as error:
@@ -88,6 +91,20 @@ def check_place(scene, name, mesh, source):
         )
 
 
+def check_centre(scene, name: str, centre: np.ndarray) -> None:
+    """Raise SceneError for a joint whose centre lies so far from all bones that poses lose their digits."""
+    if not scene.bones:
+        return
+    corners = np.concatenate([bone.mesh.bounds for bone in scene.bones])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    away = float(np.linalg.norm(np.maximum(low - centre, centre - high).clip(min=0)))
+    if away > FARTHEST_CENTRE * np.linalg.norm(high - low):
+        raise SceneError(
+            f"joint {name!r}: centre {np.asarray(centre).tolist()} lies {away:.4g} {scene.units} away from all bones; "
+            f"correct it, it is in the scene's unit ({scene.units})"
+        )
+
+
 def _likely_scale(millimetres):
     """The power of ten among the usual unit mistakes that brings the size nearest to 300 mm."""
     best = min(
@@ -123,7 +140,13 @@ def _rest_overlaps(scene):
 
 
 def check_initial(scene):
-    """Raise SceneError if a muscle lies mostly inside a bone, or at all with ``initial = "error"``."""
+    """Raise SceneError if a motion is longer than its limit, or a muscle lies mostly inside a bone.
+
+    With ``initial = "error"`` a muscle may not lie in a bone at all.
+    """
+    from rbfmuscle.sim.loop.substeps import check_substeps
+
+    check_substeps(scene)
     for finding in _rest_overlaps(scene):
         if finding.level == "error":
             raise SceneError(

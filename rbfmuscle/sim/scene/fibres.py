@@ -4,7 +4,7 @@ import itertools
 import json
 from pathlib import Path
 
-from rbfmuscle.validation import MeshError, SceneError, check_points
+from rbfmuscle.validation import MeshError, SceneError, check_points, is_file, shown
 
 
 def read_fibres(fibres, *, scale=1.0, muscle=""):
@@ -44,6 +44,8 @@ def read_fibres(fibres, *, scale=1.0, muscle=""):
 
 def _read_lines(path, place):
     suffix = path.suffix.lower()
+    if suffix in (".vtk", ".vtp", ".json") and not is_file(path):
+        raise SceneError(f"{place}: no such file")
     if suffix in (".vtk", ".vtp"):
         return _read_polydata_lines(path, place)
     if suffix != ".json":
@@ -52,8 +54,8 @@ def _read_lines(path, place):
         data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise SceneError(f"{place}: cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        raise SceneError(f"{place}: not JSON ({error})") from None
+    except (ValueError, RecursionError) as error:
+        raise SceneError(f"{place}: not JSON ({shown(str(error))})") from None
     lines = data.get("polylines") if isinstance(data, dict) else data
     if not isinstance(lines, list):
         raise SceneError(f"{place}: needs a list 'polylines'")
@@ -63,8 +65,6 @@ def _read_lines(path, place):
 def _read_polydata_lines(path, place):
     from rbfmuscle.sim.formats.polydata import read_polydata
 
-    if not path.is_file():
-        raise SceneError(f"{place}: no such file")
     try:
         data = read_polydata(path)
     except MeshError as error:

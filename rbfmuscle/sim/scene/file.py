@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from rbfmuscle.sim.scene.attachments import AttachTable
-from rbfmuscle.sim.scene.check import check_place, check_size
+from rbfmuscle.sim.scene.check import check_centre, check_place, check_size
 from rbfmuscle.sim.scene.joint_tables import (
     CouplingTable,
     JointTable,
@@ -26,9 +26,13 @@ from rbfmuscle.sim.scene.options import (
     Positive,
     SlidingOptions,
     Table,
+    check_plain,
     describe_error,
 )
-from rbfmuscle.validation import MeshError, SceneError
+from rbfmuscle.validation import MeshError, SceneError, is_file, shown
+
+# A scene file is a page or two; long lists of vertices belong into files of their own.
+LARGEST_FILE = 4_000_000
 
 
 class SceneTable(Table):
@@ -87,25 +91,41 @@ def read_scene_file(path):
     SceneError
         Naming the file, the table, the key, the value and what is right.
     """
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except IsADirectoryError:
-        raise SceneError(f"{path}: is a folder, give a scene file (.toml)") from None
-    except FileNotFoundError:
-        raise SceneError(f"{path}: no such scene file") from None
-    except OSError as error:
-        raise SceneError(f"{path}: cannot read the scene file: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise SceneError(f"{path}: not a text file in UTF-8, give a scene file (.toml)") from None
-    except tomllib.TOMLDecodeError as error:
-        quotes = "; text stands in quotes" if str(error).startswith("Invalid value") else ""
-        raise SceneError(f"{path}: not valid TOML: {error}{quotes}") from None
+    data = _read_toml(path)
+    check_plain(data, place=f"{path}: ")
     try:
         return SceneFile.model_validate(data)
     except ValidationError as error:
         raise SceneError(
             describe_error(error, root=str(path), name_row=lambda at: _place(at, data))
         ) from None
+
+
+def _read_toml(path):
+    if path.is_dir():
+        raise SceneError(f"{path}: is a folder, give a scene file (.toml)")
+    if not is_file(path):
+        raise SceneError(f"{shown(str(path))}: no such scene file")
+    try:
+        size = path.stat().st_size
+        if size > LARGEST_FILE:
+            raise SceneError(
+                f"{path}: has {size} bytes, a scene file at most {LARGEST_FILE}; put long lists of vertices into "
+                "files of their own"
+            )
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SceneError(f"{path}: cannot read the scene file: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise SceneError(f"{path}: not a text file in UTF-8, give a scene file (.toml)") from None
+    except tomllib.TOMLDecodeError as error:
+        quotes = "; text stands in quotes" if str(error).startswith("Invalid value") else ""
+        raise SceneError(f"{path}: not valid TOML: {shown(str(error))}{quotes}") from None
+    except (ValueError, RecursionError) as error:  # integers of thousands of digits; nesting without end
+        what = (
+            "tables or lists are nested too deep" if isinstance(error, RecursionError) else shown(str(error))
+        )
+        raise SceneError(f"{path}: not valid TOML: {what}") from None
 
 
 def load_scene(cls, path, *, skeleton=False):
@@ -131,6 +151,7 @@ def _build(scene, tables, folder, path, skeleton):
         scene.add_bone(bone.name, read)
     for joint in tables.joint:
         scene.place_joint(joint.joint())
+        check_centre(scene, joint.name, scene.joints[-1].centre)
     for coupling in tables.coupling:
         scene.place_coupling(make_coupling(coupling, scene.joints))
     for muscle in tables.muscle:

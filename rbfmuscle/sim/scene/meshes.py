@@ -3,13 +3,14 @@
 Vertex numbers in files stay usable: a read mesh knows which of its vertices each vertex of the file became.
 """
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from rbfmuscle.sim.scene.mesh_repair import repair
-from rbfmuscle.validation import MeshError, check_mesh
+from rbfmuscle.validation import MeshError, check_mesh, is_file, shown
 
 # In any unit: beyond it, squares of squares of lengths leave the range in which volumes are exact.
 LARGEST_COORDINATE = 1e12
@@ -65,9 +66,9 @@ def read_mesh(path, *, name=None, scale=1.0, may_be_open=False):
     """
     path = Path(path)
     vertices, faces = read_arrays(path)
-    read = prepare_mesh(
-        vertices * scale, faces, place=str(path), name=name or path.stem, may_be_open=may_be_open
-    )
+    with np.errstate(over="ignore", invalid="ignore"):
+        vertices = vertices * scale
+    read = prepare_mesh(vertices, faces, place=str(path), name=name or path.stem, may_be_open=may_be_open)
     read.source = str(path)
     return read
 
@@ -111,8 +112,8 @@ def read_arrays(path):
         raise MeshError(
             f"{path}: {suffix or 'no suffix'} is not a mesh format, use {', '.join(MESH_SUFFIXES)}"
         )
-    if not path.is_file():
-        raise MeshError(f"{path}: no such mesh file{_neighbours(path)}")
+    if not is_file(path):
+        raise MeshError(f"{shown(str(path))}: no such mesh file{_neighbours(path)}")
     try:
         if path.stat().st_size == 0:
             raise MeshError(f"{path}: the file is empty")
@@ -130,9 +131,12 @@ def read_arrays(path):
 def _neighbours(path):
     from rbfmuscle.sim.scene.options import did_you_mean
 
-    if not path.parent.is_dir():
-        return f" (no folder {path.parent})"
-    names = sorted(p.name for p in path.parent.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
+    if not os.path.isdir(path.parent):
+        return f" (no folder {shown(str(path.parent))})"
+    try:
+        names = sorted(p.name for p in path.parent.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
+    except OSError:
+        return ""
     return ", " + did_you_mean(path.name, names[:50]) if names else " (no meshes in that folder)"
 
 
@@ -180,7 +184,11 @@ def _read_obj(path):
             raise MeshError(f"{path}: line {number} is not readable as OBJ ({_short(error)})") from None
     if any(len(vertex) != 3 for vertex in vertices):
         raise MeshError(f"{path}: a vertex has fewer than three coordinates")
-    return np.array(vertices, dtype=np.float64).reshape(-1, 3), np.array(faces, dtype=np.int64).reshape(-1, 3)
+    try:
+        triangles = np.array(faces, dtype=np.int64).reshape(-1, 3)
+    except OverflowError:
+        raise MeshError(f"{path}: a face names a vertex far outside its {len(vertices)} vertices") from None
+    return np.array(vertices, dtype=np.float64).reshape(-1, 3), triangles
 
 
 def _read_vtk(path, suffix):
@@ -191,5 +199,4 @@ def _read_vtk(path, suffix):
 
 
 def _short(error):
-    text = " ".join(str(error).split())
-    return text[:80] if text else type(error).__name__
+    return shown(" ".join(str(error).split())) or type(error).__name__

@@ -271,8 +271,10 @@ def _waypoint_frames(stops, step, facts):
         for row in range(len(stops)):
             held = table[row, column] = held if np.isnan(table[row, column]) else table[row, column]
     rows = [table[0]]
-    for before, after in itertools.pairwise(table):
-        pace = np.abs(after - before).max() / step
+    with np.errstate(over="ignore"):
+        paces = np.abs(np.diff(table, axis=0)).max(axis=1, initial=0.0) / step
+        _check_count(np.ceil(paces).sum())
+    for pace, (before, after) in zip(paces.tolist(), itertools.pairwise(table)):
         rows.extend(before + t * (after - before) for t in _marks(pace)[1:])
     factors = np.array([FACTORS[facts[name].motion] for name in names])
     return [dict(zip(names, (row * factors).tolist())) for row in rows]
@@ -280,12 +282,19 @@ def _waypoint_frames(stops, step, facts):
 
 def _marks(pace):
     """Fractions of the way at whole steps, then the end: 2.5 steps give 0, 0.4, 0.8, 1."""
-    if pace > MAX_FRAMES:
-        raise SceneError(f"[motion]: more than {MAX_FRAMES} frames, a step is too small for its range")
+    _check_count(pace)
     if pace == 0:
         return [0.0]
     count = math.ceil(pace - 1e-9)
     return [*(k / pace for k in range(count)), 1.0]
+
+
+def _check_count(count):
+    if not count <= MAX_FRAMES:
+        raise SceneError(
+            f"[motion]: about {count:.3g} frames, more than {MAX_FRAMES}: a step is too small for its range; "
+            "make the step larger or the range smaller"
+        )
 
 
 def _slice_text(frames):

@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 
 from rbfmuscle.sim.joints.joint import Coordinate
-from rbfmuscle.validation import SceneError
+from rbfmuscle.validation import SceneError, is_file, shown
 
 NO = ("no", "false", "0")
 YES = ("yes", "true", "1")
@@ -92,6 +92,8 @@ def match_label(label: str, known: list[str]) -> str | None:
 
 
 def _parts(path):
+    if not is_file(path):
+        raise SceneError(f"[motion]: cannot read {shown(str(path))}: no such file")
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError as error:

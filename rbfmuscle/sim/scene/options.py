@@ -4,6 +4,7 @@ They check themselves, so the same rules hold for a file, for code and for ``--s
 """
 
 import difflib
+import math
 from typing import Annotated, Literal
 
 from pydantic import (
@@ -17,7 +18,13 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from rbfmuscle.validation import SceneError
+from rbfmuscle.validation import SceneError, shown
+
+# How deep tables and lists of a scene file may lie in each other, and how large a whole number may be: beyond
+# 2^53 it is no longer the number that was written once it meets a float.
+DEEPEST = 20
+MOST_NAMED = 40  # names that a message lists
+LARGEST_INTEGER = 2**53
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -35,14 +42,45 @@ def _check_length(vector):
 Axis = Annotated[Vector, AfterValidator(_check_length)]
 
 
+def check_plain(value: object, *, place: str) -> None:
+    """Raise SceneError where TOML holds what no key can mean: endless nesting, vast integers, nan or inf.
+
+    Parameters
+    ----------
+    value : object
+        What a TOML reader returned: tables, lists, numbers, texts.
+    place : str
+        Begins the message.
+    """
+    open_parts = [(value, place, 0)]
+    while open_parts:
+        part, where, depth = open_parts.pop()
+        if isinstance(part, (dict, list)):
+            if depth >= DEEPEST:
+                raise SceneError(f"{shown(where)}: tables or lists are nested more than {DEEPEST} deep")
+            items = part.items() if isinstance(part, dict) else enumerate(part, 1)
+            open_parts += [
+                (item, f"{where}{'' if depth == 0 else '.'}{shown(str(key))}", depth + 1)
+                for key, item in items
+                if not (isinstance(item, int) and abs(item) <= LARGEST_INTEGER) and not isinstance(item, str)
+            ]
+        elif isinstance(part, int) and not isinstance(part, bool) and abs(part) > LARGEST_INTEGER:
+            raise SceneError(f"{where}: a whole number must be at most 2^53 in size, got {shown(part)}")
+        elif isinstance(part, float) and not math.isfinite(part):
+            raise SceneError(f"{where}: must be a finite number, got {part}")
+
+
 def did_you_mean(word, known):
     """Return "did you mean 'x'?", or the list of what is known when nothing is near."""
     known = [str(name) for name in known]
     lower = {name.lower(): name for name in known}
-    near = difflib.get_close_matches(str(word).lower(), lower, n=1, cutoff=0.5)
+    near = difflib.get_close_matches(str(word).lower()[:100], lower, n=1, cutoff=0.5)
     if near:
         return f"did you mean {lower[near[0]]!r}?"
-    return "known: " + ", ".join(known) if known else "there are none"
+    if not known:
+        return "there are none"
+    more = f" and {len(known) - MOST_NAMED} more" if len(known) > MOST_NAMED else ""
+    return "known: " + ", ".join(shown(name) for name in known[:MOST_NAMED]) + more
 
 
 class Table(BaseModel):
@@ -61,7 +99,7 @@ class Table(BaseModel):
                 raise PydanticCustomError(
                     "unknown_key",
                     "unknown key '{key}', {hint}",
-                    {"key": key, "hint": did_you_mean(key, known)},
+                    {"key": shown(str(key)), "hint": did_you_mean(key, known)},
                 )
         return data
 
@@ -102,10 +140,10 @@ def describe_error(error, *, root="", name_row=None):
     message = first["msg"].removeprefix("Value error, ")
     message = message[0].lower() + message[1:]
     given = first.get("input")
-    shown = (
-        "" if first["type"] in ("unknown_key", "missing") or isinstance(given, dict) else f", got {given!r}"
-    )
-    return ": ".join(part for part in (root, where, message + shown) if part)
+    value = ""
+    if first["type"] not in ("unknown_key", "missing") and not isinstance(given, dict):
+        value = f", got {shown(repr(given) if isinstance(given, str) else given)}"
+    return ": ".join(part for part in (root, where, message + value) if part)
 
 
 class ContactOptions(Table):
@@ -136,7 +174,8 @@ class TunnellingOptions(Table):
     angle: Annotated[float, Field(gt=0, lt=180)] = 135.0
     action: Literal["report", "rotate", "substep"] = "substep"
     swept: bool = True
-    smallest_step: Positive = 0.1
+    # Each halving doubles the steps: a thousandth of a degree is already 2,000 for one of two degrees.
+    smallest_step: Annotated[float, Field(ge=0.001, allow_inf_nan=False)] = 0.1
 
 
 class DetectOptions(Table):
@@ -192,6 +231,7 @@ class MotionOptions(Table):
     step: Positive | None = None
     file: str | None = None
     degrees: bool | None = None
+    max_substeps: Annotated[int, Field(ge=1)] = 100_000
 
     @model_validator(mode="after")
     def _check_one_source(self):

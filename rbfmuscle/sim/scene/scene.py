@@ -23,7 +23,7 @@ from rbfmuscle.sim.scene.options import (
     OutputOptions,
     did_you_mean,
 )
-from rbfmuscle.validation import SceneError, check_points, check_positive
+from rbfmuscle.validation import SceneError, check_points, check_positive, shown
 
 # What reads files of other programs as scenes, by suffix; the room that can do it enters itself here.
 IMPORTERS = {}
@@ -357,7 +357,7 @@ def split_model(model, *, place):
         name = options.pop("name", "rbf")
         if isinstance(name, str):
             return name, options
-    raise SceneError(f"{place}: model must be a name or a table with a name, got {model!r}")
+    raise SceneError(f"{place}: model must be a name or a table with a name, got {shown(model)}")
 
 
 def _find(items, name, what, *, place=""):
@@ -371,7 +371,7 @@ def _find(items, name, what, *, place=""):
 def _check_new_name(items, name, what):
     if not isinstance(name, str) or not name or not set(name) <= _NAME_CHARACTERS:
         raise SceneError(
-            f"{what} name {name!r} may hold letters, digits, '_' and '-' only (it becomes a file name)"
+            f"{what} name {shown(repr(name))} may hold letters, digits, '_' and '-' only (it becomes a file name)"
         )
     if any(item.name == name for item in items):
         raise SceneError(f"{what} {name!r} is given twice")
@@ -384,13 +384,14 @@ def _vector(values, name, *, unit=False):
     try:
         vector = check_points([values], name=name)[0]
     except (ValueError, TypeError) as error:
-        raise SceneError(f"{name} must be three numbers, got {values!r} ({error})") from None
+        raise SceneError(f"{name} must be three numbers, got {shown(values)} ({error})") from None
     if not unit:
         return vector
-    size = np.linalg.norm(vector)
-    if size == 0:
+    largest = np.abs(vector).max()
+    if largest == 0:
         raise SceneError(f"{name} must not be the zero vector")
-    return vector / size
+    vector = vector / largest  # the squares of very long or short ones leave the range of numbers
+    return vector / np.linalg.norm(vector)
 
 
 def _as_mesh(mesh, name, scale, *, may_be_open):

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rbfmuscle.sim.scene.options import DetectOptions, SlidingOptions, did_you_mean
+from rbfmuscle.sim.scene.options import DetectOptions, SlidingOptions, check_plain, did_you_mean
 from rbfmuscle.validation import SceneError, UsageError
 
 if TYPE_CHECKING:
@@ -114,9 +114,11 @@ def parse_setting(text):
 def parse_value(text):
     """Return the value of a TOML literal (number, true, list, table), or the text itself."""
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except (ValueError, RecursionError):
         return text
+    check_plain(value, place="value")
+    return value
 
 
 def parse_slice(text):
