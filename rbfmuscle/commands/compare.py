@@ -56,17 +56,19 @@ def compare(
     as_json
         Print JSON and nothing else.
     """
+    from rbfmuscle import interruption
     from rbfmuscle.compare import compare_models
     from rbfmuscle.models import MODEL_NAMES
     from rbfmuscle.sim.scene.settings import parse_setting
 
     names = [name.strip() for name in models.split(",") if name.strip()] if models else list(MODEL_NAMES)
     changes = dict(parse_setting(text) for text in settings or [])
-    with Progress("compare") as progress:
+    with Progress("compare") as progress, interruption.keeping(lambda: output.exists()):
 
         def advance(model, done, total):
             progress.title = model
             progress(done, total)
+            interruption.check()
 
         try:
             table = compare_models(

@@ -94,16 +94,18 @@ def run(
 
 
 def _run_scene(scene, output, *, model, frames, settings, fail_on, as_json):
+    from rbfmuscle import interruption
     from rbfmuscle.run import stream_run
 
     start = time.perf_counter()
     done = 0
-    with Progress(scene.name) as progress:
+    with Progress(scene.name) as progress, interruption.keeping(lambda: done > 0):
 
         def advance(count, total):
             nonlocal done
             done = count
             progress(count, total)
+            interruption.check()
 
         try:
             info = stream_run(

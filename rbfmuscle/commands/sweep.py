@@ -95,6 +95,7 @@ def run_point(scene, settings, frames):
 
 
 def _measure(scene, output, grid, model, frames, reference, jobs, scheduler, part, retry):
+    from rbfmuscle import interruption
     from rbfmuscle.models import configure_scene
     from rbfmuscle.sim.scene.settings import parse_setting
     from rbfmuscle.study.experiment.sweep import parse_grid, plan_sweep
@@ -106,7 +107,7 @@ def _measure(scene, output, grid, model, frames, reference, jobs, scheduler, par
     plan = plan_sweep(loaded, axes, frames=frames, reference=chosen)
     for point in plan.points:  # a mistyped key is told now, not after the first point
         configure_scene(loaded, point.settings)
-    with Progress(f"sweep of {loaded.name}", what="point") as progress:
+    with Progress(f"sweep of {loaded.name}", what="point") as progress, interruption.keeping(lambda: True):
         runner = SweepRunner(
             run_point, loaded, plan, output, frames=frames, jobs=jobs, scheduler=scheduler, progress=progress
         )

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from command_line import call
 
-from rbfmuscle.cli import app
+from rbfmuscle.app import app
 from rbfmuscle.sim.scene.phantom import phantom_scene
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from blend_model import arm_scene, use_blend_model
 
-from rbfmuscle.cli import _run as command
+from rbfmuscle.app import run_command as command
 from rbfmuscle.commands.sweep import run_point
 from rbfmuscle.study.experiment.sweep import SweepFolder, parse_grid, parse_task, plan_sweep, point_key
 from rbfmuscle.study.experiment.sweep_points import SweepRunner

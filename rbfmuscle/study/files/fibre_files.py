@@ -2,8 +2,6 @@
 
 import csv
 
-import numpy as np
-
 from rbfmuscle.study.files.vtp import Collection, write_vtp_lines
 
 COLUMNS = ("frame", "muscle", "fibre", "length", "stretch")
@@ -58,8 +56,7 @@ def read_fibres(path):
     cells : dict of str to (count,) ndarray
         ``length`` and ``stretch``.
     """
-    import pyvista
+    from rbfmuscle.sim.formats.polydata import read_polydata
 
-    data = pyvista.read(path)
-    points = np.asarray(data.points, dtype=np.float64).reshape(data.n_lines, -1, 3)
-    return points, {name: np.asarray(data.cell_data[name]) for name in data.cell_data}
+    data = read_polydata(path, values=True)
+    return data.points.reshape(len(data.lines.ends), -1, 3), dict(data.values)

@@ -56,10 +56,10 @@ def read_mesh(path):
     if not path.is_file():
         raise MeshError(f"{path} is missing")
     if path.suffix == ".vtp":
-        import pyvista
+        from rbfmuscle.sim.formats.polydata import read_polydata, triangles_of
 
-        data = pyvista.read(path)
-        return np.asarray(data.points, dtype=np.float64), data.faces.reshape(-1, 4)[:, 1:]
+        data = read_polydata(path)
+        return data.points, triangles_of(data)
     import trimesh
 
     mesh = trimesh.load_mesh(path, process=path.suffix == ".stl")

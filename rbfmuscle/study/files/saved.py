@@ -1,6 +1,7 @@
 """Reading back what a run left in a folder."""
 
 import csv
+import io
 import json
 from functools import cached_property
 from pathlib import Path
@@ -9,11 +10,13 @@ import numpy as np
 
 from rbfmuscle.study.files.meshfiles import SUFFIXES, read_mesh
 from rbfmuscle.study.measure.metrics import Row
-from rbfmuscle.validation import UsageError
+from rbfmuscle.validation import MeshError, UsageError
 
 
 class SavedRun:
     """A run in a folder; surfaces are read when asked for.
+
+    Of a run that was killed, or still goes on, the frames up to the last whole one are found on the disk.
 
     Parameters
     ----------
@@ -39,11 +42,11 @@ class SavedRun:
         path = self.directory / "run.json"
         try:
             self.info = json.loads(path.read_text(encoding="utf-8"))
-            self.frames = [frame["frame"] for frame in self.info["frames"]]
             self.units = self.info["scene"]["units"]
             self.muscles = [muscle["name"] for muscle in self.info["scene"]["muscles"]]
             self.bones = [bone["name"] for bone in self.info["scene"]["bones"]]
             surfaces = self.info["scene"]["output"]["surfaces"]
+            self.frames = [frame["frame"] for frame in self.info["frames"]]
         except OSError:
             raise UsageError(
                 f"{self.directory} holds no run (no run.json); give the folder of 'run -o'"
@@ -53,6 +56,9 @@ class SavedRun:
                 f"{path} is not the run.json of a run ({error!r}); run the scene again"
             ) from None
         self.suffix = SUFFIXES[surfaces["format"]] if surfaces else None
+        if self.info.get("status") == "running":
+            self.info["frames"] = self._whole_frames()
+            self.frames = [frame["frame"] for frame in self.info["frames"]]
 
     @cached_property
     def metrics(self):
@@ -113,6 +119,33 @@ class SavedRun:
             raise UsageError(f"{self.directory} has no fibres: set output.fibres = true in the run's scene")
         return read_fibres(self.directory / "fibres" / f"{muscle}_{frame:04d}.vtp")
 
+    def _whole_frames(self):
+        """Entries of ``run.json`` for the frames of which every file is there.
+
+        A frame's surfaces are on the disk before its poses, its fibres after them: only those of the last frame
+        can be cut short.
+        """
+        planned = self.info.get("planned", [])
+        found = [
+            {"frame": frame, "coordinates": planned[frame] if frame < len(planned) else {}, "wall": None}
+            for frame, poses in self.poses.items()
+            if set(poses) >= set(self.bones) and self._has_files(frame)
+        ]
+        if found and self.has_fibres() and not self._fibres_are_whole(found[-1]["frame"]):
+            found.pop()
+        return found
+
+    def _has_files(self, frame):
+        return self.suffix is None or all(self._file("surfaces", m, frame).is_file() for m in self.muscles)
+
+    def _fibres_are_whole(self, frame):
+        try:
+            for muscle in self.muscles:
+                self.fibres(muscle, frame)
+        except (MeshError, ValueError):
+            return False
+        return True
+
     def _file(self, folder, name, frame):
         if self.suffix is None:
             raise UsageError(f"{self.directory} has no surfaces: the run's scene had output.surfaces = false")
@@ -122,5 +155,6 @@ class SavedRun:
         path = self.directory / name
         if not path.is_file():
             return []
-        with open(path, encoding="utf-8", newline="") as file:
-            return list(csv.reader(file))[1:]
+        text = path.read_text(encoding="utf-8")
+        whole = text[: text.rfind("\n") + 1]  # the last line of a run that was killed may be cut
+        return list(csv.reader(io.StringIO(whole, newline="")))[1:]

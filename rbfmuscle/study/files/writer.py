@@ -101,7 +101,13 @@ class RunWriter:
             raise SolveError(f"cannot finish the tables in {self.directory}: {error.strerror}") from None
 
     def write_info(self, info):
-        """Write ``run.json`` in one piece: a reader finds the old one or the new one, never half of it."""
+        """Write ``run.json`` in one piece: a reader finds the old one or the new one, never half of it.
+
+        While the run goes on it holds the coordinates of all frames to come, for readers of a run that was killed.
+        """
+        if info.get("status") == "running":
+            planned = [_degrees(coordinates) for coordinates in self.scene.motion.frames]
+            info = {**info, "planned": planned}
         write_json(self.directory / "run.json", info)
 
     def _write(self, frame, rows):
@@ -171,6 +177,10 @@ class RunWriter:
         if self.format != "pvd":
             return {}
         return {name: Collection(self.directory / f"{name}.pvd") for name in ("surfaces", "bones")}
+
+
+def _degrees(coordinates):
+    return {name: math.degrees(value) for name, value in coordinates.items()}
 
 
 def _fibre_files(directory):

@@ -1,0 +1,5 @@
+"""``python -m rbfmuscle``."""
+
+from rbfmuscle.cli import main
+
+main()

@@ -1,0 +1,99 @@
+"""What an interrupt does, from the first import on: end at once, or first finish what is being kept.
+
+Imports nothing but the standard library's lightest parts: it must stand before anything else is loaded.
+"""
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+
+INTERRUPTED = 130  # exit code
+_LINE = b"rbfmuscle: interrupted\n"
+_ENDING = threading.Lock()
+_SHOW_CURSOR = b"\x1b[?25h"  # a progress bar may have hidden it
+
+
+class _State:
+    """Of this process: there is one, as there is one set of signal handlers."""
+
+    asked = False
+    has_kept: Callable[[], bool] | None = None
+    as_json = False
+
+
+def install(*, as_json: bool = False, watch: bool = False) -> None:
+    """Let SIGINT and SIGTERM end the process with 130.
+
+    Parameters
+    ----------
+    as_json : bool
+        Standard output gets the error as JSON.
+    watch : bool
+        Also listen in a thread: Python's own handlers wait until compiled code of the main thread returns.
+    """
+    _State.asked, _State.has_kept, _State.as_json = False, None, as_json
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _handle)
+    if watch:
+        reader, writer = os.pipe()
+        os.set_blocking(writer, False)
+        signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+        threading.Thread(target=_listen, args=(reader,), daemon=True).start()
+
+
+@contextlib.contextmanager
+def keeping(has_kept: Callable[[], bool]) -> Iterator[None]:
+    """While inside, and once ``has_kept()``, an interrupt is a KeyboardInterrupt, and what is kept is finished.
+
+    A second interrupt ends the process at once. Compiled code and callbacks may lose the exception: :func:`check`
+    raises it again, and so does leaving.
+    """
+    before = _State.has_kept
+    _State.has_kept = has_kept
+    try:
+        yield
+        check()
+    finally:
+        _State.has_kept = before
+
+
+def check() -> None:
+    """Raise KeyboardInterrupt if one was asked for and got lost."""
+    if _State.asked:
+        raise KeyboardInterrupt
+
+
+def _must_finish():
+    return _State.has_kept is not None and _State.has_kept()
+
+
+def _handle(number, frame):
+    if _State.asked or not _must_finish():
+        _end()
+    _State.asked = True
+    raise KeyboardInterrupt
+
+
+def _listen(reader):
+    while True:
+        number = os.read(reader, 1)
+        if not number:
+            return
+        if number[0] in (signal.SIGINT, signal.SIGTERM) and not _must_finish():
+            _end()
+
+
+def _end():
+    """Leave without unwinding: whatever is under way would go on until it is done."""
+    if not _ENDING.acquire(blocking=False):  # the other of the handler and the listener is at it
+        signal.pause()
+    with contextlib.suppress(OSError):
+        if sys.stderr is not None and os.isatty(2):
+            os.write(2, _SHOW_CURSOR)
+        os.write(2, _LINE)
+        if _State.as_json:
+            os.write(1, b'{"error": "interrupted", "exit_code": 130}\n')
+    os._exit(INTERRUPTED)
