@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import rbfmuscle as rm
+from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.models import build_model
 from rbfmuscle.sim.loop.simulate import simulate_frames
 from rbfmuscle.sim.scene.options import SlidingOptions
@@ -73,7 +74,7 @@ def study_overlap(folder, models):
             if len(overlapped):
                 away = np.min(np.linalg.norm(before[:, None] - overlapped[None], axis=2), axis=1)
             far = moved[away > scene.length(30.0)]
-            volume = mesh_volume(frame.surfaces[part.name])
+            volume = _volume(frame.surfaces[part.name])
             print(
                 f"{model:12s} {part.name:16s} inside {100 * np.mean(first < 0):5.2f} % depth {-first.min():5.2f}"
                 f" -> {max(0.0, -now.min()):5.3f}  moved {moved.max():5.2f}"
@@ -127,10 +128,8 @@ def study_cost(folder, models):
         )
 
 
-def mesh_volume(surface):
-    """Enclosed volume of a closed surface."""
-    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
-    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+def _volume(surface):
+    return mesh_volume(surface.vertices, np.asarray(surface.faces))
 
 
 def overlaps(surfaces):
@@ -152,7 +151,7 @@ def overlaps(surfaces):
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         grid = grid[winding(igl, grid, one) > 0.5]
         both = int((winding(igl, grid, two) > 0.5).sum()) if len(grid) else 0
-        share = max(share, both * spacing**3 / min(mesh_volume(one), mesh_volume(two)))
+        share = max(share, both * spacing**3 / min(_volume(one), _volume(two)))
     return depth, share
 
 

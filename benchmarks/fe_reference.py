@@ -13,13 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
+from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.models import MODEL_NAMES
 from rbfmuscle.run import simulate
 from rbfmuscle.sim.distance.sdf import BoneSDF
 from rbfmuscle.sim.scene.attachments import signed_distances
 from rbfmuscle.sim.scene.motion import bone_poses
 from rbfmuscle.sim.scene.phantom import ATTACHED_ENDS, ATTACHED_WITHIN, MUSCLES, phantom_scene
-from rbfmuscle.study.measure.metrics import mesh_volume, surface_distance
+from rbfmuscle.study.measure.metrics import surface_distance
 from rbfmuscle.validation import SolveError
 
 MUSCLE = "extensor"

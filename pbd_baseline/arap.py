@@ -10,6 +10,7 @@ import numpy as np
 from pbd_baseline.topology import colour
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.harmonic import cotangent_laplacian
+from rbfmuscle.geometry.rotations import quaternion_matrix, rotate, turn_quaternion
 
 # Newton steps for the rotations: warm starts need one or two, a turn by 30 degrees at once four.
 ROTATION_STEPS = 8
@@ -113,29 +114,6 @@ class ARAPConstraint:
 
 
 @compiled
-def _matrix(q):
-    w, x, y, z = q[0], q[1], q[2], q[3]
-    return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-
-
-@compiled
-def _rotate(q, v):
-    """Rotate v by a unit quaternion."""
-    tx = 2.0 * (q[2] * v[2] - q[3] * v[1])
-    ty = 2.0 * (q[3] * v[0] - q[1] * v[2])
-    tz = 2.0 * (q[1] * v[1] - q[2] * v[0])
-    return (
-        v[0] + q[0] * tx + q[2] * tz - q[3] * ty,
-        v[1] + q[0] * ty + q[3] * tx - q[1] * tz,
-        v[2] + q[0] * tz + q[1] * ty - q[2] * tx,
-    )
-
-
-@compiled
 def _rotation_loop(points, start, ring, ring_edge, edges, rest, weights, quaternions, steps):
     moment = np.empty((3, 3))
     for i in range(len(quaternions)):
@@ -159,7 +137,7 @@ def _turn_towards(moment, q):
     With B = R^T A and S its symmetric part, the step solves (tr(S) 1 - S) omega = axial(B). One-rings are
     nearly flat, so A has rank two and a polar decomposition is not defined; this maximum is.
     """
-    r = _matrix(q)
+    r = quaternion_matrix(q)
     b = np.empty((3, 3))
     for m in range(3):
         for n in range(3):
@@ -183,21 +161,8 @@ def _turn_towards(moment, q):
     square = ox * ox + oy * oy + oz * oz
     if square > 1.0:
         ox, oy, oz = ox / np.sqrt(square), oy / np.sqrt(square), oz / np.sqrt(square)
-    _turn_quaternion(q, 0.5 * ox, 0.5 * oy, 0.5 * oz)
+    turn_quaternion(q, 0.5 * ox, 0.5 * oy, 0.5 * oz)
     return square
-
-
-@compiled
-def _turn_quaternion(q, x, y, z):
-    """q <- q (1, x, y, z), normalised: right to third order, and the fixed point is unchanged."""
-    a, b, c, d = q[0], q[1], q[2], q[3]
-    q[0] = a - b * x - c * y - d * z
-    q[1] = b + a * x + c * z - d * y
-    q[2] = c + a * y + d * x - b * z
-    q[3] = d + a * z + b * y - c * x
-    size = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
-    for k in range(4):
-        q[k] /= size
 
 
 @compiled
@@ -205,7 +170,7 @@ def _energy_loop(points, edges, rest, weights, quaternions):
     total = 0.0
     for c in range(len(edges)):
         i, j = edges[c, 0], edges[c, 1]
-        one, two = _rotate(quaternions[i], rest[c]), _rotate(quaternions[j], rest[c])
+        one, two = rotate(quaternions[i], rest[c]), rotate(quaternions[j], rest[c])
         for k in range(3):
             e = points[i, k] - points[j, k]
             total += weights[c] * ((e - one[k]) ** 2 + (e - two[k]) ** 2)
@@ -216,7 +181,7 @@ def _energy_loop(points, edges, rest, weights, quaternions):
 def _target_loop(edges, rest, weights, quaternions, out):
     for c in range(len(edges)):
         i, j = edges[c, 0], edges[c, 1]
-        one, two = _rotate(quaternions[i], rest[c]), _rotate(quaternions[j], rest[c])
+        one, two = rotate(quaternions[i], rest[c]), rotate(quaternions[j], rest[c])
         for k in range(3):
             pull = 0.5 * weights[c] * (one[k] + two[k])
             out[i, k] += pull
@@ -232,7 +197,7 @@ def _constraint_loop(points, inverse_mass, edges, rest, quaternions, compliance,
         total = wi + wj + soft
         if wi + wj <= 0.0:
             continue
-        one, two = _rotate(quaternions[i], rest[c]), _rotate(quaternions[j], rest[c])
+        one, two = rotate(quaternions[i], rest[c]), rotate(quaternions[j], rest[c])
         for k in range(3):
             value = points[i, k] - points[j, k] - 0.5 * (one[k] + two[k])
             change = -(value + soft * multiplier[c, k]) / total

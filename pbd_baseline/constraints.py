@@ -10,6 +10,7 @@ import numpy as np
 
 from pbd_baseline.topology import colour, spread
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.surfaces import volume_about, volume_cubic
 
 # A gradient shorter than this share of its natural size belongs to a collapsed element: it has no direction.
 TINY = 1e-12
@@ -81,7 +82,7 @@ class VolumeConstraint:
 
     def volume(self, points):
         """Signed enclosed volume [unit^3]."""
-        return _volume_loop(points, self.faces, np.ascontiguousarray(points[0]))
+        return volume_about(points, self.faces, np.ascontiguousarray(points[0]))
 
     def gradient(self, points):
         """Gradient (n, 3) of the volume."""
@@ -103,19 +104,22 @@ class VolumeConstraint:
         cannot meet it (no real root near zero), nothing moves and s is 0. ``clear_way(points, direction, s)``
         may take parts out of the direction, in place, and says whether it did.
         """
-        coefficients = _cubic_loop(points, direction, self.faces)
-        s = _cubic_step(coefficients, self.rest)
+        coefficients = volume_cubic(points, self.faces, direction, np.ascontiguousarray(points[0]))
+        # A slope below this is rounding: the direction shifts the surface along itself.
+        least = 1e-13 * abs(self.rest) ** (2 / 3) * float(np.abs(direction).max(initial=0.0))
+        s = _cubic_step(coefficients, self.rest, least)
         if clear_way is not None and clear_way(points, direction, s):
-            s = _cubic_step(_cubic_loop(points, direction, self.faces), self.rest)
+            again = volume_cubic(points, self.faces, direction, np.ascontiguousarray(points[0]))
+            s = _cubic_step(again, self.rest, least)
         points += s * direction
         return s
 
 
-def _cubic_step(coefficients, wanted):
+def _cubic_step(coefficients, wanted, least):
     """Root of c0 + c1 s + c2 s^2 + c3 s^3 = wanted that continues s = 0, by safeguarded Newton steps."""
     c0, c1, c2, c3 = coefficients
     error = c0 - wanted
-    if c1 == 0.0 or error == 0.0:
+    if abs(c1) <= least or error == 0.0:
         return 0.0
     limit = 4.0 * abs(error / c1)
     s = 0.0
@@ -158,19 +162,6 @@ def _edge_loop(points, inverse_mass, edges, rest, limits, stiffness, compliance,
 
 
 @compiled
-def _volume_loop(points, faces, origin):
-    """Enclosed volume; measured from ``origin`` so that a far translation costs no digits."""
-    total = 0.0
-    for f in range(len(faces)):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        ax, ay, az = points[a, 0] - origin[0], points[a, 1] - origin[1], points[a, 2] - origin[2]
-        bx, by, bz = points[b, 0] - origin[0], points[b, 1] - origin[1], points[b, 2] - origin[2]
-        cx, cy, cz = points[c, 0] - origin[0], points[c, 1] - origin[1], points[c, 2] - origin[2]
-        total += ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
-    return total / 6.0
-
-
-@compiled
 def _volume_gradient_loop(points, faces, out):
     """A third of the area vector of each face, summed at its vertices.
 
@@ -185,32 +176,3 @@ def _volume_gradient_loop(points, faces, out):
             out[v, 0] += nx
             out[v, 1] += ny
             out[v, 2] += nz
-
-
-@compiled
-def _det(a, b, c):
-    return (
-        a[0] * (b[1] * c[2] - b[2] * c[1])
-        + a[1] * (b[2] * c[0] - b[0] * c[2])
-        + a[2] * (b[0] * c[1] - b[1] * c[0])
-    )
-
-
-@compiled
-def _cubic_loop(points, direction, faces):
-    """Coefficients of V(x + s d) = c0 + c1 s + c2 s^2 + c3 s^3."""
-    c0, c1, c2, c3 = 0.0, 0.0, 0.0, 0.0
-    ox, oy, oz = points[0, 0], points[0, 1], points[0, 2]
-    for f in range(len(faces)):
-        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
-        a = (points[i, 0] - ox, points[i, 1] - oy, points[i, 2] - oz)
-        b = (points[j, 0] - ox, points[j, 1] - oy, points[j, 2] - oz)
-        c = (points[k, 0] - ox, points[k, 1] - oy, points[k, 2] - oz)
-        u = (direction[i, 0], direction[i, 1], direction[i, 2])
-        v = (direction[j, 0], direction[j, 1], direction[j, 2])
-        w = (direction[k, 0], direction[k, 1], direction[k, 2])
-        c0 += _det(a, b, c)
-        c1 += _det(u, b, c) + _det(a, v, c) + _det(a, b, w)
-        c2 += _det(u, v, c) + _det(u, b, w) + _det(a, v, w)
-        c3 += _det(u, v, w)
-    return c0 / 6.0, c1 / 6.0, c2 / 6.0, c3 / 6.0

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 from rbfmuscle.sim.loop.frame import MuscleModel
 from rbfmuscle.sim.plan.forecast import MuscleCost
 from rbfmuscle.sim.scene.objects import Muscle
-from rbfmuscle.sim.scene.options import Table, did_you_mean
+from rbfmuscle.sim.scene.options import Table
 from rbfmuscle.sim.scene.scene import Scene
-from rbfmuscle.validation import SceneError, UsageError
+from rbfmuscle.validation import SceneError, UsageError, did_you_mean
 
 
 class _Home(NamedTuple):

@@ -3,7 +3,9 @@
 The one module that every room may import; it imports nothing of ours.
 """
 
+import difflib
 import os
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -58,6 +60,7 @@ class NumericalWarning(UserWarning):
     """A result is usable but less accurate than asked; the message names the cause and the remedy."""
 
 
+MOST_NAMED = 40  # names that a message lists
 LONGEST_SHOWN = 80
 
 
@@ -159,3 +162,22 @@ def check_mesh(vertices, faces, *, name="mesh"):
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise MeshError(f"faces of {name} point outside its {len(vertices)} vertices")
     return vertices, faces
+
+
+def did_you_mean(word: object, known: Iterable[object]) -> str:
+    """Return "did you mean 'x'?", or the list of what is known when nothing is near.
+
+    Examples
+    --------
+    >>> did_you_mean("Cubik", ["cubic", "quintic"])
+    "did you mean 'cubic'?"
+    """
+    names = [str(name) for name in known]
+    lower = {name.lower(): name for name in names}
+    near = difflib.get_close_matches(str(word).lower()[:100], lower, n=1, cutoff=0.5)
+    if near:
+        return f"did you mean {lower[near[0]]!r}?"
+    if not names:
+        return "there are none"
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return "known: " + ", ".join(shown(name) for name in names[:MOST_NAMED]) + more

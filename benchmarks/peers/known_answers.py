@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
+from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.study.measure.centreline import Centreline
-from rbfmuscle.study.measure.metrics import mesh_volume
 
 # Points of a centreline: their chords fall short of an arc of 90 degrees by 0.01 %.
 SLICES = 64

@@ -76,7 +76,7 @@ def _parse_stop(text):
 
 
 def _begin_at(viewer, stops):
-    from rbfmuscle.sim.scene.options import did_you_mean
+    from rbfmuscle.validation import did_you_mean
 
     for name, value in stops:
         known = list(viewer.coordinates) if viewer.live else ["frame"]

@@ -4,7 +4,6 @@ import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.threads import in_chunks
-from rbfmuscle.validation import MeshError, check_mesh, check_points
 
 # A triangle whose plane the point lies in, seen from outside it, adds nothing.
 _FLAT = 1e-12
@@ -34,7 +33,7 @@ def mean_value_weights(points, vertices, faces):
 
     Raises
     ------
-    MeshError
+    ValueError
         If the weights do not give a point back, as on a vertex of the mesh.
 
     Notes
@@ -43,8 +42,9 @@ def mean_value_weights(points, vertices, faces):
     vector of a spherical triangle: m = sum of (angle of an edge / 2) times the unit normal of its plane
     through the point, and w_i = m . (v_j x v_k) / det(v_i, v_j, v_k).
     """
-    points = check_points(points)
-    vertices, faces = check_mesh(vertices, faces)
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    vertices = np.ascontiguousarray(vertices, dtype=np.float64)
+    faces = np.ascontiguousarray(faces, dtype=np.int64)
     weights = np.zeros((len(points), len(vertices)))
 
     def work(a, b):
@@ -57,7 +57,7 @@ def mean_value_weights(points, vertices, faces):
     wrong = ~(np.linalg.norm(weights @ vertices - points, axis=1) < _EXACT * size)
     if wrong.any():
         row = int(np.argmax(wrong))
-        raise MeshError(f"point {row} at {points[row]} does not lie inside the mesh, off its vertices")
+        raise ValueError(f"point {row} at {points[row]} does not lie inside the mesh, off its vertices")
     return weights
 
 

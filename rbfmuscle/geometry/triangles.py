@@ -192,3 +192,42 @@ def fill_pseudonormals(vertices, faces, across, edge_normals, vertex_normals):
             other = across[n, k]
             for j in range(3):
                 edge_normals[n, k, j] = unit[n, j] + (unit[other, j] if other >= 0 else 0.0)
+
+
+@compiled
+def _dot(a, b, p, q):
+    """(b - a) . (p - q), without temporary arrays."""
+    return (b[0] - a[0]) * (p[0] - q[0]) + (b[1] - a[1]) * (p[1] - q[1]) + (b[2] - a[2]) * (p[2] - q[2])
+
+
+@compiled
+def nearest_weights(p, a, b, c, weights):
+    """Barycentric weights of the point of a triangle nearest to p (Ericson 2005, section 5.1.5)."""
+    d1, d2 = _dot(a, b, p, a), _dot(a, c, p, a)
+    weights[:] = 0.0
+    if d1 <= 0.0 and d2 <= 0.0:
+        weights[0] = 1.0
+        return
+    d3, d4 = _dot(a, b, p, b), _dot(a, c, p, b)
+    if d3 >= 0.0 and d4 <= d3:
+        weights[1] = 1.0
+        return
+    d5, d6 = _dot(a, b, p, c), _dot(a, c, p, c)
+    if d6 >= 0.0 and d5 <= d6:
+        weights[2] = 1.0
+        return
+    vc, vb, va = d1 * d4 - d3 * d2, d5 * d2 - d1 * d6, d3 * d6 - d5 * d4
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        weights[1] = d1 / (d1 - d3)
+        weights[0] = 1.0 - weights[1]
+    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        weights[2] = d2 / (d2 - d6)
+        weights[0] = 1.0 - weights[2]
+    elif va <= 0.0 and d4 >= d3 and d5 >= d6:
+        weights[2] = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        weights[1] = 1.0 - weights[2]
+    else:
+        # The whole is zero on a triangle without area, all of which its edges hold.
+        whole = max(va + vb + vc, 1e-300)
+        weights[1], weights[2] = vb / whole, vc / whole
+        weights[0] = 1.0 - weights[1] - weights[2]

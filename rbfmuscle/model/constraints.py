@@ -8,6 +8,8 @@ the muscle instead of dinting one point.
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.rotations import quaternion_matrix
+from rbfmuscle.geometry.surfaces import volume_and_gradient
 
 CONTACT_SWEEPS = 60
 CONTACT_ROUNDS = 6
@@ -18,9 +20,7 @@ def _rotation_loop(m, q):
     """Turn the unit quaternion q in place towards the rotational part of the 3x3 matrix m (Müller 2016)."""
     for _ in range(20):
         w, x, y, z = q[0], q[1], q[2], q[3]
-        r00, r01, r02 = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-        r10, r11, r12 = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-        r20, r21, r22 = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+        (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = quaternion_matrix(q)
         # Sum of cross products of the columns of R and of m: the torque that aligns them.
         ox = r10 * m[2, 0] - r20 * m[1, 0] + r11 * m[2, 1] - r21 * m[1, 1] + r12 * m[2, 2] - r22 * m[1, 2]
         oy = r20 * m[0, 0] - r00 * m[2, 0] + r21 * m[0, 1] - r01 * m[2, 1] + r22 * m[0, 2] - r02 * m[2, 2]
@@ -67,23 +67,10 @@ def _local_loop(x, arm, start, other, inverse, fibre, low, high, hold, q, target
                     f[a, 0] * inverse[i, 0, b] + f[a, 1] * inverse[i, 1, b] + f[a, 2] * inverse[i, 2, b]
                 )
         _rotation_loop(deformation[i], q[i])
-        w, qx, qy, qz = q[i, 0], q[i, 1], q[i, 2], q[i, 3]
         r = target[i]
-        r[0, 0], r[0, 1], r[0, 2] = (
-            1 - 2 * (qy * qy + qz * qz),
-            2 * (qx * qy - w * qz),
-            2 * (qx * qz + w * qy),
-        )
-        r[1, 0], r[1, 1], r[1, 2] = (
-            2 * (qx * qy + w * qz),
-            1 - 2 * (qx * qx + qz * qz),
-            2 * (qy * qz - w * qx),
-        )
-        r[2, 0], r[2, 1], r[2, 2] = (
-            2 * (qx * qz - w * qy),
-            2 * (qy * qz + w * qx),
-            1 - 2 * (qx * qx + qy * qy),
-        )
+        first, second, third = quaternion_matrix(q[i])
+        for b in range(3):
+            r[0, b], r[1, b], r[2, b] = first[b], second[b], third[b]
         stretch = 0.0
         for a in range(3):
             stretch += (
@@ -173,31 +160,6 @@ class ShapeConstraint:
         return float(self.weight @ ((x[self.other] - x[head] - wanted) ** 2).sum(axis=1))
 
 
-@compiled(error_model="numpy")
-def _volume_loop(p, faces, gradient):
-    gradient[:] = 0.0
-    volume = 0.0
-    o = p[0]
-    for f in range(len(faces)):
-        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
-        ax, ay, az = p[i, 0] - o[0], p[i, 1] - o[1], p[i, 2] - o[2]
-        bx, by, bz = p[j, 0] - o[0], p[j, 1] - o[1], p[j, 2] - o[2]
-        cx, cy, cz = p[k, 0] - o[0], p[k, 1] - o[1], p[k, 2] - o[2]
-        ux, uy, uz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
-        volume += ax * ux + ay * uy + az * uz
-        gradient[i, 0] += ux
-        gradient[i, 1] += uy
-        gradient[i, 2] += uz
-        gradient[j, 0] += cy * az - cz * ay
-        gradient[j, 1] += cz * ax - cx * az
-        gradient[j, 2] += cx * ay - cy * ax
-        gradient[k, 0] += ay * bz - az * by
-        gradient[k, 1] += az * bx - ax * bz
-        gradient[k, 2] += ax * by - ay * bx
-    gradient /= 6.0
-    return volume / 6.0
-
-
 class VolumeConstraint:
     """C(p) = V(p) - V0 with V = (1/6) Σ a · (b × c) and ∂V/∂a = (1/6) Σ b × c over the faces at a.
 
@@ -215,7 +177,7 @@ class VolumeConstraint:
     def evaluate(self, points):
         """Return ``(C, gradient (n, 3))``."""
         gradient = np.empty_like(points)
-        return _volume_loop(points, self.faces, gradient) - self.volume, gradient
+        return volume_and_gradient(points, self.faces, gradient) - self.volume, gradient
 
 
 @compiled(error_model="numpy")

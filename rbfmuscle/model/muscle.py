@@ -159,7 +159,7 @@ class RBFMuscle:
             # In the muscle's own frame, so that a scene that is turned chooses the same.
             self.epsilon = choose_surface_epsilon(
                 centres.points, centres.normals, kernel=self.kernel, held_out=samples.points,
-                distance=ExactDistance((frame.local, faces)).signed_distance, derivatives=self.derivatives,
+                distance=ExactDistance(frame.local, faces).signed_distance, derivatives=self.derivatives,
             ).epsilon / frame.size  # fmt: skip
 
     def _fit_centres(self, frame, faces, centres):

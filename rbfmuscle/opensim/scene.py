@@ -108,7 +108,7 @@ def clean_name(name: str, taken: set[str]) -> str:
 def _keep(model, bodies):
     """Leave out every body that is neither named nor on the way from one of those to the ground."""
     from rbfmuscle.opensim.functions import Problem
-    from rbfmuscle.sim.scene.options import did_you_mean
+    from rbfmuscle.validation import did_you_mean
 
     towards = {}
     for joint, backward in model.tree():

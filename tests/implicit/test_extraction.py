@@ -9,9 +9,10 @@ import pytest
 import trimesh
 from skimage.measure import marching_cubes
 
+from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction.band import Band, BandGrid
 from rbfmuscle.implicit.extraction.obstacles import ObstaclePoints
-from rbfmuscle.implicit.extraction.surface import extract_surface, mesh_volume
+from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.sampling import sample_surface
 

@@ -111,9 +111,9 @@ class TestReference:
         assert (1 - volumes[0]) / (1 - volumes[1]) == pytest.approx(4, rel=0.2)  # second order
 
     def test_file_is_small_and_keeps_rest_volume_and_bones(self, study):
+        from rbfmuscle.geometry.surfaces import mesh_volume
         from rbfmuscle.sim.distance.sdf import BoneSDF
         from rbfmuscle.sim.scene.motion import bone_poses
-        from rbfmuscle.study.measure.metrics import mesh_volume
 
         assert DATA.stat().st_size < 300_000
         kept = np.load(DATA)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
 from rbfmuscle.sim.joints.joint import Coordinate
 from rbfmuscle.sim.loop.simulate import Event, Frame, ModelSurface
 from rbfmuscle.sim.scene.motion import Motion
@@ -16,12 +17,9 @@ from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.measure.metrics import (
     MetricsRecorder,
     count_components,
-    edge_lengths,
     edge_strain,
-    mesh_volume,
     moment_arms,
     surface_distance,
-    unique_edges,
 )
 from rbfmuscle.study.measure.occupancy import OccupancyGrid
 from rbfmuscle.study.measure.penetration import BoneProbe, bone_depth, faces_near, surface_depth

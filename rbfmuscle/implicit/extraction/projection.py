@@ -3,6 +3,7 @@
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.surfaces import volume_cubic
 from rbfmuscle.implicit.extraction.obstacles import push_off_points
 
 
@@ -59,7 +60,7 @@ class Projector:
 
         By Newton steps on the volume, a cubic polynomial of the change.
         """
-        c0, c1, c2, c3 = _volume_terms_loop(self.vertices, faces, self.vertices.mean(axis=0), self._direction)
+        c0, c1, c2, c3 = volume_cubic(self.vertices, faces, self._direction, self.vertices.mean(axis=0))
         change = 0.0
         for _ in range(steps):
             lack = target - (c0 + change * (c1 + change * (c2 + change * c3)))
@@ -116,32 +117,6 @@ def _step_loop(rows, step, spacing, vertices, unsettled):
         for a in range(3):
             vertices[rows[n], a] += share * step[n, a]
         unsettled[n] = length > 1e-2 * spacing
-
-
-@compiled(error_model="numpy", inline="always")
-def _triple(x, y):
-    """The cross product of the two vectors in x, times y."""
-    (a, b, c), (d, e, f) = x
-    return (b * f - c * e) * y[0] + (c * d - a * f) * y[1] + (a * e - b * d) * y[2]
-
-
-@compiled(error_model="numpy")
-def _volume_terms_loop(x, faces, origin, direction):
-    """Coefficients of the enclosed volume as a cubic polynomial of the way along the directions."""
-    c0, c1, c2, c3 = 0.0, 0.0, 0.0, 0.0
-    for n in range(len(faces)):
-        i, j, k = faces[n, 0], faces[n, 1], faces[n, 2]
-        p = (x[i, 0] - origin[0], x[i, 1] - origin[1], x[i, 2] - origin[2])
-        q = (x[j, 0] - origin[0], x[j, 1] - origin[1], x[j, 2] - origin[2])
-        r = (x[k, 0] - origin[0], x[k, 1] - origin[1], x[k, 2] - origin[2])
-        u = (direction[i, 0], direction[i, 1], direction[i, 2])
-        v = (direction[j, 0], direction[j, 1], direction[j, 2])
-        w = (direction[k, 0], direction[k, 1], direction[k, 2])
-        c0 += _triple((p, q), r)
-        c1 += _triple((p, q), w) + _triple((q, r), u) + _triple((r, p), v)
-        c2 += _triple((u, v), r) + _triple((v, w), p) + _triple((w, u), q)
-        c3 += _triple((u, v), w)
-    return c0 / 6.0, c1 / 6.0, c2 / 6.0, c3 / 6.0
 
 
 def with_gradient(function, step):

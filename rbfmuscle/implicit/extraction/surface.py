@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.surfaces import corner_from, mesh_volume, six_volumes
 from rbfmuscle.implicit.extraction.band import Band, BandGrid
 from rbfmuscle.implicit.extraction.obstacles import CHORD, points_near_cells
 from rbfmuscle.implicit.extraction.projection import Projector
@@ -248,17 +249,8 @@ def _label_sheets_loop(faces, size):
 def _sheet_volumes_loop(x, faces, label, origin, out):
     """Add the signed volumes of the tetrahedra under all triangles to those of their sheets, out."""
     for f in range(len(faces)):
-        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
-        px, py, pz = x[i, 0] - origin[0], x[i, 1] - origin[1], x[i, 2] - origin[2]
-        qx, qy, qz = x[j, 0] - origin[0], x[j, 1] - origin[1], x[j, 2] - origin[2]
-        rx, ry, rz = x[k, 0] - origin[0], x[k, 1] - origin[1], x[k, 2] - origin[2]
-        out[label[i]] += (
-            px * (qy * rz - qz * ry) + py * (qz * rx - qx * rz) + pz * (qx * ry - qy * rx)
-        ) / 6.0
+        p = corner_from(x, faces[f, 0], origin)
+        q = corner_from(x, faces[f, 1], origin)
+        r = corner_from(x, faces[f, 2], origin)
+        out[label[faces[f, 0]]] += six_volumes(q, r, p) / 6.0
     return out
-
-
-def mesh_volume(vertices, faces):
-    """Volume enclosed by a closed outward mesh."""
-    label = np.zeros(len(vertices), dtype=np.int64)
-    return float(_sheet_volumes_loop(vertices, faces, label, vertices.mean(axis=0), np.zeros(1))[0])

@@ -17,14 +17,13 @@ SciPy's ``RBFInterpolator`` for names and signs. ``skala_cervenka`` is second-ha
 was not checked against the original of 2019, and neither was the default exponent.
 """
 
-import difflib
 import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from rbfmuscle.implicit.kernels import radial
-from rbfmuscle.validation import UsageError, check_finite
+from rbfmuscle.validation import UsageError, check_finite, did_you_mean
 
 _TERMS = 5
 
@@ -272,9 +271,7 @@ def get_kernel(name, *, parameter=None):
     if name in _REFUSED:
         raise UsageError(f"kernel '{name}' is refused: {_REFUSED[name]}; use wendland_c0, _c2, _c4 or _c6")
     if name not in KERNELS:
-        near = difflib.get_close_matches(str(name), KERNELS, n=1, cutoff=0.4)
-        hint = f", did you mean '{near[0]}'?" if near else f"; allowed: {', '.join(KERNELS)}"
-        raise UsageError(f"unknown kernel '{name}'{hint}")
+        raise UsageError(f"unknown kernel {str(name)!r}, {did_you_mean(name, KERNELS)}")
     kernel = KERNELS[name]
     return kernel if parameter is None else _with_parameter(kernel, float(parameter))
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.surfaces import face_normals, unique_edges
 from rbfmuscle.implicit.placement.control_mesh import contract_clusters
 
 # Least ratio of cell size to edge length: about ten mesh vertices a cell, or cells get ragged.
@@ -19,20 +20,6 @@ class FineMesh:
     vertices: np.ndarray
     faces: np.ndarray
     parent: np.ndarray
-
-
-def face_normals(vertices, faces):
-    """Area vectors of triangles: outward, half the parallelogram's area long."""
-    a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
-    return 0.5 * np.cross(b - a, c - a)
-
-
-def vertex_normals(vertices, faces):
-    """Unit normals at vertices, mean of the faces around weighted by area; zero where these cancel."""
-    vectors = np.repeat(face_normals(vertices, faces), 3, axis=0)
-    sums = [np.bincount(faces.ravel(), vectors[:, k], len(vertices)) for k in range(3)]
-    normals = np.stack(sums, axis=1)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1), np.finfo(float).tiny)[:, None]
 
 
 def refine_mesh(vertices, faces, count):
@@ -103,11 +90,6 @@ def cluster_mesh(fine, density, count, seed):
     _equalise_loop(fine.vertices, weight, edges, labels, count, 200)
     _connect_loop(fine.vertices, weight, start, other, labels, count)
     return contract_clusters(fine.faces, labels, weight, count)
-
-
-def unique_edges(faces):
-    sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
-    return sides[sides[:, 0] < sides[:, 1]]
 
 
 def _neighbours(edges, size):

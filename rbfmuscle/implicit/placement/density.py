@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from rbfmuscle.geometry.surfaces import face_normals, unique_edges, vertex_normals
 from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.placement.clustering import cluster_mesh, face_normals, unique_edges, vertex_normals
+from rbfmuscle.implicit.placement.clustering import cluster_mesh
 
 # Densities stay within this ratio, so that no part of the surface is left without centres that carry it.
 LARGEST_DENSITY = 30.0

@@ -6,7 +6,9 @@ from functools import partial
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
-from rbfmuscle.implicit.placement.clustering import cluster_mesh, face_normals, refine_mesh, vertex_normals
+from rbfmuscle.geometry.surfaces import barycentric_weights, face_normals, vertex_normals
+from rbfmuscle.geometry.triangles import nearest_weights
+from rbfmuscle.implicit.placement.clustering import cluster_mesh, refine_mesh
 from rbfmuscle.implicit.placement.control_mesh import opposite_half_edges
 from rbfmuscle.implicit.placement.density import GREEDY_LARGEST, curvature_density, greedy_sample
 from rbfmuscle.validation import check_mesh
@@ -127,7 +129,7 @@ def _gather(vertices, faces, fine, count, labels, control):
     _nearest_in_cell_loop(fine.vertices, fine.faces, corner, centroid, points, piece, distance)
     normals = _normals_at(fine, points, piece, corner)
     face = fine.parent[piece]
-    barycentric = _barycentric(points, vertices[faces[face]])
+    barycentric = barycentric_weights(points, vertices[faces[face]])
     vertex = faces[face, barycentric.argmax(axis=1)]
     return SurfaceSample(points, normals, areas, face, barycentric, vertex, control)
 
@@ -139,7 +141,7 @@ def _normals_at(fine, points, piece, corner):
     field bulge far out where a few points stand on a sharp rim.
     """
     corners = fine.faces[piece]
-    weights = _barycentric(points, fine.vertices[corners])
+    weights = barycentric_weights(points, fine.vertices[corners])
     here = np.einsum("kc,kcd->kd", weights, vertex_normals(fine.vertices, fine.faces)[corners])
     vectors = face_normals(fine.vertices, fine.faces)
     mean = [np.bincount(corner.ravel(), np.repeat(vectors[:, k], 3), len(points)) for k in range(3)]
@@ -151,60 +153,23 @@ def _normals_at(fine, points, piece, corner):
     return normals / np.linalg.norm(normals, axis=1)[:, None]
 
 
-def _barycentric(points, corners):
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    normal = np.cross(b - a, c - a)
-    square = np.einsum("ij,ij->i", normal, normal)
-    v = np.einsum("ij,ij->i", np.cross(points - a, c - a), normal) / square
-    w = np.einsum("ij,ij->i", np.cross(b - a, points - a), normal) / square
-    out = np.clip(np.column_stack([1 - v - w, v, w]), 0, 1)
-    return out / out.sum(axis=1)[:, None]
-
-
-@compiled
-def _nearest_on_triangle(p, a, b, c, out):
-    """Nearest point of a triangle (Ericson 2005, section 5.1.5); returns the squared distance."""
-    ab, ac, ap = b - a, c - a, p - a
-    d1, d2 = np.dot(ab, ap), np.dot(ac, ap)
-    bp, cp = p - b, p - c
-    d3, d4, d5, d6 = np.dot(ab, bp), np.dot(ac, bp), np.dot(ab, cp), np.dot(ac, cp)
-    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
-    v, w = 0.0, 0.0
-    if d1 <= 0 and d2 <= 0:
-        pass
-    elif d3 >= 0 and d4 <= d3:
-        v = 1.0
-    elif vc <= 0 and d1 >= 0 and d3 <= 0:
-        v = d1 / (d1 - d3)
-    elif d6 >= 0 and d5 <= d6:
-        w = 1.0
-    elif vb <= 0 and d2 >= 0 and d6 <= 0:
-        w = d2 / (d2 - d6)
-    elif va <= 0 and d4 - d3 >= 0 and d5 - d6 >= 0:
-        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
-        v = 1.0 - w
-    elif va + vb + vc > 0:
-        v, w = vb / (va + vb + vc), vc / (va + vb + vc)
-    total = 0.0
-    for k in range(3):
-        out[k] = a[k] + v * ab[k] + w * ac[k]
-        total += (p[k] - out[k]) ** 2
-    return total
-
-
 @compiled
 def _nearest_in_cell_loop(vertices, faces, corner, target, points, face, distance):
     """Of the triangles wholly in cell k, the point nearest to target[k]; a cell without one gives a vertex.
 
     Triangles between cells are left out: at a thin rim two cells would take the same point of one.
     """
-    q = np.empty(3)
+    q, share = np.empty(3), np.empty(3)
     for f in range(len(faces)):
         k = corner[f, 0]
         if corner[f, 1] != k or corner[f, 2] != k:
             continue
         a, b, d = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
-        square = _nearest_on_triangle(target[k], a, b, d, q)
+        nearest_weights(target[k], a, b, d, share)
+        square = 0.0
+        for c in range(3):
+            q[c] = a[c] + share[1] * (b[c] - a[c]) + share[2] * (d[c] - a[c])
+            square += (target[k, c] - q[c]) ** 2
         if square < distance[k]:
             distance[k] = square
             face[k] = f

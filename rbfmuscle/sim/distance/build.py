@@ -240,21 +240,6 @@ def _cut_blocks(builder, shape, blocks, offsets, samples, edge, bands):
     return np.where(fine, _small_cells(builder, shape, blocks, fine, edge, BLOCK), cells)
 
 
-def _active_cells(builder, lists, blocks, offsets, samples, edge, band, side):
-    """Which small cells (k, side^3) may hold points nearer than ``band``."""
-    active = np.zeros((len(blocks), side**3), dtype=np.bool_)
-    ids, corners, centres = samples
-    records, origin = builder.exact.records, builder.origin
-
-    def work(a, b):
-        _active_loop(ids[a:b], corners, centres[a:b], edge, band, side, active[a:b])
-        if builder.inside is None:
-            _near_loop(blocks[a:b], offsets[a:b], lists, records, origin, edge, band, side, active[a:b])
-
-    in_chunks(len(blocks), work, least=256)
-    return active
-
-
 def _small_cells(builder, shape, blocks, active, edge, side):
     """Offsets (k, side^3) of the lists of active cells, ``side`` to an edge of a block."""
     cells = np.zeros(active.shape, dtype=np.int32)

@@ -7,7 +7,7 @@ import numpy as np
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.sim.distance.mesh import prepare_bone, winding_test
-from rbfmuscle.validation import UsageError, check_points
+from rbfmuscle.validation import UsageError, check_mesh, check_points
 
 # Share of the longest side that a baseline's grid reaches beyond the mesh.
 MARGIN = 0.1
@@ -58,7 +58,8 @@ class TreeDetector(PointDetector):
     @classmethod
     def from_mesh(cls, mesh):
         """Tree of a closed mesh (trimesh.Trimesh or a pair of vertices and faces)."""
-        return cls(ExactDistance(mesh))
+        pair = mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)
+        return cls(ExactDistance(*check_mesh(*pair)))
 
     @property
     def memory(self):
@@ -124,7 +125,7 @@ def grid_of(mesh):
     """Exact distance of a mesh, and the box (low, high) of a baseline's grid around it."""
     vertices, faces = (mesh.vertices, mesh.faces) if hasattr(mesh, "faces") else mesh
     bone = prepare_bone(np.asarray(vertices), np.asarray(faces))
-    exact = ExactDistance((bone.vertices, bone.faces))
+    exact = ExactDistance(bone.vertices, bone.faces)
     low, high = bone.vertices.min(axis=0), bone.vertices.max(axis=0)
     margin = MARGIN * (high - low).max()
     if bone.closed:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.geometry.triangles import opposite_faces, vertex_faces
 from rbfmuscle.validation import MeshError, check_mesh
 
@@ -62,7 +63,7 @@ def prepare_bone(vertices, faces, *, name="bone"):
         mesh.doubtful = border[mesh.faces].any(axis=1)
         count = int((across < 0).sum())
         mesh.notes.append(f"not closed ({count} open edges): the sign comes from winding numbers")
-    if _volume(mesh) < 0.0:
+    if mesh_volume(mesh.vertices, mesh.faces) < 0.0:
         mesh.faces = np.ascontiguousarray(mesh.faces[:, ::-1])
         mesh.notes.append("faces pointed inward and were turned")
     return mesh
@@ -117,8 +118,3 @@ def _mend(mesh):
             mesh.notes.append("neighbouring faces were oriented alike")
         across = _across(mesh)
     return across
-
-
-def _volume(mesh):
-    corners = mesh.vertices[mesh.faces] - mesh.vertices[mesh.faces].mean(axis=(0, 1))
-    return float(np.einsum("ni,ni->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))) / 6.0

@@ -84,7 +84,7 @@ class BoneSDF:
     @cached_property
     def exact(self):
         """The exact distance to the mesh (:class:`ExactDistance`), built when first asked for."""
-        return ExactDistance((self.vertices, self.faces))
+        return ExactDistance(self.vertices, self.faces)
 
     @staticmethod
     def is_kept(mesh, *, tolerance=None, region=None):
@@ -236,7 +236,7 @@ class _Parts(NamedTuple):
 
 def _build(mesh, frame, tolerance, region, memory_limit, name):
     """Refine until the field errs by no more than the tolerance."""
-    exact = ExactDistance((mesh.vertices, mesh.faces))
+    exact = ExactDistance(mesh.vertices, mesh.faces)
     edge = _mean_edge(mesh)
     used = mesh.vertices[np.unique(mesh.faces)]
     extent = float(np.ptp(used, axis=0).max())

@@ -4,6 +4,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.surfaces import vertex_normals
+from rbfmuscle.geometry.triangles import nearest_weights
 
 
 class CarriedSurface:
@@ -48,8 +50,7 @@ class CarriedSurface:
     def refresh(self):
         """Take over where the model is now."""
         self.vertices = np.ascontiguousarray(self.model.carried_mesh()[0], dtype=np.float64)
-        self.normals = np.zeros_like(self.vertices)
-        _normals_loop(self.vertices, self.faces, self.normals)
+        self.normals = vertex_normals(self.vertices, self.faces)
         self.box = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
         self.shape = (np.ceil((self.box[1] - self.box[0]) / self.cell).astype(np.int64) + 1).clip(1)
         self.first = np.zeros(int(np.prod(self.shape)) + 1, dtype=np.int64)
@@ -143,22 +144,6 @@ def _nearest_loop(points, which, vertices, box, cell, shape, first, members, bou
 
 
 @compiled
-def _normals_loop(vertices, faces, normals):
-    """Area-weighted vertex normals of unit length."""
-    for f in range(len(faces)):
-        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
-        for k in range(3):
-            i, j = (k + 1) % 3, (k + 2) % 3
-            area = (b[i] - a[i]) * (c[j] - a[j]) - (b[j] - a[j]) * (c[i] - a[i])
-            for corner in range(3):
-                normals[faces[f, corner], k] += area
-    for v in range(len(normals)):
-        length = np.sqrt(normals[v, 0] ** 2 + normals[v, 1] ** 2 + normals[v, 2] ** 2)
-        for k in range(3):
-            normals[v, k] /= max(length, 1e-300)
-
-
-@compiled
 def _distance_loop(points, index, nearest, vertices, normals, faces, start, ring, distance, normal):
     weights, best = np.empty(3), np.empty(3)
     for q in range(len(index)):
@@ -166,7 +151,8 @@ def _distance_loop(points, index, nearest, vertices, normals, faces, start, ring
         least, face = np.inf, -1
         for r in range(start[nearest[q]], start[nearest[q] + 1]):
             f = ring[r]
-            _closest(points[p], vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]], weights)
+            a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+            nearest_weights(points[p], a, b, c, weights)
             squared = 0.0
             for k in range(3):
                 at = 0.0
@@ -188,41 +174,3 @@ def _distance_loop(points, index, nearest, vertices, normals, faces, start, ring
         for k in range(3):
             normal[q, k] /= max(np.sqrt(size), 1e-300)
         distance[q] = np.sqrt(least) if side >= 0.0 else -np.sqrt(least)
-
-
-@compiled
-def _dot(a, b, p, q):
-    """(b - a) . (p - q), without temporary arrays."""
-    return (b[0] - a[0]) * (p[0] - q[0]) + (b[1] - a[1]) * (p[1] - q[1]) + (b[2] - a[2]) * (p[2] - q[2])
-
-
-@compiled
-def _closest(p, a, b, c, weights):
-    """Barycentric weights of the point of a triangle nearest to p (Ericson 2005, section 5.1.5)."""
-    d1, d2 = _dot(a, b, p, a), _dot(a, c, p, a)
-    weights[:] = 0.0
-    if d1 <= 0.0 and d2 <= 0.0:
-        weights[0] = 1.0
-        return
-    d3, d4 = _dot(a, b, p, b), _dot(a, c, p, b)
-    if d3 >= 0.0 and d4 <= d3:
-        weights[1] = 1.0
-        return
-    d5, d6 = _dot(a, b, p, c), _dot(a, c, p, c)
-    if d6 >= 0.0 and d5 <= d6:
-        weights[2] = 1.0
-        return
-    vc, vb, va = d1 * d4 - d3 * d2, d5 * d2 - d1 * d6, d3 * d6 - d5 * d4
-    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        weights[1] = d1 / (d1 - d3)
-        weights[0] = 1.0 - weights[1]
-    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        weights[2] = d2 / (d2 - d6)
-        weights[0] = 1.0 - weights[2]
-    elif va <= 0.0 and d4 >= d3 and d5 >= d6:
-        weights[2] = (d4 - d3) / ((d4 - d3) + (d5 - d6))
-        weights[1] = 1.0 - weights[2]
-    else:
-        whole = va + vb + vc
-        weights[1], weights[2] = vb / whole, vc / whole
-        weights[0] = 1.0 - weights[1] - weights[2]

@@ -67,7 +67,7 @@ def _visit(count=20_000, row=7):
 def _query(count=1000):
     from rbfmuscle.geometry.exact_distance import ExactDistance
 
-    tree = ExactDistance(_bumpy_sphere(48))
+    tree = ExactDistance(*_bumpy_sphere(48))
     points = np.random.default_rng(0).normal(size=(count, 3))
     points *= 1.1 / np.linalg.norm(points, axis=1, keepdims=True)
     return shortest(lambda: tree.signed_distance(points)) / count

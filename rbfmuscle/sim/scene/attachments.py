@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from rbfmuscle.sim.scene.options import NotNegative, Positive, Table, Vector, did_you_mean
-from rbfmuscle.validation import SceneError, is_file, shown
+from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.sim.distance.mesh import winding_test
+from rbfmuscle.sim.scene.options import NotNegative, Positive, Table, Vector
+from rbfmuscle.validation import SceneError, did_you_mean, is_file, shown
 
 
 @dataclass
@@ -96,13 +98,12 @@ def _select(table, read, bone, place):
 
 def signed_distances(points, mesh):
     """Exact distance of points to a mesh, negative inside (by pseudonormals, or winding numbers if open)."""
-    import igl
-
-    kind = "PSEUDONORMAL" if mesh.is_watertight else "FAST_WINDING_NUMBER"
-    sign = getattr(igl.SignedDistanceType, f"SIGNED_DISTANCE_TYPE_{kind}")
-    vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
-    faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
-    return igl.signed_distance(np.ascontiguousarray(points), vertices, faces, sign)[0]
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    exact = ExactDistance(mesh.vertices, mesh.faces)
+    if mesh.is_watertight:
+        return exact.signed_distance(points)
+    inside = winding_test(exact)(points)
+    return np.where(inside, -1.0, 1.0) * np.abs(exact.signed_distance(points))
 
 
 def _listed_vertices(listed, read, place):

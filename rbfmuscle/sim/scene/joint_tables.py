@@ -29,8 +29,8 @@ from rbfmuscle.sim.joints.joint import (
     frame_at,
 )
 from rbfmuscle.sim.joints.skeleton import all_coordinates
-from rbfmuscle.sim.scene.options import Axis, Finite, Table, Vector, did_you_mean
-from rbfmuscle.validation import SceneError
+from rbfmuscle.sim.scene.options import Axis, Finite, Table, Vector
+from rbfmuscle.validation import SceneError, did_you_mean
 
 # What a number in a file is multiplied by.
 FACTORS = {"rotation": math.pi / 180.0, "translation": 1.0, "coupled": 1.0}

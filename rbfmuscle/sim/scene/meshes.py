@@ -129,7 +129,7 @@ def read_arrays(path):
 
 
 def _neighbours(path):
-    from rbfmuscle.sim.scene.options import did_you_mean
+    from rbfmuscle.validation import did_you_mean
 
     if not os.path.isdir(path.parent):
         return f" (no folder {shown(str(path.parent))})"

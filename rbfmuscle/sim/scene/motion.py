@@ -16,8 +16,8 @@ from rbfmuscle.sim.joints.skeleton import (
 )
 from rbfmuscle.sim.scene.joint_tables import FACTORS, full_name
 from rbfmuscle.sim.scene.motion_file import read_motion_file
-from rbfmuscle.sim.scene.options import MotionOptions, did_you_mean
-from rbfmuscle.validation import SceneError
+from rbfmuscle.sim.scene.options import MotionOptions
+from rbfmuscle.validation import SceneError, did_you_mean
 
 __all__ = ["Motion", "bone_poses", "coordinate_names", "interpolate", "rotation_about"]
 

@@ -3,7 +3,6 @@
 They check themselves, so the same rules hold for a file, for code and for ``--set``.
 """
 
-import difflib
 import math
 from typing import Annotated, Literal
 
@@ -18,12 +17,11 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from rbfmuscle.validation import SceneError, shown
+from rbfmuscle.validation import SceneError, did_you_mean, shown
 
 # How deep tables and lists of a scene file may lie in each other, and how large a whole number may be: beyond
 # 2^53 it is no longer the number that was written once it meets a float.
 DEEPEST = 20
-MOST_NAMED = 40  # names that a message lists
 LARGEST_INTEGER = 2**53
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -68,19 +66,6 @@ def check_plain(value: object, *, place: str) -> None:
             raise SceneError(f"{where}: a whole number must be at most 2^53 in size, got {shown(part)}")
         elif isinstance(part, float) and not math.isfinite(part):
             raise SceneError(f"{where}: must be a finite number, got {part}")
-
-
-def did_you_mean(word, known):
-    """Return "did you mean 'x'?", or the list of what is known when nothing is near."""
-    known = [str(name) for name in known]
-    lower = {name.lower(): name for name in known}
-    near = difflib.get_close_matches(str(word).lower()[:100], lower, n=1, cutoff=0.5)
-    if near:
-        return f"did you mean {lower[near[0]]!r}?"
-    if not known:
-        return "there are none"
-    more = f" and {len(known) - MOST_NAMED} more" if len(known) > MOST_NAMED else ""
-    return "known: " + ", ".join(shown(name) for name in known[:MOST_NAMED]) + more
 
 
 class Table(BaseModel):
@@ -182,9 +167,6 @@ class DetectOptions(Table):
     """``[detect]``: what is looked for while a motion runs."""
 
     tunnelling: TunnellingOptions | None = None
-
-
-SURFACE_FORMATS = ("pvd", "vtp", "ply", "stl", "obj", "glb")
 
 
 class SurfaceOptions(Table):

@@ -21,9 +21,8 @@ from rbfmuscle.sim.scene.options import (
     ContactOptions,
     MotionOptions,
     OutputOptions,
-    did_you_mean,
 )
-from rbfmuscle.validation import SceneError, check_points, check_positive, shown
+from rbfmuscle.validation import SceneError, check_points, check_positive, did_you_mean, shown
 
 # What reads files of other programs as scenes, by suffix; the room that can do it enters itself here.
 IMPORTERS = {}

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rbfmuscle.sim.scene.options import DetectOptions, SlidingOptions, check_plain, did_you_mean
-from rbfmuscle.validation import SceneError, UsageError
+from rbfmuscle.sim.scene.options import DetectOptions, SlidingOptions, check_plain
+from rbfmuscle.validation import SceneError, UsageError, did_you_mean
 
 if TYPE_CHECKING:
     from rbfmuscle.sim.scene.scene import Scene

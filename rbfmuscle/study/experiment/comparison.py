@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rbfmuscle.sim.scene.scene import MM_PER_UNIT
 from rbfmuscle.study.files.runinfo import machine, versions
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.files.writer import write_json
@@ -313,7 +314,7 @@ def best_models(results, quantity, units):
     }
     if measure.against == FIRST or len(values) < 2:
         return []
-    scale = {"mm": 1.0, "cm": 0.1, "m": 0.001}[units] if measure.kind == "length" else 1.0
+    scale = 1.0 / MM_PER_UNIT[units] if measure.kind == "length" else 1.0
     limit = _TIE * min(values.values()) + measure.floor * scale
     return [name for name, value in values.items() if value <= limit]
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rbfmuscle.implicit.extraction.surface import extract_surface, mesh_volume
+from rbfmuscle.geometry.surfaces import mesh_volume
+from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
 from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample

@@ -8,14 +8,13 @@ of the scene's content and the point's settings, so what is there is never compu
 import hashlib
 import itertools
 import json
-import os
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
-from rbfmuscle.sim.scene.options import did_you_mean
 from rbfmuscle.sim.scene.settings import parse_value
-from rbfmuscle.validation import UsageError
+from rbfmuscle.study.files.writer import write_json
+from rbfmuscle.validation import UsageError, did_you_mean
 
 FORMAT = 1
 # Of these keys the reference takes the greatest value of the grid, or the least; of all others the scene's own.
@@ -320,13 +319,6 @@ class SweepFolder:
     def waiting_file(self, key):
         """Surfaces of a point that waits for its reference."""
         return self.surfaces / f"{key}.waiting.npz"
-
-
-def write_json(path, values):
-    """Write JSON in one move, so that whoever reads it finds the old or the new."""
-    fresh = path.with_name(f".{path.name}.{os.getpid()}")
-    fresh.write_text(json.dumps(values, indent=1, default=str) + "\n", encoding="utf-8")
-    os.replace(fresh, path)
 
 
 def parse_task(text):

@@ -6,8 +6,9 @@ import json
 import math
 from dataclasses import dataclass
 
-from rbfmuscle.study.experiment.sweep import SweepFolder, SweepPlan, write_json
+from rbfmuscle.study.experiment.sweep import SweepFolder, SweepPlan
 from rbfmuscle.study.experiment.sweep_points import TIMES, VALUES
+from rbfmuscle.study.files.writer import write_json
 from rbfmuscle.validation import UsageError
 
 # The default may be this much worse than the front, in error and in time at once.
@@ -69,7 +70,7 @@ def sweep_rows(plan, folder):
                 "model": point.model,
                 "reference": point.reference,
                 "settings": point.settings,
-                **{name: values.get(name, math.nan) for name in VALUES},
+                **{name: math.nan if values.get(name) is None else values[name] for name in VALUES},
                 "front": False,
                 "threads": result.get("threads", ""),
                 "jobs": result.get("jobs", ""),

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rbfmuscle.sim.scene.scene import MM_PER_UNIT
 from rbfmuscle.study.files.meshfiles import write_mesh
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.files.storage import export_lengths
@@ -13,7 +14,6 @@ from rbfmuscle.validation import SolveError, UsageError
 
 FORMATS = ("pvd", "vtp", "ply", "stl", "obj", "glb")
 TABLES = ("sto",)
-METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
 def export_run(directory, formats, *, output=None, units=None, frames=None, ascii=False):
@@ -53,7 +53,7 @@ def export_run(directory, formats, *, output=None, units=None, frames=None, asci
     for name in formats:
         if name not in FORMATS + TABLES:
             raise UsageError(f"unknown format {name!r}; known: {', '.join(FORMATS + TABLES)}")
-    if units is not None and units not in METRES:
+    if units is not None and units not in MM_PER_UNIT:
         raise UsageError(f"units must be m, cm or mm, got {units!r}")
     chosen = saved.frames[frames] if frames is not None else saved.frames
     if not chosen or not (saved.has_surfaces() or set(formats) <= set(TABLES)):
@@ -63,7 +63,7 @@ def export_run(directory, formats, *, output=None, units=None, frames=None, asci
     try:
         for name in formats:
             wanted = units or ("m" if name == "glb" else saved.units)
-            factor = METRES[saved.units] / METRES[wanted]
+            factor = MM_PER_UNIT[saved.units] / MM_PER_UNIT[wanted]
             if name == "sto":
                 written += export_lengths(saved, base / name, chosen, factor)
                 continue

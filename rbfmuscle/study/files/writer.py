@@ -190,9 +190,9 @@ def _fibre_files(directory):
 
 
 def write_json(path, data):
-    """Write JSON in one piece; NaN and infinity become null, which is what JSON has."""
+    """Write JSON in one move, so that whoever reads it finds the old or the new; NaN and infinity become null."""
     path = Path(path)
-    part = path.with_name(path.name + ".part")
+    part = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         part.write_text(json.dumps(_plain(data), indent=1, allow_nan=False) + "\n", encoding="utf-8")
         os.replace(part, path)

@@ -5,9 +5,9 @@ import math
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.implicit.placement.clustering import face_normals
+from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.surfaces import barycentric_weights, edge_lengths, face_normals, unique_edges
 from rbfmuscle.implicit.placement.sampling import sample_surface, spread_points
-from rbfmuscle.study.measure.metrics import edge_lengths, unique_edges
 
 POINTS = 1200  # material points of a muscle
 PATCHES = 5000  # points at which curvature is taken
@@ -32,14 +32,11 @@ class MaterialProbe:
     """
 
     def __init__(self, mesh, vertices, faces, *, count=POINTS):
-        import igl
-
         sample = sample_surface(np.asarray(mesh.vertices), np.asarray(mesh.faces), count, placement="even")
         faces = np.asarray(faces, dtype=np.int64)
-        _, nearest, closest = igl.point_mesh_squared_distance(sample.points, vertices, faces)[:3]
+        _, closest, nearest, _ = ExactDistance(vertices, faces).nearest(sample.points)
         self.corners = faces[nearest]
-        a, b, c = (np.ascontiguousarray(vertices[self.corners[:, k]]) for k in range(3))
-        self.shares = np.clip(igl.barycentric_coordinates(closest, a, b, c), 0.0, 1.0)
+        self.shares = barycentric_weights(closest, vertices[self.corners])
         self.edges = unique_edges(sample.control_faces)
         self.rest = edge_lengths(sample.points, self.edges)
 

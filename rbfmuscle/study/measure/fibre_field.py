@@ -13,7 +13,7 @@ from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.study.measure.metrics import mesh_volume
+from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.validation import SolveError
 
 # Nodes inside a muscle: 1 to 2.5 mm apart in the muscles of the hip.
@@ -56,7 +56,7 @@ class FibreField:
     """
 
     def __init__(self, vertices, faces, sides, *, nodes=NODES):
-        exact = ExactDistance((vertices, faces))
+        exact = ExactDistance(vertices, faces)
         self.spacing = _spacing(vertices, faces, nodes)
         low = vertices.min(axis=0) - (_LAYERS + 1) * self.spacing
         shape = np.ceil((np.ptp(vertices, axis=0)) / self.spacing).astype(int) + 2 * (_LAYERS + 1) + 1

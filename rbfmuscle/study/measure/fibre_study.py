@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.mean_value import mean_value_weights
 from rbfmuscle.study.measure.centreline import split_ends
 from rbfmuscle.study.measure.fibre_lines import grow_fibres
+from rbfmuscle.validation import MeshError
 
 
 class FibreLines(NamedTuple):
@@ -60,7 +61,10 @@ class FibreBundle:
         inner = self.rest[:, 1:-1].reshape(-1, 3)
         # Half the memory, and an error of less than 1e-6 of the muscle's size: positions are taken about
         # a mean vertex.
-        self.weights = mean_value_weights(inner, vertices, faces).astype(np.float32)
+        try:
+            self.weights = mean_value_weights(inner, vertices, faces).astype(np.float32)
+        except ValueError as error:
+            raise MeshError(f"muscle {muscle.name!r}: fibre {error}") from None
 
     def lines(self, vertices, poses):
         """Fibres now.

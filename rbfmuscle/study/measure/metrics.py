@@ -8,6 +8,7 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components
 
+from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
 from rbfmuscle.sim.scene.motion import shown_value
 from rbfmuscle.study.measure.centreline import Centreline
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
@@ -233,42 +234,12 @@ def unit_text(kind, units):
     return {"length": units, "volume": f"{units}^3"}.get(kind, kind)
 
 
-def mesh_volume(vertices, faces):
-    """Volume enclosed by a closed, outward mesh.
-
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-        [scene unit]
-    faces : (m, 3) ndarray of int
-
-    Returns
-    -------
-    float
-        [scene unit cubed]. Summed about the mean vertex, so that a far origin costs no digits.
-    """
-    a, b, c = np.moveaxis((vertices - vertices.mean(axis=0))[faces], 1, 0)
-    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
-
-
 def count_components(count, faces):
     """Number of connected pieces among ``count`` vertices; vertices that no face uses do not count."""
     ends = np.concatenate([faces[:, :2], faces[:, 1:]])
     graph = sparse.coo_matrix((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), shape=(count, count))
     _, label = connected_components(graph, directed=False)
     return len(np.unique(label[faces[:, 0]]))
-
-
-def unique_edges(faces):
-    """Edges of a triangle mesh, (e, 2), each once."""
-    faces = np.asarray(faces)
-    ends = np.sort(np.concatenate([faces[:, :2], faces[:, 1:], faces[:, ::2]]), axis=1)
-    return np.unique(ends, axis=0)
-
-
-def edge_lengths(vertices, edges):
-    """Length of each edge [scene unit]."""
-    return np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
 
 
 def edge_strain(vertices, edges, rest_lengths):

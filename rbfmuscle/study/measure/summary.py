@@ -1,13 +1,12 @@
 """What a run amounts to: least, greatest and mean of each quantity, and the limits that it is held to."""
 
-import difflib
 import math
 from collections import defaultdict
 
 import numpy as np
 
 from rbfmuscle.study.measure.metrics import ALL, QUANTITIES
-from rbfmuscle.validation import LimitExceededError, UsageError
+from rbfmuscle.validation import LimitExceededError, UsageError, did_you_mean
 
 # Quantity: greatest allowed magnitude; lengths in millimetres, converted to the scene's unit.
 LIMITS = {
@@ -151,9 +150,7 @@ def require_limits(table, limits):
 
 def _check_quantity(name):
     if name not in QUANTITIES:
-        near = difflib.get_close_matches(name, QUANTITIES, n=1, cutoff=0.5)
-        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(QUANTITIES)}"
-        raise UsageError(f"--fail-on: unknown quantity {name!r}, {hint}")
+        raise UsageError(f"--fail-on: unknown quantity {name!r}, {did_you_mean(name, QUANTITIES)}")
 
 
 def _number(text, part):

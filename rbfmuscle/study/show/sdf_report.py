@@ -77,7 +77,7 @@ def measure_field(field, *, count=COUNT, seed=0, width=None):
         between the gradient and the exact direction; the median over all points, creases included),
         ``time_value, time_gradient`` (seconds a point).
     """
-    exact = ExactDistance((field.vertices, field.faces))
+    exact = ExactDistance(field.vertices, field.faces)
     points, width = points_near(field.vertices, field.faces, count, seed=seed, width=width)
     distance, closest, _, _ = exact.nearest(points)
     if not field.closed:

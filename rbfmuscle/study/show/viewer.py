@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
 from rbfmuscle.sim.scene.motion import inner_value, shown_value
+from rbfmuscle.sim.scene.scene import MM_PER_UNIT
 from rbfmuscle.study.files.meshfiles import write_mesh
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
-from rbfmuscle.study.measure.metrics import edge_lengths, mesh_volume, unique_edges
 from rbfmuscle.study.measure.penetration import BoneProbe, bone_coordinates, surface_depth
 from rbfmuscle.study.show.render import coordinate_texts
 from rbfmuscle.validation import SolveError, UsageError
@@ -298,7 +299,7 @@ class SavedViewer(Viewer):
         if not saved.has_surfaces():
             raise UsageError(f"{saved.directory} has no surfaces to show; run it with output.surfaces")
         bones = {name: saved.bone(name) for name in saved.bones}
-        super().__init__(saved.units, {"mm": 1.0, "cm": 0.1, "m": 0.001}[saved.units], bones, saved.muscles)
+        super().__init__(saved.units, 1.0 / MM_PER_UNIT[saved.units], bones, saved.muscles)
         self.saved, self.place = saved, 0
         self._kept, self._stale = {}, True
         self._metrics = {(r.frame, r.muscle, r.quantity): r.value for r in saved.metrics}

@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 
+from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.study.show.appearance import BACKGROUND, BONE_COLOUR, muscle_colours
 from rbfmuscle.study.show.viewer import COLOURINGS
 from rbfmuscle.validation import MissingPartError
@@ -336,14 +337,3 @@ class Window:
         """Take the window away."""
         self.plotter.close()
         self.viewer.close()
-
-
-def vertex_normals(vertices, faces):
-    """Unit normals at the vertices of an outward mesh, (n, 3), weighted by area."""
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    cross = np.cross(b - a, c - a)
-    normals = np.stack(
-        [np.bincount(faces.ravel(), np.repeat(cross[:, k], 3), minlength=len(vertices)) for k in range(3)],
-        axis=1,
-    )
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
