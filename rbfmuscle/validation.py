@@ -6,8 +6,10 @@ The one module that every room may import; it imports nothing of ours.
 import difflib
 import os
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 
 class RBFMuscleError(Exception):
@@ -73,7 +75,7 @@ def shown(value: object) -> str:
     return text if len(text) <= LONGEST_SHOWN else f"{text[: LONGEST_SHOWN - 15]} ... {text[-10:]}"
 
 
-def is_file(path: str | os.PathLike) -> bool:
+def is_file(path: str | os.PathLike[str]) -> bool:
     """Whether a path is a regular file: no folder, pipe or device, and a name that the system takes."""
     try:
         return os.path.isfile(path)
@@ -81,7 +83,7 @@ def is_file(path: str | os.PathLike) -> bool:
         return False
 
 
-def check_points(points, *, name="points"):
+def check_points(points: ArrayLike, *, name: str = "points") -> NDArray[np.float64]:
     """Return points as a finite, C-contiguous (n, 3) float64 array.
 
     Parameters
@@ -102,7 +104,7 @@ def check_points(points, *, name="points"):
     return points
 
 
-def _as_floats(values, name):
+def _as_floats(values: ArrayLike, name: str) -> NDArray[np.float64]:
     try:
         return np.ascontiguousarray(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
@@ -110,7 +112,7 @@ def _as_floats(values, name):
         raise ValueError(f"{name} must be an array of numbers ({reason})") from None
 
 
-def check_vectors(vectors, count, *, name="normals"):
+def check_vectors(vectors: ArrayLike, count: int, *, name: str = "normals") -> NDArray[np.float64]:
     """Return (count, 3) finite float64 vectors, one for each point."""
     vectors = check_points(vectors, name=name)
     if len(vectors) != count:
@@ -118,7 +120,7 @@ def check_vectors(vectors, count, *, name="normals"):
     return vectors
 
 
-def check_values(values, count, *, name="values"):
+def check_values(values: ArrayLike, count: int, *, name: str = "values") -> NDArray[np.float64]:
     """Return (count,) finite float64 values, one for each point."""
     values = _as_floats(values, name)
     if values.shape != (count,):
@@ -127,14 +129,14 @@ def check_values(values, count, *, name="values"):
     return values
 
 
-def check_finite(array, *, name):
+def check_finite(array: NDArray[Any], *, name: str) -> None:
     """Raise ValueError naming the first row that holds NaN or infinity."""
     if not np.isfinite(array).all():
         row = int(np.argwhere(~np.isfinite(array))[0][0])
         raise ValueError(f"{name} must be finite, row {row} is {array[row]}")
 
 
-def check_positive(value, *, name):
+def check_positive(value: float, *, name: str) -> float:
     """Return value as a finite float above zero."""
     value = float(value)
     if not (np.isfinite(value) and value > 0):
@@ -142,7 +144,9 @@ def check_positive(value, *, name):
     return value
 
 
-def check_mesh(vertices, faces, *, name="mesh"):
+def check_mesh(
+    vertices: ArrayLike, faces: ArrayLike, *, name: str = "mesh"
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return ``(vertices, faces)`` as (n, 3) float64 and (m, 3) int64, indices in range.
 
     Raises

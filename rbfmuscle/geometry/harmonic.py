@@ -1,14 +1,19 @@
 """Harmonic weights on a closed mesh: how much of each bone's motion a surface point takes over."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Array, Floats, Integers
 
 
-def cotangent_laplacian(vertices, faces):
+def cotangent_laplacian(vertices: Floats, faces: Integers) -> Any:
     """Positive semi-definite cotangent Laplacian with weights clamped from below.
 
     Parameters
@@ -43,7 +48,7 @@ def cotangent_laplacian(vertices, faces):
     return (sparse.diags(np.asarray(weights.sum(axis=1)).ravel()) - weights).tocsc()
 
 
-def harmonic_weights(vertices, faces, groups):
+def harmonic_weights(vertices: Floats, faces: Integers, groups: list[Integers]) -> Floats:
     """Solve Laplace's equation on the surface once for each group of fixed vertices.
 
     Parameters
@@ -73,7 +78,7 @@ def harmonic_weights(vertices, faces, groups):
     return weights / weights.sum(axis=1, keepdims=True)
 
 
-def surface_gradient(vertices, faces, values):
+def surface_gradient(vertices: Floats, faces: Array, values: Floats) -> Floats:
     """Area-weighted gradient of a piecewise linear function at each vertex of a surface.
 
     Returns
@@ -94,7 +99,7 @@ def surface_gradient(vertices, faces, values):
     return total / np.maximum(weight, 1e-300)
 
 
-def blended_motion(points, weights, motions):
+def blended_motion(points: Floats, weights: Floats, motions: Floats) -> Floats:
     """Move each point by a weighted mean of rigid motions.
 
     The motions' twists (logarithms in se(3)) are averaged with the point's weights and exponentiated, so a motion
@@ -140,7 +145,7 @@ def _exponential_loop(points, twists, out):
         out[n, 2] = z + w + first * pz + second * (a * py - b * px + sz) + third * (a * sy - b * sx)
 
 
-def _twist(motion):
+def _twist(motion: Floats) -> Floats:
     """Logarithm of a rigid 4x4 motion as (omega, velocity)."""
     rotation = Rotation.from_matrix(motion[:3, :3])
     omega = rotation.as_rotvec()

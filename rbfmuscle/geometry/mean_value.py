@@ -1,6 +1,11 @@
 """Mean value coordinates: points inside a closed mesh as weighted means of its vertices."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.threads import in_chunks
@@ -12,7 +17,7 @@ _LEAST_SHARE = 16
 _EXACT = 1e-8
 
 
-def mean_value_weights(points, vertices, faces):
+def mean_value_weights(points: ArrayLike, vertices: ArrayLike, faces: ArrayLike) -> Any:
     """Weights of a mesh's vertices that give back each point.
 
     They are smooth inside, sum to one and reproduce every affine motion of the vertices exactly, so a point that

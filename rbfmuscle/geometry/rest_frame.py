@@ -1,11 +1,16 @@
 """Coordinates of a rest mesh that stay the same wherever its scene lies."""
 
+from __future__ import annotations
+
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats
 
-def diameter(points):
+
+def diameter(points: Floats) -> float:
     """Twice the greatest distance from the mean: a size that does not change when the scene is turned."""
     return 2.0 * float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
 
@@ -26,7 +31,7 @@ class RestFrame:
         Vertices in a frame spanned by the first of them, in units of the mesh's size, rounded to 1e-8.
     """
 
-    def __init__(self, vertices):
+    def __init__(self, vertices: Floats) -> None:
         self.origin = vertices.mean(axis=0)
         offset = vertices - self.origin
         distance = np.linalg.norm(offset, axis=1)
@@ -40,23 +45,23 @@ class RestFrame:
         self.axes = np.array([first, second, np.cross(first, second)])
         self.local = np.round(offset @ self.axes.T / self.size, 8)
 
-    def points(self, local):
+    def points(self, local: Floats) -> Floats:
         """World positions of local points."""
         return local @ self.axes * self.size + self.origin
 
-    def directions(self, local):
+    def directions(self, local: Floats) -> Floats:
         """World directions of local ones."""
         return local @ self.axes
 
 
-def on_one_line(vertices):
+def on_one_line(vertices: Floats) -> bool:
     """Whether all vertices coincide or lie on one line, so that they span no frame."""
     offset = vertices - vertices.mean(axis=0)
     sizes = np.linalg.svd(offset, full_matrices=False, compute_uv=False)
     return bool(sizes[1] <= 1e-12 * max(sizes[0], 1e-300))
 
 
-def _principal_axes(points):
+def _principal_axes(points: Floats) -> Floats:
     """Right-handed principal axes as rows; the axes themselves where rounding would choose between others."""
     _, sizes, axes = np.linalg.svd(points, full_matrices=False)
     if np.diff(sizes).max() > -0.02 * sizes[0]:
@@ -84,7 +89,7 @@ class BoneFrame:
         Vertices in local units, rounded to 1e-8.
     """
 
-    def __init__(self, vertices):
+    def __init__(self, vertices: Floats) -> None:
         frame = RestFrame(vertices)
         # Found in rounded numbers, so that equal moments give the same axes for every pose of the scene.
         turn = _principal_axes(frame.local)
@@ -92,18 +97,18 @@ class BoneFrame:
         self.local = np.round(frame.local @ turn.T, 8)
         self._placed = lru_cache(maxsize=16)(self._place)
 
-    def box(self, bounds):
+    def box(self, bounds: Any) -> Any:
         """Local box (2, 3) that holds a box given in bone coordinates."""
         corners = np.array(np.meshgrid(*np.transpose(bounds))).reshape(3, -1).T
         local = (corners - self.origin) @ self.axes.T / self.size
         return np.array([local.min(axis=0), local.max(axis=0)])
 
-    def placed(self, pose):
+    def placed(self, pose: Floats) -> Floats:
         """Transform (4, 4) whose transpose takes world points to local units, for a pose of the bone."""
         # The same pose is asked for many times a frame.
         return self._placed(pose.tobytes())
 
-    def _place(self, pose):
+    def _place(self, pose: bytes) -> Floats:
         pose, out = np.frombuffer(pose).reshape(4, 4), np.eye(4)
         out[:3, :3] = pose[:3, :3] @ self.axes.T / self.size
         out[:3, 3] = pose[:3, :3] @ self.origin + pose[:3, 3]

@@ -94,7 +94,7 @@ def mesh_volume(vertices: Floats, faces: Integers) -> float:
 
 @compiled(error_model="numpy", inline="always")
 def six_volumes(p, q, r):
-    """Six times the signed volume of the tetrahedron of the origin and three points: (p x q) . r."""
+    """Six times the signed volume of the tetrahedron of the origin and three points: r . (p x q)."""
     return (
         (p[1] * q[2] - p[2] * q[1]) * r[0]
         + (p[2] * q[0] - p[0] * q[2]) * r[1]
@@ -161,8 +161,8 @@ def volume_cubic(vertices, faces, direction, origin):
         u = corner_from(direction, i, still)
         v = corner_from(direction, j, still)
         w = corner_from(direction, k, still)
-        c0 += six_volumes(p, q, r)
-        c1 += six_volumes(p, q, w) + six_volumes(q, r, u) + six_volumes(r, p, v)
-        c2 += six_volumes(u, v, r) + six_volumes(v, w, p) + six_volumes(w, u, q)
-        c3 += six_volumes(u, v, w)
+        c0 += six_volumes(q, r, p)
+        c1 += six_volumes(q, r, u) + six_volumes(v, r, p) + six_volumes(q, w, p)
+        c2 += six_volumes(v, r, u) + six_volumes(q, w, u) + six_volumes(v, w, p)
+        c3 += six_volumes(v, w, u)
     return c0 / 6.0, c1 / 6.0, c2 / 6.0, c3 / 6.0

@@ -1,8 +1,12 @@
 """Large loops over points, split over a few threads; the loops themselves are serial and release the lock."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from itertools import pairwise
+from typing import Any
 
 import numba
 
@@ -11,11 +15,11 @@ LEAST_SHARE = 1024
 
 
 @lru_cache(maxsize=4)
-def _pool(workers):
+def _pool(workers: int) -> Any:
     return ThreadPoolExecutor(workers, thread_name_prefix="rbfmuscle")
 
 
-def in_chunks(count, work, *, least=LEAST_SHARE):
+def in_chunks(count: int, work: Callable[..., Any], *, least: int = LEAST_SHARE) -> None:
     """Call ``work(start, stop)`` over the range of ``count``, on at most ``numba.get_num_threads()`` threads.
 
     The number of threads is the caller's own (numba keeps it for each thread), so what already runs in

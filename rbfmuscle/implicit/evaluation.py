@@ -4,24 +4,33 @@ Points are handled in blocks that stay in the first-level cache; the inner loops
 a block. Large sets are split over threads.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.implicit.kernels.radial import _radial_loop
 from rbfmuscle.implicit.kernels.values import _add_values_loop
+
+if TYPE_CHECKING:
+    from rbfmuscle.implicit.kernels.table import Kernel
+
 
 _BLOCK = 256
 _SERIAL = 400_000  # pairs below which starting threads does not pay
 _SORT_FROM = (
     200  # centres from which sorting the points pays, so that blocks out of a kernel's reach are skipped
 )
-_POOLS = {}
+_POOLS: dict[int, ThreadPoolExecutor] = {}
 
 
-def run_in_chunks(loop, count, cost):
+def run_in_chunks(loop: Callable[..., Any], count: int, cost: int) -> None:
     """Call ``loop(start, stop)`` over 0 ... count, on threads where ``cost`` (pairs) is worth it."""
     threads = min(numba.get_num_threads(), -(-count // _BLOCK))
     if threads < 2 or cost < _SERIAL:
@@ -34,7 +43,7 @@ def run_in_chunks(loop, count, cost):
     edges = [count * k // parts for k in range(parts + 1)]
     left = iter(range(parts))
 
-    def work():
+    def work() -> None:
         for k in left:
             loop(edges[k], edges[k + 1])
 
@@ -280,7 +289,17 @@ def _evaluate_loop(
             hessian[:, low : low + n] = h[:, :n]
 
 
-def evaluate(points, origin, scale, centres, weights, kernel, epsilon, polynomial, order):
+def evaluate(
+    points: Floats,
+    origin: Floats,
+    scale: float,
+    centres: Floats,
+    weights: Floats,
+    kernel: Kernel,
+    epsilon: Floats,
+    polynomial: tuple[Floats, Integers],
+    order: int,
+) -> tuple[Floats, Floats, Floats]:
     """A field, its gradient, and the radial part of its Hessian.
 
     Parameters
@@ -333,7 +352,7 @@ def evaluate(points, origin, scale, centres, weights, kernel, epsilon, polynomia
     return value[back], gradient[back] if order > 0 else gradient, hessian[:, back] if order > 1 else hessian
 
 
-def _by_cells(points):
+def _by_cells(points: Floats) -> Integers:
     """Order (n,) in which points lie cell by cell of a grid with about one block of points in each."""
     low, size = points.min(axis=0), np.ptp(points, axis=0)
     side = max((size.prod() * _BLOCK / len(points)) ** (1 / 3), size.max() / 30)

@@ -3,12 +3,17 @@
 f(x) = sum_j a_j phi(|x - c_j|) - B_j . grad phi(x - c_j) + p(x), with B = 0 for a fit to values.
 """
 
+from __future__ import annotations
+
 import warnings
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.implicit.evaluation import evaluate
 from rbfmuscle.implicit.fit import assembly
 from rbfmuscle.implicit.fit.cross_validation import LeastSquaresPath
@@ -24,6 +29,9 @@ from rbfmuscle.validation import (
     check_values,
     check_vectors,
 )
+
+if TYPE_CHECKING:
+    from rbfmuscle.implicit.kernels.table import Kernel
 
 
 class RBFField:
@@ -49,8 +57,18 @@ class RBFField:
     """
 
     def __init__(
-        self, centres, origin, scale, kernel, epsilon, weights, coefficients, powers, condition, smoothing=0.0
-    ):
+        self,
+        centres: Floats,
+        origin: Floats,
+        scale: float,
+        kernel: Kernel,
+        epsilon: float,
+        weights: Floats,
+        coefficients: Floats,
+        powers: Integers,
+        condition: float,
+        smoothing: float = 0.0,
+    ) -> None:
         self.centres, self.origin, self.scale = centres, origin, scale
         self.kernel, self.epsilon = kernel, epsilon
         self.weights, self.coefficients, self.powers = weights, coefficients, powers
@@ -62,7 +80,16 @@ class RBFField:
         self._polynomial = np.ascontiguousarray(coefficients, dtype=float), np.ascontiguousarray(powers)
 
     @classmethod
-    def fit(cls, points, values, *, kernel="cubic", epsilon=1.0, degree=None, smoothing=0.0):
+    def fit(
+        cls,
+        points: ArrayLike,
+        values: ArrayLike,
+        *,
+        kernel: Kernel | str = "cubic",
+        epsilon: float = 1.0,
+        degree: int | None = None,
+        smoothing: float | str = 0.0,
+    ) -> RBFField:
         """Interpolate values at points.
 
         Parameters
@@ -103,7 +130,16 @@ class RBFField:
         return cls(points, origin, scale, kernel, epsilon, weights, coefficients, *rest)
 
     @classmethod
-    def fit_hermite(cls, points, normals, *, kernel="cubic", epsilon=1.0, smoothing=0.0, derivatives="all"):
+    def fit_hermite(
+        cls,
+        points: ArrayLike,
+        normals: ArrayLike,
+        *,
+        kernel: Kernel | str = "cubic",
+        epsilon: float = 1.0,
+        smoothing: float | str = 0.0,
+        derivatives: str = "all",
+    ) -> RBFField:
         """Fit f = 0 and grad f = normal at every point (Hermite RBF, Macedo 2011).
 
         Parameters
@@ -144,11 +180,22 @@ class RBFField:
         weights, rest = hermite_weights(basis, weights), (basis.powers, condition, smoothing)
         fitted = cls(points, origin, scale, kernel, epsilon, weights, coefficients, *rest)
         if kernel.has_epsilon:
-            _warn_if_narrow(fitted, points, normals)
+            _warn_if_narrow(
+                fitted, np.asarray(points, dtype=np.float64), np.asarray(normals, dtype=np.float64)
+            )
         return fitted
 
     @classmethod
-    def fit_surface(cls, points, normals, *, kernel="cubic", epsilon=1.0, smoothing=0.0, derivatives="all"):
+    def fit_surface(
+        cls,
+        points: ArrayLike,
+        normals: ArrayLike,
+        *,
+        kernel: Kernel | str = "cubic",
+        epsilon: float = 1.0,
+        smoothing: float = 0.0,
+        derivatives: str = "all",
+    ) -> RBFField:
         """Fit a surface through points with normals, whatever the kernel.
 
         A Hermite fit where the kernel is C2. Else a fit to values on the surface and off it (Carr et al. 2001): three
@@ -174,13 +221,24 @@ class RBFField:
             *off_surface_points(points, normals), kernel=kernel, epsilon=epsilon, smoothing=smoothing
         )
         if kernel.has_epsilon:
-            _warn_if_narrow(fitted, points, normals)
+            _warn_if_narrow(
+                fitted, np.asarray(points, dtype=np.float64), np.asarray(normals, dtype=np.float64)
+            )
         return fitted
 
     @classmethod
     def fit_least_squares(
-        cls, points, values, centres, *, kernel="cubic", epsilon=1.0, degree=None, smoothing=0.0, cutoff=1e-14
-    ):
+        cls,
+        points: ArrayLike,
+        values: ArrayLike,
+        centres: ArrayLike,
+        *,
+        kernel: Kernel | str = "cubic",
+        epsilon: float = 1.0,
+        degree: Any = None,
+        smoothing: float = 0.0,
+        cutoff: float = 1e-14,
+    ) -> RBFField:
         """Fit values at more points than centres, by truncated SVD; the remedy for flat kernels.
 
         Parameters
@@ -223,23 +281,23 @@ class RBFField:
         rest = powers, condition, smoothing
         return cls(centres, origin, scale, kernel, epsilon, weights, coefficients, *rest)
 
-    def __call__(self, points):
+    def __call__(self, points: ArrayLike) -> Floats:
         """Field value at (n, 3) points: (n,), negative inside."""
         return self._evaluate(check_points(points), 0)[0]
 
-    def gradient(self, points):
+    def gradient(self, points: Floats) -> Floats:
         """Gradient at (n, 3) points: (n, 3)."""
         return self.value_and_gradient(points)[1]
 
-    def value_and_gradient(self, points):
+    def value_and_gradient(self, points: Floats) -> tuple[Floats, Floats]:
         """Value (n,) and gradient (n, 3) at (n, 3) points, for little more than the value alone."""
         return self._evaluate(check_points(points), 1)[:2]
 
-    def hessian(self, points):
+    def hessian(self, points: Floats) -> Floats:
         """Second derivatives at (n, 3) points: (n, 3, 3) [1/scene unit]."""
         return self._derivatives(check_points(points))[1]
 
-    def mean_curvature(self, points):
+    def mean_curvature(self, points: Floats) -> Floats:
         """Mean curvature of the level sets (n,): 1/R on a sphere of radius R, positive where convex.
 
         (|g|^2 tr H - g^T H g) / (2 |g|^3) with gradient g and Hessian H.
@@ -249,14 +307,14 @@ class RBFField:
         bend = np.einsum("ni,nij,nj->n", g, h, g)
         return (length**2 * np.trace(h, axis1=1, axis2=2) - bend) / (2 * length**3)
 
-    def gaussian_curvature(self, points):
+    def gaussian_curvature(self, points: Floats) -> Floats:
         """Gaussian curvature of the level sets (n,): g^T adj(H) g / |g|^4, 1/R^2 on a sphere."""
         g, h = self._derivatives(check_points(points))
         rows = [np.cross(h[:, (i + 1) % 3], h[:, (i + 2) % 3]) for i in range(3)]
         adjugate = np.stack(rows, axis=1)
         return np.einsum("ni,nij,nj->n", g, adjugate, g) / (g * g).sum(axis=1) ** 2
 
-    def surface(self, resolution=64):
+    def surface(self, resolution: int = 64) -> Any:
         """Zero set as a closed outward ``trimesh.Trimesh``; resolution in cells along the longest side."""
         import trimesh
 
@@ -265,7 +323,7 @@ class RBFField:
         result = extract_surface(self, points=self.centres, resolution=resolution)
         return trimesh.Trimesh(result.vertices, result.faces, process=False)
 
-    def _derivatives(self, points):
+    def _derivatives(self, points: Floats) -> tuple[Floats, Floats]:
         _, gradient, flat = self._evaluate(points, 2)
         hessian = flat[[0, 3, 4, 3, 1, 5, 4, 5, 2]].T.reshape(-1, 3, 3)
         if len(self.powers):
@@ -275,14 +333,14 @@ class RBFField:
             )
         return gradient, hessian / self.scale**2
 
-    def _evaluate(self, points, order):
+    def _evaluate(self, points: Floats, order: int) -> tuple[Floats, Floats, Floats]:
         return evaluate(
             points, self.origin, self.scale, self._scaled, self._rows, self.kernel, self._shape, self._polynomial,
             order,
         )  # fmt: skip
 
 
-def frame(points):
+def frame(points: Floats) -> tuple[Floats, float]:
     """Origin (3,) and scale: the points lie in the unit ball of (x - origin) / scale."""
     if not len(points):
         raise UsageError("a fit needs at least one point, got none")
@@ -291,7 +349,9 @@ def frame(points):
     return origin, scale if scale > 0 else 1.0
 
 
-def hermite_system(points, normals, kernel, epsilon, derivatives):
+def hermite_system(
+    points: Floats, normals: Floats, kernel: Kernel, epsilon: float, derivatives: str
+) -> tuple[Basis, Floats, Floats, float]:
     """Basis, right side, origin and scale of a Hermite fit (arguments as in `RBFField.fit_hermite`)."""
     origin, scale = frame(points)
     shape = epsilon * scale if kernel.has_epsilon else 1.0
@@ -307,7 +367,7 @@ def hermite_system(points, normals, kernel, epsilon, derivatives):
     return basis, np.concatenate([np.zeros(len(points)), lengths]) * scale, origin, scale
 
 
-def _warn_if_narrow(fitted, points, normals):
+def _warn_if_narrow(fitted: RBFField, points: Floats, normals: Floats) -> None:
     """Warn where the field does not rise outwards between its centres: the kernel does not reach that far."""
     points, normals = check_points(points), check_vectors(normals, len(points))
     if len(points) < 20:
@@ -324,7 +384,7 @@ def _warn_if_narrow(fitted, points, normals):
         )
 
 
-def _warn_if_truncated(kernel, rank, size):
+def _warn_if_truncated(kernel: Kernel, rank: int, size: int) -> None:
     analytic = kernel.smoothness == 99
     remedy = "raise epsilon or fit with FlatField.fit_least_squares" if analytic else "spread the centres"
     warnings.warn(
@@ -335,7 +395,7 @@ def _warn_if_truncated(kernel, rank, size):
     )
 
 
-def hermite_weights(basis, weights):
+def hermite_weights(basis: Basis, weights: Floats) -> Floats:
     """Rows (a, B) for each centre from the solution of a Hermite system: (K, 4)."""
     if basis.kind == "gradient":
         return weights.reshape(4, -1).T.copy()
@@ -343,7 +403,15 @@ def hermite_weights(basis, weights):
     return np.column_stack([value, along[:, None] * basis.normals])
 
 
-def collocation(points, centres, kernel, epsilon, degree, origin, scale):
+def collocation(
+    points: Floats,
+    centres: Floats,
+    kernel: Kernel,
+    epsilon: Floats | float,
+    degree: int,
+    origin: Floats,
+    scale: float,
+) -> tuple[Floats, Integers]:
     """Matrix (n, K + q) that maps weights and polynomial coefficients to values at points, and the powers."""
     shape = epsilon * scale if kernel.has_epsilon else 1.0
     at, centred = (points - origin) / scale, (centres - origin) / scale
@@ -352,7 +420,7 @@ def collocation(points, centres, kernel, epsilon, degree, origin, scale):
     return np.hstack([radial, assembly.monomials(at, powers).T]), powers
 
 
-def _check_degree(kernel, degree, count):
+def _check_degree(kernel: Kernel, degree: int | None, count: int) -> int:
     least = kernel.degree
     degree = least if degree is None else int(degree)
     if degree < least:

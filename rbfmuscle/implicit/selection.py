@@ -1,12 +1,18 @@
 """Choosing the shape parameter epsilon."""
 
+from __future__ import annotations
+
 import math
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.field import RBFField, _check_degree, collocation, frame, hermite_system
 from rbfmuscle.implicit.fit.cross_validation import LeastSquaresPath, SmoothingPath, leave_one_out
 from rbfmuscle.implicit.fit.fitting import DOUBTFUL, Basis, solve
@@ -20,6 +26,11 @@ from rbfmuscle.validation import (
     check_values,
     check_vectors,
 )
+
+if TYPE_CHECKING:
+    from rbfmuscle.implicit.fit.regularisation import SmoothingChoice
+    from rbfmuscle.implicit.kernels.table import Kernel
+
 
 CRITERIA = ("loo", "gcv", "held_out", "condition")
 SPAN = (0.02, 20.0)
@@ -63,23 +74,23 @@ class EpsilonChoice:
     tried: np.ndarray
 
 
-def hardy_epsilon(points):
+def hardy_epsilon(points: Floats) -> float:
     """Hardy (1971): 1 / (0.815 d), d the mean distance to the nearest neighbour."""
     return 1.0 / (0.815 * spacing(points).mean())
 
 
-def franke_epsilon(points):
+def franke_epsilon(points: Floats) -> float:
     """Franke (1982): 0.8 sqrt(N) / D, D the diameter of the bounding sphere of `frame`."""
     points = check_points(points)
     return 0.8 * math.sqrt(len(points)) / (2 * frame(points)[1])
 
 
-def spacing_epsilon(points, *, factor=0.5):
+def spacing_epsilon(points: Floats, *, factor: float = 0.5) -> float:
     """factor / h, h the mean distance to the nearest neighbour: what scattered points in 3-D ask for."""
     return check_positive(factor, name="factor") / spacing(points).mean()
 
 
-def spacing(points, *, neighbours=1):
+def spacing(points: Floats, *, neighbours: int = 1) -> Floats:
     """Distance (n,) of each point to its nearest neighbours, their mean.
 
     Raises
@@ -97,20 +108,20 @@ def spacing(points, *, neighbours=1):
 
 
 def choose_epsilon(
-    points,
+    points: ArrayLike,
     *,
-    values=None,
-    normals=None,
-    kernel="gaussian",
-    criterion="loo",
-    held_out=None,
-    target=1e10,
-    derivatives="all",
-    smoothing=0.0,
-    span=SPAN,
-    coarse=13,
-    refine=8,
-):
+    values: ArrayLike | None = None,
+    normals: ArrayLike | None = None,
+    kernel: Kernel | str = "gaussian",
+    criterion: str = "loo",
+    held_out: ArrayLike | None = None,
+    target: float = 1e10,
+    derivatives: str = "all",
+    smoothing: float | str = 0.0,
+    span: tuple[float, float] = SPAN,
+    coarse: int = 13,
+    refine: int = 8,
+) -> EpsilonChoice:
     """Search epsilon for a fit to values or, with normals, for a Hermite fit.
 
     A log-spaced scan brackets the minimum, golden sections narrow it. Where the condition exceeds 1e13 the objective
@@ -151,12 +162,18 @@ def choose_epsilon(
         )
     points, kernel = check_points(points), get_kernel(kernel)
     _check_request(kernel, criterion, values, normals, held_out)
-    objective = _objective(
-        points, values, normals, kernel, criterion, held_out, target, derivatives, smoothing
+    data = _Data(
+        points,
+        None if values is None else check_values(values, len(points)),
+        None if normals is None else check_vectors(normals, len(points)),
+        kernel,
+        derivatives,
+        smoothing,
     )
+    objective = _objective(data, criterion, target, held_out)
     unit = 1.0 / spacing(points).mean()
     noise = _NOISE_HELD_OUT if criterion == "held_out" else _NOISE
-    tried = [_trial(objective, e * unit) for e in np.geomspace(*span, coarse)]
+    tried = [_trial(objective, e * unit) for e in np.geomspace(span[0], span[1], coarse)]
     best = int(np.argmin(believed(tried, noise)))
     # Noise has no valley to narrow: there the range is scanned, and a wider one.
     noisy = tried[best][2] > DOUBTFUL
@@ -171,18 +188,18 @@ def choose_epsilon(
 
 
 def choose_smoothing(
-    points,
+    points: ArrayLike,
     *,
-    values=None,
-    normals=None,
-    centres=None,
-    kernel="cubic",
-    epsilon=1.0,
-    degree=None,
-    criterion="gcv",
-    derivatives="all",
-    cutoff=1e-14,
-):
+    values: ArrayLike | None = None,
+    normals: ArrayLike | None = None,
+    centres: ArrayLike | None = None,
+    kernel: str = "cubic",
+    epsilon: float = 1.0,
+    degree: Any = None,
+    criterion: str = "gcv",
+    derivatives: str = "all",
+    cutoff: float = 1e-14,
+) -> SmoothingChoice:
     """Choose the Tikhonov parameter of a fit along one decomposition, for the time of thirty to forty fits.
 
     Parameters
@@ -216,7 +233,7 @@ def choose_smoothing(
         return search_smoothing(
             SmoothingPath(*hermite_system(points, normals, kernel, epsilon, derivatives)[:2]), criterion
         )
-    values = check_values(values, len(points))
+    values = check_values(np.asarray(values), len(points))
     degree = _check_degree(kernel, degree, len(points))
     if centres is None:
         origin, scale = frame(points)
@@ -229,7 +246,7 @@ def choose_smoothing(
     return search_smoothing(LeastSquaresPath(matrix, values, cutoff=cutoff), criterion)
 
 
-def surface_miss(fitted, points, reach):
+def surface_miss(fitted: RBFField, points: Floats, reach: float) -> float:
     """Root mean square distance of a field's surface from points that should lie on it, to first order.
 
     |f| / |grad f|, at most ``reach``. Where the field is flat it knows no surface, though it may be 0: beyond a few
@@ -255,7 +272,7 @@ def surface_miss(fitted, points, reach):
     return float(np.sqrt((missed**2).mean() + flat * reach**2))
 
 
-def _check_request(kernel, criterion, values, normals, held_out):
+def _check_request(kernel: Kernel, criterion: str, values: object, normals: object, held_out: object) -> None:
     if not kernel.has_epsilon:
         raise UsageError(
             f"kernel '{kernel.name}' has no shape parameter: epsilon does not change its interpolant"
@@ -268,46 +285,57 @@ def _check_request(kernel, criterion, values, normals, held_out):
         raise UsageError("held_out points are needed for, and only for, criterion 'held_out'")
 
 
-def _objective(points, values, normals, kernel, criterion, held_out, target, derivatives, smoothing):
+class _Data(NamedTuple):
+    """What is fitted while epsilon is sought: values (n,) or normals (n, 3) at points (n, 3)."""
+
+    points: Floats
+    values: Floats | None
+    normals: Floats | None
+    kernel: Kernel
+    derivatives: str
+    smoothing: float
+
+    def system(self, epsilon: float) -> tuple[Any, Any]:
+        """Basis and right side."""
+        if self.normals is not None:
+            return hermite_system(self.points, self.normals, self.kernel, epsilon, self.derivatives)[:2]
+        origin, scale = frame(self.points)
+        local = (self.points - origin) / scale
+        return Basis(local, self.kernel, epsilon * scale, self.kernel.degree), self.values
+
+    def field(self, epsilon: float) -> RBFField:
+        """The fitted field."""
+        settings: dict[str, Any] = {"kernel": self.kernel, "epsilon": epsilon, "smoothing": self.smoothing}
+        if self.normals is not None:
+            return RBFField.fit_hermite(self.points, self.normals, derivatives=self.derivatives, **settings)
+        return RBFField.fit(self.points, np.asarray(self.values), **settings)
+
+
+def _objective(
+    data: _Data, criterion: str, target: float, held_out: ArrayLike | None
+) -> Callable[[float], tuple[float, float]]:
     """epsilon -> (objective, condition)."""
-    if values is not None:
-        values = check_values(values, len(points))
-    else:
-        normals = check_vectors(normals, len(points))
-    if held_out is not None:
-        held_out = check_points(held_out, name="held_out")
-
-    def system(epsilon):
-        if normals is not None:
-            return hermite_system(points, normals, kernel, epsilon, derivatives)[:2]
-        origin, scale = frame(points)
-        return Basis((points - origin) / scale, kernel, epsilon * scale, kernel.degree), values
-
-    reach = spacing(points).mean()
+    others = None if held_out is None else check_points(held_out, name="held_out")
+    reach = spacing(data.points).mean()
     # A direction that is wrong by one at a left-out centre misses the surface by a part of the spacing.
-    lever = 0.0 if normals is None else SLOPE_SHARE * reach / frame(points)[1]
+    lever = 0.0 if data.normals is None else SLOPE_SHARE * reach / frame(data.points)[1]
 
-    def by_residuals(epsilon):
-        found = leave_one_out(*system(epsilon), smoothing=smoothing)
+    def by_residuals(epsilon: float) -> tuple[float, float]:
+        found = leave_one_out(*data.system(epsilon), smoothing=data.smoothing)
         return found.score(criterion, lever), found.condition
 
-    def by_held_out(epsilon):
-        if normals is not None:
-            field = RBFField.fit_hermite(
-                points, normals, kernel=kernel, epsilon=epsilon, smoothing=smoothing, derivatives=derivatives
-            )
-        else:
-            field = RBFField.fit(points, values, kernel=kernel, epsilon=epsilon, smoothing=smoothing)
-        return surface_miss(field, held_out, reach), field.condition
+    def by_held_out(epsilon: float) -> tuple[float, float]:
+        field = data.field(epsilon)
+        return surface_miss(field, np.asarray(others), reach), field.condition
 
-    def by_condition(epsilon):
-        condition = solve(*system(epsilon), smoothing=smoothing)[2]
+    def by_condition(epsilon: float) -> tuple[float, float]:
+        condition = solve(*data.system(epsilon), smoothing=data.smoothing)[2]
         return abs(math.log10(condition / target)), condition
 
     return {"held_out": by_held_out, "condition": by_condition}.get(criterion, by_residuals)
 
 
-def _trial(objective, epsilon):
+def _trial(objective: Callable[..., Any], epsilon: float) -> tuple[float, float, float]:
     """(epsilon, objective, condition); infinite where the fit fails."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NumericalWarning)
@@ -318,13 +346,15 @@ def _trial(objective, epsilon):
     return epsilon, score if math.isfinite(score) else math.inf, condition
 
 
-def believed(tried, noise=_NOISE_HELD_OUT):
+def believed(tried: ArrayLike, noise: float = _NOISE_HELD_OUT) -> Floats:
     """Objectives (n,) of trials (n, 3), those of a doubtful condition made worse by ``noise``."""
     tried = np.asarray(tried)
     return tried[:, 1] * np.where(tried[:, 2] > DOUBTFUL, noise, 1.0)
 
 
-def _golden(objective, low, high, count, noise):
+def _golden(
+    objective: Callable[..., Any], low: float, high: float, count: int, noise: float
+) -> list[tuple[float, float, float]]:
     """Golden-section search of the logarithm between low and high."""
     a, b = math.log(low), math.log(high)
     x, y = b - _GOLDEN * (b - a), a + _GOLDEN * (b - a)

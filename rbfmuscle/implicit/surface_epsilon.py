@@ -1,15 +1,25 @@
 """Choosing epsilon for a surface that is at hand: the error is measured on it, and the zero set is looked at."""
 
+from __future__ import annotations
+
 import warnings
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.placement.off_surface import off_surface_points
 from rbfmuscle.implicit.selection import SPAN, EpsilonChoice, believed, choose_epsilon, spacing
 from rbfmuscle.validation import NumericalWarning
+
+if TYPE_CHECKING:
+    from rbfmuscle.implicit.kernels.table import Kernel
+
 
 # Evaluations of the scan and of the refinement. Flat Gaussians close their surface in spans of a factor of 1.3 only.
 COARSE, REFINE = 25, 6
@@ -20,8 +30,16 @@ ALIKE = 1.05
 
 
 def choose_surface_epsilon(
-    points, normals, *, kernel, held_out=None, distance=None, criterion=None, derivatives="all", smoothing=0.0
-):
+    points: ArrayLike,
+    normals: ArrayLike,
+    *,
+    kernel: Kernel | str,
+    held_out: ArrayLike | None = None,
+    distance: Callable[..., Any] | None = None,
+    criterion: str | None = None,
+    derivatives: str = "all",
+    smoothing: float = 0.0,
+) -> EpsilonChoice:
     """Search epsilon for `RBFField.fit_surface`, whatever the kernel.
 
     Parameters
@@ -44,10 +62,10 @@ def choose_surface_epsilon(
     EpsilonChoice
         Where the zero set was looked at, the objective is the root mean square distance both ways.
     """
-    kernel = get_kernel(kernel)
+    kernel, points, normals = get_kernel(kernel), np.asarray(points), np.asarray(normals)
     criterion = criterion or ("loo" if held_out is None else "held_out")
     if kernel.hermite:
-        data = {"points": points, "normals": normals, "derivatives": derivatives}
+        data: dict[str, Any] = {"points": points, "normals": normals, "derivatives": derivatives}
     else:
         where, values = off_surface_points(points, normals)
         data = {"points": where, "values": values}
@@ -60,7 +78,7 @@ def choose_surface_epsilon(
     if criterion != "held_out" or distance is None:
         return choice
 
-    def fit(epsilon):
+    def fit(epsilon: float) -> RBFField:
         return RBFField.fit_surface(
             points, normals, kernel=kernel, epsilon=epsilon, derivatives=derivatives, smoothing=smoothing
         )
@@ -68,7 +86,9 @@ def choose_surface_epsilon(
     return _look_at_zero_sets(choice, fit, points, distance)
 
 
-def _look_at_zero_sets(choice, fit, points, distance):
+def _look_at_zero_sets(
+    choice: EpsilonChoice, fit: Callable[..., Any], points: Floats, distance: Callable[..., Any]
+) -> EpsilonChoice:
     """The best of the tried epsilons by the distance both ways; the choice itself where none is closed."""
     found, least = choice, np.inf
     for number in np.argsort(believed(choice.tried), kind="stable"):
@@ -84,7 +104,7 @@ def _look_at_zero_sets(choice, fit, points, distance):
     return found
 
 
-def _back(fit, epsilon, points, distance):
+def _back(fit: Callable[..., Any], epsilon: float, points: Floats, distance: Callable[..., Any]) -> float:
     """Root mean square distance of the zero set's vertices from the surface, infinite where it is open."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NumericalWarning)

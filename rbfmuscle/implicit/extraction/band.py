@@ -4,11 +4,17 @@ The band starts in the cells that hold predicted surface points and grows throug
 crosses, so it follows the surface wherever it went, and the field is evaluated at no node that is not needed.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.implicit.extraction.marching import (
     EDGE_AXIS,
     EDGE_CORNER,
@@ -18,6 +24,10 @@ from rbfmuscle.implicit.extraction.marching import (
     marching_tables,
 )
 from rbfmuscle.validation import check_points
+
+if TYPE_CHECKING:
+    from rbfmuscle.implicit.field import RBFField
+
 
 # More nodes than this are refused: 2 bytes of state and 8 of index each.
 MAX_NODES = 50_000_000
@@ -45,11 +55,13 @@ class BandGrid:
 
     origin: np.ndarray
     spacing: float
-    shape: tuple
+    shape: tuple[int, ...]
     axes: np.ndarray
 
     @classmethod
-    def around(cls, points, *, resolution=48, padding=3, axes=None):
+    def around(
+        cls, points: ArrayLike, *, resolution: int = 48, padding: int = 3, axes: ArrayLike | None = None
+    ) -> BandGrid:
         """Grid around points, with ``resolution`` cells along their longest side.
 
         Parameters
@@ -86,25 +98,25 @@ class BandGrid:
         return cls(corner @ axes, spacing, tuple(int(n) + 1 for n in cells), axes)
 
     @property
-    def strides(self):
+    def strides(self) -> Integers:
         """Step in flat node number along each axis."""
         return np.array([self.shape[1] * self.shape[2], self.shape[2], 1])
 
-    def coordinates(self, points):
+    def coordinates(self, points: Floats) -> Any:
         """Positions in cells from the origin, (n, 3)."""
         return (points - self.origin) @ self.axes.T / self.spacing
 
-    def positions(self, coordinates):
+    def positions(self, coordinates: Floats) -> Floats:
         """World positions of grid coordinates, the inverse of `coordinates`."""
         return coordinates @ (self.spacing * self.axes) + self.origin
 
-    def nodes(self, flat):
+    def nodes(self, flat: Integers) -> Floats:
         """World positions of flat node numbers."""
         out = np.empty((len(flat), 3))
         _nodes_loop(flat, self.strides, self.origin, self.spacing * self.axes, out)
         return out
 
-    def cells(self, points):
+    def cells(self, points: Floats) -> Integers:
         """Flat numbers of the cells that hold points; outside the grid its outermost cells."""
         out, last = np.empty(len(points), dtype=np.int64), np.array(self.shape) - 2
         _cells_loop(points, self.origin, self.axes / self.spacing, last, self.strides, out)
@@ -121,7 +133,9 @@ class Band:
         ``(n, 3) -> (n,)``; ``cut`` may be None.
     """
 
-    def __init__(self, grid, field, cut=None):
+    def __init__(
+        self, grid: BandGrid, field: Callable[..., Any] | RBFField, cut: Callable[..., Any] | None = None
+    ) -> None:
         total = int(np.prod(grid.shape))
         self.grid, self.field, self.cut = grid, field, cut
         self.index = np.full(total, -1, dtype=np.int32)
@@ -134,25 +148,25 @@ class Band:
         _close_border_loop(self.state, *grid.shape)
 
     @property
-    def cells(self):
+    def cells(self) -> Integers:
         """Flat numbers of the visited cells."""
         return self._cells[: self.cell_count]
 
-    def seed(self, points):
+    def seed(self, points: Floats) -> None:
         """Visit the cells that hold points."""
         self._visit(np.unique(self.grid.cells(points)))
 
-    def visit_all(self):
+    def visit_all(self) -> None:
         """Visit every cell of the grid."""
         self._visit(np.flatnonzero(self.state == 0))
 
-    def _visit(self, cells):
+    def _visit(self, cells: Integers) -> None:
         cells = cells[self.state[cells] == 0]
         self.state[cells] = 1
         self._cells[self.cell_count : self.cell_count + len(cells)] = cells
         self.cell_count += len(cells)
 
-    def grow(self, level):
+    def grow(self, level: float) -> None:
         """Evaluate new nodes, and follow the level set into new cells until none is left."""
         swept = 0
         while swept < self.cell_count:
@@ -163,13 +177,13 @@ class Band:
                 self.state,
             )  # fmt: skip
 
-    def widen(self):
+    def widen(self) -> bool:
         """Visit all neighbours of the visited cells; whether there were any."""
         before = self.cell_count
         self.cell_count = _widen_loop(self._cells, before, self.grid.strides, self.state)
         return self.cell_count > before
 
-    def _evaluate(self, begin):
+    def _evaluate(self, begin: int) -> None:
         first = self.node_count
         self.node_count = _add_nodes_loop(
             self._cells, begin, self.cell_count, self.grid.strides, self.index, self._flat, first
@@ -187,12 +201,12 @@ class Band:
                 f"field or cut is NaN at {where}; check the fit (its condition) and the bone fields"
             )
 
-    def crosses(self, level):
+    def crosses(self, level: float) -> bool:
         """Whether the level set meets any visited cell."""
         combined = np.maximum(self._f[: self.node_count] - level, -self._c[: self.node_count])
         return bool((combined < 0).any() and (combined >= 0).any())
 
-    def march(self, level):
+    def march(self, level: float) -> tuple[Floats, Integers, Booleans, Booleans]:
         """Closed triangles of the level set in the visited cells.
 
         Returns
@@ -224,7 +238,7 @@ class Band:
         return coordinates, triangles[:n_triangles], is_open, near_cut
 
 
-def box_along(points, axes):
+def box_along(points: Floats, axes: Floats) -> Floats:
     """Least and greatest coordinates (2, 3) of points along the rows of ``axes``."""
     out = np.array([[np.inf] * 3, [-np.inf] * 3])
     _box_loop(points, axes, out)

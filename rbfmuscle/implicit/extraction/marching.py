@@ -7,11 +7,15 @@ are cut into triangles without a diagonal that lies in a face: the cell on the o
 and its edge would have four triangles. Each crossed edge then has one ring of cells around it: a manifold.
 """
 
+from __future__ import annotations
+
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Integers
 
 # Corner c of a cell sits at (c & 1, c >> 1 & 1, c >> 2). Edge e runs from its corner along its axis.
 EDGE_CORNER = np.array([c for axis in range(3) for c in range(8) if not c >> axis & 1])
@@ -21,7 +25,7 @@ FACE_CORNERS = np.array([[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3],
 
 
 @lru_cache(maxsize=1)
-def marching_tables():
+def marching_tables() -> tuple[Integers, ...]:
     """Tables of the 256 cases, each with one entry for every answer of its ambiguous faces.
 
     Returns
@@ -38,7 +42,8 @@ def marching_tables():
     """
     ambiguous = np.full((256, 6), -1)
     first = np.zeros(256, dtype=np.int64)
-    start, triangles = [0], []
+    start = [0]
+    triangles: list[Any] = []
     for case in range(256):
         inside = [(case >> c) & 1 for c in range(8)]
         unclear = [k for k, face in enumerate(FACE_CORNERS) if _is_ambiguous([inside[c] for c in face])]
@@ -57,11 +62,11 @@ def marching_tables():
     return ambiguous, first, np.array(start), np.array(triangles)
 
 
-def _is_ambiguous(signs):
+def _is_ambiguous(signs: list[int]) -> bool:
     return signs in ([0, 1, 0, 1], [1, 0, 1, 0])
 
 
-def _edge_between(a, b):
+def _edge_between(a: int, b: int) -> int:
     low, axis = min(a, b), int(a ^ b).bit_length() - 1
     return int(np.flatnonzero((low == EDGE_CORNER) & (axis == EDGE_AXIS))[0])
 
@@ -70,7 +75,7 @@ _FACE_EDGES = [[_edge_between(face[i], face[(i + 1) % 4]) for i in range(4)] for
 _FACES_OF_EDGE = [{k for k, edges in enumerate(_FACE_EDGES) if e in edges} for e in range(12)]
 
 
-def _trace_loops(inside, joined):
+def _trace_loops(inside: list[int], joined: set[Any]) -> list[Any]:
     """Loops of crossed edges; a segment runs from an edge that leaves the inside to one that enters."""
     following = {}
     for k, face in enumerate(FACE_CORNERS):
@@ -94,7 +99,7 @@ def _trace_loops(inside, joined):
     return loops
 
 
-def _triangulate(loop):
+def _triangulate(loop: list[int]) -> list[Any] | None:
     """Triangles of a loop of edges with no diagonal inside a face of the cell; None where there are none."""
     if len(loop) < 3:
         return []
@@ -108,7 +113,7 @@ def _triangulate(loop):
     return None
 
 
-def _shares_face(part):
+def _shares_face(part: list[int]) -> bool:
     """Whether the chord that closes a part of a loop is a diagonal that lies in a face."""
     return len(part) > 2 and bool(_FACES_OF_EDGE[part[0]] & _FACES_OF_EDGE[part[-1]])
 

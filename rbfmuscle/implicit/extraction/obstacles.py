@@ -1,11 +1,20 @@
 """Chords that cut through a convex bone: vertices of the surface moved until no bone vertex is inside it."""
 
+from __future__ import annotations
+
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Array, Booleans, Floats, Integers
 from rbfmuscle.validation import check_points
+
+if TYPE_CHECKING:
+    from rbfmuscle.implicit.extraction.band import BandGrid
+
 
 # A chord is never farther from its surface than this share of a cell.
 CHORD = 0.35
@@ -24,7 +33,7 @@ class ObstaclePoints:
         In coordinates of their own, as a bone's vertices.
     """
 
-    def __init__(self, points):
+    def __init__(self, points: ArrayLike) -> None:
         points = check_points(points)
         low = points.min(axis=0, initial=np.inf)
         size = float(np.ptp(points, axis=0).max(initial=0.0)) if len(points) else 0.0
@@ -39,7 +48,9 @@ class ObstaclePoints:
         ).reshape(-1, 2, 3)
 
 
-def points_near_cells(obstacles, grid, state, cells):
+def points_near_cells(
+    obstacles: list[tuple[ObstaclePoints, Floats]], grid: BandGrid, state: Array, cells: Integers
+) -> Floats:
     """Obstacle points in or beside the cells that a band has visited, in world positions.
 
     Parameters
@@ -130,7 +141,9 @@ def _near_points_loop(points, first, last, turn, shift, shape, strides, state, b
     return count
 
 
-def push_off_points(vertices, faces, points, grid, tolerance, rounds=4):
+def push_off_points(
+    vertices: Floats, faces: Integers, points: Floats, grid: BandGrid, tolerance: float, rounds: int = 4
+) -> Booleans:
     """Move the vertices of triangles that obstacle points have come through, into the surface.
 
     A point behind a triangle (inside the mesh) by more than ``tolerance`` moves its three corners along the

@@ -1,10 +1,20 @@
 """Vertices of an extracted mesh moved onto the surface itself, and with its level to a wanted volume."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.surfaces import volume_cubic
 from rbfmuscle.implicit.extraction.obstacles import push_off_points
+
+if TYPE_CHECKING:
+    from rbfmuscle.implicit.extraction.band import BandGrid
+    from rbfmuscle.implicit.field import RBFField
 
 
 class Projector:
@@ -13,16 +23,25 @@ class Projector:
     ``near_cut`` (n,) marks the vertices that may lie on or come to the cut.
     """
 
-    def __init__(self, field, cut, vertices, spacing, near_cut):
+    def __init__(
+        self,
+        field: Callable[..., Any] | RBFField,
+        cut: Callable[..., Any] | None,
+        vertices: Floats,
+        spacing: float,
+        near_cut: Booleans,
+    ) -> None:
         self.vertices = vertices
         self.spacing = spacing
         self._field = with_gradient(field, 1e-4 * spacing)
-        self._cut = None if cut is None else with_gradient_below(cut, 1e-4 * spacing)
+        self._cut: Callable[..., Any] | None = (
+            None if cut is None else with_gradient_below(cut, 1e-4 * spacing)
+        )
         self._near_cut = near_cut
         self.slope = np.zeros(len(vertices))
         self._direction = np.zeros_like(vertices)
 
-    def project(self, level, rounds=6):
+    def project(self, level: float, rounds: int = 6) -> None:
         """Newton steps until they are shorter than 1e-4 of a cell."""
         on_field = np.ones(len(self.vertices), dtype=bool)
         todo = np.arange(len(self.vertices))
@@ -43,10 +62,12 @@ class Projector:
         self._direction[~on_field] = 0.0
         self.slope[~on_field] = 0.0
 
-    def _turn_to_cut(self, x, todo, height, step, on_field):
+    def _turn_to_cut(
+        self, x: Floats, todo: Integers, height: Floats, step: Floats, on_field: Booleans
+    ) -> None:
         """Replace the steps of vertices that lie on the cut; marks which lie on the field's own surface."""
         rows = np.flatnonzero(self._near_cut[todo])
-        if len(rows) == 0:
+        if self._cut is None or len(rows) == 0:
             return
         distance, outward = self._cut(x[rows], -height[rows])
         on_cut = height[rows] < -distance
@@ -55,7 +76,7 @@ class Projector:
         size = np.maximum(np.einsum("ij,ij->i", outward, outward), np.finfo(float).tiny)
         step[rows] = -(distance / size)[:, None] * outward
 
-    def volume_step(self, faces, target, steps=1):
+    def volume_step(self, faces: Integers, target: float, steps: int = 1) -> float:
         """Change of level that brings the mesh to the target volume, its vertices moving along their directions.
 
         By Newton steps on the volume, a cubic polynomial of the change.
@@ -74,7 +95,7 @@ class Projector:
             change += lack / rate
         return change
 
-    def push_off(self, faces, points, grid, tolerance):
+    def push_off(self, faces: Integers, points: Floats, grid: BandGrid, tolerance: float) -> None:
         """Move the vertices around points that came through a triangle; these no longer follow the level."""
         for _ in range(2):
             moved = np.flatnonzero(push_off_points(self.vertices, faces, points, grid, tolerance))
@@ -91,7 +112,7 @@ class Projector:
             size = np.maximum(np.einsum("ij,ij->i", outward, outward), 1e-12)
             self.vertices[moved[inside]] -= (distance / size)[:, None] * outward
 
-    def shift(self, step):
+    def shift(self, step: float) -> None:
         """Move the vertices as the level set moves with its level, to first order."""
         self.vertices = self.vertices + step * self._direction
 
@@ -119,7 +140,7 @@ def _step_loop(rows, step, spacing, vertices, unsettled):
         unsettled[n] = length > 1e-2 * spacing
 
 
-def with_gradient(function, step):
+def with_gradient(function: Callable[..., Any] | RBFField, step: float) -> Callable[..., Any]:
     """``points -> (values, gradients)`` of a callable: its own, or central differences."""
     if hasattr(function, "value_and_gradient"):
         return function.value_and_gradient
@@ -132,7 +153,7 @@ def with_gradient(function, step):
     return differences
 
 
-def with_gradient_below(function, step):
+def with_gradient_below(function: Any, step: float) -> Callable[..., Any]:
     """``(points, limit) -> (values, gradients)`` of a callable, only sure where a value is below its limit (n,)."""
     if hasattr(function, "value_and_gradient_below"):
         return function.value_and_gradient_below

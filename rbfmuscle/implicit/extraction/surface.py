@@ -5,16 +5,26 @@ to the bones (negative inside them). A band follows it through the grid, marchin
 and Newton steps put each vertex onto the zero set itself: all that is left of the grid is the chords.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.surfaces import corner_from, mesh_volume, six_volumes
 from rbfmuscle.implicit.extraction.band import Band, BandGrid
 from rbfmuscle.implicit.extraction.obstacles import CHORD, points_near_cells
 from rbfmuscle.implicit.extraction.projection import Projector
 from rbfmuscle.validation import check_finite, check_points, check_positive
+
+if TYPE_CHECKING:
+    from rbfmuscle.implicit.extraction.obstacles import ObstaclePoints
+    from rbfmuscle.implicit.field import RBFField
 
 
 @dataclass(frozen=True)
@@ -51,9 +61,19 @@ class ExtractedSurface:
 
 
 def extract_surface(
-    field, *, points, resolution=48, cut=None, volume=None, level=0.0, keep="largest", search="band",
-    axes=None, obstacles=None, obstacle_tolerance=None,
-):  # fmt: skip
+    field: Callable[..., Any] | RBFField,
+    *,
+    points: ArrayLike,
+    resolution: int = 48,
+    cut: Callable[..., Any] | None = None,
+    volume: float | None = None,
+    level: float = 0.0,
+    keep: str = "largest",
+    search: str = "band",
+    axes: ArrayLike | None = None,
+    obstacles: list[tuple[ObstaclePoints, Floats]] | None = None,
+    obstacle_tolerance: float | None = None,
+) -> ExtractedSurface:
     """Extract the zero set of max(field - level, -cut) as a closed mesh.
 
     Parameters
@@ -117,7 +137,7 @@ def extract_surface(
         padding = min(4 * padding, int(resolution))
 
 
-def _start(band, points, level, search):
+def _start(band: Band, points: Floats, level: float, search: str) -> None:
     """Visit first cells until some are crossed."""
     if search == "box":
         band.visit_all()
@@ -133,7 +153,9 @@ def _start(band, points, level, search):
         band.grow(level)
 
 
-def _reach_volume(band, target, level, keep, obstacles):
+def _reach_volume(
+    band: Band, target: float | None, level: float, keep: str, obstacles: tuple[Any, ...]
+) -> ExtractedSurface | None:
     """Mesh at the level that gives the target volume; None where the surface leaves the grid."""
     spacing = band.grid.spacing
     for _ in range(20):
@@ -166,7 +188,16 @@ def _reach_volume(band, target, level, keep, obstacles):
     return _finish(band, projector, faces, target, level, components, spurious, obstacles)
 
 
-def _finish(band, projector, faces, target, level, components, spurious, obstacles):
+def _finish(
+    band: Band,
+    projector: Projector,
+    faces: Integers,
+    target: float | None,
+    level: float,
+    components: int,
+    spurious: int,
+    obstacles: tuple[Any, ...],
+) -> ExtractedSurface:
     bones, tolerance = obstacles
     if bones:
         points = points_near_cells(bones, band.grid, band.state, band.cells)
@@ -190,7 +221,7 @@ def _finish(band, projector, faces, target, level, components, spurious, obstacl
     )
 
 
-def _closed_sheets(band, level, keep):
+def _closed_sheets(band: Band, level: float, keep: str) -> tuple[Floats, Integers, Booleans, int, int] | None:
     """Vertices, faces, which are near the cut, number of sheets and of those left out; None where open."""
     coordinates, faces, on_border, near_cut = band.march(level)
     label, sheets = _label_sheets_loop(faces, len(coordinates))

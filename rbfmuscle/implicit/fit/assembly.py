@@ -5,14 +5,17 @@ derivatives), so that every column of every block is one contiguous run. Only th
 order) is filled.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.implicit.kernels.radial import _radial_loop
 from rbfmuscle.implicit.kernels.values import _add_values_loop
 
 
-def exponents(degree):
+def exponents(degree: int) -> Integers:
     """Exponents (q, 3) of the monomials of total degree up to ``degree``; (0, 3) for degree -1."""
     rows = [
         (i, j, total - i - j)
@@ -23,7 +26,7 @@ def exponents(degree):
     return np.array(rows, dtype=np.int64).reshape(-1, 3)
 
 
-def monomials(points, powers):
+def monomials(points: Floats, powers: Integers) -> Floats:
     """Monomials at points: (q, n)."""
     out = np.ones((len(powers), len(points)))
     for row, power in zip(out, powers):
@@ -33,7 +36,7 @@ def monomials(points, powers):
     return out
 
 
-def monomial_gradients(points, powers):
+def monomial_gradients(points: Floats, powers: Integers) -> Floats:
     """Derivatives of the monomials at points: (3, q, n)."""
     out = np.zeros((3, len(powers), len(points)))
     for axis in range(3):
@@ -44,7 +47,7 @@ def monomial_gradients(points, powers):
     return out
 
 
-def monomial_hessians(points, powers):
+def monomial_hessians(points: Floats, powers: Integers) -> Floats:
     """Second derivatives of the monomials at points: (3, 3, q, n)."""
     out = np.zeros((3, 3, len(powers), len(points)))
     for axis in range(3):
@@ -55,7 +58,7 @@ def monomial_hessians(points, powers):
     return out
 
 
-def hermite_polynomials(points, powers):
+def hermite_polynomials(points: Floats, powers: Integers) -> Floats:
     """Polynomial block (q, 4n): values, then the three derivatives, at each point."""
     return np.hstack([monomials(points, powers), *monomial_gradients(points, powers)])
 
@@ -115,7 +118,7 @@ def _hermite_matrix_loop(x, epsilon, base, parameter, compact, table, out):
                     target[i] = -e2 * e2 * second[i] * dc[i] * de[i]
 
 
-def normal_polynomials(points, normals, powers):
+def normal_polynomials(points: Floats, normals: Floats, powers: Integers) -> Floats:
     """Polynomial block (q, 2n): values, then derivatives along the normals, at each point."""
     along = np.einsum("cqn,nc->qn", monomial_gradients(points, powers), normals)
     return np.hstack([monomials(points, powers), along])

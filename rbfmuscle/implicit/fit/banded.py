@@ -4,8 +4,11 @@ The centres are numbered so that neighbours are close in number (reverse Cuthill
 centre side by side. The matrix is then a band, and its Cholesky factorisation takes (unknowns) (width)^2 operations.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import sparse
@@ -13,7 +16,12 @@ from scipy.linalg import blas, lapack
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.spatial import cKDTree
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.implicit.fit.condition import largest_eigenvalue, probe
+
+if TYPE_CHECKING:
+    from rbfmuscle.implicit.fit.fitting import Basis
+
 
 _FEWEST = {"value": 800, "normal": 300, "gradient": 300}
 _NEIGHBOURS = {"value": 0.04, "normal": 0.08, "gradient": 0.12}
@@ -40,7 +48,7 @@ class BandFactor:
     order: np.ndarray
     norm: float
 
-    def solve(self, right):
+    def solve(self, right: Floats) -> tuple[Floats, Floats, float]:
         """Weights (size,), no coefficients (0,), and an estimate of the condition."""
         block = np.empty((len(right), 2), order="F")
         block[:, 0] = right[self.order]
@@ -51,7 +59,7 @@ class BandFactor:
         return weights, np.zeros(0), self.norm * math.sqrt(block[:, 1] @ block[:, 1])
 
 
-def factorise_band(basis, smoothing=0.0):
+def factorise_band(basis: Basis, smoothing: float = 0.0) -> BandFactor | None:
     """Factor of A + smoothing I as a band, where that is faster than as a full matrix.
 
     Parameters
@@ -85,7 +93,7 @@ def factorise_band(basis, smoothing=0.0):
     return None if info else BandFactor(band, order, norm)
 
 
-def _places(pairs, count):
+def _places(pairs: Integers, count: int) -> Integers:
     """New number of each centre."""
     both = np.concatenate([pairs, pairs[:, ::-1]])
     graph = sparse.csr_array((np.ones(len(both), np.int8), (both[:, 0], both[:, 1])), shape=(count, count))
@@ -94,7 +102,9 @@ def _places(pairs, count):
     return place
 
 
-def _band(basis, pairs, place, width, smoothing):
+def _band(
+    basis: Basis, pairs: Integers, place: Integers, width: int, smoothing: float
+) -> tuple[Floats, Integers]:
     """Band storage ((width + 1) kinds, size) and the unknown at each place."""
     count = len(basis.points)
     kinds = basis.size // count
@@ -115,7 +125,7 @@ def _band(basis, pairs, place, width, smoothing):
     return band, order
 
 
-def _pair_blocks(basis, i, j):
+def _pair_blocks(basis: Basis, i: Integers, j: Integers) -> list[list[Floats]]:
     """Entries [a][b] (pairs,) between condition a of centre i and condition b of centre j; see `assembly`."""
     kernel, epsilon = basis.kernel, basis.epsilon
     d = (basis.points[i] - basis.points[j]).T

@@ -1,11 +1,17 @@
 """Estimates of the extreme eigenvalues of a factored matrix, for a few products with vectors."""
 
+from __future__ import annotations
+
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats
 
-def largest_eigenvalue(size, multiply):
+
+def largest_eigenvalue(size: int, multiply: Callable[..., Any]) -> float:
     """Largest eigenvalue of a symmetric matrix by two steps of power iteration, a lower bound.
 
     Parameters
@@ -30,7 +36,7 @@ def largest_eigenvalue(size, multiply):
     return norm
 
 
-def probe(pivots):
+def probe(pivots: Floats) -> Floats:
     """Probe for the smallest eigenvector: random signs, and the unit vector of the smallest pivot.
 
     Parameters

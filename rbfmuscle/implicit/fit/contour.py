@@ -14,18 +14,27 @@ below 0: the null vector of stacked Toeplitz matrices, in the least-squares sens
 so that the flat interpolant is a sum of N well-conditioned ones, which can be evaluated anywhere.
 """
 
+from __future__ import annotations
+
 import math
 from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import linalg
 from scipy.spatial.distance import cdist
 
+from rbfmuscle.geometry.arrays import Array, Floats
 from rbfmuscle.implicit.field import _check_degree, frame
 from rbfmuscle.implicit.fit import assembly
 from rbfmuscle.implicit.fit.fitting import raise_if_singular
-from rbfmuscle.implicit.kernels.table import get_kernel, radial
+from rbfmuscle.implicit.kernels import radial
+from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.validation import UsageError
+
+if TYPE_CHECKING:
+    from rbfmuscle.implicit.kernels.table import Kernel
+
 
 _HALF = 64  # solves a circle
 _CONDITIONS = (1e6, 1e8, 1e10)  # of the real matrix on the circles that are tried with an entire kernel
@@ -39,7 +48,7 @@ _MOST_CENTRES = 600
 class System:
     """Scaled centres, kernel and polynomials; solves for any complex epsilon."""
 
-    def __init__(self, centres, kernel, degree, reach):
+    def __init__(self, centres: Floats, kernel: Kernel, degree: int, reach: float) -> None:
         self.points, self.kernel, self.reach, self.size = centres, kernel, reach, len(centres)
         self.powers = assembly.exponents(degree)
         self.squares = cdist(centres, centres, "sqeuclidean")
@@ -47,7 +56,9 @@ class System:
         raise_if_singular(self)
 
     @classmethod
-    def of(cls, points, kernel, degree, reach):
+    def of(
+        cls, points: Floats, kernel: str, degree: Any, reach: float
+    ) -> tuple[System, tuple[Floats, float]]:
         kernel = get_kernel(kernel)
         if kernel.base not in (radial.GAUSS, radial.BINOMIAL):
             raise UsageError(
@@ -63,7 +74,7 @@ class System:
         origin, scale = frame(points)
         return cls((points - origin) / scale, kernel, degree, reach), (origin, scale)
 
-    def check_reach(self, points):
+    def check_reach(self, points: Floats) -> Floats:
         """The scaled points, if none lies beyond the reach."""
         far = np.sqrt((points * points).sum(axis=1).max(initial=0.0))
         if far > self.reach * (1 + 1e-12):
@@ -73,7 +84,7 @@ class System:
             )
         return points
 
-    def matrix(self, z):
+    def matrix(self, z: Any) -> Array:
         """The augmented matrix at epsilon^2 = z."""
         count, q = len(self.points), len(self.powers)
         full = np.zeros((count + q, count + q), dtype=complex)
@@ -81,7 +92,7 @@ class System:
         full[count:, :count], full[:count, count:] = self.polynomials, self.polynomials.T
         return full
 
-    def radial(self, u, k):
+    def radial(self, u: Array, k: int) -> Array:
         """The k-th radial function (see `kernels`) at complex u = s^2."""
         row = self.kernel.table[k]
         if self.kernel.base == radial.GAUSS:
@@ -97,14 +108,14 @@ class System:
             rest = rest * base if whole > 0 else rest / base
         return row[2] * rest
 
-    def radii(self):
+    def radii(self) -> list[float]:
         """Radii of circles to try, the largest first."""
         if self.kernel.base == radial.GAUSS:
             found = [self._radius_of(condition) for condition in _CONDITIONS]
             return [max(radius, least) for radius, least in zip(found, _LEAST_RADII)]
         return [shrink / (1.0 + self.reach) for shrink in _SHRINK]
 
-    def _radius_of(self, condition):
+    def _radius_of(self, condition: float) -> float:
         """Real epsilon with a given condition, by bisection of its logarithm."""
         low, high = -6.0, 6.0
         for _ in range(16):
@@ -113,7 +124,7 @@ class System:
             low, high = (low, middle) if sizes.max() < condition * sizes.min() else (middle, high)
         return 2.0**high
 
-    def probes(self, count):
+    def probes(self, count: int) -> Floats:
         """Points on lines through two centres each, a little beyond them too: (count, 3)."""
         rng = np.random.default_rng(0)
         first, second = self.points[rng.integers(len(self.points), size=(2, count))]
@@ -124,7 +135,7 @@ class System:
 class Circle:
     """Interpolants on a circle of complex epsilon and the denominator that continues them inwards."""
 
-    def __init__(self, system, radius, values):
+    def __init__(self, system: System, radius: float, values: Floats) -> None:
         self.system, self.radius, self.size = system, radius, np.abs(values).max()
         self.angles = np.pi * (np.arange(_HALF) + 0.5) / _HALF
         self.squares = radius**2 * np.exp(1j * self.angles)
@@ -136,7 +147,7 @@ class Circle:
         coefficients = self._coefficients(np.array([self._direct(k, self.sites)[0] for k in range(_HALF)]))
         self.denominator = common_denominator(coefficients)
 
-    def _solve(self, z, right):
+    def _solve(self, z: Any, right: Floats) -> Array:
         matrix = self.system.matrix(z)
         factor, pivots, info = linalg.lapack.zgetrf(matrix)
         if info:
@@ -145,12 +156,12 @@ class Circle:
         self.condition = max(self.condition, 1.0 / max(linalg.lapack.zgecon(factor, norm)[0], 1e-300))
         return linalg.lapack.zgetrs(factor, pivots, right)[0]
 
-    def _coefficients(self, samples):
+    def _coefficients(self, samples: Array) -> Floats:
         """Fourier coefficients -H ... H - 1 of samples on the upper half circle: (2H, M), real."""
         orders = np.arange(-_HALF, _HALF)
         return (np.exp(-1j * np.outer(orders, self.angles)) @ samples).real / _HALF
 
-    def _direct(self, k, points, gradient=False):
+    def _direct(self, k: int, points: Floats, gradient: bool = False) -> Array:
         """Interpolant (and gradient) at the k-th complex epsilon: (1 or 4, n)."""
         system, z, weights = self.system, self.squares[k], self.weights[k]
         count = len(system.points)
@@ -165,7 +176,7 @@ class Circle:
             out[1:] += np.einsum("q,cqn->cn", weights[count:], slopes)
         return out
 
-    def shares(self, epsilon):
+    def shares(self, epsilon: float) -> Array:
         """c_k of the module's formula for the upper half circle, times two: (H,)."""
         if not epsilon < self.radius:
             raise UsageError(
@@ -176,7 +187,7 @@ class Circle:
         bottom = np.polynomial.polynomial.polyval(t, self.denominator)
         return np.polynomial.polynomial.polyval(ends, self.denominator) * series / (_HALF * bottom)
 
-    def evaluate(self, points, epsilon, gradient=False):
+    def evaluate(self, points: Floats, epsilon: float, gradient: bool = False) -> Floats:
         """Value (and gradient) at scaled points for a scaled real epsilon: (1 or 4, n)."""
         shares = self.shares(epsilon)
         out = np.zeros((4 if gradient else 1, len(points)))
@@ -187,7 +198,7 @@ class Circle:
                 out[:, some] += (share * self._direct(k, points[some], gradient)).real
         return out
 
-    def influence(self, points, epsilon):
+    def influence(self, points: Floats, epsilon: float) -> Floats:
         """Matrix that maps values at the centres to the field at scaled points: (n, K)."""
         system, count = self.system, len(self.system.points)
         squares = cdist(points, system.points, "sqeuclidean")
@@ -199,13 +210,13 @@ class Circle:
             out += (share * self._solve(z, rows.T)[:count].T).real
         return out
 
-    def difference(self, other, epsilon):
+    def difference(self, other: Circle, epsilon: float) -> float:
         """Largest difference from another circle's values at the probes, as a share of the data."""
         mine, others = (circle.evaluate(self.sites, epsilon) for circle in (self, other))
         return float(np.abs(mine - others).max() / max(self.size, 1e-300))
 
 
-def common_denominator(coefficients):
+def common_denominator(coefficients: Floats) -> Floats:
     """Coefficients of the common denominator, of the least degree that reaches the level of the noise.
 
     Parameters
@@ -233,7 +244,7 @@ def common_denominator(coefficients):
     return found[degree][2][-1]
 
 
-def choose_circles(system, values, epsilon):
+def choose_circles(system: System, values: Floats, epsilon: float) -> tuple[Circle, Circle]:
     """The two neighbouring circles that agree best at epsilon, the better conditioned one first."""
     circles = [Circle(system, radius, values) for radius in system.radii() if radius > epsilon]
     if len(circles) < 2:

@@ -6,17 +6,25 @@ a small block solve. The blocks are products of columns of the inverted Cholesky
 operations as the factorisation.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import linalg
 from scipy.spatial import cKDTree
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.fit import fitting
 from rbfmuscle.implicit.fit.lapack import invert_factor
 from rbfmuscle.validation import UsageError
+
+if TYPE_CHECKING:
+    from rbfmuscle.implicit.fit.fitting import Basis
+
 
 # Of the spacing: what an error of one in the left-out normal counts when smoothing is chosen. With less, noisy points
 # are best met by smoothing all away, as f = 0 meets them too; with more, the smoothing suits the normals alone.
@@ -46,7 +54,7 @@ class Residuals:
     averaged: np.ndarray
     condition: float
 
-    def score(self, criterion, lever=0.0):
+    def score(self, criterion: str, lever: float = 0.0) -> float:
         """Root mean square of value and lever times slope, left out ("loo") or averaged ("gcv")."""
         if criterion == "gcv":
             missed, turned = self.averaged[:, 0], self.averaged[:, 1:]
@@ -55,7 +63,7 @@ class Residuals:
         return math.sqrt((missed**2).mean() + lever**2 * (turned**2).sum(axis=1).mean())
 
 
-def leave_one_out(basis, right, *, smoothing=0.0):
+def leave_one_out(basis: Basis, right: Floats, *, smoothing: float = 0.0) -> Residuals:
     """Leave-one-out residuals of a fit, for about the time of two.
 
     Parameters
@@ -71,7 +79,7 @@ def leave_one_out(basis, right, *, smoothing=0.0):
     """
     factor = fitting.factorise(basis, smoothing)
     solved = factor.solve(right) if factor is not None else None
-    if solved is None or solved[2] > fitting.DOUBTFUL:
+    if factor is None or solved is None or solved[2] > fitting.DOUBTFUL:
         return _from_eigenvectors(basis, right, smoothing)
     weights, _, condition = solved
     count = len(basis.points)
@@ -101,7 +109,7 @@ def _blocks_loop(columns, blocks):
                 blocks[k, b, a] = total
 
 
-def _residuals(blocks, weights, count, condition):
+def _residuals(blocks: Floats, weights: Floats, count: int, condition: float) -> Residuals:
     per_centre = weights.reshape(-1, count).T
     residuals = np.linalg.solve(blocks, per_centre[:, :, None])[:, :, 0]
     averaged = np.linalg.solve(blocks.mean(axis=0), per_centre.T).T
@@ -110,7 +118,7 @@ def _residuals(blocks, weights, count, condition):
     return Residuals(residuals[:, 0], residuals[:, 1:], gcv, averaged, condition)
 
 
-def _from_eigenvectors(basis, right, smoothing):
+def _from_eigenvectors(basis: Basis, right: Floats, smoothing: float) -> Residuals:
     """The same where Cholesky fails: F^-1 without its smallest eigenvalues."""
     count, size = len(basis.points), basis.size
     values, vectors = linalg.eigh(basis.full_matrix(smoothing), driver="evd")
@@ -125,7 +133,9 @@ def _from_eigenvectors(basis, right, smoothing):
     return _residuals(blocks, weights, count, sizes.max() / max(sizes.min(), 1e-300))
 
 
-def least_squares_residuals(matrix, right, *, smoothing=0.0, cutoff=1e-14):
+def least_squares_residuals(
+    matrix: Floats, right: Floats, *, smoothing: float = 0.0, cutoff: float = 1e-14
+) -> Residuals:
     """Leave-one-out residuals (y - Hy)_k / (1 - H_kk) and GCV of a ridge or truncated least-squares fit.
 
     Parameters
@@ -162,7 +172,7 @@ class LeastSquaresPath:
 
     lever = 0.0
 
-    def __init__(self, matrix, right, *, cutoff=1e-14):
+    def __init__(self, matrix: Floats, right: Floats, *, cutoff: float = 1e-14) -> None:
         left, values, _ = linalg.svd(matrix, full_matrices=False)
         keep = values > cutoff * values[0]
         self._left, self._squares, self._right = left[:, keep], values[keep] ** 2, right
@@ -170,7 +180,7 @@ class LeastSquaresPath:
         self.condition = float(values[0] / max(values[-1], 1e-300))
         self.span = 1e-28 * self._squares[0], self._squares[0]
 
-    def residuals(self, smoothing):
+    def residuals(self, smoothing: float) -> Residuals:
         """`Residuals` with a given smoothing."""
         damp = self._squares / (self._squares + smoothing)
         residual = self._right - self._left @ (damp * self._along)
@@ -200,7 +210,7 @@ class SmoothingPath:
         Weight of slopes among the residuals, 0 for a fit to values.
     """
 
-    def __init__(self, basis, right):
+    def __init__(self, basis: Basis, right: Floats) -> None:
         count, size, q = len(basis.points), basis.size, len(basis.powers)
         if size == q:
             raise UsageError(
@@ -217,7 +227,7 @@ class SmoothingPath:
         if basis.kind != "value" and count > 1:
             self.lever = _SLOPE_SHARE * cKDTree(basis.points).query(basis.points, k=2)[0][:, 1].mean()
 
-    def residuals(self, smoothing):
+    def residuals(self, smoothing: float) -> Residuals:
         """`Residuals` with a given smoothing above 0."""
         damp = 1.0 / (self._values + smoothing)
         weights = self._vectors @ (damp * self._along)

@@ -3,13 +3,23 @@
 The weights of a flat kernel grow without bound, the field itself does not; `contour` says how it is found.
 """
 
+from __future__ import annotations
+
 import warnings
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import linalg
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.fit.contour import System, choose_circles
 from rbfmuscle.validation import NumericalWarning, UsageError, check_points, check_values
+
+if TYPE_CHECKING:
+    from rbfmuscle.implicit.fit.contour import Circle
+    from rbfmuscle.implicit.kernels.table import Kernel
+
 
 DOUBTFUL = 1e-3
 """Estimated error, as a share of the values, above which a flat fit is reported as doubtful."""
@@ -32,7 +42,14 @@ class FlatField:
         The worst on the circle, 1-norm, estimated.
     """
 
-    def __init__(self, centres, kernel, epsilon, frame, circles):
+    def __init__(
+        self,
+        centres: Floats,
+        kernel: Kernel,
+        epsilon: float,
+        frame: tuple[Floats, float],
+        circles: tuple[Circle, Circle],
+    ) -> None:
         self.centres, self.kernel, self.epsilon = centres, kernel, epsilon
         self._origin, self._scale = frame
         self._circles = circles
@@ -41,7 +58,16 @@ class FlatField:
         self.error = circle.difference(other, epsilon * self._scale)
 
     @classmethod
-    def fit(cls, points, values, *, kernel="gaussian", epsilon=0.0, degree=None, reach=1.1):
+    def fit(
+        cls,
+        points: ArrayLike,
+        values: ArrayLike,
+        *,
+        kernel: str = "gaussian",
+        epsilon: float = 0.0,
+        degree: int | None = None,
+        reach: float = 1.1,
+    ) -> FlatField:
         """Interpolate values at points with a kernel as flat as one likes.
 
         Parameters
@@ -81,8 +107,16 @@ class FlatField:
 
     @classmethod
     def fit_least_squares(
-        cls, points, values, centres, *, kernel="gaussian", epsilon=0.0, degree=None, reach=1.1
-    ):
+        cls,
+        points: ArrayLike,
+        values: ArrayLike,
+        centres: ArrayLike,
+        *,
+        kernel: str = "gaussian",
+        epsilon: float = 0.0,
+        degree: Any = None,
+        reach: float = 1.1,
+    ) -> FlatField:
         """Fit values at more points than centres, in the space of the flat interpolants of `fit`.
 
         The unknowns are the values at the centres, whose influence on the field stays bounded where weights do not.
@@ -116,7 +150,9 @@ class FlatField:
         return cls._best(centres, system, (origin, scale), solution, epsilon)
 
     @classmethod
-    def _best(cls, centres, system, place, values, epsilon):
+    def _best(
+        cls, centres: Floats, system: System, place: tuple[Floats, float], values: Floats, epsilon: float
+    ) -> FlatField:
         circles = choose_circles(system, values, epsilon * place[1])
         fitted = cls(centres, system.kernel, epsilon, place, circles)
         if fitted.error > DOUBTFUL:
@@ -129,32 +165,32 @@ class FlatField:
             )
         return fitted
 
-    def at(self, epsilon):
+    def at(self, epsilon: float) -> FlatField:
         """The same data with another epsilon, without another solve: FlatField."""
         epsilon = _check_epsilon(epsilon)
         place = self._origin, self._scale
         return FlatField(self.centres, self.kernel, epsilon, place, self._circles)
 
-    def __call__(self, points):
+    def __call__(self, points: ArrayLike) -> Floats:
         """Field value at (n, 3) points: (n,)."""
         return self._evaluate(points, False)[0]
 
-    def gradient(self, points):
+    def gradient(self, points: Floats) -> Floats:
         """Gradient at (n, 3) points: (n, 3)."""
         return self.value_and_gradient(points)[1]
 
-    def value_and_gradient(self, points):
+    def value_and_gradient(self, points: Floats) -> tuple[Floats, Floats]:
         """Value (n,) and gradient (n, 3) at (n, 3) points."""
         out = self._evaluate(points, True)
         return out[0], np.ascontiguousarray(out[1:].T / self._scale)
 
-    def _evaluate(self, points, gradient):
+    def _evaluate(self, points: ArrayLike, gradient: bool) -> Floats:
         circle = self._circles[0]
         at = circle.system.check_reach((check_points(points) - self._origin) / self._scale)
         return circle.evaluate(at, self.epsilon * self._scale, gradient)
 
 
-def _check_epsilon(epsilon):
+def _check_epsilon(epsilon: float) -> float:
     epsilon = float(epsilon)
     if not (np.isfinite(epsilon) and epsilon >= 0):
         raise UsageError(f"epsilon must be a number of at least 0, got {epsilon}")

@@ -4,10 +4,15 @@ SciPy's Python wrappers hold the lock while they work, so that muscles fitted si
 the same routines called through their published addresses (`scipy.linalg.cython_lapack`) do not.
 """
 
+from __future__ import annotations
+
 import ctypes
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats
 
 _INT = ctypes.POINTER(ctypes.c_int)
 _REAL = ctypes.POINTER(ctypes.c_double)
@@ -15,7 +20,7 @@ _CHAR, _ARRAY = ctypes.c_char_p, ctypes.c_void_p
 
 
 @lru_cache(maxsize=8)
-def _routine(name, *types):
+def _routine(name: str, *types: Any) -> Any:
     from scipy.linalg import cython_blas, cython_lapack
 
     published = {**cython_blas.__pyx_capi__, **cython_lapack.__pyx_capi__}
@@ -28,7 +33,7 @@ def _routine(name, *types):
     return ctypes.CFUNCTYPE(None, *types)(address)
 
 
-def factor_cholesky(matrix):
+def factor_cholesky(matrix: Floats) -> int:
     """Replace the lower triangle of a symmetric matrix by its Cholesky factor.
 
     Parameters
@@ -48,7 +53,7 @@ def factor_cholesky(matrix):
     return info.value
 
 
-def solve_cholesky(factor, right):
+def solve_cholesky(factor: Floats, right: Floats) -> None:
     """Replace the few columns of ``right`` by the solutions of the factored system.
 
     Parameters
@@ -68,7 +73,7 @@ def solve_cholesky(factor, right):
             routine(b"L", turned, b"N", size, factor.ctypes.data, size, column.ctypes.data, one)
 
 
-def invert_factor(factor):
+def invert_factor(factor: Floats) -> None:
     """Replace the lower triangle of a Cholesky factor by that of its inverse.
 
     Parameters
@@ -82,7 +87,7 @@ def invert_factor(factor):
     routine(b"L", b"N", size, factor.ctypes.data, size, info)
 
 
-def multiply_symmetric(matrix, right):
+def multiply_symmetric(matrix: Floats, right: Floats) -> Floats:
     """Product of a symmetric matrix (lower triangle) and a few columns.
 
     Parameters
@@ -107,7 +112,7 @@ def multiply_symmetric(matrix, right):
     return out
 
 
-def subtract_products(matrix, left, right):
+def subtract_products(matrix: Floats, left: Floats, right: Floats) -> None:
     """Subtract ``left right^T + right left^T`` from the lower triangle of a symmetric matrix, in place.
 
     Parameters
@@ -126,6 +131,6 @@ def subtract_products(matrix, left, right):
     )  # fmt: skip
 
 
-def _check(array):
+def _check(array: Floats) -> None:
     if array.dtype != np.float64 or not array.flags.f_contiguous or array.ndim != 2:
         raise ValueError("LAPACK needs a two-dimensional float64 array in Fortran order")

@@ -1,14 +1,23 @@
 """Tikhonov regularisation: how much smoothing noisy or ill-conditioned data ask for."""
 
+from __future__ import annotations
+
 import math
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from rbfmuscle.implicit.fit.cross_validation import SmoothingPath
+from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.implicit.fit.cross_validation import LeastSquaresPath, SmoothingPath
 from rbfmuscle.validation import NumericalWarning, UsageError
+
+if TYPE_CHECKING:
+    from rbfmuscle.implicit.fit.fitting import Basis
+
 
 SMOOTHING_CRITERIA = ("gcv", "loo")
 _PER_DECADE = 4
@@ -33,7 +42,7 @@ class SmoothingChoice:
     tried: np.ndarray
 
 
-def search_smoothing(path, criterion="gcv"):
+def search_smoothing(path: SmoothingPath | LeastSquaresPath, criterion: str = "gcv") -> SmoothingChoice:
     """The smoothing that makes a criterion least along a decomposition: a scan, then a refinement.
 
     Parameters
@@ -53,7 +62,7 @@ def search_smoothing(path, criterion="gcv"):
     """
     check_criterion(criterion)
 
-    def objective(exponent):
+    def objective(exponent: float) -> float:
         return path.residuals(10.0**exponent).score(criterion, path.lever)
 
     low, high = (math.log10(end) for end in path.span)
@@ -62,9 +71,9 @@ def search_smoothing(path, criterion="gcv"):
     best = int(np.argmin([score for _, score in tried]))
     ends = exponents[max(best - 1, 0)], exponents[min(best + 1, len(exponents) - 1)]
     found = minimize_scalar(objective, bounds=ends, method="bounded", options={"xatol": 1e-3})
-    tried = np.array(sorted([*tried, (float(found.x), float(found.fun))]))
-    tried[:, 0] = 10.0 ** tried[:, 0]
-    best = tried[np.argmin(tried[:, 1])]
+    scores = np.array(sorted([*tried, (float(found.x), float(found.fun))]))
+    scores[:, 0] = 10.0 ** scores[:, 0]
+    best = scores[np.argmin(scores[:, 1])]
     if path.lever and best[0] > 0.1 * path.span[1]:
         warnings.warn(
             f"the smoothing chosen by '{criterion}' ({best[0]:.2g}) leaves hardly anything of the surface: points and "
@@ -72,16 +81,16 @@ def search_smoothing(path, criterion="gcv"):
             NumericalWarning,
             stacklevel=2,
         )
-    return SmoothingChoice(float(best[0]), float(best[1]), tried)
+    return SmoothingChoice(float(best[0]), float(best[1]), scores)
 
 
-def check_criterion(criterion):
+def check_criterion(criterion: str) -> None:
     """Raise UsageError for a criterion that does not choose smoothing."""
     if criterion not in SMOOTHING_CRITERIA:
         raise UsageError(f"smoothing is a number or chosen by 'gcv' or 'loo', got {criterion!r}")
 
 
-def resolve_smoothing(smoothing, path):
+def resolve_smoothing(smoothing: float | str, path: Callable[..., Any]) -> float:
     """Smoothing as a number: as given, or chosen where a criterion is named.
 
     Parameters
@@ -104,6 +113,6 @@ def resolve_smoothing(smoothing, path):
     return smoothing
 
 
-def basis_smoothing(smoothing, basis, right):
+def basis_smoothing(smoothing: float | str, basis: Basis, right: Floats) -> float:
     """`resolve_smoothing` for a square system with this right side."""
     return resolve_smoothing(smoothing, lambda: SmoothingPath(basis, right))

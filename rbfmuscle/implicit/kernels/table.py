@@ -17,11 +17,16 @@ SciPy's ``RBFInterpolator`` for names and signs. ``skala_cervenka`` is second-ha
 was not checked against the original of 2019, and neither was the default exponent.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.kernels import radial
 from rbfmuscle.validation import UsageError, check_finite, did_you_mean
 
@@ -60,32 +65,32 @@ class Kernel:
     table: np.ndarray = field(repr=False, compare=False)
 
     @property
-    def hermite(self):
+    def hermite(self) -> bool:
         """Whether phi is smooth enough (C2) for a fit to points and normals."""
         return self.smoothness >= 2
 
     @property
-    def degree(self):
+    def degree(self) -> int:
         """Least polynomial degree, -1 for none."""
         return self.order - 1
 
-    def phi(self, r, epsilon=1.0):
+    def phi(self, r: ArrayLike, epsilon: float = 1.0) -> Floats:
         """Kernel at distances r (any shape), shape parameter epsilon [1/length]."""
         return self._radial(r, epsilon, 0)
 
-    def first(self, r, epsilon=1.0):
+    def first(self, r: ArrayLike, epsilon: float = 1.0) -> Floats:
         """phi'(r)/r, with its limit at r = 0 (which is infinite for kernels that are not C2)."""
         return self._radial(r, epsilon, 1)
 
-    def second(self, r, epsilon=1.0):
+    def second(self, r: ArrayLike, epsilon: float = 1.0) -> Floats:
         """(phi'' - phi'/r)/r**2, with its limit at r = 0 (infinite for kernels that are not C4)."""
         return self._radial(r, epsilon, 2)
 
-    def third(self, r, epsilon=1.0):
+    def third(self, r: ArrayLike, epsilon: float = 1.0) -> Floats:
         """Derivative of ``second`` divided by r, with its limit at r = 0 (infinite below C6)."""
         return self._radial(r, epsilon, 3)
 
-    def _radial(self, r, epsilon, k):
+    def _radial(self, r: ArrayLike, epsilon: float, k: int) -> Floats:
         r = np.asarray(r, dtype=float)
         check_finite(np.atleast_1d(r), name="r")
         flat = np.ascontiguousarray(np.abs(r).ravel() * epsilon)
@@ -104,7 +109,7 @@ class Kernel:
         values[flat == 0.0] = self._limit(k)
         return (values * epsilon ** (2 * k)).reshape(r.shape)
 
-    def _limit(self, k):
+    def _limit(self, k: int) -> float:
         """Value of the k-th radial function at s = 0."""
         power, inner, outer = self.table[k, 0], self.table[k, 2 : 2 + _TERMS], self.table[k, 2 + _TERMS :]
         limit = outer[0]
@@ -119,7 +124,7 @@ class Kernel:
         return limit if power == 0 or limit == 0 else math.copysign(math.inf, limit)
 
 
-def _row(power, inner=(), outer=(), extra=0):
+def _row(power: int, inner: tuple[Any, ...] = (), outer: tuple[Any, ...] = (), extra: int = 0) -> Floats:
     """One radial function: s**power (base * inner(s) + outer(s)); extra is the base's own exponent."""
     row = np.zeros(2 + 2 * _TERMS)
     row[0], row[1] = power, extra
@@ -128,20 +133,20 @@ def _row(power, inner=(), outer=(), extra=0):
     return row
 
 
-def _power_rows(k, sign):
+def _power_rows(k: int, sign: float) -> list[Floats]:
     """Odd polyharmonic sign * s**k."""
     factors = np.cumprod([sign, k, k - 2, k - 4])
     return [_row(k - 2 * i, outer=(factors[i],)) for i in range(4)]
 
 
-def _binomial_rows(beta):
+def _binomial_rows(beta: float) -> list[Floats]:
     """sign * (1 + s**2)**beta; the sign makes it conditionally positive definite."""
     sign = (-1.0) ** max(math.ceil(beta), 0)
     factors = np.cumprod([sign, 2 * beta, 2 * (beta - 1), 2 * (beta - 2)])
     return [_row(0, (factors[i],), extra=i) for i in range(4)]
 
 
-def _skala_rows(a):
+def _skala_rows(a: float) -> list[Floats]:
     """s**2 (s**a - 1)."""
     factors = np.cumprod([1.0, 2 + a, a, a - 2])
     outer = (-1.0, -2.0, 0.0, 0.0)
@@ -232,7 +237,7 @@ _ROWS = [
 ]  # fmt: skip
 
 
-def _build():
+def _build() -> dict[str, Kernel]:
     kernels = {}
     for number, (name, order, smooth, compact, has_epsilon, parameter, base, rows) in enumerate(_ROWS):
         table = np.array(rows(parameter) if callable(rows) else rows)
@@ -250,7 +255,7 @@ _REFUSED = {
 }
 
 
-def get_kernel(name, *, parameter=None):
+def get_kernel(name: Kernel | str, *, parameter: float | None = None) -> Kernel:
     """Look a kernel up by name.
 
     Parameters
@@ -276,7 +281,7 @@ def get_kernel(name, *, parameter=None):
     return kernel if parameter is None else _with_parameter(kernel, float(parameter))
 
 
-def _with_parameter(kernel, value):
+def _with_parameter(kernel: Kernel, value: float) -> Kernel:
     if kernel.name == "generalised_multiquadric":
         if not 0 < value < 4 or value == int(value):
             raise UsageError(f"beta of {kernel.name} must lie in (0, 4) and be no integer, got {value}")

@@ -4,12 +4,14 @@ The formulas are those of `radial.py`, which fills derivatives as well; here the
 commonest evaluation, and one loop over the points keeps it in registers.
 """
 
+from typing import Any
+
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.implicit.kernels.radial import BINOMIAL, CUT, EXP, GAUSS, LOG, ONE, _exp, _log
 
-_FAST = {"error_model": "numpy", "fastmath": {"contract"}}
+_FAST: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
 
 
 @compiled(**_FAST)

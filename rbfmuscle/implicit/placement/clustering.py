@@ -1,11 +1,14 @@
 """Cells of equal size on a closed mesh: long edges split, farthest points, clustering."""
 
+from __future__ import annotations
+
 import heapq
 from dataclasses import dataclass
 
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import face_normals, unique_edges
 from rbfmuscle.implicit.placement.control_mesh import contract_clusters
 
@@ -22,7 +25,7 @@ class FineMesh:
     parent: np.ndarray
 
 
-def refine_mesh(vertices, faces, count):
+def refine_mesh(vertices: Floats, faces: Integers, count: int) -> FineMesh:
     area = np.linalg.norm(face_normals(vertices, faces), axis=1).sum()
     limit = np.sqrt(2 / np.sqrt(3) * area / count) / FINENESS
     parent = np.arange(len(faces))
@@ -32,7 +35,9 @@ def refine_mesh(vertices, faces, count):
             return FineMesh(vertices, faces, parent)
 
 
-def _split_long_edges(vertices, faces, parent, limit):
+def _split_long_edges(
+    vertices: Floats, faces: Integers, parent: Integers, limit: float
+) -> tuple[Floats, Integers, Integers, bool]:
     """Split every edge longer than ``limit`` at its middle, conforming, once."""
     sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
     sides = np.sort(sides, axis=1)
@@ -73,7 +78,7 @@ def _split_long_edges(vertices, faces, parent, limit):
     return vertices, np.vstack(pieces), np.concatenate(parents), False
 
 
-def cluster_mesh(fine, density, count, seed):
+def cluster_mesh(fine: FineMesh, density: Floats, count: int, seed: int) -> tuple[Integers, Integers]:
     """Cells of equal ``density`` times area, and the triangulation dual to them."""
     area = np.linalg.norm(face_normals(fine.vertices, fine.faces), axis=1)
     weight = np.bincount(fine.faces.ravel(), np.repeat(area / 3, 3), len(fine.vertices)) * density
@@ -92,7 +97,7 @@ def cluster_mesh(fine, density, count, seed):
     return contract_clusters(fine.faces, labels, weight, count)
 
 
-def _neighbours(edges, size):
+def _neighbours(edges: Integers, size: int) -> tuple[Integers, Integers]:
     """Rows of neighbours: those of v are ``other[start[v]:start[v + 1]]``."""
     tail = np.concatenate([edges[:, 0], edges[:, 1]])
     head = np.concatenate([edges[:, 1], edges[:, 0]])

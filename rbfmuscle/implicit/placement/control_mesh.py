@@ -7,13 +7,18 @@ exactly two neighbours; Dey et al. 1999). What cannot be contracted goes to a ne
 is therefore closed, 2-manifold and of the input's genus, whatever the clusters look like.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.validation import MeshError
 
 
-def contract_clusters(faces, labels, weights, count):
+def contract_clusters(
+    faces: Integers, labels: Integers, weights: Floats, count: int
+) -> tuple[Integers, Integers]:
     """Contract a closed mesh to ``count`` vertices, following a clustering as far as the topology allows.
 
     Parameters
@@ -63,7 +68,7 @@ def contract_clusters(faces, labels, weights, count):
     return final, order[alive]
 
 
-def opposite_half_edges(faces):
+def opposite_half_edges(faces: Integers) -> Integers:
     """Index of the opposite half-edge of each half-edge ``3 * face + corner``.
 
     Raises

@@ -1,10 +1,22 @@
 """How densely centres lie: evenly, more of them where the surface bends, or where a trial fit misses it."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import face_normals, unique_edges, vertex_normals
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.clustering import cluster_mesh
+from rbfmuscle.validation import MeshError
+
+if TYPE_CHECKING:
+    from rbfmuscle.implicit.placement.clustering import FineMesh
+    from rbfmuscle.implicit.placement.sampling import SurfaceSample
+
 
 # Densities stay within this ratio, so that no part of the surface is left without centres that carry it.
 LARGEST_DENSITY = 30.0
@@ -13,7 +25,7 @@ GREEDY_ROUNDS = 10
 GREEDY_LARGEST = 1000
 
 
-def curvature_density(fine, count):
+def curvature_density(fine: FineMesh, count: int) -> Floats:
     """Density of centres from how much the surface bends across one cell.
 
     The mean squared turn of the normal along edges, per length squared, smoothed over a cell: it is the sum
@@ -49,11 +61,11 @@ def curvature_density(fine, count):
     return np.clip(density, 1, LARGEST_DENSITY)
 
 
-def _edge_sum(i, j, values, size):
-    return np.bincount(i, values, size) + np.bincount(j, values, size)
+def _edge_sum(i: Integers, j: Integers, values: Floats, size: int) -> Floats:
+    return np.asarray(np.bincount(i, values, size) + np.bincount(j, values, size), dtype=np.float64)
 
 
-def greedy_sample(fine, count, seed, gather):
+def greedy_sample(fine: FineMesh, count: int, seed: int, gather: Callable[..., Any]) -> SurfaceSample:
     """Cells made smaller, round by round, where a cubic Hermite fit misses the mesh.
 
     Each round fits the field to the centres, takes |f| at the mesh's vertices as the distance missed, and
@@ -71,7 +83,8 @@ def greedy_sample(fine, count, seed, gather):
     -------
     SurfaceSample
     """
-    best, least = None, np.inf
+    best: SurfaceSample | None = None
+    least = np.inf
     for density in (np.ones(len(fine.vertices)), curvature_density(fine, count)):
         for _ in range(GREEDY_ROUNDS // 2):
             labels, control = cluster_mesh(fine, density, count, seed)
@@ -84,4 +97,8 @@ def greedy_sample(fine, count, seed, gather):
             np.maximum.at(worst, labels, miss)
             factor = np.clip(worst / (3 * rms), 0.7, 2.5)
             np.clip(density * factor[labels], 1, LARGEST_DENSITY, out=density)
+    if best is None:
+        raise MeshError(
+            "no field fits centres placed on this mesh: every fit was NaN; try placement = 'even'"
+        )
     return best

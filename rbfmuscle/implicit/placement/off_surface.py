@@ -1,12 +1,18 @@
 """Points beside a surface with their signed distances, for fits to values."""
 
+from __future__ import annotations
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.validation import check_points, check_positive, check_vectors
 
 
-def off_surface_points(points, normals, *, distance=None, safety=0.5):
+def off_surface_points(
+    points: ArrayLike, normals: ArrayLike, *, distance: float | None = None, safety: float = 0.5
+) -> tuple[Floats, Floats]:
     """Points on and off a surface with their signed distances, for fits to values.
 
     Each point x gives f(x) = 0, f(x + d n) = d and f(x - d n) = -d (Carr et al. 2001). The step d is cut back

@@ -6,18 +6,29 @@ points of the surface; a centre of value v_j then moves by -v_j along its normal
 zeros and unit normals, refitted in motion like any other, and takes no more numbers.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import linalg
 from scipy.spatial.distance import cdist
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.field import RBFField, hermite_system
 from rbfmuscle.implicit.fit import assembly
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.placement.sampling import spread_points
 from rbfmuscle.implicit.selection import spacing, surface_miss
 from rbfmuscle.validation import UsageError, check_points, check_vectors
+
+if TYPE_CHECKING:
+    from rbfmuscle.implicit.fit.fitting import Basis
+    from rbfmuscle.implicit.kernels.table import Kernel
+    from rbfmuscle.implicit.placement.sampling import SurfaceSample
+
 
 # Name of this placement of centres beside those of `sampling.PLACEMENTS`.
 FITTED = "fitted"
@@ -29,7 +40,15 @@ SAMPLES = 4000
 _CHUNK = 1000
 
 
-def fit_sample(sample, vertices, faces, *, kernel="cubic", epsilon=1.0, seed=0):
+def fit_sample(
+    sample: SurfaceSample,
+    vertices: ArrayLike,
+    faces: ArrayLike,
+    *,
+    kernel: Kernel | str = "cubic",
+    epsilon: float = 1.0,
+    seed: int = 0,
+) -> SurfaceSample:
     """A `SurfaceSample` with points and normals as `fit_centres` finds them; the points then lie beside the surface.
 
     Parameters
@@ -46,12 +65,20 @@ def fit_sample(sample, vertices, faces, *, kernel="cubic", epsilon=1.0, seed=0):
     -------
     SurfaceSample
     """
-    where, _ = spread_points(vertices, faces, SAMPLES, seed=seed)
+    where, _ = spread_points(np.asarray(vertices), np.asarray(faces), SAMPLES, seed=seed)
     points, normals = fit_centres(sample.points, sample.normals, where, kernel=kernel, epsilon=epsilon)
     return replace(sample, points=points, normals=normals)
 
 
-def fit_centres(points, normals, samples, *, kernel="cubic", epsilon=1.0, rounds=ROUNDS):
+def fit_centres(
+    points: ArrayLike,
+    normals: ArrayLike,
+    samples: ArrayLike,
+    *,
+    kernel: Kernel | str = "cubic",
+    epsilon: float = 1.0,
+    rounds: int = ROUNDS,
+) -> tuple[Floats, Floats]:
     """Move centres along their normals and turn the normals, so that the field is small at the samples.
 
     Parameters
@@ -83,7 +110,7 @@ def fit_centres(points, normals, samples, *, kernel="cubic", epsilon=1.0, rounds
         )
     reach = spacing(points).mean()
 
-    def missed(where, direction):
+    def missed(where: Floats, direction: Floats) -> float:
         field = RBFField.fit_hermite(where, direction, kernel=kernel, epsilon=epsilon)
         return surface_miss(field, samples, reach)
 
@@ -96,7 +123,9 @@ def fit_centres(points, normals, samples, *, kernel="cubic", epsilon=1.0, rounds
     return best
 
 
-def _step(points, normals, samples, kernel, epsilon, reach):
+def _step(
+    points: Floats, normals: Floats, samples: Floats, kernel: Kernel, epsilon: float, reach: float
+) -> tuple[Floats, Floats]:
     """One linear least-squares problem for the values and gradients at the centres, and what follows for these."""
     count = len(points)
     basis, right, origin, scale = hermite_system(points, normals, kernel, epsilon, "all")
@@ -119,7 +148,7 @@ def _step(points, normals, samples, kernel, epsilon, reach):
     return points - (change[:count] / size)[:, None] * turned, turned
 
 
-def _rows(basis, kernel, shape, at):
+def _rows(basis: Basis, kernel: Kernel, shape: float, at: Floats) -> Floats:
     """Rows (n, size + q) of the field at scaled points: for the weights a, B and the polynomial."""
     offset = at[:, None, :] - basis.points[None]
     r = cdist(at, basis.points)

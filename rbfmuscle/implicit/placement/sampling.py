@@ -1,17 +1,25 @@
 """Centres on a closed mesh: even cover, normals, areas, and the control triangulation over them."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import barycentric_weights, face_normals, vertex_normals
 from rbfmuscle.geometry.triangles import nearest_weights
 from rbfmuscle.implicit.placement.clustering import cluster_mesh, refine_mesh
 from rbfmuscle.implicit.placement.control_mesh import opposite_half_edges
 from rbfmuscle.implicit.placement.density import GREEDY_LARGEST, curvature_density, greedy_sample
 from rbfmuscle.validation import check_mesh
+
+if TYPE_CHECKING:
+    from rbfmuscle.implicit.placement.clustering import FineMesh
 
 
 @dataclass(frozen=True)
@@ -45,7 +53,9 @@ class SurfaceSample:
     control_faces: np.ndarray
 
 
-def sample_surface(vertices, faces, count, *, seed=0, placement="adaptive"):
+def sample_surface(
+    vertices: ArrayLike, faces: ArrayLike, count: int, *, seed: int = 0, placement: str = "adaptive"
+) -> SurfaceSample:
     """Cover a closed mesh with ``count`` points.
 
     The mesh is split into ``count`` connected cells of equal size (farthest points by distance along the
@@ -98,7 +108,7 @@ CELL_SHARE = 0.5
 PLACEMENTS = ("even", "adaptive", "greedy")
 
 
-def spread_points(vertices, faces, count, *, seed=0):
+def spread_points(vertices: Floats, faces: Integers, count: int, *, seed: int = 0) -> tuple[Floats, Integers]:
     """Points on a mesh, evenly by area: one at random in each of ``count`` strips of equal area.
 
     Returns
@@ -116,7 +126,9 @@ def spread_points(vertices, faces, count, *, seed=0):
     return np.einsum("nk,nkj->nj", rng.dirichlet(np.ones(3), count), corners[which]), which
 
 
-def _gather(vertices, faces, fine, count, labels, control):
+def _gather(
+    vertices: Floats, faces: Integers, fine: FineMesh, count: int, labels: Integers, control: Integers
+) -> SurfaceSample:
     """Points, normals and areas of the cells."""
     third = np.linalg.norm(face_normals(fine.vertices, fine.faces), axis=1) / 3
     corner = labels[fine.faces]
@@ -134,7 +146,7 @@ def _gather(vertices, faces, fine, count, labels, control):
     return SurfaceSample(points, normals, areas, face, barycentric, vertex, control)
 
 
-def _normals_at(fine, points, piece, corner):
+def _normals_at(fine: FineMesh, points: Floats, piece: Integers, corner: Integers) -> Floats:
     """Normals in triangles ``piece``, drawn towards the mean of each point's cell.
 
     The mean alone flattens what the field shows between the points; the normal of the point alone makes the
@@ -144,8 +156,8 @@ def _normals_at(fine, points, piece, corner):
     weights = barycentric_weights(points, fine.vertices[corners])
     here = np.einsum("kc,kcd->kd", weights, vertex_normals(fine.vertices, fine.faces)[corners])
     vectors = face_normals(fine.vertices, fine.faces)
-    mean = [np.bincount(corner.ravel(), np.repeat(vectors[:, k], 3), len(points)) for k in range(3)]
-    mean = np.stack(mean, axis=1)
+    sums = [np.bincount(corner.ravel(), np.repeat(vectors[:, k], 3), len(points)) for k in range(3)]
+    mean: Floats = np.stack(sums, axis=1).astype(np.float64)
     mean /= np.maximum(np.linalg.norm(mean, axis=1), np.finfo(float).tiny)[:, None]
     normals = here + CELL_SHARE * mean
     cancelled = np.linalg.norm(normals, axis=1) < 1e-6
