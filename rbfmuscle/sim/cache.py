@@ -4,6 +4,8 @@ An entry is an uncompressed archive of arrays, whose checksums are tested on rea
 its place and moved there, so that several processes may build the same field and none reads half of it.
 """
 
+from __future__ import annotations
+
 import contextlib
 import hashlib
 import logging
@@ -11,8 +13,11 @@ import os
 import tempfile
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+from rbfmuscle.geometry.arrays import Array, Floats, Integers
 
 log = logging.getLogger(__name__)
 
@@ -23,7 +28,7 @@ SUFFIX = ".sdf.npz"
 _DAMAGE = (OSError, ValueError, KeyError, EOFError, IndexError, NotImplementedError, zipfile.BadZipFile)
 
 
-def cache_path():
+def cache_path() -> Path:
     """Folder of the cache: ``RBFMUSCLE_CACHE``, or the user's cache folder of the platform."""
     import platformdirs
 
@@ -31,7 +36,7 @@ def cache_path():
     return Path(place) if place else Path(platformdirs.user_cache_dir("rbfmuscle", appauthor=False)) / "sdf"
 
 
-def cache_list():
+def cache_list() -> list[dict[str, Any]]:
     """Entries as a list of dict: name, bytes, modified (seconds since the epoch), latest first."""
     found = []
     for path in cache_path().glob("*" + SUFFIX):
@@ -43,7 +48,7 @@ def cache_list():
     return sorted(found, key=lambda entry: -entry["modified"])
 
 
-def cache_clear():
+def cache_clear() -> tuple[int, int]:
     """Remove all entries, and what an interrupted process left; return their number and bytes."""
     count = size = 0
     for path in cache_path().glob("*" + SUFFIX + "*"):
@@ -54,7 +59,7 @@ def cache_clear():
     return count, size
 
 
-def content_key(vertices, faces, options):
+def content_key(vertices: Floats, faces: Integers, options: tuple[Any, ...]) -> str:
     """Name of an entry: a digest of the mesh and of all options that shape the field."""
     digest = hashlib.sha256(repr((VERSION, np.dtype(float).byteorder, options)).encode())
     for array in (vertices, faces):
@@ -63,12 +68,12 @@ def content_key(vertices, faces, options):
     return digest.hexdigest()[:32]
 
 
-def has_arrays(key):
+def has_arrays(key: str) -> bool:
     """Whether there is an entry of this name; it may still turn out to be damaged."""
     return (cache_path() / (key + SUFFIX)).exists()
 
 
-def load_arrays(key):
+def load_arrays(key: str) -> dict[str, Array] | None:
     """Arrays of an entry by name, or None where there is none; a damaged entry is removed."""
     path = cache_path() / (key + SUFFIX)
     if not path.exists():
@@ -87,7 +92,7 @@ def load_arrays(key):
     return arrays
 
 
-def store_arrays(key, arrays):
+def store_arrays(key: str, arrays: dict[str, Any]) -> None:
     """Keep arrays under a name; a cache that cannot be written is reported in the log and does no harm."""
     folder = cache_path()
     try:

@@ -5,11 +5,16 @@ outer band about the surface or errs; half blocks in the outer band; fine cells,
 the inner band.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Array, Booleans, Floats, Integers
 from rbfmuscle.geometry.exact_distance import STACK, nearest_triangle, record_square, signed_side
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.geometry.triangles import FIRST
@@ -17,6 +22,10 @@ from rbfmuscle.sim.distance.cells import BLOCK
 from rbfmuscle.sim.distance.lattice import corner_ids, lattice, mark_corners, mark_loop, small_ids_loop
 from rbfmuscle.sim.distance.lists import LONGEST, SLACK, folded_list, list_loop
 from rbfmuscle.sim.distance.query import COUNT
+
+if TYPE_CHECKING:
+    from rbfmuscle.geometry.exact_distance import ExactDistance
+
 
 # Fine cells of a block.
 CUT = BLOCK**3
@@ -63,7 +72,9 @@ class _Nodes:
 class _Builder:
     """What all levels share, and the lists so far."""
 
-    def __init__(self, exact, origin, unit, inside, doubtful):
+    def __init__(
+        self, exact: ExactDistance, origin: Floats, unit: float, inside: Any, doubtful: Booleans | None
+    ) -> None:
         self.exact, self.origin, self.unit, self.inside = exact, origin, unit, inside
         self.doubtful = (
             np.zeros(len(exact.faces), dtype=np.bool_) if doubtful is None else doubtful[exact.order]
@@ -72,11 +83,12 @@ class _Builder:
         place[exact.order] = np.arange(len(exact.order))
         turn = (exact.records[:, FIRST].astype(np.int64)[:, None] + np.arange(3)) % 3
         self.across = place[np.maximum(exact.across[exact.order[:, None], turn], -1)]
-        self.lists, self.corners = [], []
+        self.lists: list[Array] = []
+        self.corners: list[Array] = []
         self.length = self.rows = self.count = 0
         self.sound = True
 
-    def nodes(self, index, edge, near=None):
+    def nodes(self, index: Array, edge: float, near: Array | None = None) -> Any:
         """Exact distances at lattice points ``index`` (n, 3) times ``edge``; ``near`` names a near record."""
         points = self.origin + edge * index
         record, distance = np.empty(len(points), dtype=np.int32), np.empty(len(points))
@@ -96,7 +108,16 @@ class _Builder:
             distance = signed
         return _Nodes(record, distance, doubt)
 
-    def write(self, low, edge, ids, corners, centres, *, probe=True):
+    def write(
+        self,
+        low: Integers,
+        edge: float,
+        ids: Array,
+        corners: Any,
+        centres: Array | None,
+        *,
+        probe: bool = True,
+    ) -> Array:
         """Lists of cells with least corner ``low`` (n, 3) in edges, probed inside; returns their offsets
         (n,)."""
         count = len(ids)
@@ -127,7 +148,15 @@ class _Builder:
         return offsets
 
 
-def build_cells(exact, spacing, band, *, inside=None, region=None, doubtful=None):
+def build_cells(
+    exact: ExactDistance,
+    spacing: float,
+    band: float,
+    *,
+    inside: Callable[..., Any] | None = None,
+    region: Floats | None = None,
+    doubtful: Booleans | None = None,
+) -> Cells:
     """Sparse cells about the mesh of an exact tree.
 
     Parameters
@@ -167,7 +196,7 @@ def build_cells(exact, spacing, band, *, inside=None, region=None, doubtful=None
     return Cells(origin, block, builder.unit, *tables, builder.sound, builder.count)
 
 
-def grid_shape(low, high, spacing, band):
+def grid_shape(low: Floats, high: Floats, spacing: float, band: float) -> Integers:
     """Coarse cells of the grid along each axis."""
     margin = band + BLOCK * spacing
     return np.maximum(np.ceil((high - low + 2 * margin) / (BLOCK * BLOCK * spacing)).astype(np.int64), 1)

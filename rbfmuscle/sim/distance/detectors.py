@@ -3,11 +3,22 @@
 They are baselines, correct and small. None is a default.
 """
 
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Booleans, Floats, MeshLike
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.sim.distance.mesh import prepare_bone, winding_test
 from rbfmuscle.validation import UsageError, check_mesh, check_points
+
+if TYPE_CHECKING:
+    pass
+
 
 # Share of the longest side that a baseline's grid reaches beyond the mesh.
 MARGIN = 0.1
@@ -18,7 +29,13 @@ class PointDetector:
 
     closed = True
 
-    def distance_and_gradient(self, points, pose=None, reach=np.inf):
+    def _local(self, points: Floats) -> tuple[Floats, Floats]:
+        """Distances (n,) and gradients (n, 3) in bone coordinates."""
+        raise NotImplementedError
+
+    def distance_and_gradient(
+        self, points: Floats, pose: Floats | None = None, reach: Floats | float = np.inf
+    ) -> tuple[Floats, Floats]:
         """Signed distance (n,) and gradient (n, 3), in the axes of ``points``; ``reach`` is not made use
         of."""
         points = check_points(points)
@@ -28,20 +45,22 @@ class PointDetector:
         distance, gradient = self._local((points - pose[:3, 3]) @ pose[:3, :3])
         return distance, gradient @ pose[:3, :3].T
 
-    def distance(self, points, pose=None, *, reach=np.inf):
+    def distance(
+        self, points: Floats, pose: Floats | None = None, *, reach: Floats | float = np.inf
+    ) -> Floats:
         """Signed distance (n,) [unit of the mesh], negative inside."""
         return self.distance_and_gradient(points, pose)[0]
 
-    def gradient(self, points, pose=None):
+    def gradient(self, points: Floats, pose: Floats | None = None) -> Floats:
         """Gradient of the distance, (n, 3)."""
         return self.distance_and_gradient(points, pose)[1]
 
-    def direction(self, points, pose=None):
+    def direction(self, points: Floats, pose: Floats | None = None) -> Floats:
         """Unit direction (n, 3) in which the distance grows."""
         gradient = self.gradient(points, pose)
         return gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-300)
 
-    def closest_point(self, points, pose=None):
+    def closest_point(self, points: Floats, pose: Floats | None = None) -> Floats:
         """Surface point (n, 3) that distance and direction point to."""
         distance, gradient = self.distance_and_gradient(points, pose)
         square = np.maximum((gradient * gradient).sum(axis=1), 0.25)
@@ -51,18 +70,18 @@ class PointDetector:
 class TreeDetector(PointDetector):
     """Every query asks the bounding volume tree for the nearest triangle: exact, and the slowest."""
 
-    def __init__(self, exact):
+    def __init__(self, exact: ExactDistance) -> None:
         self.exact = exact
         self.bounds = np.array([exact.vertices.min(axis=0), exact.vertices.max(axis=0)])
 
     @classmethod
-    def from_mesh(cls, mesh):
+    def from_mesh(cls, mesh: MeshLike) -> TreeDetector:
         """Tree of a closed mesh (trimesh.Trimesh or a pair of vertices and faces)."""
         pair = mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)
         return cls(ExactDistance(*check_mesh(*pair)))
 
     @property
-    def memory(self):
+    def memory(self) -> int:
         """Bytes of the tree and its triangles."""
         arrays = (self.exact.boxes, self.exact.records, self.exact.edge_normals, self.exact.vertex_normals)
         return sum(array.nbytes for array in arrays)
@@ -83,7 +102,7 @@ class VoxelDetector(PointDetector):
     diagonal.
     """
 
-    def __init__(self, inside, origin, edge):
+    def __init__(self, inside: Booleans, origin: Floats, edge: Floats | float) -> None:
         from scipy.ndimage import distance_transform_edt
 
         self.inside, self.origin, self.edge = inside, origin, edge
@@ -94,7 +113,7 @@ class VoxelDetector(PointDetector):
         self.values = np.where(inside, half - inward, outward - half).astype(np.float32)
 
     @classmethod
-    def from_mesh(cls, mesh, *, resolution=64):
+    def from_mesh(cls, mesh: MeshLike, *, resolution: int = 64) -> VoxelDetector:
         """Voxels along each axis of the mesh's box, widened by a tenth of its longest side."""
         exact, low, high = grid_of(mesh)
         edge = (high - low) / resolution
@@ -102,7 +121,7 @@ class VoxelDetector(PointDetector):
         return cls(sample_nodes(exact.signed_distance, axes) < 0.0, low, edge)
 
     @property
-    def memory(self):
+    def memory(self) -> int:
         """Bytes of the voxels."""
         return self.inside.nbytes + self.values.nbytes
 
@@ -121,7 +140,7 @@ class VoxelDetector(PointDetector):
         return distance.astype(np.float64), gradient
 
 
-def grid_of(mesh):
+def grid_of(mesh: MeshLike) -> tuple[Any, Floats, Floats]:
     """Exact distance of a mesh, and the box (low, high) of a baseline's grid around it."""
     vertices, faces = (mesh.vertices, mesh.faces) if hasattr(mesh, "faces") else mesh
     bone = prepare_bone(np.asarray(vertices), np.asarray(faces))
@@ -136,21 +155,21 @@ def grid_of(mesh):
 class _WoundDistance:
     """Distance of an open mesh with the sign of its winding number."""
 
-    def __init__(self, exact, inside):
+    def __init__(self, exact: ExactDistance, inside: Callable[[Floats], Booleans]) -> None:
         self.exact, self.inside = exact, inside
 
-    def signed_distance(self, points):
+    def signed_distance(self, points: Floats) -> Floats:
         distance = np.abs(self.exact.signed_distance(points))
         return np.where(self.inside(points), -distance, distance)
 
 
-def sample_nodes(function, axes):
+def sample_nodes(function: Callable[[Floats], Floats], axes: Sequence[Floats]) -> Floats:
     """Values of a function at the nodes of a grid given by its three axes."""
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     return function(nodes.reshape(-1, 3)).reshape(nodes.shape[:3])
 
 
-def build_detector(name, mesh, **options):
+def build_detector(name: str, mesh: MeshLike, **options: Any) -> Any:
     """Detector of a bone by name: ``sdf`` (`BoneSDF`), ``spline``, ``serendipity``, ``voxel`` or ``bvh``.
 
     Options are those of the detector's ``from_mesh``.
@@ -160,17 +179,17 @@ def build_detector(name, mesh, **options):
     UsageError
         If there is no detector of that name.
     """
-    if name == "sdf":
-        from rbfmuscle.sim.distance.sdf import BoneSDF as kind
-    elif name == "spline":
-        from rbfmuscle.sim.distance.spline import SplineField as kind
-    elif name == "serendipity":
-        from rbfmuscle.sim.distance.serendipity import SerendipityField as kind
-    elif name in ("voxel", "bvh"):
-        kind = VoxelDetector if name == "voxel" else TreeDetector
-    else:
+    if name not in _HOME:
         raise UsageError(f"no detector is called {name!r}; there are {', '.join(DETECTOR_NAMES)}")
-    return kind.from_mesh(mesh, **options)
+    module, kind = _HOME[name]
+    return getattr(importlib.import_module(module), kind).from_mesh(mesh, **options)
 
 
-DETECTOR_NAMES = ("sdf", "spline", "serendipity", "voxel", "bvh")
+_HOME = {
+    "sdf": ("rbfmuscle.sim.distance.sdf", "BoneSDF"),
+    "spline": ("rbfmuscle.sim.distance.spline", "SplineField"),
+    "serendipity": ("rbfmuscle.sim.distance.serendipity", "SerendipityField"),
+    "voxel": ("rbfmuscle.sim.distance.detectors", "VoxelDetector"),
+    "bvh": ("rbfmuscle.sim.distance.detectors", "TreeDetector"),
+}
+DETECTOR_NAMES = tuple(_HOME)

@@ -1,16 +1,22 @@
 """Corners of the cells of a bone's distance field: which there are, and which cells share them."""
 
+from __future__ import annotations
+
+from collections.abc import Iterable
+
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Array, Integers
 
 
-def lattice(shape):
+def lattice(shape: Iterable[int]) -> Integers:
     """All integer points (n, 3) of a box of this shape, in C order."""
-    return np.stack(np.meshgrid(*[np.arange(n) for n in shape], indexing="ij"), axis=-1).reshape(-1, 3)
+    axes: list[Integers] = [np.arange(n) for n in shape]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def mark_corners(blocks, shape):
+def mark_corners(blocks: Integers, shape: tuple[int, int, int]) -> tuple[Array, Integers]:
     """Number of each corner of the blocks in a dense table (-1 elsewhere), and the corners (n, 3) in
     order."""
     index = np.full(np.array(shape) + 1, -1, dtype=np.int32)
@@ -21,7 +27,7 @@ def mark_corners(blocks, shape):
     return index, wanted
 
 
-def corner_ids(low, index):
+def corner_ids(low: Integers, index: Array) -> Array:
     """Numbers (n, 8) of the corners of cells with least corner ``low`` (n, 3), from a dense table."""
     ids = [index[tuple((low + step).T)] for step in lattice((2, 2, 2))]
     return np.ascontiguousarray(np.stack(ids, axis=1))

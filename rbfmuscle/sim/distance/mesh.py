@@ -1,12 +1,21 @@
 """What a bone's mesh allows: which triangles count, and where the sign of the distance comes from."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.geometry.triangles import opposite_faces, vertex_faces
 from rbfmuscle.validation import MeshError, check_mesh
+
+if TYPE_CHECKING:
+    pass
+
 
 # Area below this share of the squared longest edge is rounding.
 LEAST_SHAPE = 1e-12
@@ -31,12 +40,12 @@ class BoneMesh:
     notes: list = field(default_factory=list)
 
     @property
-    def closed(self):
+    def closed(self) -> bool:
         """Whether each edge has one face on each side, consistently oriented."""
         return not self.doubtful.any()
 
 
-def prepare_bone(vertices, faces, *, name="bone"):
+def prepare_bone(vertices: Floats, faces: Integers, *, name: str = "bone") -> BoneMesh:
     """Clean arrays for a distance field: no degenerate or duplicate faces, outward as far as that can be
     told.
 
@@ -69,7 +78,7 @@ def prepare_bone(vertices, faces, *, name="bone"):
     return mesh
 
 
-def winding_test(mesh):
+def winding_test(mesh: Any) -> Callable[[Floats], Booleans]:
     """``inside(points) -> (n,) bool`` by generalised winding numbers (Barill 2018)."""
     import igl
 

@@ -5,12 +5,16 @@ Distances are negative inside. What a query reads, and how, is in ``sdf_query.py
 ``sdf_build.py``.
 """
 
+from __future__ import annotations
+
 import logging
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from rbfmuscle.geometry.arrays import Floats, MeshLike
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.rest_frame import BoneFrame, on_one_line
 from rbfmuscle.geometry.threads import in_chunks
@@ -21,6 +25,10 @@ from rbfmuscle.sim.distance.cells import BLOCK
 from rbfmuscle.sim.distance.mesh import prepare_bone, winding_test
 from rbfmuscle.sim.distance.query import FieldData, query_loop
 from rbfmuscle.validation import MeshError, check_mesh, check_points, check_positive
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.distance.build import Cells
+
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +70,7 @@ class BoneSDF:
         gives the same field.
     """
 
-    def __init__(self, vertices, frame, parts):
+    def __init__(self, vertices: Floats, frame: BoneFrame, parts: Any) -> None:
         self.vertices, self.faces, self.notes = vertices, parts.faces, tuple(parts.notes)
         used = self.vertices[np.unique(self.faces)]
         self.bounds = np.array([used.min(axis=0), used.max(axis=0)])
@@ -72,30 +80,37 @@ class BoneSDF:
         self._frame = frame
 
     @property
-    def memory(self):
+    def memory(self) -> int:
         """Bytes that queries read."""
         return sum(array.nbytes for array in self.data)
 
     @property
-    def fine_cells(self):
+    def fine_cells(self) -> int:
         """Number of fine cells."""
         return self.data.cells.size
 
     @cached_property
-    def exact(self):
+    def exact(self) -> ExactDistance:
         """The exact distance to the mesh (:class:`ExactDistance`), built when first asked for."""
         return ExactDistance(self.vertices, self.faces)
 
     @staticmethod
-    def is_kept(mesh, *, tolerance=None, region=None):
+    def is_kept(mesh: MeshLike, *, tolerance: float | None = None, region: ArrayLike | None = None) -> bool:
         """Whether :meth:`from_mesh` would find this field in the cache on disk."""
         vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
         return has_arrays(_key(vertices, faces, tolerance, region, MEMORY_LIMIT))
 
     @classmethod
     def from_mesh(
-        cls, mesh, *, tolerance=None, region=None, cache=True, memory_limit=MEMORY_LIMIT, name="bone"
-    ):
+        cls,
+        mesh: MeshLike,
+        *,
+        tolerance: float | None = None,
+        region: ArrayLike | None = None,
+        cache: bool = True,
+        memory_limit: int = MEMORY_LIMIT,
+        name: str = "bone",
+    ) -> BoneSDF:
         """Build the field of a bone, or take it from the cache.
 
         Parameters
@@ -127,7 +142,7 @@ class BoneSDF:
         if region is not None and (region.shape != (2, 3) or np.any(region[0] > region[1])):
             raise ValueError(f"region must be (2, 3), least corner first, got {region.tolist()}")
         key = _key(vertices, faces, tolerance, region, memory_limit) if cache else None
-        arrays = load_arrays(key) if cache else None
+        arrays = None if key is None else load_arrays(key)
         parts = None if arrays is None else _from_arrays(arrays)
         vertices, faces = check_mesh(vertices, faces, name=name)
         if parts is None and on_one_line(vertices):
@@ -137,13 +152,15 @@ class BoneSDF:
             parts = _build(
                 prepare_bone(frame.local, faces, name=name), frame, tolerance, region, memory_limit, name
             )
-            if cache:
+            if key is not None:
                 store_arrays(key, _to_arrays(parts))
         for note in parts.notes:
             log.warning("%s: %s", name, note)
         return cls(vertices, frame, parts)
 
-    def distance(self, points, pose=None, *, reach=np.inf):
+    def distance(
+        self, points: ArrayLike, pose: ArrayLike | None = None, *, reach: ArrayLike = np.inf
+    ) -> Floats:
         """Signed distance of points, (n,) [unit of the mesh], negative inside the bone.
 
         Parameters
@@ -168,11 +185,13 @@ class BoneSDF:
         out *= size
         return out
 
-    def gradient(self, points, pose=None):
+    def gradient(self, points: Floats, pose: Floats | None = None) -> Floats:
         """Gradient of the distance, (n, 3) unit vectors in the axes of ``points``."""
         return self.distance_and_gradient(points, pose)[1]
 
-    def distance_and_gradient(self, points, pose=None, reach=np.inf):
+    def distance_and_gradient(
+        self, points: Floats, pose: Floats | None = None, reach: Floats | float = np.inf
+    ) -> tuple[Floats, Floats]:
         """Signed distance (n,) and its gradient (n, 3), which is a unit vector; parameters as for `distance`.
 
         On the surface the gradient is the normal of the triangle. It is zero where only a lower bound is
@@ -191,11 +210,11 @@ class BoneSDF:
         gradient *= size
         return distance, gradient
 
-    def direction(self, points, pose=None):
+    def direction(self, points: Floats, pose: Floats | None = None) -> Floats:
         """Unit direction (n, 3) in which the distance grows: out of the bone, also from inside."""
         return self.gradient(points, pose)
 
-    def closest_point(self, points, pose=None):
+    def closest_point(self, points: Floats, pose: Floats | None = None) -> Floats:
         """Nearest point (n, 3) of the bone's mesh, exact."""
         points, pose = check_points(points), _check_pose(pose)
         local = (points - pose[:3, 3]) @ pose[:3, :3]
@@ -317,7 +336,7 @@ def _measure(mesh, data, exact, band, region):
     return float(np.sqrt(np.mean(difference**2)))
 
 
-def pack_field(exact, cells):
+def pack_field(exact: ExactDistance, cells: Cells) -> FieldData:
     """Arrays for queries, single precision and relative to the grid's origin, where that loses nothing."""
     records = np.empty((len(exact.records), 16), dtype=np.float32)
     records[:, :3] = exact.records[:, :3] - cells.origin

@@ -3,11 +3,21 @@
 It stands beside `BoneSDF` to be compared with it; nothing uses it by default.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import MeshLike
 from rbfmuscle.sim.distance.detectors import PointDetector, grid_of, sample_nodes
 from rbfmuscle.validation import check_points
+
+if TYPE_CHECKING:
+    pass
 
 
 class SerendipityField(PointDetector):
@@ -23,7 +33,9 @@ class SerendipityField(PointDetector):
         Cells along each axis.
     """
 
-    def __init__(self, function, low, high, cells):
+    def __init__(
+        self, function: Callable[..., Any], low: ArrayLike, high: ArrayLike, cells: ArrayLike
+    ) -> None:
         self.low, self.high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         shape = np.broadcast_to(np.asarray(cells, dtype=np.int64), (3,))
         self.edge = (self.high - self.low) / shape
@@ -38,13 +50,13 @@ class SerendipityField(PointDetector):
         return sample_nodes(function, [self.low[k] + self.edge[k] * steps[k] for k in range(3)])
 
     @classmethod
-    def from_mesh(cls, mesh, *, cells=64):
+    def from_mesh(cls, mesh: MeshLike, *, cells: int = 64) -> SerendipityField:
         """Field of a mesh over its box, widened by a tenth of the longest side."""
         exact, low, high = grid_of(mesh)
         return cls(exact.signed_distance, low, high, cells)
 
     @property
-    def memory(self):
+    def memory(self) -> int:
         """Bytes of the node values."""
         return sum(values.nbytes for values in self.nodes)
 

@@ -3,11 +3,21 @@
 It stands beside `BoneSDF` to be compared with it; nothing uses it by default.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import MeshLike
 from rbfmuscle.sim.distance.detectors import PointDetector, grid_of, sample_nodes
 from rbfmuscle.validation import check_points
+
+if TYPE_CHECKING:
+    pass
 
 
 class SplineField(PointDetector):
@@ -23,7 +33,7 @@ class SplineField(PointDetector):
         Edge of a cell.
     """
 
-    def __init__(self, function, low, high, spacing):
+    def __init__(self, function: Callable[..., Any], low: ArrayLike, high: ArrayLike, spacing: float) -> None:
         from scipy.ndimage import spline_filter
 
         self.bounds = np.array([low, high], dtype=np.float64)
@@ -35,14 +45,14 @@ class SplineField(PointDetector):
         self.coefficients = spline_filter(sample_nodes(function, axes), order=3, mode="mirror")
 
     @classmethod
-    def from_mesh(cls, mesh, *, nodes=1_900_000):
+    def from_mesh(cls, mesh: MeshLike, *, nodes: int = 1_900_000) -> SplineField:
         """Field of a mesh over its box, widened by a tenth of the longest side, with about this many
         nodes."""
         exact, low, high = grid_of(mesh)
         return cls(exact.signed_distance, low, high, float(np.prod(high - low) / nodes) ** (1 / 3))
 
     @property
-    def memory(self):
+    def memory(self) -> int:
         """Bytes of the coefficients."""
         return self.coefficients.nbytes
 
