@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test check bench docs clean
+.PHONY: demo test test-fast test-nojit coverage check bench figures docs release-check clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -21,15 +21,36 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(BIN)/python -m pytest
 
+# What each list holds, and why, stands at its top.
+test-fast: $(STAMP)
+	$(BIN)/python -m pytest -q $$(grep -v '^#' tests/fast.txt)
+
+test-nojit: $(STAMP)
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q $$(grep -v '^#' tests/nojit.txt)
+
+# Loops count as covered where they run as Python: without compiler; the rest by the quick tests.
+coverage: $(STAMP)
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q --cov --cov-report= $$(grep -v '^#' tests/nojit.txt)
+	$(BIN)/python -m pytest -q --cov --cov-append --cov-report=term:skip-covered $$(grep -v '^#' tests/fast.txt)
+
 check: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/mypy
 	$(BIN)/python -m pytest -q tests/contract/test_layers.py
 
 bench: $(STAMP)
 	$(BIN)/python -m pip install --quiet -e ".[bench]" || echo "some peers are not to be had; the table says which"
 	$(BIN)/python benchmarks/table.py -o benchmarks/last.json
 	$(BIN)/python benchmarks/interpolation.py
+
+# Measures what the tables of the pages show, writes the JSON files of docs/evidence and the tables from them.
+figures: $(STAMP)
+	$(BIN)/python docs/figures.py --measure
+
+# A wheel and an sdist, installed in a clean environment each, and the embedded hip run there.
+release-check: $(STAMP)
+	$(BIN)/python -m pytest -q -m slow tests/contract/test_release.py
 
 docs: $(STAMP)
 	$(BIN)/python -c "import furo, myst_parser, sphinx" 2>/dev/null || $(BIN)/python -m pip install --quiet -e ".[docs]"

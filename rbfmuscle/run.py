@@ -170,14 +170,17 @@ class Run:
 
     @property
     def frames(self) -> list[Frame]:
+        """Frames that were written, in their order."""
         return self._memory.frames
 
     @property
     def metrics(self) -> list[Row]:
+        """Rows (frame, coordinate, angle [degree], muscle, quantity, value, unit), frame by frame."""
         return self._memory.rows
 
     @property
     def events(self) -> list[Event]:
+        """Events of all frames, in their order."""
         return [event for frame in self.frames for event in frame.events]
 
     @property

@@ -32,6 +32,7 @@ class Progress:
         return self
 
     def __call__(self, done, total):
+        """Draw how much is done."""
         if self.bar is not None:
             self.bar.update(self.task, description=self.title, completed=done, total=total)
         elif done == total or time.monotonic() - self.last >= EVERY:

@@ -31,6 +31,7 @@ class LoopCache(_Cache):
 
     @property
     def cache_path(self):
+        """Folder that is written to, None where there is none."""
         return str(folders()[0]) if folders() else None
 
     @cached_property
@@ -46,6 +47,7 @@ class LoopCache(_Cache):
         return f"{short}-{hashlib.sha256(text.encode()).hexdigest()[:24]}"
 
     def load_overload(self, sig, target_context):
+        """The compiled loop for these argument types, None where it is not kept."""
         if not self.enabled:
             return None
         target_context.refresh()
@@ -70,6 +72,7 @@ class LoopCache(_Cache):
         return found
 
     def save_overload(self, sig, data):
+        """Keep a compiled loop."""
         arguments = _arguments(sig)
         try:
             if self.enabled and folders() and not data.lifted and not data.library.has_dynamic_globals:
@@ -84,9 +87,11 @@ class LoopCache(_Cache):
             lock.release()
 
     def enable(self):
+        """Read and write from now on."""
         self.enabled = True
 
     def disable(self):
+        """Neither read nor write from now on."""
         self.enabled = False
 
     def flush(self):

@@ -137,9 +137,9 @@ def _add_gradient_loop(a, bx, by, bz, e2, hermite, radial, d, g):
 
 @compiled(error_model="numpy", fastmath={"contract"})
 def _add_hessian_loop(a, bx, by, bz, e2, hermite, radial, d, h):
-    """h (6: xx yy zz xy xz yz) += a (first I + second d d^T) minus, for Hermite weights B,
+    """Add the second derivatives to h (6: xx yy zz xy xz yz).
 
-    second ((B . d) I + d B^T + B d^T) + third (B . d) d d^T.
+    a (first I + second d d^T), less second ((B . d) I + d B^T + B d^T) + third (B . d) d d^T for Hermite weights B.
     """
     first, second, third = radial[1], radial[2], radial[3]
     e4 = e2 * e2

@@ -91,9 +91,11 @@ class ElasticSolver:
         )  # fmt: skip
 
     def snapshot(self):
+        """The contact forces, to come back to."""
         return self.contact.forces.copy()
 
     def restore(self, forces):
+        """Go back to the forces of a `snapshot`."""
         self.contact.forces = forces.copy()
 
     def carry(self, x):

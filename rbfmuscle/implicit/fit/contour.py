@@ -59,6 +59,7 @@ class System:
     def of(
         cls, points: Floats, kernel: str, degree: Any, reach: float
     ) -> tuple[System, tuple[Floats, float]]:
+        """The system of these points in their own frame, and that frame (origin, scale)."""
         kernel = get_kernel(kernel)
         if kernel.base not in (radial.GAUSS, radial.BINOMIAL):
             raise UsageError(

@@ -26,6 +26,7 @@ class FineMesh:
 
 
 def refine_mesh(vertices: Floats, faces: Integers, count: int) -> FineMesh:
+    """Split long edges until ``count`` cells of even size can be made of the mesh's triangles."""
     area = np.linalg.norm(face_normals(vertices, faces), axis=1).sum()
     limit = np.sqrt(2 / np.sqrt(3) * area / count) / FINENESS
     parent = np.arange(len(faces))

@@ -44,7 +44,8 @@ FAR_DIRECTIONS = 200
 @dataclass
 class Cells:
     """The sparse grid, arrays named as in FieldData; ``sound`` tells whether the signs agree with the
-    distances."""
+    distances.
+    """
 
     origin: np.ndarray
     block: float
@@ -62,7 +63,8 @@ class Cells:
 @dataclass
 class _Nodes:
     """Points where the exact distance was asked for: nearest record, signed distance, doubt about the
-    sign."""
+    sign.
+    """
 
     record: np.ndarray
     distance: np.ndarray
@@ -119,7 +121,8 @@ class _Builder:
         probe: bool = True,
     ) -> Array:
         """Lists of cells with least corner ``low`` (n, 3) in edges, probed inside; returns their offsets
-        (n,)."""
+        (n,).
+        """
         count = len(ids)
         offsets = np.empty(count, dtype=np.int32)
         rows = np.empty((count if self.inside is not None else 0, 12), dtype=np.float32)
@@ -223,7 +226,8 @@ def _coarse_level(builder, shape, edge, band, box):
 
 def _block_level(builder, table, chosen, edge, bands, box):
     """Put the blocks' lists, and what refers to smaller cells, in the table; return the smaller cells (k,
-    64)."""
+    64).
+    """
     if len(chosen) == 0:
         return np.zeros((0, CUT), dtype=np.int32)
     index, wanted = mark_corners(chosen, table.shape)
@@ -356,7 +360,8 @@ def _active_loop(ids, distance, centre, edge, band, side, active):
 @compiled
 def _near_loop(blocks, offsets, lists, records, origin, edge, band, side, active):
     """Unmark small cells that a block's triangles show to be out of the band, unless the surface is
-    folded."""
+    folded.
+    """
     small = edge / side
     limit = (band + 0.5 * np.sqrt(3.0) * small) ** 2
     for i in range(len(blocks)):

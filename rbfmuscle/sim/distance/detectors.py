@@ -37,7 +37,8 @@ class PointDetector:
         self, points: Floats, pose: Floats | None = None, reach: Floats | float = np.inf
     ) -> tuple[Floats, Floats]:
         """Signed distance (n,) and gradient (n, 3), in the axes of ``points``; ``reach`` is not made use
-        of."""
+        of.
+        """
         points = check_points(points)
         if pose is None:
             return self._local(points)

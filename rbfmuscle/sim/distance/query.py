@@ -73,7 +73,8 @@ class FieldData(NamedTuple):
 @compiled(error_model="numpy", inline="always")
 def _square(n, x, y, z, records):
     """Squared distance to record n of a point relative to the origin, in single precision; without branches, as they
-    are a toss-up."""
+    are a toss-up.
+    """
     zero, one = np.float32(0.0), np.float32(1.0)
     qx, qy, qz = np.float32(x) - records[n, 0], np.float32(y) - records[n, 1], np.float32(z) - records[n, 2]
     u = qx * records[n, 3] + qy * records[n, 4] + qz * records[n, 5]
@@ -132,7 +133,8 @@ def _mixed_side(x, y, z, entry, lists, corners):
 @compiled(error_model="numpy", inline="always")
 def _offset(n, x, y, z, records):
     """Offset of a point from its nearest point of record n, in the record's frame; and whether that is
-    inside."""
+    inside.
+    """
     qx, qy, qz = x - records[n, 0], y - records[n, 1], z - records[n, 2]
     u = qx * records[n, 3] + qy * records[n, 4] + qz * records[n, 5]
     v = qx * records[n, 6] + qy * records[n, 7] + qz * records[n, 8]
@@ -265,7 +267,8 @@ def _stage(points, pose, reach, grid, blocks, cells, lists, far, records, local,
 @compiled(error_model="numpy")
 def _finish(count, local, entry, best, square, offset, lists, corners, records, en, vn, vertices, across):
     """Turn squared into signed distances, and fill the offsets from the surface in the frames of the
-    records."""
+    records.
+    """
     for n in range(count):
         if best[n] < 0:
             continue

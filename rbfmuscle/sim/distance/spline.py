@@ -47,7 +47,8 @@ class SplineField(PointDetector):
     @classmethod
     def from_mesh(cls, mesh: MeshLike, *, nodes: int = 1_900_000) -> SplineField:
         """Field of a mesh over its box, widened by a tenth of the longest side, with about this many
-        nodes."""
+        nodes.
+        """
         exact, low, high = grid_of(mesh)
         return cls(exact.signed_distance, low, high, float(np.prod(high - low) / nodes) ** (1 / 3))
 

@@ -119,6 +119,7 @@ class ModelProbe:
         self._material = {}
 
     def __call__(self, models, frame):
+        """Take what is kept of a frame; the rest states where ``frame`` is None."""
         if frame is None:
             for model in models:
                 vertices, faces = model.carried_mesh()

@@ -48,6 +48,7 @@ class SweepPoint:
 
     @property
     def is_reference(self):
+        """Whether others are compared with this point."""
         return self.key == self.reference
 
     @property
@@ -108,6 +109,7 @@ class SweepPlan:
 
     @property
     def references(self):
+        """Points that others are compared with."""
         return [point for point in self.points if point.is_reference]
 
     def slice(self, part):
@@ -119,9 +121,11 @@ class SweepPlan:
         return others[i - 1 :: n] if i else []
 
     def point(self, key):
+        """The point of a key."""
         return next(point for point in self.points if point.key == key)
 
     def as_dict(self):
+        """What ``plan.json`` holds."""
         points = [
             {
                 "key": p.key,
@@ -136,6 +140,7 @@ class SweepPlan:
 
     @classmethod
     def from_dict(cls, values):
+        """The plan that ``plan.json`` holds."""
         values = dict(values)
         if values.pop("format", None) != FORMAT:
             raise UsageError(f"this sweep's plan has another format than {FORMAT}; run the sweep again")
@@ -310,6 +315,7 @@ class SweepFolder:
         return self._result_file(key, True).exists()
 
     def forget(self, key):
+        """Take a point's result away."""
         (self.points / f"{key}.json").unlink(missing_ok=True)
 
     def surface_file(self, key):

@@ -39,6 +39,7 @@ class FibreFiles:
         self._collection.add(frame.index, entries)
 
     def close(self):
+        """End the files."""
         self._file.close()
         self._collection.close()
 

@@ -127,6 +127,7 @@ class Collection:
         self._close_tags()
 
     def close(self):
+        """End the file."""
         self._file.close()
 
     def _close_tags(self):

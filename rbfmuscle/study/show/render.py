@@ -194,6 +194,7 @@ class Stage:
         return self.plotter.screenshot(return_img=True)
 
     def close(self):
+        """Let the plotter go."""
         self.plotter.close()
 
     def _add_bone(self, mesh):

@@ -223,6 +223,7 @@ class LiveViewer(Viewer):
             self.session.set(name, value)
 
     def colour_by(self, name):
+        """Show another quantity in colours."""
         super().colour_by(name)
         self._stale = True
 
@@ -329,6 +330,7 @@ class SavedViewer(Viewer):
         return self.saved.frames.index(frame)
 
     def colour_by(self, name):
+        """Show another quantity in colours."""
         super().colour_by(name)
         self._stale = True
 

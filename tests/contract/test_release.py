@@ -1,0 +1,78 @@
+"""What a release consists of: one version everywhere, every package found, a distribution that installs and runs."""
+
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import rbfmuscle
+
+ROOT = Path(__file__).resolve().parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+
+
+def test_one_version_everywhere():
+    version = PROJECT["project"]["version"]
+    assert rbfmuscle.__version__ == version
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert re.search(r"^version: (.+)$", citation, re.M).group(1) == version
+    changes = (ROOT / "docs" / "changes.md").read_text(encoding="utf-8")
+    assert re.search(r"^## (\S+)", changes, re.M).group(1) == version
+
+
+def test_changes_are_grouped_by_kind():
+    changes = (ROOT / "docs" / "changes.md").read_text(encoding="utf-8")
+    kinds = re.findall(r"^### (.+)$", changes, re.M)
+    assert set(kinds) <= {"Added", "Changed", "Faster", "Fixed", "Removed"}
+    assert kinds
+
+
+def test_every_folder_with_modules_is_a_package():
+    for top in ("rbfmuscle", "pbd_baseline"):
+        assert (ROOT / top / "py.typed").exists()
+        for folder in {path.parent for path in (ROOT / top).rglob("*.py")}:
+            assert (folder / "__init__.py").exists(), folder
+
+
+def test_typed_marker_travels_with_the_packages():
+    data = PROJECT["tool"]["setuptools"]["package-data"]
+    assert data == {"rbfmuscle": ["py.typed"], "pbd_baseline": ["py.typed"]}
+
+
+def test_lists_of_tests_name_what_exists_and_every_room():
+    for name in ("fast.txt", "nojit.txt"):
+        lines = (ROOT / "tests" / name).read_text(encoding="utf-8").splitlines()
+        paths = [line.split("::")[0] for line in lines if line and not line.startswith("#")]
+        assert all((ROOT / path).exists() for path in paths), name
+        if name == "fast.txt":
+            rooms = {path.split("/")[1] for path in paths}
+            wanted = {path.parent.name for path in (ROOT / "tests").glob("*/test_*.py")}
+            assert wanted <= rooms
+
+
+def run(*command, **options):
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1800, check=False, **options)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    return done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["wheel", "sdist"])
+def test_distribution_installs_in_a_clean_environment_and_runs(kind, tmp_path):
+    """Needs the package registry; ten minutes with compiling."""
+    run(sys.executable, "-m", "build", f"--{kind}", "--outdir", str(tmp_path / "dist"), str(ROOT))
+    (file,) = (tmp_path / "dist").iterdir()
+    run(sys.executable, "-m", "venv", str(tmp_path / "env"))
+    binary = tmp_path / "env" / "bin"
+    run(str(binary / "python"), "-m", "pip", "install", "--quiet", str(file))
+    version = PROJECT["project"]["version"]
+    assert version in run(str(binary / "rbfmuscle"), "--version", cwd=tmp_path)
+    where = run(str(binary / "python"), "-c", "import rbfmuscle; print(rbfmuscle.__file__)", cwd=tmp_path)
+    assert str(tmp_path / "env") in where
+    out = tmp_path / "out"
+    run(str(binary / "rbfmuscle"), "demo", "--model", "pbd", "-o", str(out), cwd=tmp_path)
+    assert (out / "report.html").exists()
+    assert (out / "metrics.csv").stat().st_size > 0
