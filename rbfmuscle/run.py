@@ -159,9 +159,6 @@ class Run:
     scene : Scene
         As it was run.
     frames : list of Frame
-    metrics : list of Row
-        frame, coordinate, angle [degree], muscle, quantity, value, unit.
-    events : list of Event
     """
 
     def __init__(self, recording: "Recording", memory: MemorySink) -> None:

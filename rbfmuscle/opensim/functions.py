@@ -36,6 +36,7 @@ class Problem:
         self.path = path
 
     def __call__(self, message: str) -> SceneError:
+        """The error, its message headed by the file."""
         return SceneError(f"{self.path}: {message}")
 
 

@@ -55,7 +55,7 @@ class Node:
         return (inner or node).children if inner is not None else node.children
 
     def walk(self, *, skip: tuple[str, ...] = ()) -> Iterator["Node"]:
-        """This node and all below it in order; nodes of the tags in ``skip`` are left out with all they hold."""
+        """The node and all below it in order; nodes of the tags in ``skip`` are left out with all they hold."""
         waiting = [self]
         while waiting:
             node = waiting.pop()

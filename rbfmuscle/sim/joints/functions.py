@@ -16,6 +16,7 @@ class Constant:
     value: float
 
     def __call__(self, *values: float) -> float:
+        """Value at these coordinates."""
         return self.value
 
     def rescaled(self, inputs: list[float], output: float) -> "Constant":
@@ -31,6 +32,7 @@ class Linear:
     constant: float = 0.0
 
     def __call__(self, *values: float) -> float:
+        """Value at these coordinates."""
         total = 0.0
         for slope, value in zip(self.slopes, values):
             total += slope * value
@@ -49,6 +51,7 @@ class Polynomial:
     coefficients: tuple[float, ...]
 
     def __call__(self, *values: float) -> float:
+        """Value at these coordinates."""
         total = 0.0
         for coefficient in self.coefficients:
             total = total * values[0] + coefficient
@@ -68,6 +71,7 @@ class PiecewiseLinear:
     y: tuple[float, ...]
 
     def __call__(self, *values: float) -> float:
+        """Value at these coordinates."""
         if len(self.x) == 1:
             return self.y[0]
         k = min(max(bisect.bisect_right(self.x, values[0]) - 1, 0), len(self.x) - 2)
@@ -98,6 +102,7 @@ class Spline:
         object.__setattr__(self, "_bend", tuple(bend.tolist()))
 
     def __call__(self, *values: float) -> float:
+        """Value at these coordinates."""
         q, x, y, m = values[0], self.x, self.y, self._bend
         if len(x) == 1:
             return y[0]
@@ -129,6 +134,7 @@ class Scaled:
     inner: "Function"
 
     def __call__(self, *values: float) -> float:
+        """Value at these coordinates."""
         return self.factor * self.inner(*values)
 
     def rescaled(self, inputs: list[float], output: float) -> "Scaled":
