@@ -158,7 +158,6 @@ class Run:
     ----------
     scene : Scene
         As it was run.
-    frames : list of Frame
     """
 
     def __init__(self, recording: "Recording", memory: MemorySink) -> None:
