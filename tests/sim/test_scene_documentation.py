@@ -38,6 +38,7 @@ def documented_tables():
         options.OutputOptions: "`[output]`",
         options.SurfaceOptions: "`[output]`",
         options.FibreOptions: "`[output]`",
+        options.ArmOptions: "`[output]`",
     }
 
 

@@ -69,6 +69,8 @@ class Frame:
         is drawn, both are in it; over a motion the sum is what counts.
     fibres : dict of str to FibreLines
         Empty where no fibres were asked for.
+    nudged : dict of str to dict
+        For each muscle and each coordinate that moves it, a `Nudged`; empty where no moment arms were asked for.
     """
 
     index: int
@@ -80,6 +82,7 @@ class Frame:
     times: dict
     wall: float
     fibres: dict = field(default_factory=dict)
+    nudged: dict = field(default_factory=dict)
 
 
 class Drawing(Protocol):

@@ -182,16 +182,23 @@ class FibreOptions(Table):
     segments: Annotated[int, Field(ge=2, le=200)] = 15
 
 
+class ArmOptions(Table):
+    """``output.moment_arms``: how far each coordinate is nudged to either side [degree, or mm for a shift]."""
+
+    step: Annotated[float, Field(gt=0, le=10)] = 0.5
+
+
 class OutputOptions(Table):
     """``[output]``: what a run leaves behind."""
 
     surfaces: SurfaceOptions | Literal[False] = SurfaceOptions()
     fibres: FibreOptions | Literal[False] = False
+    moment_arms: ArmOptions | Literal[False] = False
     metrics: bool = True
     report: bool = True
     preview: bool = True
 
-    @field_validator("fibres", mode="before")
+    @field_validator("fibres", "moment_arms", mode="before")
     @classmethod
     def _true_means_defaults(cls, value):
         return {} if value is True else value

@@ -9,6 +9,7 @@ import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components
 
 from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
+from rbfmuscle.sim.joints.skeleton import all_coordinates
 from rbfmuscle.sim.scene.motion import shown_value
 from rbfmuscle.study.measure.centreline import Centreline
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
@@ -130,8 +131,10 @@ class MetricsRecorder:
         coordinates, _, index = self._path[here]
         unit = unit_text("length", self.units)
         rows = []
-        for muscle in self.trackers:
-            for name, arm in moment_arms([node[:2] for node in self._path], here, muscle):
+        for muscle, tracker in self.trackers.items():
+            rows += tracker.arms.pop(index, [])
+            by_difference = [] if tracker.nudged else moment_arms([n[:2] for n in self._path], here, muscle)
+            for name, arm in by_difference:
                 angle = shown_value(self.scene, name, coordinates.get(name, 0.0))
                 rows.append(Row(index, name, angle, muscle, "moment_arm", arm, unit))
             if (FIBRES, muscle) not in self._path[here][1]:
@@ -171,6 +174,11 @@ class _Tracker:
         self.line = Centreline(muscle, scene.joints, vertices, faces) if has_line else None
         self.length = math.nan
         self.rest_measured = False
+        output = getattr(scene, "output", None)
+        self.nudged = output is not None and bool(output.moment_arms) and has_line
+        # By frame, until the frame's rows are complete.
+        self.arms = {}
+        self.scene = scene
         self.offset = None
 
     def length_of(self, frame):
@@ -192,6 +200,8 @@ class _Tracker:
         self.length = self.length_of(frame)
         if self.line is not None:
             found["length"] = self.length
+        if self.nudged:
+            self.arms[frame.index] = self._nudged_arms(frame)
         if self.name in frame.fibres:
             lengths = frame.fibres[self.name].lengths
             found.update(fibre_length_mean=np.mean(lengths), fibre_length_std=np.std(lengths))
@@ -200,6 +210,16 @@ class _Tracker:
             found["time_solve"] = times.get("time_predict", 0.0) + times.get("time_solve", 0.0)
             found["time_frame"] = times["time_frame"]
         return {quantity: found[quantity] for quantity in QUANTITIES if quantity in found}
+
+    def _nudged_arms(self, frame):
+        """A row for each coordinate that moves the muscle: minus the change of length with it."""
+        facts, rows = all_coordinates(self.scene.joints), []
+        for name, (span, below, above) in frame.nudged.get(self.name, {}).items():
+            arm = -(self.line.length(*above) - self.line.length(*below)) / span
+            unit = "1" if facts[name].motion == "translation" else self.scene.units
+            value = shown_value(self.scene, name, frame.coordinates.get(name, facts[name].rest))
+            rows.append(Row(frame.index, name, value, self.name, "moment_arm", arm, unit))
+        return rows
 
     def _of_surface(self, surface, frame, probes, first_rest):
         vertices, faces = surface.vertices, np.asarray(surface.faces)
