@@ -28,19 +28,16 @@ def new(
     force
         Replace a file that exists.
     """
-    from rbfmuscle.commands.guess import guess_scene
-    from rbfmuscle.sim.scene.scene import Scene
+    from rbfmuscle.sim.guess.guess import guess_scene, write_scene
 
     output = output or mesh_dir / "scene.toml"
     if output.exists() and not force:
         raise UsageError(f"{output} exists; give another --output, or --force to replace it")
-    text = guess_scene(mesh_dir, units, output.parent)
-    try:
-        output.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"cannot write {output}: {error.strerror}; choose another --output") from None
+    guess = guess_scene(mesh_dir, units, output.parent)
+    scene = write_scene(guess, output)
     print(f"{output} written; every guess in it is marked, look them over")
-    scene = Scene.load(output)
+    for doubt in guess.doubts():
+        print(f"doubtful: {doubt}")
     for finding in scene.check():
         print(finding)
     print(f"next: rbfmuscle check {output}, then rbfmuscle run {output} -o out")
