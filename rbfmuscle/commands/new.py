@@ -1,5 +1,6 @@
-"""``rbfmuscle new``: a commented scene file to start from, guessed from a folder of meshes."""
+"""``rbfmuscle new``: a commented scene file to start from, guessed from meshes or from a volume of labels."""
 
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,31 +10,45 @@ from rbfmuscle.validation import UsageError
 
 
 def new(
-    mesh_dir: Path,
+    source: Path,
     *,
-    units: Literal["mm", "cm", "m"],
+    units: Literal["mm", "cm", "m"] | None = None,
+    labels: Path | None = None,
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     force: Annotated[bool, Parameter(negative="")] = False,
 ):
-    """Write a commented scene file for a folder of meshes.
+    """Write a commented scene file for a folder of meshes or a volume of labels.
 
     Parameters
     ----------
-    mesh_dir
-        Folder with STL, OBJ, PLY, VTK or VTP files, one bone or muscle each.
+    source
+        Folder with STL, OBJ, PLY, VTK or VTP files, one bone or muscle each (or in folders bones and muscles);
+        or a segmentation: .nii, .nii.gz, .nrrd, or a folder with one mask a file.
     units
-        Unit of the meshes.
+        Unit of the meshes; label volumes say theirs and become millimetres.
+    labels
+        Names of a segmentation's labels: JSON, CSV, TSV or ITK-SNAP's descriptions.
     output
-        Scene file to write, MESH_DIR/scene.toml by default.
+        Scene file to write, scene.toml beside the meshes by default.
     force
         Replace a file that exists.
     """
     from rbfmuscle.sim.guess.guess import guess_scene, write_scene
 
-    output = output or mesh_dir / "scene.toml"
+    volume = _is_segmentation(source)
+    if volume and units not in (None, "mm"):
+        raise UsageError(f"{source}: a segmentation says its unit, its scene is in mm; leave --units out")
+    if not volume and units is None:
+        raise UsageError("--units is missing: give the unit of the meshes, mm, cm or m")
+    if labels is not None and not volume:
+        raise UsageError(f"--labels names the labels of a segmentation, {source} is a folder of meshes")
+    folder = _beside(source, output) if volume else source
+    output = output or folder / "scene.toml"
     if output.exists() and not force:
         raise UsageError(f"{output} exists; give another --output, or --force to replace it")
-    guess = guess_scene(mesh_dir, units, output.parent)
+    if volume:
+        folder = _write_surfaces(source, labels, folder)
+    guess = guess_scene(folder, units or "mm", output.parent)
     scene = write_scene(guess, output)
     print(f"{output} written; every guess in it is marked, look them over")
     for doubt in guess.doubts():
@@ -41,3 +56,48 @@ def new(
     for finding in scene.check():
         print(finding)
     print(f"next: rbfmuscle check {output}, then rbfmuscle run {output} -o out")
+
+
+def _is_segmentation(source):
+    from rbfmuscle.sim.scene.meshes import MESH_SUFFIXES
+    from rbfmuscle.sim.volumes.read import is_volume
+
+    if not source.is_dir():
+        return is_volume(source)
+    files = [path for path in source.iterdir() if path.is_file()]
+    meshes = any(path.suffix.lower() in MESH_SUFFIXES for path in files)
+    return not meshes and any(is_volume(path) for path in files)
+
+
+def _beside(source, output):
+    """Folder of the scene of a segmentation."""
+    if output is not None:
+        return output.parent
+    name = source.name.split(".")[0] or "scene"
+    return source / "scene" if source.is_dir() else source.parent / f"{name}_scene"
+
+
+def _write_surfaces(source, labels, folder):
+    """Surfaces of all labels as PLY beside the scene; their folder."""
+    from rbfmuscle.commands.progress import Progress
+    from rbfmuscle.sim.guess.anatomy import bone_class, says_muscle
+    from rbfmuscle.sim.volumes.read import read_labels
+    from rbfmuscle.sim.volumes.surfaces import label_surface
+
+    volume = read_labels(source, names=labels)
+    meshes = folder / "meshes"
+    try:
+        meshes.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"cannot write to {folder}: {error.strerror}; choose another --output") from None
+    values = volume.values()
+    with Progress("surfaces", "label") as progress:
+        for done, label in enumerate(values, start=1):
+            name = volume.name(label)
+            several = bool(bone_class(name)) and not says_muscle(name)
+            surface = label_surface(volume, int(label), pieces=several)
+            surface.mesh.export(meshes / f"{re.sub(r'[^A-Za-z0-9_-]+', '_', surface.name)}.ply")
+            for note in surface.notes:
+                print(f"{surface.name}: {note}")
+            progress(done, len(values))
+    return meshes

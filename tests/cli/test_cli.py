@@ -298,7 +298,8 @@ class TestOtherCommands:
         scene = Scene.load(tmp_path / "scene.toml")
         assert [bone.name for bone in scene.bones] == ["femur", "pelvis", "sacrum"]
         assert scene.joints[0].centre == pytest.approx([143.68, 243.295, -432.501], abs=1)
-        assert all({a.bone for a in m.attachments} == {"pelvis", "femur"} for m in scene.muscles)
+        held = {m.name: {a.bone for a in m.attachments} for m in scene.muscles}
+        assert held == {"gluteus_maximus": {"pelvis", "sacrum", "femur"}, "iliacus": {"pelvis", "femur"}}
 
     def test_every_command_has_help(self, capsys):
         for name in ("demo", "check", "run", "export", "render", "new", "cache"):

@@ -1,6 +1,6 @@
 """Reading label volumes: NIfTI, NRRD, or a folder of masks; voxels, directions, units and names honoured.
 
-Positions come out in millimetres in the frame of NIfTI (x to the patient's right hand's left, RAS), whatever the
+Positions come out in millimetres in the frame of NIfTI (RAS: x to the right, y forward, z up), whatever the
 order and the signs of the voxels' axes; NRRD files in LPS are turned.
 """
 
@@ -20,7 +20,16 @@ VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".seg.nrrd")
 MOST_BYTES = 2_000_000_000
 MOST_LABELS = 512
 VOXEL_RANGE = (0.02, 20.0)
-_TO_MM = {"mm": 1.0, "meter": 1000.0, "m": 1000.0, "micron": 0.001, "um": 0.001, "cm": 10.0, "unknown": 1.0, "": 1.0}
+_TO_MM = {
+    "mm": 1.0,
+    "meter": 1000.0,
+    "m": 1000.0,
+    "micron": 0.001,
+    "um": 0.001,
+    "cm": 10.0,
+    "unknown": 1.0,
+    "": 1.0,
+}
 
 
 @dataclass
@@ -84,12 +93,18 @@ def read_labels(path: Path, *, names: Path | None = None) -> LabelVolume:
     if names is not None:
         volume.names.update(read_names(names))
     count = len(volume.values())
+    if count and not (volume.values() % 256).any():
+        raise MeshError(f"{path}: all labels are multiples of 256, so its bytes are swapped; export it again")
     if count == 0:
         raise MeshError(f"{path}: no voxel has a label; is it the image instead of its segmentation?")
     if count > MOST_LABELS:
-        raise MeshError(f"{path}: {count} labels, at most {MOST_LABELS}; is it the image instead of its segmentation?")
+        raise MeshError(
+            f"{path}: {count} labels, at most {MOST_LABELS}; is it the image instead of its segmentation?"
+        )
     if count == 1:
-        raise MeshError(f"{path}: only one label, {volume.name(volume.values()[0])!r}; a scene needs bones and muscles")
+        raise MeshError(
+            f"{path}: only one label, {volume.name(volume.values()[0])!r}; a scene needs bones and muscles"
+        )
     return volume
 
 
@@ -111,9 +126,13 @@ def _read_folder(path):
         mask = _read_file(file)
         if together is None:
             together = LabelVolume(np.zeros(mask.labels.shape, np.int32), mask.affine, {}, str(path))
-        same = mask.labels.shape == together.labels.shape and np.allclose(mask.affine, together.affine, atol=1e-3)
+        same = mask.labels.shape == together.labels.shape and np.allclose(
+            mask.affine, together.affine, atol=1e-3
+        )
         if not same:
-            raise MeshError(f"{file}: its grid differs from that of {files[0].name}; resample the masks to one grid")
+            raise MeshError(
+                f"{file}: its grid differs from that of {files[0].name}; resample the masks to one grid"
+            )
         together.labels[mask.labels > 0] = number
         together.names[number] = re.sub(r"(\.seg)?(\.nii(\.gz)?|\.nrrd)$", "", file.name, flags=re.IGNORECASE)
     if together is None:
@@ -129,9 +148,11 @@ def _read_nifti(path):
         raise MissingPartError("reading .nii needs nibabel: pip install 'rbfmuscle[labels]'") from None
     try:
         image = nibabel.load(path)
-        _check_size(image.shape, image.get_data_dtype().itemsize, path)
+        shape, itemsize = image.shape, image.get_data_dtype().itemsize
         unit = image.header.get_xyzt_units()[0]
-        data = np.asanyarray(image.dataobj)
+        data = np.asanyarray(image.dataobj) if _check_size(shape, itemsize, path) else None
+    except MeshError:
+        raise
     except (ImageFileError, OSError, EOFError, ValueError, KeyError, zlib.error, OverflowError) as error:
         raise MeshError(f"{path}: no readable NIfTI volume ({_first_line(error)}); export it again") from None
     factor = _TO_MM.get(unit)
@@ -161,8 +182,9 @@ def _read_nrrd(path):
     try:
         header = nrrd.read_header(str(path))
         shape = tuple(int(size) for size in header["sizes"])
-        _check_size(shape, 8, path)
-        data, header = nrrd.read(str(path))
+        data, header = nrrd.read(str(path)) if _check_size(shape, 8, path) else (None, header)
+    except MeshError:
+        raise
     except (nrrd.NRRDError, OSError, EOFError, ValueError, KeyError, zlib.error, OverflowError) as error:
         raise MeshError(f"{path}: no readable NRRD volume ({_first_line(error)}); export it again") from None
     affine = np.eye(4)
@@ -192,11 +214,17 @@ def _first_line(error):
 
 
 def _check_size(shape, itemsize, path):
-    if len([size for size in shape if size > 1]) != 3 or len(shape) < 3 or any(size > 1 for size in shape[3:]):
+    """True, or MeshError where a volume has not three axes or is too large; nothing is unpacked for it."""
+    if (
+        len([size for size in shape if size > 1]) != 3
+        or len(shape) < 3
+        or any(size > 1 for size in shape[3:])
+    ):
         raise MeshError(f"{path}: a volume of shape {tuple(shape)}; give one label map with three axes")
     size = int(np.prod([int(size) for size in shape], dtype=object)) * itemsize
     if size > MOST_BYTES:
         raise MeshError(f"{path}: {size:,} bytes unpacked, at most {MOST_BYTES:,}; crop it or split it")
+    return True
 
 
 def _check_labels(data, path):
@@ -206,12 +234,18 @@ def _check_labels(data, path):
         raise MeshError(f"{path}: voxels of type {data.dtype}; labels are whole numbers")
     if np.issubdtype(data.dtype, np.floating):
         if not np.isfinite(data).all():
-            raise MeshError(f"{path}: {int((~np.isfinite(data)).sum()):,} voxels are not finite; labels are whole numbers")
+            raise MeshError(
+                f"{path}: {int((~np.isfinite(data)).sum()):,} voxels are not finite; labels are whole numbers"
+            )
         if not (data == np.rint(data)).all():
-            raise MeshError(f"{path}: voxels between whole numbers; is it the image instead of its segmentation?")
+            raise MeshError(
+                f"{path}: voxels between whole numbers; is it the image instead of its segmentation?"
+            )
     low, high = float(data.min()), float(data.max())
     if low < 0 or high > 65535:
-        raise MeshError(f"{path}: labels from {low:g} to {high:g}, allowed are 0 to 65535; is its byte order right?")
+        raise MeshError(
+            f"{path}: labels from {low:g} to {high:g}, allowed are 0 to 65535; is its byte order right?"
+        )
     return np.ascontiguousarray(data, dtype=np.int32)
 
 

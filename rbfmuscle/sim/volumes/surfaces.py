@@ -1,6 +1,6 @@
 """From labels to smooth closed surfaces, without the steps of their voxels.
 
-The mask of a label, 1/2 inside and -1/2 outside, is smoothed by I - (I - G)^3 with a Gaussian G of one voxel:
+The mask of a label, 1/2 inside and -1/2 outside, is smoothed by I - (I - G)^4, G a Gaussian of 1.3 voxels:
 flat to fourth order in the pass band, so that curved surfaces are not drawn in as they are by G alone. Where two
 labels share a face, the fields are each other's negative there and so are their zero sets. The level is then
 shifted to the label's volume, a few hundredths of a voxel.
@@ -9,16 +9,19 @@ shifted to the label's volume, a few hundredths of a voxel.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, label as connected
+from scipy.ndimage import gaussian_filter
+from scipy.ndimage import label as connected
 
 from rbfmuscle.validation import MeshError
 
 # Deviation of the Gaussian [voxels], and how often what it lost is smoothed again.
-SMOOTHING, PASSES = 1.0, 3
+SMOOTHING, PASSES = 1.3, 4
 # Voxels kept around a label, beyond which the filter sees nothing.
 MARGIN = 6
 # Greatest shift of the level, as a share of the jump across a face.
 MOST_SHIFT = 0.35
+# Share of the largest piece from which on a piece belongs to a bone of several parts.
+PIECE = 0.01
 # Edge of the surface's triangles [voxels].
 EDGE = 2.2
 
@@ -46,8 +49,8 @@ class LabelSurface:
     notes: list
 
 
-def label_surface(volume, label: int, *, edge: float = EDGE) -> LabelSurface:
-    """Smooth surface of the largest piece of a label.
+def label_surface(volume, label: int, *, edge: float = EDGE, pieces: bool = False) -> LabelSurface:
+    """Smooth surface of a label.
 
     Parameters
     ----------
@@ -55,6 +58,8 @@ def label_surface(volume, label: int, *, edge: float = EDGE) -> LabelSurface:
     label : int
     edge : float
         Wanted edge of the triangles [voxels].
+    pieces : bool
+        Keep every piece of a hundredth of the whole or more (bones of several parts), not the largest alone.
 
     Raises
     ------
@@ -63,13 +68,13 @@ def label_surface(volume, label: int, *, edge: float = EDGE) -> LabelSurface:
     """
     name = volume.name(label)
     mask, corner = _cut_out(volume.labels, label)
-    mask, notes = _one_piece(mask, name, volume.source)
+    mask, notes = _without_islands(mask, name, volume.source, PIECE if pieces else 1.0)
     size = float(np.prod(volume.spacing))
     wanted = float(mask.sum()) * size
     field = smooth_mask(mask)
     vertices, faces = _level_of_volume(field, wanted / size)
-    vertices = _decimate(vertices, faces, edge)
-    vertices, faces = vertices
+    vertices, faces = _decimate(vertices, faces, edge)
+    vertices = _to_volume(vertices, faces, wanted / size)
     world = (vertices + corner) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
     return LabelSurface(int(label), name, _outward(world, faces), wanted, notes)
 
@@ -96,22 +101,28 @@ def _cut_out(labels, label):
     return np.pad(present[tuple(box)], MARGIN), corner
 
 
-def _one_piece(mask, name, source):
-    """The largest piece with its inner holes filled, and what was left out."""
+def _without_islands(mask, name, source, least):
+    """The pieces of at least a share of the largest, their inner holes filled, and what was left out."""
     notes = []
     pieces, count = connected(mask)
     if count > 1:
-        sizes = np.bincount(pieces.ravel())[1:]
-        mask = pieces == 1 + int(np.argmax(sizes))
-        rest = int(sizes.sum() - sizes.max())
-        notes.append(f"{count - 1} islands of {rest} voxels left out ({100 * rest / sizes.sum():.2g} %)")
+        sizes = np.bincount(pieces.ravel())
+        sizes[0] = 0
+        kept = sizes >= least * sizes.max()
+        mask = kept[pieces]
+        rest = int(sizes[~kept].sum())
+        if rest:
+            share = 100 * rest / sizes.sum()
+            notes.append(f"{int((~kept).sum()) - 1} islands of {rest} voxels left out ({share:.2g} %)")
     outside, count = connected(~mask)
     if count > 1:
         hollow = (outside != outside[0, 0, 0]) & ~mask
         mask = mask | hollow
         notes.append(f"{count - 1} holes of {int(hollow.sum())} voxels filled")
     if mask.sum() < 27:
-        raise MeshError(f"{source}: label {name!r} has {int(mask.sum())} voxels, too few for a surface; remove it")
+        raise MeshError(
+            f"{source}: label {name!r} has {int(mask.sum())} voxels, too few for a surface; remove it"
+        )
     return mask, notes
 
 
@@ -153,6 +164,18 @@ def _decimate(vertices, faces, edge):
         return vertices, faces
     found = igl.qslim(vertices, faces, target)
     return np.asarray(found[0], dtype=np.float64), np.asarray(found[1], dtype=np.int64)
+
+
+def _to_volume(vertices, faces, wanted):
+    """Vertices moved along their normals, all by the same way, until the mesh holds the wanted volume."""
+    import trimesh
+
+    for _ in range(2):
+        volume, area = _volume_and_area(vertices, faces)
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        outward = np.sign(mesh.volume) * mesh.vertex_normals
+        vertices = vertices + (wanted - volume) / area * outward
+    return vertices
 
 
 def _outward(vertices, faces):
