@@ -257,7 +257,7 @@ class TestErrors:
     def test_bug_is_one_line(self, phantom_folder):
         code = (
             "import rbfmuscle.sim.scene.scene as s, sys\n"
-            "def load(path): raise ZeroDivisionError('planted')\n"
+            "def load(path, **options): raise ZeroDivisionError('planted')\n"
             "s.Scene.load = load\n"
             "from rbfmuscle.cli import main\nmain(['check', 'x.toml'])"
         )

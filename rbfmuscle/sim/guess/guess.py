@@ -82,6 +82,9 @@ def guess_scene(folder: Path, units: str, base: Path) -> SceneGuess:
     guess = SceneGuess(f"the meshes in {folder.name or folder}", name, units, bones, root, joints)
     bodies = _bodies(bones, joints)
     guess.muscles = [guess_holds(muscle, bones, bodies, millimetre) for muscle in muscles]
+    rank = {id(joint.child): k for k, joint in enumerate(joints, start=1)}
+    for muscle in guess.muscles:  # from the bone that stands still outwards
+        muscle.holds.sort(key=lambda hold: rank.get(id(hold.bone), 0))
     return guess
 
 
