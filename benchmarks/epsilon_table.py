@@ -26,7 +26,7 @@ from rbfmuscle.implicit.kernels.table import KERNELS
 from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import SPAN, spacing, surface_miss
 from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
-from rbfmuscle.model.muscle import MOST_WITH_ALL_DERIVATIVES
+from rbfmuscle.model.placement import MOST_WITH_ALL_DERIVATIVES
 from rbfmuscle.sim.scene.meshes import read_mesh
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.validation import NumericalWarning

@@ -9,9 +9,8 @@ from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit.lapack import factor_cholesky
 from rbfmuscle.implicit.kernels.table import get_kernel
-from rbfmuscle.model.muscle import MOST_WITH_ALL_DERIVATIVES, RBFMuscle
 from rbfmuscle.model.options import RBFOptions
-from rbfmuscle.model.rest import has_sample
+from rbfmuscle.model.placement import MOST_WITH_ALL_DERIVATIVES, default_centres, sample_is_cached
 from rbfmuscle.sim.plan.forecast import MuscleCost
 from rbfmuscle.sim.plan.rates import shortest
 from rbfmuscle.sim.scene.objects import Muscle
@@ -57,7 +56,7 @@ def estimate_muscle(
     -------
     MuscleCost
     """
-    centres = options.centres or RBFMuscle._default_centres(muscle.mesh.area, scene)
+    centres = options.centres or default_centres(muscle.mesh.area, scene)
     points = centres + options.samples
     shown, nodes = _surface_size(muscle, options.resolution)
     unknowns = _unknowns(options, centres)
@@ -69,9 +68,9 @@ def estimate_muscle(
     frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
     mesh = frame.local, np.asarray(muscle.mesh.faces)
     sampling, placing = SAMPLE_VISITS * options.samples, rounds * mesh_visits
-    if has_sample(*mesh, options.samples, seed=options.seed, placement="even"):
+    if sample_is_cached(*mesh, options.samples, seed=options.seed, placement="even"):
         sampling *= KEPT
-    if has_sample(*mesh, centres, seed=options.seed, placement=options.placement):
+    if sample_is_cached(*mesh, centres, seed=options.seed, placement=options.placement):
         placing *= KEPT
     search = CROSSING_VISITS * points if scene.detect is not None else 0
     iteration = ITERATION_CALLS * call + visit * (SOLVE_VISITS * centres + CONTACT_VISITS * points)

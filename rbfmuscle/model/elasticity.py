@@ -4,7 +4,11 @@ import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.rest_frame import diameter
-from rbfmuscle.model.constraints import ContactConstraint
+from rbfmuscle.model.constraints import ShapeConstraint, VolumeConstraint
+from rbfmuscle.model.contact import ContactConstraint
+from rbfmuscle.model.options import RBFOptions
+from rbfmuscle.model.rest import Rest
+from rbfmuscle.sim.loop.contact import BoneContacts
 
 CONTACT_TOLERANCE = 2e-5  # of the muscle's size: some micrometres
 REACH_MARGIN = 0.003  # of the muscle's size
@@ -59,52 +63,56 @@ class ElasticSolver:
 
     Parameters
     ----------
-    shape : ShapeConstraint
-    volume : VolumeConstraint
-        On the samples.
-    points : (K + S, 3) ndarray
-        Contact points at rest: centres, then samples.
-    columns, shares : (K + S, 6)
-        How the contact points hang on the centres.
-    free, held : int arrays
-        Centres that move, and those that their bones carry.
+    rest : Rest
+    options : RBFOptions
     """
 
-    def __init__(self, shape, volume, points, columns, shares, free, held, *, iterations, contacts, memory):
-        self.shape, self.volume, self.points = shape, volume, points
-        self.columns, self.shares = columns, shares
-        self.free, self.held = free, held
-        self.iterations, self.batch, self.memory = iterations, contacts, memory
-        self.centres = len(shape.rest)
-        laplacian = shape.laplacian
-        self.inverse = np.linalg.inv(laplacian[np.ix_(free, free)])
+    def __init__(self, rest: Rest, options: RBFOptions) -> None:
+        self.iterations, self.memory = options.iterations, options.acceleration
+        self.shape = ShapeConstraint(
+            rest.centres, rest.start, rest.other, rest.weight, rest.fibres,
+            limits=(options.stretch_low, options.stretch_high), hold=options.stretch_hold,
+        )  # fmt: skip
+        self.volume = VolumeConstraint(rest.samples, rest.sample_faces)
+        self.points = rest.contact_points()
+        self.columns, self.shares = rest.columns, rest.shares
+        self.free, self.held = rest.free, rest.held
+        self.centres, self.scale = len(rest.centres), diameter(rest.centres)
+        laplacian = self.shape.laplacian
+        self.inverse = np.linalg.inv(laplacian[np.ix_(self.free, self.free)])
         self.inverse = 0.5 * (self.inverse + self.inverse.T)
-        self.coupling = laplacian[np.ix_(free, held)]
-        dense = np.zeros((self.centres, len(points)))
-        np.add.at(dense, (columns, np.arange(len(points))[:, None]), shares)
-        influence = np.zeros((self.centres, len(points)))
-        influence[free] = self.inverse @ dense[free]
-        self.scale = diameter(shape.rest)
+        self.coupling = laplacian[np.ix_(self.free, self.held)]
+        dense = np.zeros((self.centres, len(self.points)))
+        np.add.at(dense, (self.columns, np.arange(len(self.points))[:, None]), self.shares)
+        influence = np.zeros((self.centres, len(self.points)))
+        influence[self.free] = self.inverse @ dense[self.free]
         self.contact = ContactConstraint(
-            np.ascontiguousarray(influence.T), columns, shares,
-            batch=contacts, tolerance=CONTACT_TOLERANCE * self.scale,
+            self.columns, self.shares, influence=np.ascontiguousarray(influence.T),
+            batch=options.contacts, tolerance=CONTACT_TOLERANCE * self.scale,
         )  # fmt: skip
 
-    def snapshot(self):
-        """The contact forces, to come back to."""
-        return self.contact.forces.copy()
+    def deformation(self) -> np.ndarray:
+        """Deformation gradient (K, 3, 3) at each centre."""
+        return self.shape.deformation
 
-    def restore(self, forces):
-        """Go back to the forces of a `snapshot`."""
+    def snapshot(self) -> tuple[np.ndarray, np.ndarray]:
+        """State that ``restore`` brings back."""
+        return self.shape.quaternion.copy(), self.contact.forces.copy()
+
+    def restore(self, state: tuple[np.ndarray, np.ndarray], x: np.ndarray) -> None:
+        """Return to an earlier ``snapshot``, with the centres (K, 3) of that moment."""
+        quaternion, forces = state
+        self.shape.quaternion[:] = quaternion
         self.contact.forces = forces.copy()
+        self.shape.localise(x)
 
-    def carry(self, x):
+    def carry(self, x: np.ndarray) -> np.ndarray:
         """Contact points at centres x with the present targets, (K + S, 3)."""
         out = np.empty_like(self.points)
         _carry_all_loop(x, self.shape.target, self.shape.rest, self.points, self.columns, self.shares, out)
         return out
 
-    def solve(self, x, contacts):
+    def solve(self, x: np.ndarray, contacts: BoneContacts) -> np.ndarray:
         """Return the settled centres, (K, 3)."""
         x = x.copy()
         mixer = _Anderson(self.memory)
@@ -136,7 +144,7 @@ class ElasticSolver:
             here, 1.5 * np.sqrt((motion**2).sum(axis=1)) + REACH_MARGIN * self.scale
         )
         sources = max(1, len(contacts.names) + len(contacts.neighbours))
-        push, lost = self.contact.project(spaces, sources, motion, moved, stiffness)
+        push, lost = self.contact.correction(spaces, sources, motion, moved, stiffness)
         return new + push + response * (pressure - lost / stiffness)
 
 

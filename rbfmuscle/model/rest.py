@@ -1,133 +1,197 @@
-"""How the centres of an RBF muscle hang together and how its surface samples hang on them."""
+"""What is known of an RBF muscle at rest, found once: where its points lie, what holds them, how they hang together."""
 
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sparse
 from scipy.spatial import cKDTree
 
-from rbfmuscle.implicit.placement.sampling import SurfaceSample, sample_surface
-from rbfmuscle.sim.cache import content_key, has_arrays, load_arrays, store_arrays
+from rbfmuscle.geometry.harmonic import harmonic_weights, surface_gradient
+from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.model.clusters import bind_samples, build_clusters
+from rbfmuscle.model.fibres import fibre_directions
+from rbfmuscle.model.options import RBFOptions
+from rbfmuscle.model.placement import FieldFit, default_centres, place_points
+from rbfmuscle.sim.scene.objects import Muscle
+from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.validation import SceneError
 
-SHARES = 6  # centres that carry one sample
-SAMPLING = 1  # part of the name under which samples are kept: raise it when they are made in another way
-
-
-def kept_sample(vertices, faces, count, *, seed, placement):
-    """`sample_surface` of a muscle's mesh, kept on disk by content, as greedy placement takes a second."""
-    key = _sample_key(vertices, faces, count, seed, placement)
-    arrays = load_arrays(key)
-    if arrays is not None:
-        return SurfaceSample(**arrays)
-    sample = sample_surface(vertices, faces, count, seed=seed, placement=placement)
-    store_arrays(key, asdict(sample))
-    return sample
+# A patch smaller than the spacing of the centres still has to hold the muscle against turning.
+LEAST_ATTACHED = 4
 
 
-def has_sample(vertices, faces, count, *, seed, placement):
-    """Whether `kept_sample` has these already."""
-    return has_arrays(_sample_key(vertices, faces, count, seed, placement))
+@dataclass(frozen=True)
+class Rest:
+    """An RBF muscle at rest: K centres, whose field is its surface, and S samples of the surface that hang on them.
 
-
-def _sample_key(vertices, faces, count, seed, placement):
-    return content_key(vertices, faces, ("surface sample", SAMPLING, count, seed, placement))
-
-
-def two_rings(faces, count):
-    """Sorted neighbours of each point of a triangulation, and the neighbours' neighbours."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    linked = sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count)).tocsr()
-    linked = linked + linked.T
-    linked = (linked + linked @ linked).tolil()
-    linked.setdiag(0)
-    return [np.array(sorted(row), dtype=np.int64) for row in linked.tocsr().tolil().rows]
-
-
-def opposite_points(points, normals, samples, sample_normals):
-    """The sample that faces each point across the muscle's thickness, -1 where none does.
-
-    Among samples whose normals look away, it is the one nearest to the inward ray; a lateral offset counts
-    three times as much as depth, so that a thin part finds its own other side.
-    """
-    spacing = _spacing(samples)
-    found = np.full(len(points), -1)
-    for i, (point, normal) in enumerate(zip(points, normals)):
-        offset = samples - point
-        depth = -offset @ normal
-        lateral = np.linalg.norm(offset + depth[:, None] * normal, axis=1)
-        cost = np.maximum(depth, 0.0) + 3.0 * lateral
-        cost[(sample_normals @ normal > -0.2) | (depth < -0.5 * spacing)] = np.inf
-        best = int(np.argmin(cost))
-        if np.isfinite(cost[best]):
-            found[i] = best
-    return found
-
-
-def _spacing(points):
-    """Median distance to the nearest neighbour."""
-    return float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))
-
-
-def build_clusters(centres, normals, faces, samples, sample_normals, *, across=3, across_weight=1.0):
-    """Clusters of neighbours within two rings and of neighbours across the thickness.
-
-    One ring alone leaves thin parts so soft in bending that they buckle between poses and the iteration crawls:
-    after 16 iterations the gluteus maximus at 90 degrees of flexion is 0.8 mm from its end, with two rings 0.02 mm.
-
-    Parameters
+    Attributes
     ----------
     centres, normals : (K, 3) ndarray
-    faces : (m, 3) ndarray of int
-        Control triangulation over the centres.
-    samples, sample_normals : (S, 3) ndarray
-    across : int
-        Centres on the other side in each cluster.
-    across_weight : float
-        Weight of an edge across, in units of an edge along the surface.
-
-    Returns
-    -------
-    start : (K + 1,) int64, other : (e,) int64, weight : (e,) float64
-        CSR lists of directed edges.
+    samples : (S, 3) ndarray
+    sample_faces : (m, 3) ndarray of int
+        A closed outward triangulation of the samples.
+    fit : FieldFit
+        How the field through the centres is fitted.
+    bones : list of str
+        Bones that hold the muscle, in the order of the scene.
+    weights : (K, len(bones)) ndarray
+        Weights of their motions, 1 on a bone's own centres.
+    holder : (K + S,) ndarray of int
+        Position in ``bones`` of the bone that holds a contact point (centres, then samples), -1 where it is free.
+    free, held : ndarray of int
+        Centres that move, and those that their bones carry.
+    fibres : (K, 3) ndarray
+        Unit direction of the fibres at each centre.
+    start, other, weight : CSR lists
+        Directed edges of the clusters and their weights.
+    columns, shares : (K + S, 6) ndarray
+        Centres that carry each contact point, and with what share.
+    volume : float
+        Of the muscle's mesh [scene unit cubed].
+    axes : (3, 3) ndarray
+        The muscle's principal axes as rows.
     """
-    rings = two_rings(faces, len(centres))
-    facing = opposite_points(centres, normals, samples, sample_normals)
-    tree = cKDTree(centres)
-    start, other, weight = [0], [], []
-    for i, ring in enumerate(rings):
-        far = np.empty(0, dtype=int)
-        if facing[i] >= 0 and across > 0:
-            near = tree.query(samples[facing[i]], k=min(4 * across, len(centres)))[1]
-            near = np.atleast_1d(near)
-            agrees = normals[near] @ sample_normals[facing[i]] > 0.0
-            far = near[agrees & (near != i) & ~np.isin(near, ring)][:across]
-        other.append(np.concatenate([ring, far]))
-        weight.append(np.concatenate([np.ones(len(ring)), np.full(len(far), across_weight)]))
-        start.append(start[-1] + len(other[-1]))
-    return np.array(start), np.concatenate(other).astype(np.int64), np.concatenate(weight)
+
+    centres: np.ndarray
+    normals: np.ndarray
+    samples: np.ndarray
+    sample_faces: np.ndarray
+    fit: FieldFit
+    bones: list[str]
+    weights: np.ndarray
+    holder: np.ndarray
+    free: np.ndarray
+    held: np.ndarray
+    fibres: np.ndarray
+    start: np.ndarray
+    other: np.ndarray
+    weight: np.ndarray
+    columns: np.ndarray
+    shares: np.ndarray
+    volume: float
+    axes: np.ndarray
+
+    @classmethod
+    def from_muscle(cls, muscle: Muscle, scene: Scene, options: RBFOptions) -> "Rest":
+        """Measure a muscle of a scene.
+
+        Parameters
+        ----------
+        muscle : Muscle
+        scene : Scene
+        options : RBFOptions
+
+        Raises
+        ------
+        SceneError
+            If the placement cannot be had or no centre is left free to move.
+        """
+        frame, faces = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)), np.asarray(muscle.mesh.faces)
+        usual = default_centres(muscle.mesh.area, scene)
+        count = options.centres or usual
+        centres, samples, fit = place_points(muscle, frame, options, count)
+        points = frame.points(centres.points)
+        held_by = _Attachment(muscle, scene, frame, centres.points, samples.points)
+        free, held = np.flatnonzero(held_by.centres < 0), np.flatnonzero(held_by.centres >= 0)
+        if len(free) == 0:
+            raise SceneError(
+                f"muscle {muscle.name!r}: every centre lies on an attachment; nothing is free to move"
+            )
+        on_mesh = harmonic_weights(frame.local, faces, held_by.groups)
+        weights = on_mesh[held_by.nearest]
+        weights[held] = np.arange(len(held_by.bones)) == held_by.centres[held, None]
+        # Fibres run up the harmonic field from the first attachment to the last.
+        level = on_mesh @ np.arange(len(held_by.bones))
+        fibres = fibre_directions(
+            points,
+            frame.directions(surface_gradient(frame.local, faces, level)[held_by.nearest]),
+            muscle.fibres,
+            fallback=points[held].mean(axis=0) - points[free].mean(axis=0),
+        )
+        # Links through the thickness are one a centre: with more of them each counts less, so that the muscle
+        # resists alike however many centres it has.
+        clusters = build_clusters(
+            centres.points, centres.normals, centres.control_faces, samples.points, samples.normals,
+            across=options.across, across_weight=options.across_weight * usual / count,
+        )  # fmt: skip
+        columns, shares = _hang(centres, samples)
+        holder = np.concatenate([held_by.centres, held_by.samples])
+        return cls(
+            points,
+            frame.directions(centres.normals),
+            frame.points(samples.points),
+            samples.control_faces,
+            fit,
+            held_by.bones,
+            weights,
+            _with_hanging(holder, columns, shares),
+            free,
+            held,
+            fibres,
+            *clusters,
+            columns,
+            shares,
+            float(muscle.mesh.volume),
+            # Cells along the muscle's own axes are smaller than along the scene's, and turn with the scene.
+            frame.directions(_principal_axes(samples.points)),
+        )
+
+    def contact_points(self) -> np.ndarray:
+        """Centres, then samples, (K + S, 3)."""
+        return np.concatenate([self.centres, self.samples])
 
 
-def bind_samples(samples, sample_normals, centres, normals):
-    """Centres that carry each sample, and with what share.
+class _Attachment:
+    """Which bone holds each centre and each sample, as a position in ``bones``; -1 where none does."""
 
-    A sample goes with x_s = Σ_k share_k (x_k + T_k (X_s - X_k)); the shares fall to zero at the distance of the
-    next centre, so the carried surface has no seams. Centres of the other side of a thin part are left out.
+    def __init__(
+        self, muscle: Muscle, scene: Scene, frame: RestFrame, centres: np.ndarray, samples: np.ndarray
+    ) -> None:
+        names = [bone.name for bone in scene.bones]
+        patches = [np.asarray(attachment.vertices) for attachment in muscle.attachments]
+        numbers = np.array([names.index(attachment.bone) for attachment in muscle.attachments])
+        owner = np.full(len(frame.local), -1)
+        for number, patch in zip(numbers, patches):
+            owner[patch] = number
+        used = np.unique(owner[owner >= 0])
+        self.bones = [names[b] for b in used]
+        place = np.full(len(names) + 1, -1)
+        place[used] = np.arange(len(used))
+        owner, numbers = place[owner], place[numbers]
+        tree = cKDTree(frame.local)
+        self.nearest = tree.query(centres)[1]
+        self.groups: Sequence[np.ndarray] = [np.flatnonzero(owner == b) for b in range(len(self.bones))]
+        self.centres, self.samples = owner[self.nearest], owner[tree.query(samples)[1]]
+        for number, patch in zip(numbers, patches):
+            if number >= 0 and np.isin(self.nearest, patch).sum() < LEAST_ATTACHED:
+                distance = cKDTree(frame.local[patch]).query(centres)[0]
+                self.centres[np.argsort(distance, kind="stable")[:LEAST_ATTACHED]] = number
 
-    Returns
-    -------
-    columns : (S, 6) int64, shares : (S, 6) float64
-        Shares sum to one in each row.
+
+def _hang(centres, samples):
+    """Columns and shares of all contact points: a centre hangs on itself, a sample on the centres around it."""
+    columns, shares = bind_samples(samples.points, samples.normals, centres.points, centres.normals)
+    count = len(centres.points)
+    alone = np.repeat(np.arange(count)[:, None], columns.shape[1], axis=1)
+    whole = np.eye(1, columns.shape[1]).repeat(count, axis=0)
+    return np.concatenate([alone, columns]), np.concatenate([whole, shares])
+
+
+def _with_hanging(holder, columns, shares):
+    """Count contact points that hang for the most part on held centres to the bone that holds these.
+
+    Contact could lift them only by moving the few free centres they hang on a long way.
     """
-    wanted = min(4 * SHARES, len(centres))
-    distance, index = cKDTree(centres).query(samples, k=wanted)
-    facing = np.einsum("skj,sj->sk", normals[index], sample_normals)
-    # A centre that looks the other way counts as farther: it is used only where nothing else is near.
-    cost = distance * np.where(facing > 0.0, 1.0, 1.0 + 4.0 * np.minimum(-facing, 0.5))
-    order = np.argsort(cost, axis=1, kind="stable")
-    cost = np.take_along_axis(cost, order, axis=1)
-    index = np.take_along_axis(index, order, axis=1)
-    used = min(SHARES, wanted - 1)
-    radius = cost[:, used : used + 1]
-    shares = (1.0 - cost[:, :used] / (1.001 * radius)) ** 2
-    shares /= shares.sum(axis=1, keepdims=True)
-    return np.ascontiguousarray(index[:, :used], dtype=np.int64), np.ascontiguousarray(shares)
+    held = shares * (holder[columns] >= 0)
+    hanging = np.flatnonzero((held.sum(axis=1) > 0.5) & (holder < 0))
+    carrier = columns[hanging, held[hanging].argmax(axis=1)]
+    holder = holder.copy()
+    holder[hanging] = holder[carrier]
+    return holder
+
+
+def _principal_axes(points):
+    """Right-handed principal axes as rows."""
+    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    axes[2] *= np.sign(np.linalg.det(axes))
+    return axes

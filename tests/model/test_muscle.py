@@ -97,7 +97,7 @@ def _first(scene):
 def _surface(scene):
     model = build_model(scene.muscles[0], scene, "rbf")
     (frame,) = simulate_frames(scene, [model])
-    return frame.surfaces[model.name], np.ptp(model.rest, axis=0).max()
+    return frame.surfaces[model.name], np.ptp(model.rest.centres, axis=0).max()
 
 
 @pytest.mark.parametrize("turn", [[0.0, 0.0, 0.0], [0.7, -1.9, 0.4], [2.0, 0.3, 1.1]])
@@ -157,7 +157,7 @@ def test_fitted_centres_lie_beside_the_surface_and_move_like_others(hip):
     model = RBFMuscle(hip.muscles[0], hip, RBFOptions(placement="fitted", **options))
     greedy = RBFMuscle(hip.muscles[0], hip, RBFOptions(placement="greedy", **options))
     vertices, faces = (np.array(part) for part in (hip.muscles[0].mesh.vertices, hip.muscles[0].mesh.faces))
-    beside = np.sqrt(igl.point_mesh_squared_distance(model.rest, vertices, faces)[0])
+    beside = np.sqrt(igl.point_mesh_squared_distance(model.rest.centres, vertices, faces)[0])
     assert 0.01 < beside.max() < 1.0  # mm, of a spacing of 6
     error = [np.sqrt((part.field()(vertices) ** 2).mean()) for part in (model, greedy)]
     assert error[0] < 0.7 * error[1]

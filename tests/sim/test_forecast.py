@@ -51,9 +51,11 @@ def test_rbf_muscle_has_the_foretold_surface_and_matrix(scene):
     surface = model.field().surface(resolution=model.options.resolution)
     # A thin muscle's rim takes more vertices than its area tells.
     assert foretold.shown == pytest.approx(len(surface.vertices), rel=0.35)
-    unknowns = cost._unknowns(model.options, len(model.x))
-    assert unknowns == 4 * len(model.x)
-    assert foretold.memory > model.columns.nbytes + model.shares.nbytes + model.solver.inverse.nbytes
+    unknowns = cost._unknowns(model.options, len(model.points))
+    assert unknowns == 4 * len(model.points)
+    assert (
+        foretold.memory > model.rest.columns.nbytes + model.rest.shares.nbytes + model.solver.inverse.nbytes
+    )
 
 
 def test_more_centres_cells_and_iterations_take_more(scene):

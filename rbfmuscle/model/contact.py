@@ -1,0 +1,202 @@
+"""Contact of an RBF muscle: forces of a linear complementarity problem, through the inverse of the elastic matrix."""
+
+import numpy as np
+
+from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.sim.loop.contact import HalfSpaces
+
+# Rounds in which contacts join the working set, and sweeps over it in each.
+ROUNDS = 6
+SWEEPS = 60
+
+
+@compiled(error_model="numpy")
+def solve_contact_forces(gram, need, force, sweeps, tolerance):
+    """Contact forces of the linear complementarity problem force >= 0, gram · force >= need.
+
+    By projected Gauss-Seidel.
+
+    Parameters
+    ----------
+    gram : (c, c) ndarray
+        Motion at contact i for a unit force at contact j; symmetric, positive diagonal.
+    need : (c,) ndarray
+        Motion each contact asks for.
+    force : (c,) ndarray
+        First guess, changed in place to the solution.
+    sweeps : int
+    tolerance : float
+        Stop when no gap moves by more.
+    """
+    for _ in range(sweeps):
+        largest = 0.0
+        for c in range(len(need)):
+            residual = need[c]
+            for d in range(len(need)):
+                residual -= gram[c, d] * force[d]
+            new = max(0.0, force[c] + residual / gram[c, c])
+            largest = max(largest, abs(new - force[c]) * gram[c, c])
+            force[c] = new
+        if largest < tolerance:
+            break
+
+
+@compiled(error_model="numpy")
+def _deepest(lacking, is_chosen, tolerance, most):
+    """Contacts, not yet chosen, that lack the most motion, deepest first."""
+    found = np.flatnonzero((lacking > tolerance) & ~is_chosen)
+    return found[np.argsort(-lacking[found], kind="mergesort")[:most]]
+
+
+@compiled(error_model="numpy")
+def _gram_loop(index, normal, row, stiffness, influence, columns, shares):
+    """(n_c · n_d) w_cᵀ A⁻¹ w_d - row_c row_d / stiffness: motion at c for a unit force at d, volume kept."""
+    size = len(index)
+    gram = np.empty((size, size))
+    for c in range(size):
+        for d in range(c + 1):
+            value = 0.0
+            for k in range(columns.shape[1]):
+                value += shares[index[c], k] * influence[index[d], columns[index[c], k]]
+            value *= normal[c, 0] * normal[d, 0] + normal[c, 1] * normal[d, 1] + normal[c, 2] * normal[d, 2]
+            value -= row[c] * row[d] / stiffness
+            gram[c, d] = value
+            gram[d, c] = value
+    # A contact on held centres alone cannot be moved: its row is zero.
+    least = 1e-9 * np.abs(np.diag(gram)).max()
+    for c in range(size):
+        gram[c, c] += least
+    return gram
+
+
+@compiled(error_model="numpy")
+def _push_loop(index, normal, strength, influence, push):
+    """push = A⁻¹ Wᵀ of the forces: motion of all centres."""
+    push[:] = 0.0
+    for c in range(len(index)):
+        if strength[c] == 0.0:
+            continue
+        for k in range(len(push)):
+            for a in range(3):
+                push[k, a] += influence[index[c], k] * strength[c] * normal[c, a]
+
+
+@compiled(error_model="numpy")
+def _lacking_loop(index, normal, row, need, share, push, columns, shares, lacking):
+    """Motion that each contact still asks for after ``push`` and ``share`` of the volume's response."""
+    for c in range(len(index)):
+        value = need[c] + row[c] * share
+        for k in range(columns.shape[1]):
+            j = columns[index[c], k]
+            value -= shares[index[c], k] * (
+                normal[c, 0] * push[j, 0] + normal[c, 1] * push[j, 1] + normal[c, 2] * push[j, 2]
+            )
+        lacking[c] = value
+
+
+@compiled(error_model="numpy")
+def _contact_loop(
+    index, gap, normal, source, motion, response, stiffness, influence, columns, shares, table,
+    batch, rounds, sweeps, tolerance, push,
+):  # fmt: skip
+    """Fill ``push`` and the forces in ``table``; returns the volume's share that the push takes back."""
+    count = len(index)
+    row, need, force = np.empty(count), np.empty(count), np.empty(count)
+    for c in range(count):
+        i = index[c]
+        row[c], need[c] = 0.0, -gap[c]
+        for a in range(3):
+            row[c] += normal[c, a] * response[i, a]
+            need[c] -= normal[c, a] * motion[i, a]
+        force[c] = table[i, source[c]]
+    table[:] = 0.0
+    push[:] = 0.0
+    lost = 0.0
+    is_chosen = force > 0.0
+    chosen = np.flatnonzero(is_chosen)
+    lacking = need.copy()
+    for _ in range(rounds):
+        added = _deepest(lacking, is_chosen, tolerance, batch)
+        if len(added) == 0 and len(chosen) == 0:
+            break
+        is_chosen[added] = True
+        chosen = np.concatenate((chosen, added))
+        gram = _gram_loop(index[chosen], normal[chosen], row[chosen], stiffness, influence, columns, shares)
+        strength = force[chosen]
+        solve_contact_forces(gram, need[chosen], strength, sweeps, 0.1 * tolerance)
+        force[chosen] = strength
+        _push_loop(index[chosen], normal[chosen], strength, influence, push)
+        lost = 0.0
+        for c in chosen:
+            lost += row[c] * force[c]
+        if len(added) == 0:
+            break
+        _lacking_loop(index, normal, row, need, lost / stiffness, push, columns, shares, lacking)
+    for c in chosen:
+        table[index[c], source[c]] = force[c]
+    return lost
+
+
+class ContactConstraint:
+    """C(x) = gap + n · Δp >= 0 at each contact point, projected through the inverse of the elastic matrix.
+
+    Forces solve a linear complementarity problem on a working set: it starts from the contacts that pushed
+    before and takes in the deepest violations round by round until none is left. Few contacts push at a time,
+    but leaving one out would let the muscle jump between poses.
+
+    Parameters
+    ----------
+    columns, shares : (n, k) ndarray
+        Sparse rows of W: how the contact points hang on the centres.
+    influence : (n, K) ndarray
+        W A⁻¹: motion of the centres for a unit force at each contact point.
+    batch : int
+        Contacts that join the working set in one round.
+    tolerance : float
+        Violation that is left alone [scene unit].
+    """
+
+    def __init__(
+        self,
+        columns: np.ndarray,
+        shares: np.ndarray,
+        *,
+        influence: np.ndarray,
+        batch: int,
+        tolerance: float,
+    ) -> None:
+        self.influence, self.columns, self.shares = influence, columns, shares
+        self.batch, self.tolerance = batch, tolerance
+        self.forces = np.zeros((len(influence), 1))
+
+    def correction(
+        self,
+        spaces: HalfSpaces,
+        sources: int,
+        motion: np.ndarray,
+        response: np.ndarray,
+        stiffness: float,
+    ) -> tuple[np.ndarray, float]:
+        """Contact correction of the centres (K, 3), and the volume that it adds by itself.
+
+        Parameters
+        ----------
+        spaces : HalfSpaces
+        sources : int
+            Number of obstacles that ``spaces.source`` may name, neighbours counted from the end.
+        motion : (n, 3) ndarray
+            Motion of the contact points without contact.
+        response : (n, 3) ndarray
+            Their motion for a unit pressure.
+        stiffness : float
+            Volume that a unit pressure adds.
+        """
+        if self.forces.shape[1] != sources:
+            self.forces = np.zeros((len(self.influence), sources))
+        push = np.empty((self.influence.shape[1], 3))
+        lost = _contact_loop(
+            spaces.index, spaces.gap, spaces.normal, spaces.source % sources, motion, response, stiffness,
+            self.influence, self.columns, self.shares, self.forces,
+            self.batch, ROUNDS, SWEEPS, self.tolerance, push,
+        )  # fmt: skip
+        return push, lost

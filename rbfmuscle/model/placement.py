@@ -1,0 +1,160 @@
+"""Where the centres and samples of an RBF muscle lie, and the fit that its field is made by."""
+
+import warnings
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.implicit.field import RBFField
+from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
+from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
+from rbfmuscle.implicit.placement.sampling import GREEDY_LARGEST, SurfaceSample, sample_surface
+from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
+from rbfmuscle.model.options import RBFOptions
+from rbfmuscle.sim.cache import content_key, has_arrays, load_arrays, store_arrays
+from rbfmuscle.sim.scene.objects import Muscle
+from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.validation import NumericalWarning, SceneError
+
+# Area for each centre [mm²], from which their number follows where the scene names none, and the least number.
+AREA_FOR_EACH = 212.0
+LEAST_CENTRES = 150
+# With more centres than these a fit to normal derivatives alone errs less for the same time.
+MOST_WITH_ALL_DERIVATIVES = 200
+# Part of the name under which samples are cached: raise it when they are made in another way.
+SAMPLING = 1
+
+
+@dataclass(frozen=True)
+class FieldFit:
+    """How the field through a muscle's centres is fitted.
+
+    Attributes
+    ----------
+    kernel : Kernel
+    epsilon : float
+        Its shape parameter [1 / scene unit].
+    derivatives : {"all", "normal"}
+        What the fit meets at a centre.
+    """
+
+    kernel: Kernel
+    epsilon: float
+    derivatives: str
+
+    def fit(self, centres: np.ndarray, normals: np.ndarray) -> RBFField:
+        """The field through centres (K, 3) with unit normals (K, 3)."""
+        return RBFField.fit_surface(
+            centres, normals, kernel=self.kernel, epsilon=self.epsilon, derivatives=self.derivatives
+        )
+
+
+def default_centres(area: float, scene: Scene) -> int:
+    """Number of centres of a muscle of this area [scene unit squared]."""
+    return max(LEAST_CENTRES, int(round(area / (AREA_FOR_EACH * scene.length(1.0) ** 2), -1)))
+
+
+def place_points(
+    muscle: Muscle, frame: RestFrame, options: RBFOptions, count: int
+) -> tuple[SurfaceSample, SurfaceSample, FieldFit]:
+    """Centres, samples and fit of a muscle, in its own frame.
+
+    Parameters
+    ----------
+    muscle : Muscle
+    frame : RestFrame
+        Of its vertices.
+    options : RBFOptions
+    count : int
+        Of centres.
+
+    Returns
+    -------
+    centres, samples : SurfaceSample
+        In the frame's coordinates.
+    fit : FieldFit
+        In the scene's.
+
+    Raises
+    ------
+    SceneError
+        If the placement cannot be had with so many centres or with this kernel.
+    """
+    fitted = options.placement == FITTED
+    placement = "greedy" if fitted else options.placement
+    if placement == "greedy" and count > GREEDY_LARGEST:
+        raise SceneError(
+            f"muscle {muscle.name!r}: placement {options.placement!r} takes at most {GREEDY_LARGEST} "
+            f"centres, got {count}; take placement 'adaptive'"
+        )
+    faces = np.asarray(muscle.mesh.faces)
+    centres = cached_sample(frame.local, faces, count, seed=options.seed, placement=placement)
+    samples = cached_sample(frame.local, faces, options.samples, seed=options.seed, placement="even")
+    fit = _choose_fit(muscle.name, (frame, faces), options, centres, samples)
+    if fitted:
+        centres = _fit_centres(muscle.name, (frame, faces), options, centres, fit)
+    return centres, samples, fit
+
+
+def _choose_fit(name, mesh, options, centres, samples):
+    """The kernel, and its shape parameter where the scene leaves it open: by the error at the samples at rest."""
+    frame, faces = mesh
+    derivatives = options.derivatives
+    if derivatives == "auto":
+        few = len(centres.points) <= MOST_WITH_ALL_DERIVATIVES
+        derivatives = "all" if options.placement == FITTED or few else "normal"
+    kernel = get_kernel(options.kernel)
+    if not kernel.hermite:
+        warnings.warn(
+            f"muscle {name!r}: kernel {kernel.name!r} is C{kernel.smoothness} only; the field is "
+            "fitted to values on and off the surface, with three centres a point, in place of normals",
+            NumericalWarning,
+            stacklevel=6,
+        )
+    epsilon = options.epsilon or 1.0
+    if kernel.has_epsilon and not options.epsilon:
+        # In the muscle's own frame, so that a scene that is turned chooses the same.
+        epsilon = choose_surface_epsilon(
+            centres.points, centres.normals, kernel=kernel, held_out=samples.points,
+            distance=ExactDistance(frame.local, faces).signed_distance, derivatives=derivatives,
+        ).epsilon / frame.size  # fmt: skip
+    return FieldFit(kernel, epsilon, derivatives)
+
+
+def _fit_centres(name, mesh, options, centres, fit):
+    """Centres beside the surface, whose field lies nearer to all of it."""
+    frame, faces = mesh
+    if not fit.kernel.hermite or fit.derivatives != "all":
+        raise SceneError(
+            f"muscle {name!r}: placement {FITTED!r} needs a C2 kernel and derivatives 'all', got "
+            f"{fit.kernel.name!r} and {fit.derivatives!r}; take placement 'greedy'"
+        )
+    return fit_sample(
+        centres, frame.local, faces, kernel=fit.kernel, epsilon=fit.epsilon * frame.size, seed=options.seed
+    )  # fmt: skip
+
+
+def cached_sample(
+    vertices: np.ndarray, faces: np.ndarray, count: int, *, seed: int, placement: str
+) -> SurfaceSample:
+    """`sample_surface` of a muscle's mesh, from the cache on disk by content: greedy placement takes a second."""
+    key = _sample_key(vertices, faces, count, seed, placement)
+    arrays = load_arrays(key)
+    if arrays is not None:
+        return SurfaceSample(**arrays)
+    sample = sample_surface(vertices, faces, count, seed=seed, placement=placement)
+    store_arrays(key, asdict(sample))
+    return sample
+
+
+def sample_is_cached(
+    vertices: np.ndarray, faces: np.ndarray, count: int, *, seed: int, placement: str
+) -> bool:
+    """Whether `cached_sample` has these already."""
+    return has_arrays(_sample_key(vertices, faces, count, seed, placement))
+
+
+def _sample_key(vertices, faces, count, seed, placement):
+    return content_key(vertices, faces, ("surface sample", SAMPLING, count, seed, placement))
