@@ -3,16 +3,13 @@
 from collections.abc import Mapping
 
 from pbd_baseline.options import PBDOptions
-from pbd_baseline.rest import weights_are_kept
+from pbd_baseline.rest import weights_are_cached
+from pbd_baseline.shapes import METHODS, sweeps
 from rbfmuscle.sim.plan.forecast import MuscleCost
 from rbfmuscle.sim.scene.objects import Muscle
 from rbfmuscle.sim.scene.scene import Scene
 
-# Of each method: calls and visits for a vertex of one sweep; of the contacts and the volume after the last one.
-SWEEP = {
-    "pbd": (150, 160), "xpbd": (330, 250), "arap-pbd": (450, 500), "arap-volume": (1330, 750),
-    "arap-interleaved": (1030, 600),
-}  # fmt: skip
+# Of the contacts and the volume after the last sweep: calls, and visits for a vertex.
 FINISH_CALLS, FINISH_VISITS = 1000, 870
 # A sub-step besides: calls, and visits for a contact point in the search for tunnelling.
 PREDICT_CALLS, CROSSING_VISITS = 1100, 200
@@ -22,7 +19,6 @@ VERTEX_VISITS, WEIGHT_VISITS = 9500, 105_000
 SHOW_VISITS = 30
 # Bytes for a vertex with its edges, faces and constraints; more where a factor is kept; while a frame is made.
 VERTEX_BYTES, FACTOR_BYTES, WORKING_BYTES = 700, 450, 200
-FACTORED = ("arap-volume", "arap-interleaved")
 # Contact points for a vertex of a closed mesh: with the middles of edges and faces 1 + 3 + 2.
 POINTS = {"vertices": 1, "faces": 6}
 
@@ -45,14 +41,14 @@ def estimate_muscle(
     MuscleCost
     """
     count, call, visit = len(muscle.mesh.vertices), rates["call"], rates["visit"]
-    calls, visits = SWEEP[options.method]
+    method, rounds = METHODS[options.method], sweeps(options)
     search = CROSSING_VISITS * POINTS[options.contact] * count if scene.detect is not None else 0
-    weights = 0 if weights_are_kept(muscle, options.swelling_reach) else WEIGHT_VISITS
-    factor = FACTOR_BYTES if options.method in FACTORED else 0
+    weights = 0 if weights_are_cached(muscle, options.swelling_reach) else WEIGHT_VISITS
+    factor = FACTOR_BYTES if method.factored else 0
     return MuscleCost(
         build=visit * count * (VERTEX_VISITS + weights),
-        step=call * (PREDICT_CALLS + FINISH_CALLS + options.sweeps * calls)
-        + visit * (count * (FINISH_VISITS + options.sweeps * visits) + search),
+        step=call * (PREDICT_CALLS + FINISH_CALLS + rounds * method.calls)
+        + visit * (count * (FINISH_VISITS + rounds * method.visits) + search),
         show=visit * SHOW_VISITS * count,
         memory=count * (VERTEX_BYTES + factor),
         working=WORKING_BYTES * count,

@@ -1,24 +1,28 @@
 """Which way fibres run at an edge, how soft that makes it, and how thick the muscle is there."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.harmonic import cotangent_laplacian, surface_gradient
+from rbfmuscle.geometry.harmonic import cotangent_laplacian
 
 # Pieces of polyline that speak for one place.
 NEAREST = 6
 
 
-def fibre_directions(vertices, faces, weights, fibres):
-    """Unit direction of the fibres at each vertex.
+def fibre_directions(
+    points: np.ndarray, along: np.ndarray, fibres: Sequence[np.ndarray] | None
+) -> np.ndarray:
+    """Unit direction of the fibres at each point.
 
     Parameters
     ----------
-    vertices, faces : (n, 3), (m, 3) ndarray
-    weights : (n, b) ndarray
-        Harmonic weights of the bones; without ``fibres`` the fibres follow the gradient of the last.
+    points : (n, 3) ndarray
+    along : (n, 3) ndarray
+        Gradient of the last bone's harmonic weight: the fibres follow it where none are given.
     fibres : list of (k, 3) ndarray, or None
         Polylines.
 
@@ -28,15 +32,15 @@ def fibre_directions(vertices, faces, weights, fibres):
         Zero where no direction can be told.
     """
     if not fibres:
-        return _normalised(surface_gradient(vertices, faces, weights[:, -1]))
+        return _normalised(along)
     middles = np.concatenate([0.5 * (line[1:] + line[:-1]) for line in fibres])
     tangents = _normalised(np.concatenate([np.diff(line, axis=0) for line in fibres]))
     count = min(NEAREST, len(middles))
-    distance, index = cKDTree(middles).query(vertices, k=count)
+    distance, index = cKDTree(middles).query(points, k=count)
     distance, index = distance.reshape(-1, count), index.reshape(-1, count)
     nearest = tangents[index[:, :1]]
     signs = np.sign(np.einsum("nkd,nkd->nk", tangents[index], np.broadcast_to(nearest, (*index.shape, 3))))
-    share = signs / np.maximum(distance, 1e-9 * np.ptp(vertices, axis=0).max()) ** 2
+    share = signs / np.maximum(distance, 1e-9 * np.ptp(points, axis=0).max()) ** 2
     return _normalised(np.einsum("nk,nkd->nd", share, tangents[index]))
 
 

@@ -1,15 +1,17 @@
 """PBDMuscle: a muscle as a triangle mesh held together by constraints, the baseline of the RBF muscle."""
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from pbd_baseline.collision import CollisionConstraint
+from pbd_baseline.contact import ContactConstraint
 from pbd_baseline.motion import carry
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.rest import Rest
-from pbd_baseline.shapes import SHAPES
-from rbfmuscle.compiled.loop import compiled
+from pbd_baseline.shapes import METHODS, sweeps
+from rbfmuscle.sim.loop.contact import BoneContacts
 from rbfmuscle.sim.loop.frame import FinishedDrawing, ModelSurface
 from rbfmuscle.sim.scene.objects import Muscle
 from rbfmuscle.sim.scene.scene import Scene
@@ -46,10 +48,11 @@ class PBDMuscle:
     def __init__(self, muscle: Muscle, scene: Scene, options: PBDOptions | None = None) -> None:
         self.name = muscle.name
         self.options = options or PBDOptions()
-        self.rest = Rest.from_muscle(muscle, swelling_reach=self.options.swelling_reach)
-        self.shape = SHAPES[self.options.method](self.rest, self.options)
+        self.rest = Rest.from_muscle(muscle, scene, self.options)
+        self.shape = METHODS[self.options.method].shape(self.rest, self.options)
+        self.sweeps = sweeps(self.options)
         columns, shares = _contact_carriers(self.rest, faces_too=self.options.contact == "faces")
-        self.collision = CollisionConstraint(
+        self.contact = ContactConstraint(
             columns, shares, reach=scene.length(REACH), response=self.options.response
         )
         self.finishing_reach, self.depth = scene.length(FINISHING_REACH), scene.length(DEPTH)
@@ -62,11 +65,11 @@ class PBDMuscle:
         self.time = 1.0
         self.penetration = 0.0
 
-    def contact_points(self):
+    def contact_points(self) -> np.ndarray:
         """The vertices in this model's own order, then the middles of edges and faces where these are asked for."""
-        return self.points if self.options.contact == "vertices" else self.collision.place(self.points)
+        return self.points if self.options.contact == "vertices" else self.contact.place(self.points)
 
-    def predict(self, before, after):
+    def predict(self, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> None:
         """Go along with the bones; held vertices arrive exactly."""
         motions = np.array([_relative(before[bone], after[bone]) for bone in self.rest.bones])
         self.time = max(1.0, _largest_angle(motions) / STEP_ANGLE)
@@ -80,53 +83,49 @@ class PBDMuscle:
             held = self.rest.holder == b
             self.points[held] = self.rest.vertices[held] @ after[bone][:3, :3].T + after[bone][:3, 3]
 
-    def solve(self, contacts):
+    def solve(self, contacts: BoneContacts) -> None:
         """Sweep the shape, contacts inside the iteration and last, the volume on what is not in contact."""
-        self.collision.find(contacts, self.points)
-        for _ in range(self.options.sweeps):
-            self.shape.sweep(self.points, self.time / self.options.sweeps)
-            self.collision.project(self.points)
-            if self.options.method != "pbd":
-                # Three sweeps change the volume too little for PBD to feel it before the last of them.
-                self._restore_volume()
+        self.contact.find(contacts, self.points)
+        for _ in range(self.sweeps):
+            self.shape.sweep(self.points, self.time / self.sweeps)
+            self.contact.project(self.points)
+            if self.shape.volume_in_sweeps:
+                self.shape.restore_volume(self.points, self.contact)
         self._finish(contacts)
 
-    def turn(self, which, transform):
+    def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
         """Move the vertices marked in a bool mask (n,) by a (4, 4) transform; held ones stay."""
         which = self._vertices_of(which) & (self.rest.holder < 0)
         self.points[which] = self.points[which] @ transform[:3, :3].T + transform[:3, 3]
 
     def _vertices_of(self, which):
         marked = np.zeros(len(self.points), dtype=bool)
-        marked[self.collision.columns[which]] = True
+        marked[self.contact.columns[which]] = True
         return marked
 
-    def snapshot(self):
+    def snapshot(self) -> Any:
         """Everything that :meth:`restore` needs."""
-        arap = getattr(self.shape, "arap", None)
-        rotations = None if arap is None else arap.quaternions.copy()
-        return self.points.copy(), self.before.copy(), rotations, self.time, self.penetration
+        return self.points.copy(), self.before.copy(), self.shape.snapshot(), self.time, self.penetration
 
-    def restore(self, state):
+    def restore(self, state: Any) -> None:
         """Go back to a snapshot."""
-        points, before, rotations, self.time, self.penetration = state
+        points, before, shape, self.time, self.penetration = state
         self.points[:], self.before = points, before.copy()
-        if rotations is not None:
-            self.shape.arap.quaternions[:] = rotations
+        self.shape.restore(shape)
 
-    def carried_mesh(self):
+    def carried_mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and faces, numbered as in the muscle's mesh but for the order of the faces."""
         vertices = np.empty_like(self.points)
         vertices[self.rest.order] = self.points
         return vertices, self.rest.order[self.rest.topology.faces]
 
-    def drawing(self, contacts):
+    def drawing(self, contacts: BoneContacts) -> FinishedDrawing:
         """What gives the mesh as it is now."""
         return FinishedDrawing(
             ModelSurface(*self.carried_mesh(), {"solver_penetration_max": self.penetration})
         )
 
-    def volume(self):
+    def volume(self) -> float:
         """Enclosed volume now [unit^3]."""
         return self.rest.volume.volume(self.points)
 
@@ -135,28 +134,15 @@ class PBDMuscle:
 
         The half-spaces are found again where the last round still left something to do.
         """
-        self.penetration = self.collision.find(contacts, self.points, reach=self.finishing_reach)
+        self.penetration = self.contact.find(contacts, self.points, reach=self.finishing_reach)
         for k in range(FINISHING_ROUNDS):
             settled = self.penetration <= self.depth
-            self.collision.project(self.points)
-            self._restore_volume()
+            self.contact.project(self.points)
+            self.shape.restore_volume(self.points, self.contact)
             if settled or k == FINISHING_ROUNDS - 1:
-                self.penetration = self.collision.depth(self.points)
+                self.penetration = self.contact.depth(self.points)
                 return
-            self.penetration = self.collision.find(contacts, self.points, reach=self.finishing_reach)
-
-    def _restore_volume(self):
-        volume = self.rest.volume
-        if self.options.method == "arap-interleaved":
-            volume.project(self.points, self.rest.inverse_mass)
-            return
-        gradient = volume.gradient(self.points)
-        if self.options.method == "arap-volume":
-            direction = self.shape.smooth(gradient)
-        else:
-            direction = gradient.copy()
-            _scale_loop(direction, self.rest.room)
-        volume.restore(self.points, direction, clear_way=self.collision.clear_way)
+            self.penetration = self.contact.find(contacts, self.points, reach=self.finishing_reach)
 
 
 def _contact_carriers(rest, *, faces_too):
@@ -187,13 +173,3 @@ def _largest_angle(motions):
             turn = one[:3, :3] @ other[:3, :3].T
             largest = max(largest, math.acos(min(1.0, max(-1.0, 0.5 * (np.trace(turn) - 1.0)))))
     return largest
-
-
-@compiled
-def _scale_loop(direction, length):
-    """Give each row the length asked for."""
-    for i in range(len(direction)):
-        size = np.sqrt(direction[i, 0] ** 2 + direction[i, 1] ** 2 + direction[i, 2] ** 2)
-        factor = length[i] / size if size > 0.0 else 0.0
-        for k in range(3):
-            direction[i, k] *= factor

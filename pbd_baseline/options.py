@@ -6,9 +6,6 @@ from pydantic import Field
 
 from rbfmuscle.sim.scene.options import NotNegative, Positive, Share, Table
 
-# Sweeps a solve: the authors' three for PBD; sub-steps of one sweep for XPBD.
-ITERATIONS = {"pbd": 3, "xpbd": 10, "arap-pbd": 10, "arap-volume": 6, "arap-interleaved": 6}
-
 
 class PBDOptions(Table):
     """``[muscle.model]`` of the mesh models.
@@ -41,8 +38,3 @@ class PBDOptions(Table):
     swelling_reach: Positive = 0.04
     response: Literal["sum", "nearest"] = "sum"
     contact: Literal["vertices", "faces"] = "vertices"
-
-    @property
-    def sweeps(self):
-        """Number of iterations in effect."""
-        return self.iterations or ITERATIONS[self.method]

@@ -6,9 +6,13 @@ import numpy as np
 
 from pbd_baseline.constraints import VolumeConstraint
 from pbd_baseline.fibres import fibre_directions, swelling_room
+from pbd_baseline.options import PBDOptions
 from pbd_baseline.topology import Topology, cache_order
 from pbd_baseline.weights import even_weights
+from rbfmuscle.geometry.harmonic import surface_gradient
 from rbfmuscle.sim.cache import content_key, has_arrays, load_arrays, store_arrays
+from rbfmuscle.sim.scene.objects import Muscle
+from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.validation import SceneError
 
 # Raise it when weights or room are computed in another way: entries of the cache are then not found.
@@ -43,7 +47,7 @@ class Rest:
     order: np.ndarray
     vertices: np.ndarray
     topology: Topology
-    bones: list
+    bones: list[str]
     weights: np.ndarray
     holder: np.ndarray
     inverse_mass: np.ndarray
@@ -52,14 +56,14 @@ class Rest:
     volume: VolumeConstraint
 
     @classmethod
-    def from_muscle(cls, muscle, *, swelling_reach):
+    def from_muscle(cls, muscle: Muscle, scene: Scene, options: PBDOptions) -> "Rest":
         """Measure a muscle of a scene.
 
         Parameters
         ----------
         muscle : Muscle
-        swelling_reach : float
-            See `pbd_baseline.options.PBDOptions`.
+        scene : Scene
+        options : PBDOptions
 
         Raises
         ------
@@ -74,8 +78,9 @@ class Rest:
         topology = Topology.from_mesh(vertices, faces)
         volume = VolumeConstraint(vertices, faces)
         inverse_mass = np.where(holder < 0, 1.0, 0.0)
-        weights, room = _weights_and_room(vertices, faces, holder, len(bones), volume, swelling_reach)
-        fibres = fibre_directions(vertices, faces, weights, muscle.fibres)
+        weights, room = _weights_and_room(vertices, faces, holder, len(bones), volume, options.swelling_reach)
+        along = surface_gradient(vertices, faces, weights[:, -1])
+        fibres = fibre_directions(vertices, along, muscle.fibres)
         return cls(
             order, vertices, topology, bones, weights, holder, inverse_mass, fibres, room, volume
         )  # fmt: skip
@@ -92,7 +97,7 @@ class Rest:
         return np.maximum(length / median, 1e-3)
 
 
-def weights_are_kept(muscle, swelling_reach):
+def weights_are_cached(muscle: Muscle, swelling_reach: float) -> bool:
     """Whether what takes nearly all the time of a muscle's build is in the cache on disk."""
     _, vertices, faces, _, holder = _renumbered(muscle)
     return has_arrays(_weights_key(vertices, faces, holder, swelling_reach))

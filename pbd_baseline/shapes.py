@@ -1,8 +1,10 @@
 """What gives a mesh muscle its shape: one class for each way of the paper, all swept in the same manner.
 
 A shape offers ``sweep(points, time)``: one iteration, in place, that keeps held vertices where they are. The
-muscle around it adds collisions and volume after each.
+muscle around it adds contact after each, and the volume in the shape's own way.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sparse
@@ -10,18 +12,65 @@ import scipy.sparse as sparse
 from pbd_baseline.arap import ARAP, ARAPConstraint
 from pbd_baseline.bending import BendingConstraint
 from pbd_baseline.constraints import EdgeConstraint
+from pbd_baseline.contact import ContactConstraint
 from pbd_baseline.factor import SymmetricFactor
 from pbd_baseline.fibres import edge_stiffness, vertex_areas
+from pbd_baseline.options import PBDOptions
+from pbd_baseline.rest import Rest
+from rbfmuscle.compiled.loop import compiled
 
 
-class PBDShape:
+class Shape:
+    """What all ways have in common: how the volume comes back, and what a snapshot holds.
+
+    Parameters
+    ----------
+    rest : Rest
+
+    Attributes
+    ----------
+    volume_in_sweeps : bool
+        Whether the volume is restored in every sweep, not after the last one alone.
+    """
+
+    volume_in_sweeps = True
+
+    def __init__(self, rest: Rest) -> None:
+        self.volume, self.room, self.inverse_mass = rest.volume, rest.room, rest.inverse_mass
+
+    def sweep(self, points: np.ndarray, time: float) -> None:
+        """One iteration of the given time, in place."""
+        raise NotImplementedError
+
+    def restore_volume(self, points: np.ndarray, contact: ContactConstraint) -> None:
+        """Bring the volume back, in place: where there is room, and out of the way of contacts."""
+        self.volume.restore(points, self._swelling(points), clear_way=contact.clear_way)
+
+    def snapshot(self) -> np.ndarray | None:
+        """What the shape remembers from sweep to sweep; None where that is nothing."""
+        return None
+
+    def restore(self, state: np.ndarray | None) -> None:
+        """Go back to a snapshot."""
+
+    def _swelling(self, points: np.ndarray) -> np.ndarray:
+        """Direction (n, 3) in which the muscle swells: along the normals, as far as there is room."""
+        direction = self.volume.gradient(points)
+        _scale_loop(direction, self.room)
+        return direction
+
+
+class PBDShape(Shape):
     """Edges, softer along the fibres, and dihedral angles, with stiffnesses (Müller 2007)."""
 
-    def __init__(self, rest, options):
+    # Three sweeps change the volume too little for PBD to feel it before the last of them.
+    volume_in_sweeps = False
+
+    def __init__(self, rest: Rest, options: PBDOptions) -> None:
+        super().__init__(rest)
         stiffness = edge_stiffness(rest.vertices, rest.topology.edges, rest.fibres, options.fibre_exponent)
         if options.soft_length > 0.0:
             stiffness = stiffness * np.minimum(1.0, options.soft_length / rest.relative_lengths())
-        self.inverse_mass = rest.inverse_mass
         self.edges = EdgeConstraint(
             rest.vertices, rest.topology.edges, stiffness=options.edge * stiffness, limits=options.limits
         )
@@ -35,7 +84,7 @@ class PBDShape:
         self.edges.project(points, self.inverse_mass)
 
 
-class XPBDShape:
+class XPBDShape(Shape):
     """The same constraints with compliances, one iteration in each of many small steps (Macklin 2019).
 
     A muscle without inertia relaxes by c dx/dt = -grad E, so the implicit step is that of XPBD with the
@@ -43,9 +92,9 @@ class XPBDShape:
     the same place.
     """
 
-    def __init__(self, rest, options):
+    def __init__(self, rest: Rest, options: PBDOptions) -> None:
+        super().__init__(rest)
         softness = edge_stiffness(rest.vertices, rest.topology.edges, rest.fibres, options.fibre_exponent)
-        self.inverse_mass = rest.inverse_mass
         self.edges = EdgeConstraint(rest.vertices, rest.topology.edges, limits=options.limits)
         self.bending = BendingConstraint(rest.vertices, rest.topology.edges, rest.topology.wings)
         compliance = options.edge_compliance * rest.relative_lengths() / np.maximum(softness, 1e-3)
@@ -63,11 +112,11 @@ class XPBDShape:
         self.edges.project(points, self.inverse_mass)
 
 
-class ARAPShape:
+class ARAPShape(Shape):
     """The ARAP energy as PBD constraints: the paper's section 6.2, first option."""
 
-    def __init__(self, rest, options):
-        self.inverse_mass = rest.inverse_mass
+    def __init__(self, rest: Rest, options: PBDOptions) -> None:
+        super().__init__(rest)
         self.arap = ARAP(rest.vertices, rest.topology)
         self.constraint = ARAPConstraint(self.arap, compliance=options.arap_compliance)
 
@@ -77,8 +126,16 @@ class ARAPShape:
         self.constraint.reset()
         self.constraint.project(points, self.inverse_mass, time=time)
 
+    def snapshot(self) -> np.ndarray:
+        """The rotations."""
+        return self.arap.quaternions.copy()
 
-class GlobalARAPShape:
+    def restore(self, state: np.ndarray) -> None:
+        """Go back to the rotations of a snapshot."""
+        self.arap.quaternions[:] = state
+
+
+class GlobalARAPShape(Shape):
     """Local rotations and one prefactored global solve: the ARAP of the paper's second option.
 
     The global step makes E(x) + |x - z|^2 / (2 l^2) least in the surface's own measure, z where contact and
@@ -86,7 +143,8 @@ class GlobalARAPShape:
     muscle is pulled through the bone that it wraps. A free fixed point is the same for any l.
     """
 
-    def __init__(self, rest, options):
+    def __init__(self, rest: Rest, options: PBDOptions) -> None:
+        super().__init__(rest)
         self.arap = ARAP(rest.vertices, rest.topology)
         self.free = np.flatnonzero(rest.inverse_mass > 0.0)
         self.held = np.flatnonzero(rest.inverse_mass == 0.0)
@@ -103,17 +161,70 @@ class GlobalARAPShape:
         right -= self.coupling @ points[self.held]
         points[self.free] = self.factor.solve(right)
 
-    def smooth(self, gradient):
-        """L^-1 of a gradient (n, 3): its smooth (Sobolev) direction, 0 at held vertices."""
+    def snapshot(self) -> np.ndarray:
+        """The rotations."""
+        return self.arap.quaternions.copy()
+
+    def restore(self, state: np.ndarray) -> None:
+        """Go back to the rotations of a snapshot."""
+        self.arap.quaternions[:] = state
+
+    def _swelling(self, points: np.ndarray) -> np.ndarray:
+        """L^-1 of the volume's gradient: its smooth (Sobolev) direction, 0 at held vertices."""
+        gradient = self.volume.gradient(points)
         direction = np.zeros_like(gradient)
         direction[self.free] = self.factor.solve(np.ascontiguousarray(gradient[self.free]))
         return direction
 
 
-SHAPES = {
-    "pbd": PBDShape,
-    "xpbd": XPBDShape,
-    "arap-pbd": ARAPShape,
-    "arap-volume": GlobalARAPShape,
-    "arap-interleaved": GlobalARAPShape,
+class InterleavedARAPShape(GlobalARAPShape):
+    """The same with the rough volume step of the paper's figure 8: each of the two undoes what the other did."""
+
+    def restore_volume(self, points: np.ndarray, contact: ContactConstraint) -> None:
+        """One projection along the plain gradient, in place, whatever lies in the way."""
+        self.volume.project(points, self.inverse_mass)
+
+
+class Method(NamedTuple):
+    """All that is said of one way: its shape, its sweeps a solve, and what these take (`pbd_baseline.cost`).
+
+    Attributes
+    ----------
+    shape : type of Shape
+    sweeps : int
+        The authors' three for PBD; sub-steps of one sweep for XPBD.
+    calls, visits : int
+        Of one sweep: calls, and visits for a vertex.
+    factored : bool
+        Whether a sparse factor is held.
+    """
+
+    shape: type[Shape]
+    sweeps: int
+    calls: int
+    visits: int
+    factored: bool = False
+
+
+METHODS = {
+    "pbd": Method(PBDShape, 3, 150, 160),
+    "xpbd": Method(XPBDShape, 10, 330, 250),
+    "arap-pbd": Method(ARAPShape, 10, 450, 500),
+    "arap-volume": Method(GlobalARAPShape, 6, 1330, 750, factored=True),
+    "arap-interleaved": Method(InterleavedARAPShape, 6, 1030, 600, factored=True),
 }
+
+
+def sweeps(options: PBDOptions) -> int:
+    """Sweeps a solve: those of the options, or the method's own number."""
+    return options.iterations or METHODS[options.method].sweeps
+
+
+@compiled
+def _scale_loop(direction, length):
+    """Give each row the length asked for."""
+    for i in range(len(direction)):
+        size = np.sqrt(direction[i, 0] ** 2 + direction[i, 1] ** 2 + direction[i, 2] ** 2)
+        factor = length[i] / size if size > 0.0 else 0.0
+        for k in range(3):
+            direction[i, k] *= factor

@@ -64,7 +64,7 @@ class SurfaceDrawer:
         try:
             result = extract_surface(
                 field, points=points, resolution=resolution, cut=cut,
-                volume=self.rest.volume, level=self.level, axes=axes, obstacles=obstacles,
+                volume=self.rest.mesh_volume, level=self.level, axes=axes, obstacles=obstacles,
             )  # fmt: skip
         except ValueError as error:
             raise SolveError(

@@ -46,7 +46,7 @@ class Rest:
         Directed edges of the clusters and their weights.
     columns, shares : (K + S, 6) ndarray
         Centres that carry each contact point, and with what share.
-    volume : float
+    mesh_volume : float
         Of the muscle's mesh [scene unit cubed].
     axes : (3, 3) ndarray
         The muscle's principal axes as rows.
@@ -68,7 +68,7 @@ class Rest:
     weight: np.ndarray
     columns: np.ndarray
     shares: np.ndarray
-    volume: float
+    mesh_volume: float
     axes: np.ndarray
 
     @classmethod

@@ -219,7 +219,7 @@ def test_arap_holds_the_volume_at_every_iteration():
     rig.model.predict(rig.at, after)
     for _ in range(6):
         rig.model.shape.sweep(rig.model.points, 1.0)
-        rig.model._restore_volume()
+        rig.model.shape.restore_volume(rig.model.points, rig.model.contact)
         assert rig.volume_error() < 1e-10
 
 
@@ -258,7 +258,7 @@ def test_other_predictions_run(prediction):
 
 
 def test_sum_of_ways_out_leaves_two_bones_where_one_does_not():
-    from pbd_baseline.collision import CollisionConstraint
+    from pbd_baseline.contact import ContactConstraint
 
     class Corner:
         def half_spaces(self, points, reach):
@@ -269,7 +269,7 @@ def test_sum_of_ways_out_leaves_two_bones_where_one_does_not():
 
     for response, expected in (("sum", [0.0, 0.0, 0.0]), ("nearest", [0.0, -1.0, 0.0])):
         point = np.array([[-2.0, -1.0, 0.0]])
-        collision = CollisionConstraint(
+        collision = ContactConstraint(
             np.zeros((1, 3), dtype=int), np.array([[1.0, 0.0, 0.0]]), reach=5.0, response=response
         )
         collision.find(Corner(), point)
@@ -278,7 +278,7 @@ def test_sum_of_ways_out_leaves_two_bones_where_one_does_not():
 
 
 def test_the_middle_of_a_face_is_pushed_out_by_its_corners():
-    from pbd_baseline.collision import CollisionConstraint
+    from pbd_baseline.contact import ContactConstraint
 
     class Floor:
         def half_spaces(self, points, reach):
@@ -287,7 +287,7 @@ def test_the_middle_of_a_face_is_pushed_out_by_its_corners():
             return HalfSpaces(np.array([0]), points[:, 2].copy(), np.array([[0.0, 0.0, 1.0]]), np.array([0]))
 
     corners = np.array([[0.0, 0.0, 0.5], [3.0, 0.0, -2.0], [0.0, 3.0, -0.6]])
-    collision = CollisionConstraint(np.array([[0, 1, 2]]), np.full((1, 3), 1.0 / 3.0), reach=5.0)
+    collision = ContactConstraint(np.array([[0, 1, 2]]), np.full((1, 3), 1.0 / 3.0), reach=5.0)
     assert collision.find(Floor(), corners) == pytest.approx(0.7)
     collision.project(corners)
     assert collision.place(corners)[0, 2] == pytest.approx(0.0, abs=1e-12)

@@ -8,7 +8,7 @@ from rbfmuscle.compiled.loop import compiled
 TOUCHING = 1e-9
 
 
-class CollisionConstraint:
+class ContactConstraint:
     """Keeps points of the mesh out of bones: C = gap + n . (x - x_0) >= 0, linearised where the contacts were asked.
 
     A point is x = sum_k share_k x_k over up to three vertices, and moves them by share_k / sum share^2.
