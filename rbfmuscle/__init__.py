@@ -3,7 +3,11 @@
 Public names are loaded when first used, so that ``import rbfmuscle`` stays light.
 """
 
+from __future__ import annotations
+
 import importlib
+from collections.abc import Callable
+from typing import Any
 
 __version__ = "0.1.0"
 
@@ -30,7 +34,7 @@ _HOME = {
 __all__ = [*_HOME, "__version__"]
 
 
-def __getattr__(name):
+def __getattr__(name: str) -> Callable[..., Any]:
     if name in _HOME:
         value = getattr(importlib.import_module(_HOME[name]), name)
         if name == "Scene":  # the room that lets it read OpenSim models enters itself when it is loaded
@@ -40,5 +44,5 @@ def __getattr__(name):
     raise AttributeError(f"module 'rbfmuscle' has no attribute {name!r}")
 
 
-def __dir__():
+def __dir__() -> Any:
     return sorted(__all__)

@@ -1,7 +1,11 @@
 """Comparing models on one scene: the same motion, contacts and measures for each."""
 
+from __future__ import annotations
+
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rbfmuscle.models import MODEL_NAMES, build_models, check_model_name, configure_scene
 from rbfmuscle.run import stream_run
@@ -19,13 +23,24 @@ from rbfmuscle.study.experiment.comparison import (
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.validation import SolveError, UsageError
 
+if TYPE_CHECKING:
+    from rbfmuscle.sim.scene.scene import Scene
+
+
 # The motion is repeated with steps this many times as long.
 COARSER = 5
 
 
 def compare_models(
-    scene, directory, models=MODEL_NAMES, *, frames=None, settings=None, pictures=True, progress=None
-):
+    scene: Scene,
+    directory: str | Path,
+    models: Sequence[str] = MODEL_NAMES,
+    *,
+    frames: Any = None,
+    settings: dict[str, Any] | None = None,
+    pictures: bool = True,
+    progress: Callable[..., Any] | None = None,
+) -> dict[str, Any]:
     """Run every model on a scene, measure all alike, and write tables, a report and pictures.
 
     Parameters

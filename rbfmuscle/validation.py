@@ -37,9 +37,10 @@ class MeshError(RBFMuscleError, ValueError):
 
 
 class SolveError(RBFMuscleError, RuntimeError):
-    """A frame could not be solved; frames so far are kept (exit code 5)."""
+    """A frame could not be solved; frames so far are kept (exit code 5), in memory as ``run``."""
 
     exit_code = 5
+    run: Any = None
 
 
 class LimitExceededError(RBFMuscleError, RuntimeError):

@@ -1,12 +1,14 @@
 """``rbfmuscle cache``: what is kept on disk."""
 
+from __future__ import annotations
+
 from cyclopts import App
 
 cache_app = App(name="cache", help="Bone distance fields and weights of mesh muscles, kept on disk.")
 
 
 @cache_app.command
-def path():
+def path() -> None:
     """Print the folder of the cache."""
     from rbfmuscle.sim.cache import cache_path
 
@@ -14,7 +16,7 @@ def path():
 
 
 @cache_app.command(name="list")
-def list_entries():
+def list_entries() -> None:
     """Print the entries of the cache and their sizes."""
     from rbfmuscle.sim.cache import cache_list
 
@@ -23,7 +25,7 @@ def list_entries():
 
 
 @cache_app.command
-def clear():
+def clear() -> None:
     """Remove all entries of the cache."""
     from rbfmuscle.sim.cache import cache_clear
 

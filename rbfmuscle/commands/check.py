@@ -1,5 +1,7 @@
 """``rbfmuscle check``: a scene file and its meshes, nothing solved."""
 
+from __future__ import annotations
+
 import json
 import logging
 import sys
@@ -11,7 +13,7 @@ from cyclopts import Parameter
 from rbfmuscle.validation import SceneError
 
 
-def check(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False):
+def check(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False) -> int:
     """Check a scene file and its meshes; nothing is solved.
 
     Parameters

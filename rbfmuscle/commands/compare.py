@@ -1,5 +1,7 @@
 """``rbfmuscle compare``: models on one scene, beside each other."""
 
+from __future__ import annotations
+
 import json
 from typing import Annotated
 
@@ -36,7 +38,7 @@ def compare(
     frames: str | None = None,
     pictures: bool = True,
     as_json: Json = False,
-):
+) -> None:
     """Run models on one scene: the same motion, contacts and measures; tables, report, pictures.
 
     Parameters

@@ -1,5 +1,7 @@
 """``rbfmuscle import``: a scene from an OpenSim model."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,7 +19,7 @@ def import_(
     bodies: Annotated[list[str] | None, Parameter(negative="")] = None,
     motion: Path | None = None,
     force: Annotated[bool, Parameter(negative="")] = False,
-):
+) -> None:
     """Write a scene file and its meshes from an OpenSim model (.osim).
 
     Parameters

@@ -1,5 +1,7 @@
 """``rbfmuscle kernels``: which kernel, which shape parameter, how many centres."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
 from typing import Annotated
@@ -29,7 +31,7 @@ def kernels(
     pictures: bool = True,
     extremes: Annotated[bool, Parameter(negative="")] = False,
     as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
-):
+) -> int:
     """Rank kernels, shape parameters and numbers of centres on one surface; with a scene, run the best.
 
     Parameters

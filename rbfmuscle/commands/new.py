@@ -16,7 +16,7 @@ def new(
     labels: Path | None = None,
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     force: Annotated[bool, Parameter(negative="")] = False,
-):
+) -> None:
     """Write a commented scene file for a folder of meshes or a volume of labels.
 
     Parameters

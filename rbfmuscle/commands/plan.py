@@ -1,5 +1,7 @@
 """``rbfmuscle plan``: what a scene will build and do, before it is run."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
 from typing import Annotated
@@ -7,7 +9,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 
-def plan(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False):
+def plan(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False) -> None:
     """List what a run of the scene would build and take, without building it.
 
     Parameters

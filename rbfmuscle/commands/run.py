@@ -1,5 +1,7 @@
 """``rbfmuscle run`` and ``rbfmuscle demo``: a scene through its motion, into a folder."""
 
+from __future__ import annotations
+
 import json
 import math
 import time
@@ -28,7 +30,7 @@ def demo(
     model: str | None = None,
     frames: str | None = None,
     as_json: Json = False,
-):
+) -> None:
     """Run the embedded hip: no data, no network.
 
     Parameters
@@ -58,7 +60,7 @@ def run(
     frames: str | None = None,
     fail_on: str | None = None,
     as_json: Json = False,
-):
+) -> None:
     """Run a scene through its motion and write surfaces, metrics and a report.
 
     Parameters

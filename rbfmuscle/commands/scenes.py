@@ -1,11 +1,18 @@
 """The scene that a command is given: a file, or the embedded hip by name."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.scene.scene import Scene
+
 
 PHANTOM = "phantom"
 
 
-def load_scene(scene):
+def load_scene(scene: str) -> Scene:
     """The scene of a file, or the embedded hip for "phantom" where there is no file of that name."""
     from rbfmuscle.sim.scene.scene import Scene
 

@@ -1,5 +1,7 @@
 """``rbfmuscle sdf``: the distance field of one bone, measured and drawn."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +18,7 @@ def sdf(
     units: str = "",
     cache: bool = True,
     as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
-):
+) -> None:
     """Build the distance field of a bone, measure it against exact distances and draw a slice.
 
     Parameters

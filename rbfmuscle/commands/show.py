@@ -1,5 +1,7 @@
 """``rbfmuscle export`` and ``rbfmuscle render``: what a run left, in other forms."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Annotated
 
@@ -14,7 +16,7 @@ def export(
     units: str | None = None,
     frames: str | None = None,
     ascii: Annotated[bool, Parameter(negative="")] = False,
-):
+) -> None:
     """Write the surfaces of a run in other formats and units.
 
     Parameters
@@ -48,7 +50,7 @@ def render(
     frame: int | None = None,
     view: Annotated[list[str] | None, Parameter(negative="")] = None,
     seconds: float = 5.0,
-):
+) -> None:
     """Draw a run: a picture (.png) or an animation (.gif, .webp).
 
     Parameters

@@ -1,9 +1,11 @@
 """``rbfmuscle sweep``: a scene under a grid of settings, error against time a frame."""
 
+from __future__ import annotations
+
 import json
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -11,6 +13,11 @@ from rbfmuscle.commands.progress import Progress
 from rbfmuscle.commands.run import Json, Output
 from rbfmuscle.commands.scenes import load_scene
 from rbfmuscle.validation import SolveError, UsageError
+
+if TYPE_CHECKING:
+    from rbfmuscle.run import Run
+    from rbfmuscle.sim.scene.scene import Scene
+
 
 Texts = Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)]
 
@@ -30,7 +37,7 @@ def sweep(
     error: str = "error_rms",
     retry: Annotated[bool, Parameter(negative="")] = False,
     as_json: Json = False,
-):
+) -> None:
     """Run a scene under a grid of settings: errors, time a frame, Pareto front.
 
     Points that the folder holds already are not run again, so a sweep that was ended goes on where it stood.
@@ -87,7 +94,7 @@ def sweep(
     return _finish(plan, output, error, as_json)
 
 
-def run_point(scene, settings, frames):
+def run_point(scene: Scene, settings: dict[str, Any], frames: str | None) -> Run:
     """One run of a sweep, in memory; module-level, so that it can be sent to other processes."""
     from rbfmuscle.run import simulate
 

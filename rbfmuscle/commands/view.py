@@ -1,5 +1,7 @@
 """``rbfmuscle view``: a window on a scene that is moved by hand, or on a saved run."""
 
+from __future__ import annotations
+
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -25,7 +27,7 @@ def view(
     colour: str = "nothing",
     at: Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)] = None,
     screenshot: Path | None = None,
-):
+) -> None:
     """Open a window: a slider for each joint coordinate, or for the frames of a saved run.
 
     Parameters
@@ -51,7 +53,7 @@ def view(
     if colour not in COLOURINGS:
         raise UsageError(f"unknown colouring {colour!r}; known: {', '.join(COLOURINGS)}")
     # A wrong path is told before a display is asked for.
-    opened = SavedRun(scene) if scene.is_dir() else load_scene(scene)
+    opened = SavedRun(scene) if scene.is_dir() else load_scene(str(scene))
     require_display()
     viewer, motion, title = _open_saved(opened) if scene.is_dir() else _open_scene(opened, model)
     viewer.colour_by(colour)

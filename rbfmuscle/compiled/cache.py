@@ -1,9 +1,12 @@
 """Numba's cache of one loop, with names by content in place of names by file and time."""
 
+from __future__ import annotations
+
 import hashlib
 import pickle
 import time
 from functools import cached_property
+from typing import Any
 
 from numba.core import compiler, event
 from numba.core.caching import _Cache
@@ -23,30 +26,30 @@ class LoopCache(_Cache):
     loop : numba.core.dispatcher.Dispatcher
     """
 
-    def __init__(self, loop):
+    def __init__(self, loop: Any) -> None:
         _listen()
         self.loop = loop
         self.enabled = True
         self.held = {}
 
     @property
-    def cache_path(self):
+    def cache_path(self) -> Any:
         """Folder that is written to, None where there is none."""
         return str(folders()[0]) if folders() else None
 
     @cached_property
-    def digest(self):
+    def digest(self) -> str:
         """Content of the loop, read at its first call, when all that it calls is defined."""
         return loop_digest(self.loop)
 
-    def entry_name(self, arguments, codegen):
+    def entry_name(self, arguments: tuple[Any, ...], codegen: Any) -> str:
         """Name of the entry for a tuple of numba types."""
         text = repr((self.digest, machine_digest(codegen), [_type_name(kind) for kind in arguments]))
         function = self.loop.py_func
         short = f"{function.__module__.rsplit('.')[-1]}.{function.__qualname__}".replace("<locals>", "in")
         return f"{short}-{hashlib.sha256(text.encode()).hexdigest()[:24]}"
 
-    def load_overload(self, sig, target_context):
+    def load_overload(self, sig: tuple[Any, ...], target_context: Any) -> Any:
         """The compiled loop for these argument types, None where it is not kept."""
         if not self.enabled:
             return None
@@ -71,7 +74,7 @@ class LoopCache(_Cache):
             lock.release()
         return found
 
-    def save_overload(self, sig, data):
+    def save_overload(self, sig: tuple[Any, ...], data: Any) -> None:
         """Keep a compiled loop."""
         arguments = _arguments(sig)
         try:
@@ -80,21 +83,21 @@ class LoopCache(_Cache):
         finally:
             self.let_go(arguments)
 
-    def let_go(self, arguments):
+    def let_go(self, arguments: tuple[Any, ...]) -> None:
         """Free the lock of what was compiled and written, or failed to be."""
         lock = self.held.pop(tuple(arguments), None)
         if lock is not None:
             lock.release()
 
-    def enable(self):
+    def enable(self) -> None:
         """Read and write from now on."""
         self.enabled = True
 
-    def disable(self):
+    def disable(self) -> None:
         """Neither read nor write from now on."""
         self.enabled = False
 
-    def flush(self):
+    def flush(self) -> None:
         """Nothing: an entry is never wrong, only unused."""
 
 
@@ -116,10 +119,10 @@ def _load(name, target_context):
 class _Listener(event.Listener):
     """Frees the lock of a loop that could not be compiled; one that was is written before it is freed."""
 
-    def on_start(self, event):
+    def on_start(self, event: Any) -> None:
         pass
 
-    def on_end(self, event):
+    def on_end(self, event: Any) -> None:
         cache = event.data["dispatcher"]._cache
         if event.is_failed and isinstance(cache, LoopCache):
             cache.let_go(event.data["args"])

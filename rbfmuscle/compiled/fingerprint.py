@@ -6,12 +6,15 @@ their own bytecode and so on, constants and named tuples by value. Files, lines,
 part, so checkouts share what they have in common, and an edit costs the loops that it reaches.
 """
 
+from __future__ import annotations
+
 import enum
 import hashlib
 import importlib.util
 import types
 from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +35,7 @@ def loop_digest(loop: Callable) -> str:
 
 
 @cache
-def machine_digest(codegen) -> str:
+def machine_digest(codegen: Any) -> str:
     """Digest of what else shapes compiled code: Python, numba, LLVM, numpy, the processor, numba's settings.
 
     Parameters
@@ -62,14 +65,14 @@ def machine_digest(codegen) -> str:
 class _Reader:
     """Feeds a digest with values and code; what was met once is named by its place, which ends recursion."""
 
-    def __init__(self, feed):
+    def __init__(self, feed: Callable[..., Any]) -> None:
         self.feed = feed
         self.met = {}
 
-    def text(self, *parts):
+    def text(self, *parts: Any) -> None:
         self.feed(repr(parts).encode())
 
-    def loop(self, loop):
+    def loop(self, loop: Any) -> None:
         """A dispatcher of numba: its options and its function."""
         if self._again(loop):
             return
@@ -77,7 +80,7 @@ class _Reader:
         self.value(dict(loop.targetoptions))
         self.function(loop.py_func)
 
-    def function(self, function):
+    def function(self, function: Callable[..., Any]) -> None:
         code = function.__code__
         self.code(code, function.__doc__)
         self.value(function.__defaults__)
@@ -88,7 +91,7 @@ class _Reader:
                 self.text("name", name)
                 self.member(function.__globals__[name], names)
 
-    def member(self, value, names):
+    def member(self, value: Any, names: list[str]) -> None:
         """A global; of a module, the loops and constants that are read of it."""
         if not isinstance(value, types.ModuleType):
             self.value(value)
@@ -99,7 +102,7 @@ class _Reader:
                 self.text("of", value.__name__, name)
                 self.value(part)
 
-    def code(self, code, doc=None):
+    def code(self, code: Any, doc: str | None = None) -> None:
         constants = code.co_consts
         if doc is not None and constants and constants[0] == doc:
             constants = constants[1:]
@@ -108,7 +111,7 @@ class _Reader:
         self.text(getattr(code, "co_exceptiontable", b""))
         self.value(constants)
 
-    def value(self, value):
+    def value(self, value: Any) -> None:
         if isinstance(value, enum.Enum):
             self.text("enum", type(value).__qualname__, value.name, value.value)
         elif isinstance(value, _PLAIN):
@@ -129,7 +132,7 @@ class _Reader:
         else:
             self.object(value)
 
-    def object(self, value):
+    def object(self, value: Any) -> None:
         """Loops, code, classes, functions and modules."""
         if _is_loop(value):
             self.loop(value)
@@ -149,7 +152,7 @@ class _Reader:
                 f"a loop reads a global of type {type(value).__qualname__}, which has no digest: {value!r}"
             )
 
-    def kind(self, kind):
+    def kind(self, kind: Any) -> None:
         self.text("class", kind.__module__, kind.__qualname__, getattr(kind, "_fields", None))
         if issubclass(kind, enum.Enum):
             self.text([(member.name, member.value) for member in kind])

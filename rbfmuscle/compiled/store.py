@@ -4,6 +4,8 @@ Folders are read in turn and the first that can be written is written to: ``RBFM
 cache folder of the platform, else a folder of this user's in the temporary one.
 """
 
+from __future__ import annotations
+
 import contextlib
 import hashlib
 import logging
@@ -12,6 +14,7 @@ import tempfile
 import time
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 log = logging.getLogger(__name__)
 
@@ -114,9 +117,9 @@ def write_entry(name: str, data: bytes) -> None:
 class EntryLock:
     """Held by the process that compiles an entry; one that dies lets go of it."""
 
-    def __init__(self, name: str):
+    def __init__(self, name: str) -> None:
         self.path = folders()[0] / (name + LOCK) if folders() else None
-        self.file = None
+        self.file: Any = None
 
     def try_acquire(self) -> bool:
         """Take the lock if it is free; also true where there is nothing to lock with."""
@@ -137,7 +140,8 @@ class EntryLock:
         """Let go; the file is removed, as whoever waits for it looks for the entry first."""
         if self.file is not None:
             with contextlib.suppress(OSError):
-                self.path.unlink(missing_ok=True)
+                if self.path is not None:
+                    self.path.unlink(missing_ok=True)
             self.file.close()
             self.file = None
 

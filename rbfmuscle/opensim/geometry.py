@@ -1,6 +1,7 @@
 """The meshes that a model shows: found as OpenSim finds them, scaled, placed, and joined to one mesh a body."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -79,7 +80,7 @@ def body_meshes(
     return meshes, notes
 
 
-def _placed(mesh: ModelMesh, place, folders):
+def _placed(mesh: ModelMesh, place: Any, folders: Any) -> Any:
     """A note, vertices [metre, ground], triangles and file; or a text that says why there are none."""
     file = find_mesh(mesh.file, folders)
     if file is None:

@@ -3,6 +3,7 @@
 import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -172,6 +173,6 @@ def _scaled_axis(axis, own, factor, output):
     return TransformAxis(axis.direction, tuple(own[name] for name in axis.coordinates), function)
 
 
-def _rescaled(function: Function, of, factor, output) -> Function:
+def _rescaled(function: Function, of: Any, factor: Any, output: Any) -> Function:
     inputs = [factor[name] for name in of]
     return function if output == 1.0 and all(f == 1.0 for f in inputs) else function.rescaled(inputs, output)

@@ -1,6 +1,7 @@
 """Writing a scene to a folder: a TOML file that a person can read, and the meshes that it names."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,7 @@ def number(value: float) -> str:
     return "0" if text == "-0" else text
 
 
-def value_text(value: object) -> str:
+def value_text(value: Any) -> str:
     """Return a value as TOML on one line."""
     if isinstance(value, bool):
         return "true" if value else "false"

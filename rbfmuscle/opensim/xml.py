@@ -4,10 +4,13 @@ It is expat without namespaces, so that element names with two colons, which nin
 they stand. A document is a tree of `Node`.
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 from xml.parsers import expat
 
 from rbfmuscle.validation import SceneError
@@ -26,10 +29,10 @@ class Node:
 
     tag: str
     attributes: dict[str, str]
-    children: list["Node"] = field(default_factory=list)
+    children: list[Node] = field(default_factory=list)
     text: str = ""
 
-    def __iter__(self) -> Iterator["Node"]:
+    def __iter__(self) -> Iterator[Node]:
         return iter(self.children)
 
     @property
@@ -37,7 +40,7 @@ class Node:
         """The attribute ``name``."""
         return self.attributes.get("name", "")
 
-    def child(self, tag: str) -> "Node | None":
+    def child(self, tag: str) -> Node | None:
         """The first child of that tag."""
         return next((node for node in self.children if node.tag == tag), None)
 
@@ -46,7 +49,7 @@ class Node:
         node = self.child(tag)
         return (node.text.strip() if node is not None else "") or default
 
-    def objects(self, tag: str) -> list["Node"]:
+    def objects(self, tag: str) -> list[Node]:
         """What a set holds: children of ``<tag><objects>``, or of ``<tag>`` itself where there is no such level."""
         node = self.child(tag)
         if node is None:
@@ -54,7 +57,7 @@ class Node:
         inner = node.child("objects")
         return (inner or node).children if inner is not None else node.children
 
-    def walk(self, *, skip: tuple[str, ...] = ()) -> Iterator["Node"]:
+    def walk(self, *, skip: tuple[str, ...] = ()) -> Iterator[Node]:
         """The node and all below it in order; nodes of the tags in ``skip`` are left out with all they hold."""
         waiting = [self]
         while waiting:
@@ -66,8 +69,9 @@ class Node:
 
 
 class _Builder:
-    def __init__(self, path):
-        self.path, self.root, self.stack, self.count, self.size = path, None, [], 0, 0
+    def __init__(self, path: Path) -> None:
+        self.path, self.stack, self.count, self.size = path, [], 0, 0
+        self.root: Any = None
         self.parts = []
         self.parser = expat.ParserCreate()
         self.parser.buffer_text = True
@@ -76,12 +80,12 @@ class _Builder:
         self.parser.StartDoctypeDeclHandler = self.refuse_doctype
         self.parser.EntityDeclHandler = self.refuse_doctype
 
-    def refuse_doctype(self, *_):
+    def refuse_doctype(self, *_: Any) -> None:
         raise SceneError(
             f"{self.path}: has a DOCTYPE or entities, which no model needs; delete the declaration"
         )
 
-    def start(self, tag, attributes):
+    def start(self, tag: Any, attributes: Any) -> None:
         self.count += 1
         if self.count > MOST_ELEMENTS:
             raise SceneError(f"{self.path}: more than {MOST_ELEMENTS} elements, this is no OpenSim model")
@@ -98,7 +102,7 @@ class _Builder:
         self.stack.append(node)
         self.parts.append([])
 
-    def data(self, text):
+    def data(self, text: str) -> None:
         self.size += len(text)
         if self.size > MOST_TEXT:
             raise SceneError(
@@ -107,7 +111,7 @@ class _Builder:
         if self.parts:
             self.parts[-1].append(text)
 
-    def end(self, tag):
+    def end(self, tag: Any) -> None:
         node = self.stack.pop()
         node.text = "".join(self.parts.pop())
 

@@ -123,7 +123,8 @@ class Spline:
 
     def rescaled(self, inputs: list[float], output: float) -> "Spline":
         """Return the function in other units, see `Constant.rescaled`."""
-        return Spline(*_rescaled_points(self, inputs, output), natural=self.natural)
+        x, y = _rescaled_points(self, inputs, output)
+        return Spline(x, y, natural=self.natural)
 
 
 @dataclass(frozen=True)

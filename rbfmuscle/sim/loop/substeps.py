@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 
@@ -134,7 +135,7 @@ class SubSteps:
         return max(excess, float((length / self._travel).max(initial=0.0)))
 
 
-def check_substeps(scene) -> None:
+def check_substeps(scene: Any) -> None:
     """Refuse a motion of more sub-steps than ``motion.max_substeps``, before anything grows with their number.
 
     Raises
@@ -143,7 +144,7 @@ def check_substeps(scene) -> None:
         With the number, the coordinate that takes most of it, and the key that raises the limit.
     """
     by_name = estimate_substeps(scene)
-    name = max(by_name, key=by_name.get, default="")
+    name = max(by_name, key=lambda name: by_name[name], default="")
     limit = scene.motion.options.max_substeps
     if by_name and not by_name[name] <= limit:
         raise SceneError(
@@ -153,7 +154,7 @@ def check_substeps(scene) -> None:
         )
 
 
-def estimate_substeps(scene) -> dict[str, float]:
+def estimate_substeps(scene: Any) -> dict[str, float]:
     """Return about how many sub-steps each coordinate of a motion takes by itself, from rest on.
 
     Found from one probe a coordinate: how far a small change of it, from rest, moves what is attached.

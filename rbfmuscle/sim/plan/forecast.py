@@ -4,15 +4,25 @@ Counts of work (how many visits a surface vertex costs, say) are properties of t
 and of the embedded hip; seconds come from `rbfmuscle.sim.plan.rates` alone, measured when the forecast is made.
 """
 
+from __future__ import annotations
+
 import heapq
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.sim.distance.build import CUT, OUTER, grid_shape
 from rbfmuscle.sim.distance.cells import BLOCK
 from rbfmuscle.sim.distance.sdf import BAND, CELL_SHARE, LEAST_CELLS, BoneSDF
 from rbfmuscle.sim.scene.motion import bone_poses
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from rbfmuscle.sim.scene.scene import Scene
+
 
 # Work: exact distances for a fine cell; visits for a vertex that is written, that a centreline hangs on, of a bone
 # (for each muscle) and of a shown surface that are measured; exact distances for a bone's vertex while it is
@@ -76,7 +86,7 @@ class FieldCost:
     kept: bool
 
 
-def estimate_field(mesh, box, tolerance=None):
+def estimate_field(mesh: trimesh.Trimesh, box: Floats, tolerance: float | None = None) -> Any:
     """What the field of a bone within a box takes.
 
     Parameters
@@ -117,7 +127,7 @@ def estimate_field(mesh, box, tolerance=None):
     return FieldCost(float(blocks * CUT), float(memory), kept)
 
 
-def side_by_side(times, threads):
+def side_by_side(times: Any, threads: Any) -> Any:
     """Wall time of tasks that are taken in order by the first free thread [s]."""
     free = [0.0] * max(1, min(threads, len(times)))
     for time in times:
@@ -125,7 +135,16 @@ def side_by_side(times, threads):
     return max(free) * (CROWDED if len(free) > 1 else 1.0)
 
 
-def forecast(scene, fields, costs, *, substeps, rates, resident, threads):
+def forecast(
+    scene: Scene,
+    fields: list[Any],
+    costs: list[Any],
+    *,
+    substeps: int,
+    rates: dict[str, Any],
+    resident: float,
+    threads: int,
+) -> Any:
     """Memory and time of a run.
 
     Parameters

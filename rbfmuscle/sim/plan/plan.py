@@ -1,12 +1,20 @@
 """What a scene will build and do, found without building it."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
 from rbfmuscle.sim.loop.substeps import SubSteps
 from rbfmuscle.sim.plan.reach import reached_bones, sampled_poses, union_of
 
+if TYPE_CHECKING:
+    from rbfmuscle.sim.scene.scene import Scene
 
-def plan_scene(scene, estimate=None):
+
+def plan_scene(scene: Scene, estimate: Callable[..., Any] | None = None) -> dict[str, Any]:
     """Return what a run of the scene would build.
 
     Parameters

@@ -1,8 +1,11 @@
 """How fast this machine is now: a few small measurements, in which the cost of everything else is counted."""
 
+from __future__ import annotations
+
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -10,7 +13,7 @@ import numpy as np
 ROUNDS = 7
 
 
-def shortest(act):
+def shortest(act: Any) -> Any:
     """Least time of a few calls [s]; the first, which may load compiled code, does not count."""
     act()
     times = []
@@ -21,7 +24,7 @@ def shortest(act):
     return min(times)
 
 
-def measure_rates():
+def measure_rates() -> Any:
     """Seconds for one unit of each kind of work, on one thread, measured now.
 
     Returns
@@ -33,7 +36,7 @@ def measure_rates():
     return {"call": _call(), "visit": _visit(), "query": _query()}
 
 
-def resident_memory():
+def resident_memory() -> Any:
     """Memory that this process holds [bytes]; 0 where the system does not tell."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])

@@ -1,16 +1,26 @@
 """What a motion can bring together: swept boxes, and the fields worth building."""
 
+from __future__ import annotations
+
 import itertools
 import math
 from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.sim.distance.detectors import build_detector
 from rbfmuscle.sim.loop.contact import moved_box
 from rbfmuscle.sim.loop.substeps import check_substeps, path_angle
 from rbfmuscle.sim.scene.motion import bone_poses, completed, interpolate, rest_coordinates
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.distance.sdf import BoneSDF
+    from rbfmuscle.sim.scene.objects import Muscle
+    from rbfmuscle.sim.scene.scene import Scene
+
 
 # Poses of a motion that a swept box is made of; arcs between them are covered by the padding.
 SAMPLED_POSES = 48
@@ -18,7 +28,7 @@ SAMPLED_POSES = 48
 PADDING = 0.1
 
 
-def swept_region(muscle, bone_name, poses):
+def swept_region(muscle: Muscle, bone_name: str, poses: list[dict[str, Floats]]) -> Floats:
     """Box (2, 3) in a bone's coordinates that holds a muscle through a motion.
 
     Parameters
@@ -39,7 +49,7 @@ def swept_region(muscle, bone_name, poses):
     )
 
 
-def sampled_poses(scene):
+def sampled_poses(scene: Scene) -> list[dict[str, Floats]]:
     """Poses along the scene's motion, the rest pose first, thinned to a bounded number."""
     frames = scene.motion.frames
     chosen = sorted({round(k) for k in np.linspace(0, len(frames) - 1, min(len(frames), SAMPLED_POSES))})
@@ -51,7 +61,7 @@ def sampled_poses(scene):
     return poses
 
 
-def reached_bones(scene):
+def reached_bones(scene: Scene) -> dict[tuple[Any, ...], Floats]:
     """Region of each bone that each muscle can reach: dict of (muscle name, bone name) to (2, 3) box."""
     check_substeps(scene)
     poses = sampled_poses(scene)
@@ -65,7 +75,7 @@ def reached_bones(scene):
     return regions
 
 
-def build_fields(scene, regions):
+def build_fields(scene: Scene, regions: dict[tuple[Any, ...], Floats]) -> dict[str, BoneSDF]:
     """Distance fields of the bones that some muscle can reach, in parallel: dict of bone name to field.
 
     The scene's ``[contact] detector`` says of which kind; only the default is built for the reached part alone.
@@ -86,6 +96,6 @@ def build_fields(scene, regions):
         return dict(zip([bone.name for bone in bones], pool.map(build, bones)))
 
 
-def union_of(boxes):
+def union_of(boxes: list[Floats]) -> Floats:
     """Least box (2, 3) that holds all boxes."""
     return np.array([np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)])

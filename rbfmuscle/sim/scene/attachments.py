@@ -1,14 +1,25 @@
 """Which vertices of a muscle are held by which bone."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.sim.distance.mesh import winding_test
 from rbfmuscle.sim.scene.options import NotNegative, Positive, Table, Vector
 from rbfmuscle.validation import SceneError, did_you_mean, is_file, shown
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from rbfmuscle.sim.scene.meshes import ReadMesh
+    from rbfmuscle.sim.scene.objects import Bone
 
 
 @dataclass
@@ -35,7 +46,9 @@ class AttachTable(Table):
     sphere: SphereTable | None = None
 
 
-def resolve_attachments(attach, read, bones, *, muscle):
+def resolve_attachments(
+    attach: Sequence[Any], read: ReadMesh, bones: list[Bone], *, muscle: str
+) -> list[Any]:
     """Return the Attachment list of a muscle.
 
     Parameters
@@ -96,7 +109,7 @@ def _select(table, read, bone, place):
     return chosen
 
 
-def signed_distances(points, mesh):
+def signed_distances(points: Floats, mesh: trimesh.Trimesh) -> Floats:
     """Exact distance of points to a mesh, negative inside (by pseudonormals, or winding numbers if open)."""
     points = np.ascontiguousarray(points, dtype=np.float64)
     exact = ExactDistance(mesh.vertices, mesh.faces)

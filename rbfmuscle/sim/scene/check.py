@@ -1,13 +1,22 @@
 """Looking a scene over before it is solved: sizes, overlaps at rest, bones that meet in the motion."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rbfmuscle.sim.scene.attachments import signed_distances
 from rbfmuscle.sim.scene.motion import bone_poses
 from rbfmuscle.validation import MeshError, RBFMuscleError, SceneError
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from rbfmuscle.sim.scene.scene import Scene
+
 
 SMALLEST_MM = 2.0  # across: the bones of a mouse
 LARGEST_MM = 3000.0  # across: a person with arms raised
@@ -25,11 +34,11 @@ class Finding:
     place: str
     message: str
 
-    def __str__(self):
+    def __str__(self) -> str:
         return f"{self.level}: {self.place}: {self.message}"
 
 
-def check_scene(scene):
+def check_scene(scene: Scene) -> list[Any]:
     """Return all findings about a scene, the worst first; nothing is solved or changed."""
     findings = []
     for item in [*scene.bones, *scene.muscles]:
@@ -57,7 +66,7 @@ def check_scene(scene):
     return sorted(findings, key=lambda finding: order[finding.level])
 
 
-def check_extents(scene):
+def check_extents(scene: Scene) -> None:
     """Raise MeshError for a mesh whose size or place shows a wrong unit or another frame."""
     for kind, items in (("bone", scene.bones), ("muscle", scene.muscles)):
         for item in items:
@@ -66,7 +75,7 @@ def check_extents(scene):
         check_place(scene, muscle.name, muscle.mesh, muscle.source)
 
 
-def check_size(scene, kind, name, mesh, source):
+def check_size(scene: Scene, kind: str, name: str, mesh: trimesh.Trimesh, source: str) -> None:
     """Raise MeshError for a mesh smaller than a mouse's or larger than a person's."""
     size = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
     millimetres = size / scene.length(1.0)
@@ -77,7 +86,7 @@ def check_size(scene, kind, name, mesh, source):
         )
 
 
-def check_place(scene, name, mesh, source):
+def check_place(scene: Scene, name: str, mesh: trimesh.Trimesh, source: str) -> None:
     """Raise MeshError for a muscle that lies far away from all bones."""
     if not scene.bones:
         return
@@ -91,7 +100,7 @@ def check_place(scene, name, mesh, source):
         )
 
 
-def check_centre(scene, name: str, centre: np.ndarray) -> None:
+def check_centre(scene: Scene, name: str, centre: np.ndarray) -> None:
     """Raise SceneError for a joint whose centre lies so far from all bones that poses lose their digits."""
     if not scene.bones:
         return
@@ -139,7 +148,7 @@ def _rest_overlaps(scene):
     return findings
 
 
-def check_initial(scene):
+def check_initial(scene: Scene) -> None:
     """Raise SceneError if a motion is longer than its limit, or a muscle lies mostly inside a bone.
 
     With ``initial = "error"`` a muscle may not lie in a bone at all.
@@ -164,7 +173,7 @@ def _depths(points, mesh):
     return depth
 
 
-def bone_collisions(scene, frames=None):
+def bone_collisions(scene: Scene, frames: Any = None) -> list[Any]:
     """Return where a motion drives bones into each other.
 
     Parameters
@@ -180,7 +189,7 @@ def bone_collisions(scene, frames=None):
     """
     if frames is None:
         frames = np.unique(np.linspace(0, len(scene.motion) - 1, MOTION_SAMPLES).round().astype(int)).tolist()
-    rest = None
+    rest: dict[Any, float] | None = None
     found = []
     for frame in frames:
         poses = bone_poses(scene, scene.motion.frames[frame])
@@ -188,7 +197,7 @@ def bone_collisions(scene, frames=None):
         if rest is None and depths:
             rest = _pair_depths(scene, bone_poses(scene, {}))
         for pair, depth in depths.items():
-            if depth - rest.get(pair, 0.0) > scene.length(COUNTED_DEPTH_MM):
+            if depth - (rest or {}).get(pair, 0.0) > scene.length(COUNTED_DEPTH_MM):
                 found.append((frame, *pair, depth))
     return found
 
@@ -210,7 +219,7 @@ def _pair_depths(scene, poses):
     return depths
 
 
-def bone_findings(collisions, units):
+def bone_findings(collisions: list[Any], units: str) -> list[Any]:
     """Return a warning for each pair of bones that the motion drives into each other.
 
     Parameters

@@ -1,13 +1,17 @@
 """Reading muscle fibres: polylines from JSON, or from VTK and VTP PolyData."""
 
+from __future__ import annotations
+
 import itertools
 import json
 from pathlib import Path
+from typing import Any
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.validation import MeshError, SceneError, check_points, is_file, shown
 
 
-def read_fibres(fibres, *, scale=1.0, muscle=""):
+def read_fibres(fibres: Any, *, scale: float = 1.0, muscle: str = "") -> list[Floats]:
     """Return fibres as a list of (k, 3) arrays in scene units.
 
     Parameters

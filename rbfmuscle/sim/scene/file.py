@@ -1,8 +1,11 @@
 """The scene file: its tables, and the scene that they describe."""
 
+from __future__ import annotations
+
 import hashlib
 import tomllib
-from typing import Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydantic import Field, ValidationError
@@ -30,6 +33,10 @@ from rbfmuscle.sim.scene.options import (
     describe_error,
 )
 from rbfmuscle.validation import MeshError, SceneError, is_file, shown
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.scene.scene import Scene
+
 
 # A scene file is a page or two; long lists of vertices belong into files of their own.
 LARGEST_FILE = 4_000_000
@@ -83,7 +90,7 @@ class SceneFile(Table):
     output: OutputOptions = OutputOptions()
 
 
-def read_scene_file(path):
+def read_scene_file(path: Path) -> SceneFile:
     """Return the checked SceneFile of a TOML file, paths as written.
 
     Raises
@@ -128,7 +135,7 @@ def _read_toml(path):
         raise SceneError(f"{path}: not valid TOML: {what}") from None
 
 
-def load_scene(cls, path, *, skeleton=False):
+def load_scene(cls: Any, path: Path, *, skeleton: bool = False) -> Scene:
     """Return the scene (of class ``cls``) of a TOML file, its meshes read and checked; see `Scene.load`."""
     tables = read_scene_file(path)
     folder = path.parent
@@ -215,7 +222,7 @@ def _place(location, data):
     return " ".join(words)
 
 
-def describe_scene(scene):
+def describe_scene(scene: Scene) -> dict[str, Any]:
     """Return the scene as plain data for ``run.json``: names, counts, options, sources and hashes."""
     return {
         "name": scene.name,

@@ -4,7 +4,7 @@ Files and calls speak in degrees and scene units; inside are radians and scene u
 """
 
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -125,10 +125,10 @@ class CoordinateTable(Table):
 
     def coordinate(self, motion: str) -> Coordinate:
         """Return it in inner units."""
-        motion = self.motion or motion
-        factor = FACTORS[motion]
+        kind: Any = self.motion or motion
+        factor = FACTORS[kind]
         return Coordinate(
-            motion,
+            kind,
             self.rest * factor,
             None if self.default is None else self.default * factor,
             None if self.range is None else (self.range[0] * factor, self.range[1] * factor),
@@ -160,12 +160,11 @@ class JointTable(Table):
         angles = tuple(math.radians(angle) for angle in self.orientation or (0.0, 0.0, 0.0))
         frame = frame_at(np.array(self.centre or (0.0, 0.0, 0.0)), angles)
         if self.type == "custom":
-            parts = self._custom(place)
+            parts: Any = self._custom(place)
         else:
             parts = self._of_kind(place)
-        return Joint(
-            self.name, self.parent, self.child, frame, *parts, kind=self.type, backward=self.backward
-        )
+        rest: Any = {"kind": self.type, "backward": self.backward}
+        return Joint(self.name, self.parent, self.child, frame, *parts, **rest)
 
     def _of_kind(self, place):
         kind = KINDS[self.type]
@@ -276,13 +275,13 @@ def make_coupling(table: CouplingTable, joints: list[Joint]) -> Coupling:
     target = full_name(table.coordinate, known, place="coupling")
     place = f"coupling of {target!r}"
     of = tuple(full_name(name, known, place=place) for name in table.of)
-    motions = [coordinates[name].motion for name in of]
+    motions: list[Any] = [coordinates[name].motion for name in of]
     return Coupling(target, of, table.function(motions, coordinates[target].motion, place=place))
 
 
 def joint_row(joint: Joint) -> dict:
     """Return a joint as the plain table that makes it again [degree, scene unit]."""
-    row = {"name": joint.name, "parent": joint.parent, "child": joint.child}
+    row: dict[str, Any] = {"name": joint.name, "parent": joint.parent, "child": joint.child}
     if joint.kind != "ball":
         row["type"] = joint.kind
     if joint.kind != "fixed":
@@ -316,7 +315,7 @@ def coupling_row(coupling: Coupling, joints: list[Joint]) -> dict:
 
 def _coordinate_row(facts, kind):
     factor = FACTORS[facts.motion]
-    row = {"motion": facts.motion} if kind == "custom" else {}
+    row: dict[str, Any] = {"motion": facts.motion} if kind == "custom" else {}
     if facts.rest:
         row["rest"] = facts.rest / factor
     if facts.default is not None:
@@ -329,7 +328,7 @@ def _coordinate_row(facts, kind):
 
 def _axis_row(axis, motions, output):
     inputs = [motions[name] for name in axis.coordinates]
-    row = {"axis": list(axis.direction)}
+    row: dict[str, Any] = {"axis": list(axis.direction)}
     if axis.coordinates:
         row["coordinates"] = list(axis.coordinates)
     return {**row, **_function_row(axis.function, inputs, output)}

@@ -1,11 +1,14 @@
 """Mending meshes where it is safe: what is changed never moves a vertex by more than rounding."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.validation import MeshError
 
 MERGE_TOLERANCE = 1e-7  # of the diagonal: float32 files repeat vertices to about this
@@ -30,7 +33,7 @@ class Repaired:
     closed: bool = True
 
 
-def repair(vertices, faces, *, place, may_be_open=False):
+def repair(vertices: Floats, faces: Integers, *, place: str, may_be_open: bool = False) -> Repaired:
     """Return the mesh closed, manifold, outward; say what was done.
 
     Parameters

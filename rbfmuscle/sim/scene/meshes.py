@@ -3,12 +3,16 @@
 Vertex numbers in files stay usable: a read mesh knows which of its vertices each vertex of the file became.
 """
 
+from __future__ import annotations
+
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.sim.scene.mesh_repair import repair
 from rbfmuscle.validation import MeshError, check_mesh, is_file, shown
 
@@ -41,7 +45,9 @@ class ReadMesh:
     source: str = ""
 
 
-def read_mesh(path, *, name=None, scale=1.0, may_be_open=False):
+def read_mesh(
+    path: str | Path, *, name: str | None = None, scale: float = 1.0, may_be_open: bool = False
+) -> ReadMesh:
     """Read a surface mesh and mend what is safe to mend.
 
     Parameters
@@ -73,7 +79,9 @@ def read_mesh(path, *, name=None, scale=1.0, may_be_open=False):
     return read
 
 
-def prepare_mesh(vertices, faces, *, place, name, may_be_open=False):
+def prepare_mesh(
+    vertices: Floats, faces: Integers, *, place: str, name: str, may_be_open: bool = False
+) -> ReadMesh:
     """Return the ReadMesh of given arrays, mended like a file's; ``place`` begins each message."""
     import trimesh
 
@@ -105,7 +113,7 @@ def prepare_mesh(vertices, faces, *, place, name, may_be_open=False):
     return ReadMesh(mesh, result.vertex_map, result.notes, result.closed)
 
 
-def read_arrays(path):
+def read_arrays(path: Path) -> Any:
     """Return vertices (n, 3) and triangles (m, 3) of a mesh file as they stand, or raise MeshError."""
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:

@@ -1,11 +1,16 @@
 """From joint coordinates to the poses of bones: ramps, waypoints and OpenSim motion files."""
 
+from __future__ import annotations
+
 import itertools
 import math
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.sim.joints.joint import rotation_about
 from rbfmuscle.sim.joints.skeleton import (
     all_coordinates,
@@ -18,6 +23,11 @@ from rbfmuscle.sim.scene.joint_tables import FACTORS, full_name
 from rbfmuscle.sim.scene.motion_file import read_motion_file
 from rbfmuscle.sim.scene.options import MotionOptions
 from rbfmuscle.validation import SceneError, did_you_mean
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.scene.objects import Joint
+    from rbfmuscle.sim.scene.scene import Scene
+
 
 __all__ = ["Motion", "bone_poses", "coordinate_names", "interpolate", "rotation_about"]
 
@@ -39,14 +49,29 @@ class Motion:
         What a user should know: coordinates that leave their range, columns that were not used.
     """
 
-    def __init__(self, frames=None, *, options=None, times=None, notes=()):
+    def __init__(
+        self,
+        frames: list[dict[str, float]] | None = None,
+        *,
+        options: MotionOptions | None = None,
+        times: list[Any] | None = None,
+        notes: Sequence[Any] = (),
+    ) -> None:
         self.frames = [dict(frame) for frame in frames] if frames is not None else [{}]
         self.options = options or MotionOptions()
         self.times = None if times is None else list(times)
         self.notes = list(notes)
 
     @classmethod
-    def from_options(cls, options, joints, *, couplings=(), metre=1000.0, folder=None):
+    def from_options(
+        cls,
+        options: MotionOptions,
+        joints: list[Joint],
+        *,
+        couplings: Sequence[Any] = (),
+        metre: float = 1000.0,
+        folder: str | Path | None = None,
+    ) -> Motion:
         """Return the motion that ``[motion]`` asks for.
 
         Parameters
@@ -92,13 +117,13 @@ class Motion:
         return cls(frames, options=options, times=times, notes=notes)
 
     @property
-    def coordinates(self):
+    def coordinates(self) -> list[Any]:
         """Names of the coordinates that change, the one with the widest range first."""
         names = sorted({name for frame in self.frames for name in frame})
         spans = {name: np.ptp([frame.get(name, 0.0) for frame in self.frames]) for name in names}
         return sorted((name for name in names if spans[name] > 0), key=lambda name: -spans[name])
 
-    def sliced(self, frames):
+    def sliced(self, frames: slice) -> Motion:
         """Return the motion of the frames in a slice, as ``frames[A:B:S]`` does."""
         chosen = self.frames[frames]
         if not chosen:
@@ -108,28 +133,28 @@ class Motion:
         times = None if self.times is None else self.times[frames]
         return Motion(chosen, options=self.options, times=times, notes=self.notes)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.frames)
 
 
-def coordinate_names(joints):
+def coordinate_names(joints: list[Joint]) -> list[str]:
     """Return every "joint.coordinate" of the joints, in order."""
     return list(all_coordinates(joints))
 
 
-def rest_coordinates(scene):
+def rest_coordinates(scene: Scene) -> Any:
     """Return the coordinates whose rest value is not zero, by full name [radian or scene unit]."""
     if not any(facts.rest for joint in scene.joints for facts in joint.coordinates.values()):
         return {}
     return {name: value for name, value in rest_values(scene.joints, scene.couplings).items() if value}
 
 
-def completed(scene, coordinates):
+def completed(scene: Scene, coordinates: Any) -> Any:
     """Return coordinates with those that are absent at rest added, where rest is not zero."""
     return {**rest_coordinates(scene), **coordinates}
 
 
-def interpolate(before, after, t):
+def interpolate(before: dict[str, Any], after: dict[str, float], t: float) -> dict[str, float]:
     """Return the coordinates between two frames, linear in each.
 
     Parameters
@@ -143,7 +168,7 @@ def interpolate(before, after, t):
     return {name: (1 - t) * before.get(name, 0.0) + t * after.get(name, 0.0) for name in names}
 
 
-def bone_poses(scene, coordinates):
+def bone_poses(scene: Scene, coordinates: dict[str, Any]) -> dict[str, Floats]:
     """Return the pose of every bone: rest bone coordinates -> world.
 
     A joint moves its child, and all that hangs on it, against its parent. At the coordinates at which the
@@ -170,7 +195,7 @@ def bone_poses(scene, coordinates):
 SHIFT_LEVER = 50.0
 
 
-def step_angle(scene, before, after, *, shifts=True):
+def step_angle(scene: Scene, before: Any, after: Any, *, shifts: bool = True) -> Any:
     """Return the largest turn of a bone against its parent between two sets of coordinates [radian].
 
     With ``shifts``, a shift counts as the turn that moves a place 50 mm from its axis as far.
@@ -189,7 +214,7 @@ def step_angle(scene, before, after, *, shifts=True):
     return largest
 
 
-def turned_angle(rotation):
+def turned_angle(rotation: Any) -> Any:
     """Angle of a (3, 3) rotation [radian], accurate for small ones too."""
     skew = np.array(
         [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
@@ -197,19 +222,19 @@ def turned_angle(rotation):
     return math.atan2(float(np.linalg.norm(skew)), float(np.trace(rotation)) - 1.0)
 
 
-def shown_value(scene, name, value):
+def shown_value(scene: Scene, name: str, value: Any) -> Any:
     """Return a coordinate's value as files and tables show it: degrees, or scene units as it is."""
     facts = all_coordinates(scene.joints).get(name)
     return math.degrees(value) if facts is None or facts.motion == "rotation" else value
 
 
-def inner_value(scene, name, value):
+def inner_value(scene: Scene, name: str, value: Any) -> Any:
     """Return a coordinate's value [radian or scene unit] from what files and tables show."""
     facts = all_coordinates(scene.joints).get(name)
     return math.radians(value) if facts is None or facts.motion == "rotation" else value
 
 
-def unit_sign(scene, name):
+def unit_sign(scene: Scene, name: str) -> Any:
     """Return what follows a coordinate's value in text: the sign for degrees, the scene's unit, or nothing."""
     facts = all_coordinates(scene.joints).get(name)
     return {"translation": f" {scene.units}", "coupled": ""}.get(facts.motion if facts else "", "°")

@@ -1,6 +1,7 @@
 """What a scene is made of: bones, joints and muscles."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from rbfmuscle.sim.joints.joint import Joint
 
@@ -12,7 +13,7 @@ class Bone:
     """A rigid body: its mesh (trimesh.Trimesh, outward, rest pose), where it came from, what was mended."""
 
     name: str
-    mesh: object
+    mesh: Any
     source: str = ""
     closed: bool = True
     notes: list = field(default_factory=list)
@@ -23,7 +24,7 @@ class Muscle:
     """A closed surface (trimesh.Trimesh, outward, rest pose) held by bones, and the model that moves it."""
 
     name: str
-    mesh: object
+    mesh: Any
     model: str = "rbf"
     options: dict = field(default_factory=dict)
     attachments: list = field(default_factory=list)

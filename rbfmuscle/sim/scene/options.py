@@ -3,8 +3,11 @@
 They check themselves, so the same rules hold for a file, for code and for ``--set``.
 """
 
+from __future__ import annotations
+
 import math
-from typing import Annotated, Literal
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
@@ -89,14 +92,14 @@ class Table(BaseModel):
         return data
 
     @classmethod
-    def build(cls, values, *, place):
+    def build(cls, values: dict[str, Any], *, place: str) -> Any:
         """Return the table made from a dict, or raise SceneError that begins with ``place``."""
         try:
             return cls.model_validate(values)
         except ValidationError as error:
             raise SceneError(f"{place}{describe_error(error)}") from None
 
-    def changed(self, key, value, *, place):
+    def changed(self, key: str, value: Any, *, place: str) -> ContactOptions | DetectOptions | OutputOptions:
         """Return a copy with the dotted ``key`` set to ``value``, checked again."""
         values = self.model_dump(by_alias=True, exclude_unset=True)
         table = values
@@ -109,7 +112,7 @@ class Table(BaseModel):
         return type(self).build(values, place=place)
 
 
-def describe_error(error, *, root="", name_row=None):
+def describe_error(error: Any, *, root: str = "", name_row: Callable[..., Any] | None = None) -> str:
     """Return the first problem of a pydantic error as "where: what, given value".
 
     Parameters

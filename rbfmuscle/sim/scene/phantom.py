@@ -3,10 +3,14 @@
 A right hip in millimetres with the joint's centre at the origin: +x medial, +y posterior, +z up.
 """
 
+from __future__ import annotations
+
 import functools
+from typing import Any
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.sim.scene.attachments import Attachment, signed_distances
 from rbfmuscle.sim.scene.options import DetectOptions, TunnellingOptions
 from rbfmuscle.sim.scene.phantom_shapes import (
@@ -26,7 +30,7 @@ SOCKET_RADIUS = 26.5
 AXES = {"flexion": (-1, 0, 0), "adduction": (0, -1, 0), "internal_rotation": (0, 0, 1)}
 
 
-def femur_distance(points):
+def femur_distance(points: Floats) -> Floats:
     """Nearly the signed distance to the femur: head, neck, trochanters, bowed shaft, condyles."""
     shaft_stops = [(-42, 5, -45), (-42, -3, -120), (-35, -8, -210), (-22, -4, -310), (-10, 2, -375)]
     shaft = rod(points, shaft_stops, [17, 15, 13.5, 15, 24])
@@ -39,7 +43,7 @@ def femur_distance(points):
     return blend(blend(upper, knee, 0.5), ball(points, (0, 0, 0), HEAD_RADIUS), 8)
 
 
-def pelvis_distance(points):
+def pelvis_distance(points: Floats) -> Floats:
     """Nearly the signed distance to the hip bone: ilium, socket, ischium, pubis and the ring between them."""
     tilt = np.radians(14.0)
     turn = np.array([[np.cos(tilt), 0.0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0.0, np.cos(tilt)]])
@@ -56,7 +60,7 @@ def pelvis_distance(points):
 
 
 @functools.cache
-def bone_meshes(spacing=3.5):
+def bone_meshes(spacing: float = 3.5) -> dict[str, Any]:
     """Vertices and faces of both bones, by name."""
     return {
         "pelvis": solid_mesh(pelvis_distance, (-45, -75, -120), (115, 110, 165), spacing),
@@ -138,7 +142,7 @@ def _parts(spacing):
     return bone_meshes(), muscles
 
 
-def phantom_scene(*, model="rbf", end=90.0, step=2.0, spacing=3.0):
+def phantom_scene(*, model: str = "rbf", end: float = 90.0, step: float = 2.0, spacing: float = 3.0) -> Scene:
     """Return the embedded hip as a scene: flexion from 0 to ``end`` by ``step`` [degree].
 
     The muscles' volumes are known in closed form (``MUSCLES[name].volume``); a mesh of triangles with edges

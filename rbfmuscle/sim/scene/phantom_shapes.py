@@ -1,8 +1,14 @@
 """Shapes from formulas: tubes of known volume for muscles, blended solids for bones."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats, Integers
 
 
 @dataclass(frozen=True)
@@ -53,17 +59,17 @@ class Tube:
         return start, first, last, legs, angle, cut
 
     @property
-    def length(self):
+    def length(self) -> float:
         """Length of the axis."""
         _, _, _, legs, angle, cut = self._bend()
         return legs.sum() - 2 * cut + self.radius * angle
 
     @property
-    def volume(self):
+    def volume(self) -> Any:
         """Volume in closed form."""
         return np.pi * self.width * self.thickness * self.length * self.fullness / (self.fullness + 1)
 
-    def axis(self, u):
+    def axis(self, u: Floats) -> tuple[Floats, Floats, Floats]:
         """Position, tangent and binormal (each (n, 3)) at fractions u of the length."""
         start, first, last, legs, angle, cut = self._bend()
         s = np.asarray(u, dtype=float) * self.length
@@ -78,7 +84,7 @@ class Tube:
         position = start + before[:, None] * first + arc + after[:, None] * last
         return position, tangent, np.broadcast_to(np.cross(first, side), position.shape)
 
-    def sections(self, u):
+    def sections(self, u: Floats) -> tuple[Floats, Floats, Floats]:
         """Centre, wide half-axis and thin half-axis (each (n, 3)) of the ellipses at fractions u."""
         u = np.asarray(u, dtype=float)
         centre, tangent, binormal = self.axis(u)
@@ -90,12 +96,12 @@ class Tube:
         thin = np.cross(tangent, wide)
         return centre, (self.width * w * g)[:, None] * wide, (self.thickness * w / g)[:, None] * thin
 
-    def points_inside(self, u, across, thick):
+    def points_inside(self, u: Floats, across: float, thick: float) -> Floats:
         """Points at fractions u of the axis and fixed fractions (within the unit disc) of the half-axes."""
         centre, wide, thin = self.sections(u)
         return centre + across * wide + thick * thin
 
-    def mesh(self, spacing):
+    def mesh(self, spacing: float) -> tuple[Floats, Integers, Floats]:
         """Closed outward triangles with edges of about ``spacing``, vertices on the tube.
 
         Returns
@@ -141,7 +147,7 @@ def _ring(centre, wide, thin, spacing):
     return centre + np.cos(angle)[:, None] * wide + np.sin(angle)[:, None] * thin
 
 
-def stitch(vertices, lower, upper):
+def stitch(vertices: Floats, lower: Integers, upper: Integers) -> Integers:
     """Triangles between two rings with different numbers of points, always along the shorter diagonal."""
     faces = []
     i = j = 0
@@ -164,12 +170,12 @@ def stitch(vertices, lower, upper):
     return np.array(faces, dtype=np.int64)
 
 
-def ball(points, centre, radius):
+def ball(points: Floats, centre: tuple[int, int, int], radius: float) -> Floats:
     """Signed distance to a ball."""
     return np.linalg.norm(points - np.asarray(centre), axis=-1) - radius
 
 
-def ellipsoid(points, centre, radii, turn=None):
+def ellipsoid(points: Floats, centre: tuple[Any, ...], radii: tuple[Any, ...], turn: Any = None) -> Floats:
     """Nearly the signed distance to an ellipsoid; ``turn`` (3, 3) has its axes as rows."""
     local = points - np.asarray(centre)
     if turn is not None:
@@ -180,7 +186,9 @@ def ellipsoid(points, centre, radii, turn=None):
     return np.where(slope > 1e-12, value * (value - 1) / np.maximum(slope, 1e-12), -radii.min())
 
 
-def plate(points, centre, radii, half_thickness, turn):
+def plate(
+    points: Floats, centre: tuple[int, int, int], radii: tuple[int, int], half_thickness: float, turn: Floats
+) -> Floats:
     """Nearly the signed distance to an elliptic plate with a round rim, its first axis across the plate."""
     local = (points - np.asarray(centre)) @ np.asarray(turn).T
     flat = np.stack([local[..., 1], local[..., 2]], axis=-1)
@@ -188,7 +196,7 @@ def plate(points, centre, radii, half_thickness, turn):
     return np.hypot(local[..., 0], outside) - half_thickness
 
 
-def rod(points, stops, radii):
+def rod(points: Floats, stops: list[tuple[int, int, int]], radii: list[Any]) -> Floats:
     """Nearly the signed distance to a rod along a polyline whose radius is linear between its points."""
     stops = np.asarray(stops, dtype=float)
     nearest = np.full(points.shape[:-1], np.inf)
@@ -199,18 +207,20 @@ def rod(points, stops, radii):
     return nearest
 
 
-def blend(first, second, width):
+def blend(first: Floats, second: Floats, width: float) -> Floats:
     """Smooth union of two distance fields: a fillet where they are within ``width`` of each other."""
     overlap = np.clip(width - np.abs(first - second), 0, None) / width
     return np.minimum(first, second) - overlap**3 * width / 6
 
 
-def carve(solid, hole, width):
+def carve(solid: Floats, hole: Floats, width: int) -> Floats:
     """Smooth difference: the solid without the hole, its rim rounded over ``width``."""
     return -blend(-solid, hole, width)
 
 
-def solid_mesh(distance, low, high, spacing):
+def solid_mesh(
+    distance: Callable[..., Any], low: tuple[int, int, int], high: tuple[int, int, int], spacing: float
+) -> tuple[Floats, Integers]:
     """Closed outward triangles of the zero set of ``distance`` within a box, vertices projected onto it."""
     from skimage.measure import marching_cubes
 

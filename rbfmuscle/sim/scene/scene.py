@@ -3,14 +3,18 @@
 A scene is loaded from a TOML file or built in code; both pass the same checks.
 """
 
+from __future__ import annotations
+
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.sim.joints.skeleton import ordered
 from rbfmuscle.sim.scene.attachments import Attachment, resolve_attachments
 from rbfmuscle.sim.scene.joint_tables import CouplingTable, JointTable, make_coupling
@@ -23,6 +27,10 @@ from rbfmuscle.sim.scene.options import (
     OutputOptions,
 )
 from rbfmuscle.validation import SceneError, check_points, check_positive, did_you_mean, shown
+
+if TYPE_CHECKING:
+    import trimesh
+
 
 # What reads files of other programs as scenes, by suffix; the room that can do it enters itself here.
 IMPORTERS = {}
@@ -56,7 +64,7 @@ class Scene:
         The file it was loaded from.
     """
 
-    def __init__(self, name="scene", *, units="mm"):
+    def __init__(self, name: str = "scene", *, units: str = "mm") -> None:
         if units not in MM_PER_UNIT:
             raise SceneError(f"units must be m, cm or mm, got {units!r}")
         self.name = name
@@ -69,12 +77,12 @@ class Scene:
         self.motion = Motion()
         self.contact = ContactOptions()
         self.sliding = None
-        self.detect = None
+        self.detect: Any = None
         self.output = OutputOptions()
         self.path = None
 
     @classmethod
-    def load(cls, path, *, skeleton=False):
+    def load(cls, path: str | Path, *, skeleton: bool = False) -> Scene:
         """Return the scene of a TOML file; its paths are relative to the file.
 
         Parameters
@@ -95,7 +103,7 @@ class Scene:
         return load_scene(cls, Path(path), skeleton=skeleton)
 
     @classmethod
-    def from_osim(cls, path, **options):
+    def from_osim(cls, path: str | Path, **options: Any) -> Any:
         """Return a scene with the bones and joints of an OpenSim model; muscles are still to be added.
 
         Parameters
@@ -115,19 +123,21 @@ class Scene:
             raise SceneError("nothing here reads .osim files; import rbfmuscle.opensim first")
         return IMPORTERS["osim"](path, **options)
 
-    def length(self, millimetres):
+    def length(self, millimetres: float) -> float:
         """Return a length given in millimetres in the scene's unit."""
         return millimetres / MM_PER_UNIT[self.units]
 
-    def bone(self, name):
+    def bone(self, name: str) -> Any:
         """Return the bone of that name, or raise SceneError naming the nearest."""
         return _find(self.bones, name, "bone")
 
-    def muscle(self, name):
+    def muscle(self, name: str) -> Muscle:
         """Return the muscle of that name, or raise SceneError naming the nearest."""
         return _find(self.muscles, name, "muscle")
 
-    def add_bone(self, name, mesh, *, scale=1.0):
+    def add_bone(
+        self, name: str, mesh: ReadMesh | trimesh.Trimesh | tuple[Any, ...], *, scale: float = 1.0
+    ) -> Scene:
         """Add a bone and return the scene.
 
         Parameters
@@ -148,13 +158,21 @@ class Scene:
         if name in self.links:
             raise SceneError(f"bone {name!r} is given twice")
 
-    def add_link(self, name):
+    def add_link(self, name: str) -> Any:
         """Add a bone without a mesh, which carries joints only, and return the scene."""
         self._check_new_bone(name)
         self.links.append(name)
         return self
 
-    def add_joint(self, name, parent, child, centre=None, axes=None, **keys):
+    def add_joint(
+        self,
+        name: str,
+        parent: str,
+        child: str,
+        centre: ArrayLike | None = None,
+        axes: Mapping[str, ArrayLike] | None = None,
+        **keys: Any,
+    ) -> Scene:
         """Add a joint, a ball where no ``type`` is given, and return the scene.
 
         Parameters
@@ -177,7 +195,7 @@ class Scene:
             }
         return self.place_joint(JointTable.build(row, place=f"{place}: ").joint())
 
-    def place_joint(self, joint):
+    def place_joint(self, joint: Any) -> Any:
         """Add a `Joint` and return the scene; bones and joints form a tree."""
         _check_new_name(self.joints, joint.name, "joint")
         place, child = f"joint {joint.name!r}", joint.child
@@ -195,7 +213,7 @@ class Scene:
         self.joints.append(joint)
         return self
 
-    def add_coupling(self, coordinate, of, **function):
+    def add_coupling(self, coordinate: str, of: list[Any], **function: Any) -> Any:
         """Let a coordinate follow others by a function, as in ``[[coupling]]``, and return the scene.
 
         Parameters
@@ -210,12 +228,21 @@ class Scene:
         table = CouplingTable.build(row, place=f"coupling of {coordinate!r}: ")
         return self.place_coupling(make_coupling(table, self.joints))
 
-    def place_coupling(self, coupling):
+    def place_coupling(self, coupling: Any) -> Any:
         """Add a `Coupling` and return the scene."""
         self.couplings = ordered([*self.couplings, coupling])
         return self
 
-    def add_muscle(self, name, mesh, *, attach=(), model="rbf", fibres=None, scale=1.0):
+    def add_muscle(
+        self,
+        name: str,
+        mesh: ReadMesh | trimesh.Trimesh | tuple[Floats, Integers],
+        *,
+        attach: Sequence[Any] = (),
+        model: dict[str, Any] | str = "rbf",
+        fibres: ArrayLike | None = None,
+        scale: float = 1.0,
+    ) -> Scene:
         """Add a muscle and return the scene.
 
         Parameters
@@ -244,19 +271,19 @@ class Scene:
         )
         return self
 
-    def set_motion(self, *, folder=None, **options):
+    def set_motion(self, *, folder: Path | None = None, **options: Any) -> Scene:
         """Set the motion from the keys of ``[motion]`` (angles in degrees) and return the scene."""
         table = MotionOptions.build(options, place="[motion] ")
         self.motion = self.motion_from(table, folder=folder)
         return self
 
-    def motion_from(self, table, *, folder=None):
+    def motion_from(self, table: Any, *, folder: Any = None) -> Any:
         """Return the motion that a `MotionOptions` asks of this scene's joints."""
         return Motion.from_options(
             table, self.joints, couplings=self.couplings, metre=self.length(1000.0), folder=folder
         )
 
-    def validate(self):
+    def validate(self) -> Scene:
         """Raise SceneError if the scene cannot be simulated: no bones, no muscles, loose muscles."""
         for what in ("bones", "muscles"):
             if not getattr(self, what):
@@ -280,7 +307,7 @@ class Scene:
                 )
         return self
 
-    def check(self):
+    def check(self) -> list[Any]:
         """Return findings about the scene (errors, warnings, notes); nothing is solved.
 
         Returns
@@ -291,7 +318,7 @@ class Scene:
 
         return check_scene(self)
 
-    def copy(self):
+    def copy(self) -> Scene:
         """Return a copy whose lists and tables are its own; meshes are shared."""
         other = copy.copy(self)
         other.bones = list(self.bones)
@@ -307,7 +334,7 @@ class Scene:
         *,
         model: str | dict | None = None,
         frames: slice | str | None = None,
-    ) -> "Scene":
+    ) -> Scene:
         """Return a copy with other settings, another model or other frames; meshes are shared.
 
         Parameters
@@ -335,19 +362,19 @@ class Scene:
             choose_frames(scene, frames)
         return scene
 
-    def resolved(self):
+    def resolved(self) -> dict[str, Any]:
         """Return the scene as plain data for ``run.json``: names, counts, options, sources and hashes."""
         from rbfmuscle.sim.scene.file import describe_scene
 
         return describe_scene(self)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         muscles = ", ".join(f"{muscle.name} ({muscle.model})" for muscle in self.muscles) or "no muscles"
         counts = f"{len(self.bones)} bones, {muscles}, {len(self.motion)} frames"
         return f"<Scene {self.name!r}, {self.units}: {counts}>"
 
 
-def split_model(model, *, place):
+def split_model(model: dict[str, Any] | str, *, place: str) -> tuple[Any, ...]:
     """Return (name, options) of a model given as a name or as a table with ``name``."""
     if isinstance(model, str):
         return model, {}

@@ -1,5 +1,7 @@
 """Changing a scene by dotted keys: ``--set KEY=VALUE``, grids of a sweep, ``Scene.with_options``."""
 
+from __future__ import annotations
+
 import tomllib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
 TABLES = ("contact", "sliding", "detect", "output", "motion")
 
 
-def apply_model(scene, model, *, muscles=None):
+def apply_model(scene: Scene, model: dict[str, Any] | str, *, muscles: Any = None) -> None:
     """Give muscles (all by default) another model; options of a different model are dropped."""
     from rbfmuscle.sim.scene.scene import split_model
 
@@ -27,7 +29,7 @@ def apply_model(scene, model, *, muscles=None):
         muscle.options.update(options)
 
 
-def apply_settings(scene: "Scene", settings: Mapping[str, Any]) -> None:
+def apply_settings(scene: Scene, settings: Mapping[str, Any]) -> None:
     """Set dotted keys of a scene, in place.
 
     ``model`` or ``model.KEY`` change every muscle, ``muscle.NAME.model`` or ``muscle.NAME.model.KEY`` one;
@@ -59,7 +61,7 @@ def chooses_model(key: str) -> bool:
     return key == "model" or (key.startswith("muscle.") and key.endswith(".model"))
 
 
-def choose_frames(scene: "Scene", frames: slice | str) -> None:
+def choose_frames(scene: Scene, frames: slice | str) -> None:
     """Keep some frames of a scene's motion, in place: a slice or "A:B:S".
 
     Raises
@@ -97,7 +99,7 @@ def _apply(scene, key, value):
         raise SceneError(f"{key}: unknown setting, {did_you_mean(head, ['model', 'muscle', *TABLES])}")
 
 
-def parse_setting(text):
+def parse_setting(text: str) -> tuple[Any, ...]:
     """Return (key, value) of "KEY=VALUE"; the value is read as TOML, else taken as text.
 
     Raises
@@ -111,7 +113,7 @@ def parse_setting(text):
     return key.strip(), parse_value(value.strip())
 
 
-def parse_value(text):
+def parse_value(text: str) -> dict[str, Any] | int | str:
     """Return the value of a TOML literal (number, true, list, table), or the text itself."""
     try:
         value = tomllib.loads(f"value = {text}")["value"]
@@ -121,7 +123,7 @@ def parse_value(text):
     return value
 
 
-def parse_slice(text):
+def parse_slice(text: str) -> slice:
     """Return the slice of "A:B:S" (each part may be empty), or of a single frame "A".
 
     Raises
@@ -138,8 +140,9 @@ def parse_slice(text):
         raise UsageError(
             f"frames {text!r} must look like A:B:S (whole numbers, S not 0), for instance 0:46:5"
         )
-    if len(numbers) == 1:
-        return slice(numbers[0], numbers[0] + 1 or None)
+    first = numbers[0]
+    if len(numbers) == 1 and first is not None:
+        return slice(first, first + 1 or None)
     return slice(*numbers)
 
 

@@ -1,8 +1,11 @@
 """Models on one scene, measured alike: what each keeps, how far apart they are, what each costs."""
 
+from __future__ import annotations
+
 import csv
 import math
-from typing import NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -12,6 +15,11 @@ from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.files.writer import write_json
 from rbfmuscle.study.measure.comparison_measures import MaterialProbe, array_bytes, curvature_variation
 from rbfmuscle.study.measure.metrics import ALL, surface_distance, unit_text
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.loop.frame import Frame, MuscleModel
+    from rbfmuscle.sim.scene.scene import Scene
+
 
 FORMAT = 1
 LAW, MESH, OWN, FIRST, COST = "law", "input mesh", "own run", "first model", "cost"
@@ -113,12 +121,12 @@ class ModelProbe:
         Frames in which curvature is measured.
     """
 
-    def __init__(self, scene, poses):
+    def __init__(self, scene: Scene, poses: list[int]) -> None:
         self.scene, self.poses = scene, set(poses)
         self.found = {muscle.name: {} for muscle in scene.muscles}
         self._material = {}
 
-    def __call__(self, models, frame):
+    def __call__(self, models: list[MuscleModel], frame: Frame | None) -> None:
         """Take what is kept of a frame; the rest states where ``frame`` is None."""
         if frame is None:
             for model in models:
@@ -141,13 +149,13 @@ class ModelProbe:
         known[quantity] = max(known.get(quantity, 0.0), value)
 
 
-def chosen_poses(scene):
+def chosen_poses(scene: Scene) -> list[int]:
     """First, middle and last frame of the motion, each once."""
     last = len(scene.motion) - 1
     return sorted({0, last // 2, last})
 
 
-def measure_run(saved, probe, extra):
+def measure_run(saved: SavedRun, probe: ModelProbe, extra: dict[str, Any]) -> dict[str, Any]:
     """Values of every measure but the distances for one model.
 
     Parameters
@@ -208,7 +216,7 @@ def _over_muscles(quantity, muscles):
     )
 
 
-def add_distances(results, folder, poses):
+def add_distances(results: dict[str, Any], folder: Path, poses: list[int]) -> list[list[float]]:
     """Distances between the models' surfaces.
 
     Parameters
@@ -248,7 +256,14 @@ def _take_worst(found, pairs):
             found[muscle][name] = max(found[muscle].get(name, 0.0), value)
 
 
-def write_tables(folder, scene, results, failed, matrix, poses):
+def write_tables(
+    folder: Path,
+    scene: Scene,
+    results: dict[str, Any],
+    failed: dict[str, Any],
+    matrix: list[list[float]],
+    poses: list[int],
+) -> dict[str, Any]:
     """Write ``comparison.json`` and ``comparison.csv``.
 
     Parameters
@@ -300,12 +315,12 @@ def write_tables(folder, scene, results, failed, matrix, poses):
     return table
 
 
-def measure_unit(kind, units):
+def measure_unit(kind: str, units: str) -> str:
     """Unit of a measure in a scene of these units."""
     return f"1/{units}" if kind == "1/length" else unit_text(kind, units)
 
 
-def best_models(results, quantity, units):
+def best_models(results: dict[str, Any], quantity: str, units: str) -> list[Any]:
     """Models that are as good as the best in a measure: within 5 %, or within what does not count."""
     measure = MEASURES[quantity]
     values = {
@@ -320,7 +335,7 @@ def best_models(results, quantity, units):
     return [name for name, value in values.items() if value <= limit]
 
 
-def verdict(results, model, units):
+def verdict(results: dict[str, Any], model: str, units: str) -> dict[str, Any]:
     """In what a model is best alone, and in what another is better.
 
     Returns

@@ -3,10 +3,13 @@
 A fit that is wrong and says nothing is the one outcome that must not occur; the table calls it "silent".
 """
 
+from __future__ import annotations
+
 import csv
 import json
 import warnings
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +20,10 @@ from rbfmuscle.implicit.placement.off_surface import off_surface_points
 from rbfmuscle.implicit.selection import spacing
 from rbfmuscle.validation import NumericalWarning, RBFMuscleError
 
+if TYPE_CHECKING:
+    from rbfmuscle.commands.progress import Progress
+
+
 # Shape parameters, in units of 1 / (mean distance to the nearest centre).
 SHAPES = (1e-3, 1e-2, 0.1, 1.0, 10.0, 1e3)
 CENTRES = 200
@@ -26,7 +33,9 @@ OF_VALUES = f"{MOST_VALUES} centres, of values"
 HEADER = ("case", "kernel", "outcome", "error", "bound", "said")
 
 
-def study_extremes(*, kernels=None, progress=None):
+def study_extremes(
+    *, kernels: list[str] | None = None, progress: Progress | None = None
+) -> list[dict[str, Any]]:
     """Fit an ellipsoid under every extreme with every kernel.
 
     Parameters
@@ -174,7 +183,7 @@ def _look(field, points):
     return "silent", ""
 
 
-def write_extremes(rows, directory):
+def write_extremes(rows: list[dict[str, Any]], directory: Path) -> None:
     """Write ``extremes.csv``, ``extremes.json`` and the matrix ``extremes.md`` of cases and kernels."""
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
@@ -186,7 +195,7 @@ def write_extremes(rows, directory):
     (directory / "extremes.md").write_text(extremes_matrix(rows), encoding="utf-8")
 
 
-def extremes_matrix(rows):
+def extremes_matrix(rows: list[dict[str, Any]]) -> str:
     """A table in Markdown: how many kernels are right, warned of, refused, or silent in each case, and which."""
     lines = [
         "| case | right | warned | refused | silent | worst error of the right |",

@@ -3,12 +3,17 @@
 Accuracy, conditioning, time and data size are measured together, since each can be bought with the others.
 """
 
+from __future__ import annotations
+
 import time
 import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
@@ -20,6 +25,10 @@ from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
 from rbfmuscle.study.experiment.sweep_table import pareto_front
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.validation import NumericalWarning, UsageError, check_mesh
+
+if TYPE_CHECKING:
+    pass
+
 
 CENTRES = (150, 300)
 # Shape parameters of the map, in units of 1 / (mean distance to the nearest centre).
@@ -55,7 +64,7 @@ class KernelStudy:
     surfaces: list = field(default_factory=list)
     units: str = ""
 
-    def toml(self, row):
+    def toml(self, row: dict[str, Any]) -> str:
         """The lines of a scene file's model table that give this row."""
         lines = [
             "[muscle.model]",
@@ -72,9 +81,19 @@ class KernelStudy:
 
 
 def study_kernels(
-    mesh, *, kernels=None, centres=CENTRES, derivatives="all", placement=FITTED, resolution=RESOLUTION,
-    criterion="held_out", scan=True, seed=0, units="", progress=None,
-):  # fmt: skip
+    mesh: MeshLike,
+    *,
+    kernels: Sequence[str] | None = None,
+    centres: Sequence[int] = CENTRES,
+    derivatives: str = "all",
+    placement: str = FITTED,
+    resolution: int = RESOLUTION,
+    criterion: str = "held_out",
+    scan: bool = True,
+    seed: int = 0,
+    units: str = "",
+    progress: Callable[[int, int], None] | None = None,
+) -> KernelStudy:
     """Fit a surface with many kernels and numbers of centres, and measure each fit.
 
     Parameters
@@ -112,7 +131,7 @@ def study_kernels(
     MeshError
         On an unusable mesh.
     """
-    vertices, faces = check_mesh(*((mesh.vertices, mesh.faces) if hasattr(mesh, "faces") else mesh))
+    vertices, faces = check_mesh(*(mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)))
     kernels = [get_kernel(name) for name in (kernels or KERNELS)]
     if placement not in (*PLACEMENTS, FITTED):
         raise UsageError(f"placement must be one of {', '.join((*PLACEMENTS, FITTED))}, got {placement!r}")
@@ -158,7 +177,7 @@ def _mark_fronts(rows):
 class _Judge:
     """The surface that is to be met, and how far another one is from it."""
 
-    def __init__(self, vertices, faces, resolution, seed):
+    def __init__(self, vertices: Floats, faces: Integers, resolution: int, seed: int) -> None:
         self.vertices, self.faces, self.resolution = vertices, faces, resolution
         self.volume = mesh_volume(vertices, faces)
         self.distance = MeshDistance(vertices, faces)
@@ -172,14 +191,14 @@ class _Judge:
         self.points = np.einsum("nk,nkj->nj", rng.dirichlet(np.ones(3), JUDGES), corners[which])
         self.normals = normal[which] / area[which, None]
 
-    def apart(self, vertices, faces):
+    def apart(self, vertices: Floats, faces: Integers) -> tuple[float, float, Floats]:
         """RMS and greatest distance, both ways, and the distance of each vertex."""
         there = MeshDistance(vertices, faces, closed=False).unsigned(self.points)
         back = self.distance.unsigned(vertices)
         rms = float(np.sqrt(0.5 * ((there**2).mean() + (back**2).mean())))
         return rms, float(max(there.max(), back.max())), back
 
-    def decimated(self, numbers):
+    def decimated(self, numbers: int) -> dict[str, float]:
         """A decimated mesh whose vertices and faces are as many numbers (9 a vertex) as a field's."""
         import pyvista
 

@@ -5,16 +5,23 @@ move), ``references/KEY.npz`` (surfaces that errors are measured against) and th
 of the scene's content and the point's settings, so what is there is never computed again, whoever computed it.
 """
 
+from __future__ import annotations
+
 import hashlib
 import itertools
 import json
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rbfmuscle.sim.scene.settings import parse_value
 from rbfmuscle.study.files.writer import write_json
 from rbfmuscle.validation import UsageError, did_you_mean
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.scene.scene import Scene
+
 
 FORMAT = 1
 # Of these keys the reference takes the greatest value of the grid, or the least; of all others the scene's own.
@@ -47,17 +54,17 @@ class SweepPoint:
     reference: str
 
     @property
-    def is_reference(self):
+    def is_reference(self) -> bool:
         """Whether others are compared with this point."""
         return self.key == self.reference
 
     @property
-    def label(self):
+    def label(self) -> str:
         """The settings in words."""
         return " ".join(f"{key}={value}" for key, value in self.settings.items()) or "default"
 
 
-def parse_grid(texts):
+def parse_grid(texts: list[Any]) -> list[tuple[str, str, list[Any]]]:
     """Return the grid of ``["KEY=a,b,c", ...]`` as a list of (model, key, values).
 
     "MODEL:KEY=a,b" holds for the points of that model only; model is "" where the key holds for all.
@@ -108,11 +115,11 @@ class SweepPlan:
     facts: dict
 
     @property
-    def references(self):
+    def references(self) -> list[SweepPoint]:
         """Points that others are compared with."""
         return [point for point in self.points if point.is_reference]
 
-    def slice(self, part):
+    def slice(self, part: tuple[int, int] | None) -> list[Any]:
         """Points of an array job's task ``(i, n)``, the references left out; ``i = 0`` has none."""
         others = [point for point in self.points if not point.is_reference]
         if part is None:
@@ -120,11 +127,11 @@ class SweepPlan:
         i, n = part
         return others[i - 1 :: n] if i else []
 
-    def point(self, key):
+    def point(self, key: Any) -> Any:
         """The point of a key."""
         return next(point for point in self.points if point.key == key)
 
-    def as_dict(self):
+    def as_dict(self) -> dict[str, Any]:
         """What ``plan.json`` holds."""
         points = [
             {
@@ -139,7 +146,7 @@ class SweepPlan:
         return {"format": FORMAT, **self.facts, "points": points}
 
     @classmethod
-    def from_dict(cls, values):
+    def from_dict(cls, values: dict[str, Any]) -> SweepPlan:
         """The plan that ``plan.json`` holds."""
         values = dict(values)
         if values.pop("format", None) != FORMAT:
@@ -147,7 +154,13 @@ class SweepPlan:
         return cls([SweepPoint(**point) for point in values.pop("points")], values)
 
 
-def plan_sweep(scene, grid, *, frames=None, reference=None):
+def plan_sweep(
+    scene: Scene,
+    grid: list[tuple[str, str, list[Any]]],
+    *,
+    frames: str | None = None,
+    reference: dict[str, Any] | None = None,
+) -> SweepPlan:
     """Lay out a sweep; nothing is run.
 
     Parameters
@@ -225,7 +238,7 @@ def _ordered(settings):
     return dict(sorted(settings.items(), key=lambda item: item[0] != "model"))
 
 
-def scene_content(scene, frames=None):
+def scene_content(scene: Scene, frames: str | None = None) -> str:
     """Hash of what a scene would simulate, wherever its files lie."""
     facts = scene.resolved()
     for part in ("file", "output"):
@@ -242,7 +255,7 @@ def _attachments(muscle):
     return [[a.bone, [int(v) for v in a.vertices]] for a in muscle.attachments], lines
 
 
-def point_key(content, settings):
+def point_key(content: str, settings: dict[str, Any]) -> str:
     """Key of a point: 16 hexadecimal digits."""
     return _hash([FORMAT, content, sorted(settings.items())])[:16]
 
@@ -259,12 +272,12 @@ class SweepFolder:
     directory : path
     """
 
-    def __init__(self, directory):
+    def __init__(self, directory: str | Path) -> None:
         self.directory = Path(directory)
         self.points = self.directory / "points"
         self.surfaces = self.directory / "references"
 
-    def prepare(self, plan):
+    def prepare(self, plan: SweepPlan) -> None:
         """Make the folder and keep the plan.
 
         Raises
@@ -285,21 +298,21 @@ class SweepFolder:
         except OSError as error:
             raise UsageError(f"cannot write to {self.directory}: {error.strerror}") from None
 
-    def read_plan(self):
+    def read_plan(self) -> SweepPlan:
         """The sweep's plan; raises UsageError where there is none."""
         try:
             return SweepPlan.from_dict(json.loads((self.directory / "plan.json").read_text(encoding="utf-8")))
         except (OSError, json.JSONDecodeError):
             raise UsageError(f"{self.directory} is not the folder of a sweep (no plan.json)") from None
 
-    def read(self, key, *, waiting=False):
+    def read(self, key: str, *, waiting: bool = False) -> dict[str, Any] | None:
         """A point's result, None where there is none yet; ``waiting`` for one that is not compared yet."""
         try:
             return json.loads(self._result_file(key, waiting).read_text(encoding="utf-8"))
         except FileNotFoundError:
             return None
 
-    def write(self, result):
+    def write(self, result: dict[str, Any]) -> None:
         """Keep a point's result: whole or not at all."""
         waiting = result["status"] == "waiting"
         write_json(self._result_file(result["key"], waiting), result)
@@ -310,24 +323,24 @@ class SweepFolder:
     def _result_file(self, key, waiting):
         return self.surfaces / f"{key}.waiting.json" if waiting else self.points / f"{key}.json"
 
-    def is_waiting(self, key):
+    def is_waiting(self, key: str) -> bool:
         """Whether a point was run and waits for its reference."""
         return self._result_file(key, True).exists()
 
-    def forget(self, key):
+    def forget(self, key: str) -> None:
         """Take a point's result away."""
         (self.points / f"{key}.json").unlink(missing_ok=True)
 
-    def surface_file(self, key):
+    def surface_file(self, key: str) -> Path:
         """Surfaces of a reference."""
         return self.surfaces / f"{key}.npz"
 
-    def waiting_file(self, key):
+    def waiting_file(self, key: str) -> Path:
         """Surfaces of a point that waits for its reference."""
         return self.surfaces / f"{key}.waiting.npz"
 
 
-def parse_task(text):
+def parse_task(text: str) -> tuple[int, int]:
     """Return (i, n) of "I/N"; I = 0 stands for the references alone.
 
     Raises
@@ -341,7 +354,7 @@ def parse_task(text):
     return int(first), int(last)
 
 
-def check_key(name, known):
+def check_key(name: str, known: tuple[Any, ...]) -> None:
     """Raise UsageError naming the nearest right key of a table."""
     if name not in known:
         raise UsageError(f"unknown quantity {name!r}, {did_you_mean(name, known)}")

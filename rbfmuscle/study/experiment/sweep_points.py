@@ -1,20 +1,31 @@
 """Measuring the points of a sweep: one after another, side by side, or on a cluster."""
 
+from __future__ import annotations
+
 import math
 import os
 import platform
 import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import nullcontext
 from functools import lru_cache
 from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rbfmuscle.study.experiment.sweep import SweepFolder
 from rbfmuscle.study.measure.metrics import ALL, surface_distance
 from rbfmuscle.validation import MissingPartError, RBFMuscleError, UsageError
+
+if TYPE_CHECKING:
+    from rbfmuscle.commands.progress import Progress
+    from rbfmuscle.sim.scene.scene import Scene
+    from rbfmuscle.study.experiment.sweep import SweepPlan, SweepPoint
+
 
 CONNECT_WITHIN = 20  # seconds for a scheduler and its first two workers
 # What a point may fail with and leave the others standing.
@@ -43,7 +54,16 @@ TIMES = ("time_frame", "time_frame_p95", "time_extract")
 VALUES = ("error_rms", "error_max", *WORST, *TIMES)
 
 
-def measure_point(runner, scene, point, folder, *, frames=None, threads=1, jobs=1):
+def measure_point(
+    runner: Callable[..., Any],
+    scene: Scene,
+    point: SweepPoint,
+    folder: SweepFolder,
+    *,
+    frames: str | None = None,
+    threads: int = 1,
+    jobs: int = 1,
+) -> dict[str, Any]:
     """Run one point, measure it and keep the result; an error becomes the result of a failed point.
 
     Parameters
@@ -89,7 +109,7 @@ def measure_point(runner, scene, point, folder, *, frames=None, threads=1, jobs=
     return result
 
 
-def finish_point(point, folder):
+def finish_point(point: Any, folder: Any) -> Any:
     """Compare a point that was run before its reference was there."""
     result, waiting = folder.read(point.key, waiting=True), folder.waiting_file(point.key)
     result["status"] = "done"
@@ -131,10 +151,10 @@ def _take_error(shown, point, folder, result):
 class _threads:
     """Context in which loops and BLAS use so many threads."""
 
-    def __init__(self, count):
+    def __init__(self, count: int) -> None:
         self.count = count
 
-    def __enter__(self):
+    def __enter__(self) -> None:
         import numba
         from threadpoolctl import threadpool_limits
 
@@ -142,7 +162,7 @@ class _threads:
         numba.set_num_threads(max(1, min(self.count, numba.config.NUMBA_NUM_THREADS)))
         self.limits = threadpool_limits(self.count)
 
-    def __exit__(self, *error):
+    def __exit__(self, *error: Any) -> None:
         import numba
 
         self.limits.restore_original_limits()
@@ -240,8 +260,17 @@ class SweepRunner:
     """
 
     def __init__(
-        self, runner, scene, plan, directory, *, frames=None, jobs=None, scheduler=None, progress=None
-    ):
+        self,
+        runner: Callable[..., Any],
+        scene: Scene,
+        plan: SweepPlan,
+        directory: Path,
+        *,
+        frames: str | None = None,
+        jobs: int | None = None,
+        scheduler: str | None = None,
+        progress: Progress | None = None,
+    ) -> None:
         self.runner, self.scene, self.plan, self.frames = runner, scene, plan, frames
         self.folder = SweepFolder(os.path.abspath(directory))
         self.cores = available_cores()
@@ -251,7 +280,7 @@ class SweepRunner:
         self.scheduler, self.progress = scheduler, progress
         self.done = 0
 
-    def run(self, *, part=None, retry=False):
+    def run(self, *, part: tuple[int, int] | None = None, retry: bool = False) -> int:
         """Measure the references, then the points of a slice (all by default), leaving out what is there.
 
         Returns
@@ -366,13 +395,13 @@ class SweepRunner:
             self.progress(self.done, self.total)
 
 
-def delayed_calls(function, calls, **options):
+def delayed_calls(function: Callable[..., Any], calls: Iterator[Any], **options: Any) -> Iterator[Any]:
     """joblib's tasks for calls with these positional arguments."""
     from joblib import delayed
 
     return (delayed(function)(*arguments, **options) for arguments in calls)
 
 
-def available_cores():
+def available_cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

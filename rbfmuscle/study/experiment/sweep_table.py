@@ -1,10 +1,15 @@
 """The table of a sweep, its Pareto front, and whether the default stands on it."""
 
+from __future__ import annotations
+
 import csv
 import io
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from rbfmuscle.study.experiment.sweep import SweepFolder, SweepPlan
 from rbfmuscle.study.experiment.sweep_points import TIMES, VALUES
@@ -44,7 +49,7 @@ class Verdict:
     time: float
 
 
-def sweep_rows(plan, folder):
+def sweep_rows(plan: SweepPlan, folder: SweepFolder) -> list[dict[str, Any]]:
     """One dict a point, in the plan's order: role, status, settings, values, error.
 
     Parameters
@@ -82,7 +87,7 @@ def sweep_rows(plan, folder):
     return rows
 
 
-def pareto_front(errors, times):
+def pareto_front(errors: Sequence[float], times: Sequence[float]) -> list[Any]:
     """Indices of the points that no other beats in one of error and time without losing in the other.
 
     Parameters
@@ -104,7 +109,7 @@ def pareto_front(errors, times):
     return front
 
 
-def mark_front(rows, quantity="error_rms"):
+def mark_front(rows: list[Any], quantity: str = "error_rms") -> list[Any]:
     """Mark the front in the rows, a front for each reference, and judge the default of each.
 
     Parameters
@@ -158,7 +163,7 @@ def _named(row, quantity):
     return {"label": row["label"], "error": row[quantity], "time": row["time_frame"]}
 
 
-def verdict_text(verdict, units, quantity="error_rms"):
+def verdict_text(verdict: Verdict, units: str, quantity: str = "error_rms") -> str:
     """The verdict in a sentence."""
     what = f"default{f' of {verdict.group}' if verdict.group else ''}"
     unit = f" {units}" if has_length(quantity) else ""
@@ -178,25 +183,25 @@ def verdict_text(verdict, units, quantity="error_rms"):
     return text
 
 
-def has_length(quantity):
+def has_length(quantity: str) -> bool:
     """Whether a quantity is a length in the scene's unit."""
     return quantity.startswith(("error", "rest_error")) or "penetration" in quantity
 
 
-def table_columns(rows):
+def table_columns(rows: list[dict[str, Any]]) -> list[str]:
     """Columns of the table; each key of the grid has its own."""
     keys = dict.fromkeys(key for row in rows for key in row["settings"])
     head = ["point", "status", "role", "front"]
     return [*head, *keys, *VALUES, "threads", "jobs", "machine", "error", "key", "reference"]
 
 
-def flat_row(row):
+def flat_row(row: dict[str, Any]) -> dict[str, Any]:
     """A row with its settings beside its values."""
     rest = {name: value for name, value in row.items() if name not in ("settings", "label", "model")}
     return {**row["settings"], **rest}
 
 
-def table_text(rows, *, times=True):
+def table_text(rows: list[dict[str, Any]], *, times: bool = True) -> str:
     """The table as CSV; without times (and where they were taken) it is the same wherever it was computed."""
     left_out = () if times else (*TIMES, "threads", "jobs", "machine", "front")
     columns = [name for name in table_columns(rows) if name not in left_out]
@@ -215,7 +220,7 @@ def _cell(value):
     return int(value) if isinstance(value, bool) else value
 
 
-def write_table(plan, directory, *, quantity="error_rms"):
+def write_table(plan: SweepPlan, directory: Path, *, quantity: str = "error_rms") -> dict[str, Any]:
     """Write ``sweep.csv`` and ``sweep.json``.
 
     Returns
@@ -249,7 +254,7 @@ def _plain(row):
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
 
 
-def merge_sweeps(directories, output):
+def merge_sweeps(directories: list[Path], output: str | Path) -> SweepPlan:
     """Gather the results of several folders of one sweep in one.
 
     Parameters
@@ -271,7 +276,7 @@ def merge_sweeps(directories, output):
     for directory, plan in zip(directories, plans):
         if json.dumps(plan.as_dict()) != json.dumps(plans[0].as_dict()):
             raise UsageError(f"{directory} holds another sweep than {directories[0]}; merge the parts of one")
-    plan: SweepPlan = plans[0]
+    plan = plans[0]
     target = SweepFolder(output)
     target.prepare(plan)
     for directory in directories:

@@ -1,9 +1,12 @@
 """A saved run in other formats and units: surfaces as PVD with VTP, PLY, STL, OBJ, GLB; lengths as STO."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.sim.scene.scene import MM_PER_UNIT
 from rbfmuscle.study.files.meshfiles import write_mesh
 from rbfmuscle.study.files.saved import SavedRun
@@ -16,7 +19,15 @@ FORMATS = ("pvd", "vtp", "ply", "stl", "obj", "glb")
 TABLES = ("sto",)
 
 
-def export_run(directory, formats, *, output=None, units=None, frames=None, ascii=False):
+def export_run(
+    directory: str | Path,
+    formats: list[str] | str,
+    *,
+    output: str | Path | None = None,
+    units: str | None = None,
+    frames: slice | None = None,
+    ascii: bool = False,
+) -> list[Path]:
     """Write the muscles and bones of a saved run in one or more formats.
 
     Parameters
@@ -74,7 +85,7 @@ def export_run(directory, formats, *, output=None, units=None, frames=None, asci
     return written
 
 
-def posed(saved, bone, frame):
+def posed(saved: SavedRun, bone: tuple[str, Floats], frame: int) -> Floats:
     """Vertices of a bone in a frame, from its (vertices, faces) at rest and the poses."""
     pose = saved.poses[frame][bone[0]]
     return bone[1] @ pose[:3, :3].T + pose[:3, 3]

@@ -1,8 +1,17 @@
 """Fibres of a run in files: polylines for ParaView and a table of lengths, frame by frame."""
 
-import csv
+from __future__ import annotations
 
+import csv
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.study.files.vtp import Collection, write_vtp_lines
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.loop.frame import Frame
+
 
 COLUMNS = ("frame", "muscle", "fibre", "length", "stretch")
 
@@ -15,7 +24,7 @@ class FibreFiles:
     directory : pathlib.Path
     """
 
-    def __init__(self, directory):
+    def __init__(self, directory: Path) -> None:
         self.directory = directory
         (directory / "fibres").mkdir(exist_ok=True)
         self._file = open(directory / "fibre_lengths.csv", "w", encoding="utf-8", newline="")  # noqa: SIM115
@@ -23,7 +32,7 @@ class FibreFiles:
         self._table.writerow(COLUMNS)
         self._collection = Collection(directory / "fibres.pvd")
 
-    def write(self, frame):
+    def write(self, frame: Frame) -> None:
         """Write the fibres of all muscles in a frame."""
         entries = []
         for muscle, lines in frame.fibres.items():
@@ -38,13 +47,13 @@ class FibreFiles:
         self._file.flush()
         self._collection.add(frame.index, entries)
 
-    def close(self):
+    def close(self) -> None:
         """End the files."""
         self._file.close()
         self._collection.close()
 
 
-def read_fibres(path):
+def read_fibres(path: Path) -> tuple[Floats, dict[str, Floats]]:
     """Fibres of one file that a run has left.
 
     Parameters

@@ -1,16 +1,20 @@
 """Triangle meshes to and from files, by suffix."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.study.files.vtp import write_vtp
 from rbfmuscle.validation import MeshError
 
 SUFFIXES = {"pvd": ".vtp", "vtp": ".vtp", "ply": ".ply", "stl": ".stl", "obj": ".obj", "glb": ".glb"}
 
 
-def write_mesh(path, vertices, faces, *, single=False):
+def write_mesh(path: str | Path, vertices: ArrayLike, faces: ArrayLike, *, single: bool = False) -> None:
     """Write a triangle mesh in the format of the file's suffix.
 
     Parameters
@@ -35,7 +39,7 @@ def write_mesh(path, vertices, faces, *, single=False):
         path.write_bytes(mesh.export(file_type=path.suffix[1:]))
 
 
-def read_mesh(path):
+def read_mesh(path: str | Path) -> tuple[Floats, Integers]:
     """Vertices and faces of a mesh file that a run has left.
 
     Parameters

@@ -1,5 +1,7 @@
 """The facts in ``run.json``: what was run, with what, on what, how long it took and how it went."""
 
+from __future__ import annotations
+
 import hashlib
 import importlib.metadata
 import os
@@ -7,6 +9,7 @@ import platform
 from collections import defaultdict
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +22,19 @@ FORMAT = 1
 _PACKAGES = ("numpy", "scipy", "numba", "scikit-image", "trimesh", "pyvista", "vtk", "libigl")
 
 
-def build_info(scene, *, started, status, message, times, stages, frames, summary, limits, options):
+def build_info(
+    scene: Scene,
+    *,
+    started: Any,
+    status: str,
+    message: str,
+    times: dict[str, float],
+    stages: Stages,
+    frames: list[Any],
+    summary: dict[str, Any],
+    limits: dict[str, float],
+    options: dict[str, Any],
+) -> dict[str, Any]:
     """Assemble ``run.json``.
 
     Parameters
@@ -79,10 +94,10 @@ def frame_facts(scene: Scene, frame: Frame) -> dict:
 class Stages:
     """Time of each stage of each muscle over the frames."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._values = defaultdict(lambda: defaultdict(list))
 
-    def add(self, frame):
+    def add(self, frame: Frame) -> None:
         """Take in a frame's times and those that its surfaces report."""
         for name, times in frame.times.items():
             surface = frame.surfaces.get(name)
@@ -92,7 +107,7 @@ class Stages:
                     if key.startswith("time_"):
                         self._values[name][key].append(float(value))
 
-    def table(self):
+    def table(self) -> dict[str, Any]:
         """Nested dict: muscle -> stage -> total, median, 95th percentile and first [s]."""
         return {
             name: {
@@ -108,7 +123,7 @@ class Stages:
         }
 
 
-def versions():
+def versions() -> dict[str, str]:
     """Versions of Python, this library and what it computes with."""
     found = {"python": platform.python_version(), "rbfmuscle": rbfmuscle.__version__}
     for name in _PACKAGES:
@@ -119,7 +134,7 @@ def versions():
     return found
 
 
-def machine():
+def machine() -> dict[str, Any]:
     """What the times belong to."""
     import numba
 
@@ -131,7 +146,7 @@ def machine():
     }
 
 
-def input_hashes(scene):
+def input_hashes(scene: Scene) -> dict[str, Any]:
     """SHA-256 of the scene file and of every mesh file it names; files that are gone are left out."""
     sources = [scene.path, *(item.source for item in [*scene.bones, *scene.muscles])]
     found = {}

@@ -1,13 +1,17 @@
 """Reading back what a run left in a folder."""
 
+from __future__ import annotations
+
 import csv
 import io
 import json
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.study.files.meshfiles import SUFFIXES, read_mesh
 from rbfmuscle.study.measure.metrics import Row
 from rbfmuscle.validation import MeshError, UsageError
@@ -37,7 +41,7 @@ class SavedRun:
     units : str
     """
 
-    def __init__(self, directory):
+    def __init__(self, directory: str | Path) -> None:
         self.directory = Path(directory)
         path = self.directory / "run.json"
         try:
@@ -61,7 +65,7 @@ class SavedRun:
             self.frames = [frame["frame"] for frame in self.info["frames"]]
 
     @cached_property
-    def metrics(self):
+    def metrics(self) -> list[Row]:
         """Rows of ``metrics.csv``."""
         return [
             Row(int(r[0]), r[1], float(r[2]), r[3], r[4], float(r[5]), r[6])
@@ -69,43 +73,43 @@ class SavedRun:
         ]
 
     @cached_property
-    def events(self):
+    def events(self) -> list[Any]:
         """Rows of ``events.csv``: frame, muscle, bone, count, action."""
         return [(int(r[0]), r[1], r[2], int(r[3]), r[4]) for r in self._table("events.csv")]
 
     @cached_property
-    def poses(self):
+    def poses(self) -> dict[int, dict[str, Floats]]:
         """Dict of frame to dict of bone to (4, 4) ndarray."""
         found = {}
         for row in self._table("poses.csv"):
             found.setdefault(int(row[0]), {})[row[1]] = np.array(row[2:], dtype=float).reshape(4, 4)
         return found
 
-    def surface(self, muscle, frame):
+    def surface(self, muscle: str, frame: int) -> tuple[Floats, Integers]:
         """Vertices and faces of a muscle in a frame."""
         return read_mesh(self._file("surfaces", muscle, frame))
 
-    def bone(self, name):
+    def bone(self, name: str) -> tuple[Floats, Integers]:
         """Vertices and faces of a bone at rest."""
         first = self.frames[0]
         vertices, faces = read_mesh(self._file("bones", name, first))
         pose = self.poses[first][name]
         return (vertices - pose[:3, 3]) @ pose[:3, :3], faces
 
-    def series(self, muscle, quantity):
+    def series(self, muscle: str, quantity: str) -> tuple[Integers, Floats]:
         """Frames and values of a quantity of a muscle, as two arrays."""
         found = [(r.frame, r.value) for r in self.metrics if r.muscle == muscle and r.quantity == quantity]
         return np.array([f for f, _ in found]), np.array([v for _, v in found], dtype=float)
 
-    def has_surfaces(self):
+    def has_surfaces(self) -> bool:
         """Whether there is something to draw."""
         return self.suffix is not None and bool(self.frames)
 
-    def has_fibres(self):
+    def has_fibres(self) -> bool:
         """Whether the run wrote fibres."""
         return bool(self.info["scene"]["output"].get("fibres"))
 
-    def fibres(self, muscle, frame):
+    def fibres(self, muscle: str, frame: int) -> tuple[Floats, dict[str, Floats]]:
         """Points (count, k, 3) of the fibres of a muscle in a frame, and their ``length`` and ``stretch``.
 
         Raises

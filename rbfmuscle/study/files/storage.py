@@ -1,10 +1,18 @@
 """Lengths and moment arms of a saved run as CSV and as OpenSim storage files (.sto)."""
 
+from __future__ import annotations
+
 import csv
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rbfmuscle.validation import UsageError
+
+if TYPE_CHECKING:
+    from rbfmuscle.study.files.saved import SavedRun
+
 
 # Quantity: title of its file, for one coordinate.
 _TITLES = {
@@ -15,7 +23,7 @@ _TITLES = {
 }
 
 
-def write_sto(path, name, columns):
+def write_sto(path: Path, name: str, columns: dict[str, Any]) -> None:
     """Write an OpenSim storage file.
 
     Parameters
@@ -38,7 +46,7 @@ def write_sto(path, name, columns):
     path.write_text(text + "\n", encoding="ascii")
 
 
-def export_lengths(saved, folder, frames, factor):
+def export_lengths(saved: SavedRun, folder: Path, frames: list[int], factor: float) -> list[Path]:
     """Write lengths and moment arms as OpenSim's muscle analysis names them, and once as CSV.
 
     Parameters

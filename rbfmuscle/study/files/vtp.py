@@ -1,17 +1,23 @@
 """VTK files written directly: PolyData (.vtp) and collections over time (.pvd), without loading VTK."""
 
+from __future__ import annotations
+
 import base64
 import zlib
 from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 _BLOCK = 1 << 20
 _TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32", "i8": "Int64"}
 
 
-def write_vtp(path, vertices, faces, *, ascii=False, single=False):
+def write_vtp(
+    path: str | Path, vertices: ArrayLike, faces: ArrayLike, *, ascii: bool = False, single: bool = False
+) -> None:
     """Write a triangle mesh as VTK XML PolyData.
 
     Parameters
@@ -30,7 +36,9 @@ def write_vtp(path, vertices, faces, *, ascii=False, single=False):
     _write_polydata(path, vertices, ("Polys", faces.ravel(), ends), {}, ascii)
 
 
-def write_vtp_lines(path, points, *, cells=None, ascii=False):
+def write_vtp_lines(
+    path: str | Path, points: ArrayLike, *, cells: dict[str, Any] | None = None, ascii: bool = False
+) -> None:
     """Write polylines of equally many points as VTK XML PolyData.
 
     Parameters
@@ -105,13 +113,13 @@ class Collection:
     _HEAD = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n<Collection>\n'
     _TAIL = "</Collection>\n</VTKFile>\n"
 
-    def __init__(self, path):
+    def __init__(self, path: str | Path) -> None:
         self._file = open(path, "w", encoding="utf-8", newline="\n")  # noqa: SIM115
         self._file.write(self._HEAD)
         self._end = self._file.tell()
         self._close_tags()
 
-    def add(self, time, entries):
+    def add(self, time: float, entries: list[tuple[str, str]]) -> None:
         """Add one time step.
 
         Parameters
@@ -126,7 +134,7 @@ class Collection:
         self._end = self._file.tell()
         self._close_tags()
 
-    def close(self):
+    def close(self) -> None:
         """End the file."""
         self._file.close()
 

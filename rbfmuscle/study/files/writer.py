@@ -1,16 +1,25 @@
 """Writes a run to a folder while it goes on: whatever ends it, the frames so far can be read."""
 
+from __future__ import annotations
+
 import csv
 import json
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rbfmuscle.study.files.meshfiles import SUFFIXES, write_mesh
 from rbfmuscle.study.files.vtp import Collection
 from rbfmuscle.validation import SolveError, UsageError
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.loop.frame import Frame
+    from rbfmuscle.sim.scene.scene import Scene
+
 
 METRICS_COLUMNS = ("frame", "coordinate", "angle", "muscle", "quantity", "value", "unit")
 EVENTS_COLUMNS = ("frame", "muscle", "bone", "count", "action")
@@ -45,7 +54,7 @@ class RunWriter:
         If the folder cannot be written to.
     """
 
-    def __init__(self, directory, scene):
+    def __init__(self, directory: str | Path, scene: Scene) -> None:
         self.directory = Path(directory)
         self.scene = scene
         self.count = 0
@@ -67,7 +76,7 @@ class RunWriter:
             ) from None
         self._bone_files = {}
 
-    def write(self, frame, rows=()):
+    def write(self, frame: Frame, rows: Sequence[Any] = ()) -> None:
         """Write one frame and the rows of metrics that are complete by now.
 
         Parameters
@@ -87,7 +96,7 @@ class RunWriter:
             raise SolveError(f"cannot write frame {frame.index}: {error.strerror}; {kept}") from None
         self.count += 1
 
-    def close(self, rows=()):
+    def close(self, rows: Sequence[Any] = ()) -> None:
         """Write the last rows of metrics and close all files."""
         try:
             self._add_rows(rows)
@@ -100,7 +109,7 @@ class RunWriter:
         except OSError as error:
             raise SolveError(f"cannot finish the tables in {self.directory}: {error.strerror}") from None
 
-    def write_info(self, info):
+    def write_info(self, info: dict[str, Any]) -> None:
         """Write ``run.json`` in one piece: a reader finds the old one or the new one, never half of it.
 
         While the run goes on it holds the coordinates of all frames to come, for readers of a run that was killed.
@@ -189,7 +198,7 @@ def _fibre_files(directory):
     return FibreFiles(directory)
 
 
-def write_json(path, data):
+def write_json(path: Path, data: dict[str, Any]) -> None:
     """Write JSON in one move, so that whoever reads it finds the old or the new; NaN and infinity become null."""
     path = Path(path)
     part = path.with_name(f".{path.name}.{os.getpid()}")

@@ -1,9 +1,14 @@
 """Length of a muscle: a line through the slices of a harmonic field between its origin and its insertion."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 import scipy.sparse as sparse
 from scipy.spatial import cKDTree
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import harmonic_weights
 
 _FINE, _SLICES = 120, 16
@@ -29,7 +34,9 @@ class Centreline:
         Points of the line between its ends.
     """
 
-    def __init__(self, muscle, joints, vertices, faces, *, slices=_SLICES):
+    def __init__(
+        self, muscle: Any, joints: list[Any], vertices: Floats, faces: Integers, *, slices: int = _SLICES
+    ) -> None:
         self.ends = end_groups(muscle, joints)
         sides = _sides(muscle, self.ends, vertices)
         field = harmonic_weights(vertices, faces, sides)[:, 1]
@@ -40,7 +47,7 @@ class Centreline:
         even = np.interp(np.linspace(0.0, along[-1], slices), along, levels)
         self.operator = slice_operator(vertices, faces, field, even)
 
-    def points(self, vertices, poses):
+    def points(self, vertices: Floats, poses: dict[str, Floats]) -> Floats:
         """The line now.
 
         Parameters
@@ -56,12 +63,12 @@ class Centreline:
         first, last = (_carried(end, poses) for end in self.ends)
         return np.vstack([first, self.operator @ vertices, last])
 
-    def length(self, vertices, poses):
+    def length(self, vertices: Floats, poses: dict[str, Floats]) -> float:
         """Length of the line now [scene unit]."""
         return float(np.linalg.norm(np.diff(self.points(vertices, poses), axis=0), axis=1).sum())
 
 
-def end_groups(muscle, joints):
+def end_groups(muscle: Any, joints: list[Any]) -> list[list[tuple[Any, ...]]]:
     """Split the attachments into origin and insertion.
 
     The origin is every attachment on the same rigid body as the first one; the rest is the insertion. Where
@@ -78,7 +85,7 @@ def end_groups(muscle, joints):
     ]
 
 
-def split_ends(muscle, joints):
+def split_ends(muscle: Any, joints: list[Any]) -> list[Any]:
     """The attachments of the origin and those of the insertion, as `end_groups` tells them apart."""
     children = {joint.child for joint in joints}
     body = [a.bone if a.bone in children else None for a in muscle.attachments]
@@ -87,7 +94,7 @@ def split_ends(muscle, joints):
     return [origin, insertion] if insertion else [muscle.attachments[:1], muscle.attachments[1:]]
 
 
-def slice_operator(vertices, faces, field, levels):
+def slice_operator(vertices: Floats, faces: Integers, field: Floats, levels: Floats) -> Any:
     """Sparse matrix that maps vertices to the centroids of the field's isolines.
 
     Parameters

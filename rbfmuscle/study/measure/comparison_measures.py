@@ -1,13 +1,21 @@
 """Measures that mean the same for every model, whatever its mesh: material points, curvature, bytes held."""
 
+from __future__ import annotations
+
 import math
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.surfaces import barycentric_weights, edge_lengths, face_normals, unique_edges
 from rbfmuscle.implicit.placement.sampling import sample_surface, spread_points
+
+if TYPE_CHECKING:
+    import trimesh
+
 
 POINTS = 1200  # material points of a muscle
 PATCHES = 5000  # points at which curvature is taken
@@ -31,7 +39,9 @@ class MaterialProbe:
     count : int
     """
 
-    def __init__(self, mesh, vertices, faces, *, count=POINTS):
+    def __init__(
+        self, mesh: trimesh.Trimesh, vertices: Floats, faces: Integers, *, count: int = POINTS
+    ) -> None:
         sample = sample_surface(np.asarray(mesh.vertices), np.asarray(mesh.faces), count, placement="even")
         faces = np.asarray(faces, dtype=np.int64)
         _, closest, nearest, _ = ExactDistance(vertices, faces).nearest(sample.points)
@@ -40,11 +50,11 @@ class MaterialProbe:
         self.edges = unique_edges(sample.control_faces)
         self.rest = edge_lengths(sample.points, self.edges)
 
-    def points(self, vertices):
+    def points(self, vertices: Floats) -> Floats:
         """Places (count, 3) of the material points for the carried mesh's vertices now."""
         return np.einsum("pk,pkd->pd", self.shares, vertices[self.corners])
 
-    def strain(self, points, start=None):
+    def strain(self, points: Floats, start: Floats | None = None) -> float:
         """Root mean square of the relative change of the edges' lengths.
 
         Parameters
@@ -59,7 +69,7 @@ class MaterialProbe:
         return float(np.sqrt(np.mean(change**2)))
 
 
-def curvature_variation(vertices, faces, *, patches=PATCHES, seed=0):
+def curvature_variation(vertices: Floats, faces: Integers, *, patches: int = PATCHES, seed: int = 0) -> float:
     """How unevenly a surface is curved.
 
     Points are spread over the surface at random, in proportion to its area. At each a quadric is fitted to its
@@ -119,7 +129,7 @@ def _mean_curvature(points, normals, near, same_sheet):
     return top / (2 * (1 + gu**2 + gv**2) ** 1.5) / scale[:, 0]
 
 
-def array_bytes(thing, *, without=()):
+def array_bytes(thing: Any, *, without: list[Any] | tuple[()] = ()) -> int:
     """Bytes of all arrays that an object holds, in attributes and containers, each buffer once.
 
     Parameters

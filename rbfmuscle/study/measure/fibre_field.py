@@ -5,6 +5,10 @@ surface (Choi and Blemker 2013, "Skeletal muscle fascicle arrangements can be re
 vector field simulation"). Values given on the attachments instead would draw all fibres to their nearest rims.
 """
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 import scipy.sparse as sparse
 from scipy.ndimage import map_coordinates
@@ -12,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.validation import SolveError
@@ -55,7 +60,9 @@ class FibreField:
     that a wall that crosses the grid obliquely keeps fibres along it.
     """
 
-    def __init__(self, vertices, faces, sides, *, nodes=NODES):
+    def __init__(
+        self, vertices: Floats, faces: Integers, sides: list[tuple[Floats, Floats]], *, nodes: int = NODES
+    ) -> None:
         exact = ExactDistance(vertices, faces)
         self.spacing = _spacing(vertices, faces, nodes)
         low = vertices.min(axis=0) - (_LAYERS + 1) * self.spacing
@@ -71,19 +78,19 @@ class FibreField:
         self._slope = np.gradient(self.values, self.spacing)
         self._outward = np.gradient(self.distance, self.spacing)
 
-    def value(self, points):
+    def value(self, points: Floats) -> Any:
         """Field at points (n, 3), (n,)."""
         return self._read(self.values, points)
 
-    def depth(self, points):
+    def depth(self, points: Floats) -> Floats:
         """Signed distance at points, negative inside, to about a tenth of a cell."""
         return self._read(self.distance, points)
 
-    def gradient(self, points):
+    def gradient(self, points: Floats) -> Floats:
         """Gradient of the field at points, (n, 3)."""
         return np.stack([self._read(part, points) for part in self._slope], axis=1)
 
-    def outward(self, points):
+    def outward(self, points: Floats) -> Floats:
         """Unit direction out of the muscle at points, (n, 3)."""
         way = np.stack([self._read(part, points) for part in self._outward], axis=1)
         return way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
@@ -109,7 +116,9 @@ class FibreField:
         return _continued(values.reshape(self.shape))
 
 
-def attachment_points(vertices, faces, attached, spacing):
+def attachment_points(
+    vertices: Floats, faces: Integers, attached: Integers, spacing: float
+) -> tuple[Floats, Floats]:
     """Points spread over the triangles whose corners are all attached.
 
     Parameters

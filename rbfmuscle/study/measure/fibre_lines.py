@@ -1,10 +1,13 @@
 """Fibres of a muscle at rest: streamlines of its harmonic field, each with the same share of the flux."""
 
+from __future__ import annotations
+
 import warnings
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.study.measure.fibre_field import FibreField, attachment_points
 from rbfmuscle.validation import NumericalWarning, SolveError
 
@@ -15,7 +18,9 @@ _LONGEST = 4.0
 _ROUNDS = 12
 
 
-def grow_fibres(vertices, faces, ends, *, count=100, segments=15):
+def grow_fibres(
+    vertices: Floats, faces: Integers, ends: list[Integers], *, count: int = 100, segments: int = 15
+) -> Floats:
     """Fibres of a muscle at rest.
 
     They start at points spread evenly over the larger attachment, through which the flux is even, so that
@@ -59,7 +64,7 @@ def grow_fibres(vertices, faces, ends, *, count=100, segments=15):
     return np.array([resampled(line[::-1] if wide else line, segments) for line in lines])
 
 
-def spread(points, count):
+def spread(points: Floats, count: int) -> Floats:
     """Choose ``count`` of the points, spread evenly: the farthest first, then moved to their cells' means.
 
     Parameters
@@ -88,7 +93,7 @@ def spread(points, count):
     return seeds
 
 
-def resampled(line, segments):
+def resampled(line: Floats, segments: int) -> Floats:
     """A polyline's points at ``segments + 1`` equal distances along it."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     even = np.linspace(0.0, along[-1], segments + 1)

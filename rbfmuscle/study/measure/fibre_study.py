@@ -1,14 +1,22 @@
 """Fibres of the muscles through a motion: carried along by the deformation, and their lengths."""
 
-from typing import NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.mean_value import mean_value_weights
 from rbfmuscle.study.measure.centreline import split_ends
 from rbfmuscle.study.measure.fibre_lines import grow_fibres
 from rbfmuscle.validation import MeshError
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.loop.frame import Frame
+    from rbfmuscle.sim.scene.objects import Joint, Muscle
+    from rbfmuscle.sim.scene.scene import Scene
 
 
 class FibreLines(NamedTuple):
@@ -51,7 +59,16 @@ class FibreBundle:
         If origin and insertion are not joined by the inside of the muscle.
     """
 
-    def __init__(self, muscle, joints, vertices, faces, *, count=100, segments=15):
+    def __init__(
+        self,
+        muscle: Muscle,
+        joints: list[Joint],
+        vertices: Floats,
+        faces: Integers,
+        *,
+        count: int = 100,
+        segments: int = 15,
+    ) -> None:
         mesh = np.asarray(muscle.mesh.vertices, dtype=np.float64)
         groups = split_ends(muscle, joints)
         ends = [np.concatenate([np.asarray(a.vertices) for a in group]) for group in groups]
@@ -66,7 +83,7 @@ class FibreBundle:
         except ValueError as error:
             raise MeshError(f"muscle {muscle.name!r}: fibre {error}") from None
 
-    def lines(self, vertices, poses):
+    def lines(self, vertices: Floats, poses: dict[str, Floats]) -> FibreLines:
         """Fibres now.
 
         Parameters
@@ -101,8 +118,8 @@ class FibreStudy:
         Each model's carried mesh at rest, before the motion.
     """
 
-    def __init__(self, scene, carried):
-        options = scene.output.fibres
+    def __init__(self, scene: Scene, carried: dict[str, Any]) -> None:
+        options: Any = scene.output.fibres
         self.bundles = {
             muscle.name: FibreBundle(
                 muscle, scene.joints, *carried[muscle.name], count=options.count, segments=options.segments
@@ -110,14 +127,14 @@ class FibreStudy:
             for muscle in scene.muscles
         }
 
-    def at(self, frame):
+    def at(self, frame: Frame) -> dict[str, FibreLines]:
         """Fibres in a frame: dict of muscle name to FibreLines."""
         return {
             name: bundle.lines(frame.carried[name][0], frame.poses) for name, bundle in self.bundles.items()
         }
 
 
-def line_lengths(points):
+def line_lengths(points: Floats) -> Floats:
     """Length of each polyline (n, k, 3), (n,)."""
     return np.linalg.norm(np.diff(points, axis=1), axis=2).sum(axis=1)
 

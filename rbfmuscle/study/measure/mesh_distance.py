@@ -1,8 +1,12 @@
 """Distances that are measured: exact, and sure of their side where a mesh is folded on itself or open."""
 
+from __future__ import annotations
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.validation import check_mesh, check_points
 
@@ -30,13 +34,15 @@ class MeshDistance:
     winding number decides (Jacobson et al. 2013; Barill et al. 2018): inside where it exceeds one half.
     """
 
-    def __init__(self, vertices, faces, *, closed=True, whole=None):
+    def __init__(
+        self, vertices: ArrayLike, faces: ArrayLike, *, closed: bool = True, whole: ArrayLike | None = None
+    ) -> None:
         self.closed = closed
         self.vertices, self.faces = check_mesh(vertices, faces)
         self._exact = ExactDistance(self.vertices, self.faces)
         self._whole = self.faces if whole is None else np.ascontiguousarray(whole, dtype=np.int64)
 
-    def unsigned(self, points):
+    def unsigned(self, points: ArrayLike) -> Floats:
         """Distance to the surface.
 
         Parameters
@@ -50,7 +56,7 @@ class MeshDistance:
         """
         return np.abs(self._exact.signed_distance(check_points(points)))
 
-    def signed(self, points):
+    def signed(self, points: ArrayLike) -> Floats:
         """Distance to the surface, negative inside.
 
         Parameters
@@ -78,7 +84,7 @@ class MeshDistance:
             out[n] = -abs(out[n]) if inside else abs(out[n])
         return out
 
-    def depth(self, points):
+    def depth(self, points: ArrayLike) -> Floats:
         """How deep points lie inside, 0 where outside.
 
         The deepest point is looked at again with the winding number, until one is inside for certain: where a

@@ -1,13 +1,16 @@
 """What is measured of every written frame, in long form."""
 
+from __future__ import annotations
+
 import math
 from collections import defaultdict
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
 from rbfmuscle.sim.joints.skeleton import all_coordinates
 from rbfmuscle.sim.scene.motion import shown_value
@@ -15,6 +18,11 @@ from rbfmuscle.study.measure.centreline import Centreline
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.measure.penetration import BoneProbe, bone_depth, surface_depth
 from rbfmuscle.study.measure.topology import euler_characteristic, self_crossing
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.loop.frame import Frame
+    from rbfmuscle.sim.scene.scene import Scene
+
 
 # Quantity: kind of unit (volume and length follow the scene's unit), meaning; in the order of the tables.
 QUANTITIES = {
@@ -80,7 +88,7 @@ class MetricsRecorder:
         Each model's carried mesh at rest, before the motion.
     """
 
-    def __init__(self, scene, carried):
+    def __init__(self, scene: Scene, carried: dict[str, Any]) -> None:
         self.scene, self.units = scene, scene.units
         self.motion = scene.motion
         self.probes = [BoneProbe(bone.name, bone.mesh) for bone in scene.bones]
@@ -92,7 +100,7 @@ class MetricsRecorder:
         self._path = []
         self._waiting = []
 
-    def add(self, frame):
+    def add(self, frame: Frame) -> list[Any]:
         """Measure a frame.
 
         Parameters
@@ -121,7 +129,7 @@ class MetricsRecorder:
         self._waiting = rows
         return done
 
-    def finish(self):
+    def finish(self) -> list[Row]:
         """Rows of the last frame."""
         done = self._waiting + (self._arms(len(self._path) - 1) if self._waiting else [])
         self._waiting = []
@@ -164,7 +172,7 @@ class MetricsRecorder:
 class _Tracker:
     """What has to be kept of one muscle from frame to frame."""
 
-    def __init__(self, muscle, scene, vertices, faces):
+    def __init__(self, muscle: Any, scene: Any, vertices: Floats, faces: Integers) -> None:
         self.name = muscle.name
         self.rest_volume = float(muscle.mesh.volume)
         self.mesh = muscle.mesh
@@ -181,12 +189,12 @@ class _Tracker:
         self.scene = scene
         self.offset = None
 
-    def length_of(self, frame):
+    def length_of(self, frame: Frame) -> float:
         if self.line is None:
             return math.nan
         return self.line.length(frame.carried[self.name][0], frame.poses)
 
-    def measure(self, frame, probes, at_rest):
+    def measure(self, frame: Frame, probes: list[BoneProbe], at_rest: bool) -> dict[str, float]:
         """Quantities of this muscle in a frame, in the order of `QUANTITIES`."""
         found = {}
         if self.name in frame.surfaces:
@@ -249,12 +257,12 @@ class _Tracker:
         return float(np.sqrt(np.mean(change**2))), float(np.abs(change).max())
 
 
-def unit_text(kind, units):
+def unit_text(kind: str, units: str) -> str:
     """Unit of a quantity as written in tables: ``length`` and ``volume`` take the scene's unit."""
     return {"length": units, "volume": f"{units}^3"}.get(kind, kind)
 
 
-def count_components(count, faces):
+def count_components(count: int, faces: Integers) -> int:
     """Number of connected pieces among ``count`` vertices; vertices that no face uses do not count."""
     ends = np.concatenate([faces[:, :2], faces[:, 1:]])
     graph = sparse.coo_matrix((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), shape=(count, count))
@@ -262,14 +270,16 @@ def count_components(count, faces):
     return len(np.unique(label[faces[:, 0]]))
 
 
-def edge_strain(vertices, edges, rest_lengths):
+def edge_strain(vertices: Floats, edges: Integers, rest_lengths: Floats) -> float:
     """Root mean square of the relative change of edge lengths."""
     used = rest_lengths > 0
     strain = edge_lengths(vertices, edges)[used] / rest_lengths[used] - 1.0
     return float(np.sqrt(np.mean(strain**2)))
 
 
-def surface_distance(vertices, faces, other_vertices, other_faces):
+def surface_distance(
+    vertices: Floats, faces: Integers, other_vertices: Floats, other_faces: Integers
+) -> tuple[float, float]:
     """Distance between two surfaces, both ways, at their vertices.
 
     Returns
@@ -283,7 +293,9 @@ def surface_distance(vertices, faces, other_vertices, other_faces):
     return rms, float(max(there.max(), back.max()))
 
 
-def moment_arms(path, here, muscle):
+def moment_arms(
+    path: list[tuple[dict[str, Any], dict[Any, Any]]], here: int, muscle: str | tuple[str, str]
+) -> list[Any]:
     """Tendon-excursion moment arms -dl/dq at one place of a path.
 
     Parameters

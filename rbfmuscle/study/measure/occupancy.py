@@ -1,8 +1,12 @@
 """A coarse grid that says which points are certainly outside a closed mesh: few then need a distance."""
 
+from __future__ import annotations
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Integers
 from rbfmuscle.validation import check_mesh, check_points
 
 _UNKNOWN, _SURFACE, _OUTSIDE = 0, 1, 2
@@ -23,7 +27,7 @@ class OccupancyGrid:
         Cells along the longest side of the bounding box.
     """
 
-    def __init__(self, vertices, faces, *, cells=64):
+    def __init__(self, vertices: ArrayLike, faces: ArrayLike, *, cells: int = 64) -> None:
         vertices, faces = check_mesh(vertices, faces)
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         self.spacing = max(float((high - low).max()), 1e-300) / cells
@@ -34,7 +38,7 @@ class OccupancyGrid:
         stack = np.empty((self.state.size, 3), dtype=np.int32)
         _fill_loop(self.state, stack)
 
-    def candidates(self, points):
+    def candidates(self, points: ArrayLike) -> Integers:
         """Indices of the points that may lie inside the mesh.
 
         Parameters

@@ -1,10 +1,18 @@
 """How deep a muscle's surface and the bones are in each other, by exact distance to both meshes."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.measure.occupancy import OccupancyGrid
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 class BoneProbe:
@@ -17,15 +25,16 @@ class BoneProbe:
         Faces outward. Holes are allowed; the sign then comes from winding numbers.
     """
 
-    def __init__(self, name, mesh):
+    def __init__(self, name: str, mesh: trimesh.Trimesh) -> None:
         self.name = name
         self.vertices = np.ascontiguousarray(mesh.vertices, dtype=float)
         self.faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
         self.bounds = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
         self.closed = bool(mesh.is_watertight)
-        self._distance = self._grid = None
+        self._distance: MeshDistance | None = None
+        self._grid: OccupancyGrid | None = None
 
-    def depth(self, points):
+    def depth(self, points: Floats) -> Floats:
         """How deep points lie inside the bone.
 
         Parameters
@@ -51,12 +60,12 @@ class BoneProbe:
         return out
 
 
-def bone_coordinates(points, pose):
+def bone_coordinates(points: Floats, pose: Floats) -> Floats:
     """World points in the rest coordinates of a bone with this (4, 4) pose."""
     return (points - pose[:3, 3]) @ pose[:3, :3]
 
 
-def surface_depth(vertices, probes, poses):
+def surface_depth(vertices: Floats, probes: list[BoneProbe], poses: dict[str, Floats]) -> Floats:
     """Depth of surface vertices inside the bones.
 
     Parameters
@@ -77,7 +86,7 @@ def surface_depth(vertices, probes, poses):
     return out
 
 
-def bone_depth(vertices, faces, probes, poses):
+def bone_depth(vertices: Floats, faces: Integers, probes: list[BoneProbe], poses: dict[str, Floats]) -> float:
     """Greatest depth of any bone vertex inside a muscle's closed surface.
 
     Parameters
@@ -122,7 +131,7 @@ def _depth_nearby(vertices, faces, points):
     return float(deepest)
 
 
-def faces_near(vertices, faces, points, reach):
+def faces_near(vertices: Floats, faces: Integers, points: Floats, reach: float) -> Booleans:
     """Which faces may come nearer than ``reach`` to any of the points.
 
     Parameters

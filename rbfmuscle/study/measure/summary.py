@@ -1,12 +1,19 @@
 """What a run amounts to: least, greatest and mean of each quantity, and the limits that it is held to."""
 
+from __future__ import annotations
+
 import math
 from collections import defaultdict
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rbfmuscle.study.measure.metrics import ALL, QUANTITIES
 from rbfmuscle.validation import LimitExceededError, UsageError, did_you_mean
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.scene.scene import Scene
+
 
 # Quantity: greatest allowed magnitude; lengths in millimetres, converted to the scene's unit.
 LIMITS = {
@@ -30,11 +37,11 @@ LEAST = {"euler"}
 class Summary:
     """Collects rows of metrics; keeps numbers only, no surfaces."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._values = defaultdict(lambda: defaultdict(list))
         self._units = {}
 
-    def add(self, rows):
+    def add(self, rows: list[Any]) -> None:
         """Take in rows of metrics."""
         for row in rows:
             quantity = row.quantity
@@ -43,7 +50,7 @@ class Summary:
             self._values[row.muscle][quantity].append((row.frame, row.value))
             self._units[quantity] = row.unit
 
-    def table(self):
+    def table(self) -> dict[str, Any]:
         """Nested dict: muscle -> quantity -> unit, count, min, max, mean, median, last, worst and its frame.
 
         ``worst`` is the value of greatest magnitude, or the least where that is what is limited (`LEAST`). A moment
@@ -73,7 +80,7 @@ class Summary:
         return facts
 
 
-def parse_limits(limits, scene):
+def parse_limits(limits: Any, scene: Scene) -> dict[str, Any]:
     """Limits as a dict of quantity to greatest allowed magnitude.
 
     Parameters
@@ -112,7 +119,7 @@ def parse_limits(limits, scene):
     return found
 
 
-def default_limit(quantity, scene):
+def default_limit(quantity: str, scene: Scene) -> float:
     """Limit of a quantity in the scene's unit."""
     is_length = QUANTITIES[quantity][0] == "length"
     return scene.length(LIMITS[quantity]) if is_length else LIMITS[quantity]
@@ -123,7 +130,7 @@ def within(quantity: str, worst: float, limit: float) -> bool:
     return worst >= limit if quantity in LEAST else abs(worst) <= limit
 
 
-def exceeded(table, limits):
+def exceeded(table: dict[str, Any], limits: dict[str, Any]) -> list[Any]:
     """List of (muscle, quantity, worst value, limit, frame) beyond the limits; NaN counts as beyond."""
     found = []
     for muscle, quantities in table.items():
@@ -137,7 +144,7 @@ def exceeded(table, limits):
     return found
 
 
-def require_limits(table, limits):
+def require_limits(table: dict[str, Any], limits: dict[str, Any]) -> None:
     """Raise LimitExceededError naming everything beyond the limits."""
     found = exceeded(table, limits)
     if found:

@@ -18,7 +18,7 @@ class Crossings(NamedTuple):
         Their share of the surface's area.
     """
 
-    count: int
+    count: int  # type: ignore[assignment]  # a field by the name of tuple's own method
     area: float
 
 

@@ -1,7 +1,11 @@
 """The report of a comparison: pictures side by side, distance maps, plots, table; one HTML file."""
 
+from __future__ import annotations
+
 import html
 import math
+from pathlib import Path
+from typing import Any
 
 from rbfmuscle.study.experiment.comparison import COST, FIRST, LAW, MEASURES, MESH, OWN, best_models
 from rbfmuscle.study.files.saved import SavedRun
@@ -54,7 +58,7 @@ count as better or worse. <b>Curvature variation</b> is high where a surface is 
 <b>distance to the first model</b> is no error: it says how far models differ, not which is right.</p>"""
 
 
-def write_page(folder, table, *, pictures=True):
+def write_page(folder: Path, table: dict[str, Any], *, pictures: bool = True) -> Exception | None:
     """Write ``report.html`` and ``models.webp``.
 
     Parameters
@@ -104,7 +108,7 @@ def _jobs(table, folder, work):
     return jobs
 
 
-def map_limit(table):
+def map_limit(table: dict[str, Any]) -> float:
     """Distance at which the maps' colours end: one, two or five times a power of ten."""
     greatest = max(found[ALL].get("distance_max", 0.0) for found in table["results"].values())
     wanted = max(_MAP_SHARE * greatest, 1e-12)
@@ -202,7 +206,7 @@ def _table(table):
     return f"<table><tr><th></th>{head}</tr>{''.join(rows)}</table>"
 
 
-def cell(table, quantity, value):
+def cell(table: dict[str, Any], quantity: str, value: float | None) -> str:
     """A value with its unit, as people read it."""
     if value is None:
         return "-"

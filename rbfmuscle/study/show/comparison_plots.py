@@ -1,12 +1,19 @@
 """Plots of several models over the same motion."""
 
+from __future__ import annotations
+
 import io
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rbfmuscle.study.measure.metrics import ALL
 from rbfmuscle.study.show.appearance import line_colours
 from rbfmuscle.study.show.plots import PLOT_STYLE, motion_axis
+
+if TYPE_CHECKING:
+    from rbfmuscle.study.files.saved import SavedRun
+
 
 # Title, quantity, factor, unit (None: the scene's); worst over muscles in each frame.
 _WORST = (
@@ -18,7 +25,7 @@ _WORST = (
 _EACH = (("Length", "length", 1.0), ("Moment arm", "moment_arm", 1.0))
 
 
-def plot_models(runs):
+def plot_models(runs: dict[str, SavedRun]) -> list[tuple[str, bytes]]:
     """Draw every plot that the runs have values for, a line a model.
 
     Parameters

@@ -1,5 +1,7 @@
 """The kernel study as files: a table, a page, plots, and pictures of the surfaces with their errors."""
 
+from __future__ import annotations
+
 import base64
 import csv
 import html
@@ -8,11 +10,16 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rbfmuscle.study.show.page import STYLE
 from rbfmuscle.validation import MissingPartError
+
+if TYPE_CHECKING:
+    from rbfmuscle.study.experiment.kernel_study import KernelStudy
+
 
 COLUMNS = {
     "kernel": "kernel", "centres": "centres", "placement": "placement", "fit": "fit",
@@ -43,7 +50,9 @@ its volume is right.</p>
 """
 
 
-def write_study(study, directory, *, title="Kernels", pictures=True):
+def write_study(
+    study: KernelStudy, directory: str | Path, *, title: str = "Kernels", pictures: bool = True
+) -> Exception | None:
     """Write ``kernels.csv``, ``kernels.json``, ``kernels.html`` and the plots it holds.
 
     Parameters
@@ -203,7 +212,7 @@ def _draw_surfaces(study, directory):
     return picture.read_bytes()
 
 
-def main(source, target):
+def main(source: Any, target: Any) -> None:
     """The child's part."""
     import pyvista
 

@@ -1,5 +1,7 @@
 """The report's frame: markup, style and the words that explain it."""
 
+from __future__ import annotations
+
 import base64
 import html
 
@@ -67,7 +69,7 @@ PAGE = """<!doctype html>
 """
 
 
-def embedded_image(data, kind, text):
+def embedded_image(data: bytes, kind: str, text: str) -> str:
     """An ``img`` element that holds the picture itself.
 
     Parameters

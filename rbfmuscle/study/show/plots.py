@@ -1,11 +1,18 @@
 """Plots of a saved run over its motion."""
 
+from __future__ import annotations
+
 import io
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rbfmuscle.study.measure.metrics import ALL
 from rbfmuscle.study.show.appearance import line_colours
+
+if TYPE_CHECKING:
+    from rbfmuscle.study.files.saved import SavedRun
+
 
 PLOT_STYLE = {
     "font.size": 9,
@@ -36,7 +43,7 @@ PANELS = (
 )
 
 
-def motion_axis(saved):
+def motion_axis(saved: Any) -> tuple[dict[int, float], str]:
     """What the plots run along.
 
     Returns
@@ -58,7 +65,7 @@ def motion_axis(saved):
     return {frame: float(frame) for frame in saved.frames}, "frame"
 
 
-def plot_panels(saved):
+def plot_panels(saved: SavedRun) -> list[tuple[str, bytes]]:
     """Draw every panel that the run has values for.
 
     Parameters

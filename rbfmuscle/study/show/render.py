@@ -4,14 +4,19 @@ VTK may end the process where no graphics exist. So everything is saved first, t
 ``python -m rbfmuscle.study.show.render DIR`` with the job on its standard input.
 """
 
+from __future__ import annotations
+
 import json
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Integers
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.show.appearance import BACKGROUND, BONE_COLOUR, muscle_colours
 from rbfmuscle.validation import MissingPartError, RBFMuscleError, UsageError
@@ -32,7 +37,15 @@ MOST_SHOWN = 4
 _TIMEOUT = 1800
 
 
-def render_run(directory, output, *, frame=None, views=None, size=(420, 520), seconds=5.0):
+def render_run(
+    directory: str | Path,
+    output: str | Path,
+    *,
+    frame: int | None = None,
+    views: list[str] | None = None,
+    size: tuple[int, int] = (420, 520),
+    seconds: float = 5.0,
+) -> None:
     """Draw a saved run to a picture or an animation.
 
     Parameters
@@ -77,7 +90,13 @@ def render_run(directory, output, *, frame=None, views=None, size=(420, 520), se
     )
 
 
-def draw(directory, jobs, seconds=5.0, *, module="rbfmuscle.study.show.render"):
+def draw(
+    directory: str | Path,
+    jobs: list[Any],
+    seconds: float = 5.0,
+    *,
+    module: str = "rbfmuscle.study.show.render",
+) -> None:
     """Draw pictures in a child process.
 
     Parameters
@@ -111,7 +130,7 @@ def draw(directory, jobs, seconds=5.0, *, module="rbfmuscle.study.show.render"):
         )
 
 
-def draw_pictures(directory, make_jobs, **how):
+def draw_pictures(directory: str | Path, make_jobs: Callable[..., Any], **how: Any) -> tuple[Any, ...]:
     """Draw pictures to memory.
 
     Parameters
@@ -154,7 +173,7 @@ class Stage:
         colours where not given.
     """
 
-    def __init__(self, rows, size, paint=None):
+    def __init__(self, rows: list[Any], size: Any, paint: Callable[..., Any] | None = None) -> None:
         import pyvista
 
         self.paint = paint
@@ -175,7 +194,7 @@ class Stage:
             self._aim(VIEWS[view][0], bounds, size)
             self.plotter.enable_anti_aliasing("ssaa")
 
-    def show(self, frame):
+    def show(self, frame: int) -> Any:
         """Put bones and muscles where they are in a frame, and return the picture (h, w, 3) uint8."""
         for name, actors in self.bones:
             for actor in actors:
@@ -193,7 +212,7 @@ class Stage:
         self.plotter.render()  # a screenshot alone shows what was drawn last
         return self.plotter.screenshot(return_img=True)
 
-    def close(self):
+    def close(self) -> None:
         """Let the plotter go."""
         self.plotter.close()
 
@@ -266,20 +285,20 @@ def _path_bounds(runs):
     )
 
 
-def chosen_frames(frames, most=24):
+def chosen_frames(frames: list[int], most: int = 24) -> list[int]:
     """At most so many of the frames of a motion for an animation, evenly, the last one included."""
     stride = -(-len(frames) // most)
     return frames[(len(frames) - 1) % stride :: stride]
 
 
-def caption(saved, frame):
+def caption(saved: Any, frame: int) -> Any:
     """Frame number and joint angles, as text."""
     entry = next(entry for entry in saved.info["frames"] if entry["frame"] == frame)
     clock = [f"{entry['time']:.4g} s"] if "time" in entry else []
     return ", ".join([f"frame {frame}", *clock, *coordinate_texts(saved.info, entry)])
 
 
-def coordinate_texts(info, entry):
+def coordinate_texts(info: dict[str, Any], entry: dict[str, Any]) -> Any:
     """A frame's coordinates as text, each with its unit; of many, those that the motion moves most.
 
     Parameters
@@ -298,7 +317,7 @@ def coordinate_texts(info, entry):
     return [f"{name} {value:.4g}{units.get(name, '°')}" for name, value in values.items()]
 
 
-def labelled(image, text, titles, chips):
+def labelled(image: Integers, text: str, titles: list[Any], chips: dict[str, Any]) -> Any:
     """Image with a title above each column, and below a strip with a caption and what colours mean.
 
     Parameters
@@ -344,7 +363,7 @@ def _draw_job(saved, job, seconds, stages):
     save_images(images, job["file"], seconds)
 
 
-def save_images(images, path, seconds):
+def save_images(images: list[Any], path: str, seconds: float) -> None:
     """Save one picture, or several as an animation of so many seconds."""
     from PIL import Image
 
@@ -353,13 +372,14 @@ def save_images(images, path, seconds):
         return
     pause = max(20, int(1000 * seconds / len(images)))
     pauses = [pause] * (len(images) - 1) + [900]
-    kind = {".webp": {"quality": 82, "method": 2}, ".gif": {"optimize": False}}[Path(path).suffix]
+    kinds: dict[str, dict[str, Any]] = {".webp": {"quality": 82, "method": 2}, ".gif": {"optimize": False}}
+    kind = kinds[Path(path).suffix]
     if path.endswith(".gif"):
         images = [image.quantize(128, dither=Image.Dither.NONE) for image in images]
     images[0].save(path, save_all=True, append_images=images[1:], duration=pauses, loop=0, **kind)
 
 
-def main(arguments, opened=SavedRun, draw_job=_draw_job):
+def main(arguments: Any, opened: Any = SavedRun, draw_job: Any = _draw_job) -> Any:
     """The child's part: read the jobs, open the folder, draw, leave with 0.
 
     ``draw_job(found, job, seconds, stages)`` keeps in ``stages`` what later jobs can use again.

@@ -1,7 +1,11 @@
 """The report of a run: one HTML file with pictures, animation, plots and tables; no network needed."""
 
+from __future__ import annotations
+
 import html
 import math
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.metrics import QUANTITIES
@@ -12,6 +16,10 @@ from rbfmuscle.study.show.plots import plot_panels
 from rbfmuscle.study.show.render import VIEWS, chosen_frames, draw_pictures
 from rbfmuscle.validation import SolveError
 
+if TYPE_CHECKING:
+    from rbfmuscle.validation import MissingPartError
+
+
 _PICTURE_SIZE = (330, 400)
 _PREVIEW_SIZE = (330, 400)
 _MOST_EVENTS = 60
@@ -20,7 +28,9 @@ _ELSEWHERE = ("volume", "moment_arm", "time_solve", "time_fit", "time_extract")
 _TABLE = [name for name in QUANTITIES if name not in _ELSEWHERE]
 
 
-def write_report(directory, *, report=True, preview=True, pictures=True):
+def write_report(
+    directory: str | Path, *, report: bool = True, preview: bool = True, pictures: bool = True
+) -> MissingPartError:
     """Write ``report.html`` and ``preview.webp`` for a saved run.
 
     Parameters
@@ -59,7 +69,7 @@ def write_report(directory, *, report=True, preview=True, pictures=True):
     return missing
 
 
-def key_frames(saved):
+def key_frames(saved: SavedRun) -> list[int]:
     """First, middle and last written frame, each once."""
     middle = saved.frames[len(saved.frames) // 2]
     return list(dict.fromkeys([saved.frames[0], middle, saved.frames[-1]]))

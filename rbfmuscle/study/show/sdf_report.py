@@ -1,12 +1,21 @@
 """One bone's distance field: its size, its time, its errors against exact distances, and a slice to look at."""
 
+from __future__ import annotations
+
 import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.sim.distance.sdf import BoneSDF
 from rbfmuscle.validation import UsageError
+
+if TYPE_CHECKING:
+    import trimesh
+
 
 # Points of each measurement, and pixels along the longer side of a slice.
 COUNT, PIXELS = 50_000, 500
@@ -14,7 +23,17 @@ COUNT, PIXELS = 50_000, 500
 BAND_EDGES = 1.0
 
 
-def sdf_report(mesh, *, image=None, axis="y", tolerance=None, region=None, cache=True, name="bone", seed=0):
+def sdf_report(
+    mesh: trimesh.Trimesh,
+    *,
+    image: Path | None = None,
+    axis: str = "y",
+    tolerance: Any = None,
+    region: Any = None,
+    cache: bool = True,
+    name: str = "bone",
+    seed: int = 0,
+) -> dict[str, Any]:
     """Build one field, measure it and draw it.
 
     Parameters
@@ -58,7 +77,9 @@ def sdf_report(mesh, *, image=None, axis="y", tolerance=None, region=None, cache
     return report
 
 
-def measure_field(field, *, count=COUNT, seed=0, width=None):
+def measure_field(
+    field: BoneSDF, *, count: int = COUNT, seed: int = 0, width: float | None = None
+) -> dict[str, float]:
     """Errors of a field, or of a detector beside it, against exact distances at random points near the surface.
 
     Parameters
@@ -106,7 +127,9 @@ def measure_field(field, *, count=COUNT, seed=0, width=None):
     }
 
 
-def points_near(vertices, faces, count, *, seed=0, width=None):
+def points_near(
+    vertices: Floats, faces: Integers, count: int, *, seed: int = 0, width: Any = None
+) -> tuple[Floats, float]:
     """Random points (count, 3) up to ``width`` from the surface, along the faces' normals; and the width."""
     rng = np.random.default_rng(seed)
     corners = vertices[faces]
@@ -120,7 +143,7 @@ def points_near(vertices, faces, count, *, seed=0, width=None):
     return points + offset * normal[face] / area[face, None], width
 
 
-def report_lines(report, units=""):
+def report_lines(report: dict[str, Any], units: str = "") -> list[str]:
     """The report as lines of text for a terminal; ``units`` is the name of the mesh's unit."""
     length = (" " + units) if units else ""
     lines = [
@@ -140,7 +163,7 @@ def report_lines(report, units=""):
     return lines
 
 
-def draw_slice(field, path, *, axis="y", title="", pixels=PIXELS):
+def draw_slice(field: BoneSDF, path: Path, *, axis: str = "y", title: str = "", pixels: int = PIXELS) -> None:
     """Draw distances on a plane through the middle of the bone, with contour lines, to a PNG file."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -1,9 +1,12 @@
 """A sweep as a picture and a page: error against time a frame, the front and the default on it."""
 
+from __future__ import annotations
+
 import base64
 import html
 import io
 from pathlib import Path
+from typing import Any
 
 from rbfmuscle.study.experiment.sweep_table import flat_row, has_length, table_columns
 from rbfmuscle.study.show.appearance import LINE_COLOURS
@@ -44,7 +47,7 @@ is the median over the frames after the first (which loads and compiles), all mu
 included.</p>"""
 
 
-def draw_front(table, path):
+def draw_front(table: dict[str, Any], path: str | Path) -> bytes:
     """Draw the sweep to a PNG file.
 
     Parameters
@@ -112,7 +115,7 @@ def _draw_group(axes, rows, quantity, group, colour):
         axes.plot(t, e, "*", color=colour, ms=15, mec="#222222", mew=0.9, zorder=5, label=f"{name}: default")
 
 
-def write_page(table, directory):
+def write_page(table: dict[str, Any], directory: Path) -> None:
     """Write ``pareto.png`` and the self-contained ``sweep.html``."""
     directory = Path(directory)
     picture = draw_front(table, directory / "pareto.png")

@@ -1,10 +1,14 @@
 """What a window shows of a scene or a saved run, and what its switches do; no graphics here."""
 
+from __future__ import annotations
+
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -17,6 +21,11 @@ from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.measure.penetration import BoneProbe, bone_coordinates, surface_depth
 from rbfmuscle.study.show.render import coordinate_texts
 from rbfmuscle.validation import SolveError, UsageError
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.loop.live import LiveSession
+    from rbfmuscle.study.files.saved import SavedRun
+
 
 # Colouring: name, what the bar says, limits ("length" ones in mm), colour map.
 COLOURINGS = {
@@ -66,7 +75,7 @@ class Viewer:
 
     live = False
 
-    def __init__(self, units, length, bones, muscles):
+    def __init__(self, units: str, length: float, bones: dict[str, Any], muscles: list[str]) -> None:
         self.units, self.length = units, length
         self.bones, self.muscles = bones, list(muscles)
         self.colouring = "nothing"
@@ -74,7 +83,7 @@ class Viewer:
         self._shots = 0
 
     @cached_property
-    def probes(self):
+    def probes(self) -> list[BoneProbe]:
         """The bones, prepared for exact distances."""
         import trimesh
 
@@ -84,7 +93,7 @@ class Viewer:
     def _trees(self):
         return {name: MeshDistance(*mesh) for name, mesh in self.bones.items()}
 
-    def colour_by(self, name):
+    def colour_by(self, name: str) -> None:
         """Choose a colouring.
 
         Raises
@@ -96,7 +105,7 @@ class Viewer:
             raise UsageError(f"unknown colouring {name!r}; known: {', '.join(COLOURINGS)}")
         self.colouring = name
 
-    def scale(self):
+    def scale(self) -> tuple[str, tuple[float, ...], str] | None:
         """Title, limits and colour map of the present colouring, or None."""
         if self.colouring == "nothing":
             return None
@@ -105,7 +114,7 @@ class Viewer:
             return f"{title} [{self.units}]", tuple(v * self.length for v in limits), colours
         return title, limits, colours
 
-    def export(self, view, folder, label):
+    def export(self, view: View, folder: Path, label: str) -> list[Path]:
         """Write every surface of a view as PLY; returns the paths."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
@@ -114,7 +123,7 @@ class Viewer:
             write_mesh(path, vertices, faces)
         return paths
 
-    def next_name(self, folder, suffix):
+    def next_name(self, folder: Any, suffix: Any) -> Any:
         """A file name in the folder that is not taken."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
@@ -170,7 +179,9 @@ class LiveViewer(Viewer):
 
     live = True
 
-    def __init__(self, session, build, models, qualities):
+    def __init__(
+        self, session: LiveSession, build: Callable[..., Any], models: list[str], qualities: list[str]
+    ) -> None:
         scene = session.scene
         bones = {
             bone.name: (np.asarray(bone.mesh.vertices), np.asarray(bone.mesh.faces)) for bone in scene.bones
@@ -185,7 +196,7 @@ class LiveViewer(Viewer):
         self._stale = True
         self._switch()
 
-    def switch(self, *, model=None, quality=None):
+    def switch(self, *, model: str | None = None, quality: Any = None) -> None:
         """Use another model or quality; it starts at rest and goes to where the sliders are."""
         self.model, self.quality = model or self.model, quality or self.quality
         self._switch()
@@ -205,7 +216,7 @@ class LiveViewer(Viewer):
         self._stale, self.message = True, ""
 
     @property
-    def coordinates(self):
+    def coordinates(self) -> dict[str, Any]:
         """Name, limits and target of each coordinate [degree or scene unit]."""
         target, scene = self.session.target, self.session.scene
         return {
@@ -213,26 +224,26 @@ class LiveViewer(Viewer):
             for name, (low, high) in self.session.limits.items()
         }
 
-    def set(self, name, degrees):
+    def set(self, name: str, degrees: float) -> None:
         """Move a slider."""
         self.session.set(name, inner_value(self.session.scene, name, degrees))
 
-    def rest(self):
+    def rest(self) -> None:
         """All sliders to where the meshes are."""
         for name, value in self.session.rest.items():
             self.session.set(name, value)
 
-    def colour_by(self, name):
+    def colour_by(self, name: str) -> None:
         """Show another quantity in colours."""
         super().colour_by(name)
         self._stale = True
 
     @property
-    def pending(self):
+    def pending(self) -> bool:
         """Whether there is something new to show."""
         return self._stale or not self.session.arrived
 
-    def advance(self):
+    def advance(self) -> View:
         """Go one picture further and return it; a muscle that cannot be solved sends all back to rest."""
         start = time.perf_counter()
         if self._frame is None or self._stale or not self.session.arrived:
@@ -248,11 +259,11 @@ class LiveViewer(Viewer):
         return self._view(self._frame)
 
     @property
-    def frame(self):
+    def frame(self) -> Any:
         """The frame shown last."""
         return self._frame
 
-    def label(self):
+    def label(self) -> str:
         """Where the bones are, for file names."""
         return "_".join(
             f"{k.split('.')[-1]}{shown_value(self.session.scene, k, v):+.0f}"
@@ -278,7 +289,7 @@ class LiveViewer(Viewer):
     def _rest_edges(self, name, carried, faces):
         return self._edges[name]
 
-    def close(self):
+    def close(self) -> None:
         """End the session's threads."""
         self.session.close()
 
@@ -296,7 +307,7 @@ class SavedViewer(Viewer):
         If it holds no surfaces.
     """
 
-    def __init__(self, saved):
+    def __init__(self, saved: SavedRun) -> None:
         if not saved.has_surfaces():
             raise UsageError(f"{saved.directory} has no surfaces to show; run it with output.surfaces")
         bones = {name: saved.bone(name) for name in saved.bones}
@@ -306,17 +317,17 @@ class SavedViewer(Viewer):
         self._metrics = {(r.frame, r.muscle, r.quantity): r.value for r in saved.metrics}
 
     @property
-    def count(self):
+    def count(self) -> int:
         """Number of frames."""
         return len(self.saved.frames)
 
-    def scrub(self, place):
+    def scrub(self, place: float) -> None:
         """Go to the frame at this place of those written."""
         place = min(max(round(place), 0), self.count - 1)
         self._stale = self._stale or place != self.place
         self.place = place
 
-    def place_of(self, frame):
+    def place_of(self, frame: int) -> int:
         """Place of a frame among those written.
 
         Raises
@@ -329,17 +340,17 @@ class SavedViewer(Viewer):
             raise UsageError(f"frame {frame:g} was not written; the run has {first} to {last}")
         return self.saved.frames.index(frame)
 
-    def colour_by(self, name):
+    def colour_by(self, name: str) -> None:
         """Show another quantity in colours."""
         super().colour_by(name)
         self._stale = True
 
     @property
-    def pending(self):
+    def pending(self) -> bool:
         """Whether there is something new to show."""
         return self._stale
 
-    def advance(self):
+    def advance(self) -> View:
         """The present frame's picture."""
         self._stale = False
         frame = self.saved.frames[self.place]
@@ -362,7 +373,7 @@ class SavedViewer(Viewer):
             )
         return view
 
-    def label(self):
+    def label(self) -> Any:
         """The frame, for file names."""
         return f"{self.saved.frames[self.place]:04d}"
 
@@ -378,5 +389,5 @@ class SavedViewer(Viewer):
         edges = unique_edges(first[1])
         return edges, edge_lengths(first[0], edges)
 
-    def close(self):
+    def close(self) -> None:
         """Nothing is held open."""

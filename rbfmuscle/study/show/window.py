@@ -1,9 +1,13 @@
 """The window of ``rbfmuscle view``: pyvista's part, fed by a `Viewer`."""
 
+from __future__ import annotations
+
 import os
 import subprocess
 import sys
 import time
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +36,7 @@ _PROBE = (
 )
 
 
-def require_display():
+def require_display() -> None:
     """Raise MissingPartError where no window can be opened; VTK itself would end the process.
 
     The test opens a small window in a child process.
@@ -67,11 +71,14 @@ class Window:
         From the moment a slider was moved to the picture that shows it [s].
     """
 
-    def __init__(self, viewer, folder, *, motion=None, title="rbfmuscle"):
+    def __init__(
+        self, viewer: Any, folder: str | Path, *, motion: list[Any] | None = None, title: str = "rbfmuscle"
+    ) -> None:
         import pyvista
 
         self.viewer, self.folder, self.motion = viewer, folder, motion or []
-        self.latencies, self._touched, self._played, self._paces = [], None, None, []
+        self.latencies, self._touched, self._paces = [], None, []
+        self._played: int | None = None
         self.plotter = pyvista.Plotter(window_size=_SIZE, title=title)
         self.plotter.set_background(BACKGROUND)
         # Software drawing takes three to four times as long with several samples a pixel.
@@ -83,13 +90,13 @@ class Window:
         self.plotter.add_text(KEYS, position="lower_left", font_size=7, color="#777777")
         self._add_sliders()
         self._add_keys()
-        self.view = None
+        self.view: Any = None
         self.refresh(render=False)
         self._aim()
 
     # --- drawing ------------------------------------------------------------------------------------------
 
-    def refresh(self, *, render=True):
+    def refresh(self, *, render: bool = True) -> None:
         """Compute the next picture and draw it."""
         start = time.perf_counter()
         self.view = self.viewer.advance()
@@ -252,7 +259,7 @@ class Window:
     def _colour(self, name):
         self.viewer.colour_by(name)
 
-    def next_choice(self, title):
+    def next_choice(self, title: Any) -> None:
         """Go on to the next model, quality or colouring."""
         if title not in self.switches:
             return
@@ -263,11 +270,11 @@ class Window:
         bar.SetTitleText(f"{title}: {choices[place]}")
         act(choices[place])
 
-    def play(self):
+    def play(self) -> None:
         """Play the scene's motion, or stop it."""
         self._played = 0 if self._played is None else None
 
-    def rest(self):
+    def rest(self) -> None:
         """All sliders to zero."""
         self._played = None
         for name, widget in self.sliders.items():
@@ -277,21 +284,21 @@ class Window:
             else:
                 self.viewer.scrub(0)
 
-    def screenshot(self):
+    def screenshot(self) -> Any:
         """Write the window as PNG to the folder; returns the path."""
         path = self.viewer.next_name(self.folder, ".png")
         self.write_picture(path)
         print(path, file=sys.stderr)
         return path
 
-    def write_picture(self, path):
+    def write_picture(self, path: Path) -> None:
         """Write the window as PNG, with smooth edges."""
         self.plotter.render_window.SetMultiSamples(_SAMPLES)
         self.plotter.render()
         self.plotter.screenshot(path)
         self.plotter.render_window.SetMultiSamples(0)
 
-    def export(self):
+    def export(self) -> Any:
         """Write the surfaces shown as PLY to the folder; returns the paths."""
         paths = self.viewer.export(self.view, self.folder, self.viewer.label())
         for path in paths:
@@ -300,7 +307,7 @@ class Window:
 
     # --- the loop -----------------------------------------------------------------------------------------
 
-    def tick(self):
+    def tick(self) -> Any:
         """One turn of the loop: play on, then draw if there is anything new; returns whether there was."""
         if self._played is not None:
             self._play_on()
@@ -322,7 +329,7 @@ class Window:
         self.viewer.scrub(place)
         self.sliders["frame"].GetRepresentation().SetValue(place)
 
-    def open(self, *, until_closed=True):
+    def open(self, *, until_closed: bool = True) -> None:
         """Show the window; returns when it is closed, or at once."""
         self.plotter.show(interactive=False, auto_close=False, interactive_update=True)
         if not until_closed:
@@ -333,7 +340,7 @@ class Window:
         interactor.Start()
         self.close()
 
-    def close(self):
+    def close(self) -> None:
         """Take the window away."""
         self.plotter.close()
         self.viewer.close()
