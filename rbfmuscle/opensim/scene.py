@@ -164,7 +164,7 @@ def _add_joints(scene, model, places, names, metre, notes):
 
 
 def _scaled_coordinate(facts: Coordinate, factor: float) -> Coordinate:
-    limits = None if facts.range is None else tuple(end * factor for end in facts.range)
+    limits: Any = None if facts.range is None else tuple(end * factor for end in facts.range)
     return replace(facts, rest=facts.rest * factor, range=limits)
 
 
