@@ -17,7 +17,7 @@ from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.fibre_field import FibreField, attachment_points
 from rbfmuscle.study.measure.fibre_lines import grow_fibres, resampled, spread
 from rbfmuscle.study.measure.fibre_study import FibreBundle, line_lengths
-from rbfmuscle.validation import SceneError, SolveError, UsageError
+from rbfmuscle.validation import SolveError, UsageError
 
 LENGTH, RADIUS = 60.0, 8.0
 
@@ -260,7 +260,7 @@ class TestRun:
         assert scene.output.fibres is False
         changed = scene.with_options({"output.fibres": True, "output.fibres.count": 30})
         assert (changed.output.fibres.count, changed.output.fibres.segments) == (30, 15)
-        with pytest.raises(SceneError, match="count"):
+        with pytest.raises(UsageError, match="count"):
             scene.with_options({"output.fibres.count": 0})
         with pytest.raises(UsageError, match=r"output\.fibres"):
             simulate_one_frame()["biceps"].fibres()

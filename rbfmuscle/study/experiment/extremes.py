@@ -8,8 +8,9 @@ from __future__ import annotations
 import csv
 import json
 import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,10 +20,6 @@ from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
 from rbfmuscle.implicit.placement.off_surface import off_surface_points
 from rbfmuscle.implicit.selection import spacing
 from rbfmuscle.validation import NumericalWarning, RBFMuscleError
-
-if TYPE_CHECKING:
-    from rbfmuscle.commands.progress import Progress
-
 
 # Shape parameters, in units of 1 / (mean distance to the nearest centre).
 SHAPES = (1e-3, 1e-2, 0.1, 1.0, 10.0, 1e3)
@@ -34,7 +31,7 @@ HEADER = ("case", "kernel", "outcome", "error", "bound", "said")
 
 
 def study_extremes(
-    *, kernels: list[str] | None = None, progress: Progress | None = None
+    *, kernels: list[str] | None = None, progress: Callable[[int, int], None] | None = None
 ) -> list[dict[str, Any]]:
     """Fit an ellipsoid under every extreme with every kernel.
 

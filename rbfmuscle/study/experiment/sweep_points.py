@@ -22,7 +22,6 @@ from rbfmuscle.study.measure.metrics import ALL, surface_distance
 from rbfmuscle.validation import MissingPartError, RBFMuscleError, UsageError
 
 if TYPE_CHECKING:
-    from rbfmuscle.commands.progress import Progress
     from rbfmuscle.sim.scene.scene import Scene
     from rbfmuscle.study.experiment.sweep import SweepPlan, SweepPoint
 
@@ -269,7 +268,7 @@ class SweepRunner:
         frames: str | None = None,
         jobs: int | None = None,
         scheduler: str | None = None,
-        progress: Progress | None = None,
+        progress: Callable[[int, int], None] | None = None,
     ) -> None:
         self.runner, self.scene, self.plan, self.frames = runner, scene, plan, frames
         self.folder = SweepFolder(os.path.abspath(directory))
