@@ -125,8 +125,11 @@ def test_turn_moves_free_points_and_leaves_held_ones(name):
     held = part.contact_bone >= 0
     free = which & ~held
     assert moved[free, 1].mean() > 0.5
+    # A model's own points come first; those that a bone holds stay, whoever asks.
+    own = slice(len(part.points))
+    assert (which & held)[own].any() and np.abs(moved[own][(which & held)[own]]).max() == 0.0
     # Samples between held and free centres of an RBF muscle go a part of the way.
-    assert np.abs(moved[held & ~which]).mean() < 0.1
+    assert np.abs(moved[held]).mean() < 0.1
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -141,8 +144,8 @@ def test_moving_the_whole_scene_moves_the_result(name):
         joint.frame = turn @ joint.frame
     moved, _ = _run(name, scene, surfaces=False)
     expected = plain[-1].carried["strap0"][0] @ turn[:3, :3].T + turn[:3, 3]
-    # Grids of distance fields lie with the axes: contacts differ by the fields' error, 0.05 mm.
-    assert np.sqrt(((moved[-1].carried["strap0"][0] - expected) ** 2).sum(axis=1).mean()) < 0.1
+    # The ball has no axes of its own, so the grid of its distance field lies in it in another way: 2 µm.
+    assert np.abs(moved[-1].carried["strap0"][0] - expected).max() < 2e-3
 
 
 @pytest.mark.parametrize("name", MODELS)

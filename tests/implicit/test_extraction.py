@@ -1,5 +1,6 @@
 """Level sets to closed meshes: band, marching cubes, volume, cut."""
 
+import inspect
 import os
 from pathlib import Path
 
@@ -10,9 +11,9 @@ import trimesh
 from skimage.measure import marching_cubes
 
 from rbfmuscle.geometry.surfaces import mesh_volume
+from rbfmuscle.implicit.extraction import surface as extraction
 from rbfmuscle.implicit.extraction.band import Band, BandGrid
 from rbfmuscle.implicit.extraction.obstacles import ObstaclePoints
-from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.sampling import sample_surface
 
@@ -20,6 +21,34 @@ HIP = Path(os.environ.get("RBFMUSCLE_DATA", Path(__file__).parents[3] / "shared"
 MUSCLES = ("gluteus_maximus", "gluteus_medius", "iliacus", "adductor_brevis")
 needs_hip = pytest.mark.skipif(not HIP.exists(), reason="real hip not present (RBFMUSCLE_DATA)")
 CENTRE = np.array([1.0, 2.0, 3.0])
+
+
+class Formula:
+    """A field or a cut from a formula for its values; gradients are central differences."""
+
+    def __init__(self, formula, step=2e-4):
+        self.formula, self.step = formula, step
+
+    def __call__(self, points):
+        return self.formula(points)
+
+    def value_and_gradient(self, points):
+        offsets = self.step * np.vstack([np.eye(3), -np.eye(3)])
+        around = self.formula((points[None] + offsets[:, None]).reshape(-1, 3)).reshape(6, -1)
+        return self.formula(points), ((around[:3] - around[3:]) / (2.0 * self.step)).T
+
+    def value_and_gradient_below(self, points, limit):
+        value, gradient = self.formula(points), np.zeros_like(points)
+        rows = np.flatnonzero(value < limit)
+        if len(rows):
+            value[rows], gradient[rows] = self.value_and_gradient(points[rows])
+        return value, gradient
+
+
+def extract_surface(field, *, cut=None, **options):
+    """The library's, of formulas too."""
+    field, cut = (Formula(part) if inspect.isfunction(part) else part for part in (field, cut))
+    return extraction.extract_surface(field, cut=cut, **options)
 
 
 def sphere(radius=50.0, centre=CENTRE):

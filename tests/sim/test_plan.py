@@ -81,9 +81,11 @@ def test_run_without_pictures_loads_no_vtk(tmp_path):
     code = (
         "import sys; sys.path.insert(0, 'tests')\n"
         "from blend_model import arm_scene, BlendMuscle\n"
-        "import rbfmuscle.run as r\n"
-        "r.build_model = BlendMuscle\n"
-        f"r.simulate(arm_scene()).save({str(tmp_path)!r}, pictures=False)\n"
+        "import rbfmuscle.models as models, rbfmuscle.run as r\n"
+        "models.build_model = BlendMuscle\n"
+        "run = r.simulate(arm_scene())\n"
+        "assert type(run._recording.models[0]) is BlendMuscle\n"
+        f"run.save({str(tmp_path)!r}, pictures=False)\n"
         "print([m for m in sys.modules if m.split('.')[0] in ('vtk', 'vtkmodules', 'pyvista', 'matplotlib')])"
     )
     from conftest import ROOT

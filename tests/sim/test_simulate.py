@@ -1,6 +1,7 @@
 """The frame loop: sub-steps, reach, parallel muscles, interrupts, times, laziness."""
 
 import sys
+import threading
 from itertools import pairwise
 
 import numba
@@ -9,12 +10,12 @@ import pytest
 from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, hinged_scene, joint, muscle, scene, sphere
 
 from rbfmuscle import models
-from rbfmuscle.sim.loop.simulate import simulate_frames
+from rbfmuscle.sim.loop.simulate import FrameLoop, simulate_frames
 from rbfmuscle.sim.loop.substeps import SubSteps, turned_angle
 from rbfmuscle.sim.plan.reach import reached_bones, sampled_poses
 from rbfmuscle.sim.scene.motion import bone_poses
 from rbfmuscle.sim.scene.options import TunnellingOptions
-from rbfmuscle.validation import SolveError, UsageError
+from rbfmuscle.validation import SceneError, SolveError, UsageError
 
 
 def _run(angles, **options):
@@ -270,7 +271,52 @@ def test_scene_without_bones_in_reach_builds_no_field():
         [bone("base", base)], [], [muscle("m", mesh, [attach(mesh, "base", lambda v: v[:, 0] < -8)])], [{}]
     )
     sys.modules.pop("rbfmuscle.sim.distance.sdf", None)
-    list(simulate_frames(made, [ToyMuscle(made.muscles[0], made)]))
+    (frame,) = simulate_frames(made, [ToyMuscle(made.muscles[0], made)])
+    assert "rbfmuscle.sim.distance.sdf" not in sys.modules
+    # It stands apart from the bone and nothing moves, so it stays as it is.
+    assert np.array_equal(frame.surfaces["m"].vertices, mesh.vertices)
+
+
+def _crossing():
+    """A muscle that is bent by 60 degrees, watched for tunnelling."""
+    made, fields = hinged_scene([0, 10, 20, 30], tunnelling=TunnellingOptions())
+    return made, fields, ToyMuscle(made.muscles[0], made)
+
+
+def test_frames_that_are_skipped_leave_the_muscle_where_shown_ones_would():
+    made, fields, shown = _crossing()
+    with FrameLoop(made, [shown], fields=fields) as loop:
+        frames = [loop.advance(coordinates) for coordinates in made.motion.frames]
+    made, fields, skipping = _crossing()
+    with FrameLoop(made, [skipping], fields=fields) as loop:
+        for coordinates in made.motion.frames[:-1]:
+            loop.skip(coordinates)
+        last = loop.advance(made.motion.frames[-1])
+    assert last.index == 3 and np.array_equal(last.surfaces["strap"].vertices, shown.x)
+    assert skipping.solves == shown.solves
+    # What happened on the way is told with the frame that is shown.
+    assert last.events == [event for frame in frames for event in frame.events]
+    assert last.times["strap"]["time_solve"] > 0.0
+
+
+def test_a_loop_follows_a_path_that_is_not_known_beforehand():
+    made, fields, model = _crossing()
+    with FrameLoop(made, [model], fields=fields) as loop:
+        there = [loop.advance({"hinge.bend": np.radians(a)}) for a in (0, 30)]
+        back = loop.advance({"hinge.bend": 0.0})
+    assert [frame.index for frame in (*there, back)] == [0, 1, 2]
+    # The toy's target does not depend on the path; only contact does.
+    assert np.allclose(back.surfaces["strap"].vertices, there[0].surfaces["strap"].vertices, atol=0.05)
+    assert loop.here == {"hinge.bend": 0.0}
+
+
+def test_a_loop_that_cannot_begin_ends_its_threads():
+    made, fields = hinged_scene([0], initial="error")
+    made.muscles[0].mesh.apply_translation([0, -4.0, 0])
+    before = threading.active_count()
+    with pytest.raises(SceneError, match="overlaps bone 'trunk' at rest"):
+        FrameLoop(made, [ToyMuscle(made.muscles[0], made) for _ in range(3)], fields=fields)
+    assert threading.active_count() == before
 
 
 def test_unknown_model_names_the_nearest_right_one():

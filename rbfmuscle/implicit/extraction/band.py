@@ -6,7 +6,6 @@ crosses, so it follows the surface wherever it went, and the field is evaluated 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.fields import Cut, Field
 from rbfmuscle.implicit.extraction.marching import (
     EDGE_AXIS,
     EDGE_CORNER,
@@ -26,7 +26,7 @@ from rbfmuscle.implicit.extraction.marching import (
 from rbfmuscle.validation import check_points
 
 if TYPE_CHECKING:
-    from rbfmuscle.implicit.field import RBFField
+    pass
 
 
 # More nodes than this are refused: 2 bytes of state and 8 of index each.
@@ -133,9 +133,7 @@ class Band:
         ``(n, 3) -> (n,)``; ``cut`` may be None.
     """
 
-    def __init__(
-        self, grid: BandGrid, field: Callable[..., Any] | RBFField, cut: Callable[..., Any] | None = None
-    ) -> None:
+    def __init__(self, grid: BandGrid, field: Field, cut: Cut | None = None) -> None:
         total = int(np.prod(grid.shape))
         self.grid, self.field, self.cut = grid, field, cut
         self.index = np.full(total, -1, dtype=np.int32)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.fields import Cut, Field
 from rbfmuscle.geometry.surfaces import volume_cubic
 from rbfmuscle.implicit.extraction.obstacles import push_off_points
 
 if TYPE_CHECKING:
     from rbfmuscle.implicit.extraction.band import BandGrid
-    from rbfmuscle.implicit.field import RBFField
 
 
 class Projector:
@@ -25,18 +24,16 @@ class Projector:
 
     def __init__(
         self,
-        field: Callable[..., Any] | RBFField,
-        cut: Callable[..., Any] | None,
+        field: Field,
+        cut: Cut | None,
         vertices: Floats,
         spacing: float,
         near_cut: Booleans,
     ) -> None:
         self.vertices = vertices
         self.spacing = spacing
-        self._field = with_gradient(field, 1e-4 * spacing)
-        self._cut: Callable[..., Any] | None = (
-            None if cut is None else with_gradient_below(cut, 1e-4 * spacing)
-        )
+        self._field = field.value_and_gradient
+        self._cut = None if cut is None else cut.value_and_gradient_below
         self._near_cut = near_cut
         self.slope = np.zeros(len(vertices))
         self._direction = np.zeros_like(vertices)
@@ -138,32 +135,3 @@ def _step_loop(rows, step, spacing, vertices, unsettled):
         for a in range(3):
             vertices[rows[n], a] += share * step[n, a]
         unsettled[n] = length > 1e-2 * spacing
-
-
-def with_gradient(function: Callable[..., Any] | RBFField, step: float) -> Callable[..., Any]:
-    """``points -> (values, gradients)`` of a callable: its own, or central differences."""
-    if hasattr(function, "value_and_gradient"):
-        return function.value_and_gradient
-
-    def differences(points):
-        offsets = step * np.vstack([np.eye(3), -np.eye(3)])
-        around = function((points[None] + offsets[:, None]).reshape(-1, 3)).reshape(6, -1)
-        return function(points), ((around[:3] - around[3:]) / (2 * step)).T
-
-    return differences
-
-
-def with_gradient_below(function: Any, step: float) -> Callable[..., Any]:
-    """``(points, limit) -> (values, gradients)`` of a callable, only sure where a value is below its limit (n,)."""
-    if hasattr(function, "value_and_gradient_below"):
-        return function.value_and_gradient_below
-    both = with_gradient(function, step)
-
-    def below(points, limit):
-        value, gradient = function(points), np.zeros_like(points)
-        rows = np.flatnonzero(value < limit)
-        if len(rows):
-            value[rows], gradient[rows] = both(points[rows])
-        return value, gradient
-
-    return below

@@ -7,7 +7,6 @@ and Newton steps put each vertex onto the zero set itself: all that is left of t
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.fields import Cut, Field
 from rbfmuscle.geometry.surfaces import corner_from, mesh_volume, six_volumes
 from rbfmuscle.implicit.extraction.band import Band, BandGrid
 from rbfmuscle.implicit.extraction.obstacles import CHORD, points_near_cells
@@ -24,7 +24,6 @@ from rbfmuscle.validation import check_finite, check_points, check_positive
 
 if TYPE_CHECKING:
     from rbfmuscle.implicit.extraction.obstacles import ObstaclePoints
-    from rbfmuscle.implicit.field import RBFField
 
 
 @dataclass(frozen=True)
@@ -61,11 +60,11 @@ class ExtractedSurface:
 
 
 def extract_surface(
-    field: Callable[..., Any] | RBFField,
+    field: Field,
     *,
     points: ArrayLike,
     resolution: int = 48,
-    cut: Callable[..., Any] | None = None,
+    cut: Cut | None = None,
     volume: float | None = None,
     level: float = 0.0,
     keep: str = "largest",
@@ -78,16 +77,14 @@ def extract_surface(
 
     Parameters
     ----------
-    field : callable
-        ``(n, 3) -> (n,)`` values, negative inside. Its method ``value_and_gradient`` is used if it has one.
+    field : rbfmuscle.geometry.fields.Field
+        Negative inside.
     points : (n, 3) array_like
         Predicted surface points, where the search starts; also give the grid's extent [scene unit].
     resolution : int
         Grid cells along the longest side of the points' box.
-    cut : callable, optional
-        ``(n, 3) -> (n,)`` distances, negative inside what is to be cut away; beyond 1.2 cells any lower
-        bound of more than that will do. ``value_and_gradient`` as above, or ``value_and_gradient_below(points, limit)``
-        that need be right only where the value is below its limit.
+    cut : rbfmuscle.geometry.fields.Cut, optional
+        Distances, negative inside what is to be cut away; beyond 1.2 cells any lower bound of more than that will do.
     volume : float, optional
         Wanted volume of the mesh; the level is then moved from ``level`` until the mesh has it, to 1e-9.
     level : float
