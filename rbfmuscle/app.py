@@ -5,6 +5,7 @@ limit exceeded; 7 an optional part missing; 130 interrupted, frames so far kept.
 """
 
 import json
+import logging
 import os
 import sys
 import warnings
@@ -42,6 +43,7 @@ def run_command(arguments: list[str]) -> int:
     """Run one command; the process's exit code, all errors told in one line."""
     sys.excepthook = _report_bug
     warnings.showwarning = _show_warning
+    logging.lastResort = _LogLines(logging.WARNING)
     as_json = "--json" in arguments
     if sys.stdout is None:
         return _fail(
@@ -110,6 +112,13 @@ def _command_of(arguments):
 
 def _show_warning(message, category, filename, lineno, file=None, line=None):
     print(f"rbfmuscle: warning: {_one_line(message)}", file=sys.stderr)
+
+
+class _LogLines(logging.Handler):
+    """What the library logs, where nobody has set up logging, as the warnings are told."""
+
+    def emit(self, record):
+        print(f"rbfmuscle: warning: {_one_line(record.getMessage())}", file=sys.stderr)
 
 
 def _report_bug(kind, error, trace):

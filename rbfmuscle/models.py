@@ -10,7 +10,7 @@ from rbfmuscle.sim.plan.forecast import MuscleCost
 from rbfmuscle.sim.scene.objects import Muscle
 from rbfmuscle.sim.scene.options import Table
 from rbfmuscle.sim.scene.scene import Scene
-from rbfmuscle.validation import SceneError, UsageError, did_you_mean
+from rbfmuscle.validation import SceneError, UsageError, did_you_mean, shown
 
 
 class _Home(NamedTuple):
@@ -140,8 +140,8 @@ def check_model_name(name: str) -> str:
     """Return a model's name, or raise UsageError with the nearest right one."""
     if name in _HOME:
         return name
-    hint = did_you_mean(str(name).lower().replace("_", "-"), MODEL_NAMES)
-    raise UsageError(f"unknown model {name!r}, {hint}")
+    hint = did_you_mean(str(name).lower()[:100].replace("_", "-"), MODEL_NAMES)
+    raise UsageError(f"unknown model {shown(repr(name))}, {hint}")
 
 
 def _check_muscle(muscle):

@@ -55,6 +55,10 @@ class MissingPartError(RBFMuscleError, ImportError):
     exit_code = 7
 
 
+class NotFiniteError(ValueError):
+    """Numbers hold NaN or infinity; a solver's loop turns it into a `SolveError` that names muscle and frame."""
+
+
 class SceneWarning(UserWarning):
     """A scene asks for something that cannot be had as it stands, as bones driven into each other."""
 
@@ -131,10 +135,10 @@ def check_values(values: ArrayLike, count: int, *, name: str = "values") -> NDAr
 
 
 def check_finite(array: NDArray[Any], *, name: str) -> None:
-    """Raise ValueError naming the first row that holds NaN or infinity."""
+    """Raise NotFiniteError (a ValueError) naming the first row that holds NaN or infinity."""
     if not np.isfinite(array).all():
         row = int(np.argwhere(~np.isfinite(array))[0][0])
-        raise ValueError(f"{name} must be finite, row {row} is {array[row]}")
+        raise NotFiniteError(f"{name} must be finite, row {row} is {array[row]}")
 
 
 def check_positive(value: float, *, name: str) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 from rbfmuscle.sim.loop.frame import Drawing, Event, ModelSurface
 from rbfmuscle.sim.loop.tunnelling import find_crossings, turn_back
 from rbfmuscle.sim.scene.motion import bone_poses, interpolate, shown_value, step_angle, unit_sign
-from rbfmuscle.validation import SolveError
+from rbfmuscle.validation import NotFiniteError, SolveError
 
 # Depth [mm] below which a path through a bone counts as touching it; above the error of a bone's field.
 TOUCH = 0.1
@@ -110,7 +110,7 @@ class MuscleStepper:
         with self.timed("solve"):
             try:
                 self.model.solve(self.contacts)
-            except (np.linalg.LinAlgError, FloatingPointError) as error:
+            except (np.linalg.LinAlgError, FloatingPointError, NotFiniteError) as error:
                 raise SolveError(f"{self._place(coordinates)}: {error}") from error
         bad = ~np.isfinite(self.model.contact_points()).all(axis=1)
         if bad.any():

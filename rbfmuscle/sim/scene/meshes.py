@@ -133,7 +133,9 @@ def read_arrays(path: Path) -> Any:
         return _read_obj(path)
     if suffix in (".vtk", ".vtp"):
         return _read_vtk(path, suffix)
-    return _read_with_trimesh(path, suffix)
+    if suffix == ".stl":
+        return _read_stl(path)
+    return _read_ply(path)
 
 
 def _neighbours(path):
@@ -148,21 +150,29 @@ def _neighbours(path):
     return ", " + did_you_mean(path.name, names[:50]) if names else " (no meshes in that folder)"
 
 
-def _read_with_trimesh(path, suffix):
+def _read_ply(path):
     import struct
 
     import trimesh
 
     try:
-        mesh = trimesh.load(path, file_type=suffix[1:], process=False, force="mesh", skip_materials=True)
+        mesh = trimesh.load(path, file_type="ply", process=False, force="mesh", skip_materials=True)
     except (ValueError, KeyError, IndexError, TypeError, AttributeError, EOFError, struct.error) as error:
-        raise MeshError(f"{path}: not a readable {suffix[1:].upper()} file ({_short(error)})") from None
+        raise MeshError(f"{path}: not a readable PLY file ({_short(error)})") from None
     vertices = np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3)
     faces = np.asarray(getattr(mesh, "faces", np.zeros((0, 3))), dtype=np.int64).reshape(-1, 3)
-    if suffix == ".stl" and len(faces):  # an STL file repeats each vertex for every triangle
-        vertices, inverse = _unique_rows(vertices)
-        faces = inverse[faces]
     return vertices, faces
+
+
+def _read_stl(path):
+    from rbfmuscle.sim.formats.stl import read_stl
+
+    corners = read_stl(path)
+    if not len(corners):
+        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+    # An STL file repeats each vertex for every triangle.
+    vertices, inverse = _unique_rows(corners.reshape(-1, 3))
+    return vertices, inverse.reshape(-1, 3)
 
 
 def _unique_rows(vertices):

@@ -1,0 +1,155 @@
+"""Runs cases, each in a process of its own, and says what became of it.
+
+One process loads the program once, runs the small scene once with each model, and is then forked for every case:
+what ends a case ends no other, and its memory and time are its own.
+"""
+
+import math
+import os
+import re
+import resource
+import shutil
+import signal
+import sys
+import traceback
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+CLEAN_CODES = (2, 3, 4, 5, 6, 7)
+FINE, CLEAN = "fine", "clean error"
+BUG, DEATH, TIMEOUT, MEMORY, NOISE, WRONG = (
+    "a bug told as such, or a traceback", "death of the process", "more than 20 s", "more than 2 GB",
+    "more than one line, or a library's own", "NaN or a wrong volume, and code 0",
+)  # fmt: skip
+OUTCOMES = (CLEAN, FINE, BUG, DEATH, TIMEOUT, MEMORY, NOISE, WRONG)
+SECONDS = 20  # processor time of a case; a sleeping one ends by the wall clock after:
+HANG = 300
+MOST_MEMORY = 2_000_000  # KB
+LONGEST = 1200  # characters of a message
+WRONG_CODE = 99
+EXPECTED = re.compile(r"rbfmuscle: warning: |.*: frame \d+ of \d+$")  # beside the one line of an error
+
+
+class WrongResult(Exception):
+    """A case passed for fine whose result is not."""
+
+
+def run_case(action: Callable[[], int], folder: Path) -> tuple[str, str]:
+    """Run one case in a forked process; its outcome, and what it said.
+
+    Parameters
+    ----------
+    action : callable
+        Returns an exit code, and prints what a user would see.
+    folder : path
+        Made for the case, and removed after it.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    said = folder / "said.txt"
+    pid = os.fork()
+    if pid == 0:
+        _be_case(action, folder, said)
+    _, status, usage = os.wait4(pid, 0)
+    text = said.read_text(errors="replace") if said.exists() else ""
+    shutil.rmtree(folder, ignore_errors=True)
+    return _judge(status, usage, text), text
+
+
+def _be_case(action, folder, said):
+    """What the forked process does; it never returns."""
+    resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.alarm(HANG)
+    # Also what compiled libraries print is caught.
+    target = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    os.dup2(target, 1)
+    os.dup2(target, 2)
+    os.chdir(folder.parent)
+    code = 1
+    try:
+        code = action()
+    except WrongResult as error:
+        print(f"wrong: {error}", file=sys.stderr)
+        code = WRONG_CODE
+    except BaseException:  # noqa: BLE001 - what reaches this is what is looked for
+        traceback.print_exc()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+def _judge(status, usage, text):
+    if os.WIFSIGNALED(status):
+        return TIMEOUT if os.WTERMSIG(status) in (signal.SIGXCPU, signal.SIGALRM, signal.SIGKILL) else DEATH
+    if usage.ru_maxrss > MOST_MEMORY:
+        return MEMORY
+    code = os.WEXITSTATUS(status)
+    if code == WRONG_CODE:
+        return WRONG
+    if code not in (0, *CLEAN_CODES) or "Traceback" in text or ": a bug:" in text:
+        return BUG
+    lines = [line for line in text.splitlines() if not EXPECTED.match(line)]
+    if any(len(line) > LONGEST for line in text.splitlines()):
+        return NOISE
+    if code == 0:
+        return FINE if not lines else NOISE
+    return CLEAN if len(lines) == 1 and lines[0].startswith("rbfmuscle: ") else NOISE
+
+
+def tell(error: Exception) -> int:
+    """Print an error meant for users as the command line does; its exit code."""
+    print(f"rbfmuscle: {' '.join(str(error).split())}", file=sys.stderr)
+    return error.exit_code
+
+
+def show_warnings() -> None:
+    """Let warnings be told as the command line tells them."""
+    warnings.simplefilter("always")
+    warnings.showwarning = lambda message, *rest, **more: print(
+        f"rbfmuscle: warning: {' '.join(str(message).split())}", file=sys.stderr
+    )
+
+
+def check_meshes(scene) -> None:
+    """Raise WrongResult for a muscle whose volume is not what is inside its surface."""
+    for muscle in scene.muscles:
+        check_volume(np.asarray(muscle.mesh.vertices), np.asarray(muscle.mesh.faces), muscle.name)
+    for bone in scene.bones:
+        if not np.isfinite(bone.mesh.vertices).all():
+            raise WrongResult(f"bone {bone.name} is not finite")
+
+
+def check_volume(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
+    """Raise WrongResult unless the divergence theorem agrees with places tried at random.
+
+    A place is inside where the solid angles of all triangles add up to a whole turn, summed here literally.
+    """
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    volume = float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    box = float(np.prod(high - low))
+    if not (math.isfinite(volume) and 0 < volume <= box * (1 + 1e-9)):
+        raise WrongResult(f"{name}: volume {volume} in a box of {box}")
+    places = low + (high - low) * np.random.default_rng(0).random((600, 3))
+    share = float((_winding(places, a, b, c) > 0.5).mean())
+    # Four deviations of a share found from 600 places, and a tenth for surfaces that cross themselves a little.
+    allowed = 0.1 * volume / box + 4 * math.sqrt(max(share * (1 - share), 1e-3) / 600)
+    if abs(share - volume / box) > allowed:
+        raise WrongResult(f"{name}: volume {volume:.4g}, but {share * box:.4g} inside the surface")
+
+
+def _winding(places, a, b, c):
+    """Solid angle of all triangles over a full turn (Van Oosterom & Strackee 1983)."""
+    total = np.zeros(len(places))
+    for p, q, r in zip(a, b, c):
+        u, v, w = p - places, q - places, r - places
+        lu, lv, lw = (np.linalg.norm(x, axis=1) for x in (u, v, w))
+        top = np.einsum("ij,ij->i", u, np.cross(v, w))
+        dots = [np.einsum("ij,ij->i", x, y) for x, y in ((u, v), (v, w), (w, u))]
+        total += 2 * np.arctan2(top, lu * lv * lw + dots[0] * lw + dots[1] * lu + dots[2] * lv)
+    return total / (4 * np.pi)

@@ -1,0 +1,280 @@
+"""Damaged scene files: values that no key can mean, missing and foreign keys, broken text, endless motions."""
+
+import json
+from typing import Any
+
+import numpy as np
+
+from fuzz.base import FORMS, base_scene, suffix_of
+
+
+class Raw(str):
+    """Text that stands in TOML as it is."""
+
+
+def nested(depth):
+    return Raw("[" * depth + "]" * depth)
+
+
+# Values put in the place of any other.
+HOSTILE = (
+    0, -1, 1, 2, 1.5, -0.0, 1e-308, 1e308, -1e308, 1e12, 1e-12, 10**6, 2**31, 2**63, 10**20, Raw("9" * 5000),
+    float("inf"), float("-inf"), float("nan"), True, False, "", "x", "x" * 5000, "rbf", "pbd", "xpbd", "arap-pbd",
+    "../..", "/dev/zero", "/dev/null", "/proc/self/mem", "a/b", "a\nb", "\u2028", "muscle", "upper", "hip.flexion",
+    [], {}, [[]], [0, 0, 0], [1e308] * 3, [float("nan")] * 3, ["a"], [{}], [1, [2]], {"name": "rbf"}, {"name": 1},
+    {"name": "pbd", "iterations": 2}, Raw("1979-05-27T07:32:00Z"), Raw("0x10"), Raw("1_000"), Raw("1e400"),
+    nested(30), nested(1000), nested(100000), Raw("'''a'''"), Raw("{ a = 1, a = 2 }"), Raw("?"),
+)  # fmt: skip
+KEYS = (
+    "x",
+    "name",
+    "mesh",
+    "model",
+    "axes",
+    "from",
+    "step",
+    "scale",
+    "attach",
+    "near",
+    "type",
+    "",
+    "a.b",
+    "😀",
+    "\x07",
+)
+
+
+def scene_text(rng: np.random.Generator, *, deep: bool = False) -> str:
+    """A damaged scene file: one to three changes of the tables, now and then one of the text.
+
+    ``deep`` asks for changes that many scenes survive, so that what comes after reading is met too.
+    """
+    scene = base_scene()
+    changes = [_motion, _joint, _attach, _model, _tables]
+    if not deep:
+        changes += [_change_value, _change_value, _remove, _add_key, _meshes]
+    for _ in range(rng.integers(1, 3 if deep else 4)):
+        pick(rng, changes)(scene, rng)
+    text = to_toml(scene)
+    return _change_text(text, rng) if not deep and rng.random() < 0.15 else text
+
+
+def pick(rng, options):
+    """One of the options, as it is."""
+    return options[int(rng.integers(len(options)))]
+
+
+def _places(part, path=()):
+    """Every container and key in the tables."""
+    items = part.items() if isinstance(part, dict) else enumerate(part)
+    for key, value in list(items):
+        yield part, key
+        if isinstance(value, (dict, list)):
+            yield from _places(value, (*path, key))
+
+
+def _change_value(scene, rng):
+    part, key = pick(rng, list(_places(scene)))
+    part[key] = pick(rng, HOSTILE)
+
+
+def _remove(scene, rng):
+    part, key = pick(rng, list(_places(scene)))
+    del part[key]
+
+
+def _add_key(scene, rng):
+    tables = [scene] + [part[key] for part, key in _places(scene) if isinstance(part[key], dict)]
+    pick(rng, tables)[pick(rng, KEYS)] = pick(rng, HOSTILE)
+
+
+def _number(rng):
+    """From small to absurd, as likely in each decade."""
+    return float(rng.choice([-1, 1, 1, 1]) * 10.0 ** rng.uniform(-12, 14))
+
+
+def _motion(scene, rng):
+    kind, name = rng.integers(6), pick(rng, ["hip.flexion", "flexion", "hip.turn", "turn", "knee.flexion"])
+    step = abs(_number(rng)) if rng.random() < 0.7 else 3.0
+    if kind == 0:
+        scene["motion"] = {"ramp": {name: {"from": _number(rng), "to": _number(rng), "step": step}}}
+    elif kind == 1:
+        scene["motion"] = {
+            "ramp": {name: {"to": 10.0 ** rng.uniform(0, 9), "step": 10.0 ** rng.uniform(0, 8)}}
+        }
+    elif kind == 2:
+        count = int(rng.choice([1, 2, 5, 2000]))
+        stops = [{name: float(rng.normal(0, 60))} for _ in range(count)]
+        scene["motion"] = {"waypoints": stops, "step": step}
+    elif kind == 3:
+        scene["motion"] = {"waypoints": [{name: _number(rng)}, {"turn": _number(rng)}], "step": step}
+    elif kind == 4:
+        scene["motion"] = {
+            "file": pick(rng, ["flex.mot", "none.mot", "upper.ply", ".", "/dev/zero", "upper.txt"])
+        }
+    else:
+        scene["motion"] = pick(rng, HOSTILE)
+
+
+def _joint(scene, rng):
+    joint = pick(rng, scene["joint"]) if scene.get("joint") and isinstance(scene["joint"], list) else None
+    if not isinstance(joint, dict):
+        return
+    kind = rng.integers(5)
+    if kind == 0:
+        joint["centre"] = [_number(rng) for _ in range(3)]
+    elif kind == 1:
+        joint["axes"] = {"flexion": [_number(rng) for _ in range(3)]}
+    elif kind == 2:
+        joint["child"], joint["parent"] = (
+            pick(rng, ["upper", "lower", "muscle", ""]),
+            pick(rng, ["upper", "lower"]),
+        )
+    elif kind == 3:
+        joint["type"] = pick(rng, ["hinge", "slider", "free", "fixed", "custom", "ball", "bal", 3])
+    else:
+        scene["joint"] = scene["joint"] * 2
+
+
+def _attach(scene, rng):
+    muscle = _first_muscle(scene)
+    if muscle is None:
+        return
+    number = pick(rng, [0, 5, -1, 161, 162, 10**9, 10**19, 2**62])
+    places = (
+        {"vertices": [number, 1, 2]},
+        {"vertices": pick(rng, ["upper.txt", "none.txt", "upper.ply", ".", "fibres.json", "/dev/zero"])},
+        {"near": _number(rng)},
+        {"sphere": {"centre": [34.0, 0.0, _number(rng)], "radius": abs(_number(rng))}},
+        {"vertices": []},
+        {},
+    )
+    entry = {"bone": pick(rng, ["upper", "lower", "lowr", ""]), **pick(rng, places)}
+    if isinstance(muscle.get("attach"), list) and muscle["attach"]:
+        muscle["attach"][int(rng.integers(len(muscle["attach"])))] = entry
+
+
+OPTIONS = (
+    "centres", "samples", "iterations", "contacts", "epsilon", "stretch_low", "stretch_high", "stretch_hold",
+    "across", "across_weight", "acceleration", "placement", "derivatives", "seed", "kernel", "edge", "bending",
+    "arap_compliance", "limits", "damping", "prediction", "response", "contact", "soft_length", "fibre_exponent",
+)  # fmt: skip
+# What an option may be set to: out of its range, or in it and quick. What is allowed and slow is not an error.
+SETTINGS = (
+    -1, 0, 1, 3, 4, 5, 0.5, 1.5, 50, 1e-9, 1e-3, 10**7, 10**18, 1e300, float("nan"), "x", "", "even", "adaptive",
+    "fitted", "normal", "all", "gaussian", "linear", "wendland_c2", "cubik", [], [0.5, 2.0], [2.0, 0.5], {}, True,
+)  # fmt: skip
+MODELS = ("rbf", "pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
+
+
+def _model(scene, rng):
+    muscle = _first_muscle(scene)
+    if muscle is None:
+        return
+    model = {"name": pick(rng, MODELS)}
+    if model["name"] == "rbf":
+        model |= {"centres": 60, "samples": 200, "resolution": 16, "iterations": 4}
+    for _ in range(rng.integers(0, 3)):
+        model[pick(rng, OPTIONS)] = pick(rng, SETTINGS)
+    muscle["model"] = pick(rng, [*HOSTILE[:10], "pbd", "xpbd"]) if rng.random() < 0.15 else model
+
+
+def _tables(scene, rng):
+    name, key, values = pick(
+        rng,
+        [
+            ("contact", "substep_angle", [1e-300, 1e-9, 1e-3, 0.5, 90, 91, 0, -1]),
+            ("contact", "tolerance", [1e-300, 1e-9, 1e-3, 0.5, 1e9, 0]),
+            ("contact", "margin", [0, 1e-3, 5.0, 1e9, -1]),
+            ("contact", "initial", ["keep", "error", "resolv"]),
+            ("contact", "detector", ["sdf", "spline", "voxel", "bvh", "serendipity", "x"]),
+            ("sliding", "threshold", [1e-300, 0.5, 1e300, -1]),
+            ("sliding", "pairs", [[], [["muscle", "muscle"]], [["a", "b"]], [["muscle"]], 1]),
+            (
+                "detect",
+                "tunnelling",
+                [{}, {"smallest_step": 1e-300}, {"angle": 1e-9}, {"action": "rotate"}, 1],
+            ),
+            ("output", "surfaces", [False, True, {"format": "stl"}, {"format": "glb"}, {"format": "x"}]),
+            ("output", "fibres", [True, {"count": 1, "segments": 2}, {"count": 10**9}, {"segments": 0}]),
+            ("motion", "max_substeps", [0, 1, 10**15, -1]),
+            ("scene", "units", ["m", "cm", "km", 1]),
+        ],
+    )
+    if isinstance(scene.get(name, {}), dict):
+        scene.setdefault(name, {})[key] = pick(rng, values)
+
+
+def _meshes(scene, rng):
+    items = [row for kind in ("bone", "muscle") for row in _rows(scene, kind)]
+    if not items:
+        return
+    item, kind = pick(rng, items), rng.integers(4)
+    if kind == 0:
+        form = pick(rng, FORMS)
+        item["mesh"] = f"muscle-{form}{suffix_of(form)}"
+    elif kind == 1:
+        item["mesh"] = pick(
+            rng, ["upper.ply", "lower.ply", "none.ply", ".", "fibres.json", "upper.txt", "/dev/zero"]
+        )
+    elif kind == 2:
+        item["scale"] = _number(rng)
+    else:
+        item["fibres"] = pick(rng, ["fibres.json", "none.json", "upper.ply", "flex.mot", ".", 3])
+
+
+def _rows(scene, kind):
+    rows = scene.get(kind)
+    return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+
+
+def _first_muscle(scene):
+    return next(iter(_rows(scene, "muscle")), None)
+
+
+def _change_text(text, rng):
+    """Break the text itself: cut it, drop or repeat a piece, put other characters in."""
+    at, other = sorted(rng.integers(0, len(text), 2).tolist())
+    return (
+        text[:at],
+        text[:at] + text[other:],
+        text[:other] + text[at:],
+        text[:at] + "".join(chr(c) for c in rng.integers(1, 0x2FF, 5)) + text[at:],
+        text[:at] + pick(rng, ["[", "]", "{", "}", '"', "=", "\n", "\x00", "#", "[[bone]]\n"]) + text[at:],
+    )[int(rng.integers(5))]
+
+
+def to_toml(scene: dict[str, Any]) -> str:
+    """Tables as TOML: one level of headings, all else inline."""
+    lines = []
+    for name, table in scene.items():
+        rows = (
+            table
+            if isinstance(table, list) and table and all(isinstance(row, dict) for row in table)
+            else None
+        )
+        if rows is None and not isinstance(table, dict):
+            lines.insert(0, f"{_key(name)} = {_value(table)}")
+            continue
+        for row in [table] if rows is None else rows:
+            lines.append(f"[{_key(name)}]" if rows is None else f"[[{_key(name)}]]")
+            lines += [f"{_key(key)} = {_value(value)}" for key, value in row.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _key(name):
+    return name if name.isidentifier() and name.isascii() else json.dumps(name)
+
+
+def _value(value):
+    if isinstance(value, Raw):
+        return str(value)
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return json.dumps(value)
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{_key(key)} = {_value(item)}" for key, item in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_value, value)) + "]"
+    return repr(value)
