@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-fast test-nojit coverage check bench figures docs release-check clean
+.PHONY: demo test fuzz test-fast test-nojit coverage check bench figures docs release-check clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -32,6 +32,8 @@ test-nojit: $(STAMP)
 coverage: $(STAMP)
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q --cov --cov-report= $$(grep -v '^#' tests/nojit.txt)
 	$(BIN)/python -m pytest -q --cov --cov-append --cov-report=term:skip-covered $$(grep -v '^#' tests/fast.txt)
+fuzz: $(STAMP)
+	PYTHONPATH=tests $(BIN)/python -m fuzz --scene 10000 --mesh 2000 --frames 250
 
 check: $(STAMP)
 	$(BIN)/ruff check .

@@ -4,6 +4,7 @@
 limit exceeded; 7 an optional part missing; 130 interrupted, frames so far kept.
 """
 
+import contextlib
 import json
 import logging
 import os
@@ -90,8 +91,8 @@ def _describe_os_error(error):
 
 def _drop_output():
     """Nothing more can be written: what is still held back goes nowhere, so that leaving raises no second error."""
-    null = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(null, sys.stdout.fileno())
+    with contextlib.suppress(OSError):  # of a caller in Python, whose stream has no file
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _fail(message, code, as_json, *, hint=""):

@@ -89,7 +89,10 @@ def kernels(
             criterion=criterion, resolution=resolution, units=units if scene is None else scene.units, progress=bar,
         )  # fmt: skip
     moved = [] if scene is None else _run_best(scene, title, study, best, frames)
-    missing = write_study(study, output, title=f"Kernels for {title}", pictures=pictures)
+    try:
+        missing = write_study(study, output, title=f"Kernels for {title}", pictures=pictures)
+    except OSError as error:
+        raise UsageError(f"cannot write to {output}: {error.strerror}; choose another --output") from None
     if as_json:
         print(json.dumps({"rows": study.rows, "motion": moved}, indent=1))
     else:

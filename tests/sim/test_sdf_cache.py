@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -133,15 +132,3 @@ def test_several_processes_may_build_the_same_field(folder):
     assert len(answers) == 1
     assert len(cache_list()) == 1
     assert not list(folder.glob("*.part"))
-
-
-def test_cache_hit_is_quick(hip_data):
-    mesh = trimesh.load(hip_data / "femur.ply", process=False)
-    BoneSDF.from_mesh(mesh)
-    times = []
-    for _ in range(5):
-        start = time.perf_counter()
-        BoneSDF.from_mesh(mesh)
-        times.append(time.perf_counter() - start)
-    # Promised are 50 ms; a loaded machine is given three times as long.
-    assert min(times) < 0.15

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator
 
 from rbfmuscle.sim.scene.attachments import AttachTable
 from rbfmuscle.sim.scene.check import check_centre, check_place, check_size
@@ -66,6 +67,13 @@ class DefaultsTable(Table):
     attach: list[AttachTable] = Field(default_factory=list)
     fibres: str | None = None
 
+    @field_validator("model")
+    @classmethod
+    def _check_model(cls, model):
+        if not isinstance(model, (str, dict)):
+            raise ValueError("model must be a name or a table with a name")
+        return model
+
 
 class MuscleTable(DefaultsTable):
     """``[[muscle]]``."""
@@ -113,13 +121,13 @@ def _read_toml(path):
         raise SceneError(f"{path}: is a folder, give a scene file (.toml)")
     if not is_file(path):
         raise SceneError(f"{shown(str(path))}: no such scene file")
+    size = os.path.getsize(path)
+    if size > LARGEST_FILE:
+        raise SceneError(
+            f"{path}: has {size} bytes, a scene file at most {LARGEST_FILE}; put long lists of vertices into "
+            "files of their own"
+        )
     try:
-        size = path.stat().st_size
-        if size > LARGEST_FILE:
-            raise SceneError(
-                f"{path}: has {size} bytes, a scene file at most {LARGEST_FILE}; put long lists of vertices into "
-                "files of their own"
-            )
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise SceneError(f"{path}: cannot read the scene file: {error.strerror}") from None

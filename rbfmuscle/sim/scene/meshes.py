@@ -85,6 +85,7 @@ def prepare_mesh(
     """Return the ReadMesh of given arrays, mended like a file's; ``place`` begins each message."""
     import trimesh
 
+    vertices, faces = np.asarray(vertices), np.asarray(faces)
     if not len(vertices) or not len(faces):
         raise MeshError(f"{place}: the mesh is empty ({len(vertices)} vertices, {len(faces)} triangles)")
     bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
