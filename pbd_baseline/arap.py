@@ -6,6 +6,7 @@ gradient of E is its partial derivative with R frozen: grad_i E = sum_j w_ij (e_
 """
 
 import numpy as np
+import scipy.sparse as sparse
 
 from pbd_baseline.topology import colour
 from rbfmuscle.compiled.loop import compiled
@@ -25,6 +26,8 @@ class ARAP:
     vertices : (n, 3) ndarray
         Rest positions.
     topology : Topology
+    stiffer : float or (e,) ndarray
+        Factor of the edges' weights.
 
     Attributes
     ----------
@@ -34,11 +37,14 @@ class ARAP:
         Cotangent weights clamped from below: a long mesh has 22 % negative ones.
     """
 
-    def __init__(self, vertices, topology):
+    def __init__(self, vertices, topology, *, stiffer=1.0):
         self.topology = topology
         self.laplacian = cotangent_laplacian(vertices, topology.faces)
         i, j = topology.edges.T
         self.weights = -np.asarray(self.laplacian[i, j]).ravel()
+        if np.any(stiffer != 1.0):
+            self.weights = self.weights * stiffer
+            self.laplacian = _laplacian(topology, self.weights)
         self.rest = np.ascontiguousarray(vertices[i] - vertices[j])
         self.quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (topology.vertex_count, 1))
 
@@ -70,6 +76,15 @@ class ARAP:
     def gradient(self, points):
         """Gradient (n, 3) of E with the rotations frozen; the full one where they are optimal."""
         return self.laplacian @ points - self.targets()
+
+
+def _laplacian(topology, weights):
+    """Laplacian of the mesh with one weight an edge."""
+    i, j = topology.edges.T
+    count = topology.vertex_count
+    half = sparse.coo_matrix((weights, (i, j)), shape=(count, count))
+    links = (half + half.T).tocsc()
+    return (sparse.diags(np.asarray(links.sum(axis=1)).ravel()) - links).tocsc()
 
 
 class ARAPConstraint:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from pbd_baseline.contact import ContactConstraint
+from pbd_baseline.contraction import TENDON_WEIGHT, MeshFibres
 from pbd_baseline.motion import carry
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.rest import Rest
@@ -49,7 +50,9 @@ class PBDMuscle:
         self.name = muscle.name
         self.options = options or PBDOptions()
         self.rest = Rest.from_muscle(muscle, scene, self.options)
-        self.shape = METHODS[self.options.method].shape(self.rest, self.options)
+        self.fibres = MeshFibres(muscle, self.rest) if muscle.contraction is not None else None
+        stiffer = 1.0 if self.fibres is None else np.where(self.fibres.tendon, TENDON_WEIGHT, 1.0)
+        self.shape = METHODS[self.options.method].shape(self.rest, self.options, stiffer)
         self.sweeps = sweeps(self.options)
         columns, shares = _contact_carriers(self.rest, faces_too=self.options.contact == "faces")
         self.contact = ContactConstraint(
@@ -87,11 +90,17 @@ class PBDMuscle:
         """Sweep the shape, contacts inside the iteration and last, the volume on what is not in contact."""
         self.contact.find(contacts, self.points)
         for _ in range(self.sweeps):
+            if self.fibres is not None:
+                self.shape.contract(self.fibres, self.points)
             self.shape.sweep(self.points, self.time / self.sweeps)
             self.contact.project(self.points)
             if self.shape.volume_in_sweeps:
                 self.shape.restore_volume(self.points, self.contact)
         self._finish(contacts)
+
+    def activate(self, activation: float) -> None:
+        """Take an activation, 0 to 1, that the next `solve` settles under."""
+        self.fibres.law.activate(activation)
 
     def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
         """Move the vertices marked in a bool mask (n,) by a (4, 4) transform; held ones stay."""

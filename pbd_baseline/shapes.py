@@ -1,7 +1,8 @@
 """What gives a mesh muscle its shape: one class for each way of the paper, all swept in the same manner.
 
 A shape offers ``sweep(points, time)``: one iteration, in place, that keeps held vertices where they are. The
-muscle around it adds contact after each, and the volume in the shape's own way.
+muscle around it adds contact after each, and the volume in the shape's own way. ``contract(fibres, points)`` takes
+rest lengths from the fibres of a muscle that contracts; ``stiffer`` multiplies the weights of edges (of tendon).
 """
 
 from typing import NamedTuple
@@ -13,6 +14,7 @@ from pbd_baseline.arap import ARAP, ARAPConstraint
 from pbd_baseline.bending import BendingConstraint
 from pbd_baseline.constraints import EdgeConstraint
 from pbd_baseline.contact import ContactConstraint
+from pbd_baseline.contraction import TENDON_WEIGHT, MeshFibres
 from pbd_baseline.factor import SymmetricFactor
 from pbd_baseline.fibres import edge_stiffness, vertex_areas
 from pbd_baseline.options import PBDOptions
@@ -42,6 +44,10 @@ class Shape:
         """One iteration of the given time, in place."""
         raise NotImplementedError
 
+    def contract(self, fibres: MeshFibres, points: np.ndarray) -> None:
+        """Take what edges shall be from the fibres, at the present points (n, 3)."""
+        raise NotImplementedError
+
     def restore_volume(self, points: np.ndarray, contact: ContactConstraint) -> None:
         """Bring the volume back, in place: where there is room, and out of the way of contacts."""
         self.volume.restore(points, self._swelling(points), clear_way=contact.clear_way)
@@ -66,7 +72,7 @@ class PBDShape(Shape):
     # Three sweeps change the volume too little for PBD to feel it before the last of them.
     volume_in_sweeps = False
 
-    def __init__(self, rest: Rest, options: PBDOptions) -> None:
+    def __init__(self, rest: Rest, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
         super().__init__(rest)
         stiffness = edge_stiffness(rest.vertices, rest.topology.edges, rest.fibres, options.fibre_exponent)
         if options.soft_length > 0.0:
@@ -74,9 +80,16 @@ class PBDShape(Shape):
         self.edges = EdgeConstraint(
             rest.vertices, rest.topology.edges, stiffness=options.edge * stiffness, limits=options.limits
         )
+        self.passive, self.stiffest = self.edges.stiffness, options.edge
         self.bending = BendingConstraint(
             rest.vertices, rest.topology.edges, rest.topology.wings, stiffness=options.bending
         )
+
+    def contract(self, fibres: MeshFibres, points: np.ndarray) -> None:
+        """Take rest lengths and stiffnesses from the fibres: an active fibre is as stiff along as across."""
+        self.edges.rest = np.linalg.norm(fibres.targets(points), axis=1)[self.edges.order]
+        share = np.where(fibres.tendon, 1.0, fibres.activation)[self.edges.order]
+        self.edges.stiffness = self.passive + share * (self.stiffest - self.passive)
 
     def sweep(self, points, time):
         """One Gauss-Seidel sweep; PBD knows no time."""
@@ -92,15 +105,24 @@ class XPBDShape(Shape):
     the same place.
     """
 
-    def __init__(self, rest: Rest, options: PBDOptions) -> None:
+    def __init__(self, rest: Rest, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
         super().__init__(rest)
         softness = edge_stiffness(rest.vertices, rest.topology.edges, rest.fibres, options.fibre_exponent)
         self.edges = EdgeConstraint(rest.vertices, rest.topology.edges, limits=options.limits)
         self.bending = BendingConstraint(rest.vertices, rest.topology.edges, rest.topology.wings)
-        compliance = options.edge_compliance * rest.relative_lengths() / np.maximum(softness, 1e-3)
-        self.edge_compliance = compliance[self.edges.order]
+        across = options.edge_compliance * rest.relative_lengths()
+        self.edge_compliance = (across / np.maximum(softness, 1e-3))[self.edges.order]
+        self.passive, self.stiffest = self.edge_compliance, across[self.edges.order]
         # C is an angle: times a length to be comparable with the edges' C
         self.bending_compliance = options.bending_compliance / np.mean(self.edges.rest) ** 2
+
+    def contract(self, fibres: MeshFibres, points: np.ndarray) -> None:
+        """Take rest lengths and compliances from the fibres: an active fibre is as stiff along as across."""
+        self.edges.rest = np.linalg.norm(fibres.targets(points), axis=1)[self.edges.order]
+        share = np.where(fibres.tendon, 1.0, fibres.activation)[self.edges.order]
+        mixed = 1.0 / ((1.0 - share) / self.passive + share / self.stiffest)
+        self.edge_compliance = np.where(share > 0.0, mixed, self.passive)
+        self.edge_compliance[fibres.tendon[self.edges.order]] /= TENDON_WEIGHT
 
     def sweep(self, points, time):
         """One small step of the given time."""
@@ -115,10 +137,15 @@ class XPBDShape(Shape):
 class ARAPShape(Shape):
     """The ARAP energy as PBD constraints: the paper's section 6.2, first option."""
 
-    def __init__(self, rest: Rest, options: PBDOptions) -> None:
+    def __init__(self, rest: Rest, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
         super().__init__(rest)
-        self.arap = ARAP(rest.vertices, rest.topology)
+        self.arap = ARAP(rest.vertices, rest.topology, stiffer=stiffer)
         self.constraint = ARAPConstraint(self.arap, compliance=options.arap_compliance)
+
+    def contract(self, fibres: MeshFibres, points: np.ndarray) -> None:
+        """Take rest vectors from the fibres."""
+        self.arap.rest = fibres.targets(points)
+        self.constraint.rest = np.ascontiguousarray(self.arap.rest[self.constraint.order])
 
     def sweep(self, points, time):
         """Rotations, then one small step of the constraints."""
@@ -143,9 +170,9 @@ class GlobalARAPShape(Shape):
     muscle is pulled through the bone that it wraps. A free fixed point is the same for any l.
     """
 
-    def __init__(self, rest: Rest, options: PBDOptions) -> None:
+    def __init__(self, rest: Rest, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
         super().__init__(rest)
-        self.arap = ARAP(rest.vertices, rest.topology)
+        self.arap = ARAP(rest.vertices, rest.topology, stiffer=stiffer)
         self.free = np.flatnonzero(rest.inverse_mass > 0.0)
         self.held = np.flatnonzero(rest.inverse_mass == 0.0)
         reach = options.arap_reach * float(np.linalg.norm(np.ptp(rest.vertices, axis=0)))
@@ -153,6 +180,10 @@ class GlobalARAPShape(Shape):
         rows = self.arap.laplacian[self.free]
         self.factor = SymmetricFactor(rows[:, self.free] + sparse.diags(self.mass[:, 0]))
         self.coupling = rows[:, self.held].tocsr()
+
+    def contract(self, fibres: MeshFibres, points: np.ndarray) -> None:
+        """Take rest vectors from the fibres; the matrix of the global step does not change."""
+        self.arap.rest = fibres.targets(points)
 
     def sweep(self, points, time):
         """One local and one global step."""

@@ -189,7 +189,13 @@ def joint(name, parent, child, centre, **axes):
 
 def muscle(name, mesh, attachments, **options):
     return SimpleNamespace(
-        name=name, mesh=mesh, attachments=attachments, model="rbf", options=options, fibres=None
+        name=name,
+        mesh=mesh,
+        attachments=attachments,
+        model="rbf",
+        options=options,
+        fibres=None,
+        contraction=None,
     )
 
 

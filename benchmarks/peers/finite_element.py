@@ -4,6 +4,7 @@ Eight-node bricks with a constant pressure each (mean dilatation: Simo, Taylor a
 
     W = mu/2 (J^(-2/3) tr(F'F) - 3) + kappa/2 (Jm - 1)^2,   Jm = mean of J over the brick,
 
+with fibres, where a `peers.fibre_material.FibreMaterial` is given, whose energy along the stretch |F a| is added;
 solved by Newton's method with a line search on the energy. Bones push by a penalty on the surface's quadrature
 points. Mesh, shape functions and quadrature are scikit-fem's (the extra ``fem``).
 """
@@ -54,6 +55,9 @@ class HexSolid:
         Shear modulus; the unit of stress.
     poisson : float
         Poisson's ratio; 0.495 makes the bulk modulus a hundred times the shear modulus.
+    fibres : FibreMaterial, optional
+    stiffer : (m,) ndarray, optional
+        Factor of the shear and bulk moduli of each brick.
     penalty : float
         Contact pressure for each unit of depth [shear modulus / scene unit].
 
@@ -63,9 +67,11 @@ class HexSolid:
         If scikit-fem is not installed.
     """
 
-    def __init__(self, points, bricks, *, shear=1.0, poisson=0.495, penalty=30.0):
+    def __init__(self, points, bricks, *, shear=1.0, poisson=0.495, penalty=30.0, fibres=None, stiffer=None):
         skfem = _skfem()
         self.shear, self.penalty = shear, penalty
+        self.fibres, self.activation = fibres, 0.0
+        self.stiffer = np.ones(len(bricks)) if stiffer is None else np.asarray(stiffer, dtype=float)
         self.bulk = 2.0 * shear * (1.0 + poisson) / (3.0 * (1.0 - 2.0 * poisson))
         mesh = skfem.MeshHex(np.ascontiguousarray(points.T), np.ascontiguousarray(bricks.T))
         self.mesh, self.rest = mesh, np.asarray(points, dtype=float)
@@ -103,7 +109,7 @@ class HexSolid:
         """Volume of the deformed bricks [scene unit cubed]."""
         return float((np.linalg.det(self._gradient(displacement)) * self.weights).sum())
 
-    def solve(self, displacement, held, wanted, *, tolerance=1e-6):
+    def solve(self, displacement, held, wanted, *, tolerance=1e-6, settled=ENERGY_TOLERANCE):
         """Equilibrium with what is ``held`` at the displacements ``wanted`` (n, 3).
 
         Parameters
@@ -115,6 +121,8 @@ class HexSolid:
         wanted : (n, 3) ndarray
         tolerance : float
             Of the greatest force on a free node, as a share of the greatest force.
+        settled : float
+            A step that would lower the energy by a smaller share is the last.
 
         Returns
         -------
@@ -136,7 +144,7 @@ class HexSolid:
             if not first.any() and residual < tolerance:
                 return SolidState(u, iteration, residual)
             step = self._direction(force, matrix, free, first)
-            if not first.any() and abs(force @ step) < ENERGY_TOLERANCE * self.energy(u):
+            if not first.any() and abs(force @ step) < settled * self.energy(u):
                 return SolidState(u, iteration, residual)
             u = self._walk(u, step.reshape(-1, 3), force, moving=first.any())
             first = np.zeros_like(first)
@@ -187,12 +195,31 @@ class HexSolid:
             return np.inf
         mean = (j * self.weights).sum(axis=1) / self.weights.sum(axis=1)
         shape = j ** (-2 / 3) * np.einsum("eqij,eqij->eq", f, f) - 3.0
-        total = 0.5 * self.shear * (shape * self.weights).sum()
-        total += 0.5 * self.bulk * ((mean - 1.0) ** 2 * self.weights.sum(axis=1)).sum()
+        total = 0.5 * self.shear * (shape * self.weights * self.stiffer[:, None]).sum()
+        total += 0.5 * self.bulk * ((mean - 1.0) ** 2 * self.weights.sum(axis=1) * self.stiffer).sum()
+        if self.fibres is not None:
+            total += (self.fibres.evaluate(self._along(f)[1], self.activation)[0] * self.weights).sum()
         if self.obstacles:
             depth = np.minimum(self.gaps(displacement)[0], 0.0)
             total += 0.5 * self.penalty * (depth**2 * self.side_weights[self.touching]).sum()
         return float(total)
+
+    def _along(self, f):
+        """F a (brick, point, 3) and its length, the stretch of the fibres."""
+        along = np.einsum("eqij,ej->eqi", f, self.fibres.direction)
+        return along, np.linalg.norm(along, axis=-1)
+
+    def _fibre_stress(self, f):
+        """Stress (brick, point, 3, 3) of the fibres, and its derivative by F (brick, point, 9, 9)."""
+        along, stretch = self._along(f)
+        _, slope, bend = self.fibres.evaluate(stretch, self.activation)
+        a = self.fibres.direction
+        unit = along / stretch[..., None]
+        stress = np.einsum("eq,eqi,ej->eqij", slope, unit, a)
+        across = np.einsum("eqi,eqk->eqik", unit, unit)
+        spatial = bend[..., None, None] * across + (slope / stretch)[..., None, None] * (np.eye(3) - across)
+        tangent = np.einsum("eqik,ej,el->eqijkl", spatial, a, a)
+        return stress, tangent.reshape(*stretch.shape, 9, 9)
 
     def _gradient(self, displacement):
         return np.eye(3) + np.einsum("eni,eqnj->eqij", displacement[self.nodes], self.slopes, optimize=True)
@@ -226,22 +253,26 @@ class HexSolid:
         j = np.linalg.det(f)
         inverse = np.swapaxes(np.linalg.inv(f), -1, -2)  # F^-T
         volume = self.weights.sum(axis=1)
-        pressure = self.bulk * ((j * self.weights).sum(axis=1) / volume - 1.0)
-        factor = self.shear * j ** (-2 / 3)
+        bulk = self.bulk * self.stiffer
+        pressure = bulk * ((j * self.weights).sum(axis=1) / volume - 1.0)
+        factor = self.shear * self.stiffer[:, None] * j ** (-2 / 3)
         trace = np.einsum("eqij,eqij->eq", f, f)
         cofactor = j[..., None, None] * inverse
         stress = factor[..., None, None] * (f - (trace / 3)[..., None, None] * inverse)
         stress += pressure[:, None, None, None] * cofactor
+        tangent = self._tangent(f, inverse, factor, trace, pressure[:, None] * j)
+        if self.fibres is not None:
+            pull, bend = self._fibre_stress(f)
+            stress, tangent = stress + pull, tangent + bend
         weighted = self.slopes * self.weights[..., None, None]
         count = len(self.nodes)
         force = np.einsum("eqij,eqnj->eni", stress, weighted, optimize=True).reshape(count, 24)
-        tangent = self._tangent(f, inverse, factor, trace, pressure[:, None] * j)
         stiffness = np.zeros((count, 24, 24))
         for q in range(self.slopes.shape[1]):
             b = np.einsum("enj,ik->eijnk", self.slopes[:, q], np.eye(3)).reshape(count, 9, 24)
             stiffness += np.swapaxes(b, 1, 2) @ (tangent[:, q] * self.weights[:, q, None, None]) @ b
         mean = np.einsum("eqij,eqnj->eni", cofactor, weighted, optimize=True).reshape(count, 24)
-        stiffness += (self.bulk / volume)[:, None, None] * mean[:, :, None] * mean[:, None, :]
+        stiffness += (bulk / volume)[:, None, None] * mean[:, :, None] * mean[:, None, :]
         return self.nodes, force, stiffness
 
     @staticmethod

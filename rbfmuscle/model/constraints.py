@@ -10,6 +10,7 @@ import numpy as np
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.rotations import quaternion_matrix
 from rbfmuscle.geometry.surfaces import volume_and_gradient
+from rbfmuscle.sim.contraction.law import FibreLaw
 
 
 @compiled(error_model="numpy")
@@ -47,8 +48,9 @@ def _rotation_loop(m, q):
 
 
 @compiled(error_model="numpy")
-def _local_loop(x, arm, start, other, inverse, fibre, low, high, hold, q, target, deformation):
-    """Deformation gradient F and target T of each cluster, T = R (t aaᵀ + t^(-1/2) (I - aaᵀ))."""
+def _local_loop(x, arm, start, other, inverse, fibre, low, high, law, q, target, deformation):
+    """Deformation gradient F and target T of each cluster, T = R (t aaᵀ + s (I - aaᵀ))."""
+    lower, upper, share, across = law
     f = np.empty((3, 3))
     for i in range(len(start) - 1):
         f[:] = 0.0
@@ -76,8 +78,9 @@ def _local_loop(x, arm, start, other, inverse, fibre, low, high, hold, q, target
                 + deformation[i, a, 2] * fibre[i, 2]
             ) ** 2
         stretch = min(max(np.sqrt(stretch), low), high)
-        t = 1.0 + (1.0 - hold) * (stretch - 1.0)
-        s = 1.0 / np.sqrt(t)
+        goal = min(max(stretch, lower[i]), upper[i])
+        t = goal + (1.0 - share[i]) * (stretch - goal)
+        s = 1.0 / np.sqrt(goal + (1.0 - across[i]) * (stretch - goal))
         for a in range(3):
             along = r[a, 0] * fibre[i, 0] + r[a, 1] * fibre[i, 1] + r[a, 2] * fibre[i, 2]
             for b in range(3):
@@ -103,7 +106,7 @@ class ShapeConstraint:
 
     E(x) = Σ_i Σ_j w_ij |(x_j - x_i) - T_i (X_j - X_i)|²,  T_i = R_i (t aaᵀ + t^(-1/2) (I - aaᵀ)),
     with R_i the rotation of the cluster's deformation gradient F_i, a its fibre direction at rest and t its
-    fibre stretch |F_i a|, free within ``limits`` but for the share ``hold`` that pulls it back to one. Thickness
+    fibre stretch |F_i a|, free within ``limits`` but for the share that ``law`` pulls it back by. Thickness
     follows the stretch at constant volume. With T frozen E is quadratic with the matrix ``laplacian`` (as in ARAP,
     Sorkine & Alexa 2007, or projective dynamics, Bouaziz 2014).
 
@@ -116,11 +119,16 @@ class ShapeConstraint:
         Weight of each directed edge.
     fibre : (K, 3) ndarray
         Unit fibre direction at rest.
+    hold : float
+        Share that pulls the stretch back to one, where there is no ``law``.
+    law : rbfmuscle.sim.contraction.law.FibreLaw, optional
+        Of the clusters of a muscle that contracts.
     """
 
-    def __init__(self, rest, start, other, weight, fibre, *, limits=(0.5, 2.0), hold=0.1):
+    def __init__(self, rest, start, other, weight, fibre, *, limits=(0.5, 2.0), hold=0.1, law=None):
         self.rest, self.start, self.other, self.weight, self.fibre = rest, start, other, weight, fibre
-        self.limits, self.hold = limits, hold
+        self.limits = limits
+        self.law = law or FibreLaw(np.zeros(len(rest), dtype=bool), None, hold=hold)
         count = len(rest)
         head = np.repeat(np.arange(count), np.diff(start))
         edge = rest[other] - rest[head]
@@ -144,7 +152,8 @@ class ShapeConstraint:
         """Update F_i and T_i from the centres and return the right side b of laplacian · x = b, (K, 3)."""
         low, high = self.limits
         _local_loop(
-            x, self.arm, self.start, self.other, self.inverse, self.fibre, low, high, self.hold,
+            x, self.arm, self.start, self.other, self.inverse, self.fibre, low, high,
+            (self.law.lower, self.law.upper, self.law.share, self.law.across),
             self.quaternion, self.target, self.deformation,
         )  # fmt: skip
         _right_side_loop(self.arm, self.start, self.other, self.target, self.right_side)

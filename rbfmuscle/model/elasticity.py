@@ -8,11 +8,13 @@ from rbfmuscle.model.constraints import ShapeConstraint, VolumeConstraint
 from rbfmuscle.model.contact import ContactConstraint
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.model.rest import Rest
+from rbfmuscle.sim.contraction.law import FibreLaw
 from rbfmuscle.sim.loop.contact import BoneContacts
 
 CONTACT_TOLERANCE = 2e-5  # of the muscle's size: some micrometres
 REACH_MARGIN = 0.003  # of the muscle's size
 SETTLED = 1e-4  # of the muscle's size: an iteration that moves no centre farther was the last one
+SETTLED_STILL = 2e-6  # the same where no bone moves, so that only activation leads anywhere
 
 
 @compiled(error_model="numpy")
@@ -65,13 +67,17 @@ class ElasticSolver:
     ----------
     rest : Rest
     options : RBFOptions
+    law : FibreLaw, optional
+        Of a muscle that contracts.
     """
 
-    def __init__(self, rest: Rest, options: RBFOptions) -> None:
+    def __init__(self, rest: Rest, options: RBFOptions, law: FibreLaw | None = None) -> None:
+        self.settled = SETTLED
         self.iterations, self.memory = options.iterations, options.acceleration
         self.shape = ShapeConstraint(
             rest.centres, rest.start, rest.other, rest.weight, rest.fibres,
             limits=(options.stretch_low, options.stretch_high), hold=options.stretch_hold,
+            law=law,
         )  # fmt: skip
         self.volume = VolumeConstraint(rest.samples, rest.sample_faces)
         self.points = rest.contact_points()
@@ -119,7 +125,7 @@ class ElasticSolver:
         for step in range(self.iterations):
             new = self._iterate(x, contacts)
             moved = float(np.sqrt(((new - x) ** 2).sum(axis=1).max()))
-            if step + 1 == self.iterations or moved < SETTLED * self.scale:
+            if step + 1 == self.iterations or moved < self.settled * self.scale:
                 x = new
                 break
             x[self.free] = mixer.mix(x[self.free], new[self.free])

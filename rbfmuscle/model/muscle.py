@@ -7,8 +7,9 @@ import numpy as np
 
 from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.implicit.field import RBFField
+from rbfmuscle.model.contraction import contracting
 from rbfmuscle.model.drawing import RBFDrawing, SurfaceDrawer
-from rbfmuscle.model.elasticity import ElasticSolver
+from rbfmuscle.model.elasticity import SETTLED, SETTLED_STILL, ElasticSolver
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.model.rest import Rest
 from rbfmuscle.sim.loop.contact import BoneContacts
@@ -34,6 +35,8 @@ class RBFMuscle:
         The centres now.
     rest : Rest
     solver : ElasticSolver
+    law : FibreLaw or None
+        Of a muscle that contracts.
 
     Raises
     ------
@@ -45,7 +48,10 @@ class RBFMuscle:
         self.name = muscle.name
         self.options = options or RBFOptions()
         self.rest = Rest.from_muscle(muscle, scene, self.options)
-        self.solver = ElasticSolver(self.rest, self.options)
+        self.law = None
+        if muscle.contraction is not None:
+            self.rest, self.law = contracting(muscle, self.rest, self.options)
+        self.solver = ElasticSolver(self.rest, self.options, self.law)
         self.drawer = SurfaceDrawer(self.name, scene, self.rest, self.options)
         names = [bone.name for bone in scene.bones]
         numbers = np.array([names.index(bone) for bone in self.rest.bones])
@@ -64,6 +70,9 @@ class RBFMuscle:
         """Go along with the bones; held centres arrive exactly."""
         rest = self.rest
         motions = np.array([after[bone] @ np.linalg.inv(before[bone]) for bone in rest.bones])
+        if self.law is not None:
+            still = all(np.array_equal(before[bone], after[bone]) for bone in rest.bones)
+            self.solver.settled = SETTLED_STILL if still else SETTLED
         self.points = blended_motion(self.points, rest.weights, motions)
         for b, bone in enumerate(rest.bones):
             held = rest.held[rest.holder[rest.held] == b]
@@ -72,6 +81,10 @@ class RBFMuscle:
     def solve(self, contacts: BoneContacts) -> None:
         """Settle the centres under shape, volume and contact at the contacts' present poses."""
         self.points = self.solver.solve(self.points, contacts)
+
+    def activate(self, activation: float) -> None:
+        """Take an activation, 0 to 1, that the next `solve` settles under."""
+        self.law.activate(activation)
 
     def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
         """Move the centres that carry contact points marked in a bool mask by a (4, 4) transform; held ones stay."""

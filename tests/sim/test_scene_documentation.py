@@ -7,11 +7,14 @@ from typing import Literal, get_args, get_origin
 
 import pytest
 
+from rbfmuscle.sim.contraction import keys
 from rbfmuscle.sim.scene import attachments, joint_tables, options
 from rbfmuscle.sim.scene import file as scene_file
 
 TEXT = (Path(__file__).parents[2] / "docs" / "scene_file.md").read_text(encoding="utf-8")
 SECTIONS = dict(part.split("\n", 1) for part in TEXT.split("\n## ")[1:])
+CONTRACTION = "docs/contraction.md"
+SECTIONS[CONTRACTION] = (Path(__file__).parents[2] / CONTRACTION).read_text(encoding="utf-8")
 
 
 def documented_tables():
@@ -39,6 +42,9 @@ def documented_tables():
         options.SurfaceOptions: "`[output]`",
         options.FibreOptions: "`[output]`",
         options.ArmOptions: "`[output]`",
+        keys.ContractionTable: CONTRACTION,
+        keys.CourseTable: CONTRACTION,
+        keys.TendonTable: CONTRACTION,
     }
 
 

@@ -71,6 +71,8 @@ class Frame:
         Empty where no fibres were asked for.
     nudged : dict of str to dict
         For each muscle and each coordinate that moves it, a `Nudged`; empty where no moment arms were asked for.
+    activations : dict of str to float
+        Of the muscles that contract.
     """
 
     index: int
@@ -83,6 +85,7 @@ class Frame:
     wall: float
     fibres: dict = field(default_factory=dict)
     nudged: dict = field(default_factory=dict)
+    activations: dict = field(default_factory=dict)
 
 
 class Drawing(Protocol):
@@ -140,6 +143,9 @@ class MuscleModel(Protocol):
 
     def restore(self, state: Any) -> None:
         """Go back to a snapshot; it can be used again."""
+
+    def activate(self, activation: float) -> None:
+        """Take an activation, 0 to 1, that the next :meth:`solve` settles under; for muscles that contract."""
 
     def carried_mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and faces of a surface that moves with the material, of constant topology."""

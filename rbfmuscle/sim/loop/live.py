@@ -5,10 +5,12 @@ import math
 
 import numpy as np
 
+from rbfmuscle.sim.contraction.course import STEP
 from rbfmuscle.sim.joints.skeleton import all_coordinates
 from rbfmuscle.sim.loop.simulate import FrameLoop
 from rbfmuscle.sim.plan.reach import build_fields, reached_bones
 from rbfmuscle.sim.scene.motion import Motion
+from rbfmuscle.validation import UsageError
 
 # What a coordinate may be turned by where the scene's own motion does not go further [degree].
 FREE_RANGE = 30.0
@@ -31,6 +33,8 @@ class LiveSession:
         Where the bones are [radian].
     target : dict of str to float
         Where they shall be [radian].
+    activation : dict of str to float
+        What the muscles that contract shall have, 0 to 1.
     """
 
     def __init__(self, scene, *, fields=None):
@@ -39,6 +43,7 @@ class LiveSession:
         self.fields = live_fields(scene) if fields is None else fields
         self.rest = _rest(scene, self.limits)
         self.here, self.target = dict(self.rest), dict(self.rest)
+        self.activation = {m.name: 0.0 for m in scene.muscles if m.contraction is not None}
         self.models, self._rest, self._loop = [], [], None
 
     def use(self, models, rest=None):
@@ -65,6 +70,8 @@ class LiveSession:
         self.close()
         for model, state in zip(self.models, self._rest):
             model.restore(state)
+            if model.name in self.activation:
+                model.activate(0.0)
         self.here = dict(self.rest)
 
     def set(self, name, angle):
@@ -72,10 +79,19 @@ class LiveSession:
         low, high = self.limits[name]
         self.target[name] = min(max(float(angle), low), high)
 
+    def activate(self, muscle, activation):
+        """Give a muscle that contracts a new activation, kept from 0 to 1."""
+        if muscle not in self.activation:
+            raise UsageError(f"muscle {muscle!r} does not contract: give it activation = 0 in the scene")
+        self.activation[muscle] = min(max(float(activation), 0.0), 1.0)
+
     @property
     def arrived(self):
-        """Whether the bones are where they shall be."""
-        return all(abs(self.target[name] - self.here[name]) < 1e-9 for name in self.target)
+        """Whether the bones are where they shall be, and the muscles as active."""
+        active = self._loop.activations.here if self._loop else dict.fromkeys(self.activation, 0.0)
+        return all(abs(self.target[name] - self.here[name]) < 1e-9 for name in self.target) and all(
+            abs(value - active[name]) < 1e-9 for name, value in self.activation.items()
+        )
 
     def advance(self, stride=math.inf):
         """Go towards the target and return the frame reached.
@@ -83,7 +99,8 @@ class LiveSession:
         Parameters
         ----------
         stride : float
-            No coordinate changes by more [radian], so that the next picture does not wait for a long way.
+            No coordinate changes by more [radian], so that the next picture does not wait for a long way. Then no
+            activation changes by more than one sub-step's either.
 
         Returns
         -------
@@ -99,6 +116,11 @@ class LiveSession:
         step = {k: self.here[k] + share * (self.target[k] - self.here[k]) for k in self.target}
         if self._loop is None:
             self._loop = FrameLoop(_wide_scene(self.scene), self.models, fields=self.fields)
+        active = self._loop.activations
+        reach = 1.0 if stride == math.inf else STEP
+        for name, wanted in self.activation.items():
+            now = active.here[name]
+            active.target[name] = now + min(max(wanted - now, -reach), reach)
         frame = self._loop.advance(dict(self.target) if share == 1.0 else step)
         self.here = dict(frame.coordinates)
         return frame

@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
 from contextlib import contextmanager
 
+from rbfmuscle.sim.contraction.course import Activations
 from rbfmuscle.sim.loop.contact import BoneContacts
 from rbfmuscle.sim.loop.frame import Event, FinishedDrawing, Frame, ModelSurface, MuscleModel
 from rbfmuscle.sim.loop.overlap import settle_rest
@@ -50,6 +51,8 @@ class FrameLoop:
     ----------
     here : dict of str to float
         Where the bones are [radian]; empty at rest, before the first frame.
+    activations : Activations
+        Of the muscles that contract.
 
     Raises
     ------
@@ -74,6 +77,7 @@ class FrameLoop:
             for model, contacts in zip(models, _obstacles(scene, models, fields))
         ]
         self.here: dict[str, float] = {}
+        self.activations = Activations(scene)
         self._sub_steps, self._next_index, self._wall = SubSteps(scene), 0, 0.0
         self.workers = Workers(len(self.steppers))
         try:
@@ -107,14 +111,14 @@ class FrameLoop:
             If a muscle cannot be solved, naming muscle, frame and coordinates.
         """
         with self.clocked():
-            stops = self._path_to(coordinates)
+            path = self._path_to(coordinates)
             if self.surfaces and self._sliding is None and self.workers.parallel:
                 # Nothing waits for another muscle: each goes all the way, and no thread idles in between.
                 with self.workers.one_thread_each():
-                    drawn = self.workers.each(lambda stepper: stepper.go(stops).draw(), self.steppers)
+                    drawn = self.workers.each(lambda stepper: stepper.go(*path).draw(), self.steppers)
             else:
                 with self.workers.one_thread_each():
-                    self._solve(stops)
+                    self._solve(*path)
                     drawings = self._drawings() if self.surfaces else []
                 with self.workers.all_threads():
                     drawn = self.workers.each(TimedDrawing.draw, drawings)
@@ -124,12 +128,12 @@ class FrameLoop:
     def skip(self, coordinates: Mapping[str, float]) -> None:
         """Go on to a frame and show nothing: its times and events are in the next frame that is shown."""
         with self.clocked(), self.workers.one_thread_each():
-            self._solve(self._path_to(coordinates))
+            self._solve(*self._path_to(coordinates))
 
     def start(self, coordinates: Mapping[str, float]) -> list[Future]:
         """Set out for a frame: for each muscle what will be its `TimedDrawing`, for `run_ahead`."""
-        stops = self._path_to(coordinates)
-        return self.workers.start(lambda stepper: stepper.go(stops), self.steppers)
+        path = self._path_to(coordinates)
+        return self.workers.start(lambda stepper: stepper.go(*path), self.steppers)
 
     def collect(self) -> Frame:
         """The frame where the muscles are now, without its surfaces."""
@@ -142,6 +146,7 @@ class FrameLoop:
         poses = bone_poses(self.scene, self.here)
         frame = Frame(self._next_index - 1, dict(self.here), poses, {}, carried, events, times, 0.0)
         frame.nudged.update(nudged)
+        frame.activations.update(self.activations.here)
         return frame
 
     def _nudged(self) -> dict:
@@ -183,22 +188,25 @@ class FrameLoop:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _path_to(self, coordinates: Mapping[str, float]) -> list[dict]:
-        """Coordinates of the sub-steps to the next frame, the first of which is where the muscles are."""
+    def _path_to(self, coordinates: Mapping[str, float]) -> tuple[list[dict], list[dict]]:
+        """Coordinates of the sub-steps to the next frame, the first of which is where the muscles are; activations."""
         # Whatever a motion chooses to move starts at rest, which for most coordinates is zero.
         here = self.here or dict.fromkeys(coordinates, 0.0) | rest_coordinates(self.scene)
         self.here = completed(self.scene, coordinates)
         for stepper in self.steppers:
             stepper.frame = self._next_index
         self._next_index += 1
-        return [here, *self._sub_steps.split(here, self.here)]
+        stops = [here, *self._sub_steps.split(here, self.here)]
+        return self.activations.refine(self._next_index - 1, stops)
 
-    def _solve(self, stops: list[dict]) -> None:
+    def _solve(self, stops: list[dict], activations: list[dict]) -> None:
         """Bring all muscles through sub-steps; those that slide take each together."""
         if self._sliding is None:
-            self.workers.each(lambda stepper: stepper.advance(stops), self.steppers)
+            self.workers.each(lambda stepper: stepper.advance(stops, activations), self.steppers)
             return
-        for before, after in itertools.pairwise(stops):
+        for before, after, activation in itertools.zip_longest(stops[:-1], stops[1:], activations):
+            for stepper in self.steppers:
+                stepper.excite(activation)
             self.workers.each(lambda stepper: self._begin(stepper, before, after), self.steppers)  # noqa: B023
             self.workers.each(self._sliding.update, self.steppers)
             self.workers.each(MuscleStepper.finish, self.steppers)

@@ -3,6 +3,7 @@
 import itertools
 import math
 import time
+from collections.abc import Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -71,10 +72,19 @@ class MuscleStepper:
             key = f"time_{stage}"
             self.times[key] = self.times.get(key, 0.0) + time.perf_counter() - start
 
-    def advance(self, stops):
-        """Go through sub-steps: a list of coordinates, the first of which is where the muscle is."""
-        for before, after in itertools.pairwise(stops):
+    def advance(self, stops, activations=()):
+        """Go through sub-steps: a list of coordinates, the first of which is where the muscle is.
+
+        ``activations`` holds, for muscles that contract, the activation by muscle at the end of each.
+        """
+        for before, after, activation in itertools.zip_longest(stops[:-1], stops[1:], activations):
+            self.excite(activation)
             self.step(before, after)
+
+    def excite(self, activation):
+        """Give the model its activation, where it is among those (by muscle; None for no muscle at all)."""
+        if activation is not None and self.name in activation:
+            self.model.activate(activation[self.name])
 
     def step(self, before, after):
         """One sub-step, watched for tunnelling where the scene asks for it."""
@@ -119,9 +129,9 @@ class MuscleStepper:
                 "try a smaller substep_angle in [contact]"
             )
 
-    def go(self, stops: list[dict]) -> TimedDrawing:
+    def go(self, stops: list[dict], activations: Sequence[dict] = ()) -> TimedDrawing:
         """Go through sub-steps; what draws the muscle there."""
-        self.advance(stops)
+        self.advance(stops, activations)
         return self.drawing()
 
     def drawing(self) -> TimedDrawing:

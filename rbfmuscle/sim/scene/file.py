@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field, ValidationError, field_validator
 
+from rbfmuscle.sim.contraction.keys import KEYS
 from rbfmuscle.sim.scene.attachments import AttachTable
 from rbfmuscle.sim.scene.check import check_centre, check_place, check_size
 from rbfmuscle.sim.scene.joint_tables import (
@@ -66,6 +67,11 @@ class DefaultsTable(Table):
     scale: Positive = 1.0
     attach: list[AttachTable] = Field(default_factory=list)
     fibres: str | None = None
+    activation: Any = None
+    fibre_stretch_at_rest: Any = None
+    optimal_fibre_length: Any = None
+    shortening: Any = None
+    tendon: Any = None
 
     @field_validator("model")
     @classmethod
@@ -195,6 +201,8 @@ def _add_muscle(scene, muscle, defaults, folder):
         model=_merge_model(given.get("model", "rbf"), defaults.model),
         fibres=str(folder / fibres) if fibres is not None else None,
         scale=scale,
+        folder=folder,
+        **{key: given[key] for key in KEYS if key in given},
     )
 
 
@@ -263,8 +271,13 @@ def _describe_muscle(muscle):
         "model": {"name": muscle.model, **muscle.options},
         "attach": [{"bone": a.bone, "vertices": len(a.vertices)} for a in muscle.attachments],
         "fibres": len(muscle.fibres) if muscle.fibres else 0,
+        **_describe_contraction(muscle.contraction),
         **_mesh_facts(muscle),
     }
+
+
+def _describe_contraction(keys):
+    return {} if keys is None else keys.model_dump(by_alias=True, exclude_none=True)
 
 
 def _mesh_facts(item):

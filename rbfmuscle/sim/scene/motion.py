@@ -45,6 +45,8 @@ class Motion:
         What the frames were made from.
     times : list of float, optional
         Time of each frame [s], where a motion file gives it.
+    progress : (n,) ndarray, optional
+        Where each frame lies in the whole motion, 0 to 1; even where not given.
     notes : list of str
         What a user should know: coordinates that leave their range, columns that were not used.
     """
@@ -55,11 +57,13 @@ class Motion:
         *,
         options: MotionOptions | None = None,
         times: list[Any] | None = None,
+        progress: np.ndarray | None = None,
         notes: Sequence[Any] = (),
     ) -> None:
         self.frames = [dict(frame) for frame in frames] if frames is not None else [{}]
         self.options = options or MotionOptions()
         self.times = None if times is None else list(times)
+        self.progress = np.linspace(0.0, 1.0, len(self.frames)) if progress is None else progress
         self.notes = list(notes)
 
     @classmethod
@@ -131,7 +135,8 @@ class Motion:
                 f"frames {_slice_text(frames)} selects none of the {len(self.frames)} frames of the motion"
             )
         times = None if self.times is None else self.times[frames]
-        return Motion(chosen, options=self.options, times=times, notes=self.notes)
+        progress = self.progress[frames]
+        return Motion(chosen, options=self.options, times=times, progress=progress, notes=self.notes)
 
     def __len__(self) -> int:
         return len(self.frames)

@@ -48,7 +48,7 @@ def read_motion_file(
     SceneError
         Naming the file and what is wrong in it.
     """
-    header, labels, rows = _parts(path)
+    header, labels, rows = storage_parts(path)
     if len(rows) > most:
         raise SceneError(f"[motion]: {path} has {len(rows)} rows, more than {most}")
     known = list(facts)
@@ -91,17 +91,20 @@ def match_label(label: str, known: list[str]) -> str | None:
     return None
 
 
-def _parts(path):
+def storage_parts(
+    path: Path, *, place: str = "[motion]"
+) -> tuple[dict[str, str], list[str], list[list[str]]]:
+    """Header, labels of the columns and rows, as words, of an OpenSim storage; errors begin with ``place``."""
     if not is_file(path):
-        raise SceneError(f"[motion]: cannot read {shown(str(path))}: no such file")
+        raise SceneError(f"{place}: cannot read {shown(str(path))}: no such file")
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError as error:
-        raise SceneError(f"[motion]: cannot read {path}: {error.strerror}") from None
+        raise SceneError(f"{place}: cannot read {path}: {error.strerror}") from None
     ends = [row for row, line in enumerate(lines) if line.strip().lower() == "endheader"]
     if not ends or len(lines) < ends[0] + 3:
         raise SceneError(
-            f"[motion]: {path} is no OpenSim motion: no 'endheader' line with columns and rows after it"
+            f"{place}: {path} is no OpenSim motion: no 'endheader' line with columns and rows after it"
         )
     header = dict(line.split("=", 1) for line in lines[: ends[0]] if "=" in line)
     header = {key.strip().lower(): value.strip().lower() for key, value in header.items()}

@@ -21,7 +21,10 @@ class Bone:
 
 @dataclass
 class Muscle:
-    """A closed surface (trimesh.Trimesh, outward, rest pose) held by bones, and the model that moves it."""
+    """A closed surface (trimesh.Trimesh, outward, rest pose) held by bones, and the model that moves it.
+
+    ``contraction`` holds the keys of a muscle that contracts (ContractionTable), None for any other.
+    """
 
     name: str
     mesh: Any
@@ -31,3 +34,4 @@ class Muscle:
     fibres: list | None = None
     source: str = ""
     notes: list = field(default_factory=list)
+    contraction: object = None

@@ -242,6 +242,8 @@ class Scene:
         model: dict[str, Any] | str = "rbf",
         fibres: ArrayLike | None = None,
         scale: float = 1.0,
+        folder: Path | None = None,
+        **contraction: Any,
     ) -> Scene:
         """Add a muscle and return the scene.
 
@@ -258,7 +260,12 @@ class Scene:
         fibres : path or list of (k, 3) array_like, optional
         scale : float
             Factor from the mesh's unit to the scene's; fibres are scaled alike.
+        folder : path, optional
+            What the files of ``contraction`` are relative to.
+        **contraction
+            ``activation``, ``fibre_stretch_at_rest``, ``optimal_fibre_length``, ``shortening``, ``tendon``.
         """
+        from rbfmuscle.sim.contraction.resolve import contraction_keys
         from rbfmuscle.sim.scene.fibres import read_fibres
 
         _check_new_name(self.muscles, name, "muscle")
@@ -266,8 +273,9 @@ class Scene:
         model_name, options = split_model(model, place=f"muscle {name!r}")
         attachments = resolve_attachments(attach, read, self.bones, muscle=name)
         lines = None if fibres is None else read_fibres(fibres, scale=scale, muscle=name)
+        keys = contraction_keys(contraction, muscle=name, folder=folder)
         self.muscles.append(
-            Muscle(name, read.mesh, model_name, options, attachments, lines, read.source, read.notes)
+            Muscle(name, read.mesh, model_name, options, attachments, lines, read.source, read.notes, keys)
         )
         return self
 
@@ -305,7 +313,16 @@ class Scene:
                 raise SceneError(
                     f"muscle {muscle.name!r} is attached to {bones[0]!r} only, give attach a second bone"
                 )
+            if muscle.contraction is not None:
+                self._check_contraction(muscle)
         return self
+
+    def _check_contraction(self, muscle: Muscle) -> None:
+        from rbfmuscle.sim.contraction.course import activation_course
+        from rbfmuscle.sim.contraction.resolve import resolve_contraction
+
+        resolve_contraction(muscle)
+        activation_course(muscle, self.motion)
 
     def check(self) -> list[Any]:
         """Return findings about the scene (errors, warnings, notes); nothing is solved.

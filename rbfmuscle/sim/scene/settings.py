@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rbfmuscle.sim.contraction.keys import KEYS
 from rbfmuscle.sim.scene.options import DetectOptions, SlidingOptions, check_plain
 from rbfmuscle.validation import SceneError, UsageError, did_you_mean
 
@@ -34,7 +35,8 @@ def apply_settings(scene: Scene, settings: Mapping[str, Any]) -> None:
 
     ``model`` or ``model.KEY`` change every muscle, ``muscle.NAME.model`` or ``muscle.NAME.model.KEY`` one;
     ``contact.KEY``, ``sliding.KEY``, ``detect.KEY`` and ``output.KEY`` change a table (one that the scene
-    lacks is switched on); ``motion.step`` changes the step of every ramp and
+    lacks is switched on); ``activation`` and the other keys of contraction change every muscle,
+    ``muscle.NAME.activation`` one; ``motion.step`` changes the step of every ramp and
     ``motion.ramp.NAME.COORDINATE.KEY`` one key of one. Whole models come first, whatever the order, as another
     model drops the settings of the one before.
 
@@ -83,9 +85,16 @@ def _apply(scene, key, value):
         name, _, rest = rest.partition(".")
         head, _, rest = rest.partition(".")
         muscle = scene.muscle(name)
+        if head in KEYS:
+            _set_contraction([muscle], scene, head, rest, value)
+            return
         if head != "model":
-            raise SceneError(f"{key}: of a muscle only its model can be set (muscle.{name}.model.KEY)")
+            raise SceneError(
+                f"{key}: of a muscle its model (muscle.{name}.model.KEY) and {', '.join(KEYS)} can be set"
+            )
         _set_model([muscle], scene, rest, value, key)
+    elif head in KEYS:
+        _set_contraction(scene.muscles, scene, head, rest, value)
     elif head == "motion":
         _set_motion(scene, rest, value, key)
     elif head in TABLES and rest:
@@ -96,7 +105,7 @@ def _apply(scene, key, value):
     elif head in TABLES:
         raise SceneError(f"{key}: name a key of the table, for instance {head}.KEY=VALUE")
     else:
-        raise SceneError(f"{key}: unknown setting, {did_you_mean(head, ['model', 'muscle', *TABLES])}")
+        raise SceneError(f"{key}: unknown setting, {did_you_mean(head, ['model', 'muscle', *KEYS, *TABLES])}")
 
 
 def parse_setting(text: str) -> tuple[Any, ...]:
@@ -160,6 +169,21 @@ def _set_model(muscles, scene, rest, value, key):
             options[parent] = dict(inner)
             options = options[parent]
         options[last] = value
+
+
+def _set_contraction(muscles, scene, key, rest, value):
+    from rbfmuscle.sim.contraction.resolve import contraction_keys
+
+    folder = scene.path.parent if scene.path else None
+    for muscle in muscles:
+        table = muscle.contraction
+        given = {} if table is None else table.model_dump(by_alias=True, exclude_unset=True)
+        if rest:
+            inner = given.get(key)
+            given[key] = {**(inner if isinstance(inner, dict) else {}), rest: value}
+        else:
+            given[key] = value
+        muscle.contraction = contraction_keys(given, muscle=muscle.name, folder=folder)
 
 
 def _set_motion(scene, rest, value, key):

@@ -48,6 +48,15 @@ QUANTITIES = {
     "condition": ("1", "condition estimate of the fit"),
     "length": ("length", "centreline from origin to insertion"),
     "moment_arm": ("length", "minus the change of length with the coordinate's angle"),
+    "activation": ("1", "activation, 0 to 1; this and the next seven for muscles that contract"),
+    "fibre_length": ("length", "mean length of the fibres without their tendon"),
+    "fibre_stretch": ("1", "mean stretch of these against the scan"),
+    "fibre_stretch_5": ("1", "the stretch that 5 % of their segments stay below"),
+    "fibre_stretch_95": ("1", "the stretch that 5 % of their segments exceed"),
+    "pennation": ("deg", "mean angle of these to the line between the middles of origin and insertion"),
+    "belly_thickness": ("length", "least width of the greatest section across that line"),
+    "csa_max": ("area", "area of the greatest section across that line"),
+    "csa_place": ("1", "where it lies: 0 at the origin, 1 at the insertion"),
     "fibre_length_mean": ("length", "mean length of the fibres"),
     "fibre_length_std": ("length", "standard deviation of the fibres' lengths"),
     "fibre_moment_arm_mean": ("length", "mean over the fibres of their moment arms"),
@@ -180,6 +189,7 @@ class _Tracker:
         self.rest_lengths = edge_lengths(vertices, self.edges)
         has_line = len(muscle.attachments) > 1
         self.line = Centreline(muscle, scene.joints, vertices, faces) if has_line else None
+        self.contraction = _contraction(muscle, scene, vertices, faces)
         self.length = math.nan
         self.rest_measured = False
         output = getattr(scene, "output", None)
@@ -210,6 +220,10 @@ class _Tracker:
             found["length"] = self.length
         if self.nudged:
             self.arms[frame.index] = self._nudged_arms(frame)
+        if self.contraction is not None:
+            found["activation"] = frame.activations[self.name]
+            surface = frame.surfaces.get(self.name)
+            found.update(self.contraction.measure(frame.carried[self.name][0], frame.poses, surface))
         if self.name in frame.fibres:
             lengths = frame.fibres[self.name].lengths
             found.update(fibre_length_mean=np.mean(lengths), fibre_length_std=np.std(lengths))
@@ -257,9 +271,17 @@ class _Tracker:
         return float(np.sqrt(np.mean(change**2))), float(np.abs(change).max())
 
 
+def _contraction(muscle, scene, vertices, faces):
+    if getattr(muscle, "contraction", None) is None:
+        return None
+    from rbfmuscle.study.measure.contraction import ContractionStudy
+
+    return ContractionStudy(muscle, scene.joints, vertices, faces)
+
+
 def unit_text(kind: str, units: str) -> str:
     """Unit of a quantity as written in tables: ``length`` and ``volume`` take the scene's unit."""
-    return {"length": units, "volume": f"{units}^3"}.get(kind, kind)
+    return {"length": units, "area": f"{units}^2", "volume": f"{units}^3"}.get(kind, kind)
 
 
 def count_components(count: int, faces: Integers) -> int:

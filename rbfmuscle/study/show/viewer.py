@@ -34,8 +34,13 @@ COLOURINGS = {
     "distance": ("distance to bone", (0.0, 20.0), "viridis"),
     "stretch": ("stretch of edges", (-0.5, 0.5), "coolwarm"),
     "volume": ("volume error", (-0.01, 0.01), "coolwarm"),
+    "fibres": ("stretch of fibres", (0.5, 1.5), "coolwarm"),
+    "activation": ("activation", (0.0, 1.0), "Reds"),
 }
 LENGTHS = ("penetration", "distance")
+CONTRACTION = ("fibres", "activation")  # colourings of muscles that contract
+NEAREST_FIBRES = 4  # segments that speak for one vertex
+ACTIVATION = "activation "  # what the name of a muscle's slider begins with
 # Coordinates advance by so many sub-steps a picture, so that a picture never waits for a long way.
 SUBSTEPS_A_PICTURE = 1
 
@@ -193,6 +198,7 @@ class LiveViewer(Viewer):
         self.rest_volume = {m.name: float(m.mesh.volume) for m in scene.muscles}
         self.stride = SUBSTEPS_A_PICTURE * math.radians(scene.contact.substep_angle)
         self._built, self._edges, self._frame, self._rate = {}, {}, None, 0.0
+        self._studies, self._rests = {}, {}
         self._stale = True
         self._switch()
 
@@ -213,25 +219,31 @@ class LiveViewer(Viewer):
                 carried, faces = model.carried_mesh()
                 edges = unique_edges(faces)
                 self._edges[model.name] = edges, edge_lengths(carried, edges)
+                self._rests[(*key, model.name)] = carried, faces
         self._stale, self.message = True, ""
 
     @property
     def coordinates(self) -> dict[str, Any]:
-        """Name, limits and target of each coordinate [degree or scene unit]."""
+        """Name, limits and target of each coordinate [degree or scene unit], and of each activation (0 to 1)."""
         target, scene = self.session.target, self.session.scene
         return {
             name: tuple(shown_value(scene, name, value) for value in (low, high, target[name]))
             for name, (low, high) in self.session.limits.items()
-        }
+        } | {ACTIVATION + name: (0.0, 1.0, value) for name, value in self.session.activation.items()}
 
     def set(self, name: str, degrees: float) -> None:
         """Move a slider."""
-        self.session.set(name, inner_value(self.session.scene, name, degrees))
+        if name.startswith(ACTIVATION):
+            self.session.activate(name.removeprefix(ACTIVATION), degrees)
+        else:
+            self.session.set(name, inner_value(self.session.scene, name, degrees))
 
     def rest(self) -> None:
         """All sliders to where the meshes are."""
         for name, value in self.session.rest.items():
             self.session.set(name, value)
+        for name in self.session.activation:
+            self.session.activate(name, 0.0)
 
     def colour_by(self, name: str) -> None:
         """Show another quantity in colours."""
@@ -281,10 +293,28 @@ class LiveViewer(Viewer):
                 found = self._values(
                     name, surface.vertices, surface.faces, frame.poses, frame.carried[name], error
                 )
+                if self.colouring in CONTRACTION and name in self.session.activation:
+                    found = self._contraction(name, frame)
                 view.values[name] = found
         if self.message:
             view.lines.append(self.message)
         return view
+
+    def _contraction(self, name, frame):
+        """Activation of a muscle, or the stretch of its nearest fibres, at each vertex of its surface."""
+        vertices = frame.surfaces[name].vertices
+        if self.colouring == "activation":
+            return np.full(len(vertices), frame.activations[name])
+        key = (self.model, self.quality, name)
+        if key not in self._studies:
+            from rbfmuscle.study.measure.contraction import ContractionStudy
+
+            scene = self.session.scene
+            self._studies[key] = ContractionStudy(scene.muscle(name), scene.joints, *self._rests[key])
+        middles, stretch = self._studies[key].stretches(frame.carried[name][0])
+        distance, index = cKDTree(middles).query(vertices, k=min(NEAREST_FIBRES, len(middles)))
+        share = 1.0 / np.maximum(distance, 1e-9 * np.ptp(vertices)) ** 2
+        return (share * stretch[index]).sum(axis=1) / share.sum(axis=1)
 
     def _rest_edges(self, name, carried, faces):
         return self._edges[name]

@@ -1,0 +1,145 @@
+"""Scenes of muscles that contract, whose answers are known: by closed forms, or by finite elements.
+
+All lengths are in millimetres. Muscles lie along x at rest.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from peers.known_scenes import FAR, Bar, _block
+from rbfmuscle.sim.scene.attachments import Attachment
+from rbfmuscle.sim.scene.phantom_shapes import stitch
+from rbfmuscle.sim.scene.scene import Scene
+
+MUSCLE = "muscle"
+# Long against its radius: the ends keep theirs, over about one radius each, and that volume goes to the middle.
+FREE_BAR = Bar(length=600.0, width=10.0, thickness=10.0, dome=10.0)
+
+
+@dataclass(frozen=True)
+class Spindle:
+    """A belly between two tendons, round, of radius
+
+        r(x) = tendon + (belly - tendon) cos²(π x / belly_length)    for |x| < belly_length / 2, else tendon.
+
+    Parameters
+    ----------
+    length : float
+        Between the two flat ends; a dome of the tendon's radius lies beyond each.
+    belly_length, belly, tendon : float
+        Length of the belly, radius of its middle, radius of the tendons.
+    """
+
+    length: float = 320.0
+    belly_length: float = 120.0
+    belly: float = 15.0
+    tendon: float = 9.0
+
+    def radius(self, x):
+        """Radius at x, and its derivative."""
+        turn = np.pi * np.clip(np.asarray(x, dtype=float) / self.belly_length, -0.5, 0.5)
+        swell = self.belly - self.tendon
+        slope = -swell * np.pi / self.belly_length * np.sin(2.0 * turn)
+        return self.tendon + swell * np.cos(turn) ** 2, slope
+
+    def mesh(self, spacing):
+        """Closed outward triangles of about equal sides: vertices (n, 3) and faces (m, 3)."""
+        half, tip = 0.5 * self.length, self.tendon
+        rows = 2 * round(self.length / (np.sqrt(3) * spacing))
+        middle = np.linspace(-half, half, rows + 1)
+        deep = max(4, round(0.5 * np.pi * tip / spacing))
+        turn = 0.5 * np.pi * np.arange(1, deep) / deep
+        beyond, size = half + tip * np.sin(turn), tip * np.cos(turn)
+        x = np.concatenate([[-half - tip], -beyond[::-1], middle, beyond, [half + tip]])
+        radius = np.concatenate([[0.0], size[::-1], self.radius(middle)[0], size, [0.0]])
+        rings = []
+        for k, (place, r) in enumerate(zip(x, radius)):
+            count = 1 if r == 0.0 else max(6, round(2 * np.pi * r / spacing))
+            angle = 2 * np.pi * (np.arange(count) + 0.5 * (k % 2)) / count
+            rings.append(np.column_stack([np.full(count, place), r * np.cos(angle), r * np.sin(angle)]))
+        starts = np.concatenate([[0], np.cumsum([len(ring) for ring in rings])])
+        vertices = np.concatenate(rings)
+        faces = [
+            stitch(vertices, np.arange(a, b), np.arange(b, c))
+            for a, b, c in zip(starts[:-2], starts[1:-1], starts[2:])
+        ]
+        return vertices, np.concatenate(faces)
+
+    def fibres(self, *, count=60):
+        """Lines at constant shares of the radius, in the middle, at a half and at nine tenths of it."""
+        x = np.linspace(-0.5, 0.5, count) * self.length
+        radius = self.radius(x)[0]
+        lines = [np.column_stack([x, 0 * x, 0 * x])]
+        for share, number in ((0.5, 6), (0.9, 12)):
+            for angle in 2 * np.pi * np.arange(number) / number:
+                side = share * radius
+                lines.append(np.column_stack([x, side * math.cos(angle), side * math.sin(angle)]))
+        return lines
+
+
+SPINDLE = Spindle()
+
+
+def spindle_scene(*, spindle=SPINDLE, spacing=3.0, frames=10, model="rbf", **contraction):
+    """A spindle between two bones that stand still, activated from 0 to 1.
+
+    Parameters
+    ----------
+    spindle : Spindle
+    spacing : float
+        Edge length of the muscle's mesh [mm].
+    frames : int
+        Frames after the one at rest.
+    model : str or dict
+    **contraction
+        Keys of contraction; ``activation`` rises from 0 to 1 where not given.
+
+    Returns
+    -------
+    Scene
+    """
+    scene = Scene("spindle", units="mm")
+    ends = Bar(length=spindle.length, width=spindle.tendon, thickness=spindle.tendon, dome=spindle.tendon)
+    _add_slider(scene, ends)
+    vertices, faces = spindle.mesh(spacing)
+    contraction.setdefault("activation", [0.0, 1.0])
+    _add(scene, vertices, faces, 0.5 * spindle.length - 1e-6, spindle.fibres(), model, contraction)
+    scene.set_motion(waypoints=[{"slider.pull": 0.0}, {"slider.pull": 0.0}], step=1.0)
+    return with_frames(scene, [0.0] * (frames + 1), spindle.length)
+
+
+def bar_scene(*, bar=FREE_BAR, spacing=2.5, model="rbf", **contraction):
+    """A bar on a slider: `with_frames` moves it."""
+    scene = Scene("free_bar", units="mm")
+    _add_slider(scene, bar)
+    vertices, faces = bar.mesh(spacing)
+    # Only the domes are held, so that little of the bar keeps its girth.
+    _add(scene, vertices, faces, 0.5 * bar.length + 0.5 * bar.dome, bar.fibres(), model, contraction)
+    return scene
+
+
+def with_frames(scene, pulls, length):
+    """The scene with one frame for each pull of the slider [mm, positive shortens]."""
+    from rbfmuscle.sim.scene.motion import Motion
+
+    far = FAR * length
+    moved = scene.copy()
+    moved.motion = Motion([{"slider.pull": math.asin(pull / far)} for pull in pulls])
+    return moved.with_options({"contact.substep_angle": math.degrees(length / 50 / far)})
+
+
+def _add_slider(scene, bar):
+    """Two bones; the insertion turns about a far joint, so that it moves along x."""
+    scene.add_bone("origin", _block(bar, -1.0)).add_bone("insertion", _block(bar, 1.0))
+    far = FAR * bar.length
+    scene.add_joint("slider", "origin", "insertion", (0.5 * bar.length, 0.0, far), {"pull": (0, 1, 0)})
+
+
+def _add(scene, vertices, faces, edge, fibres, model, contraction):
+    attach = [
+        Attachment("origin", np.flatnonzero(vertices[:, 0] <= -edge)),
+        Attachment("insertion", np.flatnonzero(vertices[:, 0] >= edge)),
+    ]
+    scene.add_muscle(MUSCLE, (vertices, faces), attach=attach, model=model, fibres=fibres, **contraction)

@@ -1,0 +1,79 @@
+"""Mesh muscles that contract: rest lengths along and across the fibres follow the law of the fibres."""
+
+import numpy as np
+
+from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.sim.contraction.law import FibreLaw
+from rbfmuscle.sim.contraction.resolve import resolve_contraction
+
+# Weight of tendon edges in the ARAP energy, as in the RBF model (`rbfmuscle.model.fibres.TENDON_WEIGHT`).
+TENDON_WEIGHT = 100.0
+
+
+class MeshFibres:
+    """Fibres of a mesh muscle: a frame along the fibre at each edge, and what the edge should be in it.
+
+    An edge with the rest vector E, the fibre direction a and the target stretches t along and s across (means of its
+    two vertices) is wanted as T E, T = t aaᵀ + s (1 - aaᵀ): the frames of the RBF model, on edges.
+
+    Parameters
+    ----------
+    muscle : Muscle
+    rest : pbd_baseline.rest.Rest
+    hold : float
+        Share by which a passive fibre is pulled back: 1, as the mesh models know no other passive fibre.
+    """
+
+    def __init__(self, muscle, rest, *, hold=1.0):
+        contraction = resolve_contraction(muscle)
+        count = len(rest.vertices)
+        tendon = np.zeros(count, dtype=bool) if contraction is None else contraction.tendon[rest.order]
+        self.law = FibreLaw(tendon, contraction, hold=hold)
+        edges = rest.topology.edges
+        self.edges = edges
+        self.tendon = tendon[edges].all(axis=1)
+        self.vectors = rest.vertices[edges[:, 0]] - rest.vertices[edges[:, 1]]
+        one, other = rest.fibres[edges[:, 0]], rest.fibres[edges[:, 1]]
+        axis = one + np.where(np.einsum("ij,ij->i", one, other) < 0.0, -1.0, 1.0)[:, None] * other
+        size = np.linalg.norm(axis, axis=1, keepdims=True)
+        self.known = size > 1e-12  # else the fibres have no direction there
+        axis = np.divide(axis, size, out=np.zeros_like(axis), where=self.known)
+        along = np.einsum("ij,ij->i", self.vectors, axis)
+        self.along = along[:, None] * axis
+        square = np.einsum("ij,ij->i", self.vectors, self.vectors)
+        self.lengths = np.sqrt(square)
+        # How much an edge tells of the stretch along the fibre: the fourth power of the cosine between them.
+        self.says = (along**2 / np.maximum(square, 1e-300)) ** 2
+        self.stretch = np.ones(count)
+
+    @property
+    def activation(self):
+        """Present activation, 0 to 1."""
+        return self.law.activation
+
+    def targets(self, points):
+        """Wanted vectors of the edges (e, 3) in the rest frame, for the present points (n, 3)."""
+        _stretch_loop(points, self.edges, self.lengths, self.says, self.stretch)
+        along, across = self.law.goal(self.stretch)
+        t = 0.5 * (along[self.edges[:, 0]] + along[self.edges[:, 1]])[:, None]
+        s = 0.5 * (across[self.edges[:, 0]] + across[self.edges[:, 1]])[:, None]
+        t, s = np.where(self.known, t, 1.0), np.where(self.known, s, 1.0)
+        return s * self.vectors + (t - s) * self.along
+
+
+@compiled(error_model="numpy")
+def _stretch_loop(points, edges, lengths, says, stretch):
+    """Stretch along the fibre at each vertex: mean ratio of its edges, by how much they lie along the fibre."""
+    weight = np.full(len(stretch), 1e-9)
+    stretch[:] = 1e-9
+    for c in range(len(edges)):
+        i, j = edges[c, 0], edges[c, 1]
+        square = 0.0
+        for k in range(3):
+            square += (points[i, k] - points[j, k]) ** 2
+        ratio = says[c] * np.sqrt(square) / lengths[c]
+        stretch[i] += ratio
+        stretch[j] += ratio
+        weight[i] += says[c]
+        weight[j] += says[c]
+    stretch /= weight

@@ -1,0 +1,70 @@
+"""Muscles that contract, in both models: closed forms, laws, and finite elements."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from peers.contraction_scenes import MUSCLE, bar_scene, spindle_scene, with_frames
+from peers.known_scenes import Bar
+
+import rbfmuscle as rm
+from rbfmuscle.sim.contraction.keys import ContractionTable
+
+MODELS = ("rbf", "pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
+SETTLED = ("rbf", "arap-volume", "arap-interleaved")
+TENDON = {"length": 100.0, "strain": 0.08}
+DATA = Path(__file__).resolve().parents[1] / "data" / "contraction_spindle.npz"
+
+
+def carried(run, frame):
+    return run.frames[frame].carried[MUSCLE][0]
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_activation_zero_changes_nothing_to_the_last_digit(model):
+    phantom = rm.phantom_scene(end=20.0, step=10.0, spacing=4.0)
+    phantom.muscles = [phantom.muscle("extensor")]
+    plain = rm.simulate(phantom, model=model)
+    phantom.muscles[0].contraction = ContractionTable(activation=0.0)
+    active = rm.simulate(phantom, model=model)
+    for one, other in zip(plain.frames, active.frames):
+        assert np.array_equal(one.carried["extensor"][0], other.carried["extensor"][0])
+        assert np.array_equal(one.surfaces["extensor"].vertices, other.surfaces["extensor"].vertices)
+
+
+@pytest.mark.parametrize("model", SETTLED)
+def test_shapes_do_not_depend_on_how_activation_gets_there(model):
+    reached = []
+    for count in (2, 10):
+        scene = spindle_scene(model=model, frames=2 * count, spacing=5.0, activation=[0, 1, 0], tendon=TENDON)
+        run = rm.simulate(scene, settings={"output.surfaces": False})
+        reached.append(carried(run, count))
+        back = np.linalg.norm(carried(run, -1) - carried(run, 0), axis=1).max()
+        assert back < 0.05  # mm, as the issue asks
+    assert np.linalg.norm(reached[0] - reached[1], axis=1).max() < 0.1  # mm, likewise
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_spindle_between_fixed_ends_thickens_and_keeps_its_volume(model):
+    run = rm.simulate(spindle_scene(model=model, frames=2, spacing=4.0, tendon=TENDON))
+    # Interleaved ARAP leaves a volume step undone by its last global step, as without activation.
+    assert np.abs(run.values(MUSCLE, "volume_error")).max() < (1e-6 if model == "arap-interleaved" else 1e-10)
+    x = carried(run, 0)[:, 0]
+    moved = carried(run, -1)[:, 0] - x
+    junctions = [np.abs(x - side * 60.0) < 5.0 for side in (-1, 1)]
+    belly = moved[junctions[1]].mean() - moved[junctions[0]].mean()
+    assert -30.0 < belly < -4.0  # the tendons yield by 0.08 of 200 mm, the mesh models by less
+
+
+@pytest.mark.parametrize("model", ("rbf", "arap-volume"))
+@pytest.mark.parametrize("stretch", (0.9, 0.8, 0.7))
+def test_free_bar_is_as_thick_as_its_volume_says(model, stretch):
+    bar = Bar(length=600.0, width=10.0, thickness=10.0, dome=10.0)
+    settings = {"name": "rbf", "centres": 350, "resolution": 160} if model == "rbf" else model
+    scene = bar_scene(bar=bar, spacing=4.0, model=settings, activation=[0, 1], shortening=stretch)
+    pulls = np.linspace(0.0, (1.0 - stretch) * bar.length, 6)
+    run = rm.simulate(with_frames(scene, pulls, bar.length), frames="5:6")
+    points = run.frames[-1].surfaces[MUSCLE].vertices
+    middle = 0.5 * (points[:, 0].min() + points[:, 0].max())
+    radius = np.linalg.norm(points[np.abs(points[:, 0] - middle) < 60.0][:, 1:], axis=1)
+    assert radius.mean() == pytest.approx(10.0 / np.sqrt(stretch), rel=0.01)  # as the issue asks
