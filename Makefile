@@ -13,7 +13,7 @@ $(STAMP): pyproject.toml
 	touch $(STAMP)
 
 demo: $(STAMP)
-	@echo "The first run compiles for one to two minutes; later ones start at once."
+	@echo "The first run compiles what it needs; later ones start at once."
 	$(BIN)/rbfmuscle demo --model rbf -o demo_output/rbf
 	$(BIN)/rbfmuscle demo --model pbd -o demo_output/pbd
 	@echo "Open demo_output/rbf/report.html and demo_output/pbd/report.html"

@@ -29,6 +29,7 @@ _HOME = {
     "phantom_scene": "rbfmuscle.sim.scene.phantom",
     "simulate": "rbfmuscle.run",
     "study_kernels": "rbfmuscle.study.experiment.kernel_study",
+    "warm_up": "rbfmuscle.compiled.warm",
 }
 
 __all__ = [*_HOME, "__version__"]

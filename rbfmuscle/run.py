@@ -6,12 +6,15 @@ Both are one run, a generator of frames, and differ in the sink that takes them.
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 
+from rbfmuscle.compiled.progress import Progress
+from rbfmuscle.compiled.warm import compile_ahead
+from rbfmuscle.compiled.watch import compiled_so_far, tell_stage
 from rbfmuscle.models import build_models, configure_scene
 from rbfmuscle.sim.loop.frame import Event, Frame
 from rbfmuscle.sim.loop.simulate import simulate_frames
@@ -31,7 +34,7 @@ def simulate(
     *,
     settings: Mapping[str, Any] | None = None,
     frames: slice | str | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | bool | None = None,
 ) -> "Run":
     """Run a scene through its motion and keep every frame in memory.
 
@@ -44,8 +47,9 @@ def simulate(
         Dotted keys with their values, as for `Scene.with_options`: ``{"model.centres": 200}``.
     frames : slice or str, optional
         Frames of the motion, a slice or "A:B:S".
-    progress : callable, optional
-        Called as ``progress(done, total)`` after each frame.
+    progress : callable or bool, optional
+        Called as ``progress(done, total)`` after each frame; ``True`` shows on stderr what goes on, compiling and
+        building included.
 
     Returns
     -------
@@ -60,10 +64,13 @@ def simulate(
     SolveError
         If a frame cannot be solved; its ``run`` attribute holds the frames so far.
     """
+    if progress is True:
+        with Progress(scene.name) as shown:
+            return simulate(scene, model, settings=settings, frames=frames, progress=shown)
     recording, memory = _record(scene, model, settings, frames), MemorySink()
     run = Run(recording, memory)
     try:
-        recording.feed(memory, progress=progress)
+        recording.feed(memory, progress=progress or None)
     except SolveError as error:
         error.run = run
         raise
@@ -136,7 +143,7 @@ def _finish(recording, writer, limits, pictures):
     """Report and pictures, then the limits: a missing part must not hide a broken limit."""
     output = recording.scene.output
     missing = None
-    with recording.timed("report"):
+    with recording.timed("report"), tell_stage("drawing pictures"):
         if output.report or output.preview:
             from rbfmuscle.study.show.report import write_report
 
@@ -289,11 +296,14 @@ class Recording:
         self.started, self._start = datetime.now(UTC), time.perf_counter()
         self.scene = scene.validate()
         self.options = options or {}
+        self._compiled = compiled_so_far()
         self.times: dict[str, float] = {}
         self.status, self.message = "running", ""
         self.summary, self.stages = Summary(), Stages()
         self.written: list[dict] = []
-        with self.timed("build"):
+        with self.timed("compile"):
+            compile_ahead({muscle.model for muscle in scene.muscles})
+        with self.timed("build"), tell_stage("building"):
             check_initial(self.scene)
             self.models = build_models(scene)
             carried = {m.name: m.carried_mesh() for m in self.models}
@@ -346,7 +356,10 @@ class Recording:
         wanted = bool(self.scene.output.surfaces) or self.recorder is not None
         frames = simulate_frames(self.scene, self.models, surfaces=wanted)
         while True:
-            with self.timed("simulate"):
+            with (
+                self.timed("simulate"),
+                nullcontext() if self.written else tell_stage("solving the first frame"),
+            ):
                 frame = next(frames, None)
             if frame is None:
                 return
@@ -365,6 +378,8 @@ class Recording:
     def info(self, status: str | None = None) -> dict:
         """What ``run.json`` holds by now."""
         self.times["wall"] = time.perf_counter() - self._start
+        found = compiled_so_far()
+        compiled = {name: found[name] - self._compiled[name] for name in found}
         return build_info(
             self.scene,
             started=self.started,
@@ -376,6 +391,7 @@ class Recording:
             summary=self.summary.table(),
             limits={name: default_limit(name, self.scene) for name in LIMITS},
             options=self.options,
+            compiled=compiled,
         )
 
 

@@ -10,6 +10,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from rbfmuscle.compiled.progress import Progress
+from rbfmuscle.compiled.warm import compile_ahead
+from rbfmuscle.compiled.watch import tell_stage
 from rbfmuscle.validation import SceneError
 
 
@@ -23,12 +26,8 @@ def check(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", nega
     as_json
         Print JSON and nothing else.
     """
-    from rbfmuscle.models import check_models
-    from rbfmuscle.sim.scene.scene import Scene
-
-    loaded = Scene.load(scene, skeleton=True)
-    check_models(loaded)
-    findings = [*loaded.check(), *_field_notes(loaded)]
+    with Progress(f"check {scene.name}"):
+        loaded, findings = _findings(scene)
     errors = [finding for finding in findings if finding.level == "error"]
     if as_json:
         shown = [{"level": f.level, "place": f.place, "message": f.message} for f in findings]
@@ -39,6 +38,17 @@ def check(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", nega
             print(finding)
         print("not usable" if errors else "usable", file=sys.stderr)
     return SceneError.exit_code if errors else 0
+
+
+def _findings(path):
+    from rbfmuscle.models import check_models
+    from rbfmuscle.sim.scene.scene import Scene
+
+    loaded = Scene.load(path, skeleton=True)
+    check_models(loaded)
+    compile_ahead(["check"])
+    with tell_stage("fields of the bones"):
+        return loaded, [*loaded.check(), *_field_notes(loaded)]
 
 
 def _field_notes(scene):

@@ -7,9 +7,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from rbfmuscle.commands.progress import Progress
 from rbfmuscle.commands.run import Json, Output
 from rbfmuscle.commands.scenes import load_scene
+from rbfmuscle.compiled.progress import Progress
 from rbfmuscle.validation import SolveError
 
 # What the table on the terminal holds.
@@ -68,7 +68,7 @@ def compare(
     with Progress("compare") as progress, interruption.keeping(lambda: output.exists()):
 
         def advance(model, done, total):
-            progress.title = model
+            progress.stage.text = model
             progress(done, total)
             interruption.check()
 

@@ -8,7 +8,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from rbfmuscle.commands.progress import Progress
+from rbfmuscle.compiled.progress import Progress
+from rbfmuscle.compiled.warm import compile_ahead
+from rbfmuscle.compiled.watch import tell_stage
 from rbfmuscle.validation import UsageError
 
 
@@ -82,17 +84,19 @@ def kernels(
         return _extremes(names, output, as_json)
     if source is None:
         raise UsageError("which surface? give a mesh, a scene file or phantom, or --extremes")
-    scene, mesh, title = _surface(source, muscle)
     with Progress("kernels", what="fit") as bar:
+        scene, mesh, title = _surface(source, muscle)
+        compile_ahead(["kernels"])
         study = study_kernels(
             mesh, kernels=names, centres=counts, derivatives=derivatives, placement=placement,
             criterion=criterion, resolution=resolution, units=units if scene is None else scene.units, progress=bar,
         )  # fmt: skip
-    moved = [] if scene is None else _run_best(scene, title, study, best, frames)
-    try:
-        missing = write_study(study, output, title=f"Kernels for {title}", pictures=pictures)
-    except OSError as error:
-        raise UsageError(f"cannot write to {output}: {error.strerror}; choose another --output") from None
+        moved = [] if scene is None else _run_best(scene, title, study, best, frames)
+        try:
+            with tell_stage("drawing pictures"):
+                missing = write_study(study, output, title=f"Kernels for {title}", pictures=pictures)
+        except OSError as error:
+            raise UsageError(f"cannot write to {output}: {error.strerror}; choose another --output") from None
     if as_json:
         print(json.dumps({"rows": study.rows, "motion": moved}, indent=1))
     else:

@@ -8,6 +8,10 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from rbfmuscle.compiled.progress import Progress
+from rbfmuscle.compiled.warm import compile_ahead
+from rbfmuscle.compiled.watch import tell_stage
+
 
 def plan(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False) -> None:
     """List what a run of the scene would build and take, without building it.
@@ -19,14 +23,21 @@ def plan(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", negat
     as_json
         Print JSON and nothing else.
     """
+    with Progress(f"plan {scene.name}"):
+        made = _plan(scene)
+    print(json.dumps(made, indent=1) if as_json else "\n".join(_lines(made)))
+
+
+def _plan(path):
     from rbfmuscle.models import check_models, estimate_model
     from rbfmuscle.sim.plan.plan import plan_scene
     from rbfmuscle.sim.scene.scene import Scene
 
-    loaded = Scene.load(scene)
+    loaded = Scene.load(path)
     check_models(loaded)
-    made = plan_scene(loaded, estimate_model)
-    print(json.dumps(made, indent=1) if as_json else "\n".join(_lines(made)))
+    compile_ahead(["plan"])
+    with tell_stage("measuring this machine"):
+        return plan_scene(loaded, estimate_model)
 
 
 def _lines(made):

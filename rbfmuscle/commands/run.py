@@ -10,7 +10,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from rbfmuscle.commands.progress import Progress
+from rbfmuscle.compiled.progress import Progress
 from rbfmuscle.validation import RBFMuscleError
 
 Output = Annotated[Path, Parameter(name=["--output", "-o"])]
@@ -44,10 +44,21 @@ def demo(
     as_json
         Print JSON and nothing else.
     """
-    from rbfmuscle.sim.scene.phantom import phantom_scene
+
+    def load():
+        from rbfmuscle.sim.scene.phantom import phantom_scene
+
+        return phantom_scene()
 
     _run_scene(
-        phantom_scene(), output, model=model, frames=frames, settings={}, fail_on=None, as_json=as_json
+        load,
+        output,
+        title="phantom_hip",
+        model=model,
+        frames=frames,
+        settings={},
+        fail_on=None,
+        as_json=as_json,
     )
 
 
@@ -80,13 +91,19 @@ def run(
     as_json
         Print JSON and nothing else.
     """
-    from rbfmuscle.sim.scene.scene import Scene
     from rbfmuscle.sim.scene.settings import parse_setting
 
     changes = dict(parse_setting(text) for text in settings or [])
+
+    def load():
+        from rbfmuscle.sim.scene.scene import Scene
+
+        return Scene.load(scene)
+
     _run_scene(
-        Scene.load(scene),
+        load,
         output,
+        title=scene.stem,
         model=model,
         frames=frames,
         settings=changes,
@@ -95,13 +112,15 @@ def run(
     )
 
 
-def _run_scene(scene, output, *, model, frames, settings, fail_on, as_json):
+def _run_scene(load, output, *, title, model, frames, settings, fail_on, as_json):
     from rbfmuscle import interruption
-    from rbfmuscle.run import stream_run
 
     start = time.perf_counter()
     done = 0
-    with Progress(scene.name) as progress, interruption.keeping(lambda: done > 0):
+    with Progress(title) as progress, interruption.keeping(lambda: done > 0):
+        from rbfmuscle.run import stream_run
+
+        scene = load()
 
         def advance(count, total):
             nonlocal done

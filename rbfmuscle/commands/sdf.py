@@ -8,6 +8,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from rbfmuscle.compiled.progress import Progress
+from rbfmuscle.compiled.warm import compile_ahead
+
 
 def sdf(
     mesh: Path,
@@ -38,8 +41,6 @@ def sdf(
     as_json
         Print JSON and nothing else.
     """
-    from rbfmuscle.sim.scene.meshes import read_mesh
-    from rbfmuscle.study.show.sdf_report import report_lines, sdf_report
     from rbfmuscle.validation import UsageError
 
     output = Path(f"{mesh.stem}_sdf.png") if output is None else output
@@ -47,13 +48,18 @@ def sdf(
         raise UsageError(f"the slice is drawn to a .png file, got {str(output)!r}")
     if tolerance is not None and not tolerance > 0:
         raise UsageError(f"--tolerance must be positive, got {tolerance:g}")
-    read = read_mesh(mesh, may_be_open=True)
-    output.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        report = sdf_report(
-            read.mesh, image=output, axis=axis, tolerance=tolerance, cache=cache, name=mesh.stem
-        )
-    except OSError as error:
-        raise UsageError(f"cannot write {output}: {error.strerror or error}") from error
+    with Progress(f"sdf {mesh.name}"):
+        from rbfmuscle.sim.scene.meshes import read_mesh
+        from rbfmuscle.study.show.sdf_report import report_lines, sdf_report
+
+        read = read_mesh(mesh, may_be_open=True)
+        output.parent.mkdir(parents=True, exist_ok=True)
+        compile_ahead(["sdf"])
+        try:
+            report = sdf_report(
+                read.mesh, image=output, axis=axis, tolerance=tolerance, cache=cache, name=mesh.stem
+            )
+        except OSError as error:
+            raise UsageError(f"cannot write {output}: {error.strerror or error}") from error
     report["notes"] = [*read.notes, *report["notes"]]
     print(json.dumps(report, indent=1) if as_json else "\n".join(report_lines(report, units)))

@@ -7,6 +7,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from rbfmuscle.compiled.progress import Progress
+from rbfmuscle.compiled.watch import tell_stage
+
 
 def export(
     directory: Path,
@@ -34,11 +37,12 @@ def export(
     ascii
         VTP as text, as OpenSim reads it.
     """
-    from rbfmuscle.sim.scene.settings import parse_slice
-    from rbfmuscle.study.files.export import export_run
+    with Progress(f"export {directory}"):
+        from rbfmuscle.sim.scene.settings import parse_slice
+        from rbfmuscle.study.files.export import export_run
 
-    chosen = parse_slice(frames) if frames is not None else None
-    written = export_run(directory, formats, output=output, units=units, frames=chosen, ascii=ascii)
+        chosen = parse_slice(frames) if frames is not None else None
+        written = export_run(directory, formats, output=output, units=units, frames=chosen, ascii=ascii)
     folders = sorted({str(path.parent) for path in written})
     print(f"{len(written)} files in {', '.join(folders)}")
 
@@ -66,7 +70,9 @@ def render(
     seconds
         Length of an animation.
     """
-    from rbfmuscle.study.show.render import render_run
+    with Progress(f"render {directory}"):
+        from rbfmuscle.study.show.render import render_run
 
-    render_run(directory, output, frame=frame, views=view, seconds=seconds)
+        with tell_stage("drawing pictures"):
+            render_run(directory, output, frame=frame, views=view, seconds=seconds)
     print(output)

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from rbfmuscle.commands.progress import Progress
 from rbfmuscle.commands.run import Json, Output
 from rbfmuscle.commands.scenes import load_scene
+from rbfmuscle.compiled.progress import Progress
 from rbfmuscle.validation import SolveError, UsageError
 
 if TYPE_CHECKING:

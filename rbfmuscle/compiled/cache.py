@@ -14,6 +14,7 @@ from numba.core.serialize import dumps
 
 from rbfmuscle.compiled.fingerprint import loop_digest, machine_digest
 from rbfmuscle.compiled.store import PATIENCE, EntryLock, folders, has_entry, read_entry, write_entry
+from rbfmuscle.compiled.watch import tell_begin, tell_end, tell_needed
 
 _POLL = 0.02  # seconds between looks at an entry that another process compiles
 
@@ -51,10 +52,11 @@ class LoopCache(_Cache):
 
     def load_overload(self, sig: tuple[Any, ...], target_context: Any) -> Any:
         """The compiled loop for these argument types, None where it is not kept."""
+        arguments = _arguments(sig)
+        tell_needed(self.loop, arguments)
         if not self.enabled:
             return None
         target_context.refresh()
-        arguments = _arguments(sig)
         name = self.entry_name(arguments, target_context.codegen())
         found = _load(name, target_context)
         if found is not None:
@@ -117,15 +119,16 @@ def _load(name, target_context):
 
 
 class _Listener(event.Listener):
-    """Frees the lock of a loop that could not be compiled; one that was is written before it is freed."""
+    """Tells who watches; frees the lock of a loop that could not be compiled (else it is written first)."""
 
     def on_start(self, event: Any) -> None:
-        pass
+        tell_begin(event.data["dispatcher"])
 
     def on_end(self, event: Any) -> None:
-        cache = event.data["dispatcher"]._cache
-        if event.is_failed and isinstance(cache, LoopCache):
-            cache.let_go(event.data["args"])
+        loop = event.data["dispatcher"]
+        tell_end(loop)
+        if event.is_failed and isinstance(loop._cache, LoopCache):
+            loop._cache.let_go(event.data["args"])
 
 
 _LISTENER = _Listener()

@@ -1,7 +1,8 @@
 """Triangles of a surface that go through others of the same surface."""
 
-import numba
 import numpy as np
+
+from rbfmuscle.compiled.loop import compiled
 
 # Cells of the sorting grid for each triangle, at most.
 CELLS_A_FACE = 4
@@ -47,7 +48,7 @@ def crossing_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return marked
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _count_loop(first, last, shape, start):
     """Number of triangles in each cell, summed up: those of cell c end at start[c + 1]."""
     for f in range(len(first)):
@@ -59,7 +60,7 @@ def _count_loop(first, last, shape, start):
         start[c + 1] += start[c]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _fill_loop(first, last, shape, start, members):
     filled = start[:-1].copy()
     for f in range(len(first)):
@@ -71,7 +72,7 @@ def _fill_loop(first, last, shape, start, members):
                     filled[c] += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _cross_loop(vertices, faces, low, high, start, members, marked):
     for c in range(len(start) - 1):
         for m in range(start[c], start[c + 1]):
@@ -89,7 +90,7 @@ def _cross_loop(vertices, faces, low, high, start, members, marked):
                     marked[f], marked[g] = True, True
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _shared(faces, f, g):
     """Corners that two triangles have in common."""
     count = 0
@@ -99,7 +100,7 @@ def _shared(faces, f, g):
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _edges_cross(vertices, faces, f, g):
     """Whether an edge of f goes through the inside of g."""
     a, b, c = faces[g, 0], faces[g, 1], faces[g, 2]
@@ -117,7 +118,7 @@ def _edges_cross(vertices, faces, f, g):
     return False
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _side(vertices, a, b, c, d):
     """Six times the signed volume of a tetrahedron: which side of the triangle abc the point d lies on."""
     o, u, v, w = vertices[a], vertices[b], vertices[c], vertices[d]

@@ -278,7 +278,7 @@ def _nearest_loop(points, reach, tree, normals, out):
     order = normals[3]
     distance, closest, face, normal = out
     nodes, squares = np.empty(STACK, np.int64), np.empty(STACK)
-    best = -1
+    best = np.int64(-1)
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         square = reach * reach
@@ -294,8 +294,8 @@ def _nearest_loop(points, reach, tree, normals, out):
         )
         if best < 0:
             distance[i], face[i] = reach, -1
-            closest[i] = points[i]
-            normal[i] = 0.0
+            for k in range(3):
+                closest[i, k], normal[i, k] = points[i, k], 0.0
             continue
         face[i] = order[best]
         side = signed_side(records[best], order[best], points[i], normals, closest[i], normal[i])

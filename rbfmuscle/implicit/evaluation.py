@@ -16,7 +16,7 @@ import numpy as np
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.implicit.kernels.radial import _radial_loop
-from rbfmuscle.implicit.kernels.values import _add_values_loop
+from rbfmuscle.implicit.kernels.values import _add_values_loop, _cubic_loop
 
 if TYPE_CHECKING:
     from rbfmuscle.implicit.kernels.table import Kernel
@@ -170,20 +170,23 @@ def _cubic_block_loop(centres, a, b, hermite, gradient, p, acc, g):
             _cubic_hermite_gradient_loop(p, cx, cy, cz, w, b[0, j], b[1, j], b[2, j], acc, g)
         elif hermite:
             _cubic_hermite_value_loop(p, cx, cy, cz, w, b[0, j], b[1, j], b[2, j], acc)
-        else:
+        elif gradient:
             _cubic_gradient_loop(p, cx, cy, cz, w, acc, g)
+        else:
+            _cubic_loop(p, cx, cy, cz, 1.0, w, acc)
 
 
 @compiled(error_model="numpy")
 def _ball(p):
     """Centre and radius of a ball around the points (3, n): that of their box."""
-    x, y, z = (
-        0.5 * (p[0].min() + p[0].max()),
-        0.5 * (p[1].min() + p[1].max()),
-        0.5 * (p[2].min() + p[2].max()),
-    )
-    dx, dy, dz = p[0].max() - x, p[1].max() - y, p[2].max() - z
-    return x, y, z, np.sqrt(dx * dx + dy * dy + dz * dz)
+    middle, square = np.empty(3), 0.0
+    for c in range(3):
+        least, most = p[c, 0], p[c, 0]
+        for i in range(p.shape[1]):
+            least, most = min(least, p[c, i]), max(most, p[c, i])
+        middle[c] = 0.5 * (least + most)
+        square += (most - middle[c]) ** 2
+    return middle[0], middle[1], middle[2], np.sqrt(square)
 
 
 @compiled(error_model="numpy")
@@ -255,38 +258,79 @@ def _polynomial_loop(coefficients, powers, gradient, p, acc, g):
 
 
 @compiled(error_model="numpy")
+def _fill_block_loop(points, origin, scale, low, n, p):
+    """Scaled points of a block, coordinates in rows; its end repeats the last point."""
+    for i in range(p.shape[1]):
+        for c in range(3):
+            p[c, i] = (points[low + min(i, n - 1), c] - origin[c]) / scale
+
+
+@compiled(error_model="numpy")
+def _give_block_loop(scale, low, n, acc, g, value, gradient):
+    for i in range(n):
+        value[low + i] = acc[i]
+    if len(gradient) > 0:
+        for i in range(n):
+            for c in range(3):
+                gradient[low + i, c] = g[c, i] / scale
+
+
+# The length of a block is a multiple of a cache line, so that all rows are contiguous and filled alike. The cubic
+# kernel has a loop of its own, so that what muscles use by default does not wait for the others to be compiled.
+
+
+@compiled(error_model="numpy")
+def _evaluate_cubic_loop(
+    points, origin, scale, centres, a, b, hermite, coefficients, powers, start, stop, value, gradient
+):
+    """Value and, where there is room for it, gradient of the cubic kernel with epsilon 1 at points[start:stop]."""
+    for low in range(start, stop, _BLOCK):
+        n = min(_BLOCK, stop - low)
+        size = (n + 7) // 8 * 8
+        p, acc, g = np.empty((3, size)), np.zeros(size), np.zeros((3, size))
+        _fill_block_loop(points, origin, scale, low, n, p)
+        _cubic_block_loop(centres, a, b, hermite, len(gradient) > 0, p, acc, g)
+        _polynomial_loop(coefficients, powers, len(gradient) > 0, p, acc, g)
+        _give_block_loop(scale, low, n, acc, g, value, gradient)
+
+
+@compiled(error_model="numpy")
+def _evaluate_values_loop(
+    points, origin, scale, centres, a, epsilon, base, parameter, compact, table,
+    coefficients, powers, start, stop, value
+):  # fmt: skip
+    """Values alone of a field of any kernel without Hermite weights at points[start:stop]."""
+    nothing = np.empty((0, 3))
+    for low in range(start, stop, _BLOCK):
+        n = min(_BLOCK, stop - low)
+        size = (n + 7) // 8 * 8
+        p, acc = np.empty((3, size)), np.zeros(size)
+        _fill_block_loop(points, origin, scale, low, n, p)
+        _value_block_loop(centres, a, epsilon, base, parameter, compact, table[0], p, acc)
+        _polynomial_loop(coefficients, powers, False, p, acc, p)
+        _give_block_loop(scale, low, n, acc, p, value, nothing)
+
+
+@compiled(error_model="numpy")
 def _evaluate_loop(
-    points, origin, scale, centres, a, b, hermite, order, epsilon, base, parameter, compact, table, cubic,
+    points, origin, scale, centres, a, b, hermite, order, epsilon, base, parameter, compact, table,
     coefficients, powers, start, stop, value, gradient, hessian
 ):  # fmt: skip
-    """Value, gradient and radial part of the Hessian (order 0, 1, 2) at points[start:stop].
-
-    The length of a block is a multiple of a cache line (its end repeats the last point), so that all rows are
-    contiguous and filled alike.
-    """
+    """Value, gradient and radial part of the Hessian (order 0, 1, 2) of any kernel at points[start:stop]."""
     for low in range(start, stop, _BLOCK):
         n = min(_BLOCK, stop - low)
         size = (n + 7) // 8 * 8
         p, acc, g, h = np.empty((3, size)), np.zeros(size), np.zeros((3, size)), np.zeros((6, size))
-        for i in range(size):
-            for c in range(3):
-                p[c, i] = (points[low + min(i, n - 1), c] - origin[c]) / scale
-        if order == 0 and not hermite:
-            _value_block_loop(centres, a, epsilon, base, parameter, compact, table[0], p, acc)
-        elif cubic and order < 2:
-            _cubic_block_loop(centres, a, b, hermite, order == 1, p, acc, g)
-        else:
-            _general_block_loop(
-                centres, a, b, hermite, order, epsilon, base, parameter, compact, table, p, acc, g, h
-            )
+        _fill_block_loop(points, origin, scale, low, n, p)
+        _general_block_loop(
+            centres, a, b, hermite, order, epsilon, base, parameter, compact, table, p, acc, g, h
+        )
         _polynomial_loop(coefficients, powers, order > 0, p, acc, g)
-        value[low : low + n] = acc[:n]
-        if order > 0:
-            for i in range(n):
-                for c in range(3):
-                    gradient[low + i, c] = g[c, i] / scale
+        _give_block_loop(scale, low, n, acc, g, value, gradient)
         if order > 1:
-            hessian[:, low : low + n] = h[:, :n]
+            for c in range(6):
+                for i in range(n):
+                    hessian[c, low + i] = h[c, i]
 
 
 def evaluate(
@@ -338,11 +382,21 @@ def evaluate(
         places = _by_cells(points)
         points = points[places]
 
+    where, of_kernel = (
+        (points, origin, scale, centres, weights[0]),
+        (kernel.base, kernel.parameter, kernel.compact),
+    )
+
     def loop(start, stop):
-        _evaluate_loop(
-            points, origin, scale, centres, weights[0], b, hermite, order, epsilon, kernel.base, kernel.parameter,
-            kernel.compact, kernel.table, cubic, *polynomial, start, stop, value, gradient, hessian,
-        )  # fmt: skip
+        if cubic and order < 2:
+            _evaluate_cubic_loop(*where, b, hermite, *polynomial, start, stop, value, gradient)
+        elif order == 0 and not hermite:
+            _evaluate_values_loop(*where, epsilon, *of_kernel, kernel.table, *polynomial, start, stop, value)
+        else:
+            _evaluate_loop(
+                *where, b, hermite, order, epsilon, *of_kernel, kernel.table, *polynomial,
+                start, stop, value, gradient, hessian,
+            )  # fmt: skip
 
     run_in_chunks(loop, count, count * centres.shape[1])
     if not sort:

@@ -43,9 +43,21 @@ def solve_contact_forces(gram, need, force, sweeps, tolerance):
 
 @compiled(error_model="numpy")
 def _deepest(lacking, is_chosen, tolerance, most):
-    """Contacts, not yet chosen, that lack the most motion, deepest first."""
-    found = np.flatnonzero((lacking > tolerance) & ~is_chosen)
-    return found[np.argsort(-lacking[found], kind="mergesort")[:most]]
+    """Contacts, not yet chosen, that lack the most motion, deepest first; of equals the first."""
+    found = np.empty(most, np.int64)
+    count = 0
+    for c in range(len(lacking)):
+        if not lacking[c] > tolerance or is_chosen[c]:
+            continue
+        if count == most and lacking[c] <= lacking[found[count - 1]]:
+            continue
+        count = min(count + 1, most)
+        place = count - 1
+        while place > 0 and lacking[found[place - 1]] < lacking[c]:
+            found[place] = found[place - 1]
+            place -= 1
+        found[place] = c
+    return found[:count]
 
 
 @compiled(error_model="numpy")
@@ -63,9 +75,11 @@ def _gram_loop(index, normal, row, stiffness, influence, columns, shares):
             gram[c, d] = value
             gram[d, c] = value
     # A contact on held centres alone cannot be moved: its row is zero.
-    least = 1e-9 * np.abs(np.diag(gram)).max()
+    most = 0.0
     for c in range(size):
-        gram[c, c] += least
+        most = max(most, abs(gram[c, c]))
+    for c in range(size):
+        gram[c, c] += 1e-9 * most
     return gram
 
 
@@ -119,12 +133,14 @@ def _contact_loop(
         added = _deepest(lacking, is_chosen, tolerance, batch)
         if len(added) == 0 and len(chosen) == 0:
             break
-        is_chosen[added] = True
+        for c in added:
+            is_chosen[c] = True
         chosen = np.concatenate((chosen, added))
         gram = _gram_loop(index[chosen], normal[chosen], row[chosen], stiffness, influence, columns, shares)
         strength = force[chosen]
         solve_contact_forces(gram, need[chosen], strength, sweeps, 0.1 * tolerance)
-        force[chosen] = strength
+        for k in range(len(chosen)):
+            force[chosen[k]] = strength[k]
         _push_loop(index[chosen], normal[chosen], strength, influence, push)
         lost = 0.0
         for c in chosen:

@@ -14,7 +14,7 @@ ABOVE = (*LEAVES, "rbfmuscle.implicit", "rbfmuscle.sim", "rbfmuscle.study", "rbf
 # Which of our own modules (by prefix) a room may import; the first matching room counts.
 ALLOWED = {
     "rbfmuscle.validation": (),
-    "rbfmuscle.compiled": ("rbfmuscle.compiled",),
+    "rbfmuscle.compiled": ("rbfmuscle.compiled", "rbfmuscle.validation"),
     "rbfmuscle.geometry": ("rbfmuscle.geometry", "rbfmuscle.compiled"),
     "rbfmuscle.implicit": (*LEAVES, "rbfmuscle.implicit"),
     "rbfmuscle.sim": (*LEAVES, "rbfmuscle.sim"),

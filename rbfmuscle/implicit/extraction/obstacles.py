@@ -212,7 +212,8 @@ def _sort_faces_loop(vertices, faces, turn, origin, last, strides, cell, start, 
         i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
         for a in range(3):
             middle[n, a] = (vertices[i, a] + vertices[j, a] + vertices[k, a]) / 3.0
-    start[:-1] = start[1:]
+    for c in range(len(start) - 1):
+        start[c] = start[c + 1]
     start[-1] = len(faces)
 
 

@@ -88,34 +88,55 @@ def _value_matrix_loop(x, epsilon, base, parameter, compact, table, out):
 
 @compiled(error_model="numpy")
 def _hermite_matrix_loop(x, epsilon, base, parameter, compact, table, out):
-    """Lower triangle of the Hermite matrix; out[column, row] is its transpose.
+    """Lower triangle of the Hermite matrix; out[column, row] is its transpose."""
+    n = x.shape[1]
+    d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((3, n)), np.empty((4, n))
+    for j in range(n):
+        _offsets_loop(x, j, epsilon * epsilon, 0, d, u)
+        _radial_loop(base, parameter, compact, table, 7, u, work, radial)
+        _hermite_columns_loop(j, epsilon * epsilon, d, radial, out)
+
+
+@compiled(error_model="numpy")
+def _cubic_hermite_matrix_loop(x, epsilon, out):
+    """As `_hermite_matrix_loop` for the kernel s^3, which muscles use and which should not wait for the others."""
+    n = x.shape[1]
+    d, u, radial = np.empty((3, n)), np.empty(n), np.empty((3, n))
+    for j in range(n):
+        _offsets_loop(x, j, epsilon * epsilon, 0, d, u)
+        for i in range(n):
+            s = np.sqrt(u[i])
+            radial[0, i] = u[i] * s
+            radial[1, i] = 3.0 * s
+            radial[2, i] = 3.0 / s if s > 0.0 else 0.0
+        _hermite_columns_loop(j, epsilon * epsilon, d, radial, out)
+
+
+@compiled(error_model="numpy")
+def _hermite_columns_loop(j, e2, d, radial, out):
+    """The four columns of centre j, from the offsets of all centres and the radial functions there.
 
     Blocks: (value, value) phi; (d/dx_c, value) first * d_c;
     (d/dx_c, d/dx_e) -(first * delta + second * d_c d_e).
     """
-    n = x.shape[1]
-    e2 = epsilon * epsilon
-    d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((3, n)), np.empty((4, n))
-    for j in range(n):
-        _offsets_loop(x, j, e2, 0, d, u)
-        _radial_loop(base, parameter, compact, table, 7, u, work, radial)
-        phi, first, second = radial[0], radial[1], radial[2]
-        column = out[j]
+    n = d.shape[1]
+    phi, first, second = radial[0], radial[1], radial[2]
+    column = out[j]
+    for i in range(j, n):
+        column[i] = phi[i]
+    for c in range(3):
+        target, dc = column[(c + 1) * n : (c + 2) * n], d[c]
+        for i in range(n):
+            target[i] = e2 * first[i] * dc[i]
+    for e in range(3):
+        de = d[e]
+        column = out[(e + 1) * n + j]
         for i in range(j, n):
-            column[i] = phi[i]
-        for c in range(3):
+            column[(e + 1) * n + i] = -e2 * (first[i] + e2 * second[i] * de[i] * de[i])
+        for c in range(e + 1, 3):
             target, dc = column[(c + 1) * n : (c + 2) * n], d[c]
             for i in range(n):
-                target[i] = e2 * first[i] * dc[i]
-        for e in range(3):
-            de = d[e]
-            column = out[(e + 1) * n + j]
-            for i in range(j, n):
-                column[(e + 1) * n + i] = -e2 * (first[i] + e2 * second[i] * de[i] * de[i])
-            for c in range(e + 1, 3):
-                target, dc = column[(c + 1) * n : (c + 2) * n], d[c]
-                for i in range(n):
-                    target[i] = -e2 * e2 * second[i] * dc[i] * de[i]
+                target[i] = -e2 * e2 * second[i] * dc[i] * de[i]
 
 
 def normal_polynomials(points: Floats, normals: Floats, powers: Integers) -> Floats:

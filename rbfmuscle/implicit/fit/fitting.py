@@ -96,6 +96,9 @@ class Basis:
         first = (np.ascontiguousarray(self.points.T),)
         if self.kind == "normal":
             first += (np.ascontiguousarray(self.normals.T),)
+        if self.kind == "gradient" and kernel.name == "cubic":
+            assembly._cubic_hermite_matrix_loop(*first, float(self.epsilon), out)
+            return out.T
         loop = {
             "value": assembly._value_matrix_loop,
             "gradient": assembly._hermite_matrix_loop,

@@ -185,15 +185,21 @@ def _nearest_in_cell_loop(vertices, faces, corner, target, points, face, distanc
         if square < distance[k]:
             distance[k] = square
             face[k] = f
-            points[k] = q
-    whole = np.isfinite(distance)
+            for c in range(3):
+                points[k, c] = q[c]
+    whole = np.empty(len(distance), np.bool_)
+    for k in range(len(distance)):
+        whole[k] = distance[k] < np.inf
     for f in range(len(faces)):
         for c in range(3):
             k = corner[f, c]
             if whole[k]:
                 continue
-            square = np.sum((vertices[faces[f, c]] - target[k]) ** 2)
+            square = 0.0
+            for a in range(3):
+                square += (vertices[faces[f, c], a] - target[k, a]) ** 2
             if square < distance[k]:
                 distance[k] = square
                 face[k] = f
-                points[k] = vertices[faces[f, c]]
+                for a in range(3):
+                    points[k, a] = vertices[faces[f, c], a]

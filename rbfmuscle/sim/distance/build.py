@@ -92,7 +92,7 @@ class _Builder:
 
     def nodes(self, index: Array, edge: float, near: Array | None = None) -> Any:
         """Exact distances at lattice points ``index`` (n, 3) times ``edge``; ``near`` names a near record."""
-        points = self.origin + edge * index
+        points = np.ascontiguousarray(self.origin + edge * index)
         record, distance = np.empty(len(points), dtype=np.int32), np.empty(len(points))
         near = np.full(len(points), -1, dtype=np.int32) if near is None else near
         exact = self.exact

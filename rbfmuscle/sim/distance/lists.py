@@ -37,7 +37,7 @@ def list_loop(low, ids, nodes, centre, edge, unit, mesh, probe, out):
         for k in range(9):
             n = centre[i] if k == 8 else record[ids[i, k]]
             if n >= 0:
-                count = _add(listed, count, n)
+                count = _add(listed, count, np.int64(n))
             if k < 8:
                 doubted = doubted or doubt[ids[i, k]]
         folded = abs(distance[ids[i, 0]]) < FOLD_REACH * edge and folded_list(mesh[0][2], listed, count)
@@ -99,11 +99,11 @@ def _probe(listed, count, folded, low, edge, mesh, nodes_left, squares):
         x = origin[0] + edge * (low[0] + 0.5 + PROBES[k, 0])
         y = origin[1] + edge * (low[1] + 0.5 + PROBES[k, 1])
         z = origin[2] + edge * (low[2] + 0.5 + PROBES[k, 2])
-        best, square = listed[0], np.inf
+        best, square = np.int64(listed[0]), np.inf
         for m in range(count):
             s = record_square(records, listed[m], x, y, z)
             if s < square * (1 - SLACK):
-                best, square = listed[m], s
+                best, square = np.int64(listed[m]), s
         if folded:
             end, _ = nearest_triangle(
                 boxes, starts, records, order, x, y, z, best, square, SLACK, nodes_left, squares

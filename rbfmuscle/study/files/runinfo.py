@@ -34,6 +34,7 @@ def build_info(
     summary: dict[str, Any],
     limits: dict[str, float],
     options: dict[str, Any],
+    compiled: dict[str, float],
 ) -> dict[str, Any]:
     """Assemble ``run.json``.
 
@@ -55,6 +56,8 @@ def build_info(
         Quantity -> limit in the unit of ``metrics.csv``.
     options : dict
         What the caller asked for.
+    compiled : dict
+        Loops that this process compiled meanwhile and the processor time they took [s].
 
     Returns
     -------
@@ -72,6 +75,7 @@ def build_info(
         "machine": machine(),
         "inputs": input_hashes(scene),
         "times": times,
+        "compiled": compiled,
         "stages": stages.table(),
         "limits": limits,
         "muscles": {name: facts for name, facts in summary.items() if name != "all"},

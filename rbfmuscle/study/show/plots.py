@@ -110,11 +110,31 @@ def _draw_lines(axes, saved, quantity, factor, axis):
         places = [axis[frame] for frame in frames]
         axes.plot(places, values * factor, color=colour, lw=1.6, label=name, marker="o", ms=2.2)
     if quantity == "time_frame" and tracks:
-        # The first frame loads and compiles; it would flatten all others.
+        # The first frame loads and compiles, and so may a later one that meets something new; it would flatten
+        # all others, so it ends at the edge, and the edge says how high it goes.
         later = factor * np.concatenate([values[1:] for _, _, values, _ in tracks])
         if len(later):
-            axes.set_ylim(0, 1.15 * later.max())
+            top = 1.15 * min(later.max(), 3.0 * np.percentile(later, 90))
+            axes.set_ylim(0, top)
+            _name_hidden(axes, tracks[-1], axis, factor, top)
     return bool(tracks)
+
+
+def _name_hidden(axes, track, axis, factor, top):
+    """Write the height of frames that go beyond the plot, of one track, beside where they leave it."""
+    _, frames, values, colour = track
+    for frame, value in zip(frames, values * factor):
+        if value > top:
+            text = f"{value / 1000:.1f} s" if value >= 1000 else f"{value:.0f} ms"
+            axes.annotate(
+                text,
+                (axis[frame], top),
+                (3, -3),
+                textcoords="offset points",
+                fontsize=7,
+                color=colour,
+                va="top",
+            )
 
 
 def _draw_limit(axes, saved, quantity, factor, both):

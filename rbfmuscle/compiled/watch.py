@@ -1,0 +1,113 @@
+"""What goes on, told to whoever watches: loops needed and compiled, stages of a command.
+
+Watchers are the bar on stderr (`rbfmuscle.compiled.progress`), the recorder of needs and the clock of a report.
+"""
+
+import threading
+import time
+from typing import Any
+
+# Objects with any of ``needed(loop, arguments)``, ``begins(loop)``, ``ends(loop, seconds)``, ``stage(stages)``.
+_watchers: list[Any] = []
+_here = threading.local()
+_lock = threading.Lock()
+_totals = {"loops": 0, "seconds": 0.0}
+_stages: list[Any] = []
+_working: list[str] = []  # nested ones after those that call them
+
+
+class watched_by:
+    """Within the context, ``watcher`` is told of every loop; from all threads."""
+
+    def __init__(self, watcher):
+        self.watcher = watcher
+
+    def __enter__(self):
+        _watchers.append(self.watcher)
+        return self.watcher
+
+    def __exit__(self, *error):
+        _watchers.remove(self.watcher)
+
+
+def compiled_so_far() -> dict[str, float]:
+    """Loops that this process has compiled, and the processor time its threads spent at that [s]."""
+    with _lock:
+        return dict(_totals)
+
+
+def tell_needed(loop, arguments):
+    """A call from Python needs a loop; one that another loop calls comes with it."""
+    if not getattr(_here, "starts", ()):
+        _tell("needed", loop, arguments)
+
+
+def tell_begin(loop):
+    """A thread begins to compile a loop, maybe within another."""
+    starts = _here.__dict__.setdefault("starts", [])
+    starts.append(time.thread_time())
+    _working.append(loop.py_func.__qualname__)
+    _tell("begins", loop)
+
+
+def tell_end(loop):
+    """It has, or has failed to."""
+    spent = time.thread_time() - _here.starts.pop()
+    _working.remove(loop.py_func.__qualname__)
+    with _lock:
+        _totals["loops"] += not loop.py_func.__module__.startswith("numba.")
+        if not _here.starts:
+            _totals["seconds"] += spent
+    _tell("ends", loop, spent)
+
+
+class tell_stage:
+    """Within the context this goes on; with a count, call the result with how many are done.
+
+    Parameters
+    ----------
+    text : str
+        What is done, as "building".
+    what : str, optional
+        What is counted.
+    total : int, optional
+        How many there are.
+    """
+
+    def __init__(self, text, what="", total=None):
+        self.text, self.what, self.total, self.done = text, what, total, 0
+
+    def __call__(self, done, total=None):
+        """Say how many are done."""
+        self.done, self.total = done, self.total if total is None else total
+        _tell("stage", current_stage())
+
+    def __enter__(self):
+        with _lock:
+            _stages.append(self)
+        _tell("stage", self)
+        return self
+
+    def __exit__(self, *error):
+        with _lock:
+            _stages.remove(self)
+        _tell("stage", current_stage())
+
+
+def current_stage():
+    """The innermost stage, or None."""
+    with _lock:
+        return _stages[-1] if _stages else None
+
+
+def loop_in_work():
+    """The loop that some thread compiles right now, by name, or None."""
+    working = list(_working)
+    return working[0] if working else None
+
+
+def _tell(what, *facts):
+    for watcher in list(_watchers):
+        listener = getattr(watcher, what, None)
+        if listener is not None:
+            listener(*facts)
