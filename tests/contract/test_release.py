@@ -37,9 +37,9 @@ def test_every_folder_with_modules_is_a_package():
             assert (folder / "__init__.py").exists(), folder
 
 
-def test_typed_marker_travels_with_the_packages():
+def test_typed_marker_and_table_of_loops_travel_with_the_packages():
     data = PROJECT["tool"]["setuptools"]["package-data"]
-    assert data == {"rbfmuscle": ["py.typed"], "pbd_baseline": ["py.typed"]}
+    assert data == {"rbfmuscle": ["py.typed", "compiled/needs.json"], "pbd_baseline": ["py.typed"]}
 
 
 def test_lists_of_tests_name_what_exists_and_every_room():
