@@ -1,6 +1,6 @@
 """The first minute: what a cold `rbfmuscle demo` costs until its first frame is written, and what it says meanwhile.
 
-    python benchmarks/first_run.py [--against CHECKOUT] [--model rbf] [-o FILE.json]
+    python benchmarks/first_run.py [--against CHECKOUT] [--model rbf] [--frames A:B:S] [-o FILE.json]
 
 Runs the demo with empty caches, again with full ones, from a copy of the sources, and twice at once with empty ones;
 with ``--against`` the same cold and warm runs of another checkout (which holds .venv/bin/python), in turn with our
@@ -33,7 +33,7 @@ class Start:
             "RBFMUSCLE_LOOPS": str(caches / "loops"), "RBFMUSCLE_CACHE": str(caches / "fields"),
         }  # fmt: skip
         call = "from rbfmuscle.cli import main; main()"
-        command = [_python(checkout), "-c", call, "demo", "--model", model, "-o", str(out)]
+        command = [_python(checkout), "-c", call, "demo", "--model", model[0], "-o", str(out), *model[1:]]
         pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
         self.process = subprocess.Popen(command, env=environment, cwd=out.parent, **pipes)
         self.spoken = [self.begun]
@@ -115,7 +115,9 @@ def main():
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--brief", action="store_true", help="cold and warm runs only")
     parser.add_argument("-o", "--output", type=Path)
+    parser.add_argument("--frames", help="of the motion, as A:B:S; all by default")
     chosen = parser.parse_args()
+    chosen.model = [chosen.model, *(["--frames", chosen.frames] if chosen.frames else [])]
     table = {}
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
