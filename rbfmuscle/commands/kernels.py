@@ -134,13 +134,25 @@ def _surface(source, muscle):
     return scene, chosen.mesh, chosen.name
 
 
+def _to_run(study, best):
+    """The recommended row, the quickest and the most accurate, then the next best of the table."""
+    found = study.recommended
+    chosen = [found.row, found.quickest, found.most_accurate] if found else []
+    chosen += [row for row in study.rows if not row["unfit"]]
+    rows = []
+    for row in chosen:
+        if row is not None and not any(row is other for other in rows):
+            rows.append(row)
+    return rows[:best]
+
+
 def _run_best(scene, name, study, best, frames):
     """Run one muscle's motion with the best settings; a setting that fails says so and stops no other."""
     from rbfmuscle.run import simulate
     from rbfmuscle.validation import RBFMuscleError
 
     moved = []
-    for row in [row for row in study.rows if row["rms"] is not None][:best]:
+    for row in _to_run(study, best):
         settings = {
             name: row[name.split(".")[1]] for name in ("model.kernel", "model.centres", "model.placement")
         }
@@ -169,27 +181,40 @@ def _run_best(scene, name, study, best, frames):
 
 
 def _print(study, moved, output):
-    unit = study.units or "unit"
-    print(f"{'kernel':26s} {'centres':>7s} {'eps h':>6s} {'RMS':>8s} {'Hausd.':>8s} {'vol %':>7s} {'sheets':>6s} "
+    from rbfmuscle.study.experiment.kernel_choice import cost, named
+
+    unit = study.units or "mesh units"
+    print(f"{'kernel':26s} {'centres':>7s} {'eps h':>6s} {'RMS':>8s} {'from':>8s} {'to':>8s} "
+          f"{'Hausd.':>8s} {'vol %':>7s} "
           f"{'cond.':>8s} {'fit ms':>7s} {'numbers':>7s} {'mesh':>7s}   [{unit}]")  # fmt: skip
     for row in study.rows:
         start = f"{row['kernel']:26s} {row['centres']:7d} {_text(row['shape'], 6)} "
-        if row["rms"] is None:
-            print(f"{start} {row['note'][:90]}")
+        if row["unfit"]:
+            print(f"{start} unfit: {row['unfit'][:90]}")
             continue
         print(
-            f"{start}{_text(row['rms'], 8)} {_text(row['hausdorff'], 8)} {_text(100 * row['volume_error'], 7)} "
-            f"{row['components']:6d} {row['condition']:8.1e} {_text(1e3 * row['fit_time'], 7)} {row['numbers']:7d} "
-            f"{_text(row['decimated_rms'], 7)}"
+            f"{start}{_text(row['rms'], 8)} {_text(row['low'], 8)} {_text(row['high'], 8)} "
+            f"{_text(row['hausdorff'], 8)} "
+            f"{_text(100 * row['volume_error'], 7)} {row['condition']:8.1e} {_text(1e3 * row['fit_time'], 7)} "
+            f"{row['numbers']:7d} {_text(row['decimated_rms'], 7)}"
         )
     for facts in moved:
         said = facts["error"] or ", ".join(
             f"{name} {value:.3g}" for name, value in facts.items() if isinstance(value, float)
         )
         print(f"in motion, {facts['kernel']} with {facts['centres']} centres: {said}")
-    print(
-        f"page in {output / 'kernels.html'}; to paste at the end of a [[muscle]]:\n\n{study.toml(study.rows[0])}"
-    )
+    print(f"page in {output / 'kernels.html'}")
+    found = study.recommended
+    if found is None:
+        print("recommended: none, every field is unfit; try more centres")
+        return
+    print(f"recommended: {named(found.row)}: {found.reason}")
+    if found.quickest is not None:
+        times = f"{1e3 * cost(found.quickest):.3g} ms instead of {1e3 * cost(found.row):.3g}"
+        print(f"for speed: {named(found.quickest)}, {found.quickest['rms']:.3g} RMS in {times}")
+    if found.most_accurate is not None:
+        print(f"smallest figure: {named(found.most_accurate)}, {found.most_accurate['rms']:.3g} RMS")
+    print(f"to paste at the end of a [[muscle]]:\n\n{study.toml(found.row)}")
 
 
 def _text(value, width):

@@ -41,6 +41,8 @@ _GOLDEN = 0.5 * (math.sqrt(5) - 1)
 _NOISE, _NOISE_HELD_OUT = 2.0, 1.05
 
 
+# Objectives this much apart are alike: the best-conditioned of them is taken.
+WITHIN = 1.02
 # Slope of a field, 1 where all is well, below which it is taken to be flat.
 LEAST_SLOPE = 0.3
 # Of all points, so many may lie where the field is flat.
@@ -183,7 +185,7 @@ def choose_epsilon(
     else:
         tried += _golden(objective, low, high, refine, noise)
     tried = np.array(sorted(tried))
-    best = tried[np.argmin(believed(tried, noise))]
+    best = tried[by_worth(tried, noise)[0]]
     return EpsilonChoice(float(best[0]), float(best[1]), float(best[2]), tried)
 
 
@@ -344,6 +346,13 @@ def _trial(objective: Callable[..., Any], epsilon: float) -> tuple[float, float,
         except np.linalg.LinAlgError:
             return epsilon, math.inf, math.inf
     return epsilon, score if math.isfinite(score) else math.inf, condition
+
+
+def by_worth(tried: ArrayLike, noise: float = _NOISE_HELD_OUT) -> np.ndarray:
+    """Order (n,) of trials (n, 3): those within 2 % of the best by their condition, then the others by objective."""
+    worth, condition = believed(tried, noise), np.asarray(tried)[:, 2]
+    alike = worth <= WITHIN * worth.min()
+    return np.lexsort((np.where(alike, condition, worth), ~alike))
 
 
 def believed(tried: ArrayLike, noise: float = _NOISE_HELD_OUT) -> Floats:

@@ -14,7 +14,7 @@ from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.placement.off_surface import off_surface_points
-from rbfmuscle.implicit.selection import SPAN, EpsilonChoice, believed, choose_epsilon, spacing
+from rbfmuscle.implicit.selection import SPAN, EpsilonChoice, by_worth, choose_epsilon, spacing
 from rbfmuscle.validation import NumericalWarning
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def _look_at_zero_sets(
 ) -> EpsilonChoice:
     """The best of the tried epsilons by the distance both ways; the choice itself where none is closed."""
     found, least = choice, np.inf
-    for number in np.argsort(believed(choice.tried), kind="stable"):
+    for number in by_worth(choice.tried):
         epsilon, missed, condition = (float(x) for x in choice.tried[number])
         # The distance both ways is at least this, and twice the error has never been the better surface.
         if missed > 2.0 * least or missed / np.sqrt(2.0) > least or not np.isfinite(missed):

@@ -22,6 +22,7 @@ from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
 from rbfmuscle.implicit.placement.sampling import PLACEMENTS, sample_surface
 from rbfmuscle.implicit.selection import spacing, surface_miss
 from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
+from rbfmuscle.study.experiment.kernel_choice import Bootstrap, Recommendation, mark_unfit, recommend
 from rbfmuscle.study.experiment.sweep_table import pareto_front
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.validation import NumericalWarning, UsageError, check_mesh
@@ -48,7 +49,7 @@ class KernelStudy:
     Attributes
     ----------
     rows : list of dict
-        One for each kernel and number of centres, the smallest error first; those that gave no closed surface last.
+        One for each kernel and number of centres, the smallest error first; unfit ones (``unfit`` says why) last.
     scan : list of dict
         ``kernel, centres, shape`` (epsilon times the spacing), ``error, condition`` over a range of shapes.
     decimated : dict of int to dict
@@ -56,6 +57,8 @@ class KernelStudy:
     surfaces : list of (vertices, faces, error)
         Of the rows, in their order; None where there is none.
     units : str
+    recommended : Recommendation or None
+        The row to take and why; None where every one is unfit.
     """
 
     rows: list
@@ -63,6 +66,7 @@ class KernelStudy:
     decimated: dict = field(default_factory=dict)
     surfaces: list = field(default_factory=list)
     units: str = ""
+    recommended: Recommendation | None = None
 
     def toml(self, row: dict[str, Any]) -> str:
         """The lines of a scene file's model table that give this row."""
@@ -149,7 +153,8 @@ def study_kernels(
                 study.scan += _scan(judge, sample, kernel, derivatives)
             if progress is not None:
                 progress(len(found), total)
-    found.sort(key=lambda pair: (pair[0]["rms"] is None, pair[0]["rms"] or 0.0))
+    mark_unfit([row for row, _ in found], sheets=judge.sheets)
+    found.sort(key=lambda pair: (bool(pair[0]["unfit"]), pair[0]["rms"] is None, pair[0]["rms"] or 0.0))
     study.rows, study.surfaces = [row for row, _ in found], [surface for _, surface in found]
     for row in study.rows:
         numbers = row["numbers"]
@@ -157,12 +162,13 @@ def study_kernels(
             study.decimated[numbers] = judge.decimated(numbers)
         row["decimated_rms"] = study.decimated[numbers]["rms"]
     _mark_fronts(study.rows)
+    study.recommended = recommend(study.rows)
     return study
 
 
 def _mark_fronts(rows):
     """Mark what no other row beats both in error and in time (or in size)."""
-    good = [row for row in rows if row["rms"] is not None]
+    good = [row for row in rows if not row["unfit"]]
     for row in rows:
         row["front_time"] = row["front_size"] = False
     if not good:
@@ -190,13 +196,15 @@ class _Judge:
         which = rng.choice(len(area), JUDGES, p=area / area.sum())
         self.points = np.einsum("nk,nkj->nj", rng.dirichlet(np.ones(3), JUDGES), corners[which])
         self.normals = normal[which] / area[which, None]
+        self.sheets = _sheets(faces)
+        self.bootstrap = Bootstrap(JUDGES, seed)
 
-    def apart(self, vertices: Floats, faces: Integers) -> tuple[float, float, Floats]:
-        """RMS and greatest distance, both ways, and the distance of each vertex."""
+    def apart(self, vertices: Floats, faces: Integers) -> tuple[float, float, Floats, tuple[float, float]]:
+        """RMS and greatest distance, both ways, the distance of each vertex, and the interval of the RMS."""
         there = MeshDistance(vertices, faces, closed=False).unsigned(self.points)
         back = self.distance.unsigned(vertices)
         rms = float(np.sqrt(0.5 * ((there**2).mean() + (back**2).mean())))
-        return rms, float(max(there.max(), back.max())), back
+        return rms, float(max(there.max(), back.max())), back, self.bootstrap.interval(there, back)
 
     def decimated(self, numbers: int) -> dict[str, float]:
         """A decimated mesh whose vertices and faces are as many numbers (9 a vertex) as a field's."""
@@ -208,8 +216,20 @@ class _Judge:
         small = surface.decimate(share) if share > 0.0 else surface
         vertices = np.asarray(small.points, dtype=float)
         faces = np.asarray(small.regular_faces)
-        rms, hausdorff, _ = self.apart(vertices, faces)
+        rms, hausdorff, *_ = self.apart(vertices, faces)
         return {"vertices": len(vertices), "rms": rms, "hausdorff": hausdorff}
+
+
+def _sheets(faces):
+    """Parts of a mesh."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    size = int(faces.max()) + 1
+    graph = coo_matrix((np.ones(len(ends)), ends.T), shape=(size, size))
+    used = np.unique(faces)
+    return len(np.unique(connected_components(graph, directed=False)[1][used]))
 
 
 def _fit(sample, kernel, epsilon, derivatives):
@@ -232,8 +252,9 @@ def _measure(judge, sample, kernel, derivatives, criterion, placement):
         placement = "greedy"
     row = {
         "kernel": kernel.name, "centres": count, "placement": placement, "epsilon": 0.0, "shape": None,
-        "fit": derivatives if kernel.hermite else "values", "rms": None, "hausdorff": None,
-        "normal_error": None, "volume_error": None, "components": None, "spurious": None, "condition": None,
+        "fit": derivatives if kernel.hermite else "values", "rms": None, "low": None, "high": None,
+        "hausdorff": None, "normal_error": None, "volume_error": None,
+        "components": None, "spurious": None, "condition": None,
         "fit_time": None, "evaluation_time": None, "numbers": _stored(kernel, derivatives, count),
         "note": "" if kernel.hermite else "values on and off the surface, the kernel is not C2",
     }  # fmt: skip
@@ -247,6 +268,9 @@ def _measure(judge, sample, kernel, derivatives, criterion, placement):
                 sample = fit_sample(
                     sample, judge.vertices, judge.faces, kernel=kernel, epsilon=row["epsilon"] or 1.0
                 )
+                if kernel.has_epsilon:  # what was best for the greedy centres need not be so for these
+                    row["epsilon"] = _choose(judge, sample, kernel, derivatives, criterion)
+                    row["shape"] = float(row["epsilon"] * spacing(sample.points).mean())
             surface = _fill(row, judge, sample, kernel, derivatives)
         except (ValueError, np.linalg.LinAlgError) as error:
             row["note"], surface = " ".join(str(error).split()), None
@@ -275,7 +299,7 @@ def _fill(row, judge, sample, kernel, derivatives):
     )
     row["components"], row["spurious"] = found.components, found.spurious
     row["volume_error"] = found.volume / judge.volume - 1.0
-    row["rms"], row["hausdorff"], error = judge.apart(found.vertices, found.faces)
+    row["rms"], row["hausdorff"], error, (row["low"], row["high"]) = judge.apart(found.vertices, found.faces)
     if found.spurious:
         row["note"] = f"{found.spurious} spurious sheets; {row['note']}".rstrip("; ")
     return found.vertices, found.faces, error

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rbfmuscle.study.experiment.kernel_choice import named
 from rbfmuscle.study.show.page import STYLE
 from rbfmuscle.validation import MissingPartError
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 COLUMNS = {
     "kernel": "kernel", "centres": "centres", "placement": "placement", "fit": "fit",
     "shape": "epsilon times spacing", "rms": "RMS",
+    "low": "from", "high": "to",
     "hausdorff": "Hausdorff", "normal_error": "normals, degrees", "volume_error": "volume, %",
     "components": "sheets", "condition": "condition", "fit_time": "fit, ms",
     "evaluation_time": "20,000 values, ms", "numbers": "stored numbers", "decimated_rms": "mesh of that size, RMS",
@@ -38,13 +40,15 @@ PAGE = """<!doctype html>
 <title>{title}</title><style>{style} tr.front td:first-child{{font-weight:650}} td.text{{text-align:left}}</style>
 </head><body><main><h1>{title}</h1>
 <p class="sub">Each kernel with as many centres, its shape parameter chosen by the error at other points of the mesh</p>
-<p>The best: <b>{best}</b>. Distances{units} are measured both ways between the mesh and the extracted surface;
+<p>Recommended: <b>{best}</b>: {reason}.{others} Distances{units} are measured both ways between the mesh and the
+extracted surface, with the interval that holds nine of ten other sets of points; rows whose intervals reach the
+best one's are a tie, in which time decides;
 normals by the field's gradient; the mesh in the last but one column was decimated to as many stored numbers. Kernels in
 bold are on the front of error against time. A volume error is that of the level zero; a muscle's level is moved until
 its volume is right.</p>
 <h2>What each costs</h2><div class="plots"><figure><img alt="error against time and size" src="{fronts}"></figure>
 </div>{maps}{pictures}
-<h2>All of them</h2><div class="wide"><table><tr>{head}</tr>{body}</table></div>
+<h2>All of them</h2><div class="wide"><table><tr>{head}</tr>{body}</table></div>{unfit}
 <h2>To paste</h2><pre>{toml}</pre>
 </main></body></html>
 """
@@ -85,19 +89,37 @@ def write_study(
         except MissingPartError as error:
             missing = error
     page = PAGE.format(
-        title=html.escape(title), style=STYLE, best=html.escape(_named(study.rows[0])),
+        title=html.escape(title), style=STYLE, **_advice(study),
         units=f" in {study.units}" if study.units else "", fronts=_inline(fronts),
         maps=_figure("Error and condition over the shape parameter", maps),
         pictures=_figure("The best surfaces, coloured by their distance to the mesh", drawn),
         head="".join(f"<th>{html.escape(name)}</th>" for name in COLUMNS.values()),
-        body="".join(_row(row) for row in study.rows), toml=html.escape(study.toml(study.rows[0])),
+        body="".join(_row(row) for row in study.rows if not row["unfit"]),
     )  # fmt: skip
     (directory / "kernels.html").write_text(page, encoding="utf-8")
     return missing
 
 
-def _named(row):
-    return f"{row['kernel']}, {row['centres']} centres"
+def _advice(study):
+    """What the page says to take, and what not."""
+    bad = [row for row in study.rows if row["unfit"]]
+    items = "".join(f"<li>{html.escape(named(row))}: {html.escape(row['unfit'])}</li>" for row in bad)
+    unfit = f"<h2>Unfit</h2><ul>{items}</ul>" if bad else ""
+    found = study.recommended
+    if found is None:
+        return {"best": "none", "reason": "every field is unfit", "others": "", "toml": "", "unfit": unfit}
+    others = ""
+    if found.quickest is not None:
+        others += f" For speed: {named(found.quickest)}, {found.quickest['rms']:.3g} RMS."
+    if found.most_accurate is not None:
+        others += f" The smallest figure: {named(found.most_accurate)}, {found.most_accurate['rms']:.3g} RMS."
+    return {
+        "best": html.escape(named(found.row)),
+        "reason": html.escape(found.reason),
+        "others": html.escape(others),
+        "toml": html.escape(study.toml(found.row)),
+        "unfit": unfit,
+    }
 
 
 def _save(path, draw, study):
@@ -135,7 +157,7 @@ def _row(row):
 
 
 def _draw_fronts(study, figure):
-    good = [row for row in study.rows if row["rms"] is not None]
+    good = [row for row in study.rows if not row["unfit"]]
     figure.set_size_inches(11, 4.6)
     left, right = figure.subplots(1, 2, sharey=True)
     for axes, cost, front in (
@@ -156,7 +178,7 @@ def _draw_fronts(study, figure):
     right.plot(
         [s[0] for s in sizes], [s[1] for s in sizes], "s--", color="#a63d38", ms=4, label="decimated mesh"
     )
-    left.set(xlabel="fit and 20,000 values [ms]", ylabel=f"RMS error [{study.units or 'unit'}]")
+    left.set(xlabel="fit and 20,000 values [ms]", ylabel=f"RMS error [{study.units or 'mesh units'}]")
     right.set_xlabel("stored numbers")
     right.legend(fontsize=8)
 
@@ -169,7 +191,7 @@ def _draw_maps(study, figure):
     figure.set_size_inches(11, 1.6 + 0.26 * len(names))
     for axes, key, label in zip(
         figure.subplots(1, 2, sharey=True), ("error", "condition"),
-        (f"RMS error [{study.units or 'unit'}]", "condition"), strict=True,
+        (f"RMS error [{study.units or 'mesh units'}]", "condition"), strict=True,
     ):  # fmt: skip
         grid = np.full((len(names), len(shapes)), np.nan)
         for row in rows:
@@ -185,13 +207,15 @@ def _draw_maps(study, figure):
 def _draw_surfaces(study, directory):
     """Draw in a child process: VTK may end the process where no graphics exist."""
     chosen = [
-        (row, surface) for row, surface in zip(study.rows, study.surfaces, strict=True) if surface is not None
+        (row, surface)
+        for row, surface in zip(study.rows, study.surfaces, strict=True)
+        if surface is not None and not row["unfit"]
     ][:PICTURES]
     if not chosen:
         return None
     arrays = {"most": np.array(max(float(np.quantile(s[2], 0.995)) for _, s in chosen))}
     for k, (row, (vertices, faces, error)) in enumerate(chosen):
-        text = f"{_named(row)}: {row['rms']:.2g} RMS, {row['hausdorff']:.2g} greatest"
+        text = f"{named(row)}: {row['rms']:.2g} RMS, {row['hausdorff']:.2g} greatest"
         arrays |= {f"v{k}": vertices, f"f{k}": faces, f"e{k}": error, f"t{k}": np.array(text)}
     np.savez(directory / "surfaces.npz", **arrays)
     picture = directory / "surfaces.png"
