@@ -91,6 +91,11 @@ class LoopCache(_Cache):
         if lock is not None:
             lock.release()
 
+    def let_go_all(self) -> None:
+        """Free what is still held: compiling failed, or gave other argument types than were asked for."""
+        for arguments in list(self.held):
+            self.let_go(arguments)
+
     def enable(self) -> None:
         """Read and write from now on."""
         self.enabled = True

@@ -32,9 +32,12 @@ class Loop(CPUDispatcher):
         return self._cache.entry_name(arguments, self.targetctx.codegen())
 
     def compile(self, sig):
-        """Numba's, with the garbage collector held back."""
+        """Numba's, with the garbage collector held back; whatever ends it, no lock is left behind."""
         with _NO_COLLECTION:
-            return super().compile(sig)
+            try:
+                return super().compile(sig)
+            finally:
+                self._cache.let_go_all()
 
 
 class _NoCollection:

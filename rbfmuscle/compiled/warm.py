@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 
 from rbfmuscle.compiled.needs import loops_missing, task_names
 from rbfmuscle.compiled.progress import Progress
-from rbfmuscle.compiled.store import EntryLock, has_entry
+from rbfmuscle.compiled.store import PATIENCE, EntryLock, has_entry
 from rbfmuscle.compiled.watch import tell_stage
 from rbfmuscle.validation import UsageError
 
@@ -43,9 +43,11 @@ def compile_ahead(
     helpers = _start_helpers(tasks, missing, jobs)
     try:
         with tell_stage("compiling, once for this machine", "loop", len(missing)) as advance:
-            left = missing
-            while left:
-                left = _compile_one(left)
+            left, since = missing, time.monotonic()
+            # What another process holds for long is left to the call that needs it.
+            while left and time.monotonic() - since < PATIENCE:
+                before, left = left, _compile_one(left)
+                since = since if len(left) == len(before) else time.monotonic()
                 done = len(missing) - sum(not has_entry(need.entry) for need in left)
                 advance(done)
                 if progress is not None:

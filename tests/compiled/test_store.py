@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -214,3 +215,18 @@ def test_old_entries_are_removed_in_time(folder, tmp_path):
     run(folder, cache, "from rbfmuscle.compiled.store import folders; folders()")
     assert list(cache.glob("*.loop")) == [kept]
     assert not (cache / "half.part").exists()
+
+
+def test_a_loop_that_cannot_be_compiled_leaves_no_lock_behind():
+    """The same process would otherwise wait for itself."""
+    from numba.core.errors import NumbaError
+
+    from rbfmuscle.compiled.loop import compiled
+
+    @compiled
+    def _wrong_loop(x):
+        return x.nothing_of_that_name
+
+    with pytest.raises(NumbaError):
+        _wrong_loop(np.zeros(3))
+    assert not _wrong_loop._cache.held
