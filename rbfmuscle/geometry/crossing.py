@@ -3,12 +3,48 @@
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 
-# Cells of the sorting grid for each triangle, at most.
-CELLS_A_FACE = 4
+# Triangles in a leaf of the tree, and bits of their places along each axis by which they are sorted.
+LEAF, BITS = 4, 10
+# Pairs of nodes that wait at a time: less than four for each level of the tree.
+WAITING = 512
 
 
-def crossing_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+class FaceTree:
+    """Boxes around the triangles of a mesh, by nearness at one moment; good for later ones with the same faces.
+
+    Parameters
+    ----------
+    vertices : (n, 3) ndarray
+    faces : (m, 3) ndarray of int
+    """
+
+    def __init__(self, vertices: Floats, faces: Integers) -> None:
+        self.faces = np.ascontiguousarray(faces, dtype=np.int64)
+        middle = (vertices[self.faces[:, 0]] + vertices[self.faces[:, 1]] + vertices[self.faces[:, 2]]) / 3.0
+        low = middle.min(axis=0)
+        size = max(float((middle.max(axis=0) - low).max()), np.finfo(float).tiny)
+        cell = np.minimum((middle - low) * ((1 << BITS) / size), (1 << BITS) - 1).astype(np.int64)
+        code = np.zeros(len(self.faces), dtype=np.int64)
+        for bit in range(BITS):
+            for axis in range(3):
+                code |= (cell[:, axis] >> bit & 1) << (3 * bit + axis)
+        self.order = np.argsort(code, kind="stable")
+        self.leaves = 1 << max(int(np.ceil(len(self.faces) / LEAF)) - 1, 0).bit_length()
+
+    def crossing(self, vertices: Floats, among: Booleans | None = None) -> Booleans:
+        """Which triangles cross others, as `crossing_faces` says, for places of the vertices now."""
+        vertices = np.ascontiguousarray(vertices, dtype=np.float64)
+        box, node = np.empty((len(self.faces), 6)), np.empty((2 * self.leaves, 6))
+        _boxes_loop(vertices, self.faces, self.order, box, self.leaves, node)
+        marked = np.zeros(len(self.faces), dtype=np.bool_)
+        among = np.ones(len(self.faces), dtype=np.bool_) if among is None else among
+        _cross_loop(vertices, self.faces, self.order, box, self.leaves, node, among, marked)
+        return marked
+
+
+def crossing_faces(vertices: Floats, faces: Integers) -> Booleans:
     """Which triangles cross others of the same surface.
 
     An edge crosses a triangle where its ends lie on either side of it and its line passes through the inside.
@@ -25,69 +61,70 @@ def crossing_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     -------
     (m,) ndarray of bool
     """
-    vertices = np.ascontiguousarray(vertices, dtype=np.float64)
-    faces = np.ascontiguousarray(faces, dtype=np.int64)
-    marked = np.zeros(len(faces), dtype=np.bool_)
     if len(faces) == 0:
-        return marked
-    used = vertices[faces]
-    low, high = used.min(axis=1), used.max(axis=1)
-    # Twice the mean extent: a triangle lies in few cells, and a cell holds few triangles.
-    size = max(2.0 * float((high - low).max(axis=1).mean()), 1e-300)
-    extent = np.maximum(high.max(axis=0) - low.min(axis=0), 1e-300)
-    while np.prod(np.floor(extent / size) + 1.0) > CELLS_A_FACE * len(faces) + 64:
-        size *= 1.3
-    shape = np.floor(extent / size).astype(np.int64) + 1
-    first = np.floor((low - low.min(axis=0)) / size).astype(np.int64)
-    last = np.minimum(np.floor((high - low.min(axis=0)) / size).astype(np.int64), shape - 1)
-    start = np.zeros(int(np.prod(shape)) + 1, dtype=np.int64)
-    _count_loop(first, last, shape, start)
-    members = np.empty(start[-1], dtype=np.int64)
-    _fill_loop(first, last, shape, start, members)
-    _cross_loop(vertices, faces, low, high, start, members, marked)
-    return marked
+        return np.zeros(0, dtype=bool)
+    vertices = np.asarray(vertices, dtype=np.float64)
+    return FaceTree(vertices, faces).crossing(vertices)
 
 
 @compiled
-def _count_loop(first, last, shape, start):
-    """Number of triangles in each cell, summed up: those of cell c end at start[c + 1]."""
-    for f in range(len(first)):
-        for i in range(first[f, 0], last[f, 0] + 1):
-            for j in range(first[f, 1], last[f, 1] + 1):
-                for k in range(first[f, 2], last[f, 2] + 1):
-                    start[(i * shape[1] + j) * shape[2] + k + 1] += 1
-    for c in range(len(start) - 1):
-        start[c + 1] += start[c]
+def _boxes_loop(vertices, faces, order, box, leaves, node):
+    """Boxes of the triangles in their order, and of the tree's nodes: node k holds those of 2k and 2k + 1."""
+    node[:, :3], node[:, 3:] = np.inf, -np.inf
+    for m in range(len(order)):
+        f, k = order[m], leaves + m // LEAF
+        for a in range(3):
+            x, y, z = vertices[faces[f, 0], a], vertices[faces[f, 1], a], vertices[faces[f, 2], a]
+            box[m, a], box[m, 3 + a] = min(x, y, z), max(x, y, z)
+            node[k, a], node[k, 3 + a] = min(node[k, a], box[m, a]), max(node[k, 3 + a], box[m, 3 + a])
+    for k in range(leaves - 1, 0, -1):
+        for a in range(3):
+            node[k, a] = min(node[2 * k, a], node[2 * k + 1, a])
+            node[k, 3 + a] = max(node[2 * k, 3 + a], node[2 * k + 1, 3 + a])
 
 
 @compiled
-def _fill_loop(first, last, shape, start, members):
-    filled = start[:-1].copy()
-    for f in range(len(first)):
-        for i in range(first[f, 0], last[f, 0] + 1):
-            for j in range(first[f, 1], last[f, 1] + 1):
-                for k in range(first[f, 2], last[f, 2] + 1):
-                    c = (i * shape[1] + j) * shape[2] + k
-                    members[filled[c]] = f
-                    filled[c] += 1
+def _apart(one, i, other, j):
+    """Whether two boxes do not touch."""
+    return (
+        one[i, 0] > other[j, 3] or other[j, 0] > one[i, 3] or one[i, 1] > other[j, 4]
+        or other[j, 1] > one[i, 4] or one[i, 2] > other[j, 5] or other[j, 2] > one[i, 5]
+    )  # fmt: skip
 
 
 @compiled
-def _cross_loop(vertices, faces, low, high, start, members, marked):
-    for c in range(len(start) - 1):
-        for m in range(start[c], start[c + 1]):
-            f = members[m]
-            for n in range(m + 1, start[c + 1]):
-                g = members[n]
-                if marked[f] and marked[g]:
-                    continue
-                apart = False
-                for a in range(3):
-                    apart |= low[f, a] > high[g, a] or low[g, a] > high[f, a]
-                if apart or _shared(faces, f, g) > 1:
-                    continue
-                if _edges_cross(vertices, faces, f, g) or _edges_cross(vertices, faces, g, f):
-                    marked[f], marked[g] = True, True
+def _cross_loop(vertices, faces, order, box, leaves, node, among, marked):
+    """All pairs of leaves whose boxes touch, from the root down."""
+    waiting = np.empty((WAITING, 2), dtype=np.int64)
+    waiting[0, 0], waiting[0, 1] = 1, 1
+    count = 1
+    while count > 0:
+        count -= 1
+        i, j = waiting[count, 0], waiting[count, 1]
+        if i != j and _apart(node, i, node, j):
+            continue
+        if i >= leaves:
+            _leaf_loop(vertices, faces, order, box, LEAF * (i - leaves), LEAF * (j - leaves), among, marked)
+            continue
+        # Nodes of a pair are of one level.
+        for a in range(2):
+            for b in range(2):
+                if i != j or a <= b:
+                    waiting[count, 0], waiting[count, 1] = 2 * i + a, 2 * j + b
+                    count += 1
+
+
+@compiled
+def _leaf_loop(vertices, faces, order, box, first, second, among, marked):
+    for m in range(first, min(first + LEAF, len(order))):
+        for n in range(max(second, m + 1), min(second + LEAF, len(order))):
+            if _apart(box, m, box, n):
+                continue
+            f, g = order[m], order[n]
+            if (marked[f] and marked[g]) or not (among[f] or among[g]) or _shared(faces, f, g) > 1:
+                continue
+            if _cross(vertices, faces, f, g):
+                marked[f], marked[g] = True, True
 
 
 @compiled
@@ -101,6 +138,29 @@ def _shared(faces, f, g):
 
 
 @compiled
+def _cross(vertices, faces, f, g):
+    """Whether an edge of one triangle goes through the inside of the other."""
+    if not (_straddles(vertices, faces, f, g) and _straddles(vertices, faces, g, f)):
+        return False
+    return _edges_cross(vertices, faces, f, g) or _edges_cross(vertices, faces, g, f)
+
+
+@compiled
+def _straddles(vertices, faces, f, g):
+    """Whether f has corners on both sides of the plane of g; those that they share lie in it."""
+    a, b, c = faces[g, 0], faces[g, 1], faces[g, 2]
+    above, below = False, False
+    for k in range(3):
+        p = faces[f, k]
+        if p in (a, b, c):
+            continue
+        side = _side(vertices, a, b, c, p)
+        above |= side > 0.0
+        below |= side < 0.0
+    return above and below
+
+
+@compiled
 def _edges_cross(vertices, faces, f, g):
     """Whether an edge of f goes through the inside of g."""
     a, b, c = faces[g, 0], faces[g, 1], faces[g, 2]
@@ -110,10 +170,12 @@ def _edges_cross(vertices, faces, f, g):
             continue
         if _side(vertices, a, b, c, p) * _side(vertices, a, b, c, q) >= 0.0:
             continue
-        along = _side(vertices, p, q, a, b), _side(vertices, p, q, b, c), _side(vertices, p, q, c, a)
-        if (along[0] > 0.0 and along[1] > 0.0 and along[2] > 0.0) or (
-            along[0] < 0.0 and along[1] < 0.0 and along[2] < 0.0
-        ):
+        one, two, three = (
+            _side(vertices, p, q, a, b),
+            _side(vertices, p, q, b, c),
+            _side(vertices, p, q, c, a),
+        )
+        if (one > 0.0 and two > 0.0 and three > 0.0) or (one < 0.0 and two < 0.0 and three < 0.0):
             return True
     return False
 
@@ -121,11 +183,11 @@ def _edges_cross(vertices, faces, f, g):
 @compiled
 def _side(vertices, a, b, c, d):
     """Six times the signed volume of a tetrahedron: which side of the triangle abc the point d lies on."""
-    o, u, v, w = vertices[a], vertices[b], vertices[c], vertices[d]
-    ux, uy, uz = u[0] - o[0], u[1] - o[1], u[2] - o[2]
-    vx, vy, vz = v[0] - o[0], v[1] - o[1], v[2] - o[2]
+    x, y, z = vertices[a, 0], vertices[a, 1], vertices[a, 2]
+    ux, uy, uz = vertices[b, 0] - x, vertices[b, 1] - y, vertices[b, 2] - z
+    vx, vy, vz = vertices[c, 0] - x, vertices[c, 1] - y, vertices[c, 2] - z
     return (
-        (uy * vz - uz * vy) * (w[0] - o[0])
-        + (uz * vx - ux * vz) * (w[1] - o[1])
-        + (ux * vy - uy * vx) * (w[2] - o[2])
+        (uy * vz - uz * vy) * (vertices[d, 0] - x)
+        + (uz * vx - ux * vz) * (vertices[d, 1] - y)
+        + (ux * vy - uy * vx) * (vertices[d, 2] - z)
     )

@@ -9,8 +9,10 @@ from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit.lapack import factor_cholesky
 from rbfmuscle.implicit.kernels.table import get_kernel
+from rbfmuscle.model.drawing import MARCHING_CELLS
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.model.placement import MOST_WITH_ALL_DERIVATIVES, default_centres, sample_is_cached
+from rbfmuscle.model.shown import shown_vertices
 from rbfmuscle.sim.plan.forecast import MuscleCost
 from rbfmuscle.sim.plan.rates import shortest
 from rbfmuscle.sim.scene.objects import Muscle
@@ -58,7 +60,7 @@ def estimate_muscle(
     """
     centres = options.centres or default_centres(muscle.mesh.area, scene)
     points = centres + options.samples
-    shown, nodes = _surface_size(muscle, options.resolution)
+    shown, nodes = _surface_size(muscle, options)
     unknowns = _unknowns(options, centres)
     pair, flop = _field_rates(options.kernel)
     call, visit = rates["call"], rates["visit"]
@@ -87,8 +89,11 @@ def estimate_muscle(
     )
 
 
-def _surface_size(muscle, resolution):
-    """Vertices of the extracted surface, and nodes of its grid."""
+def _surface_size(muscle, options):
+    """Vertices of the shown surface, and nodes of the grid where it is marched."""
+    if options.surface == "material":
+        return shown_vertices(muscle, options.resolution), 0.0
+    resolution = options.resolution or MARCHING_CELLS
     vertices = np.asarray(muscle.mesh.vertices, dtype=float)
     axes = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
     extent = np.ptp(vertices @ axes.T, axis=0)

@@ -1,29 +1,58 @@
-"""How an RBF muscle is shown: its field refitted, the bones cut away, the closed surface extracted."""
+"""How an RBF muscle is shown: its field refitted, the bones cut away, the closed surface brought onto the level set."""
 
 import time
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
 from rbfmuscle.geometry.fields import LevelField
 from rbfmuscle.implicit.extraction.band import box_along
+from rbfmuscle.implicit.extraction.material import FittedMesh, carry_material, fit_material
 from rbfmuscle.implicit.extraction.obstacles import ObstaclePoints
-from rbfmuscle.implicit.extraction.surface import extract_surface
+from rbfmuscle.implicit.extraction.surface import ExtractedSurface, extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.model.rest import Rest
+from rbfmuscle.model.shown import ShownMesh
 from rbfmuscle.sim.loop.contact import BoneContacts
 from rbfmuscle.sim.loop.frame import ModelSurface
+from rbfmuscle.sim.scene.objects import Muscle
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.validation import SolveError
 
+# Cells along the longest side where marching cubes is asked for and no resolution.
+MARCHING_CELLS = 48
+# Bones are asked for exact distances within so many mean edges of the mesh.
+REACH = 3.0
+# A tenth of the edges this much longer than at rest is the cause of what cannot be fitted.
+STRETCHED = 1.6
+
+
+class Moment(NamedTuple):
+    """Where a muscle's points are at one moment.
+
+    Attributes
+    ----------
+    centres, normals : (K, 3) ndarray
+    points : (K + S, 3) ndarray
+        Contact points.
+    carried : (n, 3) ndarray or None
+        Vertices of the shown mesh where the material takes them.
+    """
+
+    centres: np.ndarray
+    normals: np.ndarray
+    points: np.ndarray
+    carried: np.ndarray | None
+
 
 class SurfaceDrawer:
-    """Extracts the surface of one muscle, from frame to frame.
+    """Draws the surface of one muscle, from frame to frame.
 
     Parameters
     ----------
-    name : str
-        The muscle's.
+    muscle : Muscle
     scene : Scene
     rest : Rest
     options : RBFOptions
@@ -32,52 +61,99 @@ class SurfaceDrawer:
     ----------
     level : float
         Of the field that met the rest volume last: where the next search for it begins.
+    shown : ShownMesh or None
+        The material's mesh, where it is not marching cubes that show the surface.
     """
 
-    def __init__(self, name: str, scene: Scene, rest: Rest, options: RBFOptions) -> None:
-        self.name, self.rest, self.options = name, rest, options
+    def __init__(self, muscle: Muscle, scene: Scene, rest: Rest, options: RBFOptions) -> None:
+        self.name, self.rest, self.options = muscle.name, rest, options
         self.bone_points = [ObstaclePoints(bone.mesh.vertices) for bone in scene.bones]
         self.level = 0.0
+        self.shown = ShownMesh(muscle, rest, options) if options.surface == "material" else None
 
-    def extract(self, field: RBFField, points: np.ndarray, contacts: BoneContacts) -> ModelSurface:
+    def draw(self, fit: Callable[[], RBFField], now: Moment, contacts: BoneContacts) -> ModelSurface:
         """The closed surface at the rest volume.
 
         Parameters
         ----------
-        field : RBFField
-        points : (n, 3) ndarray
-            The muscle's contact points: the surface is sought around them.
+        fit : callable
+            Gives the field.
+        now : Moment
         contacts : BoneContacts
-            What cuts it.
+            What cuts the surface.
 
         Raises
         ------
         SolveError
-            If there is no closed surface.
+            If marching cubes find no closed surface.
         """
-        axes = self.rest.axes @ contacts.poses[self.rest.bones[0]][:3, :3].T
-        resolution = self.options.resolution
+        notes: list[tuple[str, int, str]] = []
+        if self.shown is None or now.carried is None:
+            result: ExtractedSurface = self._march(fit, now, contacts)
+            left = 0.0
+        else:
+            result = self._of_material(fit, now.carried, contacts)
+            left = result.left / len(now.carried)
+            if left == 1.0:
+                bone, cause = self._cause(now, contacts)
+                notes.append((bone, len(now.carried), f"carried_{cause}"))
+        quantities = {"components": result.components, "level": self.level, "unfitted_fraction": left}
+        return ModelSurface(result.vertices, result.faces, quantities, notes)
+
+    def _of_material(
+        self, fit: Callable[[], RBFField], carried: np.ndarray, contacts: BoneContacts
+    ) -> FittedMesh:
+        """The material's mesh on the level set, or where the material is if there is no fit."""
+        mesh = self.shown.mesh
+        cut = _BoneCut(contacts, REACH * mesh.edge(carried)) if contacts.names else None
+        where = {"cut": cut, "obstacles": self._obstacles(contacts), "axes": self._axes(contacts)}
+        volume = self.rest.mesh_volume
+        try:
+            result = fit_material(mesh, carried, fit(), volume=volume, level=self.level, **where)
+        except (ValueError, np.linalg.LinAlgError):
+            return carry_material(mesh, carried, volume=volume, **where)
+        self.level = result.level
+        return result
+
+    def _march(self, fit: Callable[[], RBFField], now: Moment, contacts: BoneContacts) -> ExtractedSurface:
+        axes, resolution = self._axes(contacts), self.options.resolution or MARCHING_CELLS
         # Farther than a cell from the bones a lower bound will do: no vertex gets there.
-        reach = 1.25 * float(np.diff(box_along(points, axes), axis=0).max()) / resolution
-        cut = _BoneCut(contacts, reach) if contacts.names else None
-        obstacles = [(self.bone_points[b], contacts.poses[contacts.names[b]]) for b in contacts.reached]
+        reach = 1.25 * float(np.diff(box_along(now.points, axes), axis=0).max()) / resolution
         try:
             result = extract_surface(
-                field, points=points, resolution=resolution, cut=cut,
-                volume=self.rest.mesh_volume, level=self.level, axes=axes, obstacles=obstacles,
+                fit(), points=now.points, resolution=resolution,
+                cut=_BoneCut(contacts, reach) if contacts.names else None,
+                volume=self.rest.mesh_volume, level=self.level, axes=axes, obstacles=self._obstacles(contacts),
             )  # fmt: skip
-        except ValueError as error:
+        except (ValueError, np.linalg.LinAlgError) as error:
             raise SolveError(
-                f"muscle {self.name!r}: no closed surface with kernel "
-                f"{self.options.kernel!r} and {len(self.rest.centres)} centres: {error}"
+                f"muscle {self.name!r}: no closed surface by marching cubes with kernel "
+                f"{self.options.kernel!r} and {len(now.centres)} centres: {error}; surface = 'material' shows one"
             ) from error
         self.level = result.level
-        quantities = {
-            "components": result.components,
-            "condition": field.condition,
-            "level": result.level,
-        }
-        return ModelSurface(result.vertices, result.faces, quantities)
+        return result
+
+    def _axes(self, contacts: BoneContacts) -> np.ndarray:
+        """Axes that turn with the scene: what is sorted by them then falls out alike."""
+        return self.rest.axes @ contacts.poses[self.rest.bones[0]][:3, :3].T
+
+    def _obstacles(self, contacts: BoneContacts) -> list[tuple[ObstaclePoints, np.ndarray]]:
+        return [(self.bone_points[b], contacts.poses[contacts.names[b]]) for b in contacts.reached]
+
+    def _cause(self, now: Moment, contacts: BoneContacts) -> tuple[str, str]:
+        """Bone and cause of a surface that cannot be fitted: a held end in a bone, stretch, or sheets that met."""
+        depth, found = self.shown.mesh.edge(now.carried), ""
+        holder = self.rest.holder[: len(now.centres)]
+        for b in contacts.reached:
+            name = contacts.names[b]
+            own = self.rest.bones.index(name) if name in self.rest.bones else -1
+            held = (holder >= 0) & (holder != own)
+            deepest = -contacts.distance_and_direction(now.centres[held], b)[0].min(initial=0.0)
+            if deepest > depth:
+                depth, found = deepest, name
+        if found:
+            return found, "held_end"
+        return "", "stretched" if self.shown.stretch(now.carried) > STRETCHED else "sheets"
 
 
 class RBFDrawing:
@@ -86,23 +162,14 @@ class RBFDrawing:
     Parameters
     ----------
     drawer : SurfaceDrawer
-    centres, normals : (K, 3) ndarray
-    points : (K + S, 3) ndarray
-        Contact points.
+    now : Moment
     contacts : BoneContacts
         As they stand.
     """
 
-    def __init__(
-        self,
-        drawer: SurfaceDrawer,
-        centres: np.ndarray,
-        normals: np.ndarray,
-        points: np.ndarray,
-        contacts: BoneContacts,
-    ) -> None:
-        self._drawer, self._centres, self._normals, self._points = drawer, centres, normals, points
-        self._depth, self._contacts = contacts.depth(points), contacts.frozen()
+    def __init__(self, drawer: SurfaceDrawer, now: Moment, contacts: BoneContacts) -> None:
+        self._drawer, self._now = drawer, now
+        self._depth, self._contacts = contacts.depth(now.points), contacts.frozen()
         self._fitted: RBFField | None = None
         self._time_fit = 0.0
 
@@ -112,12 +179,13 @@ class RBFDrawing:
 
     def surface(self) -> ModelSurface:
         """The closed surface at the rest volume, cut by what lay in the way."""
-        field = self._fit()
         started = time.perf_counter()
-        surface = self._drawer.extract(field, self._points, self._contacts)
+        before = self._time_fit
+        surface = self._drawer.draw(self._fit, self._now, self._contacts)
         surface.quantities.update(
+            condition=np.inf if self._fitted is None else self._fitted.condition,
             time_fit=self._time_fit,
-            time_extract=time.perf_counter() - started,
+            time_extract=time.perf_counter() - started - (self._time_fit - before),
             solver_penetration_max=self._depth,
         )
         return surface
@@ -125,7 +193,7 @@ class RBFDrawing:
     def _fit(self) -> RBFField:
         if self._fitted is None:
             started = time.perf_counter()
-            self._fitted = self._drawer.rest.fit.fit(self._centres, self._normals)
+            self._fitted = self._drawer.rest.fit.fit(self._now.centres, self._now.normals)
             self._time_fit = time.perf_counter() - started
         return self._fitted
 

@@ -60,6 +60,29 @@ def _carry_all_loop(x, target, rest, points, columns, shares, out):
                 out[s, a] += shares[s, k] * (x[j, a] + t[a, 0] * dx + t[a, 1] * dy + t[a, 2] * dz)
 
 
+def carry_points(x, shape, points, columns, shares):
+    """Where centres carry points that hang on them.
+
+    Parameters
+    ----------
+    x : (K, 3) ndarray
+        Centres now.
+    shape : ShapeConstraint
+        With its present targets.
+    points : (n, 3) ndarray
+        At rest.
+    columns, shares : (n, k) ndarray
+        Centres of each point, and their shares.
+
+    Returns
+    -------
+    (n, 3) ndarray
+    """
+    out = np.empty_like(points)
+    _carry_all_loop(x, shape.target, shape.rest, points, columns, shares, out)
+    return out
+
+
 class ElasticSolver:
     """Alternates local targets with one dense global solve, accelerated (Anderson), contacts inside.
 
@@ -114,9 +137,7 @@ class ElasticSolver:
 
     def carry(self, x: np.ndarray) -> np.ndarray:
         """Contact points at centres x with the present targets, (K + S, 3)."""
-        out = np.empty_like(self.points)
-        _carry_all_loop(x, self.shape.target, self.shape.rest, self.points, self.columns, self.shares, out)
-        return out
+        return carry_points(x, self.shape, self.points, self.columns, self.shares)
 
     def solve(self, x: np.ndarray, contacts: BoneContacts) -> np.ndarray:
         """Return the settled centres, (K, 3)."""

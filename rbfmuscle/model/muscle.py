@@ -8,7 +8,7 @@ import numpy as np
 from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.model.contraction import contracting
-from rbfmuscle.model.drawing import RBFDrawing, SurfaceDrawer
+from rbfmuscle.model.drawing import Moment, RBFDrawing, SurfaceDrawer
 from rbfmuscle.model.elasticity import SETTLED, SETTLED_STILL, ElasticSolver
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.model.rest import Rest
@@ -52,7 +52,7 @@ class RBFMuscle:
         if muscle.contraction is not None:
             self.rest, self.law = contracting(muscle, self.rest, self.options)
         self.solver = ElasticSolver(self.rest, self.options, self.law)
-        self.drawer = SurfaceDrawer(self.name, scene, self.rest, self.options)
+        self.drawer = SurfaceDrawer(muscle, scene, self.rest, self.options)
         names = [bone.name for bone in scene.bones]
         numbers = np.array([names.index(bone) for bone in self.rest.bones])
         self.contact_bone = np.where(self.rest.holder < 0, -1, numbers[self.rest.holder])
@@ -119,4 +119,7 @@ class RBFMuscle:
 
     def drawing(self, contacts: BoneContacts) -> RBFDrawing:
         """The muscle as it is now, for its surface."""
-        return RBFDrawing(self.drawer, self.points.copy(), self.normals(), self.contact_points(), contacts)
+        shown = self.drawer.shown
+        carried = None if shown is None else shown.carried(self.points, self.solver)
+        now = Moment(self.points.copy(), self.normals(), self.contact_points(), carried)
+        return RBFDrawing(self.drawer, now, contacts)

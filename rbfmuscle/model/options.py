@@ -25,16 +25,18 @@ class RBFOptions(Table):
     from the error at rest. ``samples`` of the surface meet the bones; ``contacts`` of them join in one round.
     ``iterations`` a solve, ``acceleration`` of them remembered (Anderson). The fibre stretch is free from
     ``stretch_low`` to ``stretch_high`` but for the share ``stretch_hold`` that pulls it back to one; ``across``
-    links a centre go through the thickness, each counting ``across_weight``. ``resolution`` is the number of cells
-    along the longest side at extraction. ``placement`` of the centres, and ``derivatives`` that the fit meets there;
-    ``seed`` of what is drawn by chance.
+    links a centre go through the thickness, each counting ``across_weight``. ``surface`` is shown by a mesh of the
+    ``material`` that is brought onto the level set, or by ``marching`` cubes; ``resolution`` is the number of edges or
+    cells along the longest side, 0 for as many as the muscle's thickness wants. ``placement`` of the centres, and
+    ``derivatives`` that the fit meets there; ``seed`` of what is drawn by chance.
     """
 
     centres: Annotated[int, Field(ge=0, le=20_000)] = 0
     samples: Annotated[int, Field(ge=50, le=200_000)] = 2000
     iterations: Annotated[int, Field(ge=1, le=1000)] = 8
     contacts: Annotated[int, Field(ge=1, le=10_000)] = 24
-    resolution: Annotated[int, Field(ge=4, le=1000)] = 48
+    surface: Literal["material", "marching"] = "material"
+    resolution: Annotated[int, Field(ge=0, le=1000)] = 0
     kernel: Annotated[str, AfterValidator(_known_kernel)] = "cubic"
     epsilon: NotNegative = 0.0
     stretch_low: Annotated[float, Field(ge=0.01, le=1.0)] = 0.5

@@ -130,7 +130,7 @@ def test_unknown_settings_are_refused_by_name(hip):
 @pytest.mark.parametrize("kernel", [k for k in KERNELS if k != "gaussian"])
 def test_any_kernel_drives_a_muscle(kernel):
     scene = phantom_scene().with_options(
-        frames="0:6:5", **{"model.kernel": kernel, "model.centres": 100, "model.resolution": 32}
+        {"model.kernel": kernel, "model.centres": 100, "model.resolution": 32}, frames="0:6:5"
     )
     scene.muscles = [scene.muscle("adductor_posterior")]
     smooth = get_kernel(kernel).hermite
@@ -174,15 +174,37 @@ def test_fitted_centres_need_a_hermite_fit_to_all_derivatives(hip):
                 RBFMuscle(hip.muscles[0], hip, RBFOptions(placement="fitted", **options))
 
 
-@pytest.mark.filterwarnings("ignore:kernel .* does not reach")
-def test_a_kernel_that_gives_no_surface_is_a_clear_error():
+def unshowable(surface):
     scene = phantom_scene().with_options(
-        **{"model.kernel": "gaussian", "model.epsilon": 1.0, "model.centres": 100}
+        {"model.kernel": "gaussian", "model.epsilon": 1.0, "model.centres": 100, "model.surface": surface}
     )
     scene.muscles = [scene.muscle("adductor_posterior")]
-    model = build_model(scene.muscles[0], scene, "rbf")
-    with pytest.raises(SolveError, match=r"adductor_posterior.*no closed surface with kernel 'gaussian'"):
+    return build_model(scene.muscles[0], scene, "rbf"), scene
+
+
+@pytest.mark.filterwarnings("ignore:kernel .* does not reach")
+def test_a_kernel_that_gives_no_surface_is_a_clear_error_of_marching_cubes():
+    model, scene = unshowable("marching")
+    message = r"adductor_posterior.*no closed surface by marching cubes with kernel 'gaussian'"
+    with pytest.raises(SolveError, match=message):
         next(iter(simulate_frames(scene, [model])))
+
+
+@pytest.mark.filterwarnings("ignore:kernel .* does not reach")
+def test_where_no_level_set_can_be_shown_the_material_is_and_an_event_says_so():
+    model, scene = unshowable("material")
+    frame = next(iter(simulate_frames(scene, [model])))
+    surface = frame.surfaces[model.name]
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    assert mesh.is_watertight and mesh.euler_number == 2
+    assert mesh.volume == pytest.approx(scene.muscles[0].mesh.volume, rel=1e-10)
+    near = igl.point_mesh_squared_distance(
+        surface.vertices, np.array(scene.muscles[0].mesh.vertices), np.array(scene.muscles[0].mesh.faces)
+    )[0]  # fmt: skip
+    # At rest the material is where the input mesh is, but for chords of 3 mm edges.
+    assert np.sqrt(near.max()) < 0.5
+    assert [(e.muscle, e.action) for e in frame.events] == [(model.name, "carried_sheets")]
+    assert surface.quantities["unfitted_fraction"] == 1.0
 
 
 @pytest.mark.parametrize(

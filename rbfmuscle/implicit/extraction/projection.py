@@ -24,7 +24,7 @@ class Projector:
 
     def __init__(
         self,
-        field: Field,
+        field: Field | None,
         cut: Cut | None,
         vertices: Floats,
         spacing: float,
@@ -32,14 +32,19 @@ class Projector:
     ) -> None:
         self.vertices = vertices
         self.spacing = spacing
-        self._field = field.value_and_gradient
+        self._field = None if field is None else field.value_and_gradient
         self._cut = None if cut is None else cut.value_and_gradient_below
         self._near_cut = near_cut
+        # Distance (n,) from the cut at which vertices that fall into it end; 0 where None.
+        self.clearance: Floats | None = None
         self.slope = np.zeros(len(vertices))
+        self.on_field = np.ones(len(vertices), dtype=bool)
         self._direction = np.zeros_like(vertices)
 
     def project(self, level: float, rounds: int = 6) -> None:
         """Newton steps until they are shorter than 1e-4 of a cell."""
+        if self._field is None:
+            raise ValueError("there is no field to project onto")
         on_field = np.ones(len(self.vertices), dtype=bool)
         todo = np.arange(len(self.vertices))
         for _ in range(rounds):
@@ -58,6 +63,7 @@ class Projector:
                 break
         self._direction[~on_field] = 0.0
         self.slope[~on_field] = 0.0
+        self.on_field = on_field
 
     def _turn_to_cut(
         self, x: Floats, todo: Integers, height: Floats, step: Floats, on_field: Booleans
@@ -66,12 +72,56 @@ class Projector:
         rows = np.flatnonzero(self._near_cut[todo])
         if self._cut is None or len(rows) == 0:
             return
-        distance, outward = self._cut(x[rows], -height[rows])
+        distance, outward = self._cut(x[rows], self._limit(todo[rows]) - height[rows])
+        distance = distance - self._limit(todo[rows])
         on_cut = height[rows] < -distance
         on_field[todo[rows]] = ~on_cut
         rows, distance, outward = rows[on_cut], distance[on_cut], outward[on_cut]
         size = np.maximum(np.einsum("ij,ij->i", outward, outward), np.finfo(float).tiny)
         step[rows] = -(distance / size)[:, None] * outward
+
+    def _limit(self, rows: Integers) -> Floats | float:
+        return 0.0 if self.clearance is None else self.clearance[rows]
+
+    def hold(self, rows: Integers | slice) -> None:
+        """Let vertices stay where they are when the level changes."""
+        self._direction[rows] = 0.0
+        self.slope[rows] = 0.0
+
+    def move_along(self, direction: Floats) -> None:
+        """Let vertices move along given directions (n, 3) when the level changes."""
+        self._direction[:] = direction
+        self.slope[:] = np.linalg.norm(direction, axis=1)
+
+    def part(self, rows: Integers) -> Projector:
+        """A projector of some of the vertices."""
+        part = Projector.__new__(Projector)
+        part.vertices, part.spacing = self.vertices[rows], self.spacing
+        part._field, part._cut, part._near_cut = self._field, self._cut, self._near_cut[rows]
+        part.clearance = None if self.clearance is None else self.clearance[rows]
+        part.slope, part._direction = np.zeros(len(rows)), np.zeros((len(rows), 3))
+        return part
+
+    def take(self, part: Projector, rows: Integers) -> None:
+        """Take over the vertices of a part, with their motions."""
+        self.vertices[rows], self.slope[rows] = part.vertices, part.slope
+        self._direction[rows] = part._direction
+
+    def lift(self) -> None:
+        """Move vertices that lie in the cut onto it, and let these stay there when the level changes."""
+        if self._cut is None:
+            return
+        rows = np.flatnonzero(self._near_cut)
+        for _ in range(2):
+            limit = self._limit(rows) * np.ones(len(rows))
+            distance, outward = self._cut(self.vertices[rows], limit)
+            distance = distance - limit
+            rows, distance, outward = rows[distance < 0], distance[distance < 0], outward[distance < 0]
+            if len(rows) == 0:
+                break
+            size = np.maximum(np.einsum("ij,ij->i", outward, outward), np.finfo(float).tiny)
+            self.vertices[rows] -= (distance / size)[:, None] * outward
+            self.hold(rows)
 
     def volume_step(self, faces: Integers, target: float, steps: int = 1) -> float:
         """Change of level that brings the mesh to the target volume, its vertices moving along their directions.

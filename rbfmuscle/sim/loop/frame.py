@@ -16,6 +16,8 @@ class Event:
 
     ``action`` is ``"angle_flag"`` (the angle test spoke), ``"reported"`` (crossed, nothing done),
     ``"rotated"``, ``"halved"`` (the step was), ``"unresolved"`` (crossed, and no correction helped),
+    ``"carried_stretched"``, ``"carried_held_end"`` or ``"carried_sheets"`` (no level set could be shown, so the surface
+    is where the material is: it is stretched too far, an end is held inside the bone named, or sheets have met),
     ``"overlap_kept"`` or ``"overlap_resolved"`` (at rest, before the first frame), or, with no muscle,
     ``"bones_overlap"`` (the motion drives two bones into each other).
     """
@@ -37,11 +39,14 @@ class ModelSurface:
     faces : (m, 3) ndarray of int
     quantities : dict of str to float
         For example ``solver_penetration_max``, ``condition``, ``time_fit``, ``time_extract``.
+    notes : list of (bone, count, action)
+        What becomes events of the frame.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     quantities: dict = field(default_factory=dict)
+    notes: list = field(default_factory=list)
 
 
 @dataclass

@@ -164,6 +164,7 @@ class FrameLoop:
         """The frame with its surfaces, and the time since the one before."""
         for name, (surface, seconds) in zip(frame.carried, drawn):
             frame.surfaces[name] = surface
+            frame.events.extend(Event(frame.index, name, *note) for note in surface.notes)
             for key in ("time_surface", "time_frame"):
                 frame.times[name][key] += seconds
         frame.wall, self._wall = self._wall, 0.0

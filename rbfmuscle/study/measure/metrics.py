@@ -36,6 +36,10 @@ QUANTITIES = {
     "euler": ("1", "Euler characteristic of the surface: 2 for a sphere, two less for each handle"),
     "self_crossing": ("1", "triangles of the surface that cross others of it"),
     "self_crossing_area": ("1", "their share of the surface's area"),
+    "unfitted_fraction": (
+        "1",
+        "share of the surface's vertices kept off the level set; 1 where none is shown",
+    ),
     "flicker_rms": (
         "length",
         "change, since the frame before, of the way from the carried mesh to the surface",
@@ -69,7 +73,7 @@ QUANTITIES = {
 }
 ALL = "all"
 FIBRES = "fibres"
-_FROM_MODEL = ("solver_penetration_max", "condition", "time_fit", "time_extract")
+_FROM_MODEL = ("solver_penetration_max", "unfitted_fraction", "condition", "time_fit", "time_extract")
 
 # Events whose points stayed beyond a bone; those turned back or halved away are in events.csv only.
 _THROUGH = ("reported", "unresolved")

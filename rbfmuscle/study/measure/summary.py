@@ -24,6 +24,7 @@ LIMITS = {
     "components": 1.0,
     "euler": 2.0,
     "self_crossing": 0.0,
+    "unfitted_fraction": 0.05,
     "flicker_rms": 0.1,
     "flicker_max": 0.5,
     "tunnelled": 0.0,

@@ -1,0 +1,443 @@
+"""A triangulation that goes with the material and is brought onto a level set: no grid, one topology.
+
+Marching cubes sees a sheet only where a node of its grid lies inside, so rims come and go with the grid, and sheets
+that come within a cell of each other grow together. A triangulation of the rest surface that the muscle carries
+along starts next to the level set, keeps its topology, and samples the same material in every frame. Vertices go
+onto the zero set of max(f - s, -d) by Newton steps, the level s follows from the volume as for the marched mesh, and
+what a fold of the field or the edge of a bone has turned inside out is smoothed.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Array, Booleans, Floats, Integers
+from rbfmuscle.geometry.crossing import FaceTree
+from rbfmuscle.geometry.fields import Cut, Field
+from rbfmuscle.geometry.surfaces import mesh_volume
+from rbfmuscle.implicit.extraction.band import BandGrid
+from rbfmuscle.implicit.extraction.obstacles import CHORD, ObstaclePoints, points_near_cells
+from rbfmuscle.implicit.extraction.projection import Projector
+from rbfmuscle.implicit.extraction.surface import ExtractedSurface
+from rbfmuscle.validation import check_finite
+
+# No vertex goes farther than this from where the material carries it, in mean edges; and where the field's slope
+# has sunk to these shares of its slope at rest, not at all, or as far as it likes within that.
+FARTHEST = 1.0
+UNSURE, SURE = 0.3, 0.7
+# What is within this many mean edges of the bones may come to lie on them.
+NEAR_CUT = 2.5
+# Rounds of smoothing for triangles that cross others, and how the smoothed region grows with them.
+UNTANGLE, GROWTH = 24, 4
+# What the material takes so many mean edges deep into a bone, or a bone sent so
+# far away, is drawn as a skin over the place where it goes in: so many sweeps of smoothing first, and in each of some
+# rounds after, each followed by the way out of the bone.
+SUNK, STRAYED = 1.0, 1.5
+FILL_SWEEPS, GATHER, GATHER_SWEEPS = 150, 4, 12
+# Where both sides of a muscle sink into a bone, the far one stays above it by this share of a mean edge.
+LAMELLA = 0.02
+
+
+class MaterialMesh:
+    """A closed triangulation of fixed topology.
+
+    Parameters
+    ----------
+    vertices : (n, 3) ndarray
+        At rest.
+    faces : (m, 3) ndarray of int
+        Closed, outward.
+
+    Attributes
+    ----------
+    start, other : CSR lists of neighbours.
+    slope : (n,) ndarray or None
+        The field's slope at the vertices at rest; where it sinks, sheets have met and the field is not to be trusted.
+    """
+
+    def __init__(self, vertices: Floats, faces: Integers) -> None:
+        self.slope: Floats | None = None
+        self.tree = FaceTree(vertices, faces)
+        self.faces = np.ascontiguousarray(faces, dtype=np.int64)
+        ends = np.concatenate([self.faces[:, :2], self.faces[:, 1:], self.faces[:, ::2]])
+        pairs = np.unique(np.concatenate([ends, ends[:, ::-1]]), axis=0)
+        self.other = np.ascontiguousarray(pairs[:, 1])
+        self.start = np.searchsorted(pairs[:, 0], np.arange(len(vertices) + 1))
+
+    def edge(self, vertices: Floats) -> float:
+        """Mean length of an edge [scene unit]."""
+        return _edges_loop(vertices, self.faces)[0]
+
+    def around(self, marked: Booleans, rings: int) -> Booleans:
+        """Mask (n,) of the vertices within some rings of marked ones."""
+        for _ in range(rings):
+            grown = marked.copy()
+            _grow_loop(marked, self.start, self.other, grown)
+            marked = grown
+        return marked
+
+
+@dataclass(frozen=True)
+class FittedMesh(ExtractedSurface):
+    """A material mesh on a level set.
+
+    Attributes
+    ----------
+    left : int
+        Vertices that were kept from a level set far from where the material carries them.
+    smoothed : int
+        Vertices that were smoothed, as triangles around them crossed others.
+    crossing : int
+        Triangles that still cross others.
+    """
+
+    left: int = 0
+    smoothed: int = 0
+    crossing: int = 0
+
+
+def fit_material(
+    mesh: MaterialMesh,
+    vertices: Floats,
+    field: Field,
+    *,
+    volume: float | None = None,
+    level: float = 0.0,
+    cut: Cut | None = None,
+    obstacles: list[tuple[ObstaclePoints, Floats]] | None = None,
+    axes: Floats | None = None,
+) -> FittedMesh:
+    """Bring a triangulation onto the zero set of max(field - level, -cut).
+
+    Parameters
+    ----------
+    mesh : MaterialMesh
+    vertices : (n, 3) ndarray
+        Where the material carries them [scene unit].
+    field, cut, volume, level, obstacles, axes
+        As for `rbfmuscle.implicit.extraction.surface.extract_surface`.
+
+    Returns
+    -------
+    FittedMesh
+
+    Raises
+    ------
+    ValueError
+        On NaN in field or cut, and where no level gives the volume.
+    """
+    fitting = _Fitting(mesh, vertices, field, cut, float(level))
+    if volume is None:
+        fitting.project()
+    else:
+        fitting.reach(volume)
+    return fitting.finish(volume, obstacles, axes)
+
+
+def carry_material(
+    mesh: MaterialMesh,
+    vertices: Floats,
+    *,
+    volume: float | None = None,
+    cut: Cut | None = None,
+    obstacles: list[tuple[ObstaclePoints, Floats]] | None = None,
+    axes: Floats | None = None,
+) -> FittedMesh:
+    """A triangulation where the material is, out of the bones and blown up to a volume: for want of a level set.
+
+    Parameters
+    ----------
+    mesh, vertices, volume, cut, obstacles, axes
+        As for `fit_material`.
+
+    Returns
+    -------
+    FittedMesh
+        All of its vertices are ``left``.
+    """
+    fitting = _Fitting(mesh, vertices, None, cut, 0.0)
+    fitting.inflate(volume)
+    return fitting.finish(volume, obstacles, axes)
+
+
+class _Fitting:
+    """A material mesh on its way to a level set."""
+
+    def __init__(
+        self,
+        mesh: MaterialMesh,
+        vertices: Floats,
+        field: Field | None,
+        cut: Cut | None,
+        level: float,
+    ) -> None:
+        self.mesh, self.carried, self.level = mesh, np.ascontiguousarray(vertices, dtype=np.float64), level
+        self.field, self.cut = field, cut
+        self.edge = mesh.edge(self.carried)
+        near = np.zeros(len(vertices), dtype=np.bool_)
+        if cut is not None:
+            near = cut(self.carried) < NEAR_CUT * self.edge
+        self.projector = Projector(field, cut if near.any() else None, self.carried.copy(), self.edge, near)
+        self.sunk = np.zeros(len(vertices), dtype=np.bool_)
+        self.projector.clearance = self._clearance(near)
+        self.left = np.zeros(len(vertices), dtype=np.bool_)
+        self.evaluations = 0
+        self.reach_of = None
+        if mesh.slope is not None and field is not None:
+            _, gradient = field.value_and_gradient(self.carried)
+            share = np.sqrt(np.einsum("nd,nd->n", gradient, gradient)) / mesh.slope
+            self.reach_of = FARTHEST * self.edge * np.clip((share - UNSURE) / (SURE - UNSURE), 0.0, 1.0)
+
+    def _clearance(self, near: Booleans) -> Floats | None:
+        """How far from the bones vertices that sink into them end: those that look away keep off the others."""
+        rows = np.flatnonzero(near)
+        if self.cut is None or len(rows) == 0:
+            return None
+        normals = np.zeros_like(self.carried)
+        _normals_loop(self.carried, self.mesh.faces, normals)
+        distance, outward = self.cut.value_and_gradient_below(
+            self.carried[rows], np.full(len(rows), NEAR_CUT * self.edge)
+        )
+        away = np.einsum("nd,nd->n", normals[rows], outward) > 0.0
+        clearance = np.zeros(len(self.carried))
+        clearance[rows[away]] = LAMELLA * self.edge
+        self.sunk[rows] = distance < -SUNK * self.edge
+        return clearance
+
+    def project(self) -> None:
+        """Newton steps onto the level set, no farther from where the material is than the field is to be trusted."""
+        projector = self.projector
+        projector.project(self.level)
+        self.evaluations += len(projector.vertices)
+        if self.reach_of is None:
+            return
+        _bound_loop(projector.vertices, self.carried, self.reach_of, projector.on_field, self.left)
+        rows = np.flatnonzero(self.left)
+        if len(rows):
+            self._lift(rows)
+
+    def reach(self, volume: float) -> None:
+        """Move the level until the mesh has the volume."""
+        for _ in range(20):
+            self.project()
+            step = self.projector.volume_step(self.mesh.faces, volume)
+            largest = np.abs(self.projector.slope).max()
+            step = float(np.clip(step, -self.edge / largest, self.edge / largest))
+            self.level += step
+            self.projector.shift(step)
+            if abs(step) * largest < 2e-3 * self.edge:
+                return
+        raise ValueError(f"no level gives a volume of {volume:g}; is it the volume of the surface fitted?")
+
+    def inflate(self, volume: float | None) -> None:
+        """Out of the bones, and along the normals to the volume; every vertex counts as left."""
+        projector, faces = self.projector, self.mesh.faces
+        self.left[:] = True
+        projector.lift()
+        if volume is None:
+            return
+        for _ in range(20):
+            normals = np.zeros_like(self.carried)
+            _normals_loop(projector.vertices, faces, normals)
+            length = np.linalg.norm(normals, axis=1)[:, None]
+            projector.move_along(normals / np.maximum(length, np.finfo(float).tiny))
+            step = float(np.clip(projector.volume_step(faces, volume), -0.5 * self.edge, 0.5 * self.edge))
+            projector.shift(step)
+            projector.lift()
+            if abs(step) < 1e-3 * self.edge:
+                break
+
+    def finish(
+        self,
+        volume: float | None,
+        obstacles: list[tuple[ObstaclePoints, Floats]] | None,
+        axes: Floats | None,
+    ) -> FittedMesh:
+        """Bone vertices pushed off, crossings smoothed, the volume met: the mesh."""
+        self.gather()
+        if obstacles:
+            self.push_off(obstacles, 0.01 * self.edge, axes)
+        smoothed, crossing = self.untangle()
+        if volume is not None:
+            step = self.projector.volume_step(self.mesh.faces, volume, steps=4)
+            self.level += step
+            self.projector.shift(step)
+        vertices, faces = self.projector.vertices, self.mesh.faces
+        check_finite(vertices, name="fitted vertices")
+        return FittedMesh(
+            vertices, faces, self.level, mesh_volume(vertices, faces), 1, 0, self.edge,
+            self.evaluations, int(self.left.sum()), smoothed, crossing,
+        )  # fmt: skip
+
+    def gather(self) -> None:
+        """Close the surface over what is deep in a bone: a sheet that is folded over it would cross itself."""
+        projector = self.projector
+        away = projector.vertices - self.carried
+        strayed = np.einsum("nd,nd->n", away, away) > (STRAYED * self.edge) ** 2
+        lost = np.asarray(self.sunk | strayed, dtype=np.bool_)
+        if not lost.any():
+            return
+        rows = np.flatnonzero(self.mesh.around(lost, 1))
+        for turn in range(GATHER):
+            for _ in range(GATHER_SWEEPS if turn else FILL_SWEEPS):
+                _smooth_loop(projector.vertices, rows, self.mesh.start, self.mesh.other)
+            if self.field is None:
+                self._lift(rows)
+                continue
+            part = projector.part(rows)
+            part.project(self.level)
+            projector.take(part, rows)
+
+    def _lift(self, rows: Integers) -> None:
+        """Bring vertices out of the bones, where they stay."""
+        part = self.projector.part(rows)
+        part.lift()
+        part.hold(slice(None))
+        self.projector.take(part, rows)
+
+    def push_off(
+        self, obstacles: list[tuple[ObstaclePoints, Floats]], tolerance: float, axes: Floats | None
+    ) -> None:
+        """Move the corners of triangles that a bone's vertices came through."""
+        vertices, faces = self.projector.vertices, self.mesh.faces
+        # So large that no corner is farther than 1.3 cells from its triangle's middle.
+        spacing = max(self.edge, 0.52 * _edges_loop(vertices, faces)[1])
+        size = float(np.ptp(vertices, axis=0).max())
+        grid = BandGrid.around(vertices, resolution=max(int(size / spacing), 4), padding=2, axes=axes)
+        state = np.zeros(int(np.prod(grid.shape)), dtype=np.uint8)
+        cells = _touched_cells(grid, vertices, faces, state)
+        points = points_near_cells(obstacles, grid, state, cells)
+        if self.field is not None:
+            points = points[self.field(points) - self.level < CHORD * grid.spacing]
+        self.projector.push_off(faces, points, grid, tolerance)
+
+    def untangle(self) -> tuple[int, int]:
+        """Smooth what crosses itself; numbers of vertices that were smoothed and of triangles that still cross."""
+        projector, faces = self.projector, self.mesh.faces
+        touched, crossing = np.zeros(len(self.carried), dtype=np.bool_), 0
+        among: Booleans | None = None
+        for turn in range(UNTANGLE + 1):
+            # What was not moved does not begin to cross.
+            bad = self.mesh.tree.crossing(projector.vertices, among)
+            crossing = int(bad.sum())
+            if crossing == 0 or turn == UNTANGLE:
+                break
+            marked = np.zeros(len(self.carried), dtype=np.bool_)
+            marked[faces[bad].ravel()] = True
+            region = self.mesh.around(marked, 1 + turn // GROWTH)
+            among = np.asarray(region[faces].any(axis=1), dtype=np.bool_)
+            touched |= region
+            onto_field = self.field is not None and turn < UNTANGLE // 2
+            self._smooth(np.flatnonzero(region), onto_field)
+        return int(touched.sum()), crossing
+
+    def _smooth(self, rows: Integers, onto_field: bool) -> None:
+        """Move vertices towards their neighbours, then back onto the surface, or out of the bones at least."""
+        projector = self.projector
+        before = projector.vertices[rows]
+        for _ in range(3):
+            _smooth_loop(projector.vertices, rows, self.mesh.start, self.mesh.other)
+        if not onto_field:
+            self._lift(rows)
+            return
+        part = projector.part(rows)
+        part.project(self.level)
+        gone = np.einsum("nd,nd->n", part.vertices - before, part.vertices - before) > self.edge**2
+        part.vertices[gone] = projector.vertices[rows[gone]]
+        projector.take(part, rows)
+
+
+def _touched_cells(grid: BandGrid, vertices: Floats, faces: Integers, state: Array) -> Integers:
+    """Mark the cells that hold vertices or middles of triangles, and those beside them; their flat numbers."""
+    middles = (vertices[faces[:, 0]] + vertices[faces[:, 1]] + vertices[faces[:, 2]]) / 3.0
+    cells = np.empty(len(state), dtype=np.int64)
+    return cells[: _touch_loop(grid.cells(np.concatenate([vertices, middles])), grid.strides, state, cells)]
+
+
+@compiled(error_model="numpy")
+def _touch_loop(holders, strides, state, cells):
+    """Mark cells and their neighbours, each once; returns how many."""
+    count = 0
+    for cell in holders:
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                for k in range(-1, 2):
+                    near = cell + i * strides[0] + j * strides[1] + k * strides[2]
+                    if 0 <= near < len(state) and state[near] == 0:
+                        state[near] = 1
+                        cells[count] = near
+                        count += 1
+    return count
+
+
+@compiled(error_model="numpy")
+def _edges_loop(vertices, faces):
+    """Mean and greatest length of the edges."""
+    total, greatest = 0.0, 0.0
+    for f in range(len(faces)):
+        for k in range(3):
+            a, b = faces[f, k], faces[f, (k + 1) % 3]
+            x, y, z = (
+                vertices[a, 0] - vertices[b, 0],
+                vertices[a, 1] - vertices[b, 1],
+                vertices[a, 2] - vertices[b, 2],
+            )
+            length = np.sqrt(x * x + y * y + z * z)
+            total += length
+            greatest = max(greatest, length)
+    return total / (3.0 * len(faces)), greatest
+
+
+@compiled(error_model="numpy")
+def _grow_loop(marked, start, other, out):
+    for v in range(len(marked)):
+        if marked[v]:
+            for n in range(start[v], start[v + 1]):
+                out[other[n]] = True
+
+
+@compiled(error_model="numpy")
+def _smooth_loop(vertices, rows, start, other):
+    """Half the way to the mean of the neighbours, one vertex after the other."""
+    for v in rows:
+        x, y, z = 0.0, 0.0, 0.0
+        for n in range(start[v], start[v + 1]):
+            x += vertices[other[n], 0]
+            y += vertices[other[n], 1]
+            z += vertices[other[n], 2]
+        count = start[v + 1] - start[v]
+        vertices[v, 0] = 0.5 * (vertices[v, 0] + x / count)
+        vertices[v, 1] = 0.5 * (vertices[v, 1] + y / count)
+        vertices[v, 2] = 0.5 * (vertices[v, 2] + z / count)
+
+
+@compiled(error_model="numpy")
+def _bound_loop(vertices, carried, reach, on_field, left):
+    """Bring back vertices on the field that went beyond their reach, and mark them."""
+    for v in range(len(vertices)):
+        square = 0.0
+        for a in range(3):
+            square += (vertices[v, a] - carried[v, a]) ** 2
+        # NaN counts as beyond.
+        left[v] = on_field[v] and not square <= reach[v] ** 2
+        if left[v]:
+            share = reach[v] / np.sqrt(square) if square < np.inf else 0.0
+            for a in range(3):
+                way = share * (vertices[v, a] - carried[v, a]) if share > 0.0 else 0.0
+                vertices[v, a] = carried[v, a] + way
+
+
+@compiled(error_model="numpy")
+def _normals_loop(vertices, faces, normals):
+    """Area-weighted normals at the vertices, of any length."""
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            area = (vertices[b, i] - vertices[a, i]) * (vertices[c, j] - vertices[a, j]) - (
+                vertices[b, j] - vertices[a, j]
+            ) * (vertices[c, i] - vertices[a, i])
+            normals[a, k] += area
+            normals[b, k] += area
+            normals[c, k] += area

@@ -1,0 +1,92 @@
+"""The mesh of a muscle's material that shows it: where its vertices lie at rest, and where the centres carry them."""
+
+import numpy as np
+
+from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.implicit.extraction.material import MaterialMesh, fit_material
+from rbfmuscle.model.clusters import bind_samples
+from rbfmuscle.model.elasticity import ElasticSolver, carry_points
+from rbfmuscle.model.options import RBFOptions
+from rbfmuscle.model.placement import cached_sample
+from rbfmuscle.model.rest import Rest
+from rbfmuscle.sim.scene.objects import Muscle
+
+# Edges of the shown mesh for each thickness of a muscle, and bounds on its vertices: by themselves, and asked for.
+EDGES_THROUGH, USUAL, WANTED = 3.0, (2500, 4000), (200, 12_000)
+# Vertices of a triangulation on an area of one edge squared.
+VERTICES_AN_EDGE = 1.15
+
+
+def shown_vertices(muscle: Muscle, resolution: int) -> int:
+    """Vertices of the shown mesh of a muscle: three edges through its mean thickness, or as wide as cells.
+
+    Parameters
+    ----------
+    muscle : Muscle
+    resolution : int
+        Edges along the longest side; 0 for as many as the thickness wants.
+    """
+    mesh, (low, high) = muscle.mesh, WANTED if resolution else USUAL
+    edge = 2.0 * float(mesh.volume) / (float(mesh.area) * EDGES_THROUGH)
+    if resolution:
+        points = np.asarray(mesh.vertices, dtype=float)
+        axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+        edge = float(np.ptp(points @ axes.T, axis=0).max()) / resolution
+    return int(np.clip(VERTICES_AN_EDGE * float(mesh.area) / edge**2, low, high))
+
+
+class ShownMesh:
+    """A triangulation of the rest surface that the centres carry along.
+
+    Parameters
+    ----------
+    muscle : Muscle
+    rest : Rest
+    options : RBFOptions
+
+    Attributes
+    ----------
+    mesh : MaterialMesh
+    rest : (n, 3) ndarray
+        Vertices at rest, on the level set that has the mesh's volume.
+    """
+
+    def __init__(self, muscle: Muscle, rest: Rest, options: RBFOptions) -> None:
+        frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
+        count = shown_vertices(muscle, options.resolution)
+        faces = np.asarray(muscle.mesh.faces)
+        sample = cached_sample(frame.local, faces, count, seed=options.seed, placement="adaptive")
+        points = frame.points(sample.points)
+        self.mesh = MaterialMesh(points, sample.control_faces)
+        self.rest = self._on_level(rest, points)
+        # Rounded as the frame rounds, so that a scene that is turned binds alike.
+        local, centres = (
+            np.round((part - frame.origin) @ frame.axes.T / frame.size, 8)
+            for part in (self.rest, rest.centres)
+        )
+        normals = rest.normals @ frame.axes.T
+        self.columns, self.shares = bind_samples(local, sample.normals, centres, normals)
+        self._sides = self._lengths(self.rest)
+
+    def _on_level(self, rest: Rest, points: np.ndarray) -> np.ndarray:
+        """The vertices on the level set at rest, where they stay as part of the material."""
+        try:
+            field = rest.fit.fit(rest.centres, rest.normals)
+            fitted = fit_material(self.mesh, points, field, volume=rest.mesh_volume)
+        except (ValueError, np.linalg.LinAlgError):
+            # What the input mesh holds is a surface too; the frames say what is wrong with the field.
+            return points
+        self.mesh.slope = np.linalg.norm(field.value_and_gradient(fitted.vertices)[1], axis=1)
+        return fitted.vertices
+
+    def carried(self, centres: np.ndarray, solver: ElasticSolver) -> np.ndarray:
+        """Where the material takes the vertices (n, 3) for centres (K, 3) and the solver's present targets."""
+        return carry_points(centres, solver.shape, self.rest, self.columns, self.shares)
+
+    def stretch(self, vertices: np.ndarray) -> float:
+        """Length of edges relative to rest that a tenth of them exceeds."""
+        return float(np.percentile(self._lengths(vertices) / self._sides, 90.0))
+
+    def _lengths(self, vertices):
+        sides = vertices[self.mesh.faces] - vertices[np.roll(self.mesh.faces, 1, axis=1)]
+        return np.maximum(np.linalg.norm(sides, axis=2), np.finfo(float).tiny)
