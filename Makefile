@@ -32,6 +32,8 @@ test-nojit: $(STAMP)
 coverage: $(STAMP)
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q --cov --cov-report= $$(grep -v '^#' tests/nojit.txt)
 	$(BIN)/python -m pytest -q --cov --cov-append --cov-report=term:skip-covered $$(grep -v '^#' tests/fast.txt)
+
+# Damaged scenes and meshes by the thousand; ends with a table of what became of them.
 fuzz: $(STAMP)
 	PYTHONPATH=tests $(BIN)/python -m fuzz --scene 10000 --mesh 2000 --frames 250
 

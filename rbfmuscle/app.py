@@ -69,15 +69,15 @@ def _run(arguments, as_json):
     try:
         action, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False)
     except CycloptsError as error:
-        return _fail(_one_line(error), 2, as_json, hint=f"try 'rbfmuscle {_command_of(arguments)}--help'")
+        return _fail(one_line(error), 2, as_json, hint=f"try 'rbfmuscle {_command_of(arguments)}--help'")
     try:
         code = action(*bound.args, **bound.kwargs)
     except KeyboardInterrupt as error:
         return _fail(str(error) or "interrupted", INTERRUPTED, as_json)
     except RBFMuscleError as error:
-        return _fail(_one_line(error), error.exit_code, as_json)
+        return _fail(one_line(error), error.exit_code, as_json)
     except MemoryError as error:
-        asked = f" ({_one_line(error)})" if str(error) else ""
+        asked = f" ({one_line(error)})" if str(error) else ""
         message = f"not enough memory{asked}; take fewer centres, coarser cells or smaller meshes"
         return _fail(message, SolveError.exit_code, as_json)
     return code if isinstance(code, int) else 0
@@ -86,7 +86,7 @@ def _run(arguments, as_json):
 def _describe_os_error(error):
     """What the system refused; that of a stream without a name is standard output."""
     what = f"{error.filename}" if error.filename else "standard output or a file of the command"
-    return f"cannot read or write {what}: {error.strerror or _one_line(error)}; free or choose another place"
+    return f"cannot read or write {what}: {error.strerror or one_line(error)}; free or choose another place"
 
 
 def _drop_output():
@@ -102,7 +102,8 @@ def _fail(message, code, as_json, *, hint=""):
     return code
 
 
-def _one_line(error):
+def one_line(error: object) -> str:
+    """Return a message without line breaks, cut where it is longer than any that is meant."""
     text = " ".join(str(error).split())
     return text if len(text) <= LONGEST_LINE else f"{text[: LONGEST_LINE - 60]} ... {text[-50:]}"
 
@@ -112,14 +113,14 @@ def _command_of(arguments):
 
 
 def _show_warning(message, category, filename, lineno, file=None, line=None):
-    print(f"rbfmuscle: warning: {_one_line(message)}", file=sys.stderr)
+    print(f"rbfmuscle: warning: {one_line(message)}", file=sys.stderr)
 
 
 class _LogLines(logging.Handler):
     """What the library logs, where nobody has set up logging, as the warnings are told."""
 
     def emit(self, record):
-        print(f"rbfmuscle: warning: {_one_line(record.getMessage())}", file=sys.stderr)
+        print(f"rbfmuscle: warning: {one_line(record.getMessage())}", file=sys.stderr)
 
 
 def _report_bug(kind, error, trace):
@@ -131,7 +132,7 @@ def _report_bug(kind, error, trace):
         trace = trace.tb_next
     place = f"{os.path.basename(trace.tb_frame.f_code.co_filename)}:{trace.tb_lineno}"
     print(
-        f"rbfmuscle: a bug: {kind.__name__}: {_one_line(error)} (at {place}); "
+        f"rbfmuscle: a bug: {kind.__name__}: {one_line(error)} (at {place}); "
         "set RBFMUSCLE_TRACEBACK=1 for the whole trace and report it",
         file=sys.stderr,
     )

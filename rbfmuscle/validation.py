@@ -71,13 +71,18 @@ MOST_NAMED = 40  # names that a message lists
 LONGEST_SHOWN = 80
 
 
-def shown(value: object) -> str:
+def shown(value: object, *, longest: int = LONGEST_SHOWN) -> str:
     """Return a value as a message shows it, cut where it is long."""
     try:
         text = value if isinstance(value, str) else repr(value)
     except (ValueError, RecursionError):  # numbers of thousands of digits have no decimal form
         text = f"a {type(value).__name__} too long to show"
-    return text if len(text) <= LONGEST_SHOWN else f"{text[: LONGEST_SHOWN - 15]} ... {text[-10:]}"
+    return text if len(text) <= longest else f"{text[: longest - 15]} ... {text[-10:]}"
+
+
+def shown_path(path: str | os.PathLike[str]) -> str:
+    """Return a path as a message shows it: whole, unless it is longer than paths are."""
+    return shown(str(path), longest=400)
 
 
 def is_file(path: str | os.PathLike[str]) -> bool:

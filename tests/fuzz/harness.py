@@ -103,7 +103,9 @@ def _judge(status, usage, text):
 
 def tell(error: Exception) -> int:
     """Print an error meant for users as the command line does; its exit code."""
-    print(f"rbfmuscle: {' '.join(str(error).split())}", file=sys.stderr)
+    from rbfmuscle.app import one_line
+
+    print(f"rbfmuscle: {one_line(error)}", file=sys.stderr)
     return error.exit_code
 
 

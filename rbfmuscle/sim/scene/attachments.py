@@ -13,7 +13,7 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.sim.distance.mesh import winding_test
 from rbfmuscle.sim.scene.options import NotNegative, Positive, Table, Vector
-from rbfmuscle.validation import SceneError, did_you_mean, is_file, shown
+from rbfmuscle.validation import SceneError, did_you_mean, is_file, shown, shown_path
 
 if TYPE_CHECKING:
     import trimesh
@@ -141,7 +141,7 @@ def _listed_vertices(listed, read, place):
 
 def _read_numbers(path, place):
     if not is_file(path):
-        raise SceneError(f"{place}: cannot read {shown(str(path))}: no such file")
+        raise SceneError(f"{place}: cannot read {shown_path(path)}: no such file")
     try:
         words = path.read_text(encoding="utf-8", errors="replace").split()
     except OSError as error:

@@ -34,7 +34,7 @@ from rbfmuscle.sim.scene.options import (
     check_plain,
     describe_error,
 )
-from rbfmuscle.validation import MeshError, SceneError, is_file, shown
+from rbfmuscle.validation import MeshError, SceneError, is_file, shown, shown_path
 
 if TYPE_CHECKING:
     from rbfmuscle.sim.scene.scene import Scene
@@ -126,7 +126,7 @@ def _read_toml(path):
     if path.is_dir():
         raise SceneError(f"{path}: is a folder, give a scene file (.toml)")
     if not is_file(path):
-        raise SceneError(f"{shown(str(path))}: no such scene file")
+        raise SceneError(f"{shown_path(path)}: no such scene file")
     size = os.path.getsize(path)
     if size > LARGEST_FILE:
         raise SceneError(

@@ -14,7 +14,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.sim.scene.mesh_repair import repair
-from rbfmuscle.validation import MeshError, check_mesh, is_file, shown
+from rbfmuscle.validation import MeshError, check_mesh, is_file, shown, shown_path
 
 # In any unit: beyond it, squares of squares of lengths leave the range in which volumes are exact.
 LARGEST_COORDINATE = 1e12
@@ -119,10 +119,10 @@ def read_arrays(path: Path) -> Any:
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise MeshError(
-            f"{path}: {suffix or 'no suffix'} is not a mesh format, use {', '.join(MESH_SUFFIXES)}"
+            f"{shown_path(path)}: {shown(suffix) or 'no suffix'} is not a mesh format, use {', '.join(MESH_SUFFIXES)}"
         )
     if not is_file(path):
-        raise MeshError(f"{shown(str(path))}: no such mesh file{_neighbours(path)}")
+        raise MeshError(f"{shown_path(path)}: no such mesh file{_neighbours(path)}")
     try:
         if path.stat().st_size == 0:
             raise MeshError(f"{path}: the file is empty")
@@ -143,7 +143,7 @@ def _neighbours(path):
     from rbfmuscle.validation import did_you_mean
 
     if not os.path.isdir(path.parent):
-        return f" (no folder {shown(str(path.parent))})"
+        return f" (no folder {shown_path(path.parent)})"
     try:
         names = sorted(p.name for p in path.parent.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
     except OSError:

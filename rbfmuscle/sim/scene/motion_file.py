@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 
 from rbfmuscle.sim.joints.joint import Coordinate
-from rbfmuscle.validation import SceneError, is_file, shown
+from rbfmuscle.validation import SceneError, is_file, shown_path
 
 NO = ("no", "false", "0")
 YES = ("yes", "true", "1")
@@ -96,7 +96,7 @@ def storage_parts(
 ) -> tuple[dict[str, str], list[str], list[list[str]]]:
     """Header, labels of the columns and rows, as words, of an OpenSim storage; errors begin with ``place``."""
     if not is_file(path):
-        raise SceneError(f"{place}: cannot read {shown(str(path))}: no such file")
+        raise SceneError(f"{place}: cannot read {shown_path(path)}: no such file")
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError as error:
