@@ -143,3 +143,104 @@ def _add(scene, vertices, faces, edge, fibres, model, contraction):
         Attachment("insertion", np.flatnonzero(vertices[:, 0] >= edge)),
     ]
     scene.add_muscle(MUSCLE, (vertices, faces), attach=attach, model=model, fibres=fibres, **contraction)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A flat pennate muscle between two plates: fibres of a length, at an angle to the plates.
+
+    Parameters
+    ----------
+    length : float
+        Of the plates.
+    width : float
+        Across the plane of the fibres.
+    fibre : float
+        Length of the fibres at rest.
+    pennation : float
+        Angle between fibres and plates at rest [degree].
+    """
+
+    length: float = 120.0
+    width: float = 40.0
+    fibre: float = 60.0
+    pennation: float = 25.0
+
+    @property
+    def height(self):
+        """Distance of the plates: it does not change, nor does the volume."""
+        return self.fibre * math.sin(math.radians(self.pennation))
+
+
+PANEL = Panel()
+
+
+def panel_pennation(stretch, *, panel=PANEL):
+    """Pennation [degree] at a stretch of the fibres: height / (fibre stretch) is its sine (constant thickness)."""
+    return math.degrees(math.asin(panel.height / (panel.fibre * stretch)))
+
+
+def panel_scene(stretch, *, panel=PANEL, spacing=4.0, frames=5, model="rbf"):
+    """The panel with its upper plate slid so far that straight fibres have the stretch, fully active at the end.
+
+    The line of action is along the plates: attachments are the lower and the upper face, and fibres are given.
+    """
+    import trimesh
+
+    lean = panel.fibre * math.cos(math.radians(panel.pennation))
+    divisions = [max(2, round(size / spacing)) for size in (panel.length, panel.width, panel.height)]
+    vertices, faces = _box(divisions)
+    vertices = vertices * [panel.length, panel.width, panel.height]
+    vertices[:, 0] += lean * (vertices[:, 2] / panel.height)
+    scene = Scene("panel", units="mm")
+    for name, low in (("lower", -6.0), ("upper", panel.height + 2.0)):
+        plate = trimesh.creation.box(extents=(0.5 * panel.length, panel.width, 4.0))
+        plate.apply_translation((0.0 if low < 0 else lean, 0.0, low + 2.0))
+        scene.add_bone(name, plate)
+    far = FAR * panel.length
+    scene.add_joint("slider", "lower", "upper", (lean, 0.0, panel.height + far), {"pull": (0, 1, 0)})
+    attach = [
+        Attachment("lower", np.flatnonzero(vertices[:, 2] <= 1e-9)),
+        Attachment("upper", np.flatnonzero(vertices[:, 2] >= panel.height - 1e-9)),
+    ]
+    starts = [(x, y) for x in (-0.3, 0.0, 0.3) for y in (-0.25, 0.25)]
+    share = np.linspace(0.02, 0.98, 12)[:, None]
+    fibres = [
+        np.array([x * panel.length, y * panel.width, 0.0]) + share * [lean, 0.0, panel.height]
+        for x, y in starts
+    ]
+    scene.add_muscle(
+        MUSCLE,
+        (vertices, faces),
+        attach=attach,
+        model=model,
+        fibres=fibres,
+        activation=[0, 1],
+        shortening=stretch,
+    )
+    shortened = math.sqrt((panel.fibre * stretch) ** 2 - panel.height**2)
+    return with_frames(scene, np.linspace(0.0, lean - shortened, frames + 1), panel.length)
+
+
+def _box(divisions):
+    """A box of edge 1 about the origin in x and y, from 0 up in z, in squares cut in two: vertices and faces."""
+    import trimesh
+
+    vertices, faces = [], []
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        a, b = np.meshgrid(np.arange(divisions[u] + 1), np.arange(divisions[v] + 1), indexing="ij")
+        for side in (0.0, 1.0):
+            points = np.zeros((a.size, 3))
+            points[:, u], points[:, v], points[:, axis] = (
+                a.ravel() / divisions[u], b.ravel() / divisions[v], side
+            )  # fmt: skip
+            number = np.arange(a.size).reshape(a.shape) + sum(map(len, vertices))
+            p, q, r, s = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+            two = np.concatenate(
+                [np.stack([p, q, r], -1).reshape(-1, 3), np.stack([p, r, s], -1).reshape(-1, 3)]
+            )
+            faces.append(two if side else two[:, ::-1])
+            vertices.append(points)
+    mesh = trimesh.Trimesh(np.concatenate(vertices) - [0.5, 0.5, 0.0], np.concatenate(faces), process=True)
+    return np.asarray(mesh.vertices).copy(), np.asarray(mesh.faces)

@@ -187,7 +187,7 @@ def test_length_without_fibres_is_refused():
 
 def test_fibres_that_leave_the_muscle_are_refused():
     made = scene()
-    made.muscle(MUSCLE).fibres = [line + [0, 0, 40.0] for line in made.muscle(MUSCLE).fibres]
+    made.muscle(MUSCLE).fibres = [line + [0, 0, 80.0] for line in made.muscle(MUSCLE).fibres]
     with pytest.raises(SceneError, match="leaves the muscle"):
         made.validate()
 

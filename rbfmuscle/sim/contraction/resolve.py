@@ -11,8 +11,8 @@ from rbfmuscle.sim.contraction.keys import KEYS, Contraction, ContractionTable, 
 from rbfmuscle.validation import SceneError, did_you_mean
 
 # A fibre that lies farther outside than this share of the muscle's diagonal is one of another muscle or frame:
-# lines drawn on a surface, and surfaces that were smoothed since, stay well below.
-OUTSIDE = 0.03
+# lines that run on to the bone, beyond the mesh of the muscle, stay below.
+OUTSIDE = 0.1
 
 
 def contraction_keys(given, *, muscle, folder=None):

@@ -47,16 +47,17 @@ class ContractionStudy:
         tendon = resolve_contraction(muscle).tendon[cKDTree(mesh).query(lines)[1]]
         # A segment is belly where neither end is tendon; a line of tendon alone counts for nothing.
         self.belly = ~(tendon[:, 1:] | tendon[:, :-1])
-        self.rest_lengths = _segments(self._lines(vertices))
+        self.rest_lengths = _segments(self.lines(vertices))
         self.ends = end_groups(muscle, joints)
 
-    def _lines(self, vertices):
+    def lines(self, vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The fibres (n, k, 3) that a carried mesh with these vertices holds."""
         middle = vertices.mean(axis=0)
         return (self.weights @ (vertices - middle) + middle).reshape(self.shape)
 
     def stretches(self, vertices: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Middles (s, 3) of the fibres' segments in belly, and their stretch against the scan (s,)."""
-        lines = self._lines(vertices)
+        lines = self.lines(vertices)
         middles = 0.5 * (lines[:, 1:] + lines[:, :-1])
         return middles[self.belly], (_segments(lines) / self.rest_lengths)[self.belly]
 
@@ -76,7 +77,7 @@ class ContractionStudy:
         dict of str to float
             Lengths in scene units, ``pennation`` in degrees, ``csa_place`` as a share of the line of action.
         """
-        lines = self._lines(vertices)
+        lines = self.lines(vertices)
         lengths = _segments(lines)
         counted = self.belly.any(axis=1)
         stretch = (lengths / self.rest_lengths)[self.belly]

@@ -1,0 +1,61 @@
+"""Fibres with active stress in the finite-element solid: derivatives, and the closed form of a free bar."""
+
+import numpy as np
+import pytest
+from peers.fibre_material import FibreMaterial, active_curve, free_stretch, passive_curve
+
+STEP = 1e-5
+
+
+@pytest.mark.parametrize("curve", [active_curve, passive_curve])
+def test_curves_are_derivatives_of_each_other(curve):
+    # Between the joints of the pieces, where slopes jump.
+    x = np.array([0.3, 0.45, 0.55, 0.7, 0.95, 1.05, 1.2, 1.35, 1.45, 1.55, 1.7])
+    above, below, here = curve(x + STEP), curve(x - STEP), curve(x)
+    assert (above[0] - below[0]) / (2 * STEP) == pytest.approx(here[1], abs=1e-8)
+    assert (above[1] - below[1]) / (2 * STEP) == pytest.approx(here[2], abs=1e-7)
+
+
+def _bricks(direction, **options):
+    pytest.importorskip("skfem")
+    from peers.finite_element import HexSolid, brick_grid
+
+    cube, bricks = brick_grid((3, 3, 3))
+    count = len(bricks)
+    made = FibreMaterial(
+        np.broadcast_to(direction, (count, 3)), np.arange(count) % 3 == 0, np.full(count, 1.3), **options
+    )
+    return cube * [20.0, 10.0, 10.0], bricks, made, HexSolid
+
+
+def test_forces_and_stiffness_are_the_energys_derivatives():
+    rng = np.random.default_rng(0)
+    points, bricks, made, solid_of = _bricks(np.array([2.0, 1.0, 0.5]) / np.sqrt(5.25))
+    solid = solid_of(points, bricks, fibres=made, stiffer=1.0 + np.arange(len(bricks)) % 2)
+    solid.activation = 0.7
+    u, way = rng.normal(size=(2, *points.shape)) * [[[0.5]], [[1.0]]]
+    force, matrix = solid._assemble(u)
+    slope = (solid.energy(u + STEP * way) - solid.energy(u - STEP * way)) / (2 * STEP)
+    assert slope == pytest.approx(force @ way.ravel(), rel=1e-6)
+    change = (solid._assemble(u + STEP * way)[0] - solid._assemble(u - STEP * way)[0]) / (2 * STEP)
+    assert change == pytest.approx(matrix @ way.ravel(), abs=1e-6 * np.abs(change).max())
+
+
+def test_free_bar_shortens_to_the_closed_form():
+    points, bricks, made, solid_of = _bricks(np.array([1.0, 0.0, 0.0]))
+    count = len(bricks)
+    made = FibreMaterial(made.direction, np.zeros(count, dtype=bool), np.ones(count))
+    solid = solid_of(points, bricks, poisson=0.4995, fibres=made)
+    held = np.zeros(points.shape, dtype=bool)
+    left = points[:, 0] < -19.9
+    held[left, 0] = True
+    corner = [np.flatnonzero(left & (points[:, 1] == y) & (points[:, 2] == -10.0))[0] for y in (-10.0, 10.0)]
+    held[corner[0]], held[corner[1], 2] = True, True
+    u = np.zeros_like(points)
+    for activation in np.linspace(0.0, 1.0, 11)[1:]:
+        solid.activation = activation
+        u = solid.solve(u, held, np.zeros_like(u), settled=1e-12).displacement
+    stretch = np.ptp((points + u)[:, 0]) / 40.0
+    # Poisson's ratio 0.4995: the volume gives by some 1e-4.
+    assert stretch == pytest.approx(free_stretch(30.0), rel=1e-3)
+    assert np.ptp((points + u)[:, 1]) / 20.0 == pytest.approx(free_stretch(30.0) ** -0.5, rel=1e-3)
