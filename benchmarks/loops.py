@@ -123,12 +123,13 @@ def record(tasks):
     """Run all tasks on empty caches and write the table."""
     from rbfmuscle.compiled.needs import TABLE
 
+    old = json.loads(TABLE.read_text())["loops"] if TABLE.exists() else []
+    costs = {(row["loop"], json.dumps(row["types"])): row["cost"] for row in old}
     found = {}
-    if set(tasks) != set(TASKS) and TABLE.exists():
-        for row in json.loads(TABLE.read_text())["loops"]:
-            kept = [task for task in row["tasks"] if task not in tasks]
-            if kept:
-                found[row["loop"], json.dumps(row["types"])] = [kept, row["cost"]]
+    for row in old:
+        kept = [task for task in row["tasks"] if task not in tasks]
+        if kept:
+            found[row["loop"], json.dumps(row["types"])] = [kept, row["cost"]]
     with tempfile.TemporaryDirectory() as place:
         for task in tasks:
             folder = Path(place) / task
@@ -143,7 +144,7 @@ def record(tasks):
             for name, types, cost in json.loads(out.read_text()):
                 row = found.setdefault((name, types), [[], 0.0])
                 row[0].append(task)
-                row[1] = max(row[1], cost)
+                row[1] = max(row[1], cost, costs.get((name, types), 0.0))
     rows = [
         {"loop": name, "types": json.loads(types), "tasks": sorted(tasks), "cost": round(cost, 2)}
         for (name, types), (tasks, cost) in sorted(found.items())

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable
+from pathlib import Path
 
 from rbfmuscle.compiled.needs import loops_missing, task_names
 from rbfmuscle.compiled.progress import Progress
@@ -127,15 +128,15 @@ def _typing_errors():
 def _start_helpers(tasks, missing, jobs):
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     count = min((jobs or cores) - 1, int(sum(need.cost for need in missing) / _WORTH))
-    command = [sys.executable, "-m", "rbfmuscle.compiled.warm", *tasks]
+    # Nothing that lies in the present folder shall take the place of a module.
+    command = [sys.executable, "-P", "-m", "rbfmuscle.compiled.warm", *tasks]
+    places = [str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(place for place in places if place)}
+    quiet = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
     helpers = []
     for _ in range(count):
         with contextlib.suppress(OSError):  # then this process does it alone
-            helpers.append(
-                subprocess.Popen(
-                    command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-                )
-            )
+            helpers.append(subprocess.Popen(command, env=environment, **quiet))
     return helpers
 
 
