@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 from rbfmuscle.compiled.store import has_entry
 from rbfmuscle.compiled.types import read_type
 
+# Ends the name of an entry that says: these types do not fit this loop, do not try again.
+UNFIT = "-unfit"
 TABLE = Path(__file__).with_name("needs.json")
 
 
@@ -59,10 +61,15 @@ def loops_needed(tasks: Iterable[str]) -> list[Need]:
     return sorted(found, key=lambda need: -need.cost)
 
 
+def is_settled(need: Need) -> bool:
+    """Whether a loop is on disk, or was found not to fit its row."""
+    return has_entry(need.entry) or has_entry(need.entry + UNFIT)
+
+
 def loops_missing(tasks: Iterable[str]) -> list[Need]:
     """Those of `loops_needed` that are neither in this process nor on disk."""
     return [
         need
         for need in loops_needed(tasks)
-        if need.arguments not in need.loop.overloads and not has_entry(need.entry)
+        if need.arguments not in need.loop.overloads and not is_settled(need)
     ]

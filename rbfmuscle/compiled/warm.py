@@ -8,9 +8,9 @@ import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from rbfmuscle.compiled.needs import loops_missing, task_names
+from rbfmuscle.compiled.needs import UNFIT, is_settled, loops_missing, task_names
 from rbfmuscle.compiled.progress import Progress
-from rbfmuscle.compiled.store import PATIENCE, EntryLock, has_entry
+from rbfmuscle.compiled.store import PATIENCE, EntryLock, write_entry
 from rbfmuscle.compiled.watch import tell_stage
 from rbfmuscle.validation import UsageError
 
@@ -49,7 +49,7 @@ def compile_ahead(
             while left and time.monotonic() - since < PATIENCE:
                 before, left = left, _compile_one(left)
                 since = since if len(left) == len(before) else time.monotonic()
-                done = len(missing) - sum(not has_entry(need.entry) for need in left)
+                done = len(missing) - sum(not is_settled(need) for need in left)
                 advance(done)
                 if progress is not None:
                     progress(done, len(missing))
@@ -104,15 +104,17 @@ def _compile_one(left):
 
     What another process has compiled is loaded where it is called. Where all are worked on, wait a little.
     """
-    left = [need for need in left if not has_entry(need.entry)]
+    left = [need for need in left if not is_settled(need)]
     for place, need in enumerate(left):
         lock = EntryLock(need.entry)
         if not lock.try_acquire():
             continue
         lock.release()
-        # A row that no longer fits its loop; the call will say what is wrong, if it is ever made.
-        with contextlib.suppress(_typing_errors()):
+        try:
             need.loop.compile(need.arguments)
+        except _typing_errors():
+            # A row that no longer fits its loop; the call will say what is wrong, if it is ever made.
+            write_entry(need.entry + UNFIT, b"")
         return left[:place] + left[place + 1 :]
     if left:
         time.sleep(0.05)
@@ -120,9 +122,10 @@ def _compile_one(left):
 
 
 def _typing_errors():
+    """What numba raises for types, or a number of arguments, that a loop does not take."""
     from numba.core.errors import NumbaError
 
-    return NumbaError
+    return NumbaError, TypeError, ValueError, LookupError, AttributeError, NotImplementedError, AssertionError
 
 
 def _start_helpers(tasks, missing, jobs):

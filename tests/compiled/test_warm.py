@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numba.core import types
 
-from rbfmuscle.compiled import needs, progress, watch
+from rbfmuscle.compiled import needs, progress, store, watch
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.compiled.progress import Progress
 from rbfmuscle.compiled.types import read_type, spell_type
@@ -83,6 +83,15 @@ def test_rows_that_no_longer_fit_are_left_out(monkeypatch):
     ]
     monkeypatch.setattr(needs, "_rows", lambda: [good, *bad])
     assert [need.name for need in needs.loops_needed(good["tasks"])] == [good["loop"]]
+
+
+@with_jit
+def test_row_of_other_types_is_tried_once(monkeypatch, tmp_path):
+    monkeypatch.setattr(store, "folders", lambda: (tmp_path,))
+    good = needs._rows()[0]
+    monkeypatch.setattr(needs, "_rows", lambda: [{**good, "types": ["none"], "tasks": ["one"]}])
+    assert compile_ahead(["one"], jobs=1) == 1
+    assert compile_ahead(["one"], jobs=1) == 0
 
 
 def test_unknown_task_is_told():
