@@ -1,0 +1,154 @@
+"""Tables and figures of the pages, from the JSON files in ``docs/evidence``.
+
+    python docs/figures.py                   # write them anew into README.md and docs/*.md
+    python docs/figures.py --measure [NAME]  # measure first: minutes to an hour, on a quiet machine
+
+In a page a table stands between ``<!-- evidence: NAME -->`` and ``<!-- end -->``, a figure within a line between
+``<!-- value: NAME.KEY -->`` and ``<!-- end -->``. ``tests/contract/test_evidence.py`` fails where a page says
+something else than its file.
+"""
+
+import argparse
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+EVIDENCE = ROOT / "docs" / "evidence"
+_TABLE = re.compile(r"<!-- evidence: ([\w]+) -->\n.*?<!-- end -->", re.S)
+_VALUE = re.compile(r"<!-- value: ([\w]+)\.([\w]+) -->.*?<!-- end -->", re.S)
+
+# Name: what measures it. DATA stands for the folder of the real hip.
+COMMANDS = {
+    "headline": ["benchmarks/headline.py", "DATA/hip/flexion.toml", "-o", "OUT"],
+}
+
+
+def bound(value, digits):
+    """A length as a table says it: rounded, or the bound that it keeps (``{"below": b}`` where that is all we know)."""
+    least = 10.0**-digits
+    if isinstance(value, dict):
+        return f"< {value['below']:g}"
+    return f"< {least:.{digits}f}" if value < least else f"{value:.{digits}f}"
+
+
+def volume(value):
+    """A relative error of the volume."""
+    if isinstance(value, dict):
+        return f"< {value['below']:.0e}"
+    return "< 1e-12" if value < 1e-12 else f"{value:.0e}"
+
+
+def largest(values):
+    """The largest of some lengths; one known by its bound alone counts as that."""
+    return max(v["below"] if isinstance(v, dict) else v for v in values)
+
+
+def headline_table(facts):
+    """How exact the muscles of the real hip are: one column a muscle."""
+    rows = facts["rows"]
+    shown = [
+        ("volume error", lambda r: volume(r["volume_error"])),
+        (
+            "surface inside a bone, exact distance to the bone mesh (mm)",
+            lambda r: bound(r["penetration_max"], 2),
+        ),
+        ("bone vertices inside the muscle (mm)", lambda r: bound(r["bone_penetration_max"], 2)),
+        ("penetration before the bones are cut away (mm)", lambda r: bound(r["solver_penetration_max"], 2)),
+        (
+            "rest error, RMS / greatest (mm)",
+            lambda r: f"{r['rest_error_rms']:.2f} / {r['rest_error_max']:.1f}",
+        ),
+        (
+            "one pose by steps of 2, 5, 10, 30 degrees, greatest RMS apart (mm)",
+            lambda r: f"{r['steps_apart']:.2f}",
+        ),
+        ("there and back to rest by 2 degrees (mm RMS)", lambda r: f"{r['there_and_back']:.2f}"),
+    ]
+    names = [name.replace("_", " ") for name in rows]
+    lines = [f"| what | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
+    lines += [f"| {what} | {' | '.join(text(row) for row in rows.values())} |" for what, text in shown]
+    return lines
+
+
+TABLES = {"headline": headline_table}
+
+
+def span(rows, key):
+    """The least and the greatest of a key over all muscles, as text."""
+    values = [f"{row[key]:.2f}" for row in rows.values()]
+    return f"{min(values)} to {max(values)}"
+
+
+VALUES = {
+    ("headline", "steps_apart"): lambda facts: max(f"{r['steps_apart']:.2f}" for r in facts["rows"].values()),
+    ("headline", "there_and_back"): lambda facts: span(facts["rows"], "there_and_back"),
+    ("headline", "solver_penetration"): lambda facts: bound(
+        largest(r["solver_penetration_max"] for r in facts["rows"].values()), 2
+    ),
+    ("headline", "rest_rms"): lambda facts: f"{facts['rows']['gluteus_maximus']['rest_error_rms']:.2f}",
+    ("headline", "rest_max"): lambda facts: f"{facts['rows']['gluteus_maximus']['rest_error_max']:.1f}",
+}
+
+
+def facts_of(name):
+    """What a file of evidence holds."""
+    return json.loads((EVIDENCE / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def provenance(facts):
+    """The line under a table: command, commit, machine, and what else has to be known."""
+    note = f" {facts['note']}" if facts.get("note") else ""
+    return f"`{facts['command']}`, commit {facts['commit']}, {facts['machine']}.{note}"
+
+
+def written(text):
+    """A page with its tables and figures as the files of evidence have them."""
+
+    def table(match):
+        facts = facts_of(match[1])
+        body = "\n".join([*TABLES[match[1]](facts), "", provenance(facts)])
+        return f"<!-- evidence: {match[1]} -->\n{body}\n<!-- end -->"
+
+    def value(match):
+        return f"<!-- value: {match[1]}.{match[2]} -->{VALUES[match[1], match[2]](facts_of(match[1]))}<!-- end -->"
+
+    return _VALUE.sub(value, _TABLE.sub(table, text))
+
+
+def page_files():
+    """The README and the pages of ``docs``."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def measure(names):
+    """Run what measures; the real hip is found as tests find it."""
+    places = [os.environ.get("RBFMUSCLE_DATA"), ROOT.parent / "shared" / "data"]
+    data = next((str(p) for p in places if p and (Path(p) / "hip").is_dir()), None)
+    for name in names:
+        if data is None:
+            sys.exit(f"{name}: the real hip is not here (set RBFMUSCLE_DATA to the folder that holds hip/)")
+        command = [part.replace("DATA", data) for part in COMMANDS[name]]
+        command[command.index("OUT")] = str(EVIDENCE / f"{name}.json")
+        subprocess.run([sys.executable, *command], cwd=ROOT, check=True)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--measure", nargs="*", choices=sorted(COMMANDS), metavar="NAME")
+    given = parser.parse_args()
+    if given.measure is not None:
+        measure(given.measure or sorted(COMMANDS))
+    for path in page_files():
+        text = path.read_text(encoding="utf-8")
+        new = written(text)
+        if new != text:
+            path.write_text(new, encoding="utf-8")
+            print(f"written: {path.relative_to(ROOT)}")
+
+
+if __name__ == "__main__":
+    main()

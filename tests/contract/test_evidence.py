@@ -1,0 +1,44 @@
+"""Tables of the pages say what their files of evidence hold, and where these come from."""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "docs"))
+import figures  # noqa: E402
+
+FILES = sorted((ROOT / "docs" / "evidence").glob("*.json"))
+
+
+@pytest.mark.parametrize("page", figures.page_files(), ids=lambda path: path.stem)
+def test_page_says_what_the_files_hold(page):
+    text = page.read_text(encoding="utf-8")
+    assert figures.written(text) == text, "run python docs/figures.py"
+
+
+def test_changed_figure_is_found():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    planted = text.replace("| volume error | ", "| volume error | 9", 1)
+    assert planted != text
+    assert figures.written(planted) == text
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_file_names_command_commit_and_machine(path):
+    facts = json.loads(path.read_text(encoding="utf-8"))
+    assert all(isinstance(facts[key], str) and facts[key] for key in ("command", "commit", "machine"))
+    script = re.match(r"python (benchmarks/\w+\.py)", facts["command"]).group(1)
+    assert (ROOT / script).exists()
+    assert facts["rows"]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_file_is_shown_and_can_be_measured_again(path):
+    shown = "".join(page.read_text(encoding="utf-8") for page in figures.page_files())
+    assert f"<!-- evidence: {path.stem} -->" in shown
+    assert path.stem in figures.COMMANDS
+    assert (ROOT / figures.COMMANDS[path.stem][0]).exists()
