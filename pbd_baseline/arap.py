@@ -5,13 +5,22 @@ at rest, each R_i the rotation that makes E least (Sorkine and Alexa 2007). With
 gradient of E is its partial derivative with R frozen: grad_i E = sum_j w_ij (e_ij - (R_i + R_j) E_ij / 2).
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 import scipy.sparse as sparse
 
 from pbd_baseline.topology import colour
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.harmonic import cotangent_laplacian
 from rbfmuscle.geometry.rotations import quaternion_matrix, rotate, turn_quaternion
+
+if TYPE_CHECKING:
+    from pbd_baseline.topology import Topology
+
 
 # Newton steps for the rotations: warm starts need one or two, a turn by 30 degrees at once four.
 ROTATION_STEPS = 8
@@ -37,7 +46,7 @@ class ARAP:
         Cotangent weights clamped from below: a long mesh has 22 % negative ones.
     """
 
-    def __init__(self, vertices, topology, *, stiffer=1.0):
+    def __init__(self, vertices: Floats, topology: Topology, *, stiffer: Floats | float = 1.0) -> None:
         self.topology = topology
         self.laplacian = cotangent_laplacian(vertices, topology.faces)
         i, j = topology.edges.T
@@ -48,7 +57,7 @@ class ARAP:
         self.rest = np.ascontiguousarray(vertices[i] - vertices[j])
         self.quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (topology.vertex_count, 1))
 
-    def fit_rotations(self, points, *, steps=ROTATION_STEPS):
+    def fit_rotations(self, points: Floats, *, steps: int = ROTATION_STEPS) -> None:
         """The local step: the best rotation of every one-ring, from the present ones on."""
         t = self.topology
         _rotation_loop(
@@ -63,17 +72,17 @@ class ARAP:
             steps,
         )
 
-    def energy(self, points):
+    def energy(self, points: Floats) -> float:
         """E with the present rotations [unit^2, as the cotangents have none]."""
         return _energy_loop(points, self.topology.edges, self.rest, self.weights, self.quaternions)
 
-    def targets(self):
+    def targets(self) -> Floats:
         """Right side (n, 3) of the global step: sum_j w_ij (R_i + R_j) E_ij / 2."""
         out = np.zeros((len(self.quaternions), 3))
         _target_loop(self.topology.edges, self.rest, self.weights, self.quaternions, out)
         return out
 
-    def gradient(self, points):
+    def gradient(self, points: Floats) -> Floats:
         """Gradient (n, 3) of E with the rotations frozen; the full one where they are optimal."""
         return self.laplacian @ points - self.targets()
 
@@ -100,7 +109,7 @@ class ARAPConstraint:
         Factor of 1 / w_ij; over the time of the step.
     """
 
-    def __init__(self, arap, *, compliance=1.0):
+    def __init__(self, arap: ARAP, *, compliance: float = 1.0) -> None:
         self.arap = arap
         edges = arap.topology.edges
         order, self.colours = colour(edges, arap.topology.vertex_count)
@@ -110,11 +119,11 @@ class ARAPConstraint:
         self.compliance = compliance / arap.weights[order]
         self.multiplier = np.zeros((len(order), 3))
 
-    def reset(self):
+    def reset(self) -> None:
         """Forget the multipliers, as each time step does."""
         self.multiplier[:] = 0.0
 
-    def project(self, points, inverse_mass, *, time=1.0):
+    def project(self, points: Floats, inverse_mass: Floats, *, time: float = 1.0) -> None:
         """One Gauss-Seidel sweep over ``points`` (n, 3), in place, with the arap's rotations."""
         _constraint_loop(
             points,

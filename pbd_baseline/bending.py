@@ -1,9 +1,12 @@
 """Dihedral bending: constraints of one colour are gathered in blocks and projected by vector instructions."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from pbd_baseline.topology import colour, spread
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats, Integers
 
 # A gradient shorter than this share of its natural size belongs to a collapsed element: it has no direction.
 TINY = 1e-12
@@ -34,7 +37,15 @@ class BendingConstraint:
         As in :class:`~pbd_baseline.constraints.EdgeConstraint`; the compliance is per radian squared.
     """
 
-    def __init__(self, vertices, edges, wings, *, stiffness=0.9, compliance=0.0):
+    def __init__(
+        self,
+        vertices: Floats,
+        edges: Integers,
+        wings: Integers,
+        *,
+        stiffness: float = 0.9,
+        compliance: float = 0.0,
+    ) -> None:
         members = np.column_stack([edges, wings])
         order, self.colours = colour(members, len(vertices))
         self.members = np.ascontiguousarray(members[order])
@@ -45,7 +56,7 @@ class BendingConstraint:
         self.compliance = spread(compliance, order)
         self.multiplier = np.zeros(len(order))
 
-    def values(self, points):
+    def values(self, points: Floats) -> Floats:
         """C of each edge, in the order of ``self.members``."""
         now = np.empty_like(self.rest)
         _dihedral_loop(points, self.members, now)
@@ -53,11 +64,11 @@ class BendingConstraint:
         cosine = now[:, 0] * self.rest[:, 0] + now[:, 1] * self.rest[:, 1]
         return 2.0 * sine / np.maximum(1.0 + cosine, TINY)
 
-    def reset(self):
+    def reset(self) -> None:
         """Forget the multipliers, as each time step does."""
         self.multiplier[:] = 0.0
 
-    def project(self, points, inverse_mass):
+    def project(self, points: Floats, inverse_mass: Floats) -> None:
         """One Gauss-Seidel sweep over ``points`` (n, 3), in place."""
         _sweep_loop(
             points,

@@ -6,10 +6,16 @@ is the hard constraint of PBD, and k in [0, 1] its stiffness (Müller 2007). w i
 vertex is held.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
 from pbd_baseline.topology import colour, spread
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import volume_about, volume_cubic
 
 # A gradient shorter than this share of its natural size belongs to a collapsed element: it has no direction.
@@ -33,7 +39,15 @@ class EdgeConstraint:
         Ratios of length to rest length beyond which an edge is hard whatever its stiffness.
     """
 
-    def __init__(self, vertices, edges, *, stiffness=1.0, compliance=0.0, limits=(0.0, np.inf)):
+    def __init__(
+        self,
+        vertices: Floats,
+        edges: Integers,
+        *,
+        stiffness: Floats | float = 1.0,
+        compliance: float = 0.0,
+        limits: list[float] | tuple[float, float] = (0.0, np.inf),
+    ) -> None:
         order, self.colours = colour(edges, len(vertices))
         self.edges = np.ascontiguousarray(edges[order])
         self.order = order
@@ -43,15 +57,15 @@ class EdgeConstraint:
         self.compliance = spread(compliance, order)
         self.multiplier = np.zeros(len(order))
 
-    def values(self, points):
+    def values(self, points: Floats) -> Floats:
         """C of each edge, in the order of ``self.edges``."""
         return np.linalg.norm(points[self.edges[:, 0]] - points[self.edges[:, 1]], axis=1) - self.rest
 
-    def reset(self):
+    def reset(self) -> None:
         """Forget the multipliers, as each time step does."""
         self.multiplier[:] = 0.0
 
-    def project(self, points, inverse_mass):
+    def project(self, points: Floats, inverse_mass: Floats) -> None:
         """One Gauss-Seidel sweep over ``points`` (n, 3), in place."""
         _edge_loop(
             points,
@@ -76,28 +90,30 @@ class VolumeConstraint:
         Closed, outward.
     """
 
-    def __init__(self, vertices, faces):
+    def __init__(self, vertices: Floats, faces: Integers) -> None:
         self.faces = np.ascontiguousarray(faces)
         self.rest = self.volume(vertices)
 
-    def volume(self, points):
+    def volume(self, points: Floats) -> float:
         """Signed enclosed volume [unit^3]."""
         return volume_about(points, self.faces, np.ascontiguousarray(points[0]))
 
-    def gradient(self, points):
+    def gradient(self, points: Floats) -> Floats:
         """Gradient (n, 3) of the volume."""
         out = np.zeros_like(points)
         _volume_gradient_loop(points, self.faces, out)
         return out
 
-    def project(self, points, inverse_mass):
+    def project(self, points: Floats, inverse_mass: Floats) -> None:
         """One PBD projection along the plain gradient, in place: the rough step of the paper's figure 8."""
         step = self.gradient(points) * inverse_mass[:, None]
         slope = (step * step).sum()
         if slope > 0.0:
             points += step * ((self.rest - self.volume(points)) / slope)
 
-    def restore(self, points, direction, *, clear_way=None):
+    def restore(
+        self, points: Floats, direction: Floats, *, clear_way: Callable[..., Any] | None = None
+    ) -> float:
         """Move points along a direction (n, 3) until the volume is the rest volume; return the factor s.
 
         V(x + s d) is a cubic in s, computed exactly, so the volume is met to rounding. Where the direction

@@ -1,8 +1,13 @@
 """Collision response of a mesh: half-spaces from the contacts, the sum of their ways out."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats
 
 # A half-space counts as violated below this share of the search reach.
 TOUCHING = 1e-9
@@ -24,23 +29,23 @@ class ContactConstraint:
         the authors' earlier papers.
     """
 
-    def __init__(self, columns, shares, *, reach, response="sum"):
+    def __init__(self, columns: Floats, shares: Floats, *, reach: float, response: str = "sum") -> None:
         self.columns, self.shares = columns, shares
         self.reach = float(reach)
         self.nearest_only = response == "nearest"
         self.index, self.gap = np.zeros(0, dtype=np.int64), np.zeros(0)
         self.normal = self.anchor = np.zeros((0, 3))
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.index)
 
-    def place(self, points):
+    def place(self, points: Floats) -> Any:
         """Contact points (p, 3) of vertices (n, 3)."""
         out = np.empty((len(self.columns), 3))
         _place_loop(points, self.columns, self.shares, out)
         return out
 
-    def find(self, contacts, points, *, reach=None):
+    def find(self, contacts: Any, points: Floats, *, reach: Any = None) -> Any:
         """Ask the contacts where the vertices (n, 3) are now; return the greatest depth."""
         placed = self.place(points)
         found = contacts.half_spaces(placed, self.reach if reach is None else reach)
@@ -49,13 +54,13 @@ class ContactConstraint:
         self.anchor = placed[self.index]
         return max(0.0, -float(self.gap.min(initial=0.0)))
 
-    def depth(self, points):
+    def depth(self, points: Floats) -> Any:
         """Greatest depth of the points in the half-spaces found last."""
         if len(self.index) == 0:
             return 0.0
         return self._depths(points, np.empty(len(self.index)))
 
-    def project(self, points):
+    def project(self, points: Floats) -> Any:
         """Push vertices out of the half-spaces, in place; return the greatest violation before."""
         if len(self.index) == 0:
             return 0.0
@@ -67,7 +72,7 @@ class ContactConstraint:
             _push_loop(points, self.columns, self.shares, self.index, self.normal, depth)
         return worst
 
-    def clear_way(self, points, direction, step):
+    def clear_way(self, points: Floats, direction: Any, step: Any) -> Any:
         """Take out of ``step * direction``, in place, what would lead into a half-space; say if anything."""
         if len(self.index) == 0 or step == 0.0:
             return False

@@ -1,8 +1,13 @@
 """Mesh muscles that contract: rest lengths along and across the fibres follow the law of the fibres."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.sim.contraction.law import FibreLaw
 from rbfmuscle.sim.contraction.resolve import resolve_contraction
 
@@ -24,7 +29,7 @@ class MeshFibres:
         Share by which a passive fibre is pulled back: 1, as the mesh models know no other passive fibre.
     """
 
-    def __init__(self, muscle, rest, *, hold=1.0):
+    def __init__(self, muscle: Any, rest: Any, *, hold: float = 1.0) -> None:
         contraction = resolve_contraction(muscle)
         count = len(rest.vertices)
         tendon = np.zeros(count, dtype=bool) if contraction is None else contraction.tendon[rest.order]
@@ -47,11 +52,11 @@ class MeshFibres:
         self.stretch = np.ones(count)
 
     @property
-    def activation(self):
+    def activation(self) -> Any:
         """Present activation, 0 to 1."""
         return self.law.activation
 
-    def targets(self, points):
+    def targets(self, points: Floats) -> Any:
         """Wanted vectors of the edges (e, 3) in the rest frame, for the present points (n, 3)."""
         _stretch_loop(points, self.edges, self.lengths, self.says, self.stretch)
         along, across = self.law.goal(self.stretch)

@@ -1,9 +1,14 @@
 """A sparse symmetric factor that solves three right sides at once, outside Python's lock."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 from scipy.sparse.linalg import splu
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats
 
 
 class SymmetricFactor:
@@ -19,7 +24,7 @@ class SymmetricFactor:
         If the matrix is not positive definite, as when nothing of the mesh is held.
     """
 
-    def __init__(self, matrix):
+    def __init__(self, matrix: Any) -> None:
         try:
             lu = splu(
                 matrix.tocsc(),
@@ -39,7 +44,7 @@ class SymmetricFactor:
         self.inverse_pivots = 1.0 / pivots
         self.place = np.asarray(lu.perm_c, dtype=np.int64)
 
-    def solve(self, right):
+    def solve(self, right: Floats) -> Floats:
         """Solution (n, 3) of matrix @ x = right (n, 3)."""
         out = np.empty_like(right)
         work = np.empty_like(right)

@@ -1,12 +1,16 @@
 """Which way fibres run at an edge, how soft that makes it, and how thick the muscle is there."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.harmonic import cotangent_laplacian
 
 # Pieces of polyline that speak for one place.
@@ -44,7 +48,7 @@ def fibre_directions(
     return _normalised(np.einsum("nk,nkd->nd", share, tangents[index]))
 
 
-def edge_stiffness(vertices, edges, directions, exponent):
+def edge_stiffness(vertices: Floats, edges: Integers, directions: Floats, exponent: float) -> Floats:
     """k = (1 - |cos(edge, fibre)|)^a: edges along the fibres are soft (Cervenka and Kohout, a = 0.5).
 
     Returns
@@ -62,7 +66,7 @@ def edge_stiffness(vertices, edges, directions, exponent):
     return np.clip(1.0 - aligned, 0.0, 1.0) ** exponent
 
 
-def swelling_room(vertices, faces, normals, held, share):
+def swelling_room(vertices: Floats, faces: Integers, normals: Floats, held: Booleans, share: float) -> Any:
     """How far the surface moves at each vertex when the muscle swells: its local half thickness.
 
     A uniform offset would turn thin rims inside out; in proportion to the thickness it is a change of
@@ -93,7 +97,7 @@ def swelling_room(vertices, faces, normals, held, share):
     return np.maximum(room, 0.0)
 
 
-def vertex_areas(vertices, faces):
+def vertex_areas(vertices: Floats, faces: Integers) -> Floats:
     """A third of the area of the faces around each vertex, (n,)."""
     area = np.zeros(len(vertices))
     a, b, c = (vertices[faces[:, k]] for k in range(3))

@@ -1,12 +1,15 @@
 """Where vertices go when the bones move: harmonic weights between rigid motions."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.harmonic import blended_motion
 
 
-def carry(points, weights, motions):
+def carry(points: Floats, weights: Floats, motions: Floats) -> None:
     """Move points (n, 3) in place by a weighted mean of rigid motions (b, 4, 4); weights (n, b).
 
     Where all bones but one rest, the mean is a rotation about that bone's axis by a share of its angle, and

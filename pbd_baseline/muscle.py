@@ -50,9 +50,10 @@ class PBDMuscle:
         self.name = muscle.name
         self.options = options or PBDOptions()
         self.rest = Rest.from_muscle(muscle, scene, self.options)
-        self.fibres = MeshFibres(muscle, self.rest) if muscle.contraction is not None else None
+        self.fibres: Any = MeshFibres(muscle, self.rest) if muscle.contraction is not None else None
         stiffer = 1.0 if self.fibres is None else np.where(self.fibres.tendon, TENDON_WEIGHT, 1.0)
-        self.shape = METHODS[self.options.method].shape(self.rest, self.options, stiffer)
+        kind: Any = METHODS[self.options.method].shape
+        self.shape = kind(self.rest, self.options, stiffer)
         self.sweeps = sweeps(self.options)
         columns, shares = _contact_carriers(self.rest, faces_too=self.options.contact == "faces")
         self.contact = ContactConstraint(

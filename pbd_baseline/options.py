@@ -27,7 +27,9 @@ class PBDOptions(Table):
     prediction: Literal["carried", "velocity", "none"] = "carried"
     damping: Share = 0.99
     fibre_exponent: NotNegative = 0.5
-    limits: Annotated[list[Positive], Field(min_length=2, max_length=2, default_factory=lambda: [0.6, 2.2])]
+    limits: Annotated[list[Positive], Field(min_length=2, max_length=2)] = Field(
+        default_factory=lambda: [0.6, 2.2]
+    )
     soft_length: NotNegative = 0.3
     edge: Share = 1.0
     bending: Share = 0.9

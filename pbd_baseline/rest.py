@@ -1,5 +1,7 @@
 """What is known of a mesh muscle at rest, found once and shared by all its models."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +11,7 @@ from pbd_baseline.fibres import fibre_directions, swelling_room
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.topology import Topology, cache_order
 from pbd_baseline.weights import even_weights
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.harmonic import surface_gradient
 from rbfmuscle.sim.cache import content_key, has_arrays, load_arrays, store_arrays
 from rbfmuscle.sim.scene.objects import Muscle
@@ -56,7 +59,7 @@ class Rest:
     volume: VolumeConstraint
 
     @classmethod
-    def from_muscle(cls, muscle: Muscle, scene: Scene, options: PBDOptions) -> "Rest":
+    def from_muscle(cls, muscle: Muscle, scene: Scene, options: PBDOptions) -> Rest:
         """Measure a muscle of a scene.
 
         Parameters
@@ -85,7 +88,7 @@ class Rest:
             order, vertices, topology, bones, weights, holder, inverse_mass, fibres, room, volume
         )  # fmt: skip
 
-    def relative_lengths(self):
+    def relative_lengths(self) -> Floats:
         """Length of each edge in units of the median one.
 
         A piece of an elastic sheet is the softer the longer it is. With one stiffness for all edges the

@@ -5,7 +5,9 @@ muscle around it adds contact after each, and the volume in the shape's own way.
 rest lengths from the fibres of a muscle that contracts; ``stiffer`` multiplies the weights of edges (of tendon).
 """
 
-from typing import NamedTuple
+from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sparse
@@ -20,6 +22,7 @@ from pbd_baseline.fibres import edge_stiffness, vertex_areas
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.rest import Rest
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats
 
 
 class Shape:
@@ -56,7 +59,7 @@ class Shape:
         """What the shape remembers from sweep to sweep; None where that is nothing."""
         return None
 
-    def restore(self, state: np.ndarray | None) -> None:
+    def restore(self, state: Any) -> None:
         """Go back to a snapshot."""
 
     def _swelling(self, points: np.ndarray) -> np.ndarray:
@@ -91,7 +94,7 @@ class PBDShape(Shape):
         share = np.where(fibres.tendon, 1.0, fibres.activation)[self.edges.order]
         self.edges.stiffness = self.passive + share * (self.stiffest - self.passive)
 
-    def sweep(self, points, time):
+    def sweep(self, points: Floats, time: float) -> None:
         """One Gauss-Seidel sweep; PBD knows no time."""
         self.bending.project(points, self.inverse_mass)
         self.edges.project(points, self.inverse_mass)
@@ -124,7 +127,7 @@ class XPBDShape(Shape):
         self.edge_compliance = np.where(share > 0.0, mixed, self.passive)
         self.edge_compliance[fibres.tendon[self.edges.order]] /= TENDON_WEIGHT
 
-    def sweep(self, points, time):
+    def sweep(self, points: Floats, time: float) -> None:
         """One small step of the given time."""
         self.edges.compliance = self.edge_compliance / time
         self.bending.compliance[:] = self.bending_compliance / time
@@ -147,7 +150,7 @@ class ARAPShape(Shape):
         self.arap.rest = fibres.targets(points)
         self.constraint.rest = np.ascontiguousarray(self.arap.rest[self.constraint.order])
 
-    def sweep(self, points, time):
+    def sweep(self, points: Floats, time: float) -> None:
         """Rotations, then one small step of the constraints."""
         self.arap.fit_rotations(points)
         self.constraint.reset()
@@ -157,7 +160,7 @@ class ARAPShape(Shape):
         """The rotations."""
         return self.arap.quaternions.copy()
 
-    def restore(self, state: np.ndarray) -> None:
+    def restore(self, state: Any) -> None:
         """Go back to the rotations of a snapshot."""
         self.arap.quaternions[:] = state
 
@@ -185,7 +188,7 @@ class GlobalARAPShape(Shape):
         """Take rest vectors from the fibres; the matrix of the global step does not change."""
         self.arap.rest = fibres.targets(points)
 
-    def sweep(self, points, time):
+    def sweep(self, points: Floats, time: float) -> None:
         """One local and one global step."""
         self.arap.fit_rotations(points)
         right = self.arap.targets()[self.free] + self.mass * points[self.free]
@@ -196,7 +199,7 @@ class GlobalARAPShape(Shape):
         """The rotations."""
         return self.arap.quaternions.copy()
 
-    def restore(self, state: np.ndarray) -> None:
+    def restore(self, state: Any) -> None:
         """Go back to the rotations of a snapshot."""
         self.arap.quaternions[:] = state
 

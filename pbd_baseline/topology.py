@@ -1,5 +1,7 @@
 """Connections of a closed triangle mesh: edges, wings, one-rings, and the colouring of constraints."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,6 +9,7 @@ import scipy.sparse as sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.validation import MeshError, check_mesh
 
 
@@ -36,7 +39,7 @@ class Topology:
     ring_edge: np.ndarray
 
     @classmethod
-    def from_mesh(cls, vertices, faces):
+    def from_mesh(cls, vertices: Floats, faces: Integers) -> Topology:
         """Connect a mesh.
 
         Raises
@@ -58,7 +61,7 @@ class Topology:
         return cls(*parts)
 
     @property
-    def vertex_count(self):
+    def vertex_count(self) -> int:
         """Number of vertices."""
         return len(self.ring_start) - 1
 
@@ -88,7 +91,7 @@ def _one_rings(edges, count):
     return start, np.ascontiguousarray(target[order]), np.ascontiguousarray(index[order])
 
 
-def colour(members, count):
+def colour(members: Integers, count: int) -> tuple[Integers, Integers]:
     """Order constraints so that those of one colour share no vertex.
 
     Greedy: each constraint takes the smallest colour that none of its vertices has yet. Constraints of one
@@ -120,7 +123,7 @@ def colour(members, count):
     return order, start
 
 
-def spread(value, order):
+def spread(value: Floats | float, order: Integers) -> Floats:
     """A constraint's parameter, one number or one a constraint, as an array in the order of the colours."""
     value = np.asarray(value, dtype=np.float64)
     return np.ascontiguousarray(value[order]) if value.ndim else np.full(len(order), float(value))
@@ -145,7 +148,7 @@ def _colour_loop(members, taken, colours):
             break
 
 
-def cache_order(faces, count):
+def cache_order(faces: Integers, count: int) -> Integers:
     """Order of vertices in which neighbours lie near each other in memory (reverse Cuthill and McKee 1969).
 
     It follows from the connections alone, so a mesh that is moved, turned or scaled keeps its order of sweeps

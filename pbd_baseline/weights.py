@@ -5,10 +5,13 @@ there fivefold, and local sweeps cannot take that back. The p-Laplace equation, 
 |grad w|^p, spreads the gradient over the whole length; p = 4 nearly halves the worst stretch on the hip.
 """
 
+from __future__ import annotations
+
 import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import harmonic_weights
 
 POWER = 4.0
@@ -18,7 +21,7 @@ LEAST_GRADIENT = 1e-3
 LEAST_COTANGENT = 1e-3
 
 
-def even_weights(vertices, faces, groups):
+def even_weights(vertices: Floats, faces: Integers, groups: list[Integers]) -> Floats:
     """Weights in [0, 1] that sum to one, 1 on a group's own vertices, by re-weighted Laplace solves.
 
     Parameters

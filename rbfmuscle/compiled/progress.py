@@ -1,8 +1,11 @@
 """What goes on, shown on stderr: a bar on a terminal, else a line every two seconds; nothing for what is quick."""
 
+from __future__ import annotations
+
 import sys
 import threading
 import time
+from typing import Any
 
 from rbfmuscle.compiled.watch import current_stage, loop_in_work, tell_stage
 
@@ -21,15 +24,15 @@ class Progress:
         What is counted.
     """
 
-    _shown = None  # one display a process
+    _shown: Any = None  # one display a process
     _lock = threading.Lock()
 
-    def __init__(self, title: str, what: str = "frame"):
+    def __init__(self, title: str, what: str = "frame") -> None:
         self.title = title
         self.stage = tell_stage("", what)
-        self.display = None
+        self.display: Any = None
 
-    def __enter__(self):
+    def __enter__(self) -> Any:
         with Progress._lock:
             if Progress._shown is None:
                 Progress._shown = self.display = _Bar() if sys.stderr.isatty() else _Lines()
@@ -41,14 +44,14 @@ class Progress:
         """Take note of how much is done."""
         self.stage(done, total)
 
-    def __exit__(self, *error):
+    def __exit__(self, *error: Any) -> None:
         self.stage.__exit__()
         if self.display is not None:
             Progress._shown = None
             self.display.stop(self.stage, failed=error[0] is not None)
 
 
-def describe_stage(stage) -> str:
+def describe_stage(stage: Any) -> str:
     """What goes on, in words: the loop that is compiled where nothing says more."""
     loop = loop_in_work()
     text = stage.text
@@ -62,7 +65,7 @@ def describe_stage(stage) -> str:
 class _Lines:
     """A line whenever EVERY seconds have passed, and one for the last count."""
 
-    def start(self, title):
+    def start(self, title: Any) -> None:
         self.title, self.begun, self.said = title, time.monotonic(), 0
         self.ended = threading.Event()
         self.thread = threading.Thread(target=self._beat, name="rbfmuscle-progress", daemon=True)
@@ -79,7 +82,7 @@ class _Lines:
         self.said += 1
         print(text, file=sys.stderr, flush=True)
 
-    def stop(self, stage, *, failed):
+    def stop(self, stage: Any, *, failed: Any) -> None:
         self.ended.set()
         self.thread.join()
         if stage.total and not failed and (self.said or stage.done == stage.total):
@@ -89,7 +92,7 @@ class _Lines:
 class _Bar:
     """A bar that is drawn anew ten times a second, once two seconds have passed."""
 
-    def start(self, title):
+    def start(self, title: Any) -> None:
         self.title = title
         self.ended = threading.Event()
         self.thread = threading.Thread(target=self._beat, name="rbfmuscle-progress", daemon=True)
@@ -110,6 +113,6 @@ class _Bar:
                     text = f"{self.title}: {describe_stage(stage)}"
                     bar.update(task, description=text, completed=stage.done, total=stage.total)
 
-    def stop(self, stage, *, failed):
+    def stop(self, stage: Any, *, failed: Any) -> None:
         self.ended.set()
         self.thread.join()

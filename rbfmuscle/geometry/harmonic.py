@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -48,7 +49,7 @@ def cotangent_laplacian(vertices: Floats, faces: Integers) -> Any:
     return (sparse.diags(np.asarray(weights.sum(axis=1)).ravel()) - weights).tocsc()
 
 
-def harmonic_weights(vertices: Floats, faces: Integers, groups: list[Integers]) -> Floats:
+def harmonic_weights(vertices: Floats, faces: Integers, groups: Sequence[Integers]) -> Floats:
     """Solve Laplace's equation on the surface once for each group of fixed vertices.
 
     Parameters

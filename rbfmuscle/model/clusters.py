@@ -1,13 +1,19 @@
 """How the centres of an RBF muscle hang together and how its surface samples hang on them."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 import scipy.sparse as sparse
 from scipy.spatial import cKDTree
 
+from rbfmuscle.geometry.arrays import Floats, Integers
+
 SHARES = 6  # centres that carry one sample
 
 
-def two_rings(faces, count):
+def two_rings(faces: Integers, count: int) -> Any:
     """Sorted neighbours of each point of a triangulation, and the neighbours' neighbours."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     linked = sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count)).tocsr()
@@ -17,7 +23,7 @@ def two_rings(faces, count):
     return [np.array(sorted(row), dtype=np.int64) for row in linked.tocsr().tolil().rows]
 
 
-def opposite_points(points, normals, samples, sample_normals):
+def opposite_points(points: Floats, normals: Floats, samples: Any, sample_normals: Any) -> Any:
     """The sample that faces each point across the muscle's thickness, -1 where none does.
 
     Among samples whose normals look away, it is the one nearest to the inward ray; a lateral offset counts
@@ -37,12 +43,21 @@ def opposite_points(points, normals, samples, sample_normals):
     return found
 
 
-def _spacing(points):
+def _spacing(points: Floats) -> Any:
     """Median distance to the nearest neighbour."""
     return float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))
 
 
-def build_clusters(centres, normals, faces, samples, sample_normals, *, across=3, across_weight=1.0):
+def build_clusters(
+    centres: Floats,
+    normals: Floats,
+    faces: Integers,
+    samples: Floats,
+    sample_normals: Floats,
+    *,
+    across: int = 3,
+    across_weight: float = 1.0,
+) -> Any:
     """Clusters of neighbours within two rings and of neighbours across the thickness.
 
     One ring alone leaves thin parts so soft in bending that they buckle between poses and the iteration crawls:
@@ -81,7 +96,7 @@ def build_clusters(centres, normals, faces, samples, sample_normals, *, across=3
     return np.array(start), np.concatenate(other).astype(np.int64), np.concatenate(weight)
 
 
-def bind_samples(samples, sample_normals, centres, normals):
+def bind_samples(samples: Any, sample_normals: Any, centres: Floats, normals: Floats) -> Any:
     """Centres that carry each sample, and with what share.
 
     A sample goes with x_s = Σ_k share_k (x_k + T_k (X_s - X_k)); the shares fall to zero at the distance of the

@@ -5,9 +5,14 @@ projected in the metric of that energy (through the inverse of its matrix), so a
 the muscle instead of dinting one point.
 """
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.rotations import quaternion_matrix
 from rbfmuscle.geometry.surfaces import volume_and_gradient
 from rbfmuscle.sim.contraction.law import FibreLaw
@@ -125,7 +130,18 @@ class ShapeConstraint:
         Of the clusters of a muscle that contracts.
     """
 
-    def __init__(self, rest, start, other, weight, fibre, *, limits=(0.5, 2.0), hold=0.1, law=None):
+    def __init__(
+        self,
+        rest: Floats,
+        start: Integers,
+        other: Integers,
+        weight: Floats,
+        fibre: Floats,
+        *,
+        limits: tuple[float, float] = (0.5, 2.0),
+        hold: float = 0.1,
+        law: Any = None,
+    ) -> None:
         self.rest, self.start, self.other, self.weight, self.fibre = rest, start, other, weight, fibre
         self.limits = limits
         self.law = law or FibreLaw(np.zeros(len(rest), dtype=bool), None, hold=hold)
@@ -148,7 +164,7 @@ class ShapeConstraint:
         self.deformation = np.tile(np.eye(3), (count, 1, 1))
         self.right_side = np.zeros_like(rest)
 
-    def localise(self, x):
+    def localise(self, x: Floats) -> Floats:
         """Update F_i and T_i from the centres and return the right side b of laplacian · x = b, (K, 3)."""
         low, high = self.limits
         _local_loop(
@@ -159,7 +175,7 @@ class ShapeConstraint:
         _right_side_loop(self.arm, self.start, self.other, self.target, self.right_side)
         return self.right_side
 
-    def energy(self, x):
+    def energy(self, x: Floats) -> float:
         """E(x) with the targets of the last ``localise``."""
         head = np.repeat(np.arange(len(self.rest)), np.diff(self.start))
         wanted = np.einsum("eab,eb->ea", self.target[head], self.rest[self.other] - self.rest[head])

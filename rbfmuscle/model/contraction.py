@@ -1,10 +1,14 @@
 """The fibres of an RBF muscle that contracts: which clusters are tendon, and how stiff that makes their edges."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.model.rest import Rest
 from rbfmuscle.sim.contraction.law import FibreLaw
@@ -40,7 +44,7 @@ def contracting(muscle: Muscle, rest: Rest, options: RBFOptions) -> tuple[Rest, 
     return replace(rest, weight=stiffened(rest.weight, rest.start, rest.other, tendon)), law
 
 
-def stiffened(weight, start, other, tendon):
+def stiffened(weight: Any, start: Any, other: Any, tendon: Any) -> Any:
     """Weights (e,) of the clusters' edges, by whether they lie in tendon and belly."""
     if not tendon.any():
         return weight
@@ -48,7 +52,9 @@ def stiffened(weight, start, other, tendon):
     return weight * np.where(head, np.where(tendon[other], TENDON_WEIGHT, LOOSE), 1.0)
 
 
-def even_pull(rest, start, other, weight, fibre, level, belly):
+def even_pull(
+    rest: Floats, start: Any, other: Any, weight: Any, fibre: Floats, level: Floats, belly: Booleans
+) -> Any:
     """Share (K,) by which a fully activated cluster is pulled, such that all sections pull alike.
 
     Fibres run from end to end, so their tension is one along the muscle, whatever its girth. Clusters are spread

@@ -1,8 +1,13 @@
 """Local and global steps of an RBF muscle, with volume and contact projected inside the iteration."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import diameter
 from rbfmuscle.model.constraints import ShapeConstraint, VolumeConstraint
 from rbfmuscle.model.contact import ContactConstraint
@@ -153,7 +158,7 @@ class ElasticSolver:
         self.shape.localise(x)
         return x
 
-    def _iterate(self, x, contacts):
+    def _iterate(self, x: Floats, contacts: BoneContacts) -> Floats:
         """One local step, one global step, and on top of it pressure and contact together."""
         right = self.shape.localise(x)
         new = x.copy()
@@ -164,7 +169,7 @@ class ElasticSolver:
         _gather_loop(gradient, self.columns[self.centres :], self.shares[self.centres :], pull)
         response[self.free] = self.inverse @ pull[self.free]
         _move_loop(new - x, response, self.columns, self.shares, motion, moved)
-        stiffness = np.vdot(pull, response)
+        stiffness = float(np.vdot(pull, response))
         pressure = -(excess + np.vdot(gradient, motion[self.centres :])) / stiffness
         motion += pressure * moved
         spaces = contacts.half_spaces(
@@ -178,11 +183,12 @@ class ElasticSolver:
 class _Anderson:
     """Anderson acceleration of a fixed-point map (Walker & Ni 2011), with plain steps until it has memory."""
 
-    def __init__(self, memory):
+    def __init__(self, memory: int) -> None:
         self.memory = memory
-        self.values, self.residuals = [], []
+        self.values: list[Any] = []
+        self.residuals: list[Any] = []
 
-    def mix(self, x, g):
+    def mix(self, x: Floats, g: Floats) -> Floats:
         """Next iterate from x and its image g."""
         if self.memory == 0:
             return g

@@ -48,7 +48,7 @@ class RBFMuscle:
         self.name = muscle.name
         self.options = options or RBFOptions()
         self.rest = Rest.from_muscle(muscle, scene, self.options)
-        self.law = None
+        self.law: Any = None
         if muscle.contraction is not None:
             self.rest, self.law = contracting(muscle, self.rest, self.options)
         self.solver = ElasticSolver(self.rest, self.options, self.law)

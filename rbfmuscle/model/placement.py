@@ -1,22 +1,31 @@
 """Where the centres and samples of an RBF muscle lie, and the fit that its field is made by."""
 
+from __future__ import annotations
+
 import warnings
 from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
+from rbfmuscle.implicit.placement.density import GREEDY_LARGEST
 from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
-from rbfmuscle.implicit.placement.sampling import GREEDY_LARGEST, SurfaceSample, sample_surface
+from rbfmuscle.implicit.placement.sampling import SurfaceSample, sample_surface
 from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.sim.cache import content_key, has_arrays, load_arrays, store_arrays
 from rbfmuscle.sim.scene.objects import Muscle
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.validation import NumericalWarning, SceneError
+
+if TYPE_CHECKING:
+    pass
+
 
 # Area for each centre [mm²], from which their number follows where the scene names none, and the least number.
 AREA_FOR_EACH = 212.0
@@ -98,7 +107,7 @@ def place_points(
     return centres, samples, fit
 
 
-def _choose_fit(name, mesh, options, centres, samples):
+def _choose_fit(name: str, mesh: tuple[Any, Any], options: Any, centres: SurfaceSample, samples: Any) -> Any:
     """The kernel, and its shape parameter where the scene leaves it open: by the error at the samples at rest."""
     frame, faces = mesh
     derivatives = options.derivatives
@@ -123,7 +132,7 @@ def _choose_fit(name, mesh, options, centres, samples):
     return FieldFit(kernel, epsilon, derivatives)
 
 
-def _fit_centres(name, mesh, options, centres, fit):
+def _fit_centres(name: str, mesh: tuple[Any, Any], options: Any, centres: SurfaceSample, fit: Any) -> Any:
     """Centres beside the surface, whose field lies nearer to all of it."""
     frame, faces = mesh
     if not fit.kernel.hermite or fit.derivatives != "all":
@@ -156,5 +165,5 @@ def sample_is_cached(
     return has_arrays(_sample_key(vertices, faces, count, seed, placement))
 
 
-def _sample_key(vertices, faces, count, seed, placement):
+def _sample_key(vertices: Floats, faces: Integers, count: int, seed: int, placement: Any) -> Any:
     return content_key(vertices, faces, ("surface sample", SAMPLING, count, seed, placement))

@@ -1,13 +1,18 @@
 """What is known of an RBF muscle at rest, found once: where its points lie, what holds them, how they hang together."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import harmonic_weights, surface_gradient
 from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.implicit.placement.sampling import SurfaceSample
 from rbfmuscle.model.clusters import bind_samples, build_clusters
 from rbfmuscle.model.fibres import fibre_directions
 from rbfmuscle.model.options import RBFOptions
@@ -72,7 +77,7 @@ class Rest:
     axes: np.ndarray
 
     @classmethod
-    def from_muscle(cls, muscle: Muscle, scene: Scene, options: RBFOptions) -> "Rest":
+    def from_muscle(cls, muscle: Muscle, scene: Scene, options: RBFOptions) -> Rest:
         """Measure a muscle of a scene.
 
         Parameters
@@ -110,7 +115,7 @@ class Rest:
         )
         # Links through the thickness are one a centre: with more of them each counts less, so that the muscle
         # resists alike however many centres it has.
-        clusters = build_clusters(
+        start, other, weight = build_clusters(
             centres.points, centres.normals, centres.control_faces, samples.points, samples.normals,
             across=options.across, across_weight=options.across_weight * usual / count,
         )  # fmt: skip
@@ -128,7 +133,9 @@ class Rest:
             free,
             held,
             fibres,
-            *clusters,
+            start,
+            other,
+            weight,
             columns,
             shares,
             float(muscle.mesh.volume),
@@ -168,7 +175,7 @@ class _Attachment:
                 self.centres[np.argsort(distance, kind="stable")[:LEAST_ATTACHED]] = number
 
 
-def _hang(centres, samples):
+def _hang(centres: SurfaceSample, samples: SurfaceSample) -> tuple[Integers, Floats]:
     """Columns and shares of all contact points: a centre hangs on itself, a sample on the centres around it."""
     columns, shares = bind_samples(samples.points, samples.normals, centres.points, centres.normals)
     count = len(centres.points)
@@ -177,7 +184,7 @@ def _hang(centres, samples):
     return np.concatenate([alone, columns]), np.concatenate([whole, shares])
 
 
-def _with_hanging(holder, columns, shares):
+def _with_hanging(holder: Any, columns: Any, shares: Any) -> Any:
     """Count contact points that hang for the most part on held centres to the bone that holds these.
 
     Contact could lift them only by moving the few free centres they hang on a long way.
@@ -190,7 +197,7 @@ def _with_hanging(holder, columns, shares):
     return holder
 
 
-def _principal_axes(points):
+def _principal_axes(points: Floats) -> Any:
     """Right-handed principal axes as rows."""
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     axes[2] *= np.sign(np.linalg.det(axes))

@@ -1,15 +1,22 @@
 """Activation of the muscles along a motion, and the sub-steps that it asks for."""
 
+from __future__ import annotations
+
 import difflib
 import itertools
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rbfmuscle.sim.scene.motion import interpolate
 from rbfmuscle.sim.scene.motion_file import storage_parts
 from rbfmuscle.validation import SceneError
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.scene.scene import Scene
+
 
 # No activation changes by more in one sub-step; smaller steps change the shapes that are reached by less than
 # 0.1 mm (tests/contract/test_contraction.py).
@@ -18,7 +25,7 @@ STEP = 0.1
 SETTLING = 4
 
 
-def activation_course(muscle, motion):
+def activation_course(muscle: Any, motion: Any) -> Any:
     """Activation of one muscle in each frame.
 
     Parameters
@@ -54,7 +61,7 @@ def activation_course(muscle, motion):
     return np.interp(when, times, values)
 
 
-def read_controls(path, column, *, muscle):
+def read_controls(path: Path, column: str, *, muscle: str) -> Any:
     """Times and activations of one column of an OpenSim storage file (.sto).
 
     Parameters
@@ -126,7 +133,7 @@ class Activations:
         Set by hand, as a window does; goes before the scene's own courses.
     """
 
-    def __init__(self, scene):
+    def __init__(self, scene: Scene) -> None:
         self.courses = {
             muscle.name: activation_course(muscle, scene.motion)
             for muscle in scene.muscles
@@ -135,14 +142,14 @@ class Activations:
         self.here = dict.fromkeys(self.courses, 0.0)
         self.target = {}
 
-    def at(self, frame):
+    def at(self, frame: int) -> Any:
         """Activation of each muscle that contracts in a frame, by its place in the motion."""
         return {
             name: self.target.get(name, float(course[min(frame, len(course) - 1)]))
             for name, course in self.courses.items()
         }
 
-    def refine(self, frame, stops):
+    def refine(self, frame: int, stops: list[Any]) -> Any:
         """Sub-steps short enough in activation too.
 
         Parameters

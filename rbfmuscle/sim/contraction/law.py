@@ -1,6 +1,12 @@
 """The law of the fibres: what stretch they are pulled to, and how much of the way."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
+
+from rbfmuscle.geometry.arrays import Booleans, Floats
 
 
 class FibreLaw:
@@ -44,7 +50,9 @@ class FibreLaw:
     activation : float
     """
 
-    def __init__(self, tendon, contraction, *, hold, full=1.0):
+    def __init__(
+        self, tendon: Booleans, contraction: Any, *, hold: float, full: Floats | float = 1.0
+    ) -> None:
         self.tendon, self.contraction = np.asarray(tendon, dtype=bool), contraction
         self.hold, self.full = hold, full
         count = len(self.tendon)
@@ -55,14 +63,14 @@ class FibreLaw:
             self.activate(0.0)
 
     @property
-    def passive(self):
+    def passive(self) -> Any:
         """Whether the law is that of a muscle that does not contract."""
         given = self.contraction
         return given is None or (
             self.activation == 0.0 and given.stretch_at_rest == 1.0 and not self.tendon.any()
         )
 
-    def activate(self, activation):
+    def activate(self, activation: Any) -> None:
         """Take an activation, 0 to 1."""
         given, self.activation = self.contraction, float(activation)
         slack, content = 1.0 / given.stretch_at_rest, given.shortening / given.stretch_at_rest
@@ -74,7 +82,7 @@ class FibreLaw:
         self.upper[self.tendon] = 1.0 + activation * given.tendon_strain
         self.share[self.tendon] = self.across[self.tendon] = 1.0
 
-    def goal(self, stretch):
+    def goal(self, stretch: Any) -> Any:
         """Stretches t along and s across that elements of the given stretch (n,) are pulled to."""
         wanted = np.minimum(np.maximum(stretch, self.lower), self.upper)
         along = wanted + (1.0 - self.share) * (stretch - wanted)

@@ -1,6 +1,9 @@
 """From the keys of a muscle that contracts to numbers on its mesh: slack length, tendon."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
@@ -15,7 +18,7 @@ from rbfmuscle.validation import SceneError, did_you_mean
 OUTSIDE = 0.1
 
 
-def contraction_keys(given, *, muscle, folder=None):
+def contraction_keys(given: dict[str, Any], *, muscle: str, folder: str | Path | None = None) -> Any:
     """The checked keys of one muscle, or None where it has none.
 
     Parameters
@@ -65,7 +68,7 @@ def _check_activation(value, muscle):
             )
 
 
-def resolve_contraction(muscle):
+def resolve_contraction(muscle: Any) -> Any:
     """What the keys of a muscle come to on its mesh, or None where it has none.
 
     Parameters

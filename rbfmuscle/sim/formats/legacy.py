@@ -1,7 +1,10 @@
 """Legacy VTK files (``.vtk``) of PolyData: text or binary, with cells as lists or as offsets and numbers."""
 
+from __future__ import annotations
+
 import re
 import warnings
+from typing import Any
 
 import numpy as np
 
@@ -59,16 +62,16 @@ def parse_legacy(content: bytes) -> PolyData:
 class _Cursor:
     """A place in the bytes of a file; nothing is read beyond their end."""
 
-    def __init__(self, content):
+    def __init__(self, content: Any) -> None:
         self.content, self.at, self.binary = content, 0, False
 
-    def line(self):
+    def line(self) -> Any:
         end = self.content.find(b"\n", self.at)
         end = len(self.content) if end < 0 else end
         text, self.at = self.content[self.at : min(end, self.at + 1000)], end + 1
         return text.decode("ascii", errors="replace").strip()
 
-    def words(self):
+    def words(self) -> Any:
         """Words of the next line that has any, None at the end of the file."""
         while self.at < len(self.content):
             found = self.line().split()
@@ -76,21 +79,21 @@ class _Cursor:
                 return found
         return None
 
-    def peek(self):
+    def peek(self) -> Any:
         """The next word in capitals, without going on."""
         place = self.at
         found = self.words()
         self.at = place
         return found[0].upper() if found else ""
 
-    def count(self, words, place):
+    def count(self, words: Any, place: Any) -> Any:
         """A count that the file could hold: every number takes a byte at least."""
         text = _word(words, place)
         if not (text.isascii() and text.isdigit()) or len(text) > 18 or int(text) > len(self.content):
             raise BrokenFileError(f"{words[0][:40]} of {text[:40]!r}: more than the file can hold")
         return int(text)
 
-    def values(self, count, kind):
+    def values(self, count: int, kind: Any) -> Any:
         """The next numbers, of a type given by its name."""
         code = _TYPES.get(kind.lower())
         if code is None:
@@ -107,7 +110,7 @@ class _Cursor:
         text, self.at = self.content[self.at : end], end
         return parse_numbers(text, count, whole=code[0] != "f")
 
-    def skip_metadata(self):
+    def skip_metadata(self) -> None:
         """Metadata are lines of text up to an empty one."""
         while self.at < len(self.content) and self.line():
             pass

@@ -1,11 +1,13 @@
 """VTK XML files (``.vtp``) of PolyData: text, base64 or raw appended data, plain or compressed."""
 
+from __future__ import annotations
+
 import base64
 import binascii
 import lzma
 import re
 import zlib
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -144,10 +146,10 @@ def _values(file, array, count):
 class _Raw:
     """Bytes as they stand."""
 
-    def __init__(self, data):
+    def __init__(self, data: Any) -> None:
         self.data, self.at = data, 0
 
-    def take(self, size):
+    def take(self, size: Any) -> Any:
         """The next ``size`` bytes."""
         found = self.data[self.at : self.at + size]
         if len(found) < size:
@@ -155,17 +157,17 @@ class _Raw:
         self.at += size
         return found
 
-    def end_part(self):
+    def end_part(self) -> None:
         """The part that begins here is written by itself."""
 
 
 class _Base64(_Raw):
     """Bytes in base64; parts may be written by themselves, each with its own padding."""
 
-    def __init__(self, text):
+    def __init__(self, text: bytes) -> None:
         self.text, self.start, self.at = text, 0, 0
 
-    def take(self, size):
+    def take(self, size: Any) -> Any:
         # Only what is asked for is decoded, from the four characters on in which it begins.
         first, last = self.at // 3 * 4, -(-(self.at + size) // 3) * 4
         piece = self.text[self.start + first : self.start + last]
@@ -178,11 +180,11 @@ class _Base64(_Raw):
         self.at += size
         return found
 
-    def end_part(self):
+    def end_part(self) -> None:
         self.start += -(-self.at // 3) * 4
         self.at = 0
 
-    def header_is_apart(self):
+    def header_is_apart(self) -> Any:
         """Whether what was taken so far ends in padding."""
         end = self.start + -(-self.at // 3) * 4
         return self.text[end - 1 : end] == b"="

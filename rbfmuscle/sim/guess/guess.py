@@ -1,8 +1,11 @@
 """A scene guessed from a folder of meshes: bones, joints, attachments, each with a confidence and its reason."""
 
+from __future__ import annotations
+
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -135,7 +138,7 @@ def write_scene(guess: SceneGuess, path: Path) -> Scene:
         raise UsageError(f"cannot write {path}: {error.strerror}; choose another --output") from None
 
 
-def hold_file(muscle, hold) -> str:
+def hold_file(muscle: Any, hold: Any) -> str:
     """Name of the file of a hold's vertices."""
     return f"{muscle.muscle.name}_{hold.bone.name}.txt"
 

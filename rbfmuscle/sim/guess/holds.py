@@ -4,13 +4,20 @@ A muscle's length is measured along its surface. Where an end lies on a bone, th
 the belly stops short of its bone, the patch is the cap of the end that points there, and the tendon is missing.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from rbfmuscle.sim.scene.attachments import signed_distances
+
+if TYPE_CHECKING:
+    import trimesh
+
 
 # A bone nearer than this [mm] is touched; the patch is what lies within TOUCH of the nearest.
 NEAR, TOUCH = 6.0, 3.0
@@ -42,7 +49,7 @@ class Hold:
     reason : str
     """
 
-    bone: object
+    bone: Any
     vertices: np.ndarray
     gap: float
     reason: str
@@ -64,7 +71,7 @@ class MuscleGuess:
         Why the muscle cannot be run as guessed; empty where it can.
     """
 
-    muscle: object
+    muscle: Any
     holds: list
     confidence: float
     reasons: list = field(default_factory=list)
@@ -79,7 +86,7 @@ class Ends:
     mesh : trimesh.Trimesh
     """
 
-    def __init__(self, mesh):
+    def __init__(self, mesh: trimesh.Trimesh) -> None:
         edges, lengths, count = mesh.edges_unique, mesh.edges_unique_length, len(mesh.vertices)
         rows, cols = np.r_[edges[:, 0], edges[:, 1]], np.r_[edges[:, 1], edges[:, 0]]
         graph = coo_matrix((np.r_[lengths, lengths], (rows, cols)), shape=(count, count)).tocsr()
@@ -89,7 +96,7 @@ class Ends:
         self.away = (away, dijkstra(graph, indices=self.tips[1]))
         self.length = float(away[self.tips[1]])
 
-    def along(self, end):
+    def along(self, end: Any) -> Any:
         """Place of each vertex between an end (0) and the other one (1)."""
         total = np.maximum(self.away[0] + self.away[1], 1e-300)
         return self.away[end] / total
@@ -99,7 +106,7 @@ def _farthest(distance):
     return int(np.argmax(np.where(np.isfinite(distance), distance, -1.0)))
 
 
-def guess_holds(muscle, bones, bodies, millimetre) -> MuscleGuess:
+def guess_holds(muscle: Any, bones: list[Any], bodies: dict[str, Any], millimetre: float) -> MuscleGuess:
     """Find the bones that hold a muscle and the vertices that they hold.
 
     Parameters

@@ -6,7 +6,10 @@ the axis of the cylinder that fits the dome of the face. Both follow from the fa
 and Guibas 2004, Shape segmentation using local slippage analysis).
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -48,8 +51,8 @@ class JointGuess:
     reason : str
     """
 
-    parent: object
-    child: object
+    parent: Any
+    child: Any
     kind: str
     centre: np.ndarray
     axis: np.ndarray | None
@@ -71,7 +74,7 @@ class Facing:
         Beyond the least gap [mm].
     """
 
-    def __init__(self, first, second, millimetre, band=BAND):
+    def __init__(self, first: Any, second: Any, millimetre: float, band: float = BAND) -> None:
         a, b = first.mesh, second.mesh
         centres, normals = np.asarray(a.triangles_center), np.asarray(a.face_normals)
         reach = (FARTHEST + band) * millimetre
@@ -101,14 +104,14 @@ class Facing:
         self.weights = np.asarray(a.area_faces)[close][inside][near]
         self.area = float(self.weights.sum()) / millimetre**2
 
-    def dome(self):
+    def dome(self) -> Any:
         """The part whose normals lie about their mean."""
         mean = self.weights @ self.normals
-        near = self.normals @ (mean / max(np.linalg.norm(mean), 1e-300)) > DOME
+        near = self.normals @ (mean / max(float(np.linalg.norm(mean)), 1e-300)) > DOME
         return self.points[near], self.normals[near], self.weights[near]
 
 
-def guess_joints(bones, millimetre) -> tuple[object, list[JointGuess]]:
+def guess_joints(bones: list[Any], millimetre: float) -> tuple[Any, list[JointGuess]]:
     """The bone that stands still, and a joint for every other bone that has one.
 
     Parameters
@@ -234,7 +237,7 @@ def _merit(ball):
     return ball[2] / max(ball[1], 1e-300)
 
 
-def fit_ball(facing) -> tuple[np.ndarray, float, float, float]:
+def fit_ball(facing: Any) -> tuple[np.ndarray, float, float, float]:
     """Centre, radius, misfit (RMS) and share of a hemisphere covered, of the sphere that fits a face."""
     points, weights = facing.points, facing.weights
     if len(points) < 12:
@@ -256,7 +259,7 @@ def _rolling_face(parent, child, millimetre, band):
     return min(fits, key=lambda fit: (fit[3] > HINGE_MISFIT * fit[2], fit[2])) if fits else None
 
 
-def fit_hinge(facing) -> tuple[np.ndarray, np.ndarray, float, float] | None:
+def fit_hinge(facing: Any) -> tuple[np.ndarray, np.ndarray, float, float] | None:
     """Centre, unit axis, radius and misfit (RMS) of the cylinder that fits the dome of a face."""
     points, normals, weights = facing.dome()
     if len(points) < 20:

@@ -1,10 +1,13 @@
 """The meshes of a folder, sorted into bones and muscles."""
 
+from __future__ import annotations
+
 import os
 import re
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -40,15 +43,15 @@ class Part:
 
     name: str
     file: str
-    read: object
+    read: Any
     kind: str = ""
     side: str = ""
     reason: str = "by its name"
     sure: bool = True
-    facts: object = field(default=None, repr=False)
+    facts: Any = field(default=None, repr=False)
 
     @property
-    def mesh(self):
+    def mesh(self) -> Any:
         """The mended mesh, trimesh.Trimesh [scene unit]."""
         return self.read.mesh
 
@@ -58,7 +61,7 @@ class Part:
         return np.asarray(self.read.mesh.vertices, dtype=np.float64)
 
     @cached_property
-    def tree(self):
+    def tree(self) -> Any:
         """Tree over the middles of the faces."""
         return cKDTree(self.read.mesh.triangles_center)
 

@@ -1,5 +1,14 @@
 """The scene file of a guess: what is sure as it is, what is not marked GUESS, what cannot run commented out."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    pass
+
+
 _TAIL = """[contact]
 initial = "resolve"   # muscles that start inside a bone are pushed out; or "keep", "error"
 
@@ -11,7 +20,7 @@ surfaces = { format = "pvd" }   # or vtp, ply, stl, obj, glb
 """
 
 
-def scene_text(guess, hold_file) -> str:
+def scene_text(guess: Any, hold_file: Callable[..., Any]) -> str:
     """Text of the scene file.
 
     Parameters
@@ -28,7 +37,7 @@ def scene_text(guess, hold_file) -> str:
     return "\n".join([*parts, _TAIL])
 
 
-def joint_name(joint) -> str:
+def joint_name(joint: Any) -> str:
     """Name of a guessed joint in the scene."""
     return f"{joint.child.name}_joint"
 

@@ -1,11 +1,19 @@
 """A muscle's surface as its neighbours see it: its carried mesh, found through cells that are refilled."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.geometry.triangles import nearest_weights
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.loop.frame import MuscleModel
 
 
 class CarriedSurface:
@@ -32,7 +40,7 @@ class CarriedSurface:
         The field whose zero set is shown, for models that have one.
     """
 
-    def __init__(self, model, reach):
+    def __init__(self, model: MuscleModel, reach: float) -> None:
         self.model, self.field = model, None
         vertices, faces = model.carried_mesh()
         self.faces = np.ascontiguousarray(faces, dtype=np.int64)
@@ -47,7 +55,7 @@ class CarriedSurface:
         self.fixed = np.asarray(model.contact_bone)[nearest] >= 0
         self.refresh()
 
-    def refresh(self):
+    def refresh(self) -> None:
         """Take over where the model is now."""
         self.vertices = np.ascontiguousarray(self.model.carried_mesh()[0], dtype=np.float64)
         self.normals = vertex_normals(self.vertices, self.faces)
@@ -57,7 +65,7 @@ class CarriedSurface:
         self.members = np.empty(len(self.vertices), dtype=np.int64)
         _fill_loop(self.vertices, self.box[0], self.cell, self.shape, self.first, self.members)
 
-    def query(self, points, which, reach):
+    def query(self, points: Floats, which: Booleans, reach: float) -> Any:
         """Distances of those points that are nearer than ``reach``.
 
         Parameters

@@ -4,12 +4,17 @@ Obstacles are the bones' distance fields, which stay in bone coordinates and are
 scene asks for sliding, the surfaces of neighbouring muscles. Nothing here knows how a muscle is represented.
 """
 
+from __future__ import annotations
+
 import copy
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.validation import check_points
 
 # Share of a queried distance that later calls rely on: a field is exact near its bone, coarser far away.
@@ -37,7 +42,7 @@ class HalfSpaces:
     normal: np.ndarray
     source: np.ndarray
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.index)
 
 
@@ -56,7 +61,14 @@ class BoneContacts:
         Gap that contact points keep from bones [scene unit].
     """
 
-    def __init__(self, names, fields, *, contact_bone=None, margin=0.0):
+    def __init__(
+        self,
+        names: list[str],
+        fields: list[Any],
+        *,
+        contact_bone: ArrayLike | None = None,
+        margin: float = 0.0,
+    ) -> None:
         if len(names) != len(fields):
             raise ValueError(f"one field a bone is needed, got {len(fields)} for {len(names)} bones")
         self.names = list(names)
@@ -71,32 +83,32 @@ class BoneContacts:
         self.neighbours, self.cuts = [], []
         self._known = {}
 
-    def move(self, poses):
+    def move(self, poses: dict[str, Floats]) -> None:
         """Take the bones' poses, a dict of bone name to (4, 4) rest-to-world transform."""
         missing = [self.names[b] for b in self.reached if self.names[b] not in poses]
         if missing:
             raise ValueError(f"poses lack the bone {missing[0]!r}")
         self.poses = poses
 
-    def frozen(self):
+    def frozen(self) -> BoneContacts:
         """These obstacles as they stand, for questions from another thread while the bones move on."""
         other = copy.copy(self)
         other.cuts, other._known = list(self.cuts), {}
         return other
 
-    def allow(self, bone_index, depth):
+    def allow(self, bone_index: Any, depth: Any) -> None:
         """Let each contact point be up to ``depth`` (n,) inside a bone, [scene unit]; zeros take it back."""
         if np.any(depth > 0.0):
             self.allowed[bone_index] = np.array(depth, dtype=np.float64)
         else:
             self.allowed.pop(bone_index, None)
 
-    def distance_and_direction(self, points, bone_index):
+    def distance_and_direction(self, points: Floats, bone_index: int) -> tuple[Floats, Floats]:
         """Signed distance (n,) to one bone and the unit direction (n, 3) in which it grows, world axes."""
         points = check_points(points)
         return self._query(points, bone_index)
 
-    def nearest(self, points, reach=np.inf):
+    def nearest(self, points: ArrayLike, reach: float = np.inf) -> Floats:
         """Smallest distance over all bones and neighbours at any points: what an extracted surface is cut by.
 
         Parameters
@@ -121,7 +133,7 @@ class BoneContacts:
             np.minimum(smallest, neighbour.cut(points), out=smallest)
         return smallest
 
-    def nearest_with_gradient(self, points, limit=np.inf):
+    def nearest_with_gradient(self, points: Floats, limit: Floats | float = np.inf) -> tuple[Floats, Floats]:
         """Smallest distance (n,) over bones and neighbours, exact, and its gradient (n, 3), world axes.
 
         Where the smallest distance is beyond ``limit``, a number or (n,), any value beyond it may stand, without
@@ -136,7 +148,7 @@ class BoneContacts:
             smallest[closer], gradient[closer] = distance[closer], direction[closer]
         return smallest, gradient
 
-    def depth(self, points):
+    def depth(self, points: Floats) -> float:
         """How deep the deepest free contact point is in a bone, 0 where none is [scene unit]."""
         points = check_points(points)
         free, reach = self.free(len(points)), np.zeros(len(points))
@@ -149,7 +161,7 @@ class BoneContacts:
                 deepest = max(deepest, -float(distance.min()))
         return deepest
 
-    def query(self, points, reach):
+    def query(self, points: Floats, reach: ArrayLike) -> list[tuple[Integers, Floats, Floats]]:
         """Contacts of each bone: a list, one entry a bone, of ``(index, distance, direction)``."""
         points = check_points(points)
         free = self.free(len(points))
@@ -170,7 +182,7 @@ class BoneContacts:
             found[b] = (near[keep], distance[keep], direction[keep])
         return found
 
-    def half_spaces(self, points, reach):
+    def half_spaces(self, points: ArrayLike, reach: ArrayLike) -> HalfSpaces:
         """All pairs of contact point and obstacle nearer than ``reach``, as :class:`HalfSpaces`.
 
         Parameters
@@ -192,7 +204,7 @@ class BoneContacts:
         source = np.concatenate([np.full(len(part[0]), part[3], dtype=np.int64) for part in parts])
         return HalfSpaces(index, gap, normal, source)
 
-    def known(self, count, bone_index):
+    def known(self, count: int, bone_index: int) -> tuple[Floats, Floats]:
         """Earlier places (count, 3) of the contact points in a bone's coordinates, and distances (count,) there.
 
         The distances are lower bounds, -infinity where nothing is known; they hold wherever the bone goes.
@@ -201,7 +213,7 @@ class BoneContacts:
             self._known[bone_index] = np.zeros((count, 3)), np.full(count, -np.inf)
         return self._known[bone_index]
 
-    def free(self, count):
+    def free(self, count: int) -> Booleans:
         """Mask (n,) of the contact points that are attached to no bone."""
         if self.contact_bone is None:
             return np.ones(count, dtype=np.bool_)
@@ -228,7 +240,7 @@ class BoneContacts:
         _remember_loop(points, self.poses[self.names[b]], near, distance, *self._known[b])
 
 
-def moved_box(bounds, pose):
+def moved_box(bounds: Floats, pose: Floats) -> Floats:
     """World box (2, 3) that holds a box given in bone coordinates, after a pose."""
     centre, half = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
     middle, reach = pose[:3, :3] @ centre + pose[:3, 3], np.abs(pose[:3, :3]) @ half

@@ -1,16 +1,25 @@
 """A scene driven by hand: the frame loop, asked for frames that are not known beforehand."""
 
+from __future__ import annotations
+
 import copy
 import math
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.sim.contraction.course import STEP
 from rbfmuscle.sim.joints.skeleton import all_coordinates
 from rbfmuscle.sim.loop.simulate import FrameLoop
 from rbfmuscle.sim.plan.reach import build_fields, reached_bones
 from rbfmuscle.sim.scene.motion import Motion
 from rbfmuscle.validation import UsageError
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.loop.frame import Frame
+    from rbfmuscle.sim.scene.scene import Scene
+
 
 # What a coordinate may be turned by where the scene's own motion does not go further [degree].
 FREE_RANGE = 30.0
@@ -37,16 +46,19 @@ class LiveSession:
         What the muscles that contract shall have, 0 to 1.
     """
 
-    def __init__(self, scene, *, fields=None):
+    def __init__(self, scene: Scene, *, fields: dict[str, Any] | None = None) -> None:
         self.scene = scene
         self.limits = coordinate_limits(scene)
         self.fields = live_fields(scene) if fields is None else fields
         self.rest = _rest(scene, self.limits)
         self.here, self.target = dict(self.rest), dict(self.rest)
         self.activation = {m.name: 0.0 for m in scene.muscles if m.contraction is not None}
-        self.models, self._rest, self._loop = [], [], None
+        self.models, self._rest = [], []
+        self._loop: Any = None
 
-    def use(self, models, rest=None):
+    def use(
+        self, models: list[Any], rest: list[tuple[Floats, Floats]] | None = None
+    ) -> list[tuple[Floats, Floats]]:
         """Start these models from the rest pose; the target stays.
 
         Parameters
@@ -65,7 +77,7 @@ class LiveSession:
         self.reset()
         return self._rest
 
-    def reset(self):
+    def reset(self) -> None:
         """Put models and bones back to rest; the target stays."""
         self.close()
         for model, state in zip(self.models, self._rest):
@@ -74,26 +86,26 @@ class LiveSession:
                 model.activate(0.0)
         self.here = dict(self.rest)
 
-    def set(self, name, angle):
+    def set(self, name: str, angle: float) -> None:
         """Give a coordinate a new target [radian], kept within its limits."""
         low, high = self.limits[name]
         self.target[name] = min(max(float(angle), low), high)
 
-    def activate(self, muscle, activation):
+    def activate(self, muscle: Any, activation: Any) -> None:
         """Give a muscle that contracts a new activation, kept from 0 to 1."""
         if muscle not in self.activation:
             raise UsageError(f"muscle {muscle!r} does not contract: give it activation = 0 in the scene")
         self.activation[muscle] = min(max(float(activation), 0.0), 1.0)
 
     @property
-    def arrived(self):
+    def arrived(self) -> bool:
         """Whether the bones are where they shall be, and the muscles as active."""
         active = self._loop.activations.here if self._loop else dict.fromkeys(self.activation, 0.0)
         return all(abs(self.target[name] - self.here[name]) < 1e-9 for name in self.target) and all(
             abs(value - active[name]) < 1e-9 for name, value in self.activation.items()
         )
 
-    def advance(self, stride=math.inf):
+    def advance(self, stride: float = math.inf) -> Frame:
         """Go towards the target and return the frame reached.
 
         Parameters
@@ -125,14 +137,14 @@ class LiveSession:
         self.here = dict(frame.coordinates)
         return frame
 
-    def close(self):
+    def close(self) -> None:
         """End the loop and its threads."""
         if self._loop is not None:
             self._loop.close()
             self._loop = None
 
 
-def coordinate_limits(scene):
+def coordinate_limits(scene: Scene) -> dict[str, tuple[float, float]]:
     """What each coordinate may be set to by hand: its range, or the motion's own and 30 degrees both ways.
 
     A coordinate that follows others or is locked cannot be set. A length without a range may go 30 mm both ways.
@@ -166,7 +178,7 @@ def _rest(scene, names):
     return {name: facts[name].rest for name in names}
 
 
-def live_fields(scene):
+def live_fields(scene: Scene) -> Any:
     """Distance fields of the bones that muscles reach anywhere within the coordinates' limits.
 
     Parameters

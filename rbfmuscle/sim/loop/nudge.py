@@ -1,8 +1,10 @@
 """How a muscle answers when one coordinate is changed a little at its pose: what moment arms are made of."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -71,11 +73,12 @@ def moving_coordinates(scene: Scene, bones: list[str], coordinates: Mapping[str,
 
 def step_size(scene: Scene, motion: str) -> float:
     """Return how far a coordinate is nudged to either side: degrees for turns, millimetres for shifts."""
-    step = scene.output.moment_arms.step
+    options: Any = scene.output.moment_arms
+    step = options.step
     return scene.length(step) if motion == "translation" else math.radians(step)
 
 
-def nudge(stepper, coordinates: Mapping[str, float]) -> dict[str, Nudged]:
+def nudge(stepper: Any, coordinates: Mapping[str, float]) -> dict[str, Nudged]:
     """Change one coordinate after the other, let the muscle settle, and put all back.
 
     Parameters
@@ -92,7 +95,7 @@ def nudge(stepper, coordinates: Mapping[str, float]) -> dict[str, Nudged]:
     scene, model = stepper.scene, stepper.model
     bones = sorted({attachment.bone for attachment in scene.muscle(stepper.name).attachments})
     ends = moving_coordinates(scene, bones, coordinates)
-    state, here, found = model.snapshot(), bone_poses(scene, coordinates), {}
+    state, here, found = model.snapshot(), bone_poses(scene, dict(coordinates)), {}
     with stepper.timed("nudge"):
         for name, values in ends.items():
             sides = []
@@ -121,6 +124,6 @@ def _settle(stepper, coordinates):
 
 
 def _relative(scene, bones, coordinates):
-    poses = bone_poses(scene, coordinates)
+    poses = bone_poses(scene, dict(coordinates))
     back = np.linalg.inv(poses[bones[0]])
     return [back @ poses[bone] for bone in bones[1:]] or [np.eye(4)]

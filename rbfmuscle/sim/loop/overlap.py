@@ -1,10 +1,19 @@
 """What overlaps at rest, as bones and muscles come from different sources: kept, resolved or refused."""
 
+from __future__ import annotations
+
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.validation import SceneError
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.loop.contact import BoneContacts
+    from rbfmuscle.sim.loop.stepper import MuscleStepper
+
 
 # Depth [mm] below which nothing overlaps, and the movement [mm] below which a muscle has settled.
 DEPTH = 0.02
@@ -14,7 +23,7 @@ GROWTH = 1.0
 MOST_SOLVES = 60
 
 
-def rest_overlap(contacts, points):
+def rest_overlap(contacts: BoneContacts, points: Floats) -> dict[int, Floats]:
     """Depths at rest: dict of bone index to (n,) depth of each free contact point inside that bone."""
     free = contacts.free(len(points))
     overlap = {}
@@ -25,7 +34,7 @@ def rest_overlap(contacts, points):
     return overlap
 
 
-def settle_rest(stepper):
+def settle_rest(stepper: MuscleStepper) -> None:
     """Deal with overlap at rest as the scene's ``[contact] initial`` says; for a muscle in its rest pose.
 
     ``"resolve"`` lets the bones grow from the muscle's surface to their true size while the model holds its

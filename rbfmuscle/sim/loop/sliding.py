@@ -9,11 +9,20 @@ way by half of the overlap, so both stay on their own side of one surface whatev
 does not depend on the order in which muscles are solved, nor on how many run at a time.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.sim.loop.carried_surface import CarriedSurface
 from rbfmuscle.sim.plan.reach import sampled_poses, swept_region
 from rbfmuscle.validation import SceneError
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.scene.scene import Scene
+
 
 # Defaults [mm]: nearer than THRESHOLD at rest is linked; STRIP beyond is free; RELEASE beyond that lets go.
 THRESHOLD, STRIP, RELEASE = 2.0, 1.0, 2.0
@@ -32,14 +41,14 @@ class Planes:
         As in :class:`~rbfmuscle.sim.loop.contact.HalfSpaces`, at the points ``anchor`` (c, 3).
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.set(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
 
-    def set(self, index, gap, normal, anchor):
+    def set(self, index: Any, gap: Any, normal: Any, anchor: Any) -> None:
         """Replace the planes."""
         self.index, self.gap, self.normal, self.anchor = index, gap, normal, anchor
 
-    def contacts(self, points, reach):
+    def contacts(self, points: Floats, reach: Any) -> Any:
         """``(index, gap, normal)`` of the planes nearer than ``reach`` to the model's contact points now."""
         gap = self.gap + np.einsum("ij,ij->i", self.normal, points[self.index] - self.anchor)
         near = gap < reach
@@ -58,17 +67,17 @@ class Link:
     limits : SlidingLimits
     """
 
-    def __init__(self, stepper, own, other, limits):
+    def __init__(self, stepper: Any, own: Any, other: Any, limits: Any) -> None:
         self.stepper, self.own, self.other, self.limits = stepper, own, other, limits
         self.push, self.pull = Planes(), Planes()
         self.free = stepper.contacts.free(len(stepper.model.contact_points()))
         self.linked = np.zeros(len(self.free), dtype=bool)
-        self.before = None
+        self.before: Any = None
         self.zone = None
         index, distance, _, _ = self._near()
         self.linked[index[distance < limits.threshold]] = True
 
-    def update(self):
+    def update(self) -> None:
         """Planes from both muscles' predicted states."""
         limits = self.limits
         points = self.stepper.model.contact_points()
@@ -84,7 +93,7 @@ class Link:
         slack = share[held] * (limits.hold - distance[held])
         self.pull.set(index[held], slack, -normal[held], points[index[held]])
 
-    def measure(self):
+    def measure(self) -> Any:
         """Overlap, widest gap of linked points, and their slip over the neighbour since the last call."""
         points = self.stepper.model.contact_points()
         index, distance, normal, nearest = self._near()
@@ -99,11 +108,11 @@ class Link:
         self.before = points.copy(), self.other.vertices.copy()
         return found
 
-    def cut(self, points):
+    def cut(self, points: Floats) -> Any:
         """Half the difference of both muscles' distances near where they meet, infinity elsewhere."""
         return self.cut_with_gradient(points)[0]
 
-    def cut_with_gradient(self, points):
+    def cut_with_gradient(self, points: Floats) -> Any:
         """Cut (n,) and its gradient (n, 3): the surface midway between two overlapping muscles."""
         value, gradient = np.full(len(points), np.inf), np.zeros((len(points), 3))
         if self.zone is None or not self.limits.cut:
@@ -142,14 +151,14 @@ class Link:
 class BoneLink:
     """Points near a bone at rest, held near it in the same way; the bone's own contact keeps them out."""
 
-    def __init__(self, stepper, bone_index, limits):
+    def __init__(self, stepper: Any, bone_index: Any, limits: Any) -> None:
         self.stepper, self.bone, self.limits = stepper, bone_index, limits
         points = stepper.model.contact_points()
         distance, _ = stepper.contacts.distance_and_direction(points, bone_index)
         self.linked = stepper.contacts.free(len(points)) & (distance < limits.threshold)
         self.pull = Planes()
 
-    def update(self):
+    def update(self) -> None:
         """Planes from the predicted state."""
         limits, points = self.limits, self.stepper.model.contact_points()
         index = np.flatnonzero(self.linked)
@@ -163,7 +172,7 @@ class BoneLink:
 class SlidingLimits:
     """The distances of ``[sliding]`` in the scene's unit, with their defaults."""
 
-    def __init__(self, options, scene):
+    def __init__(self, options: Any, scene: Scene) -> None:
         def length(value, default):
             return scene.length(default) if value is None else float(value)
 
@@ -191,8 +200,8 @@ class Sliding:
         If ``pairs`` names an unknown muscle.
     """
 
-    def __init__(self, scene, steppers):
-        options = scene.sliding
+    def __init__(self, scene: Scene, steppers: list[Any]) -> None:
+        options: Any = scene.sliding
         limits = SlidingLimits(options, scene)
         self.links = {stepper.name: [] for stepper in steppers}
         self.bone_links = {stepper.name: [] for stepper in steppers}
@@ -215,26 +224,26 @@ class Sliding:
                 self.bone_links[stepper.name] = held
                 stepper.contacts.neighbours += [link.pull for link in held]
 
-    def refresh(self, stepper):
+    def refresh(self, stepper: Any) -> None:
         """Take over a muscle's surface as it is now."""
         if stepper.name in self.surfaces:
             with stepper.timed("sliding"):
                 self.surfaces[stepper.name].refresh()
 
-    def show(self, drawing):
+    def show(self, drawing: Any) -> None:
         """Take over the field that a muscle will be shown by, where it has one; its drawing comes afterwards."""
         stepper = drawing.stepper
         if self.links[stepper.name]:
             with stepper.timed("surface"):
                 self.surfaces[stepper.name].field = drawing.drawing.field()
 
-    def update(self, stepper):
+    def update(self, stepper: Any) -> None:
         """New planes for one muscle; its neighbours' surfaces have been refreshed."""
         with stepper.timed("sliding"):
             for link in [*self.links[stepper.name], *self.bone_links[stepper.name]]:
                 link.update()
 
-    def measure(self, stepper):
+    def measure(self, stepper: Any) -> Any:
         """Worst of what a muscle's links say: a dict of quantities, empty without neighbours."""
         with stepper.timed("sliding"):
             found = [link.measure() for link in self.links[stepper.name]]

@@ -1,11 +1,14 @@
 """One muscle on its way through sub-steps: its model, its obstacles, its clock and its events."""
 
+from __future__ import annotations
+
 import itertools
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +16,12 @@ from rbfmuscle.sim.loop.frame import Drawing, Event, ModelSurface
 from rbfmuscle.sim.loop.tunnelling import find_crossings, turn_back
 from rbfmuscle.sim.scene.motion import bone_poses, interpolate, shown_value, step_angle, unit_sign
 from rbfmuscle.validation import NotFiniteError, SolveError
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.loop.contact import BoneContacts
+    from rbfmuscle.sim.loop.frame import MuscleModel
+    from rbfmuscle.sim.scene.scene import Scene
+
 
 # Depth [mm] below which a path through a bone counts as touching it; above the error of a bone's field.
 TOUCH = 0.1
@@ -29,7 +38,7 @@ class TimedDrawing:
     measured : dict of str to float
     """
 
-    stepper: "MuscleStepper"
+    stepper: MuscleStepper
     drawing: Drawing
     measured: dict
 
@@ -52,18 +61,19 @@ class MuscleStepper:
     scene : Scene
     """
 
-    def __init__(self, model, contacts, scene):
+    def __init__(self, model: MuscleModel, contacts: BoneContacts, scene: Scene) -> None:
         self.model, self.contacts, self.scene = model, contacts, scene
         self.name = model.name
         self.detect = scene.detect.tunnelling if scene.detect is not None else None
         self.tolerance = scene.length(TOUCH)
         self.times, self.events = {}, {}
         self.frame = 0
-        self.path, self.saved = None, None
+        self.path: Any = None
+        self.saved: Any = None
         self.measured = {}
 
     @contextmanager
-    def timed(self, stage):
+    def timed(self, stage: str) -> Iterator[Any]:
         """Add the time spent inside to ``time_<stage>``."""
         start = time.perf_counter()
         try:
@@ -72,7 +82,7 @@ class MuscleStepper:
             key = f"time_{stage}"
             self.times[key] = self.times.get(key, 0.0) + time.perf_counter() - start
 
-    def advance(self, stops, activations=()):
+    def advance(self, stops: list[dict[str, float]], activations: Any = ()) -> None:
         """Go through sub-steps: a list of coordinates, the first of which is where the muscle is.
 
         ``activations`` holds, for muscles that contract, the activation by muscle at the end of each.
@@ -81,17 +91,17 @@ class MuscleStepper:
             self.excite(activation)
             self.step(before, after)
 
-    def excite(self, activation):
+    def excite(self, activation: Any) -> None:
         """Give the model its activation, where it is among those (by muscle; None for no muscle at all)."""
         if activation is not None and self.name in activation:
             self.model.activate(activation[self.name])
 
-    def step(self, before, after):
+    def step(self, before: dict[str, float], after: dict[str, float]) -> None:
         """One sub-step, watched for tunnelling where the scene asks for it."""
         self.begin(before, after)
         self.finish()
 
-    def begin(self, before, after):
+    def begin(self, before: dict[str, float], after: dict[str, float]) -> None:
         """First half of a sub-step: the bones move, the muscle goes along."""
         self.path, poses = (before, after), (bone_poses(self.scene, before), bone_poses(self.scene, after))
         self.saved = None
@@ -99,7 +109,7 @@ class MuscleStepper:
             self.saved = self.model.snapshot(), self.model.contact_points().copy(), poses
         self._predict(poses)
 
-    def finish(self):
+    def finish(self) -> None:
         """Second half: the muscle settles, and what passed through a bone is brought back."""
         before, after = self.path
         self.solve(after)
@@ -109,7 +119,7 @@ class MuscleStepper:
             if crossings:
                 self._correct(state, start, poses, before, after, crossings)
 
-    def solve(self, coordinates):
+    def solve(self, coordinates: dict[str, float]) -> None:
         """Solve, and refuse what is not finite.
 
         Raises
@@ -139,12 +149,12 @@ class MuscleStepper:
         with self.timed("surface"):
             return TimedDrawing(self, self.model.drawing(self.contacts), self.measured)
 
-    def report(self, bone, count, action):
+    def report(self, bone: Any, count: int, action: Any) -> None:
         """Note an event of the present frame; of one kind the most points at one time are kept."""
         key = (self.frame, bone, action)
         self.events[key] = max(int(count), self.events.get(key, 0))
 
-    def collect(self):
+    def collect(self) -> tuple[Any, ...]:
         """Times and events since the last call."""
         times = self.times
         events = [Event(k, self.name, bone, n, action) for (k, bone, action), n in self.events.items()]

@@ -1,8 +1,10 @@
 """How the way from one frame to the next is cut into sub-steps."""
 
+from __future__ import annotations
+
 import itertools
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +19,10 @@ from rbfmuscle.sim.scene.motion import (
     turned_angle,
 )
 from rbfmuscle.validation import SceneError
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.scene.scene import Scene
+
 
 # No attached point moves farther against a bone in one sub-step than this share of its muscle's diameter.
 TRAVEL = 1.0 / 27.0
@@ -39,7 +45,7 @@ class SubSteps:
     scene : Scene
     """
 
-    def __init__(self, scene):
+    def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self.limit = math.radians(scene.contact.substep_angle)
         self._facts = all_coordinates(scene.joints)
@@ -57,7 +63,7 @@ class SubSteps:
         self._owner, self._travel = np.array(owner, dtype=int), TRAVEL * np.array(size)
         self._corners = np.array(corners).reshape(-1, 8, 3)
 
-    def split(self, before, after):
+    def split(self, before: dict[str, Any], after: dict[str, float]) -> list[Any]:
         """Coordinates of the sub-steps from one frame to the next, ``before`` left out and ``after`` last.
 
         Returns
@@ -173,7 +179,7 @@ def estimate_substeps(scene: Any) -> dict[str, float]:
     return found
 
 
-def path_angle(scene, before, after):
+def path_angle(scene: Scene, before: Any, after: Any) -> Any:
     """How far the bones turn from one set of coordinates to another [radian].
 
     Angles count as they are given; where other coordinates move too, the path is followed in a few pieces.

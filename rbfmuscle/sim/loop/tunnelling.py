@@ -6,12 +6,22 @@ as the text means it: below cos 135 degrees); it misses most short crossings. Th
 by sphere tracing (Hart 1996) in the bone's distance field and cannot miss what is thicker than its tolerance.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats
+
+if TYPE_CHECKING:
+    from rbfmuscle.sim.distance.sdf import BoneSDF
+    from rbfmuscle.sim.loop.contact import BoneContacts
+    from rbfmuscle.sim.scene.options import TunnellingOptions
+
 
 # 135 degrees, the bound of the angle test.
 RIGHT_ANGLE_AND_HALF = 0.75 * math.pi
@@ -57,7 +67,9 @@ class Crossing:
     flagged: int
 
 
-def sweep_paths(field, start, end, *, tolerance, angle=RIGHT_ANGLE_AND_HALF):
+def sweep_paths(
+    field: BoneSDF, start: Floats, end: Floats, *, tolerance: float, angle: float = RIGHT_ANGLE_AND_HALF
+) -> Sweep:
     """Follow straight paths through a bone's distance field.
 
     Parameters
@@ -99,7 +111,16 @@ def sweep_paths(field, start, end, *, tolerance, angle=RIGHT_ANGLE_AND_HALF):
     return Sweep(index, lowest, through, cosine < math.cos(angle))
 
 
-def find_crossings(contacts, start, end, before, after, options, *, tolerance):
+def find_crossings(
+    contacts: BoneContacts,
+    start: Floats,
+    end: Floats,
+    before: dict[str, Floats],
+    after: dict[str, Floats],
+    options: TunnellingOptions,
+    *,
+    tolerance: float,
+) -> list[Any]:
     """Points that passed through bones while the bones went from one set of poses to another.
 
     Parameters
@@ -139,7 +160,7 @@ def find_crossings(contacts, start, end, before, after, options, *, tolerance):
     return crossings
 
 
-def turn_back(model, crossings, start, before, after, names):
+def turn_back(model: Any, crossings: Any, start: Any, before: Any, after: Any, names: Any) -> None:
     """Put points that crossed back where they were relative to the bone: turned with it about its joint.
 
     The bone's own motion from ``before`` to ``after`` is the rotation about the joint centre by the step's
@@ -154,7 +175,7 @@ def turn_back(model, crossings, start, before, after, names):
         model.turn(which, rigid_fit(model.contact_points()[crossing.index], wanted))
 
 
-def rigid_fit(points, targets):
+def rigid_fit(points: Floats, targets: Any) -> Any:
     """Rigid (4, 4) transform that takes points nearest to targets by least squares (Kabsch 1976)."""
     middle, aim = points.mean(axis=0), targets.mean(axis=0)
     u, _, vt = np.linalg.svd((points - middle).T @ (targets - aim))

@@ -6,7 +6,10 @@ labels share a face, the fields are each other's negative there and so are their
 shifted to the label's volume, a few hundredths of a voxel.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -49,7 +52,7 @@ class LabelSurface:
     notes: list
 
 
-def label_surface(volume, label: int, *, edge: float = EDGE, pieces: bool = False) -> LabelSurface:
+def label_surface(volume: Any, label: int, *, edge: float = EDGE, pieces: bool = False) -> LabelSurface:
     """Smooth surface of a label.
 
     Parameters

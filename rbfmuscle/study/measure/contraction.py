@@ -1,9 +1,14 @@
 """What is measured of muscles that contract: fibres, pennation, thickness and greatest section."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.mean_value import mean_value_weights
 from rbfmuscle.geometry.surfaces import vertex_normals
@@ -32,7 +37,7 @@ class ContractionStudy:
         The model's carried mesh at rest [scene unit].
     """
 
-    def __init__(self, muscle, joints, vertices, faces):
+    def __init__(self, muscle: Any, joints: list[Any], vertices: Floats, faces: Integers) -> None:
         self.name = muscle.name
         mesh = np.asarray(muscle.mesh.vertices, dtype=np.float64)
         if muscle.fibres:
@@ -61,7 +66,7 @@ class ContractionStudy:
         middles = 0.5 * (lines[:, 1:] + lines[:, :-1])
         return middles[self.belly], (_segments(lines) / self.rest_lengths)[self.belly]
 
-    def measure(self, vertices, poses, surface=None) -> dict[str, float]:
+    def measure(self, vertices: Floats, poses: dict[str, Any], surface: Any = None) -> dict[str, float]:
         """Quantities of a frame.
 
         Parameters
@@ -95,14 +100,14 @@ class ContractionStudy:
         return found
 
 
-def pennation(lines, counted, axis) -> float:
+def pennation(lines: Any, counted: Any, axis: Any) -> float:
     """Mean angle [degree] between the segments (n, k) of lines (n, k + 1, 3) that count and an axis (3,)."""
     along = np.diff(lines, axis=1)[counted]
     cosine = np.abs(along @ axis) / np.linalg.norm(along, axis=1)
     return float(np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0))).mean())
 
 
-def belly_measures(vertices, faces, first, last) -> dict[str, float]:
+def belly_measures(vertices: Floats, faces: Integers, first: Floats, last: Floats) -> dict[str, float]:
     """Greatest section of a closed surface across a line, where it lies, and how thick it is.
 
     Parameters
@@ -138,7 +143,7 @@ def belly_measures(vertices, faces, first, last) -> dict[str, float]:
     }
 
 
-def section_area(vertices, faces, axis, height, place) -> float:
+def section_area(vertices: Floats, faces: Integers, axis: Any, height: Any, place: Any) -> float:
     """Area of a closed surface's section where ``height`` (n,), along ``axis``, is ``place``."""
     start, end = _section(vertices, faces, height, place)
     if len(start) == 0:

@@ -197,7 +197,8 @@ class LiveViewer(Viewer):
         self.model, self.quality = self.models[0], self.qualities[0]
         self.rest_volume = {m.name: float(m.mesh.volume) for m in scene.muscles}
         self.stride = SUBSTEPS_A_PICTURE * math.radians(scene.contact.substep_angle)
-        self._built, self._edges, self._frame, self._rate = {}, {}, None, 0.0
+        self._built, self._edges, self._rate = {}, {}, 0.0
+        self._frame: Any = None
         self._studies, self._rests = {}, {}
         self._stale = True
         self._switch()
