@@ -21,6 +21,17 @@ EXAMPLES = (
     "fibres_and_moment_arms",
     "exporting",
 )
+# The Python reference: public names by topic.
+TOPICS = {
+    "Scenes": ("Scene", "phantom_scene"),
+    "Running and comparing": ("simulate", "Run", "compare_models"),
+    "Fields and kernels": ("RBFField", "FlatField", "study_kernels"),
+    "Muscles and bones": ("RBFMuscle", "BoneSDF"),
+    "Errors and warnings": (
+        "RBFMuscleError", "SceneError", "MeshError", "SolveError", "LimitExceededError", "MissingPartError",
+        "NumericalWarning",
+    ),
+}  # fmt: skip
 _TIMEOUT = 600
 _LONGEST = 60  # lines of an example's output that are shown
 
@@ -89,12 +100,25 @@ def write_reference(root, package):
     """
     folder = root / "docs" / "gallery"
     folder.mkdir(exist_ok=True)
-    lines = ["# Python reference", "", "The public names of `rbfmuscle`; each is loaded when first used.", ""]
-    for name in sorted(set(package.__all__) - {"__version__"}):
-        value = getattr(package, name)
-        kind, options = ("autoclass", "   :members:\n") if isinstance(value, type) else ("autofunction", "")
-        directive = f".. {kind}:: {value.__module__}.{name}\n{options}"
-        lines += [f"## {name}", "", f"```{{eval-rst}}\n{directive}```", ""]
+    public = sorted(set(package.__all__) - {"__version__"})
+    known = {name for names in TOPICS.values() for name in names}
+    topics = {**TOPICS, "Besides": tuple(name for name in public if name not in known)}
+    lines = [
+        "# Python reference",
+        "",
+        "The public names of `rbfmuscle` by topic; each is loaded when first used.",
+        "",
+    ]
+    for topic, names in topics.items():
+        if names:
+            lines += [f"# {topic}", ""]
+        for name in names:
+            value = getattr(package, name)
+            kind, options = (
+                ("autoclass", "   :members:\n") if isinstance(value, type) else ("autofunction", "")
+            )
+            directive = f".. {kind}:: {value.__module__}.{name}\n{options}"
+            lines += [f"## {name}", "", f"```{{eval-rst}}\n{directive}```", ""]
     (folder / "reference.md").write_text("\n".join(lines), encoding="utf-8")
 
 

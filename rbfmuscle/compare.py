@@ -75,6 +75,15 @@ def compare_models(
         If no model could be solved.
     MissingPartError
         If there are no graphics to draw with; everything else is written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from rbfmuscle import phantom_scene
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     table = compare_models(phantom_scene(end=2.0), folder, ["pbd", "xpbd"], pictures=False)
+    >>> sorted(table["models"])
+    ['pbd', 'xpbd']
     """
     variants = _variants(configure_scene(scene, frames=frames), list(models), settings or {})
     folder = Path(directory)

@@ -63,6 +63,13 @@ def simulate(
         If a setting is unknown or impossible.
     SolveError
         If a frame cannot be solved; its ``run`` attribute holds the frames so far.
+
+    Examples
+    --------
+    >>> from rbfmuscle import phantom_scene
+    >>> run = simulate(phantom_scene(end=4.0), model="pbd", settings={"output.metrics": False})
+    >>> len(run.frames)
+    3
     """
     if progress is True:
         with Progress(scene.name) as shown:
@@ -165,6 +172,15 @@ class Run:
     ----------
     scene : Scene
         As it was run.
+
+    Examples
+    --------
+    >>> from rbfmuscle import phantom_scene
+    >>> run = simulate(phantom_scene(end=0.0), model="pbd")
+    >>> [muscle.name for muscle in run][:1]
+    ['extensor']
+    >>> bool(abs(run["extensor"].surface(frame=0).volume) > 0.0)
+    True
     """
 
     def __init__(self, recording: "Recording", memory: MemorySink) -> None:

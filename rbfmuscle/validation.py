@@ -13,7 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 
 
 class RBFMuscleError(Exception):
-    """Base of the errors meant for users: one line that names file, object, value and remedy."""
+    """Base of the errors meant for users: one line that names file, object, value and remedy.
+
+    Examples
+    --------
+    >>> issubclass(SceneError, RBFMuscleError), SceneError.exit_code
+    (True, 3)
+    """
 
     exit_code = 1
 

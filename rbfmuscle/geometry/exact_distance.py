@@ -51,7 +51,7 @@ class ExactDistance:
     --------
     >>> tetrahedron = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
     >>> exact = ExactDistance(tetrahedron, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
-    >>> exact.signed_distance([[0.1, 0.1, 0.02], [0.0, 0.0, -3.0]]).tolist()
+    >>> exact.signed_distance([[0.1, 0.1, 0.02], [0.0, 0.0, -3.0]]).round(9).tolist()
     [-0.02, 3.0]
     """
 

@@ -54,6 +54,16 @@ class RBFField:
         Estimate for the matrix that was factored.
     smoothing : float
         As given, or as chosen.
+
+    Examples
+    --------
+    >>> import trimesh
+    >>> ball = trimesh.creation.icosphere(2, 1.0)
+    >>> field = RBFField.fit_hermite(ball.vertices, ball.vertex_normals)
+    >>> bool(field([[0.0, 0.0, 0.0]])[0] < 0.0)
+    True
+    >>> bool(abs(field.surface(resolution=24).volume - 4.19) < 0.1)
+    True
     """
 
     def __init__(

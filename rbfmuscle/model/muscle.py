@@ -42,6 +42,14 @@ class RBFMuscle:
     ------
     SceneError
         If the placement cannot be had or no centre is left free to move.
+
+    Examples
+    --------
+    >>> from rbfmuscle import phantom_scene
+    >>> scene = phantom_scene(end=0.0)
+    >>> muscle = RBFMuscle(scene.muscles[0], scene)
+    >>> muscle.contact_points().shape[1]
+    3
     """
 
     def __init__(self, muscle: Muscle, scene: Scene, options: RBFOptions | None = None) -> None:

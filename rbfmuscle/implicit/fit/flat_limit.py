@@ -40,6 +40,13 @@ class FlatField:
         Below which epsilon is flat [1/length]: of the smaller circle. From there on `RBFField.fit` is as good.
     condition : float
         The worst on the circle, 1-norm, estimated.
+
+    Examples
+    --------
+    >>> points = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    >>> field = FlatField.fit(points, [1.0, 2.0, 3.0, 4.0], kernel="gaussian", epsilon=0.0)
+    >>> float(field([[0.5, 0.5, 0.0]]).round(6)[0])
+    2.5
     """
 
     def __init__(

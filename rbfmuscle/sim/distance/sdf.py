@@ -68,6 +68,14 @@ class BoneSDF:
     data : FieldData
         What queries read, in a frame of the bone's own: a scene that is moved, turned or written in another unit
         gives the same field.
+
+    Examples
+    --------
+    >>> import trimesh
+    >>> ball = trimesh.creation.icosphere(4, 10.0)
+    >>> field = BoneSDF.from_mesh(ball, cache=False)
+    >>> field.distance([[0.0, 0.0, 12.0], [0.0, 0.0, 9.0]]).round(1).tolist()
+    [2.0, -1.0]
     """
 
     def __init__(self, vertices: Floats, frame: BoneFrame, parts: Any) -> None:

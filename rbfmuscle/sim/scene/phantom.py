@@ -161,6 +161,12 @@ def phantom_scene(*, model: str = "rbf", end: float = 90.0, step: float = 2.0, s
     -------
     Scene
         In millimetres.
+
+    Examples
+    --------
+    >>> scene = phantom_scene(end=10.0, step=5.0)
+    >>> len(scene.motion), scene.units
+    (3, 'mm')
     """
     bones, muscles = _parts(float(spacing))
     scene = Scene("phantom_hip", units="mm")

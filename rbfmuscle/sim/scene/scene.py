@@ -62,6 +62,14 @@ class Scene:
     output : OutputOptions
     path : pathlib.Path or None
         The file it was loaded from.
+
+    Examples
+    --------
+    >>> import trimesh
+    >>> scene = Scene("arm", units="mm")
+    >>> bone = scene.add_bone("upper", trimesh.creation.capsule(200.0, 10.0))
+    >>> [bone.name for bone in scene.bones]
+    ['upper']
     """
 
     def __init__(self, name: str = "scene", *, units: str = "mm") -> None:

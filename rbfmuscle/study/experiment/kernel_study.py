@@ -134,6 +134,14 @@ def study_kernels(
         On an unknown kernel or placement, or a number of centres below 8.
     MeshError
         On an unusable mesh.
+
+    Examples
+    --------
+    >>> import trimesh
+    >>> ball = trimesh.creation.icosphere(3, 10.0)
+    >>> study = study_kernels(ball, kernels=["cubic"], centres=[40], placement="even", resolution=16, scan=False)
+    >>> study.rows[0]["kernel"]
+    'cubic'
     """
     vertices, faces = check_mesh(*(mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)))
     kernels = [get_kernel(name) for name in (kernels or KERNELS)]

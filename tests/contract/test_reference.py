@@ -1,0 +1,57 @@
+"""Every public name has an example that runs and gives what it shows; so have the rooms' own functions."""
+
+import doctest
+import importlib
+import inspect
+import sys
+from pathlib import Path
+
+import pytest
+
+import rbfmuscle
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "docs"))
+from gallery import TOPICS  # noqa: E402
+
+ERRORS = "Errors and warnings"
+NAMES = [name for topic, names in TOPICS.items() if topic != ERRORS for name in names] + ["RBFMuscleError"]
+# Modules of which every example is run, not the public names' alone.
+MODULES = ("rbfmuscle.geometry.surfaces", "rbfmuscle.geometry.exact_distance", "rbfmuscle.validation")
+
+
+def run_examples(tests):
+    runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE)
+    for test in tests:
+        runner.run(test)
+    return runner.summarize(verbose=False)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_example_of_a_public_name_runs(name):
+    value = getattr(rbfmuscle, name)
+    module = importlib.import_module(value.__module__)
+    tests = doctest.DocTestFinder(recurse=False).find(value, name, module=module)
+    assert sum(len(test.examples) for test in tests) > 0
+    assert run_examples(tests).failed == 0
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_examples_of_a_module_run(name):
+    module = importlib.import_module(name)
+    assert run_examples(doctest.DocTestFinder().find(module)).failed == 0
+
+
+@pytest.mark.parametrize("name", [n for n in NAMES if inspect.isroutine(getattr(rbfmuscle, n))])
+def test_reference_documents_every_parameter(name):
+    value = getattr(rbfmuscle, name)
+    text = inspect.getdoc(value)
+    section = text.split("Parameters\n----------\n")[1].split("\n\n")[0]
+    listed = {word.strip() for line in section.splitlines() if not line.startswith(" ")
+              for word in line.split(" : ")[0].split(",")}  # fmt: skip
+    assert set(inspect.signature(value).parameters) <= listed
+
+
+def test_topics_hold_every_public_name():
+    known = {name for names in TOPICS.values() for name in names}
+    assert known <= set(rbfmuscle.__all__)
