@@ -31,10 +31,12 @@ TABLES = {
     ),
     "output.surfaces": (options.SurfaceOptions, {"format": "stl"}),
     "output.fibres": (options.FibreOptions, {"count": 8, "segments": 4}),
+    "output.moment_arms": (options.ArmOptions, {"step": 1.0}),
     "output": (
         options.OutputOptions,
         {
-            "surfaces": {"format": "ply"}, "fibres": {"count": 8, "segments": 4}, "metrics": False,
+            "surfaces": {"format": "ply"}, "fibres": {"count": 8, "segments": 4}, "moment_arms": {"step": 1.0},
+            "metrics": False,
             "report": False, "preview": False,
         },
     ),
@@ -58,7 +60,8 @@ MODELS = {
         },
     ),
 }  # fmt: skip
-QUICK = {"centres": 60, "samples": 200, "resolution": 12}
+# Where a motion comes from: a file has one of them, and another cannot stand beside it.
+SOURCES = {"waypoints", "file", "degrees"}
 # The name of the model decides it, so it is no key of the scene's.
 IMPLIED = {"method"}
 
@@ -72,6 +75,7 @@ OTHERS = [
     ("muscle.biceps.model", "arap-volume", ["arap-volume", "rbf"]),
     ("muscle.brachialis.model.centres", 80, ["rbf", "rbf"]),
     ("motion.step", 3.0, ["rbf", "rbf"]),
+    ("motion.max_substeps", 500, ["rbf", "rbf"]),
     ("motion.ramp.elbow.flexion.to", 4.0, ["rbf", "rbf"]),
     ("motion.ramp.elbow.flexion.from", 1.0, ["rbf", "rbf"]),
     ("motion.ramp.elbow.flexion.step", 1.0, ["rbf", "rbf"]),
@@ -153,6 +157,13 @@ def test_every_documented_key_has_a_value_here(table, values):
     assert same == []
 
 
+def test_every_key_of_the_motion_is_set_here_or_is_its_source():
+    here = {key.split(".")[1] for key, _, _ in OTHERS if key.startswith("motion.")}
+    assert here | SOURCES == set(options.MotionOptions.model_fields) and not here & SOURCES
+    ramp = {key.rsplit(".", 1)[-1] for key, _, _ in OTHERS if key.startswith("motion.ramp.")}
+    assert ramp == {field.alias or name for name, field in options.RampOptions.model_fields.items()}
+
+
 @pytest.mark.parametrize(("key", "value"), SETTINGS, ids=[key for key, _ in SETTINGS])
 @pytest.mark.filterwarnings("ignore::rbfmuscle.validation.NumericalWarning")
 def test_key_of_a_table_reaches_the_run(scene_file, tmp_path, capsys, key, value):
@@ -179,8 +190,8 @@ def test_models_and_motion_are_set(scene_file, tmp_path, capsys, key, value, mod
     if key.endswith("centres"):
         assert [m["model"]["centres"] for m in info["scene"]["muscles"]] == [60, 80]
     if key.startswith("motion"):
-        ramp = info["scene"]["motion"]["ramp"]["elbow.flexion"]
-        assert ramp[key.rsplit(".", 1)[-1]] == value
+        motion = info["scene"]["motion"]
+        assert {**motion, **motion["ramp"]["elbow.flexion"]}[key.rsplit(".", 1)[-1]] == value
 
 
 def test_a_whole_model_comes_before_its_settings_whatever_the_order(scene_file, tmp_path, capsys):
