@@ -17,6 +17,7 @@ SHARED = {
     "constraints": {"VolumeConstraint": "VolumeConstraint"},
     "contact": {"ContactConstraint": "ContactConstraint"},
     "fibres": {"fibre_directions": "fibre_directions"},
+    "contraction": {},
     "cost": {"estimate_muscle": "estimate_muscle"},
 }
 
