@@ -1,7 +1,10 @@
 """Memory and time that an RBF muscle will take, from its settings alone."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -89,7 +92,7 @@ def estimate_muscle(
     )
 
 
-def _surface_size(muscle, options):
+def _surface_size(muscle: Muscle, options: Any) -> Any:
     """Vertices of the shown surface, and nodes of the grid where it is marched."""
     if options.surface == "material":
         return shown_vertices(muscle, options.resolution), 0.0
@@ -101,7 +104,7 @@ def _surface_size(muscle, options):
     return VERTICES_A_CELL * muscle.mesh.area / cell**2, float(np.prod(extent / cell + 7.0))
 
 
-def _unknowns(options, centres):
+def _unknowns(options: Any, centres: int) -> Any:
     """Order of the matrix that is factored in each frame."""
     if not get_kernel(options.kernel).hermite:
         return 3 * centres
@@ -112,7 +115,7 @@ def _unknowns(options, centres):
 
 
 @lru_cache(maxsize=8)
-def _field_rates(kernel, count=100, points=1500, size=400):
+def _field_rates(kernel: Any, count: int = 100, points: int = 1500, size: int = 400) -> Any:
     """Seconds for a pair of point and centre, and for an operation of a Cholesky factorisation, measured now."""
     from threadpoolctl import threadpool_limits
 

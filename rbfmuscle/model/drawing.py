@@ -1,11 +1,14 @@
 """How an RBF muscle is shown: its field refitted, the bones cut away, the closed surface brought onto the level set."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.fields import LevelField
 from rbfmuscle.implicit.extraction.band import box_along
 from rbfmuscle.implicit.extraction.material import FittedMesh, carry_material, fit_material
@@ -201,11 +204,11 @@ class RBFDrawing:
 class _BoneCut:
     """What the bones cut away: their smallest distance, a lower bound where it is beyond ``reach``."""
 
-    def __init__(self, contacts, reach):
+    def __init__(self, contacts: Any, reach: Any) -> None:
         self.contacts, self.reach = contacts, reach
 
-    def __call__(self, points):
+    def __call__(self, points: Floats) -> Any:
         return self.contacts.nearest(points, self.reach)
 
-    def value_and_gradient_below(self, points, limit):
+    def value_and_gradient_below(self, points: Floats, limit: Any) -> Any:
         return self.contacts.nearest_with_gradient(points, limit)

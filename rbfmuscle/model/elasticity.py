@@ -65,7 +65,7 @@ def _carry_all_loop(x, target, rest, points, columns, shares, out):
                 out[s, a] += shares[s, k] * (x[j, a] + t[a, 0] * dx + t[a, 1] * dy + t[a, 2] * dz)
 
 
-def carry_points(x, shape, points, columns, shares):
+def carry_points(x: Floats, shape: Any, points: Floats, columns: Floats, shares: Floats) -> Any:
     """Where centres carry points that hang on them.
 
     Parameters

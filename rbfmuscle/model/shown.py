@@ -1,7 +1,12 @@
 """The mesh of a muscle's material that shows it: where its vertices lie at rest, and where the centres carry them."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.implicit.extraction.material import MaterialMesh, fit_material
 from rbfmuscle.model.clusters import bind_samples
@@ -87,6 +92,6 @@ class ShownMesh:
         """Length of edges relative to rest that a tenth of them exceeds."""
         return float(np.percentile(self._lengths(vertices) / self._sides, 90.0))
 
-    def _lengths(self, vertices):
+    def _lengths(self, vertices: Floats) -> Any:
         sides = vertices[self.mesh.faces] - vertices[np.roll(self.mesh.faces, 1, axis=1)]
         return np.maximum(np.linalg.norm(sides, axis=2), np.finfo(float).tiny)
