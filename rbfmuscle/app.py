@@ -17,9 +17,10 @@ from rbfmuscle import __version__
 from rbfmuscle.commands.cache import cache_app
 from rbfmuscle.commands.check import check
 from rbfmuscle.commands.compare import compare
-from rbfmuscle.commands.import_osim import import_
 from rbfmuscle.commands.kernels import kernels
 from rbfmuscle.commands.new import new
+from rbfmuscle.commands.opensim.import_model import import_
+from rbfmuscle.commands.opensim.paths import paths
 from rbfmuscle.commands.plan import plan
 from rbfmuscle.commands.run import demo, run
 from rbfmuscle.commands.sdf import sdf
@@ -37,6 +38,7 @@ app = App(
 for command in (demo, check, plan, run, compare, sweep, export, render, new, view, sdf, kernels):
     app.command(command)
 app.command(import_, name="import")
+app.command(paths)
 app.command(cache_app)
 
 

@@ -3,13 +3,16 @@
 import os
 from pathlib import Path
 
+from rbfmuscle.opensim.match import Match
 from rbfmuscle.opensim.scene import Imported
-from rbfmuscle.opensim.write import skeleton_text, table_text, write_meshes
+from rbfmuscle.opensim.write import skeleton_text, table_text, value_text, write_meshes
 from rbfmuscle.sim.scene.options import MotionOptions
 from rbfmuscle.validation import UsageError
 
 
-def write_scene(found: Imported, directory: Path, *, motion: Path | None = None) -> Path:
+def write_scene(
+    found: Imported, directory: Path, *, motion: Path | None = None, matches: list[Match] | None = None
+) -> Path:
     """Write ``scene.toml`` and the bones' meshes to a folder, and return the scene file.
 
     Parameters
@@ -19,6 +22,9 @@ def write_scene(found: Imported, directory: Path, *, motion: Path | None = None)
         Made where it is missing.
     motion : path, optional
         A motion file that the scene shall follow; checked against its coordinates.
+
+    matches : list of Match, optional
+        Muscles, with first attachments.
 
     Raises
     ------
@@ -35,12 +41,34 @@ def write_scene(found: Imported, directory: Path, *, motion: Path | None = None)
         found.scene.motion = found.scene.motion_from(MotionOptions(file=file), folder=directory)
         found.notes += found.scene.motion.notes
         parts.append(table_text("[motion]", {"file": file}))
+    parts += [muscle_text(match, directory) for match in matches or []]
     target = directory / "scene.toml"
     try:
         target.write_text("\n".join(parts), encoding="utf-8")
     except OSError as error:
         raise UsageError(f"cannot write {target}: {error.strerror}; choose another --output") from None
     return target
+
+
+def muscle_text(match: Match, directory: Path) -> str:
+    """Return the table of a muscle, or a comment where it has not two ends; writes its lists of vertices."""
+    file = os.path.relpath(match.file.resolve(), directory.resolve())
+    names = " ".join(path.name for path in match.paths)
+    if len(match.ends) < 2:
+        why = match.note or f"{names}: both ends are on one bone"
+        return f"# {match.file.name} is left out: {why}. Add it by hand, or correct matches.csv.\n"
+    folder = directory / "attachments"
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = ["[[muscle]]", f"name = {value_text(match.name)}", f"mesh = {value_text(file)}", "attach = ["]
+    for bone, vertices in match.ends:
+        name = f"attachments/{match.name}_{bone}.txt"
+        (directory / name).write_text("\n".join(map(str, vertices)) + "\n", encoding="utf-8")
+        entry = value_text({"bone": bone, "vertices": name})
+        lines.append(f"  {entry},   # GUESS: path points, nearness")
+    head = (
+        f"# GUESS: {match.file.name} is {names} of the model, its ends {match.distance:.4g} from the mesh\n"
+    )
+    return head + "\n".join([*lines, "]"]) + "\n"
 
 
 def head_text(found: Imported) -> str:

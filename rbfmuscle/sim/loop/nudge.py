@@ -1,22 +1,22 @@
 """How a muscle answers when one coordinate is changed a little at its pose: what moment arms are made of."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rbfmuscle.sim.joints.skeleton import all_coordinates
+from rbfmuscle.sim.loop.stepper import MuscleStepper
 from rbfmuscle.sim.scene.motion import bone_poses
+from rbfmuscle.sim.scene.options import ArmOptions
 from rbfmuscle.sim.scene.scene import Scene
 
-# A run settles a muscle on its way; a muscle that is nudged from rest has to settle in place: after 25 solves moment
-# arms of the phantom err by 1.4 mm, after 50 by 0.3. It has settled where no point moves by more than this share of
-# the muscle's size in a solve.
-MOST_SOLVES = 100
-SETTLED = 1e-7
+# A run settles a muscle on its way; one that is nudged has to settle in place: after 25 solves moment arms of the
+# phantom err by 1.4 mm, after 50 by 0.3 and after 200 by 0.4. It has settled where no point moves by more than this
+# share of the muscle's size in a solve.
+MOST_SOLVES = 60
+SETTLED = 3e-7
 # A coordinate moves a muscle where its bones change their places against each other by more than this.
 LEAST_CHANGE = 1e-9
 
@@ -73,12 +73,12 @@ def moving_coordinates(scene: Scene, bones: list[str], coordinates: Mapping[str,
 
 def step_size(scene: Scene, motion: str) -> float:
     """Return how far a coordinate is nudged to either side: degrees for turns, millimetres for shifts."""
-    options: Any = scene.output.moment_arms
-    step = options.step
+    arms = scene.output.moment_arms
+    step = arms.step if arms else ArmOptions().step
     return scene.length(step) if motion == "translation" else math.radians(step)
 
 
-def nudge(stepper: Any, coordinates: Mapping[str, float]) -> dict[str, Nudged]:
+def nudge(stepper: MuscleStepper, coordinates: Mapping[str, float]) -> dict[str, Nudged]:
     """Change one coordinate after the other, let the muscle settle, and put all back.
 
     Parameters
@@ -105,7 +105,7 @@ def nudge(stepper: Any, coordinates: Mapping[str, float]) -> dict[str, Nudged]:
                 model.restore(state)
                 stepper.contacts.move(poses)
                 model.predict(here, poses)
-                _settle(stepper, there)
+                settle(stepper, there)
                 sides.append((np.array(model.carried_mesh()[0]), poses))
             found[name] = Nudged(values[1] - values[0], *sides)
         model.restore(state)
@@ -113,7 +113,8 @@ def nudge(stepper: Any, coordinates: Mapping[str, float]) -> dict[str, Nudged]:
     return found
 
 
-def _settle(stepper, coordinates):
+def settle(stepper: MuscleStepper, coordinates: Mapping[str, float]) -> None:
+    """Solve a muscle where it is until it has come to rest there, or has had `MOST_SOLVES`."""
     points = stepper.model.contact_points().copy()
     small = SETTLED * float(np.linalg.norm(np.ptp(points, axis=0)))
     for _ in range(MOST_SOLVES):
@@ -124,6 +125,6 @@ def _settle(stepper, coordinates):
 
 
 def _relative(scene, bones, coordinates):
-    poses = bone_poses(scene, dict(coordinates))
+    poses = bone_poses(scene, coordinates)
     back = np.linalg.inv(poses[bones[0]])
     return [back @ poses[bone] for bone in bones[1:]] or [np.eye(4)]

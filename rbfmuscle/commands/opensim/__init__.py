@@ -1,0 +1,1 @@
+"""Commands that read from and write for OpenSim."""

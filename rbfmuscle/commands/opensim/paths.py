@@ -1,0 +1,65 @@
+"""``rbfmuscle paths``: fitted muscle paths for OpenSim."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from rbfmuscle.validation import UsageError
+
+
+def paths(
+    scene: Path,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    samples: int = 120,
+    muscles: Annotated[str | None, Parameter(name="--muscles")] = None,
+    ranges: Annotated[list[str] | None, Parameter(name="--range", negative="")] = None,
+    model: str | None = None,
+    order: int = 7,
+    settings: Annotated[list[str] | None, Parameter(name="--set", negative="")] = None,
+    kind: Annotated[Literal["sobol", "halton"], Parameter(name="--points")] = "sobol",
+) -> None:
+    """Sample a muscle's lengths and moment arms over its coordinates and fit a path that OpenSim loads.
+
+    What is sampled is kept: the same call goes on where it ended.
+
+    Parameters
+    ----------
+    scene
+        Scene file (TOML).
+    output
+        Folder for samples.jsonl, paths.xml, paths.csv and errors.csv.
+    samples
+        Poses for each muscle, of which every fifth is held out of the fit.
+    muscles
+        Names by commas; all of the scene by default.
+    ranges
+        COORDINATE=LOW:HIGH in degrees or scene units; else the coordinate's range, or what the motion covers.
+    model
+        Model for every muscle.
+    order
+        Highest order of the polynomials.
+    settings
+        KEY=VALUE, as for run; may be repeated.
+    kind
+        Quasi-random points.
+    """
+    from rbfmuscle.commands.opensim.sampling import Sampling, parse_ranges, report_fits
+    from rbfmuscle.compiled.progress import Progress
+    from rbfmuscle.models import configure_scene
+    from rbfmuscle.sim.scene.scene import Scene
+    from rbfmuscle.sim.scene.settings import parse_setting
+
+    if samples < 10:
+        raise UsageError(f"--samples {samples} is too few to fit anything, give 10 or more")
+    changes = dict(parse_setting(text) for text in settings or [])
+    loaded = configure_scene(Scene.load(scene), changes, model=model)
+    if muscles is not None:
+        chosen = [loaded.muscle(name.strip()).name for name in muscles.split(",")]
+        loaded.muscles = [muscle for muscle in loaded.muscles if muscle.name in chosen]
+    sampling = Sampling(loaded, output, parse_ranges(loaded, ranges or []), samples=samples, kind=kind)
+    with Progress(loaded.name, "pose") as progress:
+        sampling.run(progress)
+    for line in report_fits(sampling, order):
+        print(line)

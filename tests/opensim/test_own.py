@@ -1,0 +1,151 @@
+"""Own muscles and own bones beside a model's: names, first attachments, registration, joints that come along."""
+
+import csv
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+import rbfmuscle as rm
+from rbfmuscle.opensim.folder import write_scene
+from rbfmuscle.opensim.match import attach, likeness, match_meshes, name_score, split_name, write_table
+from rbfmuscle.opensim.register import bring_to_bones, fit_similarity
+from rbfmuscle.opensim.scene import import_osim
+from rbfmuscle.sim.joints.skeleton import all_coordinates
+from rbfmuscle.sim.scene.motion import bone_poses
+from rbfmuscle.validation import UsageError
+
+
+@pytest.mark.parametrize(
+    ("muscle", "mesh"),
+    [
+        ("bifemlh_r", "biceps_femoris_long_head"),
+        ("glmax3_r", "gluteus_maximus"),
+        ("glut_med2_l", "GluteusMedius"),
+        ("med_gas_r", "gastrocnemius_medial"),
+        ("addmagIsch_r", "adductor-magnus"),
+        ("edl_r", "m_extensor_digitorum_longus"),
+        ("peri_r", "piriformis_right"),
+        ("soleus_r", "Soleus R"),
+    ],
+)
+def test_short_names_stand_for_long_ones(muscle, mesh):
+    assert name_score(muscle, *split_name(mesh)) > 0.8
+
+
+@pytest.mark.parametrize(
+    ("muscle", "mesh"),
+    [
+        ("glmed1_r", "gluteus_minimus"),
+        ("per_tert_r", "peroneus_longus"),
+        ("soleus_r", "soleus_left"),
+        ("fdl_r", "extensor_digitorum_longus"),
+    ],
+)
+def test_other_muscles_do_not_match(muscle, mesh):
+    assert name_score(muscle, *split_name(mesh)) == 0.0
+
+
+def test_likeness_is_quick_for_long_nonsense():
+    assert likeness("a" * 60 + "b", ("a" * 30, "aa", "aaa", "aaaa")) == 0.0
+
+
+def test_similarity_is_found_back_without_mirroring():
+    points = np.random.default_rng(1).normal(size=(50, 3))
+    turn = Rotation.from_euler("xyz", [0.4, -1.0, 2.0]).as_matrix()
+    fit = fit_similarity(points, 1.7 * points @ turn.T + [1, 2, 3])
+    assert fit.scale == pytest.approx(1.7) and fit.turn == pytest.approx(turn)
+    assert np.linalg.det(fit_similarity(points, points * [1, 1, -1]).turn) == pytest.approx(1.0)
+
+
+@pytest.fixture
+def own(small):
+    """The small model in mm, and a folder with a mesh along its hamstring and one of no muscle."""
+    found = import_osim(small, units="mm")
+    folder = small.parent / "muscles"
+    folder.mkdir()
+    rod = trimesh.creation.icosphere(subdivisions=3)
+    rod.apply_scale([20, 260, 20])
+    rod.apply_translation([-40, -220, 0])
+    rod.export(folder / "hamstring_right.ply")
+    rod.export(folder / "masseter.ply")
+    return found, folder
+
+
+def test_own_muscles_get_first_attachments_marked_as_guesses(own, tmp_path):
+    found, folder = own
+    # What the ground holds, the thigh does here: the ground has no mesh.
+    found.model.paths[0].points[0].body = "thigh"
+    matches = match_meshes(found, folder)
+    for match in matches:
+        attach(found, match)
+    assert [[path.name for path in match.paths] for match in matches] == [["hamstring"], []]
+    assert [bone for bone, _ in matches[0].ends] == ["thigh", "shank"]
+    text = write_scene(found, tmp_path / "out", matches=matches).read_text()
+    assert text.count("GUESS") == 3 and "masseter.ply is left out: no muscle" in text
+    scene = rm.Scene.load(tmp_path / "out" / "scene.toml")
+    assert {a.bone for a in scene.muscle("hamstring_right").attachments} == {"thigh", "shank"}
+    write_table(matches, tmp_path / "matches.csv")
+    rows = list(csv.DictReader((tmp_path / "matches.csv").read_text().splitlines()))
+    rows[1]["muscles"] = "hamstring"
+    with (tmp_path / "corrected.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    again = match_meshes(found, folder, tmp_path / "corrected.csv")
+    assert [path.name for path in again[1].paths] == ["hamstring"]
+    (tmp_path / "wrong.csv").write_text("mesh,muscles\nmasseter.ply,nobody\n")
+    with pytest.raises(UsageError, match="no muscle 'nobody'"):
+        match_meshes(found, folder, tmp_path / "wrong.csv")
+
+
+def test_end_on_a_bone_without_a_mesh_is_said(own):
+    found, folder = own
+    match = match_meshes(found, folder)[0]
+    attach(found, match)
+    assert match.note == "ground has no mesh to hold it" and len(match.ends) == 1
+
+
+def test_model_comes_to_own_bones_with_its_joints(osim_data, tmp_path):
+    """Bones of the model itself, moved in their joints, scaled and turned: the joints are found back there."""
+    path = osim_data / "gait2392" / "gait2392_thelen2003muscle.osim"
+    found = import_osim(path, units="mm", bodies=["tibia_r"])
+    asked = {"hip_r.hip_flexion_r": 20.0, "hip_r.hip_adduction_r": -5.0, "knee_r.knee_angle_r": -30.0}
+    poses = bone_poses(found.scene, {name: np.radians(value) for name, value in asked.items()})
+    turn = Rotation.from_euler("xyz", [20, -30, 50], degrees=True).as_matrix()
+
+    def scanned(points, bone):
+        return 1.1 * (points @ poses[bone][:3, :3].T + poses[bone][:3, 3]) @ turn.T + [100, 200, -50]
+
+    for bone, file in (("pelvis", "pelvis"), ("femur_r", "femur_right"), ("tibia_r", "tibia_r")):
+        mesh = found.scene.bone(bone).mesh
+        trimesh.Trimesh(scanned(np.asarray(mesh.vertices), bone), mesh.faces, process=False).export(
+            tmp_path / f"{file}.ply"
+        )
+    centre = scanned(found.scene.joints[1].centre, "pelvis")
+    rows = bring_to_bones(found, tmp_path)
+    hip = found.scene.joints[1]
+    assert hip.name == "hip_r" and hip.centre == pytest.approx(centre, abs=1e-3)
+    facts = all_coordinates(found.scene.joints)
+    for name, value in asked.items():
+        assert np.degrees(facts[name].rest) == pytest.approx(value, abs=1e-4)
+    assert all(row["scale"] == pytest.approx(1.1, rel=1e-6) and row["rms_mm"] < 1e-3 for row in rows)
+    # From the scan back to the model's own pose: everything is where the model, scaled and turned, has it.
+    back = bone_poses(found.scene, dict.fromkeys(asked, 0.0))
+    fresh = import_osim(path, units="mm", bodies=["tibia_r"]).scene
+    for bone in ("femur_r", "tibia_r"):
+        points = np.asarray(found.scene.bone(bone).mesh.vertices)[:5]
+        moved = points @ back[bone][:3, :3].T + back[bone][:3, 3]
+        wanted = 1.1 * np.asarray(fresh.bone(bone).mesh.vertices)[:5] @ turn.T + [100, 200, -50]
+        shift = poses["pelvis"][:3, 3]
+        assert np.abs(moved - wanted - 1.1 * turn @ shift).max() < 0.01  # float32 in the files
+
+
+def test_folder_without_bones_of_the_model_is_refused(osim_data, tmp_path):
+    found = import_osim(osim_data / "leg6dof9musc" / "leg6dof9musc.osim")
+    with pytest.raises(UsageError, match="no meshes there"):
+        bring_to_bones(found, tmp_path)
+    trimesh.creation.box().export(tmp_path / "skull.ply")
+    with pytest.raises(UsageError, match="no mesh has the name of a body"):
+        bring_to_bones(found, tmp_path)
