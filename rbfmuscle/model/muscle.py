@@ -10,11 +10,13 @@ from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.model.contraction import contracting
 from rbfmuscle.model.drawing import Moment, RBFDrawing, SurfaceDrawer
 from rbfmuscle.model.elasticity import SETTLED, SETTLED_STILL, ElasticSolver
+from rbfmuscle.model.interior import build_interior
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.model.rest import Rest
 from rbfmuscle.sim.loop.contact import BoneContacts
 from rbfmuscle.sim.scene.objects import Muscle
 from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.validation import SceneError
 
 
 class RBFMuscle:
@@ -34,7 +36,8 @@ class RBFMuscle:
     points : (K, 3) ndarray
         The centres now.
     rest : Rest
-    solver : ElasticSolver
+    solver : ElasticSolver or Interior
+        An `Interior` where ``inside`` asks for one.
     law : FibreLaw or None
         Of a muscle that contracts.
 
@@ -58,21 +61,29 @@ class RBFMuscle:
         self.rest = Rest.from_muscle(muscle, scene, self.options)
         self.law: Any = None
         if muscle.contraction is not None:
+            if self.options.inside:
+                raise SceneError(
+                    f"muscle {muscle.name!r}: a muscle with an inside does not contract yet; leave out "
+                    "its activation and other keys of contraction, or model.inside"
+                )
             self.rest, self.law = contracting(muscle, self.rest, self.options)
-        self.solver = ElasticSolver(self.rest, self.options, self.law)
+        self.interior = build_interior(muscle, self.rest, self.options) if self.options.inside else None
+        self.solver = self.interior or ElasticSolver(self.rest, self.options, self.law)
         self.drawer = SurfaceDrawer(muscle, scene, self.rest, self.options)
         names = [bone.name for bone in scene.bones]
         numbers = np.array([names.index(bone) for bone in self.rest.bones])
-        self.contact_bone = np.where(self.rest.holder < 0, -1, numbers[self.rest.holder])
+        holder = self.interior.owner if self.interior else self.rest.holder
+        self.contact_bone = np.where(holder < 0, -1, numbers[holder])
         self.points = self.rest.centres.copy()
 
     def contact_points(self) -> np.ndarray:
-        """Centres, then surface samples, (K + S, 3)."""
+        """Centres, then surface samples, (K + S, 3); with an inside denser points of the surface after them."""
         return self.solver.carry(self.points)
 
     def carried_mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """The samples and their triangulation: a material surface of constant topology."""
-        return self.contact_points()[len(self.points) :], self.rest.sample_faces
+        first = len(self.points)
+        return self.contact_points()[first : first + len(self.rest.samples)], self.rest.sample_faces
 
     def predict(self, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> None:
         """Go along with the bones; held centres arrive exactly."""
@@ -85,6 +96,9 @@ class RBFMuscle:
         for b, bone in enumerate(rest.bones):
             held = rest.held[rest.holder[rest.held] == b]
             self.points[held] = rest.centres[held] @ after[bone][:3, :3].T + after[bone][:3, 3]
+        if self.interior:
+            self.interior.move(motions, [after[bone] for bone in rest.bones])
+            self.points = self.interior.centres(self.points)
 
     def solve(self, contacts: BoneContacts) -> None:
         """Settle the centres under shape, volume and contact at the contacts' present poses."""
@@ -96,6 +110,10 @@ class RBFMuscle:
 
     def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
         """Move the centres that carry contact points marked in a bool mask by a (4, 4) transform; held ones stay."""
+        if self.interior:
+            self.interior.turn(which, transform)
+            self.points = self.interior.centres(self.points)
+            return
         hit = np.zeros(len(self.points), dtype=bool)
         hit[self.rest.columns[which, 0]] = True
         hit[self.rest.held] = False

@@ -28,7 +28,9 @@ class RBFOptions(Table):
     links a centre go through the thickness, each counting ``across_weight``. ``surface`` is shown by a mesh of the
     ``material`` that is brought onto the level set, or by ``marching`` cubes; ``resolution`` is the number of edges or
     cells along the longest side, 0 for as many as the muscle's thickness wants. ``placement`` of the centres, and
-    ``derivatives`` that the fit meets there; ``seed`` of what is drawn by chance.
+    ``derivatives`` that the fit meets there; ``seed`` of what is drawn by chance. ``inside`` is the number of
+    nodes of an elastic solid that carries the centres, 0 for none; it is stiffer along the fibres by ``fibre_ratio``, a
+    ratio of Young's moduli.
     """
 
     centres: Annotated[int, Field(ge=0, le=20_000)] = 0
@@ -47,4 +49,6 @@ class RBFOptions(Table):
     acceleration: Annotated[int, Field(ge=0, le=50)] = 5
     placement: Literal["even", "adaptive", "greedy", "fitted"] = "greedy"
     derivatives: Literal["auto", "all", "normal"] = "auto"
+    inside: Annotated[int, Field(ge=0, le=3000)] = 0
+    fibre_ratio: Annotated[float, Field(ge=1.0, le=1e4)] = 1.0
     seed: int = 0

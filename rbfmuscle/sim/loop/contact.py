@@ -96,6 +96,14 @@ class BoneContacts:
         other.cuts, other._known = list(self.cuts), {}
         return other
 
+    def only(self, index: Any) -> BoneContacts:
+        """These obstacles for some of the contact points, which are then counted in the order of ``index``."""
+        other = self.frozen()
+        if self.contact_bone is not None:
+            other.contact_bone = self.contact_bone[index]
+        other.allowed = {bone: depth[index] for bone, depth in self.allowed.items()}
+        return other
+
     def allow(self, bone_index: Any, depth: Any) -> None:
         """Let each contact point be up to ``depth`` (n,) inside a bone, [scene unit]; zeros take it back."""
         if np.any(depth > 0.0):

@@ -1,0 +1,131 @@
+"""What an inside changes: RBF muscles with and without one, against the solid and the closed forms, and in time.
+
+    python benchmarks/inside.py PART ... [--scene data/hip/flexion.toml]
+
+Parts: ``solid`` (the phantom's extensor to the finite-element reference, over nodes and over centres), ``centres``
+(neighbouring numbers of centres), ``stretched``, ``bent``, ``wrapped`` (closed forms), ``ripple`` (moment arms of a
+scene's muscles by one degree) and ``time`` (processor time a frame, settings in turn). One pose over several ways is
+measured by `one_pose.py`.
+"""
+
+import argparse
+import itertools
+import time
+
+import numpy as np
+from fe_reference import DATA, distances
+from known_answers import EVEN, apart, bent, flexed, stretched, wrapped
+from peers.known_answers import observed_order
+
+from rbfmuscle.models import build_model
+from rbfmuscle.run import simulate
+from rbfmuscle.sim.loop.simulate import simulate_frames
+from rbfmuscle.sim.scene.phantom import phantom_scene
+from rbfmuscle.sim.scene.scene import Scene
+
+NODES, CENTRES = (150, 300, 600, 1200), (150, 300, 600, 1200)
+INSIDE = 300
+ROUNDS = 3
+WINDOW = 21  # frames of one degree that the smooth curve of a moment arm is fitted to, a cubic
+
+
+def solid():
+    """Distance to the finite-element solid over the nodes of the inside, and over the centres."""
+    rows = [("without", {})]
+    rows += [(f"{n} nodes", {"model.inside": n}) for n in NODES]
+    rows += [(f"{INSIDE} nodes, {k} centres", {"model.inside": INSIDE, "model.centres": k}) for k in CENTRES]
+    for name, settings in rows:
+        settings = {"model.placement": "even", **settings} if "centres" in name else settings
+        found = distances("rbf", DATA, settings=settings)
+        print(f"{name:28}" + "".join(f"{rms:7.2f} ({worst:4.1f})" for _, rms, worst, _ in found), flush=True)
+
+
+def centres():
+    """Neighbouring numbers of centres on the extensor: distance of their surfaces."""
+    for nodes in (0, INSIDE):
+        runs = [flexed({**EVEN, "centres": k, "inside": nodes, "resolution": 64}) for k in CENTRES]
+        for angle in (0, 1):
+            steps = [apart(a[angle], b[angle], same_mesh=False)[0] for a, b in itertools.pairwise(runs)]
+            order = observed_order(np.array(CENTRES[:-1]) ** -0.5, steps)
+            found = " / ".join(f"{step:.2f}" for step in steps)
+            print(f"inside {nodes}, {(30, 60)[angle]} degrees: {found}, order {order:.1f}", flush=True)
+
+
+def closed_forms(part):
+    """Errors in per cent against closed forms."""
+    for nodes in (0, 150, INSIDE, 600):
+        model = {**EVEN, "centres": 300, "inside": nodes}
+        if part == "wrapped":
+            rows = {over: wrapped(over, model, 1.0) for over in ("cylinder", "sphere")}
+        elif part == "bent":
+            rows = {"bent": bent(model, 1.5)}
+        else:
+            rows = {f"{stretch:g}": stretched(stretch, model, 1.5) for stretch in (0.8, 1.2, 1.3)}
+        for name, errors in rows.items():
+            shown = ", ".join(f"{key} {100 * value:+.2f}" for key, value in errors.items())
+            print(f"inside {nodes}, {part} {name}: {shown}", flush=True)
+
+
+def ripple(path):
+    """Moment arms by one degree: RMS about a smooth curve, greatest change in a degree [mm]."""
+    from scipy.signal import savgol_filter
+
+    scene = phantom_scene(step=1.0) if path is None else Scene.load(path)
+    (coordinate,) = scene.motion.frames[-1]
+    end = np.degrees(scene.motion.frames[-1][coordinate])
+    scene.set_motion(ramp={coordinate: {"to": float(end), "step": 1.0}})
+    for nodes in (0, INSIDE):
+        run = simulate(scene, model="rbf", settings={"model.inside": nodes})
+        for muscle in scene.muscles:
+            arm = np.array([
+                row.value for row in run.metrics if row.muscle == muscle.name and row.quantity == "moment_arm"
+            ])  # fmt: skip
+            away = arm - savgol_filter(arm, WINDOW, 3)
+            print(
+                f"inside {nodes}, {muscle.name}: {len(arm)} arms {arm.min():.1f} to {arm.max():.1f}, "
+                f"ripple {np.sqrt((away**2).mean()):.2f} RMS {np.abs(away).max():.1f} greatest, "
+                f"jump {np.abs(np.diff(arm)).max():.1f}",
+                flush=True,
+            )
+
+
+def times(path):
+    """Processor time a frame [ms] without and with an inside, settings in turn, and the median ratio."""
+    for muscle in (None,) if path is None else [m.name for m in Scene.load(path).muscles]:
+        scene = phantom_scene() if path is None else Scene.load(path)
+        scene.muscles = [scene.muscle(muscle or "extensor")]
+        taken = {nodes: [] for nodes in (0, 150, INSIDE)}
+        for _ in range(ROUNDS):
+            for nodes, spent in taken.items():
+                part = scene.with_options({"model.inside": nodes})
+                model = build_model(part.muscles[0], part)
+                start = time.process_time()
+                for frame in simulate_frames(part, [model], ahead=False):
+                    if frame.index == 0:
+                        start = time.process_time()
+                spent.append(1e3 * (time.process_time() - start) / (len(part.motion) - 1))
+        plain = np.array(taken[0])
+        for nodes, spent in taken.items():
+            ratio = np.median(np.array(spent) / plain)
+            print(
+                f"{muscle or 'extensor'}, inside {nodes}: {np.median(spent):.1f} ms, {ratio:.2f}", flush=True
+            )
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    names = ("solid", "centres", "stretched", "bent", "wrapped", "ripple", "time")
+    parser.add_argument("parts", nargs="+", choices=names)
+    parser.add_argument("--scene")
+    given = parser.parse_args()
+    for part in given.parts:
+        if part in ("stretched", "bent", "wrapped"):
+            closed_forms(part)
+        elif part in ("ripple", "time"):
+            {"ripple": ripple, "time": times}[part](given.scene)
+        else:
+            {"solid": solid, "centres": centres}[part]()
+
+
+if __name__ == "__main__":
+    main()

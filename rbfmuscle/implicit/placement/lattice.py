@@ -1,0 +1,256 @@
+"""A lattice through a muscle's volume: shape functions, quadrature of the material in each cell, regions.
+
+The lattice belongs to the muscle's shape alone, not to its centres, so what is integrated over it resists alike
+however many centres there are. Where material is, the signed distance to the rest mesh tells.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from rbfmuscle.geometry.exact_distance import ExactDistance
+
+FINE = 6  # points along a side of a cell that tell how much of it is muscle
+GROUPS = 8  # quadrature points in a cell
+LEAST_FILLED = 1e-3  # of a cell: the weight of one that only touches the surface
+MOST_WIDENED = (
+    1.3  # quadrature points move apart at most by this factor to give the material's second moments
+)
+
+# Contact points: one for so much of the muscle's surface, in shares of its square size. A ridge of a bone that fits
+# between points would hold them like a ratchet, and one pose would have several shapes.
+AREA_A_POINT = 2.4e-4
+MOST_HALVINGS = 3
+
+
+@dataclass(frozen=True)
+class Embedding:
+    """Shape functions at points: values (n, w), slopes (n, w, 3) by rest coordinates, their nodes (n, w)."""
+
+    columns: np.ndarray
+    shares: np.ndarray
+    slopes: np.ndarray
+
+
+class Lattice:
+    """Cells of a box along a mesh's principal axes that hold some of its volume, and their nodes.
+
+    Parameters
+    ----------
+    vertices : (n, 3) ndarray
+        Of the rest mesh.
+    faces : (m, 3) ndarray of int
+    nodes : int
+        About how many nodes are wanted.
+    degree : {1, 2}
+        Of the shape functions along each axis: linear ones or quadratic B-splines.
+
+    Attributes
+    ----------
+    rest : (N, 3) ndarray
+        Nodes at rest: the places that the shape functions reproduce linear functions from.
+    points, weights : (Q, 3), (Q,) ndarray
+        Quadrature of the material [volume of the mesh's unit].
+    cell : (Q,) ndarray of int
+        Cell of each quadrature point.
+    spacing : (3,) ndarray
+        Sides of a cell.
+    """
+
+    def __init__(self, vertices, faces, nodes, *, degree=2):
+        self.degree = degree
+        self.axes = _axes(vertices)
+        box = vertices @ self.axes.T
+        self.low, self.extent = box.min(axis=0), np.ptp(box, axis=0)
+        self.distance = ExactDistance(vertices, faces).signed_distance
+        surface = box[np.asarray(faces)].mean(axis=1)
+        self._choose_spacing(np.concatenate([box, surface]), nodes)
+        self._number_nodes()
+        self._integrate()
+
+    def _choose_spacing(self, surface, wanted):
+        """The coarsest cells that give the wanted nodes, by bisection."""
+        small, large = 0.01 * self.extent.max(), self.extent.max()
+        for _ in range(25):
+            side = np.sqrt(small * large)
+            self._lay_cells(surface, side)
+            self._number_nodes()
+            small, large = (small, side) if len(self.rest) < wanted else (side, large)
+        self._lay_cells(surface, large)
+
+    def _lay_cells(self, surface, side):
+        self.count = np.maximum(1, np.ceil(self.extent / side - 1e-9).astype(int))
+        self.spacing = self.extent / self.count
+        every = np.stack(np.meshgrid(*(np.arange(n) for n in self.count), indexing="ij"), -1).reshape(-1, 3)
+        middle = self.low + (every + 0.5) * self.spacing
+        depth = self.distance(middle @ self.axes)
+        half = 0.5 * float(np.linalg.norm(self.spacing))
+        used = depth < 0.0
+        touched = self._key(np.clip(((surface - self.low) / self.spacing).astype(int), 0, self.count - 1))
+        used[np.unique(touched)] = True
+        self.full = (depth < -half)[used]
+        self.cells = every[used]
+
+    def _key(self, cells):
+        return (cells[:, 0] * self.count[1] + cells[:, 1]) * self.count[2] + cells[:, 2]
+
+    def _number_nodes(self):
+        width = self.degree + 1
+        steps = np.stack(np.meshgrid(*[np.arange(width)] * 3, indexing="ij"), -1).reshape(-1, 3)
+        corner = self.cells[:, None, :] + steps
+        size = self.count + self.degree
+        flat = (corner[..., 0] * size[1] + corner[..., 1]) * size[2] + corner[..., 2]
+        known, self.nodes = np.unique(flat, return_inverse=True)
+        self.nodes = self.nodes.reshape(flat.shape).astype(np.int64)
+        self.place = np.stack([known // (size[1] * size[2]), known // size[2] % size[1], known % size[2]], 1)
+        self.rest = (self.low + (self.place - 0.5 * (self.degree - 1)) * self.spacing) @ self.axes
+        self.tree = cKDTree(self.cells + 0.5)
+
+    def embed(self, points):
+        """Shape functions at points; beyond the cells, those of the nearest cell."""
+        local = (points @ self.axes.T - self.low) / self.spacing
+        key = np.full(int(np.prod(self.count)), -1)
+        key[self._key(self.cells)] = np.arange(len(self.cells))
+        cell = key[self._key(np.clip(local.astype(int), 0, self.count - 1))]
+        lost = cell < 0
+        if lost.any():
+            cell[lost] = self.tree.query(local[lost])[1]
+        return self._at(cell, local - self.cells[cell])
+
+    def _at(self, cell, s):
+        value, slope = _basis(s, self.degree)
+        shares = np.einsum("na,nb,nc->nabc", value[:, 0], value[:, 1], value[:, 2])
+        parts = [
+            np.einsum("na,nb,nc->nabc", *(slope[:, k] if k == axis else value[:, k] for k in range(3)))
+            / self.spacing[axis]
+            for axis in range(3)
+        ]
+        count = len(s)
+        slopes = np.stack(parts, -1).reshape(count, -1, 3) @ self.axes
+        return Embedding(
+            np.ascontiguousarray(self.nodes[cell]), np.ascontiguousarray(shares.reshape(count, -1)),
+            np.ascontiguousarray(slopes),
+        )  # fmt: skip
+
+    def _integrate(self):
+        """Eight points a cell with the volume, the middle and the spread of the material in it."""
+        fine = (np.stack(np.meshgrid(*[np.arange(FINE)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5) / FINE
+        # Those of a full cell are Gauss's.
+        whole = _split(fine)
+        points, weights, cells, local = [], [], [], []
+        mixed = np.flatnonzero(~self.full)
+        where = self.low + (self.cells[mixed][:, None, :] + fine) * self.spacing
+        inside = self.distance(where.reshape(-1, 3) @ self.axes).reshape(len(mixed), -1) < 0.0
+        found = dict(zip(mixed, inside, strict=True))
+        volume = float(np.prod(self.spacing))
+        for c in range(len(self.cells)):
+            share, filled = whole, 1.0
+            if c in found:
+                filled = float(found[c].mean())
+                if filled * len(fine) >= GROUPS:
+                    share = _split(fine[found[c]])
+                filled = max(filled, LEAST_FILLED)
+            spots, sizes = share
+            local.append(spots)
+            weights.append(sizes * filled * volume)
+            cells.append(np.full(len(spots), c))
+            points.append((self.low + (self.cells[c] + spots) * self.spacing) @ self.axes)
+        self.points, self.weights = np.concatenate(points), np.concatenate(weights)
+        self.cell = np.concatenate(cells)
+        self.quadrature = self._at(self.cell, np.concatenate(local))
+
+    def regions(self, count):
+        """Region of each quadrature point: whole cells, halved by volume until there are ``count`` regions."""
+        volume = np.bincount(self.cell, self.weights, minlength=len(self.cells))
+        groups = [np.arange(len(self.cells))]
+        while len(groups) < min(count, len(self.cells)):
+            sizes = [volume[g].sum() if len(g) > 1 else -1.0 for g in groups]
+            group = groups.pop(int(np.argmax(sizes)))
+            middle = self.cells[group] * self.spacing
+            axis = int(np.argmax(np.ptp(middle, axis=0)))
+            order = group[np.argsort(middle[:, axis], kind="stable")]
+            total = np.cumsum(volume[order])
+            cut = int(np.clip(np.searchsorted(total, 0.5 * total[-1]) + 1, 1, len(order) - 1))
+            groups += [order[:cut], order[cut:]]
+        out = np.empty(len(self.cells), dtype=np.int64)
+        for k, group in enumerate(groups):
+            out[group] = k
+        return out[self.cell]
+
+    def second_differences(self):
+        """Σ over axes of the squared second differences of the nodes along them, (N, N).
+
+        Zero for every linear map of the nodes, so that it resists neither turning nor stretching; it carries
+        nodes whose support holds hardly any material along with their neighbours.
+        """
+        known = {tuple(p): k for k, p in enumerate(self.place)}
+        out = np.zeros((len(self.rest), len(self.rest)))
+        stencil = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
+        for place, k in known.items():
+            for axis in range(3):
+                step = np.eye(3, dtype=int)[axis]
+                row = [known.get(tuple(place - step)), k, known.get(tuple(place + step))]
+                if None not in row:
+                    out[np.ix_(row, row)] += stencil
+        return out
+
+
+def _axes(points):
+    """Right-handed principal axes as rows, signs by the points' skewness; the identity where they are not clear."""
+    offset = points - points.mean(axis=0)
+    _, sizes, axes = np.linalg.svd(offset, full_matrices=False)
+    if np.diff(sizes).max() > -0.02 * sizes[0]:
+        return np.eye(3)
+    skew = ((offset @ axes.T) ** 3).sum(axis=0)
+    axes = axes * np.where(skew < 0.0, -1.0, 1.0)[:, None]
+    axes[2] *= np.sign(np.linalg.det(axes))
+    return axes
+
+
+def _basis(s, degree):
+    """Values and slopes (n, 3, degree + 1) of the uniform B-splines of a cell at s in [0, 1]^3."""
+    one = np.ones_like(s)
+    if degree == 1:
+        return np.stack([1 - s, s], -1), np.stack([-one, one], -1)
+    value = np.stack([0.5 * (1 - s) ** 2, 0.5 + s - s**2, 0.5 * s**2], -1)
+    return value, np.stack([s - 1, 1 - 2 * s, s], -1)
+
+
+def _split(points):
+    """Eight points with the middle and the spread of many: halved along each axis, then moved apart."""
+    groups = [points]
+    for axis in range(3):
+        halves = []
+        for group in groups:
+            order = group[np.argsort(group[:, axis], kind="stable")]
+            cut = (len(order) + 1) // 2
+            halves += [order[:cut], order[cut:]]
+        groups = halves
+    groups = [group for group in groups if len(group)]
+    size = np.array([len(group) for group in groups], dtype=float)
+    size /= size.sum()
+    spots = np.array([group.mean(axis=0) for group in groups])
+    middle = size @ spots
+    # A midpoint stands for a uniform piece of the cell's fine grid.
+    spread = points.var(axis=0) + 1.0 / (12.0 * FINE**2)
+    between = size @ (spots - middle) ** 2
+    widen = np.minimum(np.sqrt(spread / np.maximum(between, 1e-12)), MOST_WIDENED)
+    return middle + (spots - middle) * widen, size
+
+
+def dense_points(vertices, faces, samples, sample_faces):
+    """Points (n, 3) of a mesh between its samples: middles of their edges, again and again, on to the surface."""
+    corners = samples[sample_faces]
+    area = 0.5 * np.linalg.norm(np.cross(*(corners[:, k] - corners[:, 0] for k in (1, 2))), axis=1).sum()
+    points, triangles = samples, np.asarray(sample_faces)
+    for _ in range(MOST_HALVINGS):
+        if len(points) >= area / AREA_A_POINT:
+            break
+        edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2)
+        known, which = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
+        a, b, c = (which.reshape(-1, 3) + len(points)).T
+        i, j, k = triangles.T
+        points = np.concatenate([points, points[known].mean(axis=1)])
+        triangles = np.concatenate([np.stack(t, 1) for t in ((i, a, c), (a, j, b), (c, b, k), (a, b, c))])
+    return ExactDistance(vertices, faces).closest_point(points[len(samples) :])

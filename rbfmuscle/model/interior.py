@@ -1,0 +1,398 @@
+"""The inside of an RBF muscle: an elastic, incompressible solid that carries the centres.
+
+With y the nodes of a `Lattice` and F = Σ y_k ∇N_k the deformation gradient at its quadrature points q,
+
+    E(y) = μ Σ_q w_q (|F_q - T_q|² + c (|F_q a| - t)²),    V_r(y) = Σ_{q in r} w_q det F_q = V_r at rest,
+
+with T the rotation of F, stretched by t along the fibre a where a muscle contracts (1: passive), r the regions of
+the lattice, one pressure each, and c = 3/2 (fibre_ratio - 1). For small strains and more and more nodes this is the
+incompressible solid of shear modulus μ, Young's modulus 3 μ across and 3 μ · fibre_ratio along the fibres.
+
+Each iteration solves with the matrix of E at fixed T, which never changes, and corrects the regions' volumes and the
+contacts in its metric. The pressures are kept, so that where the iteration stands still the forces balance exactly.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.spatial import cKDTree
+
+from rbfmuscle.geometry.harmonic import blended_motion
+from rbfmuscle.geometry.rest_frame import RestFrame, diameter
+from rbfmuscle.implicit.placement.lattice import Lattice, dense_points
+from rbfmuscle.model.fibres import fibre_directions
+from rbfmuscle.model.interior_loops import (
+    Mixer,
+    carry_loop,
+    mobility_loop,
+    press_loop,
+    respond_loop,
+    stress_loop,
+    swell_loop,
+    touch_loop,
+    turn_loop,
+)
+from rbfmuscle.model.options import RBFOptions
+from rbfmuscle.model.rest import LEAST_ATTACHED, Rest
+from rbfmuscle.sim.scene.objects import Muscle
+
+LEAST_ROUNDS = (
+    3  # times the iterations of a muscle without an inside: they end by the residual, mostly sooner
+)
+HOLD = 25.0  # stiffness of the spring at a held point, in that of a cell
+GHOST = 1e-3  # of a cell's stiffness: what carries nodes that hold hardly any material
+MOST_TREND = 1.5  # of the last sub-step's correction that the next one starts with
+MOBILE = 0.02  # points that move by less than this share of the median for a unit force are attached
+CONTACT_TOLERANCE = 2e-5  # of the muscle's size
+REACH_MARGIN = 0.003
+NEAR = 0.03  # points nearer to an obstacle than this take part in a solve
+SETTLED = 2e-5
+NODES_A_REGION = 8
+CONTACT_ROUNDS, CONTACT_SWEEPS = 10, 400
+
+
+class _Near(NamedTuple):
+    """Contact points near an obstacle: their indices and embedding, forces on them, obstacles, nodes then."""
+
+    index: np.ndarray
+    columns: np.ndarray
+    shares: np.ndarray
+    forces: np.ndarray
+    contacts: object
+    y: np.ndarray
+    reach: float
+
+
+class Interior:
+    """An elastic solid on a lattice, with volume and contact inside the iteration.
+
+    Parameters
+    ----------
+    lattice : Lattice
+        In the units of ``frame``.
+    frame : RestFrame
+    points : (n, 3) ndarray
+        Contact points at rest [scene unit].
+    owner : (n,) ndarray of int
+        Bone that each is attached to, -1 where free.
+    held : (h,) ndarray of int
+        Contact points by which the bones hold the muscle.
+    count : int
+        The first contact points so many are centres.
+    free : (f,) ndarray of int
+        Centres that are free to move.
+    regions, iterations, contacts, memory : int
+    """
+
+    def __init__(
+        self, lattice, frame, points, owner, held, *, count, free, regions, iterations, contacts, memory
+    ):
+        self.rest = frame.points(lattice.rest)
+        self.points, self.owner, self.held = points, owner, held
+        self.count, self.free, self._carried = count, free, None
+        self.iterations, self.batch, self.memory = LEAST_ROUNDS * iterations, contacts, memory
+        self.scale, self.side = diameter(points), float(np.prod(lattice.spacing)) ** (1 / 3) * frame.size
+        found = lattice.embed((points - frame.origin) @ frame.axes.T / frame.size)
+        self.columns, self.shares = found.columns, found.shares
+        self.slopes_at = found.slopes @ frame.axes / frame.size
+        self.quad_columns = lattice.quadrature.columns
+        self.slopes = np.ascontiguousarray(lattice.quadrature.slopes @ frame.axes / frame.size)
+        self.weights = lattice.weights * frame.size**3
+        self.quad_points = frame.points(lattice.points)
+        count = len(self.weights)
+        self.fibre, self.stretch = np.tile([1.0, 0.0, 0.0], (count, 1)), np.ones(count)
+        self.quaternion = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+        self.f, self.target = np.empty((2, count, 3, 3))
+        self._number_regions(lattice.regions(regions))
+        self._assemble(lattice)
+        self.y, self.pressure = self.rest.copy(), np.zeros(len(self.rest_volumes))
+        self.forces = np.zeros((len(points), 1))
+        self.anchor, self.history = points[held], [0.0]
+        self.trend, self.begun = None, None
+
+    def _assemble(self, lattice):
+        """Matrix of the energy with frozen targets, springs and all, its inverse, and the bones' weights."""
+        size, rows = len(self.rest), np.arange(len(self.weights))[:, None]
+        matrix = GHOST * self.side * lattice.second_differences()
+        for axis in range(3):
+            full = np.zeros((len(self.weights), size))
+            np.add.at(full, (rows, self.quad_columns), self.slopes[:, :, axis])
+            matrix += (full * self.weights[:, None]).T @ full
+        hangs = np.zeros((size, len(self.held)))
+        np.add.at(hangs, (self.columns[self.held].T, np.arange(len(self.held))), self.shares[self.held].T)
+        self.spring = HOLD * self.side * hangs
+        self.matrix, self.stiff = matrix + self.spring @ hangs.T, 0.0
+        self._invert()
+        own = self.owner[self.held]
+        self.bones = sorted(set(own.tolist()))
+        weights = np.stack([self.inverse @ self.spring[:, own == bone].sum(axis=1) for bone in self.bones], 1)
+        self.motion_weights = weights / weights.sum(axis=1, keepdims=True)
+
+    def _invert(self):
+        inverse = np.linalg.inv(self.matrix)
+        self.inverse = np.ascontiguousarray(0.5 * (inverse + inverse.T))
+
+    def rise(self):
+        """Directions at the quadrature points in which the muscle runs from its first bone to its last, (Q, 3)."""
+        height = self.motion_weights @ np.arange(len(self.bones))
+        slope = np.einsum("qk,qka->qa", height[self.quad_columns], self.slopes)
+        return slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-300)
+
+    def reinforce(self, fibre, ratio):
+        """Make the solid stiffer along unit directions (Q, 3), by a ratio of Young's moduli."""
+        self.fibre, self.stiff = np.ascontiguousarray(fibre), 1.5 * (ratio - 1.0)
+        along = np.zeros((len(self.weights), len(self.rest)))
+        slopes = np.einsum("qka,qa->qk", self.slopes, self.fibre)
+        np.add.at(along, (np.arange(len(self.weights))[:, None], self.quad_columns), slopes)
+        self.matrix = self.matrix + self.stiff * (along * self.weights[:, None]).T @ along
+        self._invert()
+
+    def hardly_move(self):
+        """Contact points that a force hardly moves, as what holds them is held."""
+        mobility = np.empty(len(self.points))
+        mobility_loop(self.columns, self.shares, self.inverse, mobility)
+        return mobility < MOBILE * np.median(mobility[self.owner < 0])
+
+    def _number_regions(self, region):
+        self.region = region
+        count = int(region.max()) + 1
+        size = len(self.rest)
+        pair = region[:, None] * size + self.quad_columns
+        known, slot = np.unique(pair, return_inverse=True)
+        self.slot = slot.reshape(pair.shape).astype(np.int64)
+        self.touched = (known % size).astype(np.int64)
+        self.start = np.searchsorted(known // size, np.arange(count + 1)).astype(np.int64)
+        self.gradient = np.empty((len(known), 3))
+        self.volumes = np.empty(count)
+        self.rest_volumes = np.bincount(region, self.weights, minlength=count)
+
+    # --- what the muscle asks -------------------------------------------------------------------------------
+
+    def carry(self, centres=None):
+        """Contact points now, (n, 3); they go with the nodes, whatever the centres are."""
+        if self._carried is None or self._carried[0] is not self.y:
+            out = np.empty_like(self.points)
+            carry_loop(self.y, self.columns, self.shares, out)
+            self._carried = self.y, out
+        return self._carried[1].copy()
+
+    def centres(self, before):
+        """Centres (K, 3) where the nodes carry the free ones; the held ones stay as they are."""
+        out, free = before.copy(), np.empty((len(self.free), 3))
+        carry_loop(self.y, self.columns[self.free], self.shares[self.free], free)
+        out[self.free] = free
+        return out
+
+    def deformation(self):
+        """Deformation gradient (n, 3, 3) at the contact points that are centres."""
+        at = slice(0, self.count)
+        return np.einsum("nka,nkb->nab", self.y[self.columns[at]], self.slopes_at[at])
+
+    def move(self, motions, poses):
+        """Nodes take their share of the bones' motions (b, 4, 4); held points go with the poses (by bone)."""
+        self.y = blended_motion(self.y, self.motion_weights, motions)
+        own, anchor = self.owner[self.held], np.empty_like(self.anchor)
+        for bone in self.bones:
+            here, pose = own == bone, poses[bone]
+            anchor[here] = self.points[self.held[here]] @ pose[:3, :3].T + pose[:3, 3]
+        step = (anchor - self.anchor).ravel()
+        self.anchor, self.begun = anchor, (step, self.y, self.pressure.copy())
+        if self.trend is not None:
+            # Where the motion goes on as before, so does what the muscle made of it.
+            last, correction, pressed = self.trend
+            share = float(step @ last) / max(float(last @ last), 1e-30)
+            share = float(np.clip(share, -MOST_TREND, MOST_TREND))
+            self.y = self.y + share * correction
+            self.pressure = self.pressure + share * pressed
+
+    def turn(self, which, transform):
+        """Nodes go along with a rigid transform as far as they carry free points of the mask ``which``."""
+        hit, every = np.zeros((2, len(self.y)))
+        marked = np.asarray(which) & (self.owner < 0)
+        np.add.at(hit, self.columns[marked], self.shares[marked])
+        np.add.at(every, self.columns, self.shares)
+        share = (hit / np.maximum(every, 1e-12))[:, None]
+        self.y = self.y + share * (self.y @ transform[:3, :3].T + transform[:3, 3] - self.y)
+
+    def snapshot(self):
+        """State that ``restore`` brings back."""
+        return (
+            self.y.copy(),
+            self.quaternion.copy(),
+            self.pressure.copy(),
+            self.forces.copy(),
+            self.anchor.copy(),
+            self.trend,
+        )
+
+    def restore(self, state, centres=None):
+        """Return to an earlier ``snapshot``."""
+        self.y, self.quaternion, self.pressure, self.forces, self.anchor = (part.copy() for part in state[:5])
+        self.trend, self.begun = state[5], None
+
+    def solve(self, centres, contacts):
+        """Return the settled centres, (K, 3)."""
+        self.settle(contacts)
+        return self.centres(centres)
+
+    def settle(self, contacts):
+        """Bring the nodes to balance under pressures and contacts."""
+        state = np.concatenate([self.y.ravel(), self.pressure])
+        size = self.y.size
+        mixer = Mixer(self.memory, self.y.size)
+        self.history = []
+        self._localise()
+        self._respond()
+        near, self.pull = None, self.spring @ self.anchor
+        for step in range(self.iterations):
+            if step:
+                self._localise()
+            if near is None or np.abs(self.y - near.y).max() > 0.4 * near.reach:
+                near = self._near(contacts, near)
+            new, pressure = self._iterate(near)
+            moved = float(np.sqrt(((new - self.y) ** 2).sum(axis=1).max()))
+            self.history.append(moved)
+            image = np.concatenate([new.ravel(), pressure])
+            last = step + 1 == self.iterations or moved < SETTLED * self.scale
+            state = image if last else mixer.mix(state, image)
+            self.y, self.pressure = state[:size].reshape(-1, 3).copy(), state[size:].copy()
+            if last:
+                break
+        self.forces[:] = 0.0
+        self.forces[near.index] = near.forces
+        if self.begun is not None:
+            motion, start, pressure = self.begun
+            if np.abs(motion).max() > SETTLED * self.scale:
+                self.trend = motion, self.y - start, self.pressure - pressure
+            self.begun = None
+
+    def _near(self, contacts, before):
+        """The contact points near an obstacle, with what pushed them until now."""
+        if before is not None:
+            self.forces[:] = 0.0
+            self.forces[before.index] = before.forces
+        sources = max(1, len(contacts.names) + len(contacts.neighbours))
+        if self.forces.shape[1] != sources:
+            self.forces = np.zeros((len(self.points), sources))
+        reach = NEAR * self.scale
+        index = np.arange(len(self.points))
+        if not contacts.neighbours:
+            index = np.unique(contacts.half_spaces(self.carry(), reach).index)
+            contacts = contacts.only(index)
+        return _Near(
+            index, self.columns[index], self.shares[index], self.forces[index], contacts, self.y.copy(), reach
+        )
+
+    def elastic(self, y):
+        """Matrix of the elastic energy times places y, targets frozen, (N, 3)."""
+        f = np.einsum("qka,qkb->qab", y[self.quad_columns], self.slopes)
+        along = np.einsum("qab,qb->qa", f, self.fibre)
+        f = f + self.stiff * along[:, :, None] * self.fibre[:, None, :]
+        out = np.zeros_like(y)
+        np.add.at(out, self.quad_columns, np.einsum("q,qab,qkb->qka", self.weights, f, self.slopes))
+        return out
+
+    def energy(self):
+        """Elastic energy over 2 μ at the present nodes."""
+        self._localise()
+        gap = self.f - self.target
+        total = 0.5 * float(self.weights @ (gap**2).sum(axis=(1, 2)))
+        if self.stiff:
+            along = np.linalg.norm(np.einsum("qab,qb->qa", self.f, self.fibre), axis=1)
+            total += 0.5 * self.stiff * float(self.weights @ (along - self.stretch) ** 2)
+        return total
+
+    def _localise(self):
+        turn_loop(
+            self.y,
+            self.quad_columns,
+            self.slopes,
+            self.fibre,
+            self.stretch,
+            self.quaternion,
+            self.f,
+            self.target,
+        )
+        self.right = np.empty_like(self.y)
+        stress_loop(
+            self.f, self.target, self.fibre, self.stretch, self.stiff, self.weights, self.quad_columns,
+            self.slopes, self.region, self.slot, self.right, self.gradient, self.volumes,
+        )  # fmt: skip
+
+    def _respond(self):
+        """How the nodes answer to pressures, at the present shape: the metric of this solve's corrections."""
+        count = len(self.pressure)
+        response, gram = np.empty((count, 3, len(self.y))), np.empty((count, count))
+        respond_loop(self.start, self.touched, self.gradient, self.inverse, response, gram)
+        gram[np.diag_indices(count)] *= 1.0 + 1e-9
+        self.factor = np.linalg.cholesky(gram)
+        white = solve_triangular(self.factor, response.reshape(count, -1), lower=True, check_finite=False)
+        self.response = np.ascontiguousarray(white.reshape(response.shape))
+
+    def _iterate(self, near):
+        right = self.right
+        press_loop(self.pressure, self.start, self.touched, self.gradient, right)
+        free = self.inverse @ (right + self.pull)
+        swollen = np.empty(len(self.pressure))
+        swell_loop(free - self.y, self.start, self.touched, self.gradient, swollen)
+        excess = self.volumes - self.rest_volumes + swollen
+        change = -solve_triangular(self.factor, excess, lower=True, check_finite=False)
+        step = free + np.tensordot(change, self.response, 1).T
+        here, there = np.empty((2, len(near.index), 3))
+        carry_loop(self.y, near.columns, near.shares, here)
+        carry_loop(step, near.columns, near.shares, there)
+        motion = there - here
+        spaces = near.contacts.half_spaces(
+            here, 1.5 * np.sqrt((motion**2).sum(axis=1)) + REACH_MARGIN * self.scale
+        )
+        push, taken = np.empty_like(self.y), np.empty_like(change)
+        touch_loop(
+            spaces.index, spaces.gap, spaces.normal, spaces.source % near.forces.shape[1], motion, self.inverse,
+            near.columns, near.shares, self.response, near.forces,
+            self.batch, CONTACT_ROUNDS, CONTACT_SWEEPS, CONTACT_TOLERANCE * self.scale, push, taken,
+        )  # fmt: skip
+        change -= taken
+        pressure = self.pressure + solve_triangular(
+            self.factor, change, lower=True, trans=1, check_finite=False
+        )
+        return step + push, pressure
+
+
+def build_interior(muscle: Muscle, rest: Rest, options: RBFOptions) -> Interior:
+    """The solid that carries the centres.
+
+    Parameters
+    ----------
+    muscle : Muscle
+    rest : Rest
+    options : RBFOptions
+
+    Returns
+    -------
+    Interior
+        Its contact points are the centres, the samples, then denser ones of the surface.
+    """
+    frame, faces = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)), np.asarray(muscle.mesh.faces)
+    samples = np.round((rest.samples - frame.origin) @ frame.axes.T / frame.size, 8)
+    denser = dense_points(frame.local, faces, samples, rest.sample_faces)
+    points, centres = np.concatenate([rest.contact_points(), frame.points(denser)]), len(rest.centres)
+    of_samples = rest.holder[centres:]
+    owner = np.concatenate([rest.holder, of_samples[cKDTree(samples).query(denser)[1]]])
+    held = centres + np.flatnonzero(of_samples >= 0)
+    for bone in range(len(rest.bones)):
+        if (owner[held] == bone).sum() < LEAST_ATTACHED:
+            held = np.concatenate([held, np.flatnonzero(rest.holder[:centres] == bone)])
+    lattice = Lattice(frame.local, faces, options.inside)
+    interior = Interior(
+        lattice, frame, points, owner, held, count=centres, free=rest.free,
+        regions=max(1, len(lattice.rest) // NODES_A_REGION), iterations=options.iterations,
+        contacts=options.contacts, memory=options.acceleration,
+    )  # fmt: skip
+    if options.fibre_ratio > 1.0:
+        axis = points[held].mean(axis=0) - points.mean(axis=0)
+        along = fibre_directions(interior.quad_points, interior.rise(), muscle.fibres, fallback=axis)
+        interior.reinforce(along, options.fibre_ratio)
+    stuck, fixed = np.flatnonzero(interior.hardly_move() & (owner < 0)), np.flatnonzero(owner >= 0)
+    interior.owner[stuck] = owner[fixed[cKDTree(points[fixed]).query(points[stuck])[1]]]
+    return interior
