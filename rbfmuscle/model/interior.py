@@ -90,7 +90,8 @@ class Interior:
     ):
         self.rest = frame.points(lattice.rest)
         self.points, self.owner, self.held = points, owner, held
-        self.count, self.free, self._carried = count, free, None
+        self.count, self.free, self._carried, self._followed = count, free, None, None
+        self.lattice, self.frame = lattice, frame
         self.iterations, self.batch, self.memory = LEAST_ROUNDS * iterations, contacts, memory
         self.scale, self.side = diameter(points), float(np.prod(lattice.spacing)) ** (1 / 3) * frame.size
         found = lattice.embed((points - frame.origin) @ frame.axes.T / frame.size)
@@ -176,6 +177,15 @@ class Interior:
             carry_loop(self.y, self.columns, self.shares, out)
             self._carried = self.y, out
         return self._carried[1].copy()
+
+    def follow(self, points):
+        """Where the nodes carry points (n, 3) of the muscle at rest; asked for the same ones again and again."""
+        if self._followed is None or self._followed[0] is not points:
+            found = self.lattice.embed((points - self.frame.origin) @ self.frame.axes.T / self.frame.size)
+            self._followed = points, found.columns, found.shares
+        out = np.empty_like(points)
+        carry_loop(self.y, *self._followed[1:], out)
+        return out
 
     def centres(self, before):
         """Centres (K, 3) where the nodes carry the free ones; the held ones stay as they are."""

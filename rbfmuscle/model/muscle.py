@@ -146,6 +146,10 @@ class RBFMuscle:
     def drawing(self, contacts: BoneContacts) -> RBFDrawing:
         """The muscle as it is now, for its surface."""
         shown = self.drawer.shown
-        carried = None if shown is None else shown.carried(self.points, self.solver)
+        carried = None
+        if shown is not None:
+            carried = (
+                self.interior.follow(shown.rest) if self.interior else shown.carried(self.points, self.solver)
+            )
         now = Moment(self.points.copy(), self.normals(), self.contact_points(), carried)
         return RBFDrawing(self.drawer, now, contacts)
