@@ -12,12 +12,15 @@ Each iteration solves with the matrix of E at fixed T, which never changes, and 
 contacts in its metric. The pressures are kept, so that where the iteration stands still the forces balance exactly.
 """
 
-from typing import NamedTuple
+from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.spatial import cKDTree
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.geometry.rest_frame import RestFrame, diameter
 from rbfmuscle.implicit.placement.lattice import Lattice, dense_points
@@ -86,8 +89,20 @@ class Interior:
     """
 
     def __init__(
-        self, lattice, frame, points, owner, held, *, count, free, regions, iterations, contacts, memory
-    ):
+        self,
+        lattice: Lattice,
+        frame: Any,
+        points: Floats,
+        owner: Any,
+        held: Any,
+        *,
+        count: int,
+        free: Any,
+        regions: Any,
+        iterations: Any,
+        contacts: Any,
+        memory: int,
+    ) -> None:
         self.rest = frame.points(lattice.rest)
         self.points, self.owner, self.held = points, owner, held
         self.count, self.free, self._carried, self._followed = count, free, None, None
@@ -112,7 +127,7 @@ class Interior:
         self.anchor, self.history = points[held], [0.0]
         self.trend, self.begun = None, None
 
-    def _assemble(self, lattice):
+    def _assemble(self, lattice: Lattice) -> Any:
         """Matrix of the energy with frozen targets, springs and all, its inverse, and the bones' weights."""
         size, rows = len(self.rest), np.arange(len(self.weights))[:, None]
         matrix = GHOST * self.side * lattice.second_differences()
@@ -130,17 +145,17 @@ class Interior:
         weights = np.stack([self.inverse @ self.spring[:, own == bone].sum(axis=1) for bone in self.bones], 1)
         self.motion_weights = weights / weights.sum(axis=1, keepdims=True)
 
-    def _invert(self):
+    def _invert(self) -> Any:
         inverse = np.linalg.inv(self.matrix)
         self.inverse = np.ascontiguousarray(0.5 * (inverse + inverse.T))
 
-    def rise(self):
+    def rise(self) -> Any:
         """Directions at the quadrature points in which the muscle runs from its first bone to its last, (Q, 3)."""
         height = self.motion_weights @ np.arange(len(self.bones))
         slope = np.einsum("qk,qka->qa", height[self.quad_columns], self.slopes)
         return slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-300)
 
-    def reinforce(self, fibre, ratio):
+    def reinforce(self, fibre: Floats, ratio: float) -> None:
         """Make the solid stiffer along unit directions (Q, 3), by a ratio of Young's moduli."""
         self.fibre, self.stiff = np.ascontiguousarray(fibre), 1.5 * (ratio - 1.0)
         along = np.zeros((len(self.weights), len(self.rest)))
@@ -149,13 +164,13 @@ class Interior:
         self.matrix = self.matrix + self.stiff * (along * self.weights[:, None]).T @ along
         self._invert()
 
-    def hardly_move(self):
+    def hardly_move(self) -> Any:
         """Contact points that a force hardly moves, as what holds them is held."""
         mobility = np.empty(len(self.points))
         mobility_loop(self.columns, self.shares, self.inverse, mobility)
         return mobility < MOBILE * np.median(mobility[self.owner < 0])
 
-    def _number_regions(self, region):
+    def _number_regions(self, region: Integers) -> Any:
         self.region = region
         count = int(region.max()) + 1
         size = len(self.rest)
@@ -170,7 +185,7 @@ class Interior:
 
     # --- what the muscle asks -------------------------------------------------------------------------------
 
-    def carry(self, centres=None):
+    def carry(self, centres: Floats | None = None) -> Any:
         """Contact points now, (n, 3); they go with the nodes, whatever the centres are."""
         if self._carried is None or self._carried[0] is not self.y:
             out = np.empty_like(self.points)
@@ -178,7 +193,7 @@ class Interior:
             self._carried = self.y, out
         return self._carried[1].copy()
 
-    def follow(self, points):
+    def follow(self, points: Floats) -> Floats:
         """Where the nodes carry points (n, 3) of the muscle at rest; asked for the same ones again and again."""
         if self._followed is None or self._followed[0] is not points:
             found = self.lattice.embed((points - self.frame.origin) @ self.frame.axes.T / self.frame.size)
@@ -187,19 +202,19 @@ class Interior:
         carry_loop(self.y, *self._followed[1:], out)
         return out
 
-    def centres(self, before):
+    def centres(self, before: Floats) -> Floats:
         """Centres (K, 3) where the nodes carry the free ones; the held ones stay as they are."""
         out, free = before.copy(), np.empty((len(self.free), 3))
         carry_loop(self.y, self.columns[self.free], self.shares[self.free], free)
         out[self.free] = free
         return out
 
-    def deformation(self):
+    def deformation(self) -> Any:
         """Deformation gradient (n, 3, 3) at the contact points that are centres."""
         at = slice(0, self.count)
         return np.einsum("nka,nkb->nab", self.y[self.columns[at]], self.slopes_at[at])
 
-    def move(self, motions, poses):
+    def move(self, motions: Any, poses: Any) -> None:
         """Nodes take their share of the bones' motions (b, 4, 4); held points go with the poses (by bone)."""
         self.y = blended_motion(self.y, self.motion_weights, motions)
         own, anchor = self.owner[self.held], np.empty_like(self.anchor)
@@ -216,7 +231,7 @@ class Interior:
             self.y = self.y + share * correction
             self.pressure = self.pressure + share * pressed
 
-    def turn(self, which, transform):
+    def turn(self, which: Any, transform: Floats) -> None:
         """Nodes go along with a rigid transform as far as they carry free points of the mask ``which``."""
         hit, every = np.zeros((2, len(self.y)))
         marked = np.asarray(which) & (self.owner < 0)
@@ -225,7 +240,7 @@ class Interior:
         share = (hit / np.maximum(every, 1e-12))[:, None]
         self.y = self.y + share * (self.y @ transform[:3, :3].T + transform[:3, 3] - self.y)
 
-    def snapshot(self):
+    def snapshot(self) -> Any:
         """State that ``restore`` brings back."""
         return (
             self.y.copy(),
@@ -236,17 +251,17 @@ class Interior:
             self.trend,
         )
 
-    def restore(self, state, centres=None):
+    def restore(self, state: Any, centres: Floats | None = None) -> None:
         """Return to an earlier ``snapshot``."""
         self.y, self.quaternion, self.pressure, self.forces, self.anchor = (part.copy() for part in state[:5])
         self.trend, self.begun = state[5], None
 
-    def solve(self, centres, contacts):
+    def solve(self, centres: Any, contacts: Any) -> Any:
         """Return the settled centres, (K, 3)."""
         self.settle(contacts)
         return self.centres(centres)
 
-    def settle(self, contacts):
+    def settle(self, contacts: Any) -> None:
         """Bring the nodes to balance under pressures and contacts."""
         state = np.concatenate([self.y.ravel(), self.pressure])
         size = self.y.size
@@ -277,7 +292,7 @@ class Interior:
                 self.trend = motion, self.y - start, self.pressure - pressure
             self.begun = None
 
-    def _near(self, contacts, before):
+    def _near(self, contacts: Any, before: Floats) -> Any:
         """The contact points near an obstacle, with what pushed them until now."""
         if before is not None:
             self.forces[:] = 0.0
@@ -294,7 +309,7 @@ class Interior:
             index, self.columns[index], self.shares[index], self.forces[index], contacts, self.y.copy(), reach
         )
 
-    def elastic(self, y):
+    def elastic(self, y: Floats) -> Floats:
         """Matrix of the elastic energy times places y, targets frozen, (N, 3)."""
         f = np.einsum("qka,qkb->qab", y[self.quad_columns], self.slopes)
         along = np.einsum("qab,qb->qa", f, self.fibre)
@@ -303,7 +318,7 @@ class Interior:
         np.add.at(out, self.quad_columns, np.einsum("q,qab,qkb->qka", self.weights, f, self.slopes))
         return out
 
-    def energy(self):
+    def energy(self) -> float:
         """Elastic energy over 2 μ at the present nodes."""
         self._localise()
         gap = self.f - self.target
@@ -313,7 +328,7 @@ class Interior:
             total += 0.5 * self.stiff * float(self.weights @ (along - self.stretch) ** 2)
         return total
 
-    def _localise(self):
+    def _localise(self) -> Any:
         turn_loop(
             self.y,
             self.quad_columns,
@@ -330,7 +345,7 @@ class Interior:
             self.slopes, self.region, self.slot, self.right, self.gradient, self.volumes,
         )  # fmt: skip
 
-    def _respond(self):
+    def _respond(self) -> Any:
         """How the nodes answer to pressures, at the present shape: the metric of this solve's corrections."""
         count = len(self.pressure)
         response, gram = np.empty((count, 3, len(self.y))), np.empty((count, count))
@@ -340,7 +355,7 @@ class Interior:
         white = solve_triangular(self.factor, response.reshape(count, -1), lower=True, check_finite=False)
         self.response = np.ascontiguousarray(white.reshape(response.shape))
 
-    def _iterate(self, near):
+    def _iterate(self, near: Any) -> Any:
         right = self.right
         press_loop(self.pressure, self.start, self.touched, self.gradient, right)
         free = self.inverse @ (right + self.pull)

@@ -1,8 +1,13 @@
 """Loops over the quadrature points of a muscle's inside."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.model.constraints import _rotation_loop
 from rbfmuscle.model.contact import solve_contact_forces
 
@@ -269,11 +274,11 @@ def touch_loop(
 class Mixer:
     """Anderson acceleration (Walker & Ni 2011) of a state whose first ``measured`` numbers tell how near it is."""
 
-    def __init__(self, memory, measured):
+    def __init__(self, memory: int, measured: Any) -> None:
         self.memory, self.measured = memory, measured
         self.df, self.dg, self.last = [], [], None
 
-    def mix(self, state, image):
+    def mix(self, state: Any, image: Floats) -> Floats:
         """Next state from one and its image."""
         if self.memory == 0:
             return image

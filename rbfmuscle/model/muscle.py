@@ -68,7 +68,7 @@ class RBFMuscle:
                 )
             self.rest, self.law = contracting(muscle, self.rest, self.options)
         self.interior = build_interior(muscle, self.rest, self.options) if self.options.inside else None
-        self.solver = self.interior or ElasticSolver(self.rest, self.options, self.law)
+        self.solver: Any = self.interior or ElasticSolver(self.rest, self.options, self.law)
         self.drawer = SurfaceDrawer(muscle, scene, self.rest, self.options)
         names = [bone.name for bone in scene.bones]
         numbers = np.array([names.index(bone) for bone in self.rest.bones])

@@ -10,7 +10,7 @@ MODULES = sorted([*(ROOT / "rbfmuscle").rglob("*.py"), *(ROOT / "pbd_baseline").
 # Loops that are compiled take plain arrays; their public half is annotated.
 COMPILED = ("compiled", "njit", "vectorize")
 MOST_PARAMETERS = 8
-MODULES_WITH_TRAINS = 28
+MODULES_WITH_TRAINS = 29
 # In rooms that grow, functions that wait for their annotations; lower it, never raise it.
 LACKING = 20
 ROOMS = ("validation", "geometry", "run", "study/files")

@@ -11,12 +11,15 @@ import time
 from collections import Counter
 from pathlib import Path
 
-import numpy as np
+for _name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[_name] = "1"  # no thread may live in what is forked; before the libraries read it
 
-from fuzz import harness
-from fuzz.base import base_scene, suffix_of, write_base
-from fuzz.meshes import write_damaged
-from fuzz.scenes import scene_text, to_toml
+import numpy as np  # noqa: E402
+
+from fuzz import harness  # noqa: E402
+from fuzz.base import base_scene, suffix_of, write_base  # noqa: E402
+from fuzz.meshes import write_damaged  # noqa: E402
+from fuzz.scenes import scene_text, to_toml  # noqa: E402
 
 MODELS = ("rbf", "pbd")
 KINDS = {"scene": 1, "mesh": 2, "frames": 3}  # and what seeds them apart

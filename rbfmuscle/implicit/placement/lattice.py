@@ -4,11 +4,15 @@ The lattice belongs to the muscle's shape alone, not to its centres, so what is 
 however many centres there are. Where material is, the signed distance to the rest mesh tells.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
 
 FINE = 6  # points along a side of a cell that tell how much of it is muscle
@@ -58,7 +62,7 @@ class Lattice:
         Sides of a cell.
     """
 
-    def __init__(self, vertices, faces, nodes, *, degree=2):
+    def __init__(self, vertices: Floats, faces: Integers, nodes: int, *, degree: int = 2) -> None:
         self.degree = degree
         self.axes = _axes(vertices)
         box = vertices @ self.axes.T
@@ -69,7 +73,7 @@ class Lattice:
         self._number_nodes()
         self._integrate()
 
-    def _choose_spacing(self, surface, wanted):
+    def _choose_spacing(self, surface: Any, wanted: float) -> Any:
         """The coarsest cells that give the wanted nodes, by bisection."""
         small, large = 0.01 * self.extent.max(), self.extent.max()
         for _ in range(25):
@@ -79,7 +83,7 @@ class Lattice:
             small, large = (small, side) if len(self.rest) < wanted else (side, large)
         self._lay_cells(surface, large)
 
-    def _lay_cells(self, surface, side):
+    def _lay_cells(self, surface: Any, side: float) -> Any:
         self.count = np.maximum(1, np.ceil(self.extent / side - 1e-9).astype(int))
         self.spacing = self.extent / self.count
         every = np.stack(np.meshgrid(*(np.arange(n) for n in self.count), indexing="ij"), -1).reshape(-1, 3)
@@ -92,10 +96,10 @@ class Lattice:
         self.full = (depth < -half)[used]
         self.cells = every[used]
 
-    def _key(self, cells):
+    def _key(self, cells: Integers) -> Any:
         return (cells[:, 0] * self.count[1] + cells[:, 1]) * self.count[2] + cells[:, 2]
 
-    def _number_nodes(self):
+    def _number_nodes(self) -> Any:
         width = self.degree + 1
         steps = np.stack(np.meshgrid(*[np.arange(width)] * 3, indexing="ij"), -1).reshape(-1, 3)
         corner = self.cells[:, None, :] + steps
@@ -107,7 +111,7 @@ class Lattice:
         self.rest = (self.low + (self.place - 0.5 * (self.degree - 1)) * self.spacing) @ self.axes
         self.tree = cKDTree(self.cells + 0.5)
 
-    def embed(self, points):
+    def embed(self, points: Floats) -> Any:
         """Shape functions at points; beyond the cells, those of the nearest cell."""
         local = (points @ self.axes.T - self.low) / self.spacing
         key = np.full(int(np.prod(self.count)), -1)
@@ -118,7 +122,7 @@ class Lattice:
             cell[lost] = self.tree.query(local[lost])[1]
         return self._at(cell, local - self.cells[cell])
 
-    def _at(self, cell, s):
+    def _at(self, cell: Integers, s: Floats) -> Any:
         value, slope = _basis(s, self.degree)
         shares = np.einsum("na,nb,nc->nabc", value[:, 0], value[:, 1], value[:, 2])
         parts = [
@@ -133,7 +137,7 @@ class Lattice:
             np.ascontiguousarray(slopes),
         )  # fmt: skip
 
-    def _integrate(self):
+    def _integrate(self) -> Any:
         """Eight points a cell with the volume, the middle and the spread of the material in it."""
         fine = (np.stack(np.meshgrid(*[np.arange(FINE)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5) / FINE
         # Those of a full cell are Gauss's.
@@ -160,7 +164,7 @@ class Lattice:
         self.cell = np.concatenate(cells)
         self.quadrature = self._at(self.cell, np.concatenate(local))
 
-    def regions(self, count):
+    def regions(self, count: int) -> Integers:
         """Region of each quadrature point: whole cells, halved by volume until there are ``count`` regions."""
         volume = np.bincount(self.cell, self.weights, minlength=len(self.cells))
         groups = [np.arange(len(self.cells))]
@@ -178,7 +182,7 @@ class Lattice:
             out[group] = k
         return out[self.cell]
 
-    def second_differences(self):
+    def second_differences(self) -> Any:
         """Σ over axes of the squared second differences of the nodes along them, (N, N).
 
         Zero for every linear map of the nodes, so that it resists neither turning nor stretching; it carries
@@ -196,7 +200,7 @@ class Lattice:
         return out
 
 
-def _axes(points):
+def _axes(points: Floats) -> Any:
     """Right-handed principal axes as rows, signs by the points' skewness; the identity where they are not clear."""
     offset = points - points.mean(axis=0)
     _, sizes, axes = np.linalg.svd(offset, full_matrices=False)
@@ -208,7 +212,7 @@ def _axes(points):
     return axes
 
 
-def _basis(s, degree):
+def _basis(s: Floats, degree: int) -> Any:
     """Values and slopes (n, 3, degree + 1) of the uniform B-splines of a cell at s in [0, 1]^3."""
     one = np.ones_like(s)
     if degree == 1:
@@ -217,7 +221,7 @@ def _basis(s, degree):
     return value, np.stack([s - 1, 1 - 2 * s, s], -1)
 
 
-def _split(points):
+def _split(points: Floats) -> Any:
     """Eight points with the middle and the spread of many: halved along each axis, then moved apart."""
     groups = [points]
     for axis in range(3):
@@ -239,7 +243,7 @@ def _split(points):
     return middle + (spots - middle) * widen, size
 
 
-def dense_points(vertices, faces, samples, sample_faces):
+def dense_points(vertices: Floats, faces: Integers, samples: Floats, sample_faces: Integers) -> Any:
     """Points (n, 3) of a mesh between its samples: middles of their edges, again and again, on to the surface."""
     corners = samples[sample_faces]
     area = 0.5 * np.linalg.norm(np.cross(*(corners[:, k] - corners[:, 0] for k in (1, 2))), axis=1).sum()

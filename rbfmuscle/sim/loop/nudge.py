@@ -118,7 +118,7 @@ def settle(stepper: MuscleStepper, coordinates: Mapping[str, float]) -> None:
     points = stepper.model.contact_points().copy()
     small = SETTLED * float(np.linalg.norm(np.ptp(points, axis=0)))
     for _ in range(MOST_SOLVES):
-        stepper.solve(coordinates)
+        stepper.solve(dict(coordinates))
         before, points = points, stepper.model.contact_points().copy()
         if np.abs(points - before).max() <= small:
             return
