@@ -90,13 +90,17 @@ def _write_surfaces(source, labels, folder):
         meshes.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"cannot write to {folder}: {error.strerror}; choose another --output") from None
-    values = volume.values()
+    values, files = volume.values(), set()
     with Progress("surfaces", "label") as progress:
         for done, label in enumerate(values, start=1):
             name = volume.name(label)
             several = bool(bone_class(name)) and not says_muscle(name)
             surface = label_surface(volume, int(label), pieces=several)
-            surface.mesh.export(meshes / f"{re.sub(r'[^A-Za-z0-9_-]+', '_', surface.name)}.ply")
+            file = re.sub(r"[^A-Za-z0-9_-]+", "_", surface.name)
+            if file.lower() in files:  # two labels of one name are two parts
+                file = f"{file}_{int(label)}"
+            files.add(file.lower())
+            surface.mesh.export(meshes / f"{file}.ply")
             for note in surface.notes:
                 print(f"{surface.name}: {note}")
             progress(done, len(values))

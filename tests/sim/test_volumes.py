@@ -140,6 +140,16 @@ def test_folder_of_masks_is_a_volume(tmp_path):
     assert sorted(volume.names.values()) == ["soleus", "tibia"] and len(volume.values()) == 2
 
 
+def test_two_labels_of_one_name_are_two_meshes(tmp_path):
+    from rbfmuscle.commands.new import _write_surfaces
+
+    labels = ball_labels(split=np.array([1.0, 0, 0])).astype(np.int16)
+    source = write_nifti(tmp_path / "a.nii", labels, np.eye(4))
+    (tmp_path / "names.csv").write_text("1,Soleus\n2,soleus\n")
+    folder = _write_surfaces(source, tmp_path / "names.csv", tmp_path / "out")
+    assert sorted(path.name for path in folder.iterdir()) == ["Soleus.ply", "soleus_2.ply"]
+
+
 def _hostile(tmp_path):
     good = ball_labels(split=np.array([1.0, 0, 0])).astype(np.int16)
     eye = np.eye(4)

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.ndimage import label as connected
 
+from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.validation import MeshError
 
 # Deviation of the Gaussian [voxels], and how often what it lost is smoothed again.
@@ -153,8 +154,8 @@ def _contour(field, level):
 
 def _volume_and_area(vertices, faces):
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    cross = np.cross(b - a, c - a)
-    return abs(float(np.einsum("ij,ij->", a, cross)) / 6.0), float(np.linalg.norm(cross, axis=1).sum() / 2.0)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0
+    return abs(mesh_volume(vertices, faces)), float(area)
 
 
 def _decimate(vertices, faces, edge):
