@@ -41,6 +41,7 @@ def write_scene(
         found.scene.motion = found.scene.motion_from(MotionOptions(file=file), folder=directory)
         found.notes += found.scene.motion.notes
         parts.append(table_text("[motion]", {"file": file}))
+    parts.append(model_text(found, directory, matches or []))
     parts += [muscle_text(match, directory) for match in matches or []]
     target = directory / "scene.toml"
     try:
@@ -48,6 +49,13 @@ def write_scene(
     except OSError as error:
         raise UsageError(f"cannot write {target}: {error.strerror}; choose another --output") from None
     return target
+
+
+def model_text(found: Imported, directory: Path, matches: list[Match]) -> str:
+    """Return the table that tells a scene of which model it is, and of which muscles its own are."""
+    file = os.path.relpath(found.model.path.resolve(), directory.resolve())
+    held = {match.name: [path.name for path in match.paths] for match in matches if len(match.ends) > 1}
+    return table_text("[opensim]", {"model": file, **({"muscles": held} if held else {})})
 
 
 def muscle_text(match: Match, directory: Path) -> str:

@@ -42,6 +42,7 @@ def documented_tables():
         options.SurfaceOptions: "`[output]`",
         options.FibreOptions: "`[output]`",
         options.ArmOptions: "`[output]`",
+        options.OpenSimOptions: "`[opensim]`",
         keys.ContractionTable: CONTRACTION,
         keys.CourseTable: CONTRACTION,
         keys.TendonTable: CONTRACTION,

@@ -223,7 +223,7 @@ class Sampling:
 
     def _fingerprint(self):
         facts = self.scene.resolved()
-        for key in ("motion", "output", "file"):
+        for key in ("motion", "output", "file", "opensim"):
             facts.pop(key, None)
         facts["muscles"] = sorted(json.dumps(m, default=str, sort_keys=True) for m in facts["muscles"])
         return hashlib.sha256(json.dumps(facts, default=str, sort_keys=True).encode()).hexdigest()

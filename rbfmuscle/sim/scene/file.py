@@ -27,6 +27,7 @@ from rbfmuscle.sim.scene.options import (
     ContactOptions,
     DetectOptions,
     MotionOptions,
+    OpenSimOptions,
     OutputOptions,
     Positive,
     SlidingOptions,
@@ -102,6 +103,7 @@ class SceneFile(Table):
     sliding: SlidingOptions | None = None
     detect: DetectOptions | None = None
     output: OutputOptions = OutputOptions()
+    opensim: OpenSimOptions | None = None
 
 
 def read_scene_file(path: Path) -> SceneFile:
@@ -182,6 +184,8 @@ def _build(scene, tables, folder, path, skeleton):
     scene.sliding = tables.sliding
     scene.detect = tables.detect
     scene.output = tables.output
+    if tables.opensim is not None:
+        scene.opensim = tables.opensim.model_copy(update={"model": str(folder / tables.opensim.model)})
     return scene if skeleton and not tables.muscle else scene.validate()
 
 
@@ -262,6 +266,7 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
         "sliding": scene.sliding.model_dump() if scene.sliding else None,
         "detect": scene.detect.model_dump() if scene.detect else None,
         "output": scene.output.model_dump(),
+        "opensim": scene.opensim.model_dump() if scene.opensim else None,
     }
 
 

@@ -207,6 +207,13 @@ class OutputOptions(Table):
         return {} if value is True else value
 
 
+class OpenSimOptions(Table):
+    """``[opensim]``: the model that a scene is of, and which of its muscles each muscle is."""
+
+    model: str
+    muscles: dict[str, Annotated[list[str], Field(min_length=1)]] = Field(default_factory=dict)
+
+
 class RampOptions(Table):
     """One coordinate from one value to another [degree or scene unit]."""
 

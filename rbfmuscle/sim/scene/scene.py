@@ -60,6 +60,8 @@ class Scene:
     sliding : SlidingOptions or None
     detect : DetectOptions or None
     output : OutputOptions
+    opensim : OpenSimOptions or None
+        The model that the scene is of.
     path : pathlib.Path or None
         The file it was loaded from.
 
@@ -87,6 +89,7 @@ class Scene:
         self.sliding = None
         self.detect: Any = None
         self.output = OutputOptions()
+        self.opensim: Any = None
         self.path = None
 
     @classmethod
@@ -323,6 +326,8 @@ class Scene:
                 )
             if muscle.contraction is not None:
                 self._check_contraction(muscle)
+        for name in self.opensim.muscles if self.opensim else ():
+            _find(self.muscles, name, "muscle", place="[opensim]")
         return self
 
     def _check_contraction(self, muscle: Muscle) -> None:

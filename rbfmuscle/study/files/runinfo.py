@@ -152,7 +152,8 @@ def machine() -> dict[str, Any]:
 
 def input_hashes(scene: Scene) -> dict[str, Any]:
     """SHA-256 of the scene file and of every mesh file it names; files that are gone are left out."""
-    sources = [scene.path, *(item.source for item in [*scene.bones, *scene.muscles])]
+    model = scene.opensim.model if scene.opensim else None
+    sources = [scene.path, model, *(item.source for item in [*scene.bones, *scene.muscles])]
     found = {}
     for source in dict.fromkeys(str(s) for s in sources if s):
         path = Path(source)

@@ -96,10 +96,19 @@ class SavedRun:
         pose = self.poses[first][name]
         return (vertices - pose[:3, 3]) @ pose[:3, :3], faces
 
-    def series(self, muscle: str, quantity: str) -> tuple[Integers, Floats]:
-        """Frames and values of a quantity of a muscle, as two arrays."""
-        found = [(r.frame, r.value) for r in self.metrics if r.muscle == muscle and r.quantity == quantity]
+    def series(self, muscle: str, quantity: str, coordinate: str | None = None) -> tuple[Integers, Floats]:
+        """Frames and values of a quantity of a muscle, of moment arms those of a coordinate, as two arrays."""
+        found = [
+            (r.frame, r.value)
+            for r in self.metrics
+            if r.muscle == muscle and r.quantity == quantity and coordinate in (None, r.coordinate)
+        ]
         return np.array([f for f, _ in found]), np.array([v for _, v in found], dtype=float)
+
+    def arm_coordinates(self, muscle: str | None = None) -> list[str]:
+        """The coordinates that a muscle, or any, has moment arms about, in their order in ``metrics.csv``."""
+        rows = (r for r in self.metrics if r.quantity == "moment_arm" and muscle in (None, r.muscle))
+        return list(dict.fromkeys(r.coordinate for r in rows))
 
     def has_surfaces(self) -> bool:
         """Whether there is something to draw."""

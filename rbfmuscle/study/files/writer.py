@@ -33,6 +33,7 @@ _OLD_FILES = (
     "fibres.pvd",
     "fibre_lengths.csv",
     "metrics.csv",
+    "opensim.csv",
     "report.html",
     "preview.webp",
 )

@@ -9,7 +9,7 @@ import numpy as np
 
 from rbfmuscle.study.measure.metrics import ALL
 from rbfmuscle.study.show.appearance import line_colours
-from rbfmuscle.study.show.plots import PLOT_STYLE, motion_axis
+from rbfmuscle.study.show.plots import PLOT_STYLE, arm_unit, motion_axis
 
 if TYPE_CHECKING:
     from rbfmuscle.study.files.saved import SavedRun
@@ -21,8 +21,6 @@ _WORST = (
     ("Surface inside a bone, worst muscle", "penetration_max", 1.0, None),
     ("Bone inside a muscle, worst muscle", "bone_penetration_max", 1.0, None),
 )
-# Of each muscle.
-_EACH = (("Length", "length", 1.0), ("Moment arm", "moment_arm", 1.0))
 
 
 def plot_models(runs: dict[str, SavedRun]) -> list[tuple[str, bytes]]:
@@ -50,11 +48,14 @@ def plot_models(runs: dict[str, SavedRun]) -> list[tuple[str, bytes]]:
         for title, quantity, factor, unit in _WORST:
             tracks = {name: _worst(run, quantity, factor) for name, run in runs.items()}
             pictures.append(_plot(title, tracks, axis, label, unit or first.units))
-        for title, quantity, factor in _EACH:
-            for muscle in first.muscles:
-                tracks = {name: run.series(muscle, quantity) for name, run in runs.items()}
-                tracks = {name: (frames, factor * values) for name, (frames, values) in tracks.items()}
-                pictures.append(_plot(f"{title}: {muscle}", tracks, axis, label, first.units))
+        for muscle in first.muscles:
+            tracks = {name: run.series(muscle, "length") for name, run in runs.items()}
+            pictures.append(_plot(f"Length: {muscle}", tracks, axis, label, first.units))
+        for muscle in first.muscles:
+            for about in first.arm_coordinates(muscle):
+                tracks = {name: run.series(muscle, "moment_arm", about) for name, run in runs.items()}
+                title = f"Moment arm: {muscle}, {about}"
+                pictures.append(_plot(title, tracks, axis, label, arm_unit(first, about)))
     return [picture for picture in pictures if picture is not None]
 
 

@@ -39,7 +39,6 @@ PANELS = (
     ("Time a frame", "time_frame", 1000.0, "ms", False),
     ("Edge strain of the carried mesh (RMS)", "edge_strain_rms", 100.0, "%", False),
     ("Length", "length", 1.0, None, False),
-    ("Moment arm", "moment_arm", 1.0, None, False),
 )
 
 
@@ -83,12 +82,18 @@ def plot_panels(saved: SavedRun) -> list[tuple[str, bytes]]:
 
     axis, label = motion_axis(saved)
     pictures = []
+    panels = [(*panel, None) for panel in PANELS]
+    # About one coordinate after the other: arms about several are no one line, nor of one unit.
+    panels += [
+        (f"Moment arm: {name}", "moment_arm", 1.0, arm_unit(saved, name), False, name)
+        for name in saved.arm_coordinates()
+    ]
     with matplotlib.rc_context(PLOT_STYLE):
-        for title, quantity, factor, unit, both in PANELS:
+        for title, quantity, factor, unit, both, coordinate in panels:
             figure = Figure(figsize=(4.6, 2.7), layout="constrained")
             FigureCanvasSVG(figure)
             axes = figure.add_subplot()
-            if not _draw_lines(axes, saved, quantity, factor, axis):
+            if not _draw_lines(axes, saved, quantity, factor, axis, coordinate):
                 continue
             _draw_limit(axes, saved, quantity, factor, both)
             axes.set_title(title)
@@ -100,9 +105,17 @@ def plot_panels(saved: SavedRun) -> list[tuple[str, bytes]]:
     return pictures
 
 
-def _draw_lines(axes, saved, quantity, factor, axis):
+def arm_unit(saved: Any, coordinate: str) -> str:
+    """Unit of the moment arms about a coordinate of a saved run."""
+    shift = saved.info.get("scene", {}).get("coordinate_units", {}).get(coordinate, "").strip()
+    return "1" if shift else saved.units
+
+
+def _draw_lines(axes, saved, quantity, factor, axis, coordinate=None):
     colours = line_colours(saved.muscles)
-    tracks = [(muscle, saved.series(muscle, quantity), colours[muscle]) for muscle in saved.muscles]
+    tracks = [
+        (muscle, saved.series(muscle, quantity, coordinate), colours[muscle]) for muscle in saved.muscles
+    ]
     if quantity == "time_frame":
         tracks.append(("all together", saved.series(ALL, quantity), "#222222"))
     tracks = [(name, *series, colour) for name, series, colour in tracks if len(series[0])]

@@ -11,6 +11,7 @@ from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.metrics import QUANTITIES
 from rbfmuscle.study.measure.summary import LEAST, within
 from rbfmuscle.study.show.appearance import line_colours
+from rbfmuscle.study.show.model_paths import beside_section
 from rbfmuscle.study.show.page import EXPLANATION, PAGE, STYLE, embedded_image
 from rbfmuscle.study.show.plots import plot_panels
 from rbfmuscle.study.show.render import VIEWS, chosen_frames, draw_pictures
@@ -105,6 +106,7 @@ def _page(saved, images, moving, reason):
         plots="".join(
             f"<figure>{embedded_image(data, 'svg+xml', title)}</figure>" for title, data in plot_panels(saved)
         ),
+        beside=beside_section({"run": saved}),
         table=_summary(saved),
         stages=_stages(saved),
         events=_events(saved),
