@@ -19,6 +19,7 @@ def export(
     units: str | None = None,
     frames: str | None = None,
     ascii: Annotated[bool, Parameter(negative="")] = False,
+    up: str = "z",
 ) -> None:
     """Write the surfaces of a run in other formats and units.
 
@@ -27,24 +28,29 @@ def export(
     directory
         Folder of the run.
     formats
-        pvd, vtp, ply, stl, obj or glb, or sto for lengths and moment arms; several may be given.
+        pvd, vtp, ply, stl, obj or glb: files for each frame; usd, animated-glb or vtkhdf: all frames as an
+        animation; sto: lengths and moment arms. Several may be given.
     output
         Folder to write to, DIR/export by default.
     units
-        m, cm or mm; the scene's by default (glb: m).
+        m, cm or mm; the scene's by default (glb, animated-glb: m).
     frames
         Of the written frames, as A:B:S.
     ascii
         VTP as text, as OpenSim reads it.
+    up
+        z or y: the scene's axis that points up, for usd and animated-glb.
     """
     with Progress(f"export {directory}"):
         from rbfmuscle.sim.scene.settings import parse_slice
         from rbfmuscle.study.files.export import export_run
 
         chosen = parse_slice(frames) if frames is not None else None
-        written = export_run(directory, formats, output=output, units=units, frames=chosen, ascii=ascii)
+        written = export_run(
+            directory, formats, output=output, units=units, frames=chosen, ascii=ascii, up=up
+        )
     folders = sorted({str(path.parent) for path in written})
-    print(f"{len(written)} files in {', '.join(folders)}")
+    print(f"{len(written)} file{'s'[: len(written) != 1]} in {', '.join(folders)}")
 
 
 def render(

@@ -260,6 +260,7 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
         "motion": {
             **scene.motion.options.model_dump(by_alias=True, exclude_none=True),
             "frames": len(scene.motion.frames),
+            **({} if scene.motion.times is None else {"times": scene.motion.times}),
         },
         "muscles": [_describe_muscle(muscle) for muscle in scene.muscles],
         "contact": scene.contact.model_dump(),

@@ -1,4 +1,4 @@
-"""A saved run in other formats and units: surfaces as PVD with VTP, PLY, STL, OBJ, GLB; lengths as STO."""
+"""A saved run in other formats and units: a file a frame, an animation in one file, lengths as tables."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from rbfmuscle.study.show.appearance import BONE_COLOUR, muscle_colours
 from rbfmuscle.validation import SolveError, UsageError
 
 FORMATS = ("pvd", "vtp", "ply", "stl", "obj", "glb")
+ANIMATIONS = ("usd", "animated-glb", "vtkhdf")
 TABLES = ("sto",)
 
 
@@ -27,6 +28,7 @@ def export_run(
     units: str | None = None,
     frames: slice | None = None,
     ascii: bool = False,
+    up: str = "z",
 ) -> list[Path]:
     """Write the muscles and bones of a saved run in one or more formats.
 
@@ -35,17 +37,20 @@ def export_run(
     directory : path
         Folder of the run.
     formats : str or list of str
-        Of `FORMATS` and `TABLES`. ``glb`` gives one file a frame with all muscles and bones as named,
-        coloured nodes; the others one file a muscle (or bone) and frame. ``pvd`` is ``vtp`` and a collection
-        over the frames. ``sto`` gives lengths and moment arms for OpenSim and needs no surfaces.
+        Of `FORMATS`, `ANIMATIONS` and `TABLES`. ``glb`` gives one file a frame with all muscles and bones as
+        named, coloured nodes; the others of `FORMATS` one file a muscle (or bone) and frame. ``pvd`` is ``vtp`` and
+        a collection over the frames. ``usd`` and ``animated-glb`` give one file of all frames, ``vtkhdf`` one a
+        muscle and bone. ``sto`` gives lengths and moment arms for OpenSim and needs no surfaces.
     output : path, optional
         ``DIR/export`` where not given; each format has its own folder there.
     units : {"m", "cm", "mm"}, optional
-        The scene's unit where not given; metres for ``glb``, which knows no other.
+        The scene's unit where not given; metres for ``glb`` and ``animated-glb``, which know no other.
     frames : slice, optional
         Of the written frames; all where not given.
     ascii : bool
         VTP as plain numbers, as OpenSim reads them.
+    up : {"z", "y"}
+        The axis of the scene that points up, for ``usd`` and ``animated-glb``.
 
     Returns
     -------
@@ -55,17 +60,15 @@ def export_run(
     Raises
     ------
     UsageError
-        If the folder holds no run, or a format or unit is unknown.
+        If the folder holds no run, or a format or unit is unknown, or a surface does not keep its vertices.
     SolveError
         If a file cannot be written.
+    MissingPartError
+        If a format needs a package that is absent.
     """
     saved = SavedRun(directory)
     formats = [formats] if isinstance(formats, str) else list(formats)
-    for name in formats:
-        if name not in FORMATS + TABLES:
-            raise UsageError(f"unknown format {name!r}; known: {', '.join(FORMATS + TABLES)}")
-    if units is not None and units not in MM_PER_UNIT:
-        raise UsageError(f"units must be m, cm or mm, got {units!r}")
+    _check_words(formats, units, up)
     chosen = saved.frames[frames] if frames is not None else saved.frames
     if not chosen or not (saved.has_surfaces() or set(formats) <= set(TABLES)):
         raise UsageError(f"{directory} has no surfaces to export")
@@ -73,10 +76,13 @@ def export_run(
     written = []
     try:
         for name in formats:
-            wanted = units or ("m" if name == "glb" else saved.units)
+            wanted = units or ("m" if name in ("glb", "animated-glb") else saved.units)
             factor = MM_PER_UNIT[saved.units] / MM_PER_UNIT[wanted]
             if name == "sto":
                 written += export_lengths(saved, base / name, chosen, factor)
+                continue
+            if name in ANIMATIONS:
+                written += _export_animation(saved, base / name, name, chosen, wanted, up)
                 continue
             act = _export_glb if name == "glb" else _export_meshes
             written += act(saved, base / name, name, chosen, factor, ascii)
@@ -85,10 +91,45 @@ def export_run(
     return written
 
 
+def _check_words(formats, units, up):
+    known = FORMATS + ANIMATIONS + TABLES
+    for name in formats:
+        if name not in known:
+            raise UsageError(f"unknown format {name!r}; known: {', '.join(known)}")
+    if units is not None and units not in MM_PER_UNIT:
+        raise UsageError(f"units must be m, cm or mm, got {units!r}")
+    if up not in ("z", "y"):
+        raise UsageError(f"up must be z or y, got {up!r}")
+    if "usd" in formats:
+        from rbfmuscle.study.animation.usd import check_usd
+
+        check_usd()
+
+
 def posed(saved: SavedRun, bone: tuple[str, Floats], frame: int) -> Floats:
     """Vertices of a bone in a frame, from its (vertices, faces) at rest and the poses."""
     pose = saved.poses[frame][bone[0]]
     return bone[1] @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _export_animation(saved, folder, name, frames, unit, up):
+    from rbfmuscle.study.animation.moving import read_moving
+
+    if name == "animated-glb" and unit != "m":
+        raise UsageError(f"animated-glb is in metres by its standard; leave out --units {unit}")
+    run = read_moving(saved, frames, unit=unit, up=up)
+    folder.mkdir(parents=True, exist_ok=True)
+    if name == "vtkhdf":
+        from rbfmuscle.study.animation.vtkhdf import write_vtkhdf
+
+        return write_vtkhdf(folder, run)
+    path = folder / f"{run.name}{'.usdc' if name == 'usd' else '.glb'}"
+    if name == "usd":
+        from rbfmuscle.study.animation.usd import write_usd as write
+    else:
+        from rbfmuscle.study.animation.gltf import write_animated_glb as write
+    write(path, run)
+    return [path]
 
 
 def _export_meshes(saved, folder, name, frames, factor, ascii):
@@ -115,7 +156,10 @@ def _export_meshes(saved, folder, name, frames, factor, ascii):
             )
     written = [folder / file for steps in groups.values() for _, entries in steps for _, file in entries]
     if name == "pvd":
-        written += [_write_collection(folder / f"{group}.pvd", steps) for group, steps in groups.items()]
+        written += [
+            _write_collection(folder / f"{group}.pvd", steps, saved.times or {})
+            for group, steps in groups.items()
+        ]
     return written
 
 
@@ -132,10 +176,10 @@ def _export_fibres(saved, folder, frame, factor, ascii):
     return entries
 
 
-def _write_collection(path, steps):
+def _write_collection(path, steps, times):
     collection = Collection(path)
     for frame, entries in steps:
-        collection.add(frame, entries)
+        collection.add(times.get(frame, frame), entries)
     collection.close()
     return path
 

@@ -56,20 +56,42 @@ def read_mesh(path: str | Path) -> tuple[Floats, Integers]:
     MeshError
         If the file is missing or holds no triangles.
     """
+    vertices, faces, _ = read_mesh_values(path)
+    return vertices, faces
+
+
+def read_mesh_values(path: str | Path) -> tuple[Floats, Integers, dict[str, Floats]]:
+    """Vertices and faces of a mesh file that a run has left, and the values of its vertices by name (VTP).
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    vertices : (n, 3) ndarray
+    faces : (m, 3) ndarray of int
+    values : dict of str to (n,) ndarray
+
+    Raises
+    ------
+    MeshError
+        If the file is missing or holds no triangles.
+    """
     path = Path(path)
     if not path.is_file():
         raise MeshError(f"{path} is missing")
     if path.suffix == ".vtp":
         from rbfmuscle.sim.formats.polydata import read_polydata, triangles_of
 
-        data = read_polydata(path)
-        return data.points, triangles_of(data)
+        data = read_polydata(path, values=True)
+        return data.points, triangles_of(data), data.point_values
     import trimesh
 
     mesh = trimesh.load_mesh(path, process=path.suffix == ".stl")
     if not len(getattr(mesh, "faces", ())):
         raise MeshError(f"{path} holds no triangles")
-    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces), {}
 
 
 def _obj_text(mesh):

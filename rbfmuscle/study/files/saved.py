@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.study.files.meshfiles import SUFFIXES, read_mesh
+from rbfmuscle.study.files.meshfiles import SUFFIXES, read_mesh, read_mesh_values
 from rbfmuscle.study.measure.metrics import Row
 from rbfmuscle.validation import MeshError, UsageError
 
@@ -85,9 +85,19 @@ class SavedRun:
             found.setdefault(int(row[0]), {})[row[1]] = np.array(row[2:], dtype=float).reshape(4, 4)
         return found
 
+    @cached_property
+    def times(self) -> dict[int, float] | None:
+        """Time of each frame [s], None where the motion has none."""
+        found = self.info["scene"].get("motion", {}).get("times")
+        return None if found is None else dict(enumerate(map(float, found)))
+
     def surface(self, muscle: str, frame: int) -> tuple[Floats, Integers]:
         """Vertices and faces of a muscle in a frame."""
         return read_mesh(self._file("surfaces", muscle, frame))
+
+    def surface_values(self, muscle: str, frame: int) -> tuple[Floats, Integers, dict[str, Floats]]:
+        """Vertices and faces of a muscle in a frame, and what the run kept of each vertex by name."""
+        return read_mesh_values(self._file("surfaces", muscle, frame))
 
     def bone(self, name: str) -> tuple[Floats, Integers]:
         """Vertices and faces of a bone at rest."""

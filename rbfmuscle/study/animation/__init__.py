@@ -1,0 +1,1 @@
+"""A run as one moving thing: USD, animated glTF and VTKHDF."""
