@@ -124,16 +124,13 @@ def _load(name, target_context):
 
 
 class _Listener(event.Listener):
-    """Tells who watches; frees the lock of a loop that could not be compiled (else it is written first)."""
+    """Tells who watches. The locks are freed after this, once the loop is written, or could not be compiled."""
 
     def on_start(self, event: Any) -> None:
         tell_begin(event.data["dispatcher"])
 
     def on_end(self, event: Any) -> None:
-        loop = event.data["dispatcher"]
-        tell_end(loop)
-        if event.is_failed and isinstance(loop._cache, LoopCache):
-            loop._cache.let_go(event.data["args"])
+        tell_end(event.data["dispatcher"])
 
 
 _LISTENER = _Listener()
