@@ -6,7 +6,7 @@ Both are one run, a generator of frames, and differ in the sink that takes them.
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from datetime import UTC, datetime
 from typing import Any
 
@@ -20,6 +20,7 @@ from rbfmuscle.sim.loop.frame import Event, Frame
 from rbfmuscle.sim.loop.simulate import simulate_frames
 from rbfmuscle.sim.scene.check import bone_collisions, bone_findings, check_initial
 from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.study.files.resume import left_behind
 from rbfmuscle.study.files.runinfo import Stages, build_info, frame_facts
 from rbfmuscle.study.files.sinks import MemorySink, Sink
 from rbfmuscle.study.files.writer import RunWriter
@@ -95,6 +96,7 @@ def stream_run(
     pictures: bool = True,
     progress: Callable[[int, int], None] | None = None,
     watch: Callable[[list, Frame | None], None] | None = None,
+    resume: bool = False,
 ) -> dict:
     """Run a scene and write it to a folder frame by frame; memory does not grow with the frames.
 
@@ -111,6 +113,9 @@ def stream_run(
         Draw pictures for the report and the preview.
     watch : callable, optional
         Called as ``watch(models, None)`` before the motion and ``watch(models, frame)`` with every frame.
+    resume : bool
+        Go on behind the last whole frame of the run that the folder holds, if it holds one; the folder then is
+        the same as that of a run that was not interrupted, but for times.
 
     Returns
     -------
@@ -120,7 +125,8 @@ def stream_run(
     Raises
     ------
     UsageError
-        If a setting is unknown or impossible, or the folder cannot be written to.
+        If a setting is unknown or impossible, the folder cannot be written to, or what shall be resumed is another
+        scene's run, or another version's.
     SolveError
         If a frame cannot be solved or written; frames so far are kept.
     LimitExceededError
@@ -130,8 +136,15 @@ def stream_run(
     """
     scene = configure_scene(scene, settings, model=model, frames=frames)
     limits = parse_limits(fail_on, scene)
-    recording = Recording(scene, options=_asked(model, settings, frames))
-    writer = RunWriter(directory, scene)
+    kept = left_behind(directory, scene) if resume else None
+    if kept is not None and kept.info["status"] == "complete":
+        require_limits(kept.info["muscles"], limits)
+        return kept.info
+    state = kept.state if kept is not None else None
+    recording = Recording(scene, options=_asked(model, settings, frames), resumable=True)
+    writer = RunWriter(directory, scene, state and state["files"])
+    if state:
+        recording.go_on(state, kept.rows)
     recording.feed(writer, progress=progress, watch=watch)
     return _finish(recording, writer, limits, pictures)
 
@@ -159,6 +172,7 @@ def _finish(recording, writer, limits, pictures):
             )
     info = recording.info()
     writer.write_info(info)
+    writer.finish()
     require_limits(recording.summary.table(), limits)
     if missing is not None:
         raise missing
@@ -306,9 +320,11 @@ class Recording:
         As it shall be run.
     options : dict, optional
         What the caller asked for, for ``run.json``.
+    resumable : bool
+        Give the sink what `go_on` needs, frame by frame.
     """
 
-    def __init__(self, scene: Scene, *, options: dict | None = None) -> None:
+    def __init__(self, scene: Scene, *, options: dict | None = None, resumable: bool = False) -> None:
         self.started, self._start = datetime.now(UTC), time.perf_counter()
         self.scene = scene.validate()
         self.options = options or {}
@@ -317,6 +333,7 @@ class Recording:
         self.status, self.message = "running", ""
         self.summary, self.stages = Summary(), Stages()
         self.written: list[dict] = []
+        self.resumable, self._behind = resumable, None
         with self.timed("compile"):
             compile_ahead({muscle.model for muscle in scene.muscles})
         with self.timed("build"), tell_stage("building"):
@@ -336,6 +353,27 @@ class Recording:
         finally:
             self.times[part] = self.times.get(part, 0.0) + time.perf_counter() - start
 
+    def go_on(self, state: dict, rows: list[Row]) -> None:
+        """Go on behind a frame: what a sink was given to keep with it, and the rows that were complete by then."""
+        self._behind, self.written = state["loop"], list(state["written"])
+        self._start -= state["times"].pop("wall", 0.0)
+        for part, seconds in state["times"].items():
+            self.times[part] = self.times.get(part, 0.0) + seconds
+        self.stages.go_on(state["stages"])
+        self.summary.add(rows)
+        if self.recorder is not None:
+            self.recorder.go_on(state["recorder"])
+
+    def _state(self, frame):
+        """What `go_on` needs behind a frame."""
+        return {
+            "loop": frame.state,
+            "written": self.written,
+            "times": {**self.times, "wall": time.perf_counter() - self._start},
+            "stages": self.stages.state(),
+            "recorder": None if self.recorder is None else self.recorder.state(),
+        }
+
     def feed(
         self,
         sink: Sink,
@@ -354,7 +392,9 @@ class Recording:
                     watch(self.models, frame)
                 with self.timed("write"):
                     sink.write(frame, rows)
-                self.written.append(frame_facts(self.scene, frame))
+                    self.written.append(frame_facts(self.scene, frame))
+                    if self.resumable:
+                        sink.keep(self._state(frame))
                 if progress is not None:
                     progress(len(self.written), len(self.scene.motion))
             self.status, self.message = "complete", ""
@@ -364,13 +404,17 @@ class Recording:
         finally:
             rows = self.recorder.finish() if self.recorder is not None else []
             self.summary.add(rows)
-            sink.close(rows)
-            sink.write_info(self.info())
+            # What ended the run says more than a disk that then refuses the rest.
+            with suppress(*((SolveError,) if self.status == "failed" else ())):
+                sink.close(rows)
+                sink.write_info(self.info())
 
     def frames(self) -> Iterator[tuple[Frame, list[Row]]]:
         """The frames as they are solved, each with the rows of metrics that became complete with it."""
         wanted = bool(self.scene.output.surfaces) or self.recorder is not None
-        frames = simulate_frames(self.scene, self.models, surfaces=wanted)
+        frames = simulate_frames(
+            self.scene, self.models, surfaces=wanted, resumable=self.resumable, start=self._behind
+        )
         while True:
             with (
                 self.timed("simulate"),

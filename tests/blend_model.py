@@ -51,6 +51,9 @@ class BlendMuscle:
     def restore(self, state):
         self.x = state.copy()
 
+    def continue_drawing(self, quantities):
+        pass
+
     def carried_mesh(self):
         return self.x.copy(), self.faces
 

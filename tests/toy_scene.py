@@ -156,6 +156,9 @@ class ToyMuscle:
     def restore(self, state):
         self.x, self.target = state[0].copy(), state[1].copy()
 
+    def continue_drawing(self, quantities):
+        pass
+
     def carried_mesh(self):
         return self.x.copy(), self.faces
 

@@ -70,6 +70,7 @@ def run(
     settings: Annotated[list[str] | None, Parameter(name="--set", negative="")] = None,
     frames: str | None = None,
     fail_on: str | None = None,
+    resume: Annotated[bool, Parameter(negative="")] = False,
     as_json: Json = False,
 ) -> None:
     """Run a scene through its motion and write surfaces, metrics and a report.
@@ -88,6 +89,8 @@ def run(
         Frames of the motion, as A:B:S (B not included).
     fail_on
         Limits that end with exit code 6, for instance volume_error=0.001,penetration_max, or all.
+    resume
+        Go on behind the last whole frame of the run that the folder holds, if it holds one.
     as_json
         Print JSON and nothing else.
     """
@@ -109,10 +112,11 @@ def run(
         settings=changes,
         fail_on=fail_on,
         as_json=as_json,
+        resume=resume,
     )
 
 
-def _run_scene(load, output, *, title, model, frames, settings, fail_on, as_json):
+def _run_scene(load, output, *, as_json, title, resume=False, **asked):
     from rbfmuscle import interruption
 
     start = time.perf_counter()
@@ -132,11 +136,9 @@ def _run_scene(load, output, *, title, model, frames, settings, fail_on, as_json
             info = stream_run(
                 scene,
                 output,
-                model=model,
-                frames=frames,
-                settings=settings,
-                fail_on=fail_on,
                 progress=advance,
+                resume=resume,
+                **asked,
             )
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"interrupted, {done} frames are kept in {output}") from None

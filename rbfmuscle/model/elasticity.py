@@ -129,16 +129,17 @@ class ElasticSolver:
         """Deformation gradient (K, 3, 3) at each centre."""
         return self.shape.deformation
 
-    def snapshot(self) -> tuple[np.ndarray, np.ndarray]:
+    def snapshot(self) -> tuple[np.ndarray, ...]:
         """State that ``restore`` brings back."""
-        return self.shape.quaternion.copy(), self.contact.forces.copy()
+        shape = self.shape
+        parts = shape.quaternion, shape.target, shape.deformation, self.contact.forces
+        return tuple(part.copy() for part in parts)
 
-    def restore(self, state: tuple[np.ndarray, np.ndarray], x: np.ndarray) -> None:
-        """Return to an earlier ``snapshot``, with the centres (K, 3) of that moment."""
-        quaternion, forces = state
-        self.shape.quaternion[:] = quaternion
+    def restore(self, state: tuple[np.ndarray, ...]) -> None:
+        """Return to an earlier ``snapshot``, to the last digit: a run that resumes goes on from one."""
+        shape = self.shape
+        shape.quaternion[:], shape.target[:], shape.deformation[:], forces = state
         self.contact.forces = forces.copy()
-        self.shape.localise(x)
 
     def carry(self, x: np.ndarray) -> np.ndarray:
         """Contact points at centres x with the present targets, (K + S, 3)."""

@@ -251,7 +251,7 @@ class Interior:
             self.trend,
         )
 
-    def restore(self, state: Any, centres: Floats | None = None) -> None:
+    def restore(self, state: Any) -> None:
         """Return to an earlier ``snapshot``."""
         self.y, self.quaternion, self.pressure, self.forces, self.anchor = (part.copy() for part in state[:5])
         self.trend, self.begun = state[5], None

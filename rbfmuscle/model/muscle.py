@@ -127,7 +127,11 @@ class RBFMuscle:
         """Go back to a snapshot."""
         points, solver = state
         self.points = points.copy()
-        self.solver.restore(solver, self.points)
+        self.solver.restore(solver)
+
+    def continue_drawing(self, quantities: Mapping[str, float]) -> None:
+        """Begin the next drawing where one with these quantities ended."""
+        self.drawer.level = quantities.get("level", 0.0)
 
     def normals(self) -> np.ndarray:
         """Unit normals at the centres, turned with the local deformation by its cofactor, (K, 3)."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from blend_model import arm_scene, files_in, use_blend_model
+from run_folders import timeless
 
 from rbfmuscle.run import simulate, stream_run
 from rbfmuscle.sim.scene.scene import Scene
@@ -23,29 +24,6 @@ def blend(monkeypatch):
 def table(path):
     with open(path, encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
-
-
-def timeless(path):
-    """What a file holds, without what a clock wrote into it."""
-    if path.name == "run.json":
-        return without_times(json.loads(path.read_text()))
-    if path.name == "metrics.csv":
-        lines = path.read_text().splitlines()
-        return [line.rsplit(",", 2)[0] if ",time_" in line else line for line in lines]
-    return path.read_bytes()
-
-
-def without_times(value):
-    """A JSON value whose clock readings are None: their keys stay."""
-    clocks = ("started", "written", "wall", "times", "stages", "frame_time")
-    if isinstance(value, dict):
-        return {
-            key: (sorted(item) if isinstance(item, dict) else None)
-            if key in clocks or key.startswith("time_")
-            else without_times(item)
-            for key, item in value.items()
-        }
-    return [without_times(item) for item in value] if isinstance(value, list) else value
 
 
 class TestSimulate:

@@ -90,6 +90,17 @@ class BoneContacts:
             raise ValueError(f"poses lack the bone {missing[0]!r}")
         self.poses = poses
 
+    def snapshot(self) -> tuple[Any, ...]:
+        """What `restore` needs: the poses, and what earlier queries left behind."""
+        known = {str(b): (anchor.copy(), bound.copy()) for b, (anchor, bound) in self._known.items()}
+        return dict(self.poses), known
+
+    def restore(self, state: tuple[Any, ...]) -> None:
+        """Go back to a snapshot."""
+        poses, known = state
+        self.poses = dict(poses)
+        self._known = {int(b): (anchor.copy(), bound.copy()) for b, (anchor, bound) in known.items()}
+
     def frozen(self) -> BoneContacts:
         """These obstacles as they stand, for questions from another thread while the bones move on."""
         other = copy.copy(self)

@@ -78,6 +78,8 @@ class Frame:
         For each muscle and each coordinate that moves it, a `Nudged`; empty where no moment arms were asked for.
     activations : dict of str to float
         Of the muscles that contract.
+    state : dict
+        What a loop needs to go on from this frame; empty where it was not asked for.
     """
 
     index: int
@@ -91,6 +93,7 @@ class Frame:
     fibres: dict = field(default_factory=dict)
     nudged: dict = field(default_factory=dict)
     activations: dict = field(default_factory=dict)
+    state: dict = field(default_factory=dict)
 
 
 class Drawing(Protocol):
@@ -148,6 +151,9 @@ class MuscleModel(Protocol):
 
     def restore(self, state: Any) -> None:
         """Go back to a snapshot; it can be used again."""
+
+    def continue_drawing(self, quantities: Mapping[str, float]) -> None:
+        """Begin the next drawing where one with these quantities ended: for a run that resumes."""
 
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next :meth:`solve` settles under; for muscles that contract."""

@@ -243,6 +243,23 @@ class Sliding:
             for link in [*self.links[stepper.name], *self.bone_links[stepper.name]]:
                 link.update()
 
+    def snapshot(self) -> dict[str, Any]:
+        """What `restore` needs: by muscle, what is linked and where its links were measured last."""
+        return {
+            name: [(link.linked.copy(), link.before) for link in links]
+            + [(link.linked.copy(), None) for link in self.bone_links[name]]
+            for name, links in self.links.items()
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go back to a snapshot."""
+        for name, found in state.items():
+            links = self.links[name]
+            for link, (linked, before) in zip([*links, *self.bone_links[name]], found):
+                link.linked = linked.copy()
+                if link in links:
+                    link.before = before
+
     def measure(self, stepper: Any) -> Any:
         """Worst of what a muscle's links say: a dict of quantities, empty without neighbours."""
         with stepper.timed("sliding"):

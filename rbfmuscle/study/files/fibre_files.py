@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.study.files.vtp import Collection, write_vtp_lines
@@ -22,15 +21,17 @@ class FibreFiles:
     Parameters
     ----------
     directory : pathlib.Path
+    table : (csv.writer, file)
+        Of ``fibre_lengths.csv``.
+    end : int, optional
+        Of the collection that is there, see `Collection`.
     """
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, table: tuple[Any, Any], end: int | None = None) -> None:
         self.directory = directory
         (directory / "fibres").mkdir(exist_ok=True)
-        self._file = open(directory / "fibre_lengths.csv", "w", encoding="utf-8", newline="")  # noqa: SIM115
-        self._table = csv.writer(self._file, lineterminator="\n")
-        self._table.writerow(COLUMNS)
-        self._collection = Collection(directory / "fibres.pvd")
+        self._table, self._file = table
+        self.collection = Collection(directory / "fibres.pvd", end)
 
     def write(self, frame: Frame) -> None:
         """Write the fibres of all muscles in a frame."""
@@ -45,12 +46,7 @@ class FibreFiles:
             for fibre, (length, ratio) in enumerate(zip(lines.lengths.tolist(), stretch.tolist())):
                 self._table.writerow((frame.index, muscle, fibre, length, ratio))
         self._file.flush()
-        self._collection.add(frame.index, entries)
-
-    def close(self) -> None:
-        """End the files."""
-        self._file.close()
-        self._collection.close()
+        self.collection.add(frame.index, entries)
 
 
 def read_fibres(path: Path) -> tuple[Floats, dict[str, Floats]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
+import json
 import os
 import platform
 from collections import defaultdict
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 import rbfmuscle
+from rbfmuscle.sim.contraction.course import activation_course
 from rbfmuscle.sim.loop.frame import Frame
 from rbfmuscle.sim.scene.motion import shown_value
 from rbfmuscle.sim.scene.scene import Scene
@@ -74,6 +76,7 @@ def build_info(
         "versions": versions(),
         "machine": machine(),
         "inputs": input_hashes(scene),
+        "content": content_hash(scene),
         "times": times,
         "compiled": compiled,
         "stages": stages.table(),
@@ -110,6 +113,19 @@ class Stages:
                 for key, value in source.items():
                     if key.startswith("time_"):
                         self._values[name][key].append(float(value))
+
+    def state(self) -> dict[str, Any]:
+        """All times so far, for `go_on`."""
+        return {
+            name: {key: np.array(values) for key, values in found.items()}
+            for name, found in self._values.items()
+        }
+
+    def go_on(self, state: dict[str, Any]) -> None:
+        """Take over the times of the frames before."""
+        for name, found in state.items():
+            for key, values in found.items():
+                self._values[name][key].extend(values.tolist())
 
     def table(self) -> dict[str, Any]:
         """Nested dict: muscle -> stage -> total, median, 95th percentile and first [s]."""
@@ -148,6 +164,17 @@ def machine() -> dict[str, Any]:
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "threads": numba.get_num_threads(),
     }
+
+
+def content_hash(scene: Scene) -> str:
+    """SHA-256 of what the resolved scene names or counts only: attached vertices, fibres, activations, frames."""
+    held = [[[a.bone, [int(v) for v in a.vertices]] for a in muscle.attachments] for muscle in scene.muscles]
+    fibres = [[np.asarray(line).tolist() for line in muscle.fibres or []] for muscle in scene.muscles]
+    courses = [activation_course(m, scene.motion) for m in scene.muscles if m.contraction is not None]
+    track = [sorted(frame.items()) for frame in scene.motion.frames]
+    facts = [held, fibres, courses, track, scene.motion.times]
+    text = json.dumps(facts, default=lambda value: np.asarray(value).tolist())
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def input_hashes(scene: Scene) -> dict[str, Any]:

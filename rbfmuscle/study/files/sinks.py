@@ -17,6 +17,9 @@ class Sink(Protocol):
     def write(self, frame: Frame, rows: Sequence[Row] = ()) -> None:
         """Take a frame, and the rows of metrics that are complete by now: those of the frame before."""
 
+    def keep(self, state: dict[str, Any]) -> None:
+        """Take what a resumed run needs beside the frame just written."""
+
     def close(self, rows: Sequence[Row] = ()) -> None:
         """Take the last rows; nothing follows but `write_info`."""
 
@@ -44,6 +47,9 @@ class MemorySink:
         self.frames.append(frame)
         self.rows.extend(rows)
         self._complete.append(len(self.rows))
+
+    def keep(self, state: dict[str, Any]) -> None:
+        """Nothing: memory ends with the process."""
 
     def close(self, rows: Sequence[Row] = ()) -> None:
         """Keep the last rows."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+import errno
+import os
 import zlib
 from pathlib import Path
 from typing import Any
@@ -104,20 +106,25 @@ def _compressed(data):
 class Collection:
     """A .pvd file that is complete after every frame, so that an interrupted run can be opened.
 
+    Its ``end`` is the number of bytes before the closing tags.
+
     Parameters
     ----------
     path : path
         The files that it names are relative to its folder.
+    end : int, optional
+        Go on with the collection that is there, of which so many bytes count; else begin a new one.
     """
 
     _HEAD = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n<Collection>\n'
     _TAIL = "</Collection>\n</VTKFile>\n"
 
-    def __init__(self, path: str | Path) -> None:
-        self._file = open(path, "w", encoding="utf-8", newline="\n")  # noqa: SIM115
-        self._file.write(self._HEAD)
-        self._end = self._file.tell()
-        self._close_tags()
+    def __init__(self, path: str | Path, end: int | None = None) -> None:
+        # Unbuffered: entries and closing tags go to the disk in one piece.
+        self._file = open(path, "wb" if end is None else "r+b", buffering=0)  # noqa: SIM115
+        if end is None:
+            end = self._file.write(self._HEAD.encode())
+        self.roll_back(end)
 
     def add(self, time: float, entries: list[tuple[str, str]]) -> None:
         """Add one time step.
@@ -127,17 +134,25 @@ class Collection:
         time : float
         entries : list of (name, file)
         """
-        self._file.seek(self._end)
-        for part, (name, file) in enumerate(entries):
-            what = f'group="" part="{part}" name={quoteattr(name)} file={quoteattr(file)}'
-            self._file.write(f'<DataSet timestep="{time}" {what}/>\n')
-        self._end = self._file.tell()
-        self._close_tags()
+        lines = [
+            f'<DataSet timestep="{time}" group="" part="{part}" name={quoteattr(name)} file={quoteattr(file)}/>\n'
+            for part, (name, file) in enumerate(entries)
+        ]
+        self._write("".join(lines))
+
+    def roll_back(self, end: int) -> None:
+        """Forget what was added beyond this ``end``."""
+        self.end = end
+        self._file.truncate(end)
+        self._write("")
 
     def close(self) -> None:
         """End the file."""
         self._file.close()
 
-    def _close_tags(self):
-        self._file.write(self._TAIL)
-        self._file.flush()
+    def _write(self, text):
+        data = text.encode()
+        self._file.seek(self.end)
+        if self._file.write(data + self._TAIL.encode()) < len(data) + len(self._TAIL):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        self.end += len(data)

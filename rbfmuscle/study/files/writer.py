@@ -6,12 +6,15 @@ import csv
 import json
 import math
 import os
+import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rbfmuscle.study.files.checkpoint import NAME, write_checkpoint
 from rbfmuscle.study.files.meshfiles import SUFFIXES, write_mesh
 from rbfmuscle.study.files.vtp import Collection
 from rbfmuscle.validation import SolveError, UsageError
@@ -36,7 +39,10 @@ _OLD_FILES = (
     "opensim.csv",
     "report.html",
     "preview.webp",
+    NAME,
 )
+# Share of a run's time that goes into checkpoints, at most.
+KEEPING_SHARE = 0.02
 
 
 class RunWriter:
@@ -48,6 +54,9 @@ class RunWriter:
         Made where it is missing. A run that lies there already is replaced.
     scene : Scene
         Its ``output`` table says which parts are written.
+    kept : dict, optional
+        What `state` gave after the last frame of the run that lies there and is to go on; what was written
+        since is taken away.
 
     Raises
     ------
@@ -55,27 +64,29 @@ class RunWriter:
         If the folder cannot be written to.
     """
 
-    def __init__(self, directory: str | Path, scene: Scene) -> None:
+    def __init__(self, directory: str | Path, scene: Scene, kept: dict[str, Any] | None = None) -> None:
         self.directory = Path(directory)
         self.scene = scene
-        self.count = 0
         output = scene.output
         self.format = output.surfaces.format if output.surfaces else None
+        kept = kept or {"last": -1, "count": 0, "sizes": {}, "ends": {}, "bones": {}}
+        self.count, self._last, self._bone_files = kept["count"], kept["last"], dict(kept["bones"])
+        self._keeper, self._failed = _Keeper(self.directory / NAME), False
         try:
-            self._clear()
-            self._tables = [
-                self._table("poses.csv", POSES_COLUMNS),
-                self._table("events.csv", EVENTS_COLUMNS),
-            ]
-            if output.metrics:
-                self._tables.append(self._table("metrics.csv", METRICS_COLUMNS))
-            self._collections = self._open_collections()
-            self._fibres = _fibre_files(self.directory) if output.fibres else None
+            self._clear(everything=not kept["sizes"])
+            self._tables = {name: self._table(name, columns, kept) for name, columns in _tables(output)}
+            names = ("surfaces", "bones") if self.format == "pvd" else ()
+            ends = {name: kept["ends"].get(name) for name in (*names, "fibres")}
+            self._collections = {n: Collection(self.directory / f"{n}.pvd", ends[n]) for n in names}
+            self._fibres = None
+            if output.fibres:
+                self._fibres = _fibre_files(self.directory, self._tables["fibre_lengths.csv"], ends["fibres"])
+                self._collections["fibres"] = self._fibres.collection
         except OSError as error:
             raise UsageError(
                 f"cannot write to {self.directory}: {error.strerror}; choose another folder"
             ) from None
-        self._bone_files = {}
+        self._good = self.state()
 
     def write(self, frame: Frame, rows: Sequence[Any] = ()) -> None:
         """Write one frame and the rows of metrics that are complete by now.
@@ -93,22 +104,43 @@ class RunWriter:
         try:
             self._write(frame, rows)
         except OSError as error:
+            self._roll_back(frame.index, rows)
             kept = f"{self.count} frames are kept in {self.directory}"
             raise SolveError(f"cannot write frame {frame.index}: {error.strerror}; {kept}") from None
-        self.count += 1
+        self.count, self._last = self.count + 1, frame.index
+        self._good = self.state()
+
+    def keep(self, state: dict[str, Any]) -> None:
+        """Keep what a resumed run needs beside the frame just written; not after every one, if that takes long."""
+        self._keeper.take({**state, "files": self._good})
 
     def close(self, rows: Sequence[Any] = ()) -> None:
-        """Write the last rows of metrics and close all files."""
+        """Write the last rows of metrics and close all files; after a frame that could not be written, nothing."""
+        self._keeper.flush()
+        if self._failed:
+            return
         try:
             self._add_rows(rows)
-            for _, file in self._tables:
+            for _, file in self._tables.values():
                 file.close()
             for collection in self._collections.values():
                 collection.close()
-            if self._fibres is not None:
-                self._fibres.close()
         except OSError as error:
             raise SolveError(f"cannot finish the tables in {self.directory}: {error.strerror}") from None
+
+    def state(self) -> dict[str, Any]:
+        """What stands in the folder now, for a writer that goes on: sizes [byte], and the bones written last."""
+        return {
+            "last": self._last,
+            "count": self.count,
+            "sizes": {name: os.fstat(file.fileno()).st_size for name, (_, file) in self._tables.items()},
+            "ends": {name: collection.end for name, collection in self._collections.items()},
+            "bones": dict(self._bone_files),
+        }
+
+    def finish(self) -> None:
+        """Nothing is left to resume."""
+        (self.directory / NAME).unlink(missing_ok=True)
 
     def write_info(self, info: dict[str, Any]) -> None:
         """Write ``run.json`` in one piece: a reader finds the old one or the new one, never half of it.
@@ -129,12 +161,12 @@ class RunWriter:
             write_mesh(self.directory / file, surface.vertices, surface.faces)
             entries.append((name, file))
         bones = self._write_bones(frame) if self.format is not None else []
-        if self._collections:
+        if "bones" in self._collections:
             times = self.scene.motion.times
             step = frame.index if times is None else times[frame.index]
             self._collections["bones"].add(step, bones)
             self._collections["surfaces"].add(step, entries)
-        (poses, poses_file), (events, events_file) = self._tables[:2]
+        (poses, poses_file), (events, events_file) = self._tables["poses.csv"], self._tables["events.csv"]
         poses.writerows(
             [frame.index, bone, *(repr(float(x)) for x in pose.ravel())] for bone, pose in frame.poses.items()
         )
@@ -147,7 +179,7 @@ class RunWriter:
 
     def _add_rows(self, rows):
         if self.scene.output.metrics:
-            metrics, file = self._tables[2]
+            metrics, file = self._tables["metrics.csv"]
             metrics.writerows(rows)
             file.flush()
 
@@ -165,38 +197,104 @@ class RunWriter:
             entries.append((bone.name, known[1]))
         return entries
 
-    def _clear(self):
-        """Make the folders, without the files of a run that was here before."""
-        self.directory.mkdir(parents=True, exist_ok=True)
-        for old in _OLD_FILES:
-            (self.directory / old).unlink(missing_ok=True)
+    def _roll_back(self, frame, rows):
+        """Leave the folder as it was before a frame that could not be written, with the rows of the one before.
+
+        What the disk still allows: nothing here can be told better than the first refusal.
+        """
+        self._failed = True
+        for name, (_, file) in self._tables.items():
+            with suppress(OSError):
+                file.close()
+            with suppress(OSError):
+                os.truncate(self.directory / name, self._good["sizes"][name])
+        for name, collection in self._collections.items():
+            with suppress(OSError):
+                collection.roll_back(self._good["ends"][name])
+                collection.close()
+        self._remove(frame - 1)
+        if self.scene.output.metrics:
+            table = self.directory / "metrics.csv"
+            try:
+                with open(table, "a", encoding="utf-8", newline="") as file:
+                    csv.writer(file, lineterminator="\n").writerows(rows)
+            except OSError:
+                os.truncate(table, self._good["sizes"][table.name])
+
+    def _remove(self, last):
+        """Take the meshes of all frames after ``last`` away."""
         for folder in ("surfaces", "bones", "fibres"):
             for file in (self.directory / folder).glob("*_[0-9][0-9][0-9][0-9]*.*"):
-                file.unlink()
-            if self.format is not None and folder != "fibres":
-                (self.directory / folder).mkdir(exist_ok=True)
+                if int(file.stem.rpartition("_")[2]) > last:
+                    file.unlink(missing_ok=True)
 
-    def _table(self, name, columns):
-        file = open(self.directory / name, "w", encoding="utf-8", newline="")  # noqa: SIM115
+    def _clear(self, everything):
+        """Make the folders, without the files of a run that was here before, or of frames that are not kept."""
+        self.directory.mkdir(parents=True, exist_ok=True)
+        for old in _OLD_FILES if everything else ():
+            (self.directory / old).unlink(missing_ok=True)
+        self._remove(self._last)
+        for folder in ("surfaces", "bones") if self.format is not None else ():
+            (self.directory / folder).mkdir(exist_ok=True)
+
+    def _table(self, name, columns, kept):
+        size = kept["sizes"].get(name)
+        mode = "w" if size is None else "r+"
+        file = open(self.directory / name, mode, encoding="utf-8", newline="")  # noqa: SIM115
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        file.flush()
+        if size is None:
+            writer.writerow(columns)
+            file.flush()
+        else:
+            file.truncate(size)
+            file.seek(size)
         return writer, file
 
-    def _open_collections(self):
-        if self.format != "pvd":
-            return {}
-        return {name: Collection(self.directory / f"{name}.pvd") for name in ("surfaces", "bones")}
+
+class _Keeper:
+    """Writes checkpoints as often as takes a small share of the time; the last one in any case."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.cost, self.written = path, 0.0, -math.inf
+        self.waiting: dict[str, Any] | None = None
+
+    def take(self, state: dict[str, Any]) -> None:
+        """Write a state, or hold it until the next one or the end."""
+        self.waiting = state
+        if time.perf_counter() - self.written >= self.cost / KEEPING_SHARE:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what is held; a full disk keeps the one before."""
+        if self.waiting is None:
+            return
+        start, state, self.waiting = time.perf_counter(), self.waiting, None
+        with suppress(OSError):
+            write_checkpoint(self.path, state)
+        self.written = time.perf_counter()
+        self.cost = self.written - start
+
+
+def _tables(output):
+    """Name and columns of each table that a run writes."""
+    found = [("poses.csv", POSES_COLUMNS), ("events.csv", EVENTS_COLUMNS)]
+    if output.metrics:
+        found.append(("metrics.csv", METRICS_COLUMNS))
+    if output.fibres:
+        from rbfmuscle.study.files.fibre_files import COLUMNS
+
+        found.append(("fibre_lengths.csv", COLUMNS))
+    return found
 
 
 def _degrees(coordinates):
     return {name: math.degrees(value) for name, value in coordinates.items()}
 
 
-def _fibre_files(directory):
+def _fibre_files(directory, table, end):
     from rbfmuscle.study.files.fibre_files import FibreFiles
 
-    return FibreFiles(directory)
+    return FibreFiles(directory, table, end)
 
 
 def write_json(path: Path, data: dict[str, Any]) -> None:
@@ -204,22 +302,23 @@ def write_json(path: Path, data: dict[str, Any]) -> None:
     path = Path(path)
     part = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        part.write_text(json.dumps(_plain(data), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        part.write_text(json.dumps(plain(data), indent=1, allow_nan=False) + "\n", encoding="utf-8")
         os.replace(part, path)
     except OSError as error:
         part.unlink(missing_ok=True)
         raise SolveError(f"cannot write {path}: {error.strerror}") from None
 
 
-def _plain(value):
+def plain(value: Any) -> Any:
+    """A tree as JSON can hold it: NaN and infinity become null, what is no plain value its text."""
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, np.generic):
         value = value.item()
     elif isinstance(value, np.ndarray):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value if isinstance(value, (str, int, float, bool, type(None))) else str(value)

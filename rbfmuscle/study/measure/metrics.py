@@ -142,6 +142,22 @@ class MetricsRecorder:
         self._waiting = rows
         return done
 
+    def state(self) -> dict[str, Any]:
+        """What `go_on` needs behind the frame measured last."""
+        path = [(coordinates, list(lengths.items()), index) for coordinates, lengths, index in self._path]
+        return {
+            "path": path,
+            "waiting": self._waiting,
+            "trackers": {name: tracker.state() for name, tracker in self.trackers.items()},
+        }
+
+    def go_on(self, state: dict[str, Any]) -> None:
+        """Take over what another recorder knew."""
+        self._path = [(coordinates, dict(lengths), index) for coordinates, lengths, index in state["path"]]
+        self._waiting = [Row(*row) for row in state["waiting"]]
+        for name, found in state["trackers"].items():
+            self.trackers[name].go_on(found)
+
     def finish(self) -> list[Row]:
         """Rows of the last frame."""
         done = self._waiting + (self._arms(len(self._path) - 1) if self._waiting else [])
@@ -202,6 +218,13 @@ class _Tracker:
         self.arms = {}
         self.scene = scene
         self.offset = None
+
+    def state(self) -> tuple[Any, ...]:
+        return self.length, self.rest_measured, self.offset, list(self.arms.items())
+
+    def go_on(self, state: tuple[Any, ...]) -> None:
+        self.length, self.rest_measured, self.offset, arms = state
+        self.arms = {frame: [Row(*row) for row in rows] for frame, rows in arms}
 
     def length_of(self, frame: Frame) -> float:
         if self.line is None:

@@ -1,0 +1,26 @@
+"""Comparing the folders of two runs: all that a clock did not write."""
+
+import json
+
+
+def timeless(path):
+    """What a file holds, without what a clock wrote into it."""
+    if path.name == "run.json":
+        return without_times(json.loads(path.read_text()))
+    if path.name == "metrics.csv":
+        lines = path.read_text().splitlines()
+        return [line.rsplit(",", 2)[0] if ",time_" in line else line for line in lines]
+    return path.read_bytes()
+
+
+def without_times(value):
+    """A JSON value whose clock readings are None: their keys stay."""
+    clocks = ("started", "written", "wall", "times", "stages", "frame_time")
+    if isinstance(value, dict):
+        return {
+            key: (sorted(item) if isinstance(item, dict) else None)
+            if key in clocks or key.startswith("time_")
+            else without_times(item)
+            for key, item in value.items()
+        }
+    return [without_times(item) for item in value] if isinstance(value, list) else value
