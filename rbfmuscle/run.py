@@ -137,14 +137,13 @@ def stream_run(
     scene = configure_scene(scene, settings, model=model, frames=frames)
     limits = parse_limits(fail_on, scene)
     kept = left_behind(directory, scene) if resume else None
-    if kept is not None and kept.info["status"] == "complete":
+    if kept is not None and kept.state is None:
         require_limits(kept.info["muscles"], limits)
         return kept.info
-    state = kept.state if kept is not None else None
     recording = Recording(scene, options=_asked(model, settings, frames), resumable=True)
-    writer = RunWriter(directory, scene, state and state["files"])
-    if state:
-        recording.go_on(state, kept.rows)
+    writer = RunWriter(directory, scene, kept and kept.state["files"])
+    if kept is not None:
+        recording.go_on(kept.state, kept.rows)
     recording.feed(writer, progress=progress, watch=watch)
     return _finish(recording, writer, limits, pictures)
 

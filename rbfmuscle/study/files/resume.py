@@ -37,7 +37,7 @@ class LeftBehind(NamedTuple):
     """
 
     info: dict[str, Any]
-    state: dict[str, Any] | None
+    state: Any
     rows: list[Row]
 
 
