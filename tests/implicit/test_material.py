@@ -6,7 +6,7 @@ import trimesh
 
 from rbfmuscle.geometry.crossing import FaceTree, crossing_faces
 from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.implicit.extraction.material import MaterialMesh, carry_material, fit_material
+from rbfmuscle.implicit.extraction.material import MaterialMesh, _Fitting, carry_material, fit_material
 from rbfmuscle.implicit.extraction.obstacles import ObstaclePoints
 
 BALL = trimesh.creation.icosphere(3)
@@ -84,6 +84,17 @@ def test_what_the_cut_takes_away_lies_on_it():
     assert on_cut.sum() > 50
     np.testing.assert_allclose(np.linalg.norm(found.vertices[~on_cut], axis=1), 1.0, atol=1e-6)
     assert not crossing_faces(found.vertices, found.faces).any()
+
+
+def test_the_last_step_to_the_volume_drives_nothing_into_a_bone():
+    """Beside what lies on the bone the level's last step moves vertices, here by 0.7 % of the radius."""
+    cut = Bone(5.0, (5.9, 0.0, 0.0))
+    fitting = _Fitting(mesh_of(), np.asarray(BALL.vertices), Sphere(), cut, 0.0)
+    fitting.reach(0.97 * VOLUME)
+    fitting.meet(0.99 * VOLUME)
+    vertices = fitting.projector.vertices
+    assert cut(vertices).min() > -1e-9
+    assert mesh_volume(vertices, BALL.faces) == pytest.approx(0.99 * VOLUME, rel=1e-12)
 
 
 def test_bone_vertices_end_up_outside():

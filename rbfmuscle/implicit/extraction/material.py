@@ -35,6 +35,8 @@ UNTANGLE, GROWTH = 24, 4
 # rounds after, each followed by the way out of the bone.
 SUNK, STRAYED = 1.0, 1.5
 FILL_SWEEPS, GATHER, GATHER_SWEEPS = 150, 4, 12
+# Rounds in which the volume is met and what that drove into a bone is brought out.
+MEET = 4
 # Where both sides of a muscle sink into a bone, the far one stays above it by this share of a mean edge.
 LAMELLA = 0.02
 
@@ -260,15 +262,22 @@ class _Fitting:
             self.push_off(obstacles, 0.01 * self.edge, axes)
         smoothed, crossing = self.untangle()
         if volume is not None:
-            step = self.projector.volume_step(self.mesh.faces, volume, steps=4)
-            self.level += step
-            self.projector.shift(step)
+            self.meet(volume)
         vertices, faces = self.projector.vertices, self.mesh.faces
         check_finite(vertices, name="fitted vertices")
         return FittedMesh(
             vertices, faces, self.level, mesh_volume(vertices, faces), 1, 0, self.edge,
             self.evaluations, int(self.left.sum()), smoothed, crossing,
         )  # fmt: skip
+
+    def meet(self, volume: float) -> None:
+        """The volume to the last digit; what its last step drove into a bone is brought out and stays there."""
+        for turn in range(MEET + 1):
+            step = self.projector.volume_step(self.mesh.faces, volume, steps=4)
+            self.level += step
+            self.projector.shift(step)
+            if turn == MEET or not self.projector.lift():
+                break
 
     def gather(self) -> None:
         """Close the surface over what is deep in a bone: a sheet that is folded over it would cross itself."""

@@ -107,10 +107,11 @@ class Projector:
         self.vertices[rows], self.slope[rows] = part.vertices, part.slope
         self._direction[rows] = part._direction
 
-    def lift(self) -> None:
-        """Move vertices that lie in the cut onto it, and let these stay there when the level changes."""
+    def lift(self) -> int:
+        """Move vertices that lie in the cut onto it, and let these stay there when the level changes: how many."""
+        moved = 0
         if self._cut is None:
-            return
+            return moved
         rows = np.flatnonzero(self._near_cut)
         for _ in range(2):
             limit = self._limit(rows) * np.ones(len(rows))
@@ -119,9 +120,11 @@ class Projector:
             rows, distance, outward = rows[distance < 0], distance[distance < 0], outward[distance < 0]
             if len(rows) == 0:
                 break
+            moved = max(moved, len(rows))
             size = np.maximum(np.einsum("ij,ij->i", outward, outward), np.finfo(float).tiny)
             self.vertices[rows] -= (distance / size)[:, None] * outward
             self.hold(rows)
+        return moved
 
     def volume_step(self, faces: Integers, target: float, steps: int = 1) -> float:
         """Change of level that brings the mesh to the target volume, its vertices moving along their directions.
