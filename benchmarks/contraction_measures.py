@@ -106,6 +106,40 @@ def spindle(model, kept):
     )
 
 
+def tendon(model):
+    """A line on tendon while the belly between shortens by a fifth, the insertion following it on its slider.
+
+    ``shortening`` is what the belly is content with there, so that little but the shape's stiffness pulls the tendon.
+    """
+    scene = spindle_scene(
+        model=settings(model),
+        frames=5,
+        tendon={"length": TENDON["length"]},
+        shortening=0.8,
+        activation=[0, 1],
+    )
+    pulls = 0.2 * SPINDLE.belly_length * np.linspace(0.0, 1.0, 6)
+    run = simulate(with_frames(scene, pulls, SPINDLE.length))
+    rest, now = (run.frames[k].carried[MUSCLE][0] for k in (0, -1))
+    belly = belly_length(rest, now)
+    change = (SPINDLE.length - pulls[-1] - belly) / (SPINDLE.length - SPINDLE.belly_length) - 1.0
+    girth = [tendon_radius(run.frames[k].surfaces[MUSCLE].vertices, pulls[k]) for k in (0, -1)]
+    print(
+        f"  tendon           belly {100 * (belly / SPINDLE.belly_length - 1):+.1f} %, tendon's length "
+        f"{100 * change:+.2f} %, its radius {100 * (girth[1] / girth[0] - 1):+.2f} %",
+        flush=True,
+    )
+
+
+def tendon_radius(vertices, pull):
+    """Mean radius of the two tendons, between a fifth and four fifths of their lengths."""
+    half, end = 0.5 * SPINDLE.belly_length, 0.5 * SPINDLE.length
+    low, high = half + 0.2 * (end - half), half + 0.8 * (end - half)
+    left = (vertices[:, 0] < -low) & (vertices[:, 0] > -high)
+    right = (vertices[:, 0] + pull > low) & (vertices[:, 0] + pull < high)
+    return np.linalg.norm(vertices[left | right][:, 1:], axis=1).mean()
+
+
 def free_bar(model):
     """Lines for the bar whose end slides to where its fibres are content on average."""
     for stretch in (0.9, 0.8, 0.7):
@@ -187,24 +221,36 @@ def cost(model):
           f"{np.median(pairs[:, 1] / pairs[:, 0]):.3f}", flush=True)  # fmt: skip
 
 
+CASES = {
+    "spindle": lambda model: spindle(model, np.load(DATA)),
+    "tendon": tendon,
+    "panel": panel,
+    "ramps": ramps,
+    "cost": cost,
+    "free_bar": free_bar,
+}
+
+
 def main():
     """Run what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("action", choices=("models", "surface"))
     parser.add_argument("names", nargs="*", help="models, or the file of a surface")
     parser.add_argument("--activation", type=float, default=1.0)
+    parser.add_argument("--cases", default=",".join(CASES), help="some of the cases, by commas")
     given = parser.parse_args()
-    kept = np.load(DATA)
     if given.action == "surface":
         import trimesh
+
+        kept = np.load(DATA)
 
         mesh = trimesh.load(given.names[0], process=False)
         print(compare_spindle(np.asarray(mesh.vertices), np.asarray(mesh.faces), given.activation, kept))
         return
     for model in given.names or MODELS:
         print(model, flush=True)
-        for case in (lambda name: spindle(name, kept), panel, ramps, cost, free_bar):
-            case(model)
+        for case in given.cases.split(","):
+            CASES[case](model)
 
 
 if __name__ == "__main__":

@@ -19,9 +19,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.run import stream_run
 from rbfmuscle.sim.scene.file import read_scene_file
 from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.study.files.saved import SavedRun
+from rbfmuscle.study.measure.mesh_distance import MeshDistance
 
 HEADS = {
     "knee": [
@@ -185,9 +188,40 @@ class Watch:
             self.before[name] = vertices.copy()
 
 
-def figures(directory: Path, watch: Watch) -> list[dict]:
-    """The wanted figures of each muscle of a finished run."""
+def free_depth(scene: Scene, saved: SavedRun, muscle: str, trees: dict[str, ExactDistance]) -> float:
+    """Depth [mm] in any bone of the vertices that no bone holds, over the frames whose surface is in a bone.
+
+    A held end is carried rigidly by its bone, up to 35 mm away from it where the data lack the tendon; what drives it
+    into another bone is the motion, not the model.
+    """
+    own = scene.muscle(muscle)
+    rest = np.asarray(own.mesh.vertices)
+    held = np.zeros(len(rest), dtype=bool)
+    for attachment in own.attachments:
+        held[np.asarray(attachment.vertices)] = True
+    near = MeshDistance(rest, np.asarray(own.mesh.faces)[held[np.asarray(own.mesh.faces)].any(axis=1)])
+    start = saved.surface(muscle, saved.frames[0])[0]
+    free = near.unsigned(start) > 1.0
+    frames, depths = saved.series(muscle, "penetration_max")
+    worst = 0.0
+    for frame in frames[depths > 0.01]:
+        points = saved.surface(muscle, int(frame))[0][free]
+        for bone, tree in trees.items():
+            pose = saved.poses[int(frame)][bone]
+            inside = -tree.signed_distance((points - pose[:3, 3]) @ pose[:3, :3])
+            worst = max(worst, float(inside.max()))
+    return worst
+
+
+def figures(directory: Path, watch: Watch, scene: Scene) -> list[dict]:
+    """The wanted figures of each muscle of a finished run; jumps of the knee to 90 degrees apart, where tables end."""
     info = json.loads((directory / "run.json").read_text())
+    saved = SavedRun(directory)
+    angles = [frame["coordinates"].get("knee.knee_angle", 0.0) for frame in info["frames"]]
+    within = np.array(angles[1:]) <= 90.0
+    trees = {
+        b.name: ExactDistance(np.asarray(b.mesh.vertices), np.asarray(b.mesh.faces)) for b in scene.bones
+    }
     rows = []
     for name, facts in info["muscles"].items():
         moves = np.array(watch.moves[name])
@@ -197,8 +231,11 @@ def figures(directory: Path, watch: Watch) -> list[dict]:
                 "tunnelled": facts["tunnelled"]["worst"],
                 "volume_error": facts["volume_error"]["worst"],
                 "penetration_max": facts["penetration_max"]["worst"],
+                "penetration_free": free_depth(scene, saved, name, trees),
                 "jump_rms": float(moves[:, 0].max() / np.median(moves[:, 0])),
                 "jump_max": float(moves[:, 1].max() / np.median(moves[:, 1])),
+                "jump_max_90": float(moves[within, 1].max() / np.median(moves[within, 1])),
+                "jump_rms_90": float(moves[within, 0].max() / np.median(moves[within, 0])),
                 "jump_frame": int(moves[:, 1].argmax() + 1),
             }
         )
@@ -223,7 +260,7 @@ def main() -> None:
         stream_run(
             scene, directory, model=other, frames=arguments.frames, watch=watch, pictures=not arguments.no_pictures
         )  # fmt: skip
-        rows = figures(directory, watch)
+        rows = figures(directory, watch, scene)
         (directory / "figures.json").write_text(json.dumps(rows, indent=1) + "\n")
         for key, row in itertools.product(("worst",), rows):
             print(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -60,6 +60,7 @@ def render(
     frame: int | None = None,
     view: Annotated[list[str] | None, Parameter(negative="")] = None,
     seconds: float = 5.0,
+    colour: Literal["muscle", "activation", "stretch"] = "muscle",
 ) -> None:
     """Draw a run: a picture (.png) or an animation (.gif, .webp).
 
@@ -72,13 +73,15 @@ def render(
     frame
         Of a picture; the last one by default.
     view
-        front, side or back; may be repeated; all by default.
+        front, side, back or far (the other side); may be repeated; the first three by default.
     seconds
         Length of an animation.
+    colour
+        What muscles are coloured by: themselves, their activation, or the stretch of their fibres (output.fibres).
     """
     with Progress(f"render {directory}"):
         from rbfmuscle.study.show.render import render_run
 
         with tell_stage("drawing pictures"):
-            render_run(directory, output, frame=frame, views=view, seconds=seconds)
+            render_run(directory, output, frame=frame, views=view, seconds=seconds, colour=colour)
     print(output)

@@ -8,8 +8,11 @@ from peers.contraction_scenes import MUSCLE, SPINDLE, spindle_scene
 import rbfmuscle as rm
 from rbfmuscle.models import build_model
 from rbfmuscle.sim.loop.live import LiveSession
+from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.contraction import ContractionStudy, belly_measures, pennation, section_area
+from rbfmuscle.study.show.paint import check_colouring, painting
 from rbfmuscle.study.show.viewer import LiveViewer
+from rbfmuscle.validation import UsageError
 
 
 def test_section_of_a_tilted_ellipsoid():
@@ -102,3 +105,40 @@ def test_slider_of_a_live_scene_activates_and_colours():
     viewer.rest()
     assert viewer.coordinates[name][2] == 0.0
     viewer.close()
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """A run of the spindle with its fibres in files."""
+    folder = tmp_path_factory.mktemp("spindle")
+    scene = spindle_scene(
+        spacing=5.0, frames=1, model="arap-volume", tendon={"length": 100.0, "strain": 0.08}
+    )
+    rm.simulate(scene, settings={"output.fibres": True}).save(folder, pictures=False)
+    return SavedRun(folder)
+
+
+def test_pictures_are_coloured_by_activation_or_stretch(saved):
+    paint, chips = painting(saved, "activation", [0, 1])
+    points = saved.surface(MUSCLE, 1)[0]
+    assert [set(paint(saved, MUSCLE, frame, points)) for frame in (0, 1)] == [{0.0}, {1.0}]
+    assert next(iter(chips)) == "activation 0" and list(chips)[-1] == "activation 1"
+    paint, chips = painting(saved, "stretch", [0, 1])
+    at_rest, short = (paint(saved, MUSCLE, frame, points) for frame in (0, 1))
+    assert at_rest == pytest.approx(0.5, abs=1e-6)
+    # The belly shortens, tendon between fixed bones yields.
+    middle = np.abs(points[:, 0]) < 20.0
+    tendon = np.abs(np.abs(points[:, 0]) - 120.0) < 20.0
+    assert 0.0 <= short[middle].max() < 0.4 and 0.5 < short[tendon].min() <= 1.0
+    assert painting(saved, "muscle", [0])[0] is None
+
+
+def test_colours_of_what_a_run_has_not_are_refused(saved):
+    with pytest.raises(UsageError, match="known: muscle, activation, stretch"):
+        check_colouring(saved, "force")
+    saved.info["scene"]["output"]["fibres"] = False
+    with pytest.raises(UsageError, match=r"output\.fibres"):
+        check_colouring(saved, "stretch")
+    saved.metrics = [row for row in saved.metrics if row.quantity != "activation"]
+    with pytest.raises(UsageError, match="none of its muscles contracts"):
+        check_colouring(saved, "activation")

@@ -11,9 +11,8 @@ import numpy as np
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.show.appearance import muscle_colours
-from rbfmuscle.study.show.render import PAINT_COLOURS, Stage, caption, labelled, main, save_images
-
-_CHIPS = 5
+from rbfmuscle.study.show.paint import CHIPS, scale_chips
+from rbfmuscle.study.show.render import Stage, caption, labelled, main, save_images
 
 
 def _open(folder):
@@ -49,13 +48,9 @@ def _distance_paint(reference, limit):
 
 
 def _scale(limit, units):
-    from matplotlib import colormaps
-    from matplotlib.colors import to_hex
-
-    shares = np.linspace(0, 1, _CHIPS)
-    texts = [f"{limit * share:.3g} {units}" for share in shares]
+    texts = [f"{limit * share:.3g} {units}" for share in np.linspace(0, 1, CHIPS)]
     texts[-1] = f"{texts[-1]} or more"
-    return {text: to_hex(colormaps[PAINT_COLOURS](share)) for text, share in zip(texts, shares)}
+    return scale_chips(texts)
 
 
 if __name__ == "__main__":

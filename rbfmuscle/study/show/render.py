@@ -19,6 +19,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Integers
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.show.appearance import BACKGROUND, BONE_COLOUR, muscle_colours
+from rbfmuscle.study.show.paint import PAINT_COLOURS, check_colouring, painting
 from rbfmuscle.validation import MissingPartError, RBFMuscleError, UsageError
 
 # Where the camera stands; z is up, as in the medical axes (left, posterior, superior).
@@ -26,11 +27,13 @@ VIEWS = {
     "front": ((0.0, -1.0, 0.12), "from -y"),
     "side": ((-1.0, -0.12, 0.12), "from -x"),
     "back": ((0.0, 1.0, 0.12), "from +y"),
+    "far": ((1.0, -0.12, 0.12), "from +x"),
 }
+# What is drawn where nothing else is asked for.
+USUAL_VIEWS = ("front", "side", "back")
 ANIMATIONS = (".webp", ".gif")
 _STRIP = 30
 _PAINT = "paint"
-PAINT_COLOURS = "viridis"
 _BONE_TRIANGLES = 12_000
 # Coordinates that a caption names at most.
 MOST_SHOWN = 4
@@ -45,6 +48,7 @@ def render_run(
     views: list[str] | None = None,
     size: tuple[int, int] = (420, 520),
     seconds: float = 5.0,
+    colour: str = "muscle",
 ) -> None:
     """Draw a saved run to a picture or an animation.
 
@@ -57,11 +61,13 @@ def render_run(
     frame : int, optional
         Of a picture; the last one where not given.
     views : list of str, optional
-        Of `VIEWS`, side by side; all where not given.
+        Of `VIEWS`, side by side; `USUAL_VIEWS` where not given.
     size : (width, height)
         Of one view [pixel].
     seconds : float
         Length of an animation.
+    colour : {"muscle", "activation", "stretch"}
+        What muscles are coloured by.
 
     Raises
     ------
@@ -71,7 +77,7 @@ def render_run(
         If there are no graphics to draw with.
     """
     saved, output = SavedRun(directory), Path(output)
-    views = list(views or VIEWS)
+    views = list(views or USUAL_VIEWS)
     for view in views:
         if view not in VIEWS:
             raise UsageError(f"unknown view {view!r}; known: {', '.join(VIEWS)}")
@@ -79,15 +85,15 @@ def render_run(
         raise UsageError(f"{output}: the suffix must be .png, .gif or .webp")
     if not saved.has_surfaces():
         raise UsageError(f"{directory} has no surfaces to draw")
+    check_colouring(saved, colour)
     frame = saved.frames[-1] if frame is None else frame
     if frame not in saved.frames:
         raise UsageError(
             f"frame {frame} was not written; the run has {saved.frames[0]} to {saved.frames[-1]}"
         )
     frames = [frame] if output.suffix == ".png" else saved.frames
-    draw(
-        directory, [{"file": str(output.resolve()), "frames": frames, "views": views, "size": size}], seconds
-    )
+    job = {"file": str(output.resolve()), "frames": frames, "views": views, "size": size, "colour": colour}
+    draw(directory, [job], seconds)
 
 
 def draw(
@@ -353,12 +359,12 @@ def labelled(image: Integers, text: str, titles: list[Any], chips: dict[str, Any
 
 
 def _draw_job(saved, job, seconds, stages):
-    views = tuple(job["views"])
-    if (views, *job["size"]) not in stages:
-        stages[views, *job["size"]] = Stage([[(saved, view) for view in views]], job["size"])
-    stage = stages[views, *job["size"]]
+    views, colour = tuple(job["views"]), job.get("colour", "muscle")
+    paint, chips = painting(saved, colour, job["frames"])
+    if (views, *job["size"], colour) not in stages:
+        stages[views, *job["size"], colour] = Stage([[(saved, view) for view in views]], job["size"], paint)
+    stage = stages[views, *job["size"], colour]
     titles = [f"{view} ({VIEWS[view][1]})" for view in job["views"]]
-    chips = muscle_colours(saved.muscles)
     images = [labelled(stage.show(frame), caption(saved, frame), titles, chips) for frame in job["frames"]]
     save_images(images, job["file"], seconds)
 

@@ -14,7 +14,7 @@ from rbfmuscle.study.show.appearance import line_colours
 from rbfmuscle.study.show.model_paths import beside_section
 from rbfmuscle.study.show.page import EXPLANATION, PAGE, STYLE, embedded_image
 from rbfmuscle.study.show.plots import plot_panels
-from rbfmuscle.study.show.render import VIEWS, chosen_frames, draw_pictures
+from rbfmuscle.study.show.render import USUAL_VIEWS, chosen_frames, draw_pictures
 from rbfmuscle.validation import SolveError
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def _jobs(saved, folder, animation, pictures, preview):
     jobs = []
     if pictures:
         for frame in key_frames(saved):
-            job = {"file": str(folder / f"{frame:06d}.png"), "frames": [frame], "views": list(VIEWS)}
+            job = {"file": str(folder / f"{frame:06d}.png"), "frames": [frame], "views": list(USUAL_VIEWS)}
             jobs.append({**job, "size": _PICTURE_SIZE})
     if preview and len(saved.frames) > 1:
         job = {
