@@ -235,3 +235,18 @@ def test_shears_that_open_again_give_the_rest_shape_back():
     frames = list(simulate_frames(made, [model], fields=fields))
     back = frames[-1].surfaces["meat"].vertices
     assert np.sqrt(((back - model.rest) ** 2).sum(axis=1).mean()) < 0.5
+
+
+@pytest.mark.parametrize("points", [np.full((5, 3), 900.0), np.zeros((0, 3))], ids=["far", "none"])
+def test_nothing_near_is_no_contact_in_every_array(points):
+    contacts, _ = _pair()
+    found = contacts.half_spaces(points, 0.5)
+    assert len(found) == 0 and found.normal.shape == (0, 3)
+    assert found.index.shape == found.gap.shape == found.source.shape == (0,)
+    assert found.index.dtype.kind == found.source.dtype.kind == "i"
+
+
+def test_half_spaces_keep_their_arrays_of_one_length():
+    contacts, _ = _pair()
+    found = contacts.half_spaces(_points(), 1.0)
+    assert len(found) == len(found.index) == len(found.gap) == len(found.normal) == len(found.source) > 0

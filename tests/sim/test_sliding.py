@@ -8,6 +8,7 @@ from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, joint, muscle, sc
 
 from rbfmuscle.sim.loop.carried_surface import CarriedSurface
 from rbfmuscle.sim.loop.simulate import simulate_frames
+from rbfmuscle.sim.loop.sliding import sliding_pairs
 from rbfmuscle.sim.scene.motion import rotation_about
 from rbfmuscle.sim.scene.options import SlidingOptions
 from rbfmuscle.validation import SceneError
@@ -239,3 +240,21 @@ def test_pairs_name_who_slides_and_unknown_names_are_refused():
 def test_pairs_whose_swept_boxes_do_not_meet_cost_nothing():
     frames, _ = _run([{"press": a} for a in (0, 2)], SlidingOptions(), gap=80.0)
     assert "sliding_gap_max" not in frames[-1].surfaces["upper"].quantities
+
+
+@pytest.mark.parametrize("order", [("trunk", "arm"), ("arm", "trunk")])
+def test_who_slides_does_not_depend_on_the_order_of_bones(order):
+    """Two muscles of the trunk 40 mm apart: however an arm that one also hangs on swings, they meet or they do not."""
+    fields = {"trunk": sphere(1.0, (0, 0, -60)), "arm": box((1, 1, 1), (60, 0, -40))}
+    meshes = [ellipsoid((30, 4, 4), (0, 0, z)) for z in (0.0, 40.0)]
+    ends = [[attach(mesh, "trunk", lambda v: np.abs(v[:, 0]) > 25)] for mesh in meshes]
+    frames = [{"hinge.press": np.radians(angle)} for angle in range(0, 120, 5)]
+    made = scene(
+        [bone(name, fields[name]) for name in order],
+        [joint("hinge", "trunk", "arm", (-30, 0, 0), press=(0, 1, 0))],
+        [muscle(name, mesh, end) for name, mesh, end in zip(("near", "far"), meshes, ends)],
+        frames,
+        sliding=SlidingOptions(),
+    )
+    assert sliding_pairs(made, ["near", "far"], 5.0) == set()
+    assert sliding_pairs(made, ["near", "far"], 35.0) == {frozenset(("near", "far"))}

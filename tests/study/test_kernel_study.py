@@ -1,6 +1,9 @@
 """The kernel study on a mesh of known shape, and its command."""
 
+import html
 import json
+import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +11,7 @@ import trimesh
 from command_line import call
 
 import rbfmuscle as rm
-from rbfmuscle.study.show.kernel_page import write_study
+from rbfmuscle.study.show.kernel_page import named, write_study
 from rbfmuscle.validation import MeshError, UsageError
 
 
@@ -123,3 +126,21 @@ def test_command_tells_the_extremes(tmp_path, capsys):
     assert code == 2 and "--centres must be whole numbers of 4 and more, got '150 some'" in err
     code, _, err = call(capsys, "kernels", "-o", tmp_path)
     assert code == 2 and "which surface" in err
+
+
+def test_page_tells_and_pastes_whichever_row_is_recommended(study, tmp_path):
+    """The words, the figure and the lines to paste are of one row, that of the recommendation."""
+    rows = [row for row in study.rows if not row["unfit"]]
+    for row in (rows[0], rows[1], rows[-1]):
+        chosen = replace(
+            study, recommended=replace(study.recommended, row=row, quickest=rows[2], most_accurate=rows[3])
+        )
+        write_study(chosen, tmp_path, pictures=False)
+        page = (tmp_path / "kernels.html").read_text()
+        text = html.unescape(page.split("<h2>To paste</h2><pre>")[1].split("</pre>")[0])
+        pasted = tomllib.loads(text)["muscle"]["model"]
+        assert pasted["kernel"] == row["kernel"] and pasted["centres"] == row["centres"]
+        assert pasted.get("epsilon", row["epsilon"]) == pytest.approx(row["epsilon"], rel=1e-5)
+        assert f"Recommended: <b>{html.escape(named(row))}</b>" in page
+        assert f"For speed: {named(rows[2])}, {rows[2]['rms']:.3g} RMS" in html.unescape(page)
+        assert f"The smallest figure: {named(rows[3])}, {rows[3]['rms']:.3g} RMS" in html.unescape(page)

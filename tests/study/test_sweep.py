@@ -10,6 +10,8 @@ import time
 import numpy as np
 import pytest
 from blend_model import arm_scene, use_blend_model
+from hypothesis import given
+from hypothesis import strategies as st
 
 from rbfmuscle.app import run_command as command
 from rbfmuscle.commands.sweep import run_point
@@ -20,6 +22,7 @@ from rbfmuscle.study.experiment.sweep_table import (
     merge_sweeps,
     pareto_front,
     table_text,
+    verdict_text,
     write_table,
 )
 from rbfmuscle.study.show.sweep_page import write_page
@@ -136,6 +139,37 @@ class TestFront:
         assert verdict.factor == pytest.approx(factor)
         assert verdict.near is near
         assert verdict.on_front is (factor == 1.0 and rows[2]["front"])
+
+    @given(st.lists(st.tuples(st.integers(0, 4), st.integers(1, 5)), min_size=2, max_size=8))
+    def test_advice_names_what_is_better_and_no_worse(self, pairs):
+        """Nothing named costs more in the other quantity, and nothing left out is better than what is named."""
+        facts = {"status": "done", "reference": "r", "model": "", "front": False}
+        rows = [
+            {
+                **facts,
+                "role": "" if k else "default",
+                "label": f"{e} {t}",
+                "error_rms": float(e),
+                "time_frame": float(t),
+            }
+            for k, (e, t) in enumerate(pairs)
+        ]
+        (verdict,) = mark_front(rows)
+        (error, time), others = pairs[0], pairs[1:]
+        better = [e for e, t in others if e < error and t <= time]
+        faster = [t for e, t in others if t < time and e <= error]
+        assert (verdict.better and verdict.better["error"]) == (min(better) if better else None)
+        assert (verdict.faster and verdict.faster["time"]) == (min(faster) if faster else None)
+        assert (verdict.error, verdict.time) == (error, time)
+        text = verdict_text(verdict, "mm")
+        assert f"{error:.3g} mm at {1e3 * time:.3g} ms" in text
+        for found, words in ((verdict.faster, "Quicker"), (verdict.better, "Better")):
+            assert (words in text) == bool(found)
+            if found:
+                assert found["label"] == f"{found['error']:.0f} {found['time']:.0f}"
+                assert f"{found['label']} ({found['error']:.3g} mm, {1e3 * found['time']:.3g} ms)" in text
+        if better or faster:
+            assert not verdict.on_front
 
 
 class TestRun:

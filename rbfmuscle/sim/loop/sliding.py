@@ -11,6 +11,7 @@ does not depend on the order in which muscles are solved, nor on how many run at
 
 from __future__ import annotations
 
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -205,7 +206,7 @@ class Sliding:
         limits = SlidingLimits(options, scene)
         self.links = {stepper.name: [] for stepper in steppers}
         self.bone_links = {stepper.name: [] for stepper in steppers}
-        pairs = _pairs(scene, [stepper.name for stepper in steppers], limits.search)
+        pairs = sliding_pairs(scene, [stepper.name for stepper in steppers], limits.search)
         reach = max(limits.search, limits.cut_depth)
         self.surfaces = {
             stepper.name: CarriedSurface(stepper.model, reach)
@@ -267,29 +268,30 @@ class Sliding:
         return {key: max(one[key] for one in found) for key in found[0]} if found else {}
 
 
-def _pairs(scene, names, reach):
-    """Pairs of muscles that slide: those named, or all, as far as their swept boxes meet."""
-    named = scene.sliding.pairs
+def sliding_pairs(scene: Scene, names: list[str], reach: float) -> set[frozenset[str]]:
+    """Pairs of muscles that slide: those named, or all, as far as their swept boxes come within ``reach``."""
+    named = scene.sliding.pairs if scene.sliding else None
     for name in sorted({name for pair in named or [] for name in pair}):
         if name not in names:
             raise SceneError(f"[sliding] pairs: unknown muscle {name!r}, known: {', '.join(names)}")
     wanted = [frozenset(pair) for pair in named] if named else None
     muscles = [muscle for muscle in scene.muscles if muscle.name in names]
-    root = scene.bones[0].name
     poses = sampled_poses(scene)
-    boxes = {muscle.name: swept_region(muscle, root, poses) for muscle in muscles}
-    found = set()
-    for i, one in enumerate(muscles):
-        for two in muscles[:i]:
-            a, b = boxes[one.name], boxes[two.name]
-            pair = frozenset((one.name, two.name))
-            if (
-                np.all(a[0] - reach <= b[1])
-                and np.all(b[0] - reach <= a[1])
-                and (not wanted or pair in wanted)
-            ):
-                found.add(pair)
-    return found
+
+    @cache
+    def box(k, bone):
+        return swept_region(muscles[k], bone, poses)
+
+    def meet(i, k):
+        """Whether the swept boxes meet as every bone that holds one of the two sees them."""
+        bones = {held.bone for muscle in (muscles[i], muscles[k]) for held in muscle.attachments}
+        boxes = ((box(i, bone), box(k, bone)) for bone in bones)
+        return all(np.all(a[0] - reach <= b[1]) and np.all(b[0] - reach <= a[1]) for a, b in boxes)
+
+    pairs = [
+        (i, k, frozenset((muscles[i].name, muscles[k].name))) for i in range(len(muscles)) for k in range(i)
+    ]
+    return {pair for i, k, pair in pairs if (not wanted or pair in wanted) and meet(i, k)}
 
 
 def _box(points, pad):

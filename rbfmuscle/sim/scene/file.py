@@ -229,7 +229,8 @@ def _place(location, data):
     here = data
     for depth, part in enumerate(location):
         known = isinstance(here, list) or (isinstance(here, dict) and part in here)
-        if isinstance(part, str) and not known and depth < len(location) - 1:
+        missing = depth == len(location) - 1 and isinstance(here, dict) and str(part).islower()
+        if isinstance(part, str) and not known and not missing:
             continue  # the name of one of several types that pydantic tried
         here = here[part] if known and not (isinstance(here, list) and not isinstance(part, int)) else None
         if isinstance(part, int):

@@ -6,6 +6,7 @@ They check themselves, so the same rules hold for a file, for code and for ``--s
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
@@ -126,7 +127,7 @@ def describe_error(error: Any, *, root: str = "", name_row: Callable[..., Any] |
     first = error.errors(include_url=False)[0]
     where = name_row(first["loc"]) if name_row else ".".join(str(part) for part in first["loc"])
     message = first["msg"].removeprefix("Value error, ")
-    message = message[0].lower() + message[1:]
+    message = re.sub(r"a valid dictionary( or instance of \w+)?", "a table", message[0].lower() + message[1:])
     given = first.get("input")
     value = ""
     if first["type"] not in ("unknown_key", "missing") and not isinstance(given, dict):

@@ -1,0 +1,171 @@
+"""``make mutants``: record which tests reach which lines, plant a seeded sample of faults, tell the table.
+
+Usage: ``python -m mutants record [TESTS...] | run [--count N] [--seed S] [--minutes M] [--rooms R,...] [--loops] | table``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parents[1]
+WORK = Path(os.environ.get("MUTANTS_FOLDER", ROOT / ".mutants"))
+# With the compiler off a test that is worth running takes seconds; the whole suite would take days.
+LIMIT, PATIENCE = 4.0, 3
+UNCOMPILED = ("geometry", "implicit", "model", "pbd", "sim", "study")
+
+
+def record(files: list[str]) -> None:
+    """Run test files with and without compiler, each in a process of its own; those recorded already are left."""
+    todo = files or sorted(str(p.relative_to(ROOT)) for p in (ROOT / "tests").rglob("test_*.py"))
+    for kind in ("plain", "compiled"):
+        for file in todo:
+            target = WORK / kind / (file.replace("/", "_") + ".json")
+            if (target.exists() and not files) or (kind == "plain" and file.split("/")[1] not in UNCOMPILED):
+                continue
+            extra = {"MUTANTS_RECORD": str(target), "PYTHONPATH": str(HERE.parent)}
+            if kind == "plain":
+                extra |= {"NUMBA_DISABLE_JIT": "1", "MUTANTS_LIMIT": str(LIMIT), "MUTANTS_PATIENCE": str(PATIENCE)}
+            command = [sys.executable, "-m", "pytest", "-q", "-p", "mutants.contexts", "-p", "no:cacheprovider", file]
+            subprocess.run(command, cwd=ROOT, env={**os.environ, **extra}, capture_output=True, check=False)
+            print(f"{kind}: {file}", flush=True)
+
+
+def run(count: int, seed: int, minutes: float, rooms: list[str], loops: bool | None) -> None:
+    """Plant the sample one after another until the time is over; what has a result is not run again."""
+    from mutants.faults import sample
+    from mutants.reach import Reach
+    from mutants.runner import copy_tree, preload
+
+    preload()
+    end = time.monotonic() + 60.0 * minutes
+    reach = {kind: Reach.load(WORK / kind) for kind in ("plain", "compiled")}
+    tree = WORK / f"tree{os.getpid()}"
+    copy_tree(tree)
+    known = {row["key"] for row in results()}
+    for fault in sample(count, seed, rooms=rooms, loops=loops):
+        if time.monotonic() > end:
+            print("time is over; the same command goes on from here")
+            break
+        row = describe(fault, seed)
+        if row is None or row["key"] in known:
+            continue
+        row |= judge(fault, tree, reach)
+        known.add(row["key"])
+        with (WORK / "results.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+        print(f"{row['outcome']:9} {fault.path}:{fault.line} {row['after'].strip()[:90]}", flush=True)
+    subprocess.run(["rm", "-rf", str(tree)], check=False)
+
+
+def describe(fault, seed: int) -> dict | None:
+    """What identifies a fault however its file grows: function, line before and after; None where nothing changes."""
+    source = (ROOT / fault.path).read_text(encoding="utf-8")
+    planted = fault.planted(source)
+    old, new = source.splitlines(), planted.splitlines()
+    changed = [(a, b) for a, b in zip(old, new) if a != b]
+    if not changed:
+        return None
+    before, after = changed[0]
+    text = "\n".join([fault.path, fault.function, before.strip(), after.strip()])
+    return {
+        "key": hashlib.sha256(text.encode()).hexdigest()[:16], "seed": seed, "group": fault.group, "path": fault.path,
+        "line": fault.line, "function": fault.function, "before": before, "after": after,
+    }  # fmt: skip
+
+
+def judge(fault, tree: Path, reach: dict) -> dict:
+    """Try the fault on the tests that reach it: without compiler first, which is quicker to start."""
+    from mutants.runner import run_tests
+
+    path = tree / fault.path
+    source = path.read_text(encoding="utf-8")
+    outcome, tried = "unreached", []
+    try:
+        path.write_text(fault.planted(source), encoding="utf-8")
+        for kind in ("plain",) if fault.loop else ("plain", "compiled"):
+            tests = reach[kind].tests(fault.path, fault.line, outside=not fault.function)
+            if tests:
+                seconds = 60.0 + 12.0 * sum(reach[kind].seconds[t] for t in tests)
+                outcome = run_tests(tree, tests, compiler=kind == "compiled", seconds=seconds)
+                tried += tests
+            if outcome in ("noticed", "slow"):
+                break
+    finally:
+        path.write_text(source, encoding="utf-8")
+    return {"outcome": outcome, "tests": len(tried), "first": tried[:3]}
+
+
+def results() -> list[dict]:
+    """All results, the last of each fault."""
+    path = WORK / "results.jsonl"
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    return list({row["key"]: row for row in map(json.loads, lines)}.values())
+
+
+def equivalent() -> dict[str, str]:
+    """Faults that change nothing that could be told, with the reason, by key."""
+    named = tomllib.loads((HERE / "equivalent.toml").read_text(encoding="utf-8")).get("fault", [])
+    return {
+        hashlib.sha256("\n".join([f["path"], f["function"], f["before"], f["after"]]).encode()).hexdigest()[:16]: f["why"]
+        for f in named
+    }
+
+
+def table(seed: int | None) -> str:
+    """Planted, noticed, unnoticed and equivalent, by room."""
+    reasons = equivalent()
+    rows: dict[str, list[int]] = {}
+    for row in results():
+        if seed is not None and row["seed"] != seed:
+            continue
+        kind = 2 if row["key"] in reasons else 0 if row["outcome"] in ("noticed", "slow") else 1
+        loops = "all loops" if row["group"].endswith("loops") else "all plain"
+        for name in (row["group"], loops, "all"):
+            rows.setdefault(name, [0, 0, 0])[kind] += 1
+    lines = ["| room | planted | noticed | unnoticed | equivalent | noticed of the others |", "|---|---|---|---|---|---|"]
+    for name in sorted(rows, key=lambda n: (n.startswith("all"), n)):
+        yes, no, same = rows[name]
+        share = f"{100.0 * yes / (yes + no):.0f} %" if yes + no else "–"
+        lines.append(f"| {name} | {yes + no + same} | {yes} | {no} | {same} | {share} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(prog="mutants", description=__doc__)
+    parser.add_argument("what", choices=["record", "run", "again", "table"])
+    parser.add_argument("files", nargs="*")
+    parser.add_argument("--count", type=int, default=400)
+    parser.add_argument("--seed", type=int, default=24)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--rooms", type=lambda text: text.split(","), default=[])
+    parser.add_argument("--loops", action="store_true", default=None)
+    given = parser.parse_args()
+    if given.what == "record":
+        record(given.files)
+    elif given.what == "run":
+        run(given.count, given.seed, given.minutes, given.rooms, given.loops)
+    elif given.what == "again":
+        forget_unnoticed()
+    if given.what != "record":
+        print(table(None if given.what == "again" else given.seed))
+
+
+def forget_unnoticed() -> None:
+    """Take back the results of what went unnoticed, so that the next run tries it on the tests of today."""
+    reasons = equivalent()
+    kept = [r for r in results() if r["outcome"] in ("noticed", "slow") or r["key"] in reasons]
+    (WORK / "results.jsonl").write_text("".join(json.dumps(row) + "\n" for row in kept), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
