@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test fuzz test-fast test-nojit coverage check bench figures docs release-check clean
+.PHONY: demo test fuzz test-fast test-nojit coverage mutants references check bench figures docs release-check clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -36,6 +36,20 @@ coverage: $(STAMP)
 # Damaged scenes and meshes by the thousand; ends with a table of what became of them.
 fuzz: $(STAMP)
 	PYTHONPATH=tests $(BIN)/python -m fuzz --scene 10000 --mesh 2000 --frames 250
+
+# Faults planted one at a time, a seeded sample of every room, each against the tests that reach its line: ten minutes a
+# share, from where the last one ended (MINUTES=600 for the whole). The first time, which tests reach what is recorded.
+MINUTES ?= 10
+SEED ?= 24
+mutants: $(STAMP)
+	$(BIN)/python -c "import cosmic_ray" 2>/dev/null || $(BIN)/python -m pip install --quiet -e ".[mutants]"
+	PYTHONPATH=benchmarks $(BIN)/python -m mutants record
+	PYTHONPATH=benchmarks $(BIN)/python -m mutants run --minutes $(MINUTES) --seed $(SEED)
+
+# Results of small whole runs that tests compare with, written anew; what differs is reviewed as part of the change.
+references: $(STAMP)
+	PYTHONPATH=tests:benchmarks $(BIN)/python -m whole_runs
+	git --no-pager diff --stat -- tests/data/references
 
 check: $(STAMP)
 	$(BIN)/ruff check .

@@ -1,6 +1,7 @@
 """``make mutants``: record which tests reach which lines, plant a seeded sample of faults, tell the table.
 
-Usage: ``python -m mutants record [TESTS...] | run [--count N] [--seed S] [--minutes M] [--rooms R,...] [--loops] | table``.
+Usage: ``python -m mutants record [TESTS...]``, ``run [--count N] [--seed S] [--minutes M] [--rooms R,...] [--loops]``,
+``again`` or ``table``.
 """
 
 from __future__ import annotations
@@ -33,8 +34,22 @@ def record(files: list[str]) -> None:
                 continue
             extra = {"MUTANTS_RECORD": str(target), "PYTHONPATH": str(HERE.parent)}
             if kind == "plain":
-                extra |= {"NUMBA_DISABLE_JIT": "1", "MUTANTS_LIMIT": str(LIMIT), "MUTANTS_PATIENCE": str(PATIENCE)}
-            command = [sys.executable, "-m", "pytest", "-q", "-p", "mutants.contexts", "-p", "no:cacheprovider", file]
+                extra |= {
+                    "NUMBA_DISABLE_JIT": "1",
+                    "MUTANTS_LIMIT": str(LIMIT),
+                    "MUTANTS_PATIENCE": str(PATIENCE),
+                }
+            command = [
+                sys.executable,
+                "-m",
+                "pytest",
+                "-q",
+                "-p",
+                "mutants.contexts",
+                "-p",
+                "no:cacheprovider",
+                file,
+            ]
             subprocess.run(command, cwd=ROOT, env={**os.environ, **extra}, capture_output=True, check=False)
             print(f"{kind}: {file}", flush=True)
 
@@ -115,7 +130,9 @@ def equivalent() -> dict[str, str]:
     """Faults that change nothing that could be told, with the reason, by key."""
     named = tomllib.loads((HERE / "equivalent.toml").read_text(encoding="utf-8")).get("fault", [])
     return {
-        hashlib.sha256("\n".join([f["path"], f["function"], f["before"], f["after"]]).encode()).hexdigest()[:16]: f["why"]
+        hashlib.sha256("\n".join([f["path"], f["function"], f["before"], f["after"]]).encode()).hexdigest()[
+            :16
+        ]: f["why"]
         for f in named
     }
 
@@ -131,7 +148,10 @@ def table(seed: int | None) -> str:
         loops = "all loops" if row["group"].endswith("loops") else "all plain"
         for name in (row["group"], loops, "all"):
             rows.setdefault(name, [0, 0, 0])[kind] += 1
-    lines = ["| room | planted | noticed | unnoticed | equivalent | noticed of the others |", "|---|---|---|---|---|---|"]
+    lines = [
+        "| room | planted | noticed | unnoticed | equivalent | noticed of the others |",
+        "|---|---|---|---|---|---|",
+    ]
     for name in sorted(rows, key=lambda n: (n.startswith("all"), n)):
         yes, no, same = rows[name]
         share = f"{100.0 * yes / (yes + no):.0f} %" if yes + no else "–"

@@ -84,7 +84,14 @@ def faults_of(path: Path) -> list[Fault]:
                 inner = [f for f in functions if f[0] <= start < f[1]]
                 name_of = inner[-1][2] if inner else ""
                 found.append(
-                    Fault(str(path.relative_to(ROOT)), name, occurrence, *start, name_of, any(f[3] for f in inner))
+                    Fault(
+                        str(path.relative_to(ROOT)),
+                        name,
+                        occurrence,
+                        *start,
+                        name_of,
+                        any(f[3] for f in inner),
+                    )
                 )
     return found
 
@@ -116,7 +123,9 @@ def _spans(tree):
     return left_out, sorted(functions)
 
 
-def sample(count: int, seed: int, *, rooms: list[str] | None = None, loops: bool | None = None) -> list[Fault]:
+def sample(
+    count: int, seed: int, *, rooms: list[str] | None = None, loops: bool | None = None
+) -> list[Fault]:
     """A seeded sample, as many of each group as nearly as its size allows, in an order that serves all groups evenly.
 
     Parameters
@@ -133,7 +142,9 @@ def sample(count: int, seed: int, *, rooms: list[str] | None = None, loops: bool
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
             for fault in faults_of(path):
-                if (loops is None or fault.loop == loops) and (not rooms or fault.group.split(",")[0] in rooms):
+                if (loops is None or fault.loop == loops) and (
+                    not rooms or fault.group.split(",")[0] in rooms
+                ):
                     places = groups.setdefault(fault.group, {})
                     places.setdefault((fault.path, fault.line, fault.column), []).append(fault)
     chosen = []

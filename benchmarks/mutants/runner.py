@@ -36,7 +36,7 @@ def preload() -> None:
 
 
 def run_tests(tree: Path, tests: list[str], *, compiler: bool, seconds: float) -> str:
-    """"noticed", "unnoticed", "slow" (noticed by the time it takes), or "wrong" where no test could be run."""
+    """ "noticed", "unnoticed", "slow" (noticed by the time it takes), or "wrong" where no test could be run."""
     child = os.fork()
     if child == 0:
         _be_child(tree, tests, compiler)
@@ -61,7 +61,9 @@ def _be_child(tree, tests, compiler):
     os.chdir(tree)
     paths = [str(tree), str(tree / "benchmarks"), str(tree / "tests")]
     own = str(ROOT)
-    sys.path[:] = paths + [p for p in sys.path if p and not (p == own or p.startswith(own + os.sep + "benchmarks"))]
+    sys.path[:] = paths + [
+        p for p in sys.path if p and not (p == own or p.startswith(own + os.sep + "benchmarks"))
+    ]
     os.environ["PYTHONPATH"] = os.pathsep.join(paths)
     os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
     sys.dont_write_bytecode = True
