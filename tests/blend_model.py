@@ -84,6 +84,49 @@ def arm_scene(*, end=20, step=10, units="mm", **output):
     return scene
 
 
+ARM_FILE = """[scene]
+format = 1
+name = "arm"
+units = "mm"
+[[bone]]
+name = "upper"
+mesh = "upper.ply"
+[[bone]]
+name = "fore"
+mesh = "fore.ply"
+[[joint]]
+name = "elbow"
+parent = "upper"
+child = "fore"
+centre = [0, 0, 0]
+axes = {{ flexion = [0, -1, 0] }}
+[motion]
+ramp = {{ "elbow.flexion" = {{ from = 0, to = {end}, step = {step} }} }}
+[defaults]
+{defaults}attach = [{{ bone = "upper", vertices = "upper.txt" }}, {{ bone = "fore", vertices = "fore.txt" }}]
+[output]
+report = false
+preview = false
+"""
+
+
+def arm_files(folder, *, end=10, step=5, muscles=(("biceps", 0.0),), defaults=""):
+    """Write `arm_scene` as files, its muscle once for each name and shift sideways; return the scene file's path."""
+    scene = arm_scene()
+    for bone in scene.bones:
+        bone.mesh.export(folder / f"{bone.name}.ply")
+    text = ARM_FILE.format(end=end, step=step, defaults=defaults)
+    for name, shift in muscles:
+        mesh = scene.muscles[0].mesh.copy()
+        mesh.apply_translation([0, shift, 0])
+        mesh.export(folder / f"{name}.ply")
+        text += f'[[muscle]]\nname = "{name}"\nmesh = "{name}.ply"\n'
+    for attachment in scene.muscles[0].attachments:
+        np.savetxt(folder / f"{attachment.bone}.txt", attachment.vertices, fmt="%d")
+    (folder / "arm.toml").write_text(text)
+    return folder / "arm.toml"
+
+
 def use_blend_model(monkeypatch, fail_at=None):
     """Let `rbfmuscle.run` build BlendMuscle for every muscle."""
     monkeypatch.setattr(BlendMuscle, "fail_at", fail_at)

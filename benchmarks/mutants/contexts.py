@@ -115,13 +115,13 @@ class _Alarm:
 
     def __enter__(self):
         if self.seconds:
-            self.before = signal.signal(signal.SIGALRM, self._ring)
-            signal.setitimer(signal.ITIMER_REAL, self.seconds)
+            self.before = signal.signal(signal.SIGPROF, self._ring)
+            signal.setitimer(signal.ITIMER_PROF, self.seconds)
 
     def __exit__(self, *caught):
         if self.seconds:
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-            signal.signal(signal.SIGALRM, self.before)
+            signal.setitimer(signal.ITIMER_PROF, 0.0)
+            signal.signal(signal.SIGPROF, self.before)
 
     @staticmethod
     def _ring(number, frame):

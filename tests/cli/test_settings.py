@@ -2,9 +2,8 @@
 
 import json
 
-import numpy as np
 import pytest
-from blend_model import arm_scene
+from blend_model import arm_files
 from command_line import call
 
 from pbd_baseline.options import PBDOptions
@@ -87,51 +86,9 @@ OTHERS = [
 @pytest.fixture(scope="module")
 def scene_file(tmp_path_factory):
     """Two small muscles beside each other over one hinge, as files."""
-    folder = tmp_path_factory.mktemp("arm")
-    scene = arm_scene(end=6, step=2)
-    for bone in scene.bones:
-        bone.mesh.export(folder / f"{bone.name}.ply")
-    egg = scene.muscles[0].mesh
-    for name, shift in (("biceps", -5.5), ("brachialis", 5.5)):
-        mesh = egg.copy()
-        mesh.apply_translation([0, shift, 0])
-        mesh.export(folder / f"{name}.ply")
-    for attachment in scene.muscles[0].attachments:
-        np.savetxt(folder / f"{attachment.bone}.txt", attachment.vertices, fmt="%d")
-    (folder / "arm.toml").write_text(SCENE)
-    return folder / "arm.toml"
-
-
-SCENE = """[scene]
-format = 1
-units = "mm"
-[[bone]]
-name = "upper"
-mesh = "upper.ply"
-[[bone]]
-name = "fore"
-mesh = "fore.ply"
-[[joint]]
-name = "elbow"
-parent = "upper"
-child = "fore"
-centre = [0, 0, 0]
-axes = { flexion = [0, -1, 0] }
-[motion]
-ramp = { "elbow.flexion" = { from = 0, to = 6, step = 2 } }
-[defaults]
-model = { name = "rbf", centres = 60, samples = 200, resolution = 12 }
-attach = [{ bone = "upper", vertices = "upper.txt" }, { bone = "fore", vertices = "fore.txt" }]
-[[muscle]]
-name = "biceps"
-mesh = "biceps.ply"
-[[muscle]]
-name = "brachialis"
-mesh = "brachialis.ply"
-[output]
-report = false
-preview = false
-"""
+    model = 'model = { name = "rbf", centres = 60, samples = 200, resolution = 12 }\n'
+    muscles = (("biceps", -5.5), ("brachialis", 5.5))
+    return arm_files(tmp_path_factory.mktemp("arm"), end=6, step=2, muscles=muscles, defaults=model)
 
 
 def run(capsys, scene_file, folder, *settings, model=None):

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from blend_model import arm_scene, use_blend_model
+from blend_model import arm_files, arm_scene, use_blend_model
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -230,42 +230,10 @@ class TestRun:
         assert (folder / "pareto.png").stat().st_size > 10_000
 
 
-SCENE = """
-[scene]
-format = 1
-name = "arm"
-units = "mm"
-[[bone]]
-name = "upper"
-mesh = "upper.ply"
-[[bone]]
-name = "fore"
-mesh = "fore.ply"
-[[joint]]
-name = "elbow"
-parent = "upper"
-child = "fore"
-centre = [0, 0, 0]
-axes = { flexion = [0, -1, 0] }
-[motion]
-ramp = { "elbow.flexion" = { to = 10, step = 5 } }
-[[muscle]]
-name = "biceps"
-mesh = "biceps.ply"
-attach = [{ bone = "upper", vertices = "upper.txt" }, { bone = "fore", vertices = "fore.txt" }]
-"""
-
-
 @pytest.fixture
 def scene_file(tmp_path):
     """The arm as files."""
-    scene = arm_scene()
-    for item in [*scene.bones, *scene.muscles]:
-        item.mesh.export(tmp_path / f"{item.name}.ply")
-    for attachment in scene.muscles[0].attachments:
-        np.savetxt(tmp_path / f"{attachment.bone}.txt", attachment.vertices, fmt="%d")
-    (tmp_path / "arm.toml").write_text(SCENE)
-    return tmp_path / "arm.toml"
+    return arm_files(tmp_path)
 
 
 class TestCommand:

@@ -1,0 +1,113 @@
+"""Laws of arithmetic on points and triangles, on a few of them."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from pbd_baseline.contraction import _stretch_loop
+from pbd_baseline.shapes import _scale_loop
+from rbfmuscle.geometry.mean_value import mean_value_weights
+from rbfmuscle.implicit.placement.off_surface import _touching_ball_loop
+
+
+def solid():
+    mesh = trimesh.creation.icosphere(subdivisions=1)
+    return np.array(mesh.vertices) * [2.0, 1.0, 0.7] + [5.0, 0.0, 1.0], np.array(mesh.faces)
+
+
+def test_mean_value_weights_give_points_back_and_follow_affine_motions():
+    vertices, faces = solid()
+    rng = np.random.default_rng(0)
+    points = [5.0, 0.0, 1.0] + rng.uniform(-0.35, 0.35, (12, 3)) * [2.0, 1.0, 0.7]
+    weights = mean_value_weights(points, vertices, faces)
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(weights @ vertices, points, atol=1e-10)
+    matrix = rng.normal(size=(3, 3))
+    np.testing.assert_allclose(weights @ (vertices @ matrix.T + 3.0), points @ matrix.T + 3.0, atol=1e-9)
+    assert weights.min() > 0.0  # the solid is convex
+
+
+def test_mean_value_weights_of_a_middle_are_even_and_do_not_depend_on_unit_place_or_order():
+    """An octahedron's middle is as near to each vertex."""
+    mesh = trimesh.creation.icosphere(subdivisions=0)
+    even = mean_value_weights([[0.0, 0.0, 0.0]], mesh.vertices, mesh.faces)
+    np.testing.assert_allclose(even, 1.0 / len(mesh.vertices), atol=1e-12)
+    vertices, faces = solid()
+    points = [5.0, 0.0, 1.0] + np.random.default_rng(1).uniform(-0.3, 0.3, (5, 3))
+    weights = mean_value_weights(points, vertices, faces)
+    np.testing.assert_allclose(
+        mean_value_weights(1e3 * points + 7.0, 1e3 * vertices + 7.0, faces), weights, atol=1e-10
+    )
+    order = np.random.default_rng(2).permutation(len(faces))
+    np.testing.assert_allclose(
+        mean_value_weights(points, vertices, np.roll(faces[order], 1, axis=1)), weights, atol=1e-12
+    )
+
+
+def test_mean_value_weights_refuse_a_vertex_of_the_mesh():
+    vertices, faces = solid()
+    with pytest.raises(ValueError, match="point 1 at"):
+        mean_value_weights([[5.0, 0.0, 1.0], vertices[3]], vertices, faces)
+
+
+def literal_balls(points, normals):
+    """Radii of the balls that touch point i along its normal and pass through point j, the least on each side."""
+    steps, nearest = np.full((2, len(points)), np.inf), np.empty(len(points))
+    for i, (p, n) in enumerate(zip(points, normals)):
+        others = np.delete(points, i, axis=0) - p
+        nearest[i] = np.linalg.norm(others, axis=1).min()
+        along = others @ n
+        radius = (others**2).sum(axis=1) / (2 * np.abs(np.where(along == 0, np.nan, along)))
+        for side, which in ((0, along > 0), (1, along < 0)):
+            if which.any():
+                steps[side, i] = radius[which].min()
+    return steps, nearest
+
+
+def test_touching_balls_are_those_of_the_definition_and_of_the_sphere():
+    rng = np.random.default_rng(3)
+    points, normals = rng.normal(size=(2, 9, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    steps, nearest = np.empty((2, 9)), np.empty(9)
+    _touching_ball_loop(points, normals, steps, nearest)
+    expected = literal_balls(points, normals)
+    np.testing.assert_allclose(steps, expected[0])
+    np.testing.assert_allclose(nearest, expected[1])
+    sphere = np.array(trimesh.creation.icosphere(subdivisions=1).vertices)
+    steps, nearest = np.empty((2, len(sphere))), np.empty(len(sphere))
+    _touching_ball_loop(3.0 * sphere, sphere, steps, nearest)
+    assert np.isinf(steps[0]).all()  # nothing lies beyond a tangent plane
+    np.testing.assert_allclose(steps[1], 3.0)  # the ball inside is the sphere
+
+
+def test_fibre_stretch_of_an_affine_stretch_is_its_own():
+    rng = np.random.default_rng(4)
+    rest = rng.normal(size=(6, 3))
+    edges = np.array([[0, 1], [1, 2], [2, 3], [3, 4], [4, 5], [5, 0], [0, 3]])
+    lengths = np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1)
+    stretch = np.empty(6)
+    _stretch_loop(1.3 * rest, edges, lengths, rng.uniform(0.1, 1.0, len(edges)), stretch)
+    np.testing.assert_allclose(stretch, 1.3, rtol=1e-7)
+    says = np.array([1.0, 0, 0, 0, 0, 0, 0])  # one edge lies along the fibre: its ends alone are told
+    moved = rest.copy()
+    moved[1] = rest[0] + 0.8 * (rest[1] - rest[0])
+    _stretch_loop(moved, edges, lengths, says, stretch)
+    np.testing.assert_allclose(stretch[:2], 0.8, rtol=1e-7)
+    np.testing.assert_allclose(stretch[3:5], 1.0, rtol=1e-7)
+
+
+def test_fibre_stretch_weighs_edges_by_what_they_say():
+    rest = np.array([[0.0, 0, 0], [1.0, 0, 0], [0, 2.0, 0]])
+    edges, lengths = np.array([[0, 1], [0, 2]]), np.array([1.0, 2.0])
+    stretch = np.empty(3)
+    _stretch_loop(rest * [1.2, 0.9, 1.0], edges, lengths, np.array([0.75, 0.25]), stretch)
+    np.testing.assert_allclose(stretch, [0.75 * 1.2 + 0.25 * 0.9, 1.2, 0.9], rtol=1e-7)
+
+
+def test_scaled_directions_have_the_length_asked_for_and_nothing_stays_nothing():
+    direction = np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 0.0], [1.0, 2.0, 2.0]])
+    before = direction.copy()
+    length = np.array([10.0, 5.0, 0.5])
+    _scale_loop(direction, length)
+    np.testing.assert_allclose(np.linalg.norm(direction, axis=1), [10.0, 0.0, 0.5])
+    np.testing.assert_allclose(np.cross(direction, before), 0.0, atol=1e-12)

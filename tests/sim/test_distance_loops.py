@@ -1,0 +1,141 @@
+"""Laws of the distance fields' loops on a few triangles, small enough to run without the compiler."""
+
+import igl
+import numpy as np
+import pytest
+import trimesh
+
+from rbfmuscle.sim.distance.sdf import BoneSDF
+from rbfmuscle.sim.distance.serendipity import SerendipityField
+from rbfmuscle.sim.distance.spline import SplineField
+
+
+def angle_iron():
+    """A prism over an L: convex and hollow edges and corners, 20 triangles."""
+    outline = np.array([[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2]], dtype=float)
+    caps = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 5], [3, 4, 5]])
+    vertices = np.vstack([np.column_stack([outline, np.full(6, z)]) for z in (0.0, 0.8)])
+    walls = [[(i, j, j + 6), (i, j + 6, i + 6)] for i in range(6) for j in [(i + 1) % 6]]
+    return vertices, np.vstack([caps[:, ::-1], caps + 6, np.concatenate(walls)])
+
+
+@pytest.fixture(scope="module")
+def solid():
+    return angle_iron()
+
+
+@pytest.fixture(scope="module")
+def field(solid):
+    return BoneSDF.from_mesh(solid, cache=False)
+
+
+def exact(points, solid):
+    found = igl.signed_distance(points, *solid, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL)
+    return found[0], found[2]
+
+
+def around(count=250, seed=0, pad=0.6):
+    return np.random.default_rng(seed).uniform([-pad] * 3, [2 + pad, 2 + pad, 0.8 + pad], (count, 3))
+
+
+def test_mesh_of_the_test_is_closed_and_outward(solid):
+    assert trimesh.Trimesh(*solid, process=False).is_watertight
+    assert trimesh.Trimesh(*solid, process=False).volume == pytest.approx(3 * 0.8)
+
+
+def test_distance_is_that_to_the_triangles_on_either_side(field, solid):
+    points = around()
+    distance, _ = exact(points, solid)
+    assert (distance < 0).sum() > 20
+    np.testing.assert_allclose(field.distance(points), distance, atol=1e-6)
+
+
+def test_gradient_points_away_from_the_nearest_point_outside_and_to_it_inside(field, solid):
+    points = around(seed=1)
+    distance, nearest = exact(points, solid)
+    _, gradient = field.distance_and_gradient(points)
+    np.testing.assert_allclose(np.linalg.norm(gradient, axis=1), 1.0, atol=1e-5)
+    # Where two faces are equally near, either is right: the way back leads to the surface.
+    back = points - field.distance(points)[:, None] * gradient
+    np.testing.assert_allclose(exact(back, solid)[0], 0.0, atol=1e-5)
+    clear = np.abs(distance) > 0.05
+    expected = (points - nearest) / np.where(distance == 0, 1.0, distance)[:, None]
+    agree = np.linalg.norm(gradient - expected, axis=1)[clear] < 1e-4
+    assert agree.mean() > 0.98
+
+
+@pytest.mark.parametrize("away", [3.0, 30.0])
+def test_beyond_the_grid_distances_stay_exact(field, solid, away):
+    unit = np.random.default_rng(2).normal(size=(40, 3))
+    points = [1.0, 1.0, 0.4] + away * unit / np.linalg.norm(unit, axis=1, keepdims=True)
+    np.testing.assert_allclose(field.distance(points), exact(points, solid)[0], rtol=1e-5)
+
+
+def test_edges_and_corners_have_their_sides(field, solid):
+    """Points a little off every edge's middle and every corner, on both sides."""
+    vertices, faces = solid
+    edges = trimesh.Trimesh(vertices, faces, process=False).edges_unique
+    spots = np.vstack([vertices, vertices[edges].mean(axis=1)])
+    step = 0.03 * np.random.default_rng(3).normal(size=(4, len(spots), 3))
+    points = (spots + step).reshape(-1, 3)
+    distance, _ = exact(points, solid)
+    found = field.distance(points)
+    np.testing.assert_allclose(found, distance, atol=1e-6)
+    assert (np.sign(found) == np.sign(distance)).all() and (distance < 0).any() and (distance > 0).any()
+
+
+def test_reach_leaves_what_is_near_exact_and_bounds_what_is_far(field, solid):
+    points = around(seed=4, pad=2.0)
+    distance, _ = exact(points, solid)
+    for reach in (0.0, 0.3, 1.0):
+        found = field.distance(points, reach=reach)
+        near = distance <= reach
+        np.testing.assert_allclose(found[near], distance[near], atol=1e-6)
+        assert (found[~near] > reach - 1e-9).all() and (found[~near] <= distance[~near] + 1e-6).all()
+
+
+def test_answers_do_not_depend_on_company(field):
+    """A stage of many points that are all out of reach is answered at once; alone or together, bounds hold."""
+    points = np.vstack([around(100, seed=5) + [40.0, 0, 0], around(30, seed=6)])
+    together = field.distance(points, reach=0.5)
+    alone = np.array([field.distance(p[None], reach=0.5)[0] for p in points])
+    near = alone <= 0.5
+    np.testing.assert_array_equal(together[near], alone[near])
+    assert (together[~near] > 0.5).all() and (alone[~near] > 0.5).all()
+
+
+def cubic(points):
+    x, y, z = points.T
+    return x**3 - 2 * y**3 + z**3 + x * y * z + x * x * y - z * z * x + y - 0.3
+
+
+def cubic_gradient(points):
+    x, y, z = points.T
+    return np.column_stack(
+        [3 * x**2 + y * z + 2 * x * y - z * z, -6 * y**2 + x * z + x * x + 1, 3 * z**2 + x * y - 2 * z * x]
+    )
+
+
+def test_serendipity_cells_hold_cubics_and_their_gradients():
+    """Cells of different edges along each axis, so that no axis stands for another."""
+    field = SerendipityField(cubic, [-1.0, -0.8, -0.5], [1.0, 0.7, 0.9], (2, 3, 1))
+    points = np.random.default_rng(0).uniform([-1, -0.8, -0.5], [1, 0.7, 0.9], (40, 3))
+    distance, gradient = field.distance_and_gradient(points)
+    np.testing.assert_allclose(distance, cubic(points), atol=1e-12)
+    np.testing.assert_allclose(gradient, cubic_gradient(points), atol=1e-11)
+
+
+def test_spline_meets_its_nodes_and_its_gradient_is_that_of_its_values():
+    field = SplineField(cubic, [-1.0] * 3, [1.0, 0.9, 0.8], 0.25)
+    nodes = np.stack(np.meshgrid(*[np.arange(-0.5, 0.6, 0.25)] * 3), axis=-1).reshape(-1, 3)
+    np.testing.assert_allclose(field.distance(nodes), cubic(nodes), atol=1e-12)
+    points = np.random.default_rng(1).uniform(-0.6, 0.6, (30, 3))
+    distance, gradient = field.distance_and_gradient(points)
+    # Natural ends leave an error of their own, which falls by a quarter with each node inward.
+    np.testing.assert_allclose(distance, cubic(points), atol=2e-2)
+    step = 6e-6
+    for k in range(3):
+        way = step * np.eye(3)[k]
+        slope = (field.distance(points + way) - field.distance(points - way)) / (2 * step)
+        np.testing.assert_allclose(gradient[:, k], slope, atol=1e-8)
+    assert np.ptp(field.distance(points + [1e-9, 0, 0]) - distance) < 1e-7
