@@ -16,9 +16,10 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
+# No plugin of pytest (hypothesis): one that is loaded before pytest is a warning, and warnings are errors here.
 HEAVY = (
     "numpy", "scipy.linalg", "scipy.sparse.linalg", "scipy.spatial.transform", "scipy.optimize", "scipy.interpolate",
-    "numba", "trimesh", "pydantic", "pytest", "hypothesis", "matplotlib.figure", "skimage.measure", "igl", "cyclopts",
+    "numba", "trimesh", "pydantic", "matplotlib.figure", "skimage.measure", "igl", "cyclopts",
 )  # fmt: skip
 LEFT_OUT = (".git", ".venv", ".mutants", "__pycache__", "images", "*.egg-info", ".hypothesis", "demo_output")
 
@@ -35,24 +36,42 @@ def preload() -> None:
         importlib.import_module(name)
 
 
-def run_tests(tree: Path, tests: list[str], *, compiler: bool, seconds: float) -> str:
-    """ "noticed", "unnoticed", "slow" (noticed by the time it takes), or "wrong" where no test could be run."""
+class Failures:
+    """A pytest plugin that writes down the first test that failed."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def pytest_runtest_logreport(self, report):
+        if report.failed and not self.path.exists():
+            self.path.write_text(report.nodeid, encoding="utf-8")
+
+
+def run_tests(tree: Path, tests: list[str], *, compiler: bool, seconds: float) -> tuple[str, str]:
+    """What became of the tests, and the first that failed.
+
+    "noticed", "unnoticed", "slow" (noticed by the time it takes), or "wrong" where no test could be run. The test is ""
+    where not a test failed but what comes before it: the import of a module, say.
+    """
+    told = tree / ".failed"
+    told.unlink(missing_ok=True)
     child = os.fork()
     if child == 0:
-        _be_child(tree, tests, compiler)
+        _be_child(tree, tests, compiler, Failures(told))
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         done, status = os.waitpid(child, os.WNOHANG)
         if done:
             code = os.waitstatus_to_exitcode(status)
-            return {0: "unnoticed", 4: "wrong", 5: "wrong"}.get(code, "noticed")
+            first = told.read_text(encoding="utf-8") if told.exists() else ""
+            return {0: "unnoticed", 5: "wrong"}.get(code, "noticed"), first
         time.sleep(0.05)
     os.killpg(child, signal.SIGKILL)
     os.waitpid(child, 0)
-    return "slow"
+    return "slow", ""
 
 
-def _be_child(tree, tests, compiler):
+def _be_child(tree, tests, compiler, plugin):
     """Never returns: runs pytest in the tree, silently, and ends with its code."""
     os.setpgid(0, 0)
     nothing = os.open(os.devnull, os.O_RDWR)
@@ -62,8 +81,10 @@ def _be_child(tree, tests, compiler):
     paths = [str(tree), str(tree / "benchmarks"), str(tree / "tests")]
     own = str(ROOT)
     sys.path[:] = paths + [
-        p for p in sys.path if p and not (p == own or p.startswith(own + os.sep + "benchmarks"))
+        p for p in sys.path if p and p != own and not p.startswith(own + os.sep + "benchmarks")
     ]
+    for name in [n for n in sys.modules if n.split(".")[0] in ("mutants", "peers")]:
+        del sys.modules[name]
     os.environ["PYTHONPATH"] = os.pathsep.join(paths)
     os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
     sys.dont_write_bytecode = True
@@ -76,6 +97,7 @@ def _be_child(tree, tests, compiler):
     try:
         import pytest
 
-        code = int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "--no-header", "--tb=no", *tests]))
+        options = ["-x", "-q", "-p", "no:cacheprovider", "--no-header", "--tb=no"]
+        code = int(pytest.main([*options, *tests], plugins=[plugin]))
     finally:
         os._exit(code)

@@ -1,0 +1,236 @@
+"""What users are told: each figure of a line or page is that of the quantity it names, in the unit it names.
+
+What turns a table into words is given one number for each fact that no other fact has, so that a figure taken from the
+wrong place, or scaled wrongly, cannot hide.
+"""
+
+import html
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+from blend_model import arm_files, arm_scene
+from command_line import call
+
+import rbfmuscle as rm
+from rbfmuscle.commands.plan import _lines as plan_lines
+from rbfmuscle.sim.scene.check import check_centre, check_extents, check_scene
+from rbfmuscle.study.measure.summary import require_limits
+from rbfmuscle.study.show.comparison_page import cell
+from rbfmuscle.study.show.kernel_page import COLUMNS
+from rbfmuscle.study.show.kernel_page import _row as kernel_row
+from rbfmuscle.study.show.report import _cell as report_cell
+from rbfmuscle.study.show.report import _facts, _stages, _summary, _verdict
+from rbfmuscle.study.show.sdf_report import report_lines
+from rbfmuscle.study.show.sweep_page import _cell as sweep_cell
+from rbfmuscle.validation import LimitExceededError, MeshError, SceneError
+
+
+def texts(page):
+    """Texts of the cells of a table, row by row."""
+    rows = re.findall(r"<tr.*?</tr>", page, re.S)
+    return [
+        [html.unescape(re.sub(r"<.*?>", " ", c)).split() for c in re.findall(r"<t[hd].*?</t[hd]>", row, re.S)]
+        for row in rows
+    ]
+
+
+class TestCommands:
+    def test_plan_tells_each_figure_of_its_table(self):
+        made = {
+            "units": "cm", "frames": 31, "substeps": 67,
+            "pairs": [{"muscle": "strap", "bone": "arm"}, {"muscle": "fan", "bone": "trunk"}],
+            "muscles": [
+                {"name": "strap", "model": "rbf", "vertices": 1201, "memory": 11e6, "build": 1.3, "step": 0.0017,
+                 "show": 0.019}
+            ],
+            "fields": [
+                {"bone": "arm", "size": [2.0, 3.0, 5.0], "share": 0.37, "triangles": 701, "memory": 13e6, "kept": True},
+                {"bone": "trunk", "size": [7.0, 11.0, 13.0], "share": 0.41, "triangles": 709},
+            ],
+            "features": {"sliding": False, "tunnelling": True},
+            "memory": {"total": 23e6, "fields": 29e6, "muscles": 31e6, "metrics": 37e6, "peak": 41e6},
+            "time": {
+                "total": 43.0, "build": {"fields": 4.7, "muscles": 5.3, "total": 5.9},
+                "frame": {"solve": 0.061, "show": 0.067, "total": 0.071},
+            },
+        }  # fmt: skip
+        assert plan_lines(made) == [
+            "31 frames in 67 sub-steps",
+            "muscle strap: rbf, 1201 vertices, can meet arm; 11 MB, 1.3 s to build, 1.7 ms a sub-step, 19 ms a surface",
+            "field of arm: 2 x 3 x 5 cm, 37% of the bone's box, 701 triangles; 13 MB, in the cache",
+            "field of trunk: 7 x 11 x 13 cm, 41% of the bone's box, 709 triangles",
+            "switched on: tunnelling",
+            "expected memory: 23 MB of the scene (fields 29 MB, muscles 31 MB, metrics 37 MB), "
+            "peak of the process 41 MB",
+            "expected time: 43 s without report and pictures; build 5.9 s (fields 4.7, muscles 5.3), "
+            "a frame 71 ms (solve 61, show 67)",
+        ]
+
+    @pytest.mark.parametrize(("units", "length"), [("", ""), ("mm", " mm")])
+    def test_sdf_tells_each_figure_of_its_report(self, units, length):
+        report = {
+            "name": "femur", "vertices": 211, "faces": 223, "closed": True, "notes": ["mended"], "build_time": 1.25,
+            "memory": 17e6, "fine_cells": 227, "spacing": 1.9, "width": 2.3, "error_rms": 0.029, "error_max": 0.31,
+            "sign_wrong": 0.0037, "angle_median": 0.41, "angle_p99": 4.3, "time_value": 47e-9, "time_gradient": 53e-9,
+        }  # fmt: skip
+        assert report_lines(report, units) == [
+            "femur: 211 vertices, 223 faces, closed",
+            "  mended",
+            f"  built or loaded in 1.250 s, 17.0 MB, 227 fine cells of 1.9{length}",
+            f"  within 2.3{length} of the surface: 0.029{length} RMS, 0.31{length} worst, sign wrong for 0.3700 %",
+            "  direction of the gradient: 0.41 degrees median, 4.3 degrees for 99 %",
+            "  a value 47 ns, with gradient 53 ns",
+        ]
+        assert "signed by winding numbers" in report_lines({**report, "closed": False})[0]
+
+    def test_check_tells_the_volume_in_cubic_centimetres_and_what_is_held(self, tmp_path, capsys):
+        path = arm_files(tmp_path)
+        code, out, _ = call(capsys, "check", path)
+        scene = rm.Scene.load(path)
+        muscle = scene.muscles[0]
+        assert code == 0 and f"{muscle.mesh.volume / 1000.0:.4g} cm3" in out
+        held = ", ".join(f"{len(a.vertices)} on {a.bone}" for a in muscle.attachments)
+        assert f"attached: {held}" in out and f"{len(scene.motion)} frames, lengths in mm" in out
+        path.write_text(path.read_text().replace('units = "mm"', 'units = "cm"'))
+        assert f"{muscle.mesh.volume:.4g} cm3" in call(capsys, "check", path)[1]
+
+
+class TestFindings:
+    def test_overlap_is_told_by_number_share_and_depth(self):
+        """An egg of 26 by 5 by 5 mm, pushed down into two boxes whose tops lie 3 mm above the axis."""
+        scene = arm_scene()
+        mesh = scene.muscles[0].mesh
+        mesh.apply_translation([0, 0, -5.0])
+        x, _, z = mesh.vertices.T
+        held = np.concatenate([a.vertices for a in scene.muscles[0].attachments])
+        free = np.setdiff1d(np.arange(len(z)), held)
+        for bone, side in (("upper", x < 0), ("fore", x > 0)):
+            low, high = scene.bones[0 if bone == "upper" else 1].mesh.bounds
+            inside = free[np.all((mesh.vertices[free] > low) & (mesh.vertices[free] < high), axis=1)]
+            (note,) = [f for f in check_scene(scene) if f"inside bone '{bone}'" in f.message]
+            deepest = np.minimum(mesh.vertices[inside] - low, high - mesh.vertices[inside]).min(axis=1).max()
+            assert len(inside) > 5 and side[inside].all()
+            share = 100.0 * len(inside) / len(z)
+            assert note.message.startswith(f"{len(inside)} free vertices ({share:.2g} %) start inside")
+            told = float(re.search(r"up to (\S+) mm deep", note.message)[1])
+            assert told == pytest.approx(deepest, rel=5e-3)
+
+    @pytest.mark.parametrize(("factor", "remedy"), [(1e-3, 1000.0), (100.0, 0.01), (1e3, 0.001)])
+    def test_remedy_of_a_wrong_unit_makes_the_size_it_says(self, factor, remedy):
+        scene = rm.Scene(units="mm").add_bone(
+            "rod", trimesh.creation.box((300.0 * factor, 1 * factor, 1 * factor))
+        )
+        with pytest.raises(MeshError) as caught:
+            check_extents(scene)
+        size = factor * np.linalg.norm([300.0, 1.0, 1.0])
+        text = str(caught.value)
+        assert f"is {size:.4g} mm across" in text
+        assert f"({remedy:g} times the present one would make it {size * remedy:.4g} mm)" in text
+
+    def test_distance_of_a_muscle_in_another_frame_is_that_of_the_boxes(self):
+        scene = arm_scene()
+        scene.muscles[0].mesh.apply_translation([0, 903.0, 0])
+        gap = scene.muscles[0].mesh.bounds[0, 1] - max(bone.mesh.bounds[1, 1] for bone in scene.bones)
+        up = max(
+            0.0, scene.muscles[0].mesh.bounds[0, 2] - max(bone.mesh.bounds[1, 2] for bone in scene.bones)
+        )
+        with pytest.raises(MeshError, match=rf"lies {np.hypot(gap, up):.4g} mm away from all bones"):
+            check_extents(scene)
+
+    def test_centre_far_away_is_told_with_its_distance(self):
+        scene = arm_scene()
+        low, high = np.array([bone.mesh.bounds for bone in scene.bones]).transpose(1, 0, 2)
+        centre = np.array([3.0, high.max(axis=0)[1] + 3e6, low.min(axis=0)[2] - 4e6])
+        with pytest.raises(SceneError, match=r"joint 'elbow': centre .* lies 5e\+06 mm away from all bones"):
+            check_centre(scene, "elbow", centre)
+        check_centre(scene, "elbow", high.max(axis=0) + 1.0)
+
+
+class TestLimits:
+    def test_what_exceeds_is_told_with_value_limit_and_frame(self):
+        facts = {
+            "strap": {
+                "volume_error": {"worst": -0.0345, "worst_frame": 7},
+                "penetration_max": {"worst": 0.5, "worst_frame": 3},
+                "components": {"worst": 2.0, "worst_frame": 11},
+            },
+            "all": {"volume_error": {"worst": 9.0, "worst_frame": 1}},
+        }
+        limits = {"volume_error": 0.02, "penetration_max": 0.5, "components": 1.0}
+        with pytest.raises(LimitExceededError) as caught:
+            require_limits(facts, limits)
+        assert str(caught.value) == (
+            "strap: volume_error = -0.0345 > 0.02 at frame 7; strap: components = 2 > 1 at frame 11"
+        )
+        require_limits(facts, {"volume_error": 0.0345, "penetration_max": 0.5, "components": 2.0})
+
+    def test_no_number_is_beyond_every_limit(self):
+        with pytest.raises(LimitExceededError, match="nan"):
+            require_limits({"strap": {"volume_error": {}}}, {"volume_error": 1.0})
+
+
+class TestPages:
+    def test_row_of_kernels_shows_each_quantity_in_its_column_and_unit(self):
+        row = {name: 1.01 + 0.1 * k for k, name in enumerate(COLUMNS)}
+        row |= {"kernel": "cubic", "note": "a <note>", "front_time": True, "centres": 80, "placement": None}
+        shown = texts(kernel_row(row))[0]
+        scale = {"volume, %": 100.0, "fit, ms": 1000.0, "20,000 values, ms": 1000.0}
+        for (name, head), found in zip(COLUMNS.items(), shown, strict=True):
+            if isinstance(row[name], float):
+                assert found == [f"{row[name] * scale.get(head, 1.0):.3g}"], head
+            else:
+                assert " ".join(found) == ("" if row[name] is None else str(row[name])), head
+
+    def test_cells_of_a_sweep_tell_times_in_milliseconds(self):
+        assert texts(f"<tr>{sweep_cell('time_frame', 0.0123)}</tr>") == [[["12.3"]]]
+        assert texts(f"<tr>{sweep_cell('error_rms', 0.0123)}</tr>") == [[["0.0123"]]]
+        assert texts(f"<tr>{sweep_cell('error_rms', None)}</tr>") == [[[]]]
+
+    def test_cells_of_a_comparison_have_their_unit(self):
+        units = {"time_frame": "s", "volume_error": "1", "penetration_max": "mm", "components": "1"}
+        table = {"measures": {name: {"unit": unit} for name, unit in units.items()}}
+        assert cell(table, "time_frame", 0.0234) == "23.4 ms" and cell(table, "time_frame", 2.34) == "2.34 s"
+        assert cell(table, "time_frame", 1.0) == "1 s" and cell(table, "time_frame", None) == "-"
+        assert cell(table, "volume_error", 0.0123) == "1.2 %" and cell(table, "components", 3.0) == "3"
+        assert texts(f"<tr><td>{cell(table, 'penetration_max', 1.234)}</td></tr>") == [[["1.23", "mm"]]]
+        assert cell(table, "penetration_max", 0.009).startswith("0 ")  # below half of what counts
+
+    def test_report_shows_each_muscles_figures_limits_and_frames(self):
+        saved = SimpleNamespace(
+            muscles=["strap", "fan"],
+            frames=[0, 1, 2],
+            info={
+                "status": "complete", "message": "", "times": {"wall": 12.34}, "frame_time": {"median": 0.0567},
+                "scene": {"muscles": [{"model": {"name": "rbf"}}, {"model": {"name": "pbd"}}]},
+                "limits": {"penetration_max": 0.5, "volume_error": 0.01},
+                "compiled": {"loops": 3, "seconds": 4.5},
+                "muscles": {
+                    "strap": {
+                        "penetration_max": {"worst": 0.61, "worst_frame": 7, "unit": "mm"},
+                        "length": {"worst": 9.0, "min": 11.1, "max": 13.3, "unit": "mm"},
+                        "volume_error": {"worst": -0.002, "worst_frame": 4, "unit": "1"},
+                    },
+                    "fan": {"penetration_max": {"worst": 0.0, "worst_frame": 0, "unit": "mm"}},
+                },
+                "stages": {"strap": {"time_solve": {"median": 0.0171, "p95": 0.0192}, "time_fit": None}},
+            },
+        )  # fmt: skip
+        assert "Beyond a limit: strap: penetration_max." in _verdict(saved)
+        rows = {row[0][0]: row[1:] for row in texts(_summary(saved))[1:]}
+        assert rows["penetration_max"] == [["0.61", "frame", "7"], ["0"], ["≤", "0.5"]]
+        assert rows["length"] == [["11.1", "…", "13.3"], ["-"], []]
+        assert rows["volume_error"] == [["-0.002", "frame", "4"], ["-"], ["≤", "0.01"]]
+        assert texts(_stages(saved)) == [[[], ["solve"], ["fit"]], [["strap"], ["17.1", "19.2"], ["-"]]]
+        facts = dict(
+            (name, html.unescape(value))
+            for value, name in re.findall(r"<div><b>(.*?)</b><span>(.*?)</span></div>", _facts(saved))
+        )
+        assert facts["time a frame, median"] == "57 ms" and facts["whole run"] == "12.3 s"
+        assert facts["model"] == "pbd, rbf" and facts["muscles"] == "2" and facts["frames"] == "3"
+        assert facts["of which compiling, this once"] == "4.5 s, 3 loops"
+        saved.info["limits"]["penetration_max"] = 0.61
+        assert "within every limit" in _verdict(saved)
+        assert report_cell("time_frame", {"worst": 1.0, "median": 0.0345}).startswith("34.5 ms")
