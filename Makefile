@@ -28,10 +28,12 @@ test-fast: $(STAMP)
 test-nojit: $(STAMP)
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q $$(grep -v '^#' tests/nojit.txt)
 
+ROOMS := $(patsubst %/,%,$(sort $(dir $(wildcard rbfmuscle/*/__init__.py)))) pbd_baseline
 # Loops count as covered where they run as Python: without compiler; the rest by the quick tests.
 coverage: $(STAMP)
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q --cov --cov-report= $$(grep -v '^#' tests/nojit.txt)
 	$(BIN)/python -m pytest -q --cov --cov-append --cov-report=term:skip-covered $$(grep -v '^#' tests/fast.txt)
+	@for room in $(ROOMS); do echo "$$room $$($(BIN)/python -m coverage report --include="$$room/*" --format=total) %"; done
 
 # Damaged scenes and meshes by the thousand; ends with a table of what became of them.
 fuzz: $(STAMP)
