@@ -71,7 +71,7 @@ def run(count: int, seed: int, minutes: float, rooms: list[str], loops: bool | N
         if time.monotonic() > end:
             print("time is over; the same command goes on from here")
             break
-        row = describe(fault, seed)
+        row = describe(fault, seed, tree)
         if row is None or row["key"] in known:
             continue
         row |= judge(fault, tree, reach, sound)
@@ -82,9 +82,9 @@ def run(count: int, seed: int, minutes: float, rooms: list[str], loops: bool | N
     subprocess.run(["rm", "-rf", str(tree)], check=False)
 
 
-def describe(fault, seed: int) -> dict | None:
+def describe(fault, seed: int, tree: Path) -> dict | None:
     """What identifies a fault however its file grows: function, line before and after; None where nothing changes."""
-    source = (ROOT / fault.path).read_text(encoding="utf-8")
+    source = (tree / fault.path).read_text(encoding="utf-8")
     planted = fault.planted(source)
     old, new = source.splitlines(), planted.splitlines()
     changed = [(a, b) for a, b in zip(old, new) if a != b]
