@@ -8,6 +8,7 @@ import trimesh
 from pbd_baseline.contraction import _stretch_loop
 from pbd_baseline.shapes import _scale_loop
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.fields import LevelField
 from rbfmuscle.geometry.mean_value import mean_value_weights
 from rbfmuscle.implicit.placement.off_surface import _touching_ball_loop
 
@@ -141,3 +142,18 @@ def test_triangles_that_are_segments_or_points_are_as_far_as_these():
     nearest = np.clip(flat - over, 0, 1)
     to_face = np.linalg.norm(points - np.column_stack([nearest, np.full(40, 9.0)]), axis=1)
     np.testing.assert_allclose(distance, np.minimum(np.min(to_axes, axis=0), to_face), atol=1e-12)
+
+
+def test_a_field_less_a_level_is_zero_where_the_field_has_the_level():
+    class Ball:
+        def __call__(self, points):
+            return np.linalg.norm(points, axis=1) - 1.0
+
+        def value_and_gradient(self, points):
+            return self(points), points / np.linalg.norm(points, axis=1, keepdims=True)
+
+    field, points = LevelField(Ball(), 0.5), np.array([[1.5, 0, 0], [0, 2.0, 0]])
+    np.testing.assert_allclose(field(points), [0.0, 0.5])
+    value, gradient = field.value_and_gradient(points)
+    np.testing.assert_allclose(value, [0.0, 0.5])
+    np.testing.assert_allclose(gradient, [[1, 0, 0], [0, 1, 0]])

@@ -1,12 +1,15 @@
 """Laws of the mesh baseline's parts: the rest costs nothing, half a way twice is the whole way."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import trimesh
 
 from pbd_baseline.arap import ARAP, ARAPConstraint
-from pbd_baseline.contact import ContactConstraint
+from pbd_baseline.contact import ContactConstraint, _keep_deepest
 from pbd_baseline.motion import carry
+from pbd_baseline.muscle import _contact_carriers
 from pbd_baseline.topology import Topology
 from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.sim.loop.contact import HalfSpaces
@@ -148,3 +151,20 @@ def test_a_way_without_contacts_stays():
     assert not contact.clear_way(POINTS, direction, 1.0) and contact.depth(POINTS) == 0.0
     np.testing.assert_array_equal(direction, DOWN)
     assert contact.project(POINTS.copy()) == 0.0
+
+
+def test_contact_points_are_vertices_and_the_middles_of_edges_and_faces(rest):
+    vertices, topology = rest
+    body = SimpleNamespace(vertices=vertices, topology=topology)
+    columns, shares = _contact_carriers(body, faces_too=True)
+    placed = ContactConstraint(columns, shares, reach=1.0).place(vertices)
+    middles = [vertices, vertices[topology.edges].mean(axis=1), vertices[topology.faces].mean(axis=1)]
+    np.testing.assert_allclose(placed, np.concatenate(middles), atol=1e-14)
+    alone = ContactConstraint(*_contact_carriers(body, faces_too=False), reach=1.0)
+    np.testing.assert_array_equal(alone.place(vertices), vertices)
+
+
+def test_nearest_response_keeps_the_deepest_of_each_point_alone():
+    depth = np.array([0.2, 0.5, 0.1, 0.3])
+    _keep_deepest(np.array([0, 0, 1, 3]), depth, 4)
+    np.testing.assert_array_equal(depth, [0.0, 0.5, 0.1, 0.3])
