@@ -60,17 +60,8 @@ class ARAP:
     def fit_rotations(self, points: Floats, *, steps: int = ROTATION_STEPS) -> None:
         """The local step: the best rotation of every one-ring, from the present ones on."""
         t = self.topology
-        _rotation_loop(
-            points,
-            t.ring_start,
-            t.ring,
-            t.ring_edge,
-            t.edges,
-            self.rest,
-            self.weights,
-            self.quaternions,
-            steps,
-        )
+        rings = t.ring_start, t.ring, t.ring_edge, t.edges
+        _rotation_loop(points, rings, self.rest, self.weights, self.quaternions, steps)
 
     def energy(self, points: Floats) -> float:
         """E with the present rotations [unit^2, as the cotangents have none]."""
@@ -138,7 +129,8 @@ class ARAPConstraint:
 
 
 @compiled
-def _rotation_loop(points, start, ring, ring_edge, edges, rest, weights, quaternions, steps):
+def _rotation_loop(points, rings, rest, weights, quaternions, steps):
+    start, ring, ring_edge, edges = rings
     moment = np.empty((3, 3))
     for i in range(len(quaternions)):
         moment[:] = 0.0

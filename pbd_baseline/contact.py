@@ -76,9 +76,8 @@ class ContactConstraint:
         """Take out of ``step * direction``, in place, what would lead into a half-space; say if anything."""
         if len(self.index) == 0 or step == 0.0:
             return False
-        return _clear_loop(
-            points, self.columns, self.shares, self.index, self.gap, self.normal, self.anchor, direction, step
-        )
+        planes = self.index, self.gap, self.normal, self.anchor
+        return _clear_loop(points, self.columns, self.shares, planes, direction, step)
 
     def _depths(self, points, depth):
         return _depth_loop(
@@ -140,7 +139,8 @@ def _push_loop(points, columns, shares, index, normal, depth):
 
 
 @compiled
-def _clear_loop(points, columns, shares, index, gap, normal, anchor, direction, step):
+def _clear_loop(points, columns, shares, planes, direction, step):
+    index, gap, normal, anchor = planes
     cleared = False
     nothing = np.zeros(3)
     for c in range(len(index)):

@@ -3,6 +3,10 @@
 The tree is a balanced binary heap over triangles in an order that halves them along the longest extent.
 """
 
+from __future__ import annotations
+
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -30,6 +34,15 @@ from rbfmuscle.geometry.triangles import (
 LEAF = 4
 # Deeper than any tree that fits in memory.
 STACK = 64
+
+
+class Tree(NamedTuple):
+    """Boxes of the heap's nodes, starts of the leaves, records of the triangles and the face of each record."""
+
+    boxes: NDArray[np.float64]
+    starts: NDArray[np.int64]
+    records: NDArray[np.float64]
+    order: NDArray[np.int64]
 
 
 class ExactDistance:
@@ -79,9 +92,9 @@ class ExactDistance:
         return bool((self.across >= 0).all())
 
     @property
-    def tree(self) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-        """The arrays that :func:`nearest_triangle` takes: boxes, starts of the leaves, records."""
-        return self.boxes, self.starts, self.records
+    def tree(self) -> Tree:
+        """The arrays that :func:`nearest_triangle` takes."""
+        return Tree(self.boxes, self.starts, self.records, self.order)
 
     def signed_distance(self, points: ArrayLike, *, reach: float = np.inf) -> NDArray[np.float64]:
         """Signed distance, (n,) [unit of the mesh], negative inside; ``reach`` where the mesh is further.
@@ -223,23 +236,25 @@ def record_feature(records, n, x, y, z):
 
 
 @compiled
-def nearest_triangle(boxes, starts, records, order, x, y, z, best, square, slack, nodes, squares):
+def nearest_triangle(tree, at, best, square, slack, stack):
     """Record of the triangle nearest to a point, and the squared distance.
 
     Parameters
     ----------
-    boxes, starts, records, order
-        The tree, and the face of each record.
-    x, y, z : float
+    tree : Tree
+    at : tuple of three floats
         The point.
     best, square : int, float
         A record known to be as near as this, or -1 and the squared reach.
     slack : float
         Of triangles whose squared distances differ by a smaller share, that of the least face number is taken, so
         that rounding and the order of the questions decide nothing.
-    nodes, squares : (STACK,) arrays of int64 and float64
+    stack : pair of (STACK,) arrays of int64 and float64
         Working space.
     """
+    boxes, starts, records, order = tree
+    x, y, z = at
+    nodes, squares = stack
     leaves = len(starts) - 1
     top = 0
     nodes[0], squares[0] = 1, _box_square(boxes, 1, x, y, z)
@@ -274,10 +289,9 @@ def nearest_triangle(boxes, starts, records, order, x, y, z, best, square, slack
 
 @compiled
 def _nearest_loop(points, reach, tree, normals, out):
-    boxes, starts, records = tree
-    order = normals[3]
+    records, order = tree.records, tree.order
     distance, closest, face, normal = out
-    nodes, squares = np.empty(STACK, np.int64), np.empty(STACK)
+    stack = np.empty(STACK, np.int64), np.empty(STACK)
     best = np.int64(-1)
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
@@ -289,9 +303,7 @@ def _nearest_loop(points, reach, tree, normals, out):
                 square = d
             else:
                 best = -1
-        best, square = nearest_triangle(
-            boxes, starts, records, order, x, y, z, best, square, 0.0, nodes, squares
-        )
+        best, square = nearest_triangle(tree, (x, y, z), best, square, 0.0, stack)
         if best < 0:
             distance[i], face[i] = reach, -1
             for k in range(3):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numba
 import numpy as np
@@ -28,6 +28,34 @@ _SORT_FROM = (
     200  # centres from which sorting the points pays, so that blocks out of a kernel's reach are skipped
 )
 _POOLS: dict[int, ThreadPoolExecutor] = {}
+
+
+class Terms(NamedTuple):
+    """A field as the loops read it, in the scaled coordinates (points - origin) / scale.
+
+    Attributes
+    ----------
+    origin : (3,) ndarray
+    scale : float
+    centres : (3, K) ndarray
+    a, b : (K,) and (3, K) ndarray
+        Weights of the values, and of the derivatives.
+    hermite : bool
+        Whether ``b`` counts.
+    epsilon : (K,) ndarray
+    coefficients, powers : (q,) and (q, 3) ndarray
+        Of the polynomial.
+    """
+
+    origin: np.ndarray
+    scale: float
+    centres: np.ndarray
+    a: np.ndarray
+    b: np.ndarray
+    hermite: bool
+    epsilon: np.ndarray
+    coefficients: np.ndarray
+    powers: np.ndarray
 
 
 def run_in_chunks(loop: Callable[..., Any], count: int, cost: int) -> None:
@@ -54,10 +82,10 @@ def run_in_chunks(loop: Callable[..., Any], count: int, cost: int) -> None:
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
-def _cubic_gradient_loop(p, cx, cy, cz, a, acc, g):
+def _cubic_gradient_loop(p, at, a, acc, g):
     """acc += a r^3, g += 3 a r d."""
     for i in range(acc.size):
-        dx, dy, dz = p[0, i] - cx, p[1, i] - cy, p[2, i] - cz
+        dx, dy, dz = p[0, i] - at[0], p[1, i] - at[1], p[2, i] - at[2]
         u = dx * dx + dy * dy + dz * dz
         w = a * np.sqrt(u)
         acc[i] += w * u
@@ -67,19 +95,21 @@ def _cubic_gradient_loop(p, cx, cy, cz, a, acc, g):
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
-def _cubic_hermite_value_loop(p, cx, cy, cz, a, bx, by, bz, acc):
+def _cubic_hermite_value_loop(p, at, a, b, acc):
     """acc += a r^3 - 3 r (B . d)."""
+    bx, by, bz = b
     for i in range(acc.size):
-        dx, dy, dz = p[0, i] - cx, p[1, i] - cy, p[2, i] - cz
+        dx, dy, dz = p[0, i] - at[0], p[1, i] - at[1], p[2, i] - at[2]
         u = dx * dx + dy * dy + dz * dz
         acc[i] += np.sqrt(u) * (a * u - 3.0 * (bx * dx + by * dy + bz * dz))
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
-def _cubic_hermite_gradient_loop(p, cx, cy, cz, a, bx, by, bz, acc, g):
+def _cubic_hermite_gradient_loop(p, at, a, b, acc, g):
     """Adds 3 a r d - 3 r B - 3/r (B . d) d to g, the value to acc."""
+    bx, by, bz = b
     for i in range(acc.size):
-        dx, dy, dz = p[0, i] - cx, p[1, i] - cy, p[2, i] - cz
+        dx, dy, dz = p[0, i] - at[0], p[1, i] - at[1], p[2, i] - at[2]
         u = dx * dx + dy * dy + dz * dz + 1e-300
         r = np.sqrt(u)
         bd = 3.0 * (bx * dx + by * dy + bz * dz)
@@ -92,10 +122,10 @@ def _cubic_hermite_gradient_loop(p, cx, cy, cz, a, bx, by, bz, acc, g):
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
-def _offsets_loop(p, cx, cy, cz, e2, d, u):
+def _offsets_loop(p, at, e2, d, u):
     """d = p - centre, u = e2 |d|^2."""
     for i in range(u.size):
-        dx, dy, dz = p[0, i] - cx, p[1, i] - cy, p[2, i] - cz
+        dx, dy, dz = p[0, i] - at[0], p[1, i] - at[1], p[2, i] - at[2]
         d[0, i] = dx
         d[1, i] = dy
         d[2, i] = dz
@@ -103,8 +133,9 @@ def _offsets_loop(p, cx, cy, cz, e2, d, u):
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
-def _add_value_loop(a, bx, by, bz, e2, hermite, radial, d, acc):
+def _add_value_loop(a, b, e2, hermite, radial, d, acc):
     """acc += a phi - first (B . d)."""
+    bx, by, bz = b
     phi, first = radial[0], radial[1]
     if not hermite:
         for i in range(acc.size):
@@ -115,8 +146,9 @@ def _add_value_loop(a, bx, by, bz, e2, hermite, radial, d, acc):
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
-def _add_gradient_loop(a, bx, by, bz, e2, hermite, radial, d, g):
+def _add_gradient_loop(a, b, e2, hermite, radial, d, g):
     """g += a first d - first B - second (B . d) d."""
+    bx, by, bz = b
     first, second = radial[1], radial[2]
     if not hermite:
         for i in range(d.shape[1]):
@@ -136,11 +168,12 @@ def _add_gradient_loop(a, bx, by, bz, e2, hermite, radial, d, g):
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
-def _add_hessian_loop(a, bx, by, bz, e2, hermite, radial, d, h):
+def _add_hessian_loop(a, b, e2, hermite, radial, d, h):
     """Add the second derivatives to h (6: xx yy zz xy xz yz).
 
     a (first I + second d d^T), less second ((B . d) I + d B^T + B d^T) + third (B . d) d d^T for Hermite weights B.
     """
+    bx, by, bz = b
     first, second, third = radial[1], radial[2], radial[3]
     e4 = e2 * e2
     for i in range(d.shape[1]):
@@ -162,18 +195,19 @@ def _add_hessian_loop(a, bx, by, bz, e2, hermite, radial, d, h):
 
 
 @compiled(error_model="numpy")
-def _cubic_block_loop(centres, a, b, hermite, gradient, p, acc, g):
+def _cubic_block_loop(terms, gradient, p, acc, g):
     """Hermite values, and gradients, of the cubic kernel with epsilon 1, the commonest by far."""
+    centres, a, b = terms.centres, terms.a, terms.b
     for j in range(centres.shape[1]):
-        cx, cy, cz, w = centres[0, j], centres[1, j], centres[2, j], a[j]
-        if hermite and gradient:
-            _cubic_hermite_gradient_loop(p, cx, cy, cz, w, b[0, j], b[1, j], b[2, j], acc, g)
-        elif hermite:
-            _cubic_hermite_value_loop(p, cx, cy, cz, w, b[0, j], b[1, j], b[2, j], acc)
+        at, w = (centres[0, j], centres[1, j], centres[2, j]), a[j]
+        if terms.hermite and gradient:
+            _cubic_hermite_gradient_loop(p, at, w, (b[0, j], b[1, j], b[2, j]), acc, g)
+        elif terms.hermite:
+            _cubic_hermite_value_loop(p, at, w, (b[0, j], b[1, j], b[2, j]), acc)
         elif gradient:
-            _cubic_gradient_loop(p, cx, cy, cz, w, acc, g)
+            _cubic_gradient_loop(p, at, w, acc, g)
         else:
-            _cubic_loop(p, cx, cy, cz, 1.0, w, acc)
+            _cubic_loop(p, at, 1.0, w, acc)
 
 
 @compiled(error_model="numpy")
@@ -190,44 +224,44 @@ def _ball(p):
 
 
 @compiled(error_model="numpy")
-def _out_of_reach(ball, cx, cy, cz, epsilon):
+def _out_of_reach(ball, at, epsilon):
     """Whether a kernel that ends at 1 / epsilon is zero in the whole ball."""
-    dx, dy, dz = ball[0] - cx, ball[1] - cy, ball[2] - cz
+    dx, dy, dz = ball[0] - at[0], ball[1] - at[1], ball[2] - at[2]
     reach = ball[3] + 1.0 / epsilon
     return dx * dx + dy * dy + dz * dz >= reach * reach
 
 
 @compiled(error_model="numpy")
-def _value_block_loop(centres, a, epsilon, base, parameter, compact, row, p, acc):
+def _value_block_loop(terms, form, p, acc):
     """Values alone of a field without Hermite weights."""
-    ball = _ball(p)
+    ball, centres, weight, epsilon = _ball(p), terms.centres, terms.a, terms.epsilon
     for j in range(centres.shape[1]):
-        cx, cy, cz, e = centres[0, j], centres[1, j], centres[2, j], epsilon[j]
-        if not (compact and _out_of_reach(ball, cx, cy, cz, e)):
-            _add_values_loop(base, parameter, compact, row, p, cx, cy, cz, e * e, a[j], acc)
+        at, e = (centres[0, j], centres[1, j], centres[2, j]), epsilon[j]
+        if not (form.compact and _out_of_reach(ball, at, e)):
+            _add_values_loop(form, p, at, e * e, weight[j], acc)
 
 
 @compiled(error_model="numpy")
-def _general_block_loop(
-    centres, a, b, hermite, order, epsilon, base, parameter, compact, table, p, acc, g, h
-):
-    """Any kernel: radial functions into scratch blocks, then their sums. epsilon (K,)."""
+def _general_block_loop(terms, form, order, p, acc, g, h):
+    """Any kernel: radial functions into scratch blocks, then their sums."""
     d, u = np.empty_like(p), np.empty_like(acc)
     work, radial = np.empty((3, u.size)), np.empty((4, u.size))
+    hermite, centres, epsilon = terms.hermite, terms.centres, terms.epsilon
+    weight, slope = terms.a, terms.b
     wanted = (2 << (order + hermite)) - 1
     ball = _ball(p)
     for j in range(centres.shape[1]):
-        e2 = epsilon[j] * epsilon[j]
-        cx, cy, cz = centres[0, j], centres[1, j], centres[2, j]
-        if compact and _out_of_reach(ball, cx, cy, cz, epsilon[j]):
+        at, e2 = (centres[0, j], centres[1, j], centres[2, j]), epsilon[j] * epsilon[j]
+        if form.compact and _out_of_reach(ball, at, epsilon[j]):
             continue
-        _offsets_loop(p, cx, cy, cz, e2, d, u)
-        _radial_loop(base, parameter, compact, table, wanted, u, work, radial)
-        _add_value_loop(a[j], b[0, j], b[1, j], b[2, j], e2, hermite, radial, d, acc)
+        a, b = weight[j], (slope[0, j], slope[1, j], slope[2, j])
+        _offsets_loop(p, at, e2, d, u)
+        _radial_loop(form, wanted, u, work, radial)
+        _add_value_loop(a, b, e2, hermite, radial, d, acc)
         if order > 0:
-            _add_gradient_loop(a[j], b[0, j], b[1, j], b[2, j], e2, hermite, radial, d, g)
+            _add_gradient_loop(a, b, e2, hermite, radial, d, g)
         if order > 1:
-            _add_hessian_loop(a[j], b[0, j], b[1, j], b[2, j], e2, hermite, radial, d, h)
+            _add_hessian_loop(a, b, e2, hermite, radial, d, h)
 
 
 @compiled(error_model="numpy")
@@ -243,8 +277,9 @@ def _monomial_loop(p, i, j, k, factor, term, out):
 
 
 @compiled(error_model="numpy")
-def _polynomial_loop(coefficients, powers, gradient, p, acc, g):
-    """Adds a polynomial to acc, its gradient to g."""
+def _polynomial_loop(terms, gradient, p, acc, g):
+    """Adds a field's polynomial to acc, its gradient to g."""
+    coefficients, powers = terms.coefficients, terms.powers
     term = np.empty_like(acc)
     for q in range(len(coefficients)):
         c, i, j, k = coefficients[q], powers[q, 0], powers[q, 1], powers[q, 2]
@@ -258,11 +293,11 @@ def _polynomial_loop(coefficients, powers, gradient, p, acc, g):
 
 
 @compiled(error_model="numpy")
-def _fill_block_loop(points, origin, scale, low, n, p):
+def _fill_block_loop(points, terms, low, n, p):
     """Scaled points of a block, coordinates in rows; its end repeats the last point."""
     for i in range(p.shape[1]):
         for c in range(3):
-            p[c, i] = (points[low + min(i, n - 1), c] - origin[c]) / scale
+            p[c, i] = (points[low + min(i, n - 1), c] - terms.origin[c]) / terms.scale
 
 
 @compiled(error_model="numpy")
@@ -280,53 +315,44 @@ def _give_block_loop(scale, low, n, acc, g, value, gradient):
 
 
 @compiled(error_model="numpy")
-def _evaluate_cubic_loop(
-    points, origin, scale, centres, a, b, hermite, coefficients, powers, start, stop, value, gradient
-):
+def _evaluate_cubic_loop(points, terms, start, stop, value, gradient):
     """Value and, where there is room for it, gradient of the cubic kernel with epsilon 1 at points[start:stop]."""
     for low in range(start, stop, _BLOCK):
         n = min(_BLOCK, stop - low)
         size = (n + 7) // 8 * 8
         p, acc, g = np.empty((3, size)), np.zeros(size), np.zeros((3, size))
-        _fill_block_loop(points, origin, scale, low, n, p)
-        _cubic_block_loop(centres, a, b, hermite, len(gradient) > 0, p, acc, g)
-        _polynomial_loop(coefficients, powers, len(gradient) > 0, p, acc, g)
-        _give_block_loop(scale, low, n, acc, g, value, gradient)
+        _fill_block_loop(points, terms, low, n, p)
+        _cubic_block_loop(terms, len(gradient) > 0, p, acc, g)
+        _polynomial_loop(terms, len(gradient) > 0, p, acc, g)
+        _give_block_loop(terms.scale, low, n, acc, g, value, gradient)
 
 
 @compiled(error_model="numpy")
-def _evaluate_values_loop(
-    points, origin, scale, centres, a, epsilon, base, parameter, compact, table,
-    coefficients, powers, start, stop, value
-):  # fmt: skip
+def _evaluate_values_loop(points, terms, form, start, stop, value):
     """Values alone of a field of any kernel without Hermite weights at points[start:stop]."""
     nothing = np.empty((0, 3))
     for low in range(start, stop, _BLOCK):
         n = min(_BLOCK, stop - low)
         size = (n + 7) // 8 * 8
         p, acc = np.empty((3, size)), np.zeros(size)
-        _fill_block_loop(points, origin, scale, low, n, p)
-        _value_block_loop(centres, a, epsilon, base, parameter, compact, table[0], p, acc)
-        _polynomial_loop(coefficients, powers, False, p, acc, p)
-        _give_block_loop(scale, low, n, acc, p, value, nothing)
+        _fill_block_loop(points, terms, low, n, p)
+        _value_block_loop(terms, form, p, acc)
+        _polynomial_loop(terms, False, p, acc, p)
+        _give_block_loop(terms.scale, low, n, acc, p, value, nothing)
 
 
 @compiled(error_model="numpy")
-def _evaluate_loop(
-    points, origin, scale, centres, a, b, hermite, order, epsilon, base, parameter, compact, table,
-    coefficients, powers, start, stop, value, gradient, hessian
-):  # fmt: skip
+def _evaluate_loop(points, terms, form, order, start, stop, out):
     """Value, gradient and radial part of the Hessian (order 0, 1, 2) of any kernel at points[start:stop]."""
+    value, gradient, hessian = out
     for low in range(start, stop, _BLOCK):
         n = min(_BLOCK, stop - low)
         size = (n + 7) // 8 * 8
         p, acc, g, h = np.empty((3, size)), np.zeros(size), np.zeros((3, size)), np.zeros((6, size))
-        _fill_block_loop(points, origin, scale, low, n, p)
-        _general_block_loop(
-            centres, a, b, hermite, order, epsilon, base, parameter, compact, table, p, acc, g, h
-        )
-        _polynomial_loop(coefficients, powers, order > 0, p, acc, g)
-        _give_block_loop(scale, low, n, acc, g, value, gradient)
+        _fill_block_loop(points, terms, low, n, p)
+        _general_block_loop(terms, form, order, p, acc, g, h)
+        _polynomial_loop(terms, order > 0, p, acc, g)
+        _give_block_loop(terms.scale, low, n, acc, g, value, gradient)
         if order > 1:
             for c in range(6):
                 for i in range(n):
@@ -335,8 +361,7 @@ def _evaluate_loop(
 
 def evaluate(
     points: Floats,
-    origin: Floats,
-    scale: float,
+    frame: tuple[Floats, float],
     centres: Floats,
     weights: Floats,
     kernel: Kernel,
@@ -349,9 +374,8 @@ def evaluate(
     Parameters
     ----------
     points : (n, 3) ndarray
-    origin : (3,) ndarray
-    scale : float
-        Scaled coordinates are (points - origin) / scale.
+    frame : pair of (3,) ndarray and float
+        Origin and scale: scaled coordinates are (points - origin) / scale.
     centres : (3, K) ndarray
         Scaled.
     weights : (4, K) or (1, K) ndarray
@@ -374,29 +398,22 @@ def evaluate(
     """
     hermite, count = len(weights) == 4, len(points)
     b = weights[1:] if hermite else np.zeros((3, weights.shape[1]))
-    cubic = kernel.name == "cubic" and bool((epsilon == 1.0).all())
+    cubic = kernel.plain_cube and bool((epsilon == 1.0).all())
     value, gradient = np.empty(count), np.empty((count if order > 0 else 0, 3))
     hessian = np.empty((6, count if order > 1 else 0))
     sort = kernel.compact and centres.shape[1] >= _SORT_FROM and count > 4 * _BLOCK and epsilon.min() > 2.0
     if sort:
         places = _by_cells(points)
         points = points[places]
-
-    where, of_kernel = (
-        (points, origin, scale, centres, weights[0]),
-        (kernel.base, kernel.parameter, kernel.compact),
-    )
+    terms, form = Terms(*frame, centres, weights[0], b, hermite, epsilon, *polynomial), kernel.form
 
     def loop(start, stop):
         if cubic and order < 2:
-            _evaluate_cubic_loop(*where, b, hermite, *polynomial, start, stop, value, gradient)
+            _evaluate_cubic_loop(points, terms, start, stop, value, gradient)
         elif order == 0 and not hermite:
-            _evaluate_values_loop(*where, epsilon, *of_kernel, kernel.table, *polynomial, start, stop, value)
+            _evaluate_values_loop(points, terms, form, start, stop, value)
         else:
-            _evaluate_loop(
-                *where, b, hermite, order, epsilon, *of_kernel, kernel.table, *polynomial,
-                start, stop, value, gradient, hessian,
-            )  # fmt: skip
+            _evaluate_loop(points, terms, form, order, start, stop, (value, gradient, hessian))
 
     run_in_chunks(loop, count, count * centres.shape[1])
     if not sort:

@@ -345,8 +345,8 @@ class RBFField:
 
     def _evaluate(self, points: Floats, order: int) -> tuple[Floats, Floats, Floats]:
         return evaluate(
-            points, self.origin, self.scale, self._scaled, self._rows, self.kernel, self._shape, self._polynomial,
-            order,
+            points, (self.origin, self.scale), self._scaled, self._rows, self.kernel, self._shape,
+            self._polynomial, order,
         )  # fmt: skip
 
 

@@ -49,9 +49,9 @@ def test_values_are_sums_of_the_kernel(kernel, epsilon):
     phi = kernel.phi(np.linalg.norm(points[:, None] - centres, axis=2), epsilon)
     shape, nothing = np.full(250, epsilon), (np.zeros(0), np.zeros((0, 3), dtype=np.int64))
     for order in (0, 1):
-        found = evaluate(points, np.zeros(3), 1.0, centres.T.copy(), weights, kernel, shape, nothing, order)[
-            0
-        ]
+        found = evaluate(
+            points, (np.zeros(3), 1.0), centres.T.copy(), weights, kernel, shape, nothing, order
+        )[0]
         assert np.abs(found - phi @ weights[0]).max() < 1e-14 * (np.abs(phi) @ np.abs(weights[0])).max()
 
 
@@ -78,7 +78,7 @@ def test_slopes_and_curvatures_are_those_of_the_literal_sum(kernel, dipoles):
 
     def found(at, order):
         shape = np.full(7, epsilon)
-        return evaluate(at, origin, scale, centres, weights, kernel, shape, (coefficients, powers), order)
+        return evaluate(at, (origin, scale), centres, weights, kernel, shape, (coefficients, powers), order)
 
     def phi(at, shift=0.0):
         way = at[:, None] - centres.T - shift

@@ -77,23 +77,23 @@ def _offsets_loop(x, j, scale2, first, d, u):
 
 
 @compiled(error_model="numpy")
-def _value_matrix_loop(x, epsilon, base, parameter, compact, table, out):
+def _value_matrix_loop(x, epsilon, form, out):
     """out[j, i] = phi(|x_i - x_j|), both halves, as whole rows are filled faster; x is (3, n)."""
     for j in range(x.shape[1]):
         column = out[j]
         column[:] = 0.0
         centre = x[0, j], x[1, j], x[2, j]
-        _add_values_loop(base, parameter, compact, table[0], x, *centre, epsilon * epsilon, 1.0, column)
+        _add_values_loop(form, x, centre, epsilon * epsilon, 1.0, column)
 
 
 @compiled(error_model="numpy")
-def _hermite_matrix_loop(x, epsilon, base, parameter, compact, table, out):
+def _hermite_matrix_loop(x, epsilon, form, out):
     """Lower triangle of the Hermite matrix; out[column, row] is its transpose."""
     n = x.shape[1]
     d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((3, n)), np.empty((4, n))
     for j in range(n):
         _offsets_loop(x, j, epsilon * epsilon, 0, d, u)
-        _radial_loop(base, parameter, compact, table, 7, u, work, radial)
+        _radial_loop(form, 7, u, work, radial)
         _hermite_columns_loop(j, epsilon * epsilon, d, radial, out)
 
 
@@ -146,7 +146,7 @@ def normal_polynomials(points: Floats, normals: Floats, powers: Integers) -> Flo
 
 
 @compiled(error_model="numpy")
-def _normal_matrix_loop(x, normals, epsilon, base, parameter, compact, table, out):
+def _normal_matrix_loop(x, normals, epsilon, form, out):
     """As `_hermite_matrix_loop`, with the derivative along the unit normal (3, n) alone.
 
     Blocks: (value, value) phi; (normal i, value j) first (d . n_i);
@@ -157,7 +157,7 @@ def _normal_matrix_loop(x, normals, epsilon, base, parameter, compact, table, ou
     d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((3, n)), np.empty((4, n))
     for j in range(n):
         _offsets_loop(x, j, e2, 0, d, u)
-        _radial_loop(base, parameter, compact, table, 7, u, work, radial)
+        _radial_loop(form, 7, u, work, radial)
         phi, first, second = radial[0], radial[1], radial[2]
         value, slope = out[j], out[n + j]
         nx, ny, nz = normals[0, j], normals[1, j], normals[2, j]

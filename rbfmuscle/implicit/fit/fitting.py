@@ -96,7 +96,7 @@ class Basis:
         first = (np.ascontiguousarray(self.points.T),)
         if self.kind == "normal":
             first += (np.ascontiguousarray(self.normals.T),)
-        if self.kind == "gradient" and kernel.name == "cubic":
+        if self.kind == "gradient" and kernel.plain_cube:
             assembly._cubic_hermite_matrix_loop(*first, float(self.epsilon), out)
             return out.T
         loop = {
@@ -104,8 +104,7 @@ class Basis:
             "gradient": assembly._hermite_matrix_loop,
             "normal": assembly._normal_matrix_loop,
         }[self.kind]
-        rest = (kernel.base, kernel.parameter, kernel.compact, kernel.table, out)
-        loop(*first, self.epsilon, *rest)
+        loop(*first, self.epsilon, kernel.form, out)
         return out.T
 
     def full_matrix(self, smoothing: float = 0.0) -> Floats:

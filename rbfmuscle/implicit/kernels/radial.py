@@ -4,12 +4,24 @@ The kernel is chosen once a block, outside the inner loops, which are short enou
 exp and log are written out here because calls into the C library keep a loop from being vectorised.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
 
 ONE, EXP, GAUSS, BINOMIAL, CUT, LOG, POWER = range(7)
 """Bases: 1, exp(-s), exp(-s^2), (1+s^2)^beta, (1-s)+, log s, s^a."""
+
+
+class Form(NamedTuple):
+    """A kernel as the loops read it: base, its own exponent, whether it ends at s = 1, rows of the table."""
+
+    base: int
+    parameter: float
+    compact: bool
+    table: np.ndarray
+
 
 _LOG2E = 1.4426950408889634
 _LN2_HIGH = 6.93147180369123816490e-01
@@ -164,12 +176,13 @@ def _inner_loop(base, row, u, s, b, out):
 
 
 @compiled(error_model="numpy")
-def _radial_loop(base, parameter, compact, table, wanted, u, work, out):
+def _radial_loop(form, wanted, u, work, out):
     """Fill out[k] (4, n) with the k-th radial function of s**2 = u for every bit k set in wanted.
 
     work is a (3, n) scratch array. Where a function is infinite at u = 0 a finite value stands in: it is
     only ever multiplied by components of the zero vector.
     """
+    base, parameter, compact, table = form
     s, b, more = work[0][: u.size], work[1][: u.size], work[2][: u.size]
     _base_loop(base, parameter, u, s, b, more)
     for k in range(4):

@@ -74,6 +74,16 @@ class Kernel:
         """Least polynomial degree, -1 for none."""
         return self.order - 1
 
+    @property
+    def form(self) -> radial.Form:
+        """What the loops read of this row."""
+        return radial.Form(self.base, self.parameter, self.compact, self.table)
+
+    @property
+    def plain_cube(self) -> bool:
+        """Whether phi is s^3, for which the loops have a shorter way."""
+        return bool(self.base == radial.ONE and self.table[0, 0] == 3.0 and self.table[0, 2 + _TERMS] == 1.0)
+
     def phi(self, r: ArrayLike, epsilon: float = 1.0) -> Floats:
         """Kernel at distances r (any shape), shape parameter epsilon [1/length]."""
         return self._radial(r, epsilon, 0)
@@ -95,16 +105,7 @@ class Kernel:
         check_finite(np.atleast_1d(r), name="r")
         flat = np.ascontiguousarray(np.abs(r).ravel() * epsilon)
         out = np.empty((4, flat.size))
-        radial._radial_loop(
-            self.base,
-            self.parameter,
-            self.compact,
-            self.table,
-            1 << k,
-            flat * flat,
-            np.empty((3, flat.size)),
-            out,
-        )
+        radial._radial_loop(self.form, 1 << k, flat * flat, np.empty((3, flat.size)), out)
         values = out[k]
         values[flat == 0.0] = self._limit(k)
         return (values * epsilon ** (2 * k)).reshape(r.shape)

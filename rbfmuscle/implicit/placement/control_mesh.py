@@ -152,8 +152,10 @@ def _contract(h, tail, twin, out, parent, weight):
 
 
 @compiled
-def _contract_inside(tail, twin, out, parent, label, weight, mark, live, count):
+def _contract_inside(edges, pieces, mark, live, count):
     """Contract edges inside clusters until none can be; return the number of vertices left."""
+    tail, twin, out = edges
+    parent, label, weight = pieces
     changed = True
     while changed and live > count:
         changed = False
@@ -189,7 +191,7 @@ def _contract_loop(tail, twin, out, parent, label, weight, live, count):
     mark = np.full(len(parent), -1)
     main = np.full(label.max() + 1, -1)
     while True:
-        live = _contract_inside(tail, twin, out, parent, label, weight, mark, live, count)
+        live = _contract_inside((tail, twin, out), (parent, label, weight), mark, live, count)
         if live <= count:
             return live
         main[:] = -1

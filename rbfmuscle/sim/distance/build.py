@@ -128,15 +128,14 @@ class _Builder:
         rows = np.empty((count if self.inside is not None else 0, 12), dtype=np.float32)
         centre = np.full(count, -1, dtype=np.int32) if centres is None else centres
         nodes = (corners.record, corners.distance, corners.doubt)
-        mesh = ((*self.exact.tree, self.exact.order), self.across, self.origin, self.doubtful)
+        mesh = (self.exact.tree, self.across, self.origin, self.doubtful)
         written = {}
 
         def work(a, b):
             lists = np.empty((b - a) * LONGEST, dtype=np.int32)
             out = (lists, offsets[a:b], rows, self.rows)
-            used, mixed, sound = list_loop(
-                low[a:b], ids[a:b], nodes, centre[a:b], float(edge), self.unit, mesh, probe, out
-            )
+            cells = low[a:b], ids[a:b], centre[a:b]
+            used, mixed, sound = list_loop(cells, nodes, float(edge), self.unit, mesh, probe, out)
             written[a, b] = (lists[:used].copy(), mixed, sound)
 
         # Rows of mixed cells are numbered in order.
@@ -259,9 +258,8 @@ def _cut_blocks(builder, shape, blocks, offsets, samples, edge, bands):
         active = np.zeros((len(blocks), side**3), dtype=np.bool_)
         _active_loop(*samples, edge, band, side, active)
         if builder.inside is None:
-            _near_loop(
-                blocks, offsets, lists, builder.exact.records, builder.origin, edge, band, side, active
-            )
+            cut = builder.origin, edge, band, side
+            _near_loop(blocks, offsets, lists, builder.exact.records, cut, active)
         marks.append(active)
     parent = (lattice((BLOCK,) * 3) // (BLOCK // 2)) @ np.array([4, 2, 1])
     fine, half = marks
@@ -313,17 +311,15 @@ def _far_records(exact, diagonal):
 
 @compiled
 def _node_loop(points, near, tree, normals, record, distance):
-    boxes, starts, records = tree
-    nodes, squares, closest, normal = np.empty(STACK, np.int64), np.empty(STACK), np.empty(3), np.empty(3)
+    records, closest, normal = tree.records, np.empty(3), np.empty(3)
+    stack = np.empty(STACK, np.int64), np.empty(STACK)
     best = 0
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         # Where nothing nearer is named, the last answer bounds this one.
         best = near[i] if near[i] >= 0 else best
         square = record_square(records, best, x, y, z)
-        best, square = nearest_triangle(
-            boxes, starts, records, normals[3], x, y, z, best, square, SLACK, nodes, squares
-        )
+        best, square = nearest_triangle(tree, (x, y, z), best, square, SLACK, stack)
         record[i] = best
         side = signed_side(records[best], normals[3][best], points[i], normals, closest, normal)
         distance[i] = np.sqrt(square) if side >= 0.0 else -np.sqrt(square)
@@ -358,10 +354,11 @@ def _active_loop(ids, distance, centre, edge, band, side, active):
 
 
 @compiled
-def _near_loop(blocks, offsets, lists, records, origin, edge, band, side, active):
+def _near_loop(blocks, offsets, lists, records, cut, active):
     """Unmark small cells that a block's triangles show to be out of the band, unless the surface is
-    folded.
+    folded. ``cut`` holds origin, edge of a block, width of the band and small cells along an edge.
     """
+    origin, edge, band, side = cut
     small = edge / side
     limit = (band + 0.5 * np.sqrt(3.0) * small) ** 2
     for i in range(len(blocks)):

@@ -24,12 +24,13 @@ LOOK_BACK = 6
 
 
 @compiled
-def list_loop(low, ids, nodes, centre, edge, unit, mesh, probe, out):
+def list_loop(cells, nodes, edge, unit, mesh, probe, out):
     """Write the list of each cell; return the lengths used and whether all signs agree with the distances."""
+    low, ids, centre = cells
     record, distance, doubt = nodes
     lists, offsets, rows, first_row = out
     used, mixed, sound = 0, 0, True
-    nodes_left, squares = np.empty(STACK, np.int64), np.empty(STACK)
+    stack = np.empty(STACK, np.int64), np.empty(STACK)
     for i in range(len(ids)):
         listed = lists[used + 1 : used + 1 + MOST]
         count = 0
@@ -40,9 +41,9 @@ def list_loop(low, ids, nodes, centre, edge, unit, mesh, probe, out):
                 count = _add(listed, count, np.int64(n))
             if k < 8:
                 doubted = doubted or doubt[ids[i, k]]
-        folded = abs(distance[ids[i, 0]]) < FOLD_REACH * edge and folded_list(mesh[0][2], listed, count)
+        folded = abs(distance[ids[i, 0]]) < FOLD_REACH * edge and folded_list(mesh[0].records, listed, count)
         if probe or folded:
-            count = _probe(listed, count, folded, low[i], edge, mesh, nodes_left, squares)
+            count = _probe(listed, count, folded, low[i], edge, mesh, stack)
         for k in range(count):
             doubted = doubted or mesh[3][listed[k]]
         state, bound = _cell_state(ids[i], distance, edge)
@@ -87,14 +88,15 @@ def folded_list(records, listed, count):
 
 
 @compiled
-def _probe(listed, count, folded, low, edge, mesh, nodes_left, squares):
+def _probe(listed, count, folded, low, edge, mesh, stack):
     """Add the triangles nearest to points inside the cell.
 
     Where a corner's nearest point lies on an edge or a vertex, several triangles are equally near and the
     corner names only one of them; inside the cell another may be nearer by far. A walk downhill over the
     surface, from the nearest triangle listed, finds it; where the surface is folded the tree is asked.
     """
-    (boxes, starts, records, order), across, origin, _ = mesh
+    tree, across, origin, _ = mesh
+    records = tree.records
     for k in range(len(PROBES)):
         x = origin[0] + edge * (low[0] + 0.5 + PROBES[k, 0])
         y = origin[1] + edge * (low[1] + 0.5 + PROBES[k, 1])
@@ -105,9 +107,7 @@ def _probe(listed, count, folded, low, edge, mesh, nodes_left, squares):
             if s < square * (1 - SLACK):
                 best, square = np.int64(listed[m]), s
         if folded:
-            end, _ = nearest_triangle(
-                boxes, starts, records, order, x, y, z, best, square, SLACK, nodes_left, squares
-            )
+            end, _ = nearest_triangle(tree, (x, y, z), best, square, SLACK, stack)
         else:
             end = _walk(best, square, x, y, z, records, across)
         if end != best:

@@ -70,6 +70,15 @@ class FieldData(NamedTuple):
     across: np.ndarray
 
 
+class Found(NamedTuple):
+    """Of the points of one stage: where relative to the origin, cell, nearest record, offset in its frame."""
+
+    local: np.ndarray
+    entry: np.ndarray
+    best: np.ndarray
+    offset: np.ndarray
+
+
 @compiled(error_model="numpy", inline="always")
 def _square(n, x, y, z, records):
     """Squared distance to record n of a point relative to the origin, in single precision; without branches, as they
@@ -208,11 +217,11 @@ def _crossed_side(x, y, z, n, records, edge_normals, vertex_normals, vertices):
 
 
 @compiled(error_model="numpy")
-def _slow_side(x, y, z, entry, n, lists, corners, records, edge_normals, vertex_normals, vertices):
+def _slow_side(x, y, z, entry, n, data):
     """Positive outside: where neither the cell nor the side of a face tells."""
-    if lists[entry] >> SIDE & 3 == MIXED:
-        return _mixed_side(x, y, z, entry, lists, corners)
-    return _crossed_side(x, y, z, n, records, edge_normals, vertex_normals, vertices)
+    if data.lists[entry] >> SIDE & 3 == MIXED:
+        return _mixed_side(x, y, z, entry, data.lists, data.corners)
+    return _crossed_side(x, y, z, n, data.records, data.edge_normals, data.vertex_normals, data.vertices)
 
 
 @compiled(error_model="numpy", inline="always")
@@ -224,12 +233,16 @@ def _unit_gradient(n, distance, du, dv, dw, least, records):
 
 
 @compiled(error_model="numpy")
-def _stage(points, pose, reach, grid, blocks, cells, lists, far, records, local, entry, best, square):
+def _stage(points, pose, reach, data, found, square):
     """Nearest record of up to STAGE points; each pass reads what the next one needs.
 
     Fills the points relative to the origin, their cells, their nearest record (-1 where out of reach)
     and the squared distance (the lower bound where out of reach).
     """
+    grid, blocks, cells, lists, far, records = (
+        data.grid, data.blocks, data.cells, data.lists, data.far, data.records
+    )  # fmt: skip
+    local, entry, best = found.local, found.entry, found.best
     scale, unit = grid[INVERSE], grid[UNIT]
     if len(points) >= LEAST_TOGETHER:
         bound = _common_bound(points, pose, grid, blocks, cells, lists)
@@ -265,10 +278,12 @@ def _stage(points, pose, reach, grid, blocks, cells, lists, far, records, local,
 
 
 @compiled(error_model="numpy")
-def _finish(count, local, entry, best, square, offset, lists, corners, records, en, vn, vertices, across):
+def _finish(count, data, found, square):
     """Turn squared into signed distances, and fill the offsets from the surface in the frames of the
     records.
     """
+    local, entry, best, offset = found
+    lists, records, across = data.lists, data.records, data.across
     for n in range(count):
         if best[n] < 0:
             continue
@@ -284,7 +299,7 @@ def _finish(count, local, entry, best, square, offset, lists, corners, records, 
         state = lists[entry[n]] >> SIDE & 3
         side = 1.0 if state == OUTSIDE else (-1.0 if state == INSIDE else dw)
         if state == MIXED or (state == CROSSED and not inside):
-            side = _slow_side(x, y, z, entry[n], m, lists, corners, records, en, vn, vertices)
+            side = _slow_side(x, y, z, entry[n], m, data)
         d = np.sqrt(square[n])
         square[n] = d if side >= 0.0 else -d
 
@@ -292,22 +307,23 @@ def _finish(count, local, entry, best, square, offset, lists, corners, records, 
 @compiled(error_model="numpy")
 def query_loop(points, pose, reach, distance, gradient, data):
     """Distances (n,) and gradients (n, 3), world axes, of points in world coordinates; ``gradient`` may be empty."""
-    grid, blocks, cells, lists, corners, far, records, en, vn, vertices, across = data
-    local, offset, entry = np.empty((STAGE, 3)), np.empty((STAGE, 3)), np.empty(STAGE, np.int32)
-    best = np.empty(STAGE, np.int32)
-    least = ROUNDING * grid[UNIT]
+    found = Found(
+        np.empty((STAGE, 3)), np.empty(STAGE, np.int32), np.empty(STAGE, np.int32), np.empty((STAGE, 3))
+    )
+    least = ROUNDING * data.grid[UNIT]
     for start in range(0, len(points), STAGE):
         end = min(start + STAGE, len(points))
         some, near, d = points[start:end], reach[start:end], distance[start:end]
-        _stage(some, pose, near, grid, blocks, cells, lists, far, records, local, entry, best, d)
-        _finish(len(some), local, entry, best, d, offset, lists, corners, records, en, vn, vertices, across)
+        _stage(some, pose, near, data, found, d)
+        _finish(len(some), data, found, d)
         if len(gradient) > 0:
-            _turn(len(some), pose, least, best, d, offset, records, gradient[start:end])
+            _turn(len(some), pose, least, found, d, data.records, gradient[start:end])
 
 
 @compiled(error_model="numpy")
-def _turn(count, pose, least, best, distance, offset, records, gradient):
+def _turn(count, pose, least, found, distance, records, gradient):
     """Gradients in world axes; zero where the bone is out of reach."""
+    best, offset = found.best, found.offset
     for n in range(count):
         gx, gy, gz = 0.0, 0.0, 0.0
         if best[n] >= 0:

@@ -6,7 +6,7 @@ It stands beside `BoneSDF` to be compared with it; nothing uses it by default.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,9 +15,6 @@ from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import MeshLike
 from rbfmuscle.sim.distance.detectors import PointDetector, grid_of, sample_nodes
 from rbfmuscle.validation import check_points
-
-if TYPE_CHECKING:
-    pass
 
 
 class SerendipityField(PointDetector):
@@ -63,12 +60,13 @@ class SerendipityField(PointDetector):
     def _local(self, points):
         points = check_points(points)
         distance, gradient = np.empty(len(points)), np.empty((len(points), 3))
-        _serendipity_loop(points, self.low, self.edge, *self.nodes, distance, gradient)
+        _serendipity_loop(points, self.low, self.edge, tuple(self.nodes), distance, gradient)
         return distance, gradient
 
 
 @compiled
-def _serendipity_loop(points, low, edge, corners, on_x, on_y, on_z, distance, gradient):
+def _serendipity_loop(points, low, edge, nodes, distance, gradient):
+    corners, on_x, on_y, on_z = nodes
     cell, t, grad = np.empty(3, np.int64), np.empty(3), np.empty(3)
     for n in range(len(points)):
         for k in range(3):
@@ -86,11 +84,11 @@ def _serendipity_loop(points, low, edge, corners, on_x, on_y, on_z, distance, gr
             for b in range(2):
                 for c in range(2):
                     node = on_x[2 * cell[0] + a, cell[1] + b, cell[2] + c]
-                    value += _edge(t, 0, 1, 2, 2 * a - 1, 2 * b - 1, 2 * c - 1, node, grad)
+                    value += _edge(t, (0, 1, 2), (2 * a - 1, 2 * b - 1, 2 * c - 1), node, grad)
                     node = on_y[cell[0] + c, 2 * cell[1] + a, cell[2] + b]
-                    value += _edge(t, 1, 2, 0, 2 * a - 1, 2 * b - 1, 2 * c - 1, node, grad)
+                    value += _edge(t, (1, 2, 0), (2 * a - 1, 2 * b - 1, 2 * c - 1), node, grad)
                     node = on_z[cell[0] + b, cell[1] + c, 2 * cell[2] + a]
-                    value += _edge(t, 2, 0, 1, 2 * a - 1, 2 * b - 1, 2 * c - 1, node, grad)
+                    value += _edge(t, (2, 0, 1), (2 * a - 1, 2 * b - 1, 2 * c - 1), node, grad)
         distance[n] = value
         for k in range(3):
             gradient[n, k] = 2.0 * grad[k] / edge[k]
@@ -108,8 +106,10 @@ def _corner(t, a, b, c, square, node, grad):
 
 
 @compiled
-def _edge(t, i, j, k, a, b, c, node, grad):
+def _edge(t, axes, sides, node, grad):
     """Add (9/64)(1 - x^2)(1 + 9 x_i x)(1 + b y)(1 + c z), x_i = a/3, x along axis i, times the node."""
+    i, j, k = axes
+    a, b, c = sides
     x = t[i]
     y, z, u, v = 1.0 + b * t[j], 1.0 + c * t[k], 1.0 - x * x, 1.0 + 3.0 * a * x
     s = 9.0 * node / 64.0

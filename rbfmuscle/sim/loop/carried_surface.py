@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -14,6 +14,28 @@ from rbfmuscle.geometry.triangles import nearest_weights
 
 if TYPE_CHECKING:
     from rbfmuscle.sim.loop.frame import MuscleModel
+
+
+class Cells(NamedTuple):
+    """Vertices sorted by the cells of a grid: its box, edge and shape; those of cell c are
+    members[first[c] : first[c + 1]].
+    """
+
+    box: np.ndarray
+    edge: float
+    shape: np.ndarray
+    first: np.ndarray
+    members: np.ndarray
+
+
+class Skin(NamedTuple):
+    """Vertices, their normals, faces, and the faces around vertex v, ring[start[v] : start[v + 1]]."""
+
+    vertices: np.ndarray
+    normals: np.ndarray
+    faces: np.ndarray
+    start: np.ndarray
+    ring: np.ndarray
 
 
 class CarriedSurface:
@@ -60,10 +82,10 @@ class CarriedSurface:
         self.vertices = np.ascontiguousarray(self.model.carried_mesh()[0], dtype=np.float64)
         self.normals = vertex_normals(self.vertices, self.faces)
         self.box = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
-        self.shape = (np.ceil((self.box[1] - self.box[0]) / self.cell).astype(np.int64) + 1).clip(1)
-        self.first = np.zeros(int(np.prod(self.shape)) + 1, dtype=np.int64)
-        self.members = np.empty(len(self.vertices), dtype=np.int64)
-        _fill_loop(self.vertices, self.box[0], self.cell, self.shape, self.first, self.members)
+        shape = (np.ceil((self.box[1] - self.box[0]) / self.cell).astype(np.int64) + 1).clip(1)
+        first = np.zeros(int(np.prod(shape)) + 1, dtype=np.int64)
+        self.cells = Cells(self.box, self.cell, shape, first, np.empty(len(self.vertices), dtype=np.int64))
+        _fill_loop(self.vertices, self.cells)
 
     def query(self, points: Floats, which: Booleans, reach: float) -> Any:
         """Distances of those points that are nearer than ``reach``.
@@ -87,28 +109,25 @@ class CarriedSurface:
             Nearest vertex.
         """
         index, nearest = np.empty(len(points), dtype=np.int64), np.empty(len(points), dtype=np.int64)
-        count = _nearest_loop(
-            points, which, self.vertices, self.box, self.cell, self.shape, self.first, self.members,
-            min(reach + self.edge, self.cell), index, nearest,
-        )  # fmt: skip
+        bound = min(reach + self.edge, self.cell)
+        count = _nearest_loop(points, which, self.vertices, self.cells, bound, index, nearest)
         index, nearest = index[:count], nearest[:count]
         distance, normal = np.empty(count), np.empty((count, 3))
-        _distance_loop(
-            points, index, nearest, self.vertices, self.normals, self.faces, self.start, self.ring,
-            distance, normal,
-        )  # fmt: skip
+        skin = Skin(self.vertices, self.normals, self.faces, self.start, self.ring)
+        _distance_loop(points, index, nearest, skin, distance, normal)
         near = distance < reach
         return index[near], distance[near], normal[near], nearest[near]
 
 
 @compiled
-def _fill_loop(vertices, origin, cell, shape, first, members):
-    """Sort the vertices by cell: those of cell c are members[first[c] : first[c + 1]]."""
+def _fill_loop(vertices, cells):
+    """Sort the vertices by cell."""
+    box, cell, shape, first, members = cells
     where = np.empty(len(vertices), dtype=np.int64)
     for v in range(len(vertices)):
         c = 0
         for k in range(3):
-            c = c * shape[k] + int((vertices[v, k] - origin[k]) / cell)
+            c = c * shape[k] + int((vertices[v, k] - box[0, k]) / cell)
         where[v] = c
         first[c + 1] += 1
     for c in range(len(first) - 1):
@@ -120,8 +139,9 @@ def _fill_loop(vertices, origin, cell, shape, first, members):
 
 
 @compiled
-def _nearest_loop(points, which, vertices, box, cell, shape, first, members, bound, index, nearest):
+def _nearest_loop(points, which, vertices, cells, bound, index, nearest):
     """Nearest vertex within ``bound``, at most a cell, of each point asked for; return how many have one."""
+    box, cell, shape, first, members = cells
     count = 0
     low, high = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)
     for p in range(len(points)):
@@ -152,7 +172,8 @@ def _nearest_loop(points, which, vertices, box, cell, shape, first, members, bou
 
 
 @compiled
-def _distance_loop(points, index, nearest, vertices, normals, faces, start, ring, distance, normal):
+def _distance_loop(points, index, nearest, skin, distance, normal):
+    vertices, normals, faces, start, ring = skin
     weights, best = np.empty(3), np.empty(3)
     for q in range(len(index)):
         p = index[q]

@@ -248,17 +248,21 @@ def _candidates(start, end, back_before, back_after, bounds, anchor, known, free
     first, second = np.empty_like(start), np.empty_like(end)
     index = np.empty(len(start), dtype=np.int64)
     count = _candidates_loop(
-        start, end, back_before, back_after, bounds, anchor, known, free, index, first, second
+        (start, end), (back_before, back_after), bounds, (anchor, known), free, index, (first, second)
     )
     return index[:count], first[:count], second[:count]
 
 
 @compiled(error_model="numpy")
-def _candidates_loop(start, end, back_before, back_after, bounds, anchor, known, free, index, first, second):
+def _candidates_loop(paths, back, bounds, answers, free, index, local):
     """Leave out paths that are shorter than what is known of their end's distance to the bone.
 
     That is the distance to the bone's box, and an earlier answer less the way since, (x + y)^2 <= 2 x^2 + 2 y^2.
     """
+    start, end = paths
+    back_before, back_after = back
+    anchor, known = answers
+    first, second = local
     count = 0
     for i in range(len(start)):
         if not free[i]:
