@@ -53,9 +53,10 @@ def _rotation_loop(m, q):
 
 
 @compiled(error_model="numpy")
-def _local_loop(x, arm, start, other, inverse, fibre, low, high, law, q, target, deformation):
+def _local_loop(x, clusters, law, q, target, deformation):
     """Deformation gradient F and target T of each cluster, T = R (t aaᵀ + s (I - aaᵀ))."""
-    lower, upper, share, across = law
+    arm, start, other, inverse, fibre = clusters
+    low, high, lower, upper, share, across = law
     f = np.empty((3, 3))
     for i in range(len(start) - 1):
         f[:] = 0.0
@@ -167,11 +168,9 @@ class ShapeConstraint:
     def localise(self, x: Floats) -> Floats:
         """Update F_i and T_i from the centres and return the right side b of laplacian · x = b, (K, 3)."""
         low, high = self.limits
-        _local_loop(
-            x, self.arm, self.start, self.other, self.inverse, self.fibre, low, high,
-            (self.law.lower, self.law.upper, self.law.share, self.law.across),
-            self.quaternion, self.target, self.deformation,
-        )  # fmt: skip
+        clusters = self.arm, self.start, self.other, self.inverse, self.fibre
+        law = low, high, self.law.lower, self.law.upper, self.law.share, self.law.across
+        _local_loop(x, clusters, law, self.quaternion, self.target, self.deformation)
         _right_side_loop(self.arm, self.start, self.other, self.target, self.right_side)
         return self.right_side
 

@@ -96,8 +96,10 @@ def _push_loop(index, normal, strength, influence, push):
 
 
 @compiled(error_model="numpy")
-def _lacking_loop(index, normal, row, need, share, push, columns, shares, lacking):
+def _lacking_loop(contacts, need, share, push, hanging, lacking):
     """Motion that each contact still asks for after ``push`` and ``share`` of the volume's response."""
+    index, normal, row = contacts
+    columns, shares = hanging
     for c in range(len(index)):
         value = need[c] + row[c] * share
         for k in range(columns.shape[1]):
@@ -109,11 +111,12 @@ def _lacking_loop(index, normal, row, need, share, push, columns, shares, lackin
 
 
 @compiled(error_model="numpy")
-def _contact_loop(
-    index, gap, normal, source, motion, response, stiffness, influence, columns, shares, table,
-    batch, rounds, sweeps, tolerance, push,
-):  # fmt: skip
+def _contact_loop(spaces, motion, volume, influence, hanging, table, effort, push):
     """Fill ``push`` and the forces in ``table``; returns the volume's share that the push takes back."""
+    index, gap, normal, source = spaces
+    response, stiffness = volume
+    columns, shares = hanging
+    batch, rounds, sweeps, tolerance = effort
     count = len(index)
     row, need, force = np.empty(count), np.empty(count), np.empty(count)
     for c in range(count):
@@ -147,7 +150,7 @@ def _contact_loop(
             lost += row[c] * force[c]
         if len(added) == 0:
             break
-        _lacking_loop(index, normal, row, need, lost / stiffness, push, columns, shares, lacking)
+        _lacking_loop((index, normal, row), need, lost / stiffness, push, hanging, lacking)
     for c in chosen:
         table[index[c], source[c]] = force[c]
     return lost
@@ -210,9 +213,10 @@ class ContactConstraint:
         if self.forces.shape[1] != sources:
             self.forces = np.zeros((len(self.influence), sources))
         push = np.empty((self.influence.shape[1], 3))
+        contacts = spaces.index, spaces.gap, spaces.normal, spaces.source % sources
+        effort = self.batch, ROUNDS, SWEEPS, self.tolerance
         lost = _contact_loop(
-            spaces.index, spaces.gap, spaces.normal, spaces.source % sources, motion, response, stiffness,
-            self.influence, self.columns, self.shares, self.forces,
-            self.batch, ROUNDS, SWEEPS, self.tolerance, push,
+            contacts, motion, (response, stiffness), self.influence, (self.columns, self.shares),
+            self.forces, effort, push,
         )  # fmt: skip
         return push, lost

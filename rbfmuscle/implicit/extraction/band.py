@@ -16,9 +16,9 @@ from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.fields import Cut, Field
 from rbfmuscle.implicit.extraction.marching import (
-    EDGE_AXIS,
-    EDGE_CORNER,
     FACE_CORNERS,
+    Made,
+    Samples,
     _combined,
     _march_loop,
     marching_tables,
@@ -146,6 +146,10 @@ class Band:
         _close_border_loop(self.state, *grid.shape)
 
     @property
+    def _samples(self) -> Samples:
+        return Samples(self.grid.strides, self.index, self._f, self._c)
+
+    @property
     def cells(self) -> Integers:
         """Flat numbers of the visited cells."""
         return self._cells[: self.cell_count]
@@ -171,9 +175,8 @@ class Band:
             self._evaluate(swept)
             begin, swept = swept, self.cell_count
             self.cell_count = _follow_loop(
-                self._cells, begin, swept, self.grid.strides, self.index, self._f, self._c, level, FACE_MASKS,
-                self.state,
-            )  # fmt: skip
+                self._cells, begin, swept, self._samples, level, FACE_MASKS, self.state
+            )
 
     def widen(self) -> bool:
         """Visit all neighbours of the visited cells; whether there were any."""
@@ -218,22 +221,18 @@ class Band:
             Vertices that a shift by a cell may bring to the cut.
         """
         count = self.cell_count
-        ambiguous, first, start, table = marching_tables()
-        vertex_of = np.full((self.node_count, 3), -1, dtype=np.int32)
-        node = np.empty(4 * self.node_count + 4, dtype=np.int64)
-        shift = np.empty((4 * self.node_count + 4, 3))
-        triangles = np.empty((12 * count + 12, 3), dtype=np.int64)
-        n_vertices, n_triangles = _march_loop(
-            self.cells, self.grid.strides, self.index, self._f, self._c, level, EDGE_CORNER, EDGE_AXIS,
-            FACE_CORNERS, ambiguous, first, start, table, vertex_of, node, shift, triangles,
-        )  # fmt: skip
-        coordinates = shift[:n_vertices]
+        made = Made(
+            np.full((self.node_count, 3), -1, dtype=np.int32),
+            np.empty(4 * self.node_count + 4, dtype=np.int64),
+            np.empty((4 * self.node_count + 4, 3)),
+            np.empty((12 * count + 12, 3), dtype=np.int64),
+        )
+        n_vertices, n_triangles = _march_loop(self.cells, self._samples, level, marching_tables(), made)
+        coordinates = made.shift[:n_vertices]
         is_open, near_cut = np.empty(n_vertices, dtype=np.bool_), np.empty(n_vertices, dtype=np.bool_)
-        _place_loop(
-            node, np.array(self.grid.shape), self.grid.strides, self.index, self._c, NEAR_CUT * self.grid.spacing,
-            coordinates, is_open, near_cut,
-        )  # fmt: skip
-        return coordinates, triangles[:n_triangles], is_open, near_cut
+        shape, near = np.array(self.grid.shape), NEAR_CUT * self.grid.spacing
+        _place_loop(made.node, shape, self._samples, near, coordinates, is_open, near_cut)
+        return coordinates, made.triangles[:n_triangles], is_open, near_cut
 
 
 def box_along(points: Floats, axes: Floats) -> Floats:
@@ -273,8 +272,9 @@ def _nodes_loop(flat, strides, origin, edges, out):
 
 
 @compiled(error_model="numpy")
-def _place_loop(node, shape, strides, index, c, near, coordinates, is_open, near_cut):
+def _place_loop(node, shape, samples, near, coordinates, is_open, near_cut):
     """Turn shifts from the nodes into grid coordinates; mark vertices on the border and near the cut."""
+    strides, index, _, c = samples
     for v in range(len(coordinates)):
         flat = node[v]
         other, axes = flat, 0
@@ -316,11 +316,12 @@ def _add_nodes_loop(cells, begin, end, strides, index, flat, count):
 
 
 @compiled(error_model="numpy")
-def _follow_loop(cells, begin, end, strides, index, f, c, level, masks, state):
+def _follow_loop(cells, begin, end, samples, level, masks, state):
     """Append the cells behind crossed faces; returns the new count of cells.
 
     A state of 2 beyond the first or last row keeps the walk inside the grid: rows are closed by non-cells.
     """
+    strides, index, f, c = samples
     count = end
     for n in range(begin, end):
         inside = 0

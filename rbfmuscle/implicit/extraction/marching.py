@@ -10,12 +10,12 @@ and its edge would have four triangles. Each crossed edge then has one ring of c
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
-from rbfmuscle.geometry.arrays import Integers
+from rbfmuscle.geometry.arrays import Floats, Integers
 
 # Corner c of a cell sits at (c & 1, c >> 1 & 1, c >> 2). Edge e runs from its corner along its axis.
 EDGE_CORNER = np.array([c for axis in range(3) for c in range(8) if not c >> axis & 1])
@@ -24,12 +24,11 @@ EDGE_AXIS = np.repeat(np.arange(3), 4)
 FACE_CORNERS = np.array([[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]])
 
 
-@lru_cache(maxsize=1)
-def marching_tables() -> tuple[Integers, ...]:
+class Tables(NamedTuple):
     """Tables of the 256 cases, each with one entry for every answer of its ambiguous faces.
 
-    Returns
-    -------
+    Attributes
+    ----------
     ambiguous : (256, 6) int array
         Faces of each case that need a decision, -1 past the last.
     first : (256,) int array
@@ -39,7 +38,48 @@ def marching_tables() -> tuple[Integers, ...]:
         Rows of ``triangles`` of each entry.
     triangles : (n, 3) int array
         Outward triangles: edge 0 .. 11, or 12 + i for the i-th loop's own middle vertex.
+    corner, axis : (12,) int array
+        Lower corner of each edge, and the axis along which it runs.
+    faces : (6, 4) int array
+        Corners of each face, anticlockwise seen from outside.
     """
+
+    ambiguous: Integers
+    first: Integers
+    start: Integers
+    triangles: Integers
+    corner: Integers
+    axis: Integers
+    faces: Integers
+
+
+class Samples(NamedTuple):
+    """Values f of the field and c of what cuts it at the nodes of cells.
+
+    A cell is the flat number of its lower node, ``strides`` are the steps of that number along the axes, and
+    ``index`` (all nodes of the grid,) tells where f and c of a node stand.
+    """
+
+    strides: Integers
+    index: Integers
+    f: Floats
+    c: Floats
+
+
+class Made(NamedTuple):
+    """What marching fills: the vertex of each node's three edges, -1 for none; of each vertex its lower node and its
+    shift from there in cells; the triangles.
+    """
+
+    of: Integers
+    node: Integers
+    shift: Floats
+    triangles: Integers
+
+
+@lru_cache(maxsize=1)
+def marching_tables() -> Tables:
+    """The tables, made from their rules."""
     ambiguous = np.full((256, 6), -1)
     first = np.zeros(256, dtype=np.int64)
     start = [0]
@@ -59,7 +99,9 @@ def marching_tables() -> tuple[Integers, ...]:
                     middle += 1
                 triangles.extend(pieces)
             start.append(len(triangles))
-    return ambiguous, first, np.array(start), np.array(triangles)
+    return Tables(
+        ambiguous, first, np.array(start), np.array(triangles), EDGE_CORNER, EDGE_AXIS, FACE_CORNERS
+    )
 
 
 def _is_ambiguous(signs: list[int]) -> bool:
@@ -144,19 +186,16 @@ def _crossing(f0, f1, c0, c1, level):
 
 
 @compiled(error_model="numpy")
-def _march_loop(
-    cells, strides, index, f, c, level, corner, axis, faces4, ambiguous, first, start, table,
-    vertex_of, vertex_node, vertex_shift, triangles,
-):  # fmt: skip
-    """Triangles of all cells; returns the numbers of vertices and triangles.
-
-    A vertex is given by its lower node (flat) and its shift from there in cells.
-    """
+def _march_loop(cells, samples, level, tables, made):
+    """Triangles of all cells; returns the numbers of vertices and triangles."""
+    strides, f, c = samples.strides, samples.f, samples.c
+    start, table, corner, axis = tables.start, tables.triangles, tables.corner, tables.axis
+    vertex_of, vertex_node, vertex_shift, triangles = made
     nodes, values = np.empty(8, dtype=np.int64), np.empty(8)
     local = np.empty(16, dtype=np.int64)
     n_vertices, n_triangles = 0, 0
     for n in range(len(cells)):
-        entry = _entry_of(cells[n], strides, index, f, c, level, faces4, ambiguous, first, nodes, values)
+        entry = _entry_of(cells[n], samples, level, tables, nodes, values)
         if entry < 0:
             continue
         rows = table[start[entry] : start[entry + 1]]
@@ -192,8 +231,10 @@ def _corner_node(cell, q, strides):
 
 
 @compiled(error_model="numpy")
-def _entry_of(cell, strides, index, f, c, level, faces4, ambiguous, first, nodes, values):
+def _entry_of(cell, samples, level, tables, nodes, values):
     """Table entry of a cell, -1 where it is not crossed; its nodes and values go to the last two arrays."""
+    strides, index, f, c = samples
+    ambiguous, faces4 = tables.ambiguous, tables.faces
     case = 0
     for q in range(8):
         nodes[q] = index[_corner_node(cell, q, strides)]
@@ -211,7 +252,7 @@ def _entry_of(cell, strides, index, f, c, level, faces4, ambiguous, first, nodes
         # The saddle is inside where the product of the inside corners is the larger one.
         if product != 0 and (product > 0) == (values[faces4[k, 0]] < 0):
             bits |= 1 << b
-    return first[case] + bits
+    return tables.first[case] + bits
 
 
 @compiled(error_model="numpy")

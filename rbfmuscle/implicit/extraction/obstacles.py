@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -48,6 +48,30 @@ class ObstaclePoints:
         ).reshape(-1, 2, 3)
 
 
+class Visited(NamedTuple):
+    """Way from points to grid coordinates, ``turn @ p + shift``, and what was visited: state of each cell, and blocks
+    of cells that hold a visited one or touch one.
+    """
+
+    turn: Floats
+    shift: Floats
+    shape: Integers
+    strides: Integers
+    state: Array
+    blocks: Booleans
+
+
+class Sorted(NamedTuple):
+    """Triangles sorted by the cell of their middle: those of cell c are order[start[c] : start[c + 1]], with their
+    middles in that order; ``cell`` (m,) is each triangle's own.
+    """
+
+    cell: Integers
+    start: Integers
+    order: Integers
+    middle: Floats
+
+
 def points_near_cells(
     obstacles: list[tuple[ObstaclePoints, Floats]], grid: BandGrid, state: Array, cells: Integers
 ) -> Floats:
@@ -76,9 +100,8 @@ def points_near_cells(
         turn = grid.axes @ pose[:3, :3] / grid.spacing
         shift = grid.axes @ (pose[:3, 3] - grid.origin) / grid.spacing
         index = np.empty(len(points), dtype=np.int64)
-        count = _near_cells_loop(
-            points, obstacle.boxes, turn, shift, shape, grid.strides, state, blocks, index
-        )
+        visited = Visited(turn, shift, shape, grid.strides, state, blocks)
+        count = _near_cells_loop(points, obstacle.boxes, visited, index)
         # In the caller's order: pushes follow one another, and a turned scene is sorted in another one.
         near = index[:count][np.argsort(obstacle.order[index[:count]])]
         found.append(points[near] @ pose[:3, :3].T + pose[:3, 3])
@@ -97,7 +120,8 @@ def _mark_blocks_loop(cells, strides, blocks):
 
 
 @compiled(error_model="numpy")
-def _near_cells_loop(points, boxes, turn, shift, shape, strides, state, blocks, index):
+def _near_cells_loop(points, boxes, visited, index):
+    turn, shift, shape, blocks = visited.turn, visited.shift, visited.shape, visited.blocks
     low, high = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)
     count = 0
     for pack in range(len(boxes)):
@@ -113,14 +137,13 @@ def _near_cells_loop(points, boxes, turn, shift, shape, strides, state, blocks, 
         if apart or not blocks[low[0] : high[0] + 1, low[1] : high[1] + 1, low[2] : high[2] + 1].any():
             continue
         last = min((pack + 1) * PACK, len(points))
-        count = _near_points_loop(
-            points, pack * PACK, last, turn, shift, shape, strides, state, blocks, index, count
-        )
+        count = _near_points_loop(points, pack * PACK, last, visited, index, count)
     return count
 
 
 @compiled(error_model="numpy")
-def _near_points_loop(points, first, last, turn, shift, shape, strides, state, blocks, index, count):
+def _near_points_loop(points, first, last, visited, index, count):
+    turn, shift, shape, strides, state, blocks = visited
     for n in range(first, last):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
         u = shift[0] + turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z
@@ -130,12 +153,12 @@ def _near_points_loop(points, first, last, turn, shift, shape, strides, state, b
             continue
         if not blocks[int(u) // BLOCK, int(v) // BLOCK, int(w) // BLOCK]:
             continue
-        visited = False
+        beside = False
         for i in range(int(u - CHORD), int(u + CHORD) + 1):
             for j in range(int(v - CHORD), int(v + CHORD) + 1):
                 for k in range(int(w - CHORD), int(w + CHORD) + 1):
-                    visited |= state[i * strides[0] + j * strides[1] + k * strides[2]] == 1
-        if visited:
+                    beside |= state[i * strides[0] + j * strides[1] + k * strides[2]] == 1
+        if beside:
             index[count] = n
             count += 1
     return count
@@ -172,25 +195,23 @@ def push_off_points(
         return moved
     start = np.zeros(int(np.prod(grid.shape)) + 1, dtype=np.int32)
     cell, order = np.empty(len(faces), dtype=np.int32), np.empty(len(faces), dtype=np.int32)
+    cells = Sorted(cell, start, order, np.empty((len(faces), 3)))
     last = np.array(grid.shape) - 2
-    turn = grid.axes / grid.spacing
-    middle = np.empty((len(faces), 3))
-    _sort_faces_loop(vertices, faces, turn, grid.origin, last, grid.strides, cell, start, order, middle)
+    _sort_faces_loop(vertices, faces, (grid.axes / grid.spacing, grid.origin, last, grid.strides), cells)
     where = grid.cells(points)
     touched = np.ones(len(start), dtype=np.bool_)
+    scale = grid.strides, grid.spacing, tolerance
     for _ in range(rounds):
-        number = _push_loop(
-            vertices, faces, points, where, order, start, middle, cell, grid.strides, grid.spacing, tolerance, moved,
-            touched,
-        )  # fmt: skip
-        if not number:
+        if not _push_loop(vertices, faces, points, where, cells, scale, moved, touched):
             break
     return moved
 
 
 @compiled(error_model="numpy")
-def _sort_faces_loop(vertices, faces, turn, origin, last, strides, cell, start, order, middle):
-    """Sort triangles by the cell of their middle: those of cell c are order[start[c] : start[c + 1]]."""
+def _sort_faces_loop(vertices, faces, frame, cells):
+    """Sort triangles by the cell of their middle."""
+    turn, origin, last, strides = frame
+    cell, start, order, middle = cells
     for f in range(len(faces)):
         i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
         x = (vertices[i, 0] + vertices[j, 0] + vertices[k, 0]) / 3.0 - origin[0]
@@ -218,28 +239,25 @@ def _sort_faces_loop(vertices, faces, turn, origin, last, strides, cell, start, 
 
 
 @compiled(error_model="numpy")
-def _push_loop(
-    vertices, faces, points, where, order, start, middle, cell, strides, reach, tolerance, moved, touched
-):  # fmt: skip
+def _push_loop(vertices, faces, points, where, cells, scale, moved, touched):
     """One pass over the points in ``touched`` cells; returns how many had to be pushed off.
 
     Points that are well outside are taken off the list (where = -1); ``touched`` then marks the cells around the
     triangles that were pushed.
     """
+    strides, reach, tolerance = scale
     number = 0
     normal, weight = np.empty(3), np.empty(3)
     pushed = np.empty(len(points), dtype=np.int64)
     for p in range(len(points)):
         if where[p] < 0 or not touched[where[p]]:
             continue
-        best, signed = _nearest_triangle(
-            vertices, faces, points[p], where[p], order, start, middle, strides, reach
-        )
+        best, signed = _nearest_triangle(vertices, faces, points[p], where[p], cells, strides, reach)
         if signed < -0.1 * reach:
             where[p] = -1
         if signed <= tolerance or signed > CHORD * reach:
             continue
-        pushed[number] = cell[best]
+        pushed[number] = cells.cell[best]
         number += 1
         _weigh(vertices, faces, best, points[p], weight, normal)
         square = weight[0] ** 2 + weight[1] ** 2 + weight[2] ** 2
@@ -253,8 +271,9 @@ def _push_loop(
 
 
 @compiled(error_model="numpy")
-def _nearest_triangle(vertices, faces, p, where, order, start, middle, strides, reach):
+def _nearest_triangle(vertices, faces, p, where, cells, strides, reach):
     """Nearest triangle right above or below p, less than ``reach`` away, and how far p lies behind it."""
+    _, start, order, middle = cells
     best, least, signed = -1, reach, -reach
     # A triangle lies in a cell: its middle is less than a cell from any point that is right behind it.
     far = (1.3 * reach) ** 2
