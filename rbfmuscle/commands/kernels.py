@@ -26,6 +26,7 @@ def kernels(
     derivatives: str = "all",
     placement: str = "fitted",
     criterion: str = "held_out",
+    condition: float = float("inf"),
     resolution: int = 64,
     best: int = 3,
     frames: str | None = None,
@@ -54,6 +55,8 @@ def kernels(
         fitted, greedy, adaptive or even; fitted centres lie beside the surface and meet all of it best.
     criterion
         How epsilon is chosen: held_out, loo, gcv or condition.
+    condition
+        None beyond it is chosen, as 1e10.
     resolution
         Cells along the longest side.
     best
@@ -89,7 +92,8 @@ def kernels(
         compile_ahead(["kernels"])
         study = study_kernels(
             mesh, kernels=names, centres=counts, derivatives=derivatives, placement=placement,
-            criterion=criterion, resolution=resolution, units=units if scene is None else scene.units, progress=bar,
+            criterion=criterion, condition=condition, resolution=resolution,
+            units=units if scene is None else scene.units, progress=bar,
         )  # fmt: skip
         moved = [] if scene is None else _run_best(scene, title, study, best, frames)
         try:

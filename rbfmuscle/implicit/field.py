@@ -99,6 +99,7 @@ class RBFField:
         epsilon: float = 1.0,
         degree: int | None = None,
         smoothing: float | str = 0.0,
+        truncate: bool = True,
     ) -> RBFField:
         """Interpolate values at points.
 
@@ -115,6 +116,8 @@ class RBFField:
         smoothing : float or {"gcv", "loo"}
             Added to the diagonal, in coordinates scaled to order one; 0 interpolates. A criterion chooses it
             (see `regularisation`), for one eigen-decomposition.
+        truncate : bool
+            Solve by a truncated eigen-decomposition where the condition is beyond 1e13; else raise there.
 
         Returns
         -------
@@ -135,7 +138,7 @@ class RBFField:
         shape = epsilon * scale if kernel.has_epsilon else 1.0
         basis = Basis((points - origin) / scale, kernel, shape, degree)
         smoothing = basis_smoothing(smoothing, basis, values)
-        weights, coefficients, condition = solve(basis, values, smoothing=smoothing)
+        weights, coefficients, condition = solve(basis, values, smoothing=smoothing, truncate=truncate)
         rest = basis.powers, condition, smoothing
         return cls(points, origin, scale, kernel, epsilon, weights, coefficients, *rest)
 
@@ -149,6 +152,7 @@ class RBFField:
         epsilon: float = 1.0,
         smoothing: float | str = 0.0,
         derivatives: str = "all",
+        truncate: bool = True,
     ) -> RBFField:
         """Fit f = 0 and grad f = normal at every point (Hermite RBF, Macedo 2011).
 
@@ -158,7 +162,7 @@ class RBFField:
             Points of the surface [scene unit].
         normals : (K, 3) array_like
             Gradients wanted there, outward; unit vectors make f a distance near the surface.
-        kernel, epsilon, smoothing
+        kernel, epsilon, smoothing, truncate
             As in `fit`; the kernel must be C2.
         derivatives : {"all", "normal"}
             "normal" asks only for the derivative along the normal: 2K unknowns in place of 4K, a quarter
@@ -186,7 +190,7 @@ class RBFField:
             raise UsageError(f"derivatives must be 'all' or 'normal', got {derivatives!r}")
         basis, right, origin, scale = hermite_system(points, normals, kernel, epsilon, derivatives)
         smoothing = basis_smoothing(smoothing, basis, right)
-        weights, coefficients, condition = solve(basis, right, smoothing=smoothing)
+        weights, coefficients, condition = solve(basis, right, smoothing=smoothing, truncate=truncate)
         weights, rest = hermite_weights(basis, weights), (basis.powers, condition, smoothing)
         fitted = cls(points, origin, scale, kernel, epsilon, weights, coefficients, *rest)
         if kernel.has_epsilon:
@@ -205,6 +209,7 @@ class RBFField:
         epsilon: float = 1.0,
         smoothing: float = 0.0,
         derivatives: str = "all",
+        truncate: bool = True,
     ) -> RBFField:
         """Fit a surface through points with normals, whatever the kernel.
 
@@ -215,7 +220,7 @@ class RBFField:
         ----------
         points : (K, 3) array_like
         normals : (K, 3) array_like
-        kernel, epsilon, smoothing, derivatives
+        kernel, epsilon, smoothing, derivatives, truncate
             As in `fit_hermite`.
 
         Returns
@@ -225,11 +230,13 @@ class RBFField:
         kernel = get_kernel(kernel)
         if kernel.hermite:
             return cls.fit_hermite(
-                points, normals, kernel=kernel, epsilon=epsilon, smoothing=smoothing, derivatives=derivatives
-            )
+                points, normals, kernel=kernel, epsilon=epsilon, smoothing=smoothing, derivatives=derivatives,
+                truncate=truncate,
+            )  # fmt: skip
         fitted = cls.fit(
-            *off_surface_points(points, normals), kernel=kernel, epsilon=epsilon, smoothing=smoothing
-        )
+            *off_surface_points(points, normals), kernel=kernel, epsilon=epsilon, smoothing=smoothing,
+            truncate=truncate,
+        )  # fmt: skip
         if kernel.has_epsilon:
             _warn_if_narrow(
                 fitted, np.asarray(points, dtype=np.float64), np.asarray(normals, dtype=np.float64)

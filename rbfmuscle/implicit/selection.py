@@ -68,12 +68,18 @@ class EpsilonChoice:
         Estimate of the condition there.
     tried : (n, 3) ndarray
         epsilon, objective, condition of all evaluations, by epsilon.
+    stopped : str
+        What the search ran out of, empty where it came to its end.
+    broken : str
+        Why the zero set of the best is none of the surface, empty where it is or was not looked at.
     """
 
     epsilon: float
     objective: float
     condition: float
     tried: np.ndarray
+    stopped: str = ""
+    broken: str = ""
 
 
 def hardy_epsilon(points: Floats) -> float:

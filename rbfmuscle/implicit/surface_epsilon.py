@@ -4,18 +4,30 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import blas
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.extraction.surface import extract_surface
-from rbfmuscle.implicit.field import RBFField
+from rbfmuscle.implicit.field import RBFField, frame, hermite_system
+from rbfmuscle.implicit.fit.condition import largest_eigenvalue
+from rbfmuscle.implicit.fit.fitting import Basis
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.placement.off_surface import off_surface_points
-from rbfmuscle.implicit.selection import SPAN, EpsilonChoice, by_worth, choose_epsilon, spacing
-from rbfmuscle.validation import NumericalWarning
+from rbfmuscle.implicit.selection import (
+    SPAN,
+    EpsilonChoice,
+    by_worth,
+    choose_epsilon,
+    spacing,
+    surface_miss,
+)
+from rbfmuscle.implicit.shape_search import RIDGE, TRUNCATED, Limits, search_shape
+from rbfmuscle.validation import NumericalWarning, check_points
 
 if TYPE_CHECKING:
     from rbfmuscle.implicit.kernels.table import Kernel
@@ -27,6 +39,13 @@ COARSE, REFINE = 25, 6
 RESOLUTION = 48
 # A zero set this much further from the mesh than the mesh from it has sheets that the mesh has not.
 ALIKE = 1.05
+# Ridge, as a share of the largest eigenvalue: errors are those of the truncated solution to a few per cent.
+RIDGE_SHARE = 1e-12
+# Zero sets that are looked at, and cells of the box in which sheets are looked for that do not belong to the surface.
+LOOKS, BOX = 12, 40
+# Where sheets are found, so much flatter kernels are looked at next.
+FLATTER = 1.15
+OPEN = "the level set is open at every epsilon that was looked at; take more centres or another kernel"
 
 
 def choose_surface_epsilon(
@@ -38,7 +57,7 @@ def choose_surface_epsilon(
     distance: Callable[..., Any] | None = None,
     criterion: str | None = None,
     derivatives: str = "all",
-    smoothing: float = 0.0,
+    limits: Limits | None = None,
 ) -> EpsilonChoice:
     """Search epsilon for `RBFField.fit_surface`, whatever the kernel.
 
@@ -54,13 +73,20 @@ def choose_surface_epsilon(
         further from the surface than the held-out points from it, the next best is looked at.
     criterion : {"held_out", "loo", "gcv", "condition"}, optional
         "held_out" where such points are given, else "loo".
-    derivatives, smoothing
+    derivatives
         As in `RBFField.fit_surface`.
+    limits : Limits, optional
+        Of a search by held-out points: fits, seconds, and the condition of what is chosen.
 
     Returns
     -------
     EpsilonChoice
         Where the zero set was looked at, the objective is the root mean square distance both ways.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Where no epsilon can be fitted, or none within the bound of the condition.
     """
     kernel, points, normals = get_kernel(kernel), np.asarray(points), np.asarray(normals)
     criterion = criterion or ("loo" if held_out is None else "held_out")
@@ -71,37 +97,115 @@ def choose_surface_epsilon(
         data = {"points": where, "values": values}
     # Points off the surface lie closer than those on it, which decide how far a kernel must reach.
     ratio = spacing(data["points"]).mean() / spacing(points).mean()
-    choice = choose_epsilon(
-        **data, kernel=kernel, criterion=criterion, held_out=held_out if criterion == "held_out" else None,
-        smoothing=smoothing, span=(SPAN[0] * ratio, SPAN[1] * ratio), coarse=COARSE, refine=REFINE,
-    )  # fmt: skip
-    if criterion != "held_out" or distance is None:
-        return choice
-
-    def fit(epsilon: float) -> RBFField:
-        return RBFField.fit_surface(
-            points, normals, kernel=kernel, epsilon=epsilon, derivatives=derivatives, smoothing=smoothing
+    span = (SPAN[0] * ratio, SPAN[1] * ratio)
+    if criterion != "held_out" or held_out is None:
+        return choose_epsilon(
+            **data,
+            kernel=kernel,
+            criterion=criterion,
+            held_out=held_out,
+            span=span,
+            coarse=COARSE,
+            refine=REFINE,
         )
+    limits, unit = limits or Limits(), 1.0 / spacing(data["points"]).mean()
+    others, reach = check_points(held_out, name="held_out"), spacing(points).mean()
 
-    return _look_at_zero_sets(choice, fit, points, distance)
+    def fit(epsilon: float, how: str = TRUNCATED) -> RBFField:
+        ridge = _ridge(data, kernel, epsilon) if how == RIDGE else 0.0
+        return RBFField.fit_surface(
+            points, normals, kernel=kernel, epsilon=epsilon, derivatives=derivatives, smoothing=ridge,
+            truncate=how == TRUNCATED,
+        )  # fmt: skip
+
+    def error(epsilon: float, how: str) -> tuple[float, float]:
+        field = fit(epsilon, how)
+        return surface_miss(field, others, reach), field.condition
+
+    each = {"all": 4, "normal": 2}[derivatives] if kernel.hermite else 3
+    tried = search_shape(
+        error,
+        (span[0] * unit, span[1] * unit),
+        coarse=COARSE,
+        refine=REFINE,
+        size=each * len(points),
+        limits=limits,
+    )
+    choice = _best_within(tried, kernel, limits)
+    return choice if distance is None else _look_at_zero_sets(choice, limits, fit, points, distance)
+
+
+def _ridge(data: dict[str, Any], kernel: Kernel, epsilon: float) -> float:
+    """What must be added to the diagonal for a condition that Cholesky can take."""
+    if "normals" in data:
+        basis = hermite_system(data["points"], data["normals"], kernel, epsilon, data["derivatives"])[0]
+    else:
+        origin, scale = frame(data["points"])
+        basis = Basis((data["points"] - origin) / scale, kernel, epsilon * scale, kernel.degree)
+    matrix = basis.matrix()
+    return RIDGE_SHARE * largest_eigenvalue(basis.size, lambda v: blas.dsymv(1.0, matrix, v, lower=1))
+
+
+def _best_within(tried: Floats, kernel: Kernel, limits: Limits) -> EpsilonChoice:
+    """The best trial whose condition is within the bound."""
+    if not len(tried):
+        raise np.linalg.LinAlgError(
+            f"no epsilon of kernel '{kernel.name}' gives a fit; take another kernel or spread the centres"
+        )
+    allowed = tried[tried[:, 2] <= limits.condition]
+    if not len(allowed):
+        raise np.linalg.LinAlgError(
+            f"no epsilon of kernel '{kernel.name}' has a condition of at most {limits.condition:g}, the least is "
+            f"{tried[:, 2].min():.1e}; raise the bound or take another kernel"
+        )
+    best = allowed[by_worth(allowed)[0]]
+    return EpsilonChoice(float(best[0]), float(best[1]), float(best[2]), tried, limits.why())
 
 
 def _look_at_zero_sets(
-    choice: EpsilonChoice, fit: Callable[..., Any], points: Floats, distance: Callable[..., Any]
+    choice: EpsilonChoice,
+    limits: Limits,
+    fit: Callable[..., Any],
+    points: Floats,
+    distance: Callable[..., Any],
 ) -> EpsilonChoice:
-    """The best of the tried epsilons by the distance both ways; the choice itself where none is closed."""
-    found, least = choice, np.inf
-    for number in by_worth(choice.tried):
-        epsilon, missed, condition = (float(x) for x in choice.tried[number])
+    """The best of the tried epsilons by the distance both ways; the choice, named broken, where none is closed."""
+    found, spare = None, replace(choice, broken=OPEN)
+    tried = choice.tried[choice.tried[:, 2] <= limits.condition]
+    looks, narrow = 0, np.inf
+    for number in by_worth(tried):
+        epsilon, missed, condition = (float(x) for x in tried[number])
+        if epsilon > narrow:
+            continue  # one little flatter has sheets of its own where the kernels end
+        looks += 1
+        least = np.inf if found is None else found.objective
         # The distance both ways is at least this, and twice the error has never been the better surface.
-        if missed > 2.0 * least or missed / np.sqrt(2.0) > least or not np.isfinite(missed):
+        if looks > LOOKS or missed > 2.0 * least or missed / np.sqrt(2.0) > least or not np.isfinite(missed):
             break
-        both = np.sqrt(0.5 * (missed**2 + _back(fit, epsilon, points, distance) ** 2))
-        if both < least:
-            found, least = EpsilonChoice(epsilon, float(both), condition, choice.tried), both
+        both = float(np.sqrt(0.5 * (missed**2 + _back(fit, epsilon, points, distance) ** 2)))
+        if both >= least:
+            continue
+        sheets, now = (
+            _sheets(fit, epsilon, points),
+            replace(choice, epsilon=epsilon, objective=both, condition=condition),
+        )
+        if sheets > 1:
+            spare, narrow = (
+                replace(now, broken=f"{sheets} sheets at every epsilon that was looked at"),
+                epsilon / FLATTER,
+            )
+            continue
+        found = now
         if both < ALIKE * missed:
             break
-    return found
+    return found or spare
+
+
+def _sheets(fit: Callable[..., Any], epsilon: float, points: Floats) -> int:
+    """Sheets of the zero set in the whole box of the points, open ones included."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NumericalWarning)
+        return extract_surface(fit(epsilon), points=points, resolution=BOX, search="box").components
 
 
 def _back(fit: Callable[..., Any], epsilon: float, points: Floats, distance: Callable[..., Any]) -> float:

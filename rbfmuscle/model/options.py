@@ -21,16 +21,16 @@ def _known_kernel(name: str) -> str:
 class RBFOptions(Table):
     """``[muscle.model]`` of an RBF muscle.
 
-    ``centres`` follow from the muscle's area where none are given, and ``epsilon`` (a kernel's shape parameter)
-    from the error at rest. ``samples`` of the surface meet the bones; ``contacts`` of them join in one round.
-    ``iterations`` a solve, ``acceleration`` of them remembered (Anderson). The fibre stretch is free from
-    ``stretch_low`` to ``stretch_high`` but for the share ``stretch_hold`` that pulls it back to one; ``across``
-    links a centre go through the thickness, each counting ``across_weight``. ``surface`` is shown by a mesh of the
-    ``material`` that is brought onto the level set, or by ``marching`` cubes; ``resolution`` is the number of edges or
-    cells along the longest side, 0 for as many as the muscle's thickness wants. ``placement`` of the centres, and
-    ``derivatives`` that the fit meets there; ``seed`` of what is drawn by chance. ``inside`` is the number of
-    nodes of an elastic solid that carries the centres, 0 for none; it is stiffer along the fibres by ``fibre_ratio``, a
-    ratio of Young's moduli.
+    ``centres`` follow from the muscle's area where none are given, and ``epsilon`` (a kernel's shape parameter) from
+    the error at rest, with a ``condition`` of at most so much, 0 for any. ``samples`` of the surface meet the bones;
+    ``contacts`` of them join in one round. ``iterations`` a solve, ``acceleration`` of them remembered (Anderson). The
+    fibre stretch is free from ``stretch_low`` to ``stretch_high`` but for the share ``stretch_hold`` that pulls it
+    back to one; ``across`` links a centre go through the thickness, each counting ``across_weight``. ``surface`` is
+    shown by a mesh of the ``material`` that is brought onto the level set, or by ``marching`` cubes; ``resolution`` is
+    the number of edges or cells along the longest side, 0 for as many as the muscle's thickness wants. ``placement``
+    of the centres, and ``derivatives`` that the fit meets there; ``seed`` of what is drawn by chance. ``inside`` is
+    the number of nodes of an elastic solid that carries the centres, 0 for none; it is stiffer along the fibres by
+    ``fibre_ratio``, a ratio of Young's moduli.
     """
 
     centres: Annotated[int, Field(ge=0, le=20_000)] = 0
@@ -41,6 +41,7 @@ class RBFOptions(Table):
     resolution: Annotated[int, Field(ge=0, le=1000)] = 0
     kernel: Annotated[str, AfterValidator(_known_kernel)] = "cubic"
     epsilon: NotNegative = 0.0
+    condition: NotNegative = 0.0
     stretch_low: Annotated[float, Field(ge=0.01, le=1.0)] = 0.5
     stretch_high: Annotated[float, Field(ge=1.0, le=100.0)] = 2.0
     stretch_hold: Share = 0.3

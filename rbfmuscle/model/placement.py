@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,11 +11,14 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.geometry.surfaces import mesh_volume
+from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
 from rbfmuscle.implicit.placement.density import GREEDY_LARGEST
 from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
 from rbfmuscle.implicit.placement.sampling import SurfaceSample, sample_surface
+from rbfmuscle.implicit.shape_search import Limits
 from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.sim.cache import content_key, has_arrays, load_arrays, store_arrays
@@ -32,6 +35,9 @@ AREA_FOR_EACH = 212.0
 LEAST_CENTRES = 150
 # With more centres than these a fit to normal derivatives alone errs less for the same time.
 MOST_WITH_ALL_DERIVATIVES = 200
+# A field at rest that is looked at before it is used: cells along its longest side, and the share of the mesh's volume
+# by which its level zero may be off.
+CELLS, VOLUME_BOUND = 48, 0.2
 # Part of the name under which samples are cached: raise it when they are made in another way.
 SAMPLING = 1
 
@@ -101,9 +107,14 @@ def place_points(
     faces = np.asarray(muscle.mesh.faces)
     centres = cached_sample(frame.local, faces, count, seed=options.seed, placement=placement)
     samples = cached_sample(frame.local, faces, options.samples, seed=options.seed, placement="even")
-    fit = _choose_fit(muscle.name, (frame, faces), options, centres, samples)
+    surface = frame, faces
+    fit = _choose_fit(muscle.name, surface, options, centres, samples)
     if fitted:
-        centres = _fit_centres(muscle.name, (frame, faces), options, centres, fit)
+        centres = _fit_centres(muscle.name, surface, options, centres, fit)
+        # what was best for the greedy centres need not be so for these
+        fit = _choose_fit(muscle.name, surface, options, centres, samples)
+    if fit.kernel.has_epsilon and not options.epsilon:
+        _refuse_broken(muscle.name, surface, fit, centres)
     return centres, samples, fit
 
 
@@ -124,12 +135,37 @@ def _choose_fit(name: str, mesh: tuple[Any, Any], options: Any, centres: Surface
         )
     epsilon = options.epsilon or 1.0
     if kernel.has_epsilon and not options.epsilon:
-        # In the muscle's own frame, so that a scene that is turned chooses the same.
-        epsilon = choose_surface_epsilon(
-            centres.points, centres.normals, kernel=kernel, held_out=samples.points,
-            distance=ExactDistance(frame.local, faces).signed_distance, derivatives=derivatives,
-        ).epsilon / frame.size  # fmt: skip
+        try:
+            # In the muscle's own frame, so that a scene that is turned chooses the same.
+            epsilon = choose_surface_epsilon(
+                centres.points, centres.normals, kernel=kernel, held_out=samples.points,
+                distance=ExactDistance(frame.local, faces).signed_distance, derivatives=derivatives,
+                limits=Limits(condition=options.condition or np.inf),
+            ).epsilon / frame.size  # fmt: skip
+        except np.linalg.LinAlgError as error:
+            raise SceneError(f"muscle {name!r}: {error}") from None
     return FieldFit(kernel, epsilon, derivatives)
+
+
+def _refuse_broken(name: str, mesh: tuple[Any, Any], fit: Any, centres: SurfaceSample) -> None:
+    """Raise where the level zero at rest is open, in more sheets than one, or of another volume."""
+    frame, faces = mesh
+    local = replace(fit, epsilon=fit.epsilon * frame.size)
+    shape = f" and epsilon {fit.epsilon:.3g}" if fit.kernel.has_epsilon else ""
+    said = f"muscle {name!r}: kernel {fit.kernel.name!r} with {len(centres.points)} centres{shape}"
+    remedy = "take kernel 'cubic', more centres, or another epsilon (rbfmuscle kernels ranks them)"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NumericalWarning)
+        try:
+            field = local.fit(centres.points, centres.normals)
+            found = extract_surface(field, points=centres.points, resolution=CELLS)
+        except (ValueError, np.linalg.LinAlgError) as error:
+            raise SceneError(f"{said} gives no surface at rest ({error}); {remedy}") from None
+    off = found.volume / mesh_volume(frame.local, faces) - 1.0
+    if found.components > 1 or abs(off) > VOLUME_BOUND:
+        raise SceneError(
+            f"{said} breaks at rest: {found.components} sheets, {100 * off:+.3g} % of volume; {remedy}"
+        )
 
 
 def _fit_centres(name: str, mesh: tuple[Any, Any], options: Any, centres: SurfaceSample, fit: Any) -> Any:

@@ -207,6 +207,31 @@ def test_where_no_level_set_can_be_shown_the_material_is_and_an_event_says_so():
     assert surface.quantities["unfitted_fraction"] == 1.0
 
 
+def test_a_chosen_epsilon_never_gives_a_broken_field():
+    """Gaussians of so good a condition do not reach from centre to centre: the muscle is refused, with the remedy."""
+    scene = phantom_scene().with_options(
+        {
+            "model.kernel": "gaussian",
+            "model.centres": 60,
+            "model.samples": 300,
+            "model.condition": 1000.0,
+            "model.derivatives": "all",
+        }
+    )
+    scene.muscles = [scene.muscle("adductor_posterior")]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with pytest.raises(SceneError, match=r"'gaussian' with 60 centres.*take kernel 'cubic'"):
+            build_model(scene.muscles[0], scene, "rbf")
+        scene.muscles[0].options |= {"kernel": "quintic", "condition": 1.5}
+        build_model(scene.muscles[0], scene, "rbf")  # without a shape parameter there is nothing to bound
+        scene.muscles[0].options |= {"kernel": "matern_52", "condition": 1.5}
+        with pytest.raises(
+            SceneError, match=r"no epsilon of kernel 'matern_52' has a condition of at most 1.5"
+        ):
+            build_model(scene.muscles[0], scene, "rbf")
+
+
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [

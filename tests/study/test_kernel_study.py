@@ -79,7 +79,7 @@ def test_fitted_centres_halve_the_error_of_greedy_ones(ellipsoid, study):
     """Bumps that 80 centres cannot follow are met on average."""
     vertices, faces = np.array(ellipsoid.vertices), np.asarray(ellipsoid.faces)
     vertices[:, 2] += 0.8 * np.sin(vertices[:, 0] / 2.5) * np.sin(vertices[:, 1] / 2.5)
-    settings = {"kernels": ["cubic"], "centres": [80], "resolution": 48, "scan": False}
+    settings = {"kernels": ["cubic"], "centres": [80], "resolution": 48}
     greedy, fitted = (
         rm.study_kernels((vertices, faces), placement=placement, **settings).rows[0]
         for placement in ("greedy", "fitted")

@@ -59,7 +59,7 @@ class Bootstrap:
         return float(low), float(high)
 
 
-def mark_unfit(rows: list[dict[str, Any]], *, sheets: int = 1) -> None:
+def mark_unfit(rows: list[dict[str, Any]], *, sheets: int = 1, condition: float = np.inf) -> None:
     """Set ``unfit`` of each row: why its field must not be used, or empty.
 
     Parameters
@@ -67,9 +67,13 @@ def mark_unfit(rows: list[dict[str, Any]], *, sheets: int = 1) -> None:
     rows : list of dict
     sheets : int
         Parts of the mesh.
+    condition : float
+        Its greatest allowed value.
     """
     for row in rows:
         row["unfit"] = _why_unfit(row, sheets)
+        if not row["unfit"] and row["condition"] > condition:
+            row["unfit"] = f"a condition of {row['condition']:.1e}, beyond {condition:g}"
     for count in {row["centres"] for row in rows}:
         good = [row for row in rows if row["centres"] == count and not row["unfit"]]
         if not good:

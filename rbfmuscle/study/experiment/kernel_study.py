@@ -9,7 +9,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,25 +17,23 @@ from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
+from rbfmuscle.implicit.fit.fitting import DOUBTFUL
+from rbfmuscle.implicit.kernels.table import KERNELS, Kernel, get_kernel
 from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
-from rbfmuscle.implicit.placement.sampling import PLACEMENTS, sample_surface
-from rbfmuscle.implicit.selection import spacing, surface_miss
+from rbfmuscle.implicit.placement.sampling import PLACEMENTS, SurfaceSample, sample_surface
+from rbfmuscle.implicit.selection import spacing
+from rbfmuscle.implicit.shape_search import Limits
 from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
 from rbfmuscle.study.experiment.kernel_choice import Bootstrap, Recommendation, mark_unfit, recommend
 from rbfmuscle.study.experiment.sweep_table import pareto_front
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.validation import NumericalWarning, UsageError, check_mesh
 
-if TYPE_CHECKING:
-    pass
-
-
 CENTRES = (150, 300)
-# Shape parameters of the map, in units of 1 / (mean distance to the nearest centre).
-SCAN = np.geomspace(0.03, 3.0, 9)
 # Points of the mesh at which errors are measured, and the cells along the longest side.
 JUDGES, RESOLUTION = 20_000, 64
+# Seconds of both searches of one kernel together, the second for the fitted centres.
+SECONDS = 4.5
 # Points of the mesh that choose epsilon.
 HELD_OUT = 2000
 # Points of one timed evaluation, and how often fit and evaluation are timed.
@@ -51,7 +49,7 @@ class KernelStudy:
     rows : list of dict
         One for each kernel and number of centres, the smallest error first; unfit ones (``unfit`` says why) last.
     scan : list of dict
-        ``kernel, centres, shape`` (epsilon times the spacing), ``error, condition`` over a range of shapes.
+        ``kernel, centres, shape`` (epsilon times the spacing), ``error, condition`` of all that the search tried.
     decimated : dict of int to dict
         For each number of stored numbers, the decimated mesh that takes as many: ``vertices, rms, hausdorff``.
     surfaces : list of (vertices, faces, error)
@@ -93,7 +91,7 @@ def study_kernels(
     placement: str = FITTED,
     resolution: int = RESOLUTION,
     criterion: str = "held_out",
-    scan: bool = True,
+    condition: float = np.inf,
     seed: int = 0,
     units: str = "",
     progress: Callable[[int, int], None] | None = None,
@@ -116,8 +114,8 @@ def study_kernels(
         Cells along the longest side of the extracted surfaces.
     criterion : {"held_out", "loo", "gcv", "condition"}
         How epsilon is chosen: by the error at other points of the mesh, or from the centres alone.
-    scan : bool
-        Also measure a range of epsilons, for the map.
+    condition : float
+        None beyond it is chosen; a kernel without a shape parameter that exceeds it is unfit.
     seed : int
     units : str
         Name of the mesh's unit, for the page.
@@ -139,7 +137,7 @@ def study_kernels(
     --------
     >>> import trimesh
     >>> ball = trimesh.creation.icosphere(3, 10.0)
-    >>> study = study_kernels(ball, kernels=["cubic"], centres=[40], placement="even", resolution=16, scan=False)
+    >>> study = study_kernels(ball, kernels=["cubic"], centres=[40], placement="even", resolution=16)
     >>> study.rows[0]["kernel"]
     'cubic'
     """
@@ -149,19 +147,20 @@ def study_kernels(
         raise UsageError(f"placement must be one of {', '.join((*PLACEMENTS, FITTED))}, got {placement!r}")
     if min(centres, default=0) < 8:
         raise UsageError(f"centres must be numbers of at least 8, got {list(centres)}")
-    judge = _Judge(vertices, faces, resolution, seed)
+    judge = SurfaceJudge(vertices, faces, resolution, seed)
+    if not condition >= 1.0:
+        raise UsageError(f"condition must be a bound of at least 1, got {condition:g}")
     study, found = KernelStudy([], units=units), []
+    ask = Request(derivatives, criterion, placement, float(condition))
     total = len(kernels) * len(centres)
     for count in centres:
         base = "greedy" if placement == FITTED else placement
         sample = sample_surface(vertices, faces, int(count), seed=seed, placement=base)
         for kernel in kernels:
-            found.append(_measure(judge, sample, kernel, derivatives, criterion, placement))
-            if scan and kernel.has_epsilon:
-                study.scan += _scan(judge, sample, kernel, derivatives)
+            found.append(measure_row(judge, sample, kernel, ask, study.scan))
             if progress is not None:
                 progress(len(found), total)
-    mark_unfit([row for row, _ in found], sheets=judge.sheets)
+    mark_unfit([row for row, _ in found], sheets=judge.sheets, condition=condition)
     found.sort(key=lambda pair: (bool(pair[0]["unfit"]), pair[0]["rms"] is None, pair[0]["rms"] or 0.0))
     study.rows, study.surfaces = [row for row, _ in found], [surface for _, surface in found]
     for row in study.rows:
@@ -188,7 +187,7 @@ def _mark_fronts(rows):
             good[index][name] = True
 
 
-class _Judge:
+class SurfaceJudge:
     """The surface that is to be met, and how far another one is from it."""
 
     def __init__(self, vertices: Floats, faces: Integers, resolution: int, seed: int) -> None:
@@ -246,45 +245,96 @@ def _fit(sample, kernel, epsilon, derivatives):
     )
 
 
-def _choose(judge, sample, kernel, derivatives, criterion):
-    return choose_surface_epsilon(
-        sample.points, sample.normals, kernel=kernel, criterion=criterion, derivatives=derivatives,
-        held_out=judge.held_out, distance=judge.distance.unsigned,
-    ).epsilon  # fmt: skip
+class Request(NamedTuple):
+    """What is asked of every kernel."""
+
+    derivatives: str
+    criterion: str
+    placement: str
+    condition: float
 
 
-def _measure(judge, sample, kernel, derivatives, criterion, placement):
-    """One row of the table and its surface."""
-    count = len(sample.points)
-    if placement == FITTED and not (kernel.hermite and derivatives == "all"):
+def _choose(row, judge, sample, kernel, ask, *, last):
+    """Choose epsilon for these centres and write it into the row; the choice, for the map."""
+    start = time.perf_counter()
+    # What is only to place centres needs none of the slow fits.
+    limits = Limits(seconds=max(SECONDS - row["search_time"], 0.5), condition=ask.condition)
+    limits.slow = limits.slow if last else 0
+    choice = choose_surface_epsilon(
+        sample.points, sample.normals, kernel=kernel, criterion=ask.criterion, derivatives=ask.derivatives,
+        held_out=judge.held_out, distance=judge.distance.unsigned if last else None, limits=limits,
+    )  # fmt: skip
+    row["epsilon"] = choice.epsilon
+    row["shape"] = float(choice.epsilon * spacing(sample.points).mean())
+    row["fits"] += limits.spent if ask.criterion == "held_out" else len(choice.tried)
+    row["search_time"] += time.perf_counter() - start
+    if choice.stopped:
+        row["note"] = f"{row['note']}; search stopped after {choice.stopped}".lstrip("; ")
+    return choice
+
+
+def measure_row(
+    judge: SurfaceJudge,
+    sample: SurfaceSample,
+    kernel: Kernel,
+    ask: Request,
+    scan: list[dict[str, Any]],
+    *,
+    confirm: SurfaceJudge | None = None,
+) -> tuple[dict[str, Any], Any]:
+    """One row of the table and its surface (vertices, faces, distances) or None.
+
+    Parameters
+    ----------
+    judge : SurfaceJudge
+    sample : SurfaceSample
+        Of as many centres.
+    kernel : Kernel
+    ask : Request
+    scan : list
+        Takes what the search tried.
+    confirm : SurfaceJudge, optional
+        Measures the row in place of the judge, which then only chooses.
+    """
+    count, placement = len(sample.points), ask.placement
+    if placement == FITTED and not (kernel.hermite and ask.derivatives == "all"):
         placement = "greedy"
     row = {
         "kernel": kernel.name, "centres": count, "placement": placement, "epsilon": 0.0, "shape": None,
-        "fit": derivatives if kernel.hermite else "values", "rms": None, "low": None, "high": None,
+        "fit": ask.derivatives if kernel.hermite else "values", "rms": None, "low": None, "high": None,
         "hausdorff": None, "normal_error": None, "volume_error": None,
-        "components": None, "spurious": None, "condition": None,
-        "fit_time": None, "evaluation_time": None, "numbers": _stored(kernel, derivatives, count),
+        "components": None, "spurious": None, "condition": None, "solved": None,
+        "fit_time": None, "evaluation_time": None, "fits": 0, "search_time": 0.0,
+        "numbers": _stored(kernel, ask.derivatives, count),
         "note": "" if kernel.hermite else "values on and off the surface, the kernel is not C2",
     }  # fmt: skip
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always", NumericalWarning)
         try:
-            if kernel.has_epsilon:
-                row["epsilon"] = _choose(judge, sample, kernel, derivatives, criterion)
-                row["shape"] = float(row["epsilon"] * spacing(sample.points).mean())
             if placement == FITTED:
+                if kernel.has_epsilon:
+                    _choose(row, judge, sample, kernel, ask, last=False)
                 sample = fit_sample(
                     sample, judge.vertices, judge.faces, kernel=kernel, epsilon=row["epsilon"] or 1.0
                 )
-                if kernel.has_epsilon:  # what was best for the greedy centres need not be so for these
-                    row["epsilon"] = _choose(judge, sample, kernel, derivatives, criterion)
-                    row["shape"] = float(row["epsilon"] * spacing(sample.points).mean())
-            surface = _fill(row, judge, sample, kernel, derivatives)
+            if kernel.has_epsilon:  # what was best for the greedy centres need not be so for these
+                choice = _choose(row, judge, sample, kernel, ask, last=True)
+                _note_trials(scan, row, choice)
+                if choice.broken:
+                    raise ValueError(choice.broken)
+            surface = _fill(row, confirm or judge, sample, kernel, ask.derivatives)
         except (ValueError, np.linalg.LinAlgError) as error:
             row["note"], surface = " ".join(str(error).split()), None
     if said and surface is not None:
         row["note"] = "; ".join([*([row["note"]] if row["note"] else []), str(said[-1].message)])
     return row, surface
+
+
+def _note_trials(scan, row, choice):
+    for epsilon, error, condition in choice.tried.tolist():
+        shape = epsilon * row["shape"] / choice.epsilon
+        scan.append({"kernel": row["kernel"], "centres": row["centres"], "shape": shape, "error": error,
+                     "condition": condition})  # fmt: skip
 
 
 def _fill(row, judge, sample, kernel, derivatives):
@@ -299,8 +349,10 @@ def _fill(row, judge, sample, kernel, derivatives):
     # The least, as the first may compile.
     row["fit_time"], row["evaluation_time"] = (float(t) for t in np.min(spent, axis=0))
     row["condition"] = float(fitted.condition)
+    row["solved"] = "eigenvectors" if fitted.condition >= DOUBTFUL else "Cholesky"
     gradient = fitted.gradient(judge.points[::5])
-    cosine = np.einsum("ij,ij->i", gradient, judge.normals[::5]) / np.linalg.norm(gradient, axis=1)
+    cosine = np.einsum("ij,ij->i", gradient, judge.normals[::5])
+    cosine /= np.maximum(np.linalg.norm(gradient, axis=1), np.finfo(float).tiny)
     row["normal_error"] = float(np.degrees(np.sqrt((np.arccos(np.clip(cosine, -1.0, 1.0)) ** 2).mean())))
     found = extract_surface(
         fitted, points=sample.points, resolution=judge.resolution, search="box", keep="largest"
@@ -318,22 +370,3 @@ def _stored(kernel, derivatives, count):
     if not kernel.hermite:
         return 3 * count * 4
     return count * (7 if derivatives == "all" else 8)
-
-
-def _scan(judge, sample, kernel, derivatives):
-    h = float(spacing(sample.points).mean())
-    rows = []
-    for shape in SCAN:
-        error, condition = None, None
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NumericalWarning)
-            try:
-                fitted = _fit(sample, kernel, shape / h, derivatives)
-                error, condition = surface_miss(fitted, judge.points[::10], h), float(fitted.condition)
-            except np.linalg.LinAlgError:
-                pass
-        rows.append(
-            {"kernel": kernel.name, "centres": len(sample.points), "shape": float(shape), "error": error,
-             "condition": condition}
-        )  # fmt: skip
-    return rows

@@ -28,7 +28,8 @@ COLUMNS = {
     "low": "from", "high": "to",
     "hausdorff": "Hausdorff", "normal_error": "normals, degrees", "volume_error": "volume, %",
     "components": "sheets", "condition": "condition", "fit_time": "fit, ms",
-    "evaluation_time": "20,000 values, ms", "numbers": "stored numbers", "decimated_rms": "mesh of that size, RMS",
+    "solved": "solved by", "evaluation_time": "20,000 values, ms", "fits": "fits of the search",
+    "search_time": "search, s", "numbers": "stored numbers", "decimated_rms": "mesh of that size, RMS",
     "note": "note",
 }  # fmt: skip
 SCALE = {"volume_error": 100.0, "fit_time": 1e3, "evaluation_time": 1e3}
@@ -184,24 +185,35 @@ def _draw_fronts(study, figure):
 
 
 def _draw_maps(study, figure):
-    names = list(dict.fromkeys(row["kernel"] for row in study.scan))
+    """What the search tried: one row a kernel, each trial a cell that reaches half-way to the next."""
     count = max(row["centres"] for row in study.scan)
     rows = [row for row in study.scan if row["centres"] == count]
-    shapes = sorted({row["shape"] for row in rows})
+    names = list(dict.fromkeys(row["kernel"] for row in rows))
     figure.set_size_inches(11, 1.6 + 0.26 * len(names))
     for axes, key, label in zip(
         figure.subplots(1, 2, sharey=True), ("error", "condition"),
-        (f"RMS error [{study.units or 'mesh units'}]", "condition"), strict=True,
+        (f"RMS error [{study.units or 'mesh units'}]", "condition [1]"), strict=True,
     ):  # fmt: skip
-        grid = np.full((len(names), len(shapes)), np.nan)
-        for row in rows:
-            if row[key]:
-                grid[names.index(row["kernel"]), shapes.index(row["shape"])] = np.log10(row[key])
-        picture = axes.imshow(grid, aspect="auto", cmap="viridis_r" if key == "error" else "magma_r")
-        axes.set_xticks(range(len(shapes)), [f"{s:.2g}" for s in shapes])
+        values = [row[key] for row in rows if row[key] and np.isfinite(row[key])]
+        norm = _log_norm(values)
+        for line, name in enumerate(names):
+            tried = sorted((r["shape"], r[key]) for r in rows if r["kernel"] == name and r[key])
+            at = np.log([shape for shape, _ in tried])
+            edges = np.concatenate([at[:1], 0.5 * (at[1:] + at[:-1]), at[-1:]])
+            picture = axes.pcolormesh(np.exp(edges), [line - 0.45, line + 0.45], [[v for _, v in tried]], norm=norm,
+                                      cmap="viridis_r" if key == "error" else "cividis_r")  # fmt: skip
+        axes.set_xscale("log")
+        axes.set_ylim(len(names) - 0.5, -0.5)
         axes.set_yticks(range(len(names)), names, fontsize=8)
-        axes.set_xlabel("epsilon times spacing")
-        figure.colorbar(picture, ax=axes, label=f"log10 of {label}, {count} centres")
+        axes.set_xlabel("epsilon times spacing [1]")
+        figure.colorbar(picture, ax=axes, label=f"{label}, {count} centres")
+
+
+def _log_norm(values):
+    """A logarithmic scale from the least value to the 80th percentile, so that what broke stretches no scale."""
+    from matplotlib.colors import LogNorm
+
+    return LogNorm(min(values), max(float(np.quantile(values, 0.8)), 1.01 * min(values)), clip=True)
 
 
 def _draw_surfaces(study, directory):
