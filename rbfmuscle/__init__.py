@@ -27,6 +27,7 @@ _HOME = {
     "SolveError": "rbfmuscle.validation",
     "compare_models": "rbfmuscle.compare",
     "phantom_scene": "rbfmuscle.sim.scene.phantom",
+    "reach_error": "rbfmuscle.study.experiment.wanted_error",
     "simulate": "rbfmuscle.run",
     "study_kernels": "rbfmuscle.study.experiment.kernel_study",
     "warm_up": "rbfmuscle.compiled.warm",

@@ -32,6 +32,9 @@ def kernels(
     frames: str | None = None,
     units: str = "",
     pictures: bool = True,
+    error: float | None = None,
+    error_max: float | None = None,
+    most: int | None = None,
     extremes: Annotated[bool, Parameter(negative="")] = False,
     as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
 ) -> int:
@@ -67,6 +70,13 @@ def kernels(
         Name of the unit of a mesh, for the text only.
     pictures
         Draw the best surfaces.
+    error
+        In place of a table: the fewest centres and the kernel that reach this RMS distance, in the mesh's unit; of a
+        scene for each muscle, or the one named.
+    error_max
+        The same for the greatest distance.
+    most
+        Centres at most for --error and --error-max, 1000 by default.
     extremes
         In place of a surface: fit an ellipsoid under every extreme, and tell what was right, warned of or refused.
     as_json
@@ -87,6 +97,11 @@ def kernels(
         return _extremes(names, output, as_json)
     if source is None:
         raise UsageError("which surface? give a mesh, a scene file or phantom, or --extremes")
+    if error is not None or error_max is not None or most is not None:
+        from rbfmuscle.commands.wanted import find_wanted
+
+        return find_wanted(source, output, as_json, error=error, error_max=error_max, most=most, kernels=names,
+                           muscle=muscle, placement=placement, units=units)  # fmt: skip
     with Progress("kernels", what="fit") as bar:
         scene, mesh, title = _surface(source, muscle)
         compile_ahead(["kernels"])

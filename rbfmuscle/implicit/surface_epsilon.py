@@ -15,7 +15,7 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField, frame, hermite_system
 from rbfmuscle.implicit.fit.condition import largest_eigenvalue
-from rbfmuscle.implicit.fit.fitting import Basis
+from rbfmuscle.implicit.fit.fitting import DOUBTFUL, Basis
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.placement.off_surface import off_surface_points
 from rbfmuscle.implicit.selection import (
@@ -190,10 +190,10 @@ def _look_at_zero_sets(
             replace(choice, epsilon=epsilon, objective=both, condition=condition),
         )
         if sheets > 1:
-            spare, narrow = (
-                replace(now, broken=f"{sheets} sheets at every epsilon that was looked at"),
-                epsilon / FLATTER,
-            )
+            if condition < DOUBTFUL:
+                narrow = epsilon / FLATTER
+            if spare.broken == OPEN or both < spare.objective:
+                spare = replace(now, broken=f"{sheets} sheets at every epsilon that was looked at")
             continue
         found = now
         if both < ALIKE * missed:

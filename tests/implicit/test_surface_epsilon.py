@@ -32,9 +32,11 @@ def both_ways(plate, kernel, epsilon):
         warnings.simplefilter("ignore", NumericalWarning)
         field = RBFField.fit_surface(centres.points, centres.normals, kernel=kernel, epsilon=epsilon)
         try:
-            found = extract_surface(field, points=centres.points, resolution=48)
+            found = extract_surface(field, points=centres.points, resolution=48, search="box")
         except ValueError:
             return np.inf
+    if found.components > 1:
+        return np.inf  # sheets of its own away from the surface: no field to use
     there = MeshDistance(found.vertices, found.faces, closed=False).unsigned(vertices)
     return np.sqrt(0.5 * ((there**2).mean() + (distance.unsigned(found.vertices) ** 2).mean()))
 
@@ -57,6 +59,9 @@ def test_an_open_zero_set_is_passed_over(plate, kernel):
     data = {"kernel": kernel, "held_out": held_out}
     blind = choose_surface_epsilon(centres.points, centres.normals, **data)
     seen = choose_surface_epsilon(centres.points, centres.normals, distance=distance.unsigned, **data)
+    if seen.broken:  # no gaussian shows one closed sheet here, which is said
+        assert kernel == "gaussian" and "sheets at every epsilon" in seen.broken
+        return
     assert np.isfinite(both_ways(plate, kernel, seen.epsilon))
     assert both_ways(plate, kernel, seen.epsilon) <= 1.05 * both_ways(plate, kernel, blind.epsilon)
 
