@@ -100,8 +100,8 @@ def kernels(
     if error is not None or error_max is not None or most is not None:
         from rbfmuscle.commands.wanted import find_wanted
 
-        return find_wanted(source, output, as_json, error=error, error_max=error_max, most=most, kernels=names,
-                           muscle=muscle, placement=placement, units=units)  # fmt: skip
+        return find_wanted(source, output, (error, error_max), muscle=muscle, units=units, as_json=as_json,
+                           kernels=names, placement=placement, most=most)  # fmt: skip
     with Progress("kernels", what="fit") as bar:
         scene, mesh, title = _surface(source, muscle)
         compile_ahead(["kernels"])

@@ -10,8 +10,16 @@ from rbfmuscle.compiled.progress import Progress
 from rbfmuscle.validation import UsageError
 
 
-def find_wanted(source: str, output: Path, as_json: bool, *, error: float | None, error_max: float | None,
-                most: int | None, muscle: str | None, units: str, **settings: Any) -> int:  # fmt: skip
+def find_wanted(
+    source: str,
+    output: Path,
+    errors: tuple[float | None, float | None],
+    *,
+    muscle: str | None,
+    units: str,
+    as_json: bool,
+    **settings: Any,
+) -> int:
     """Find, print and write what reaches an error.
 
     Parameters
@@ -19,17 +27,15 @@ def find_wanted(source: str, output: Path, as_json: bool, *, error: float | None
     source : str
         A mesh, a scene file, or ``phantom``.
     output : path
-    as_json : bool
-    error, error_max : float, optional
+    errors : pair of float or None
         Exactly one: root mean square or greatest distance [mesh unit].
-    most : int, optional
-        Centres at most.
     muscle : str, optional
         Of a scene; all by default.
     units : str
         Of a mesh.
+    as_json : bool
     **settings
-        ``kernels`` and ``placement`` of `reach_error`.
+        ``kernels``, ``placement`` and ``most`` of `reach_error`; None stands for its default.
 
     Returns
     -------
@@ -39,14 +45,13 @@ def find_wanted(source: str, output: Path, as_json: bool, *, error: float | None
     from rbfmuscle.study.experiment.wanted_error import reach_error
     from rbfmuscle.study.experiment.wanted_files import describe_wanted, write_wanted
 
+    error, error_max = errors
     if (error is None) == (error_max is None):
         raise UsageError("give one of --error (RMS) and --error-max (greatest distance)")
     wanted = error if error is not None else error_max
     if wanted is None or not wanted > 0.0:
         raise UsageError(f"the wanted error must be a positive length, got {wanted}")
     settings = {name: value for name, value in settings.items() if value is not None}
-    if most is not None:
-        settings["most"] = most
     meshes, unit = _meshes(source, muscle, units)
     results = {}
     for name, mesh in meshes.items():

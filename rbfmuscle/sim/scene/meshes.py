@@ -87,7 +87,10 @@ def prepare_mesh(
 
     vertices, faces = np.asarray(vertices), np.asarray(faces)
     if not len(vertices) or not len(faces):
-        raise MeshError(f"{place}: the mesh is empty ({len(vertices)} vertices, {len(faces)} triangles)")
+        raise MeshError(
+            f"{place}: the mesh is empty ({len(vertices)} vertices, {len(faces)} triangles); "
+            "points alone become a mesh by rbfmuscle surface FILE -o mesh.ply"
+        )
     bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
     used = np.zeros(len(vertices), dtype=bool)
     used[faces[(faces >= 0) & (faces < len(vertices))]] = True
@@ -120,6 +123,7 @@ def read_arrays(path: Path) -> Any:
     if suffix not in MESH_SUFFIXES:
         raise MeshError(
             f"{shown_path(path)}: {shown(suffix) or 'no suffix'} is not a mesh format, use {', '.join(MESH_SUFFIXES)}"
+            f"{'; rbfmuscle surface makes a mesh of points' if suffix in ('.xyz', '.npy') else ''}"
         )
     if not is_file(path):
         raise MeshError(f"{shown_path(path)}: no such mesh file{_neighbours(path)}")
