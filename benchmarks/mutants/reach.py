@@ -10,7 +10,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 # A fault is tried on tests of so many seconds together at most, and so many of them.
-BUDGET, MOST = 25.0, 40
+BUDGET, MOST = 8.0, 25
 
 
 @dataclass
