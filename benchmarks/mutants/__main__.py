@@ -72,6 +72,7 @@ def run(count: int, seed: int, minutes: float, rooms: list[str], loops: bool | N
             print("time is over; the same command goes on from here")
             break
         row = describe(fault, seed, tree)
+        known |= {r["key"] for r in results()}  # another share may run beside this one
         if row is None or row["key"] in known:
             continue
         row |= judge(fault, tree, reach, sound)
