@@ -7,6 +7,7 @@ Usage: ``python -m mutants record [TESTS...]``, ``run [--count N] [--seed S] [--
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import hashlib
 import json
 import os
@@ -56,7 +57,6 @@ def record(files: list[str]) -> None:
 
 def run(count: int, seed: int, minutes: float, rooms: list[str], loops: bool | None) -> None:
     """Plant the sample one after another until the time is over; what has a result is not run again."""
-    from mutants.faults import sample
     from mutants.reach import Reach
     from mutants.runner import copy_tree, preload
 
@@ -67,7 +67,7 @@ def run(count: int, seed: int, minutes: float, rooms: list[str], loops: bool | N
     copy_tree(tree)
     sound = Sound(tree)
     known = {row["key"] for row in results()}
-    for fault in sample(count, seed, rooms=rooms, loops=loops):
+    for fault in kept_sample(count, seed, rooms, loops):
         if time.monotonic() > end:
             print("time is over; the same command goes on from here")
             break
@@ -81,6 +81,20 @@ def run(count: int, seed: int, minutes: float, rooms: list[str], loops: bool | N
             file.write(json.dumps(row) + "\n")
         print(f"{row['outcome']:9} {fault.path}:{fault.line} {row['after'].strip()[:90]}", flush=True)
     subprocess.run(["rm", "-rf", str(tree)], check=False)
+
+
+def kept_sample(count: int, seed: int, rooms: list[str], loops: bool | None) -> list:
+    """The sample, kept on disk for as long as no source changes: to find every place takes ten seconds."""
+    from mutants.faults import PACKAGES, Fault, sample
+
+    sources = sorted(p for package in PACKAGES for p in (ROOT / package).rglob("*.py"))
+    text = "".join(p.read_text(encoding="utf-8") for p in sources) + repr((count, seed, rooms, loops))
+    path = WORK / f"sample-{hashlib.sha256(text.encode()).hexdigest()[:16]}.json"
+    if not path.exists():
+        found = [dataclasses.asdict(fault) for fault in sample(count, seed, rooms=rooms, loops=loops)]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(found), encoding="utf-8")
+    return [Fault(**row) for row in json.loads(path.read_text(encoding="utf-8"))]
 
 
 def describe(fault, seed: int, tree: Path) -> dict | None:

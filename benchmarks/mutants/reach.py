@@ -20,6 +20,7 @@ class Reach:
 
     seconds: dict[str, float] = field(default_factory=dict)
     lines: dict[str, dict[str, set[str]]] = field(default_factory=dict)
+    total: dict[str, int] = field(default_factory=dict)
 
     @classmethod
     def load(cls, folder: Path) -> Reach:
@@ -52,12 +53,26 @@ class Reach:
         else:
             contexts = lines.get(str(line), ())
         chosen, spent = [], 0.0
-        wanted = self._in_turn(self._expanded(contexts))
+        tests = self._expanded(contexts)
+        wanted = self._by_share(tests, lines) if outside else self._in_turn(tests)
         for test in wanted:
             if len(chosen) < MOST and spent + self.seconds[test] <= BUDGET * (2.0 if outside else 1.0):
                 chosen.append(test)
                 spent += self.seconds[test]
         return chosen or wanted[:1]
+
+    def _by_share(self, tests, lines):
+        """First those of whose lines the most lie in this module: a table's constants are told by who asks for them."""
+        if not self.total:
+            for kept in self.lines.values():
+                for found in kept.values():
+                    for test in found:
+                        self.total[test] = self.total.get(test, 0) + 1
+        here: dict[str, int] = {}
+        for found in lines.values():
+            for test in found:
+                here[test] = here.get(test, 0) + 1
+        return sorted(tests, key=lambda t: (-here.get(t, 0) / self.total.get(t, 1), self.seconds[t]))
 
     def _in_turn(self, tests):
         """Quick ones first, one of each test function before the second of any: their parameters say much alike."""

@@ -9,7 +9,7 @@ import pytest
 from command_line import call
 
 from rbfmuscle.sim.volumes.read import LabelVolume, read_labels, read_names
-from rbfmuscle.sim.volumes.surfaces import label_surface
+from rbfmuscle.sim.volumes.surfaces import label_surface, smooth_mask
 from rbfmuscle.validation import MeshError, UsageError
 
 nibabel = pytest.importorskip("nibabel")
@@ -199,3 +199,17 @@ def test_without_the_reader_the_message_names_the_extra(tmp_path, capsys, monkey
     (tmp_path / "a.nii").write_bytes(b"")
     code, _, err = call(capsys, "new", tmp_path / "a.nii")
     assert code == 7 and "rbfmuscle[labels]" in err
+
+
+def test_smoothing_treats_inside_and_outside_alike():
+    """The field of what is left out is the field with the other sign; a plane stays half-way between voxels."""
+    mask = np.zeros((12, 10, 9), dtype=bool)
+    mask[3:9, 2:7, 3:6] = True
+    mask[5, 4, 6] = True
+    np.testing.assert_allclose(smooth_mask(~mask), -smooth_mask(mask), atol=1e-6)
+    half = np.zeros((12, 4, 4), dtype=bool)
+    half[:6] = True
+    field = smooth_mask(half)
+    np.testing.assert_allclose(field[5], -field[6], atol=1e-6)
+    assert (field[:6] > 0).all() and (field[6:] < 0).all()
+    np.testing.assert_allclose(field, field[:, :1, :1] * np.ones_like(field), atol=1e-6)
