@@ -123,7 +123,7 @@ def judge(fault, tree: Path, reach: dict, sound: Sound) -> dict:
     for kind in ("plain",) if fault.loop else ("plain", "compiled"):
         tests = sound.kept(reach[kind].tests(fault.path, fault.line, outside=not fault.function), kind)
         while tests:
-            seconds = 30.0 + 6.0 * sum(reach[kind].seconds[t] for t in tests)
+            seconds = 20.0 + 5.0 * sum(reach[kind].seconds[t] for t in tests)
             try:
                 path.write_text(fault.planted(source), encoding="utf-8")
                 outcome, first = run_tests(tree, tests, compiler=kind == "compiled", seconds=seconds)
