@@ -11,8 +11,9 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.sim.contraction.law import FibreLaw
 from rbfmuscle.sim.contraction.resolve import resolve_contraction
 
-# Weight of tendon edges in the ARAP energy, as in the RBF model (`rbfmuscle.model.fibres.TENDON_WEIGHT`).
-TENDON_WEIGHT = 100.0
+# Weight of tendon edges in the ARAP energy. Beside a belly that shortens by a fifth tendon keeps its length within
+# 0.6 %; at 100 it takes up so little in an iteration that a belly between fixed bones ends 8 % too long.
+TENDON_WEIGHT = 20.0
 
 
 class MeshFibres:

@@ -59,8 +59,10 @@ def even_pull(
 
     Fibres run from end to end, so their tension is one along the muscle, whatever its girth. Clusters are spread
     over the surface: a section of twice the girth has twice as many, and would win over the narrow ones, which
-    it stretches. The tension across a section is the sum over the edges through it, w |a · E|; the share falls
-    with it, from 1 where it is small (a tenth of the belly lies below).
+    it stretches. The tension across a section is the sum over the edges through it, w |a · E|, which goes with the
+    girth as the clusters' resistance does. A solid's resistance goes with the section's area, and the wide middle of a
+    belly shortens less than its ends: so the share falls with the square of that sum, from 1 where it is small (a
+    tenth of the belly lies below).
 
     Parameters
     ----------
@@ -83,4 +85,4 @@ def even_pull(
         begun[np.searchsorted(low, level, side="right")] - ended[np.searchsorted(high, level, side="left")]
     )
     least = np.quantile(through[belly], 0.1)
-    return np.clip(least / np.maximum(through, 1e-12 * through.max()), 0.0, 1.0)
+    return np.clip(least / np.maximum(through, 1e-12 * through.max()), 0.0, 1.0) ** 2

@@ -30,11 +30,11 @@ TABLES = {
     ),
     "output.surfaces": (options.SurfaceOptions, {"format": "stl"}),
     "output.fibres": (options.FibreOptions, {"count": 8, "segments": 4}),
-    "output.moment_arms": (options.ArmOptions, {"step": 1.0}),
+    "output.moment_arms": (options.ArmOptions, {"step": 2.0}),
     "output": (
         options.OutputOptions,
         {
-            "surfaces": {"format": "ply"}, "fibres": {"count": 8, "segments": 4}, "moment_arms": {"step": 1.0},
+            "surfaces": {"format": "ply"}, "fibres": {"count": 8, "segments": 4}, "moment_arms": {"step": 2.0},
             "metrics": False,
             "report": False, "preview": False,
         },

@@ -65,8 +65,9 @@ class Sampling:
             raise SceneError(f"scene {scene.name!r} has no muscles, add a [[muscle]]")
         self.scene = scene.validate().copy()
         self.scene.sliding = None
-        output: Any = self.scene.output.changed("moment_arms", True, place="")
-        self.scene.output = output
+        if not self.scene.output.moment_arms:
+            output: Any = self.scene.output.changed("moment_arms", True, place="")
+            self.scene.output = output
         self.directory, self.samples, self.kind = Path(directory), samples, kind
         self.ranges = {name: self._range(name, ranges) for name in self._all_needed()}
         self.needs = {muscle.name: self._needed(muscle) for muscle in self.scene.muscles}
@@ -195,6 +196,7 @@ class Sampling:
     def _open(self):
         """What is there already; another scene or other ranges in the same folder are refused."""
         ask = {"scene": self._fingerprint(), "points": self.kind, "ranges": self.ranges}
+        ask["step"] = self.scene.output.moment_arms.step
         plan, file = self.directory / "plan.json", self.directory / "samples.jsonl"
         try:
             self.directory.mkdir(parents=True, exist_ok=True)

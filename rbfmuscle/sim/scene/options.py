@@ -189,7 +189,7 @@ class FibreOptions(Table):
 class ArmOptions(Table):
     """``output.moment_arms``: how far each coordinate is nudged to either side [degree, or mm for a shift]."""
 
-    step: Annotated[float, Field(gt=0, le=10)] = 0.5
+    step: Annotated[float, Field(gt=0, le=10)] = 1.0
 
 
 class OutputOptions(Table):

@@ -9,7 +9,7 @@ import numpy as np
 
 from rbfmuscle.study.measure.metrics import ALL
 from rbfmuscle.study.show.appearance import line_colours
-from rbfmuscle.study.show.plots import PLOT_STYLE, arm_unit, motion_axis
+from rbfmuscle.study.show.plots import PLOT_STYLE, arm_unit, motion_axis, wrapped
 
 if TYPE_CHECKING:
     from rbfmuscle.study.files.saved import SavedRun
@@ -84,7 +84,7 @@ def _plot(title, tracks, axis, label, unit, *, zero=False):
         axes.plot([axis[frame] for frame in frames], values, color=colour, lw=1.5, marker="o", ms=2.0)
     if zero:
         axes.set_ylim(bottom=0.0)
-    axes.set(title=title, xlabel=label, ylabel=unit)
+    axes.set(title=wrapped(title), xlabel=label, ylabel=unit)
     out = io.BytesIO()
     figure.savefig(out, format="svg", metadata={"Date": None})
     return title, out.getvalue()

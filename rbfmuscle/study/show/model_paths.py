@@ -14,7 +14,7 @@ from rbfmuscle.opensim.beside import ask_opensim
 from rbfmuscle.sim.scene.scene import MM_PER_UNIT
 from rbfmuscle.study.show.appearance import line_colours
 from rbfmuscle.study.show.page import embedded_image
-from rbfmuscle.study.show.plots import PLOT_STYLE, arm_unit, motion_axis
+from rbfmuscle.study.show.plots import PLOT_STYLE, arm_unit, motion_axis, wrapped
 
 if TYPE_CHECKING:
     from rbfmuscle.study.files.saved import SavedRun
@@ -170,7 +170,7 @@ def _panel(title, own, theirs, frames, place, from_first):
         if len(values):
             values = values - (values[0] if from_first else 0.0)
             axes.plot([axis[frame] for frame in times], values, color=colour, lw=1.6, marker="o", ms=2.0)
-    axes.set(title=title, xlabel=label, ylabel=unit)
+    axes.set(title=wrapped(title), xlabel=label, ylabel=unit)
     out = io.BytesIO()
     figure.savefig(out, format="svg", metadata={"Date": None})
     return out.getvalue()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -103,6 +104,11 @@ def plot_panels(saved: SavedRun) -> list[tuple[str, bytes]]:
             figure.savefig(out, format="svg", metadata={"Date": None})
             pictures.append((title, out.getvalue()))
     return pictures
+
+
+def wrapped(title: str) -> str:
+    """A panel's title on as many lines as it needs."""
+    return "\n".join(textwrap.wrap(title, 48))
 
 
 def arm_unit(saved: Any, coordinate: str) -> str:
