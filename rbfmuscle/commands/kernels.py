@@ -27,7 +27,7 @@ def kernels(
     placement: str = "fitted",
     criterion: str = "held_out",
     condition: float = float("inf"),
-    resolution: int = 64,
+    resolution: int = 128,
     best: int = 3,
     frames: str | None = None,
     units: str = "",
@@ -113,7 +113,9 @@ def kernels(
         moved = [] if scene is None else _run_best(scene, title, study, best, frames)
         try:
             with tell_stage("drawing pictures"):
-                missing = write_study(study, output, title=f"Kernels for {title}", pictures=pictures)
+                missing = write_study(
+                    study, output, title=f"Kernels for {title}", pictures=pictures, moved=moved
+                )
         except OSError as error:
             raise UsageError(f"cannot write to {output}: {error.strerror}; choose another --output") from None
     if as_json:
@@ -170,7 +172,7 @@ def _run_best(scene, name, study, best, frames):
     from rbfmuscle.run import simulate
     from rbfmuscle.validation import RBFMuscleError
 
-    moved = []
+    moved, last, rms = [], [], []
     for row in _to_run(study, best):
         settings = {
             name: row[name.split(".")[1]] for name in ("model.kernel", "model.centres", "model.placement")
@@ -183,12 +185,16 @@ def _run_best(scene, name, study, best, frames):
         alone = scene.with_options(settings, model="rbf", frames=frames)
         alone.muscles = [alone.muscle(name)]
         try:
-            table = simulate(alone).summary[name]
+            run = simulate(alone)
+            table = run.summary[name]
+            last.append((facts, run[name].surface(frame=-1)))
+            rms.append(row["rms"])
             for quantity in (
                 "volume_error",
                 "penetration_max",
                 "bone_penetration_max",
                 "components",
+                "condition",
                 "time_frame",
             ):
                 if quantity in table:
@@ -196,7 +202,21 @@ def _run_best(scene, name, study, best, frames):
         except RBFMuscleError as error:
             facts["error"] = str(error)
         moved.append(facts)
+    if len(last) > 1:
+        _compare_with_finest(last, last[rms.index(min(rms))][1])
     return moved
+
+
+def _compare_with_finest(last, finest):
+    """Write into the facts of each run how far its last surface is from that of the run of the smallest error."""
+    import numpy as np
+
+    from rbfmuscle.study.measure.mesh_distance import MeshDistance
+
+    distance = MeshDistance(finest.vertices, finest.faces)
+    for facts, surface in last:
+        apart = distance.unsigned(np.asarray(surface.vertices))
+        facts["apart_rms"], facts["apart_max"] = float(np.sqrt((apart**2).mean())), float(apart.max())
 
 
 def _print(study, moved, output):

@@ -45,12 +45,15 @@ class Limits:
         Fits by eigen-decomposition among them.
     condition : float
         None beyond it is chosen.
+    scan : int
+        Fits of the first scan.
     """
 
     fits: int = 80
     seconds: float = math.inf
     slow: int = 4
     condition: float = math.inf
+    scan: int = 25
 
     def start(self) -> None:
         """Begin to count."""
@@ -72,7 +75,6 @@ def search_shape(
     error: Callable[[float, str], tuple[float, float]],
     span: tuple[float, float],
     *,
-    coarse: int,
     refine: int,
     size: int,
     limits: Limits,
@@ -85,8 +87,8 @@ def search_shape(
         ``(epsilon, how) -> error, condition``; raises LinAlgError where a fit fails.
     span : (float, float)
         Of epsilon [1/length].
-    coarse, refine : int
-        Fits of the scan and of the refinement.
+    refine : int
+        Fits of the refinement.
     size : int
         Unknowns of a fit.
     limits : Limits
@@ -108,7 +110,7 @@ def search_shape(
                     limits.begun = time.monotonic()
         return epsilon, score if math.isfinite(score) else math.inf, condition
 
-    sound, ratio = _scan_sound(attempt, span, coarse)
+    sound, ratio = _scan_sound(attempt, span, limits.scan)
     limits.scanning = False
     tried = [t for t in sound if math.isfinite(t[1])]
     if tried:

@@ -124,12 +124,7 @@ def choose_surface_epsilon(
 
     each = {"all": 4, "normal": 2}[derivatives] if kernel.hermite else 3
     tried = search_shape(
-        error,
-        (span[0] * unit, span[1] * unit),
-        coarse=COARSE,
-        refine=REFINE,
-        size=each * len(points),
-        limits=limits,
+        error, (span[0] * unit, span[1] * unit), refine=REFINE, size=each * len(points), limits=limits
     )
     choice = _best_within(tried, kernel, limits)
     return choice if distance is None else _look_at_zero_sets(choice, limits, fit, points, distance)

@@ -61,7 +61,7 @@ def test_no_parameter_then_the_condition_decide_between_equally_quick_rows():
         row("quintic", 0.14, 2.01, condition=4e11),
     ]
     rows.append(row("cubic", 0.141, 2.02, condition=1e7))
-    assert [r["kernel"] for r in recommend(rows).tie] == ["cubic", "quintic", "matern_52"]
+    assert [r["kernel"] for r in recommend(rows).tie] == ["cubic", "matern_52", "quintic"]
 
 
 def test_a_row_that_is_really_better_is_no_tie():

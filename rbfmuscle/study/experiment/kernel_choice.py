@@ -21,6 +21,8 @@ VOLUME_BOUND = 0.1
 # The coarsest sensible kernel, |r|, is taken as the bound of the error; where it is not in the study, this many
 # times the median error of the rows with as many centres.
 COARSEST, TIMES_MEDIAN = "linear", 3.0
+# Rows beyond this condition are taken only where none of the tie is below it.
+SOUND = 1e10
 # Quicker by less than this share is no reason to prefer a row.
 QUICKER = 0.1
 
@@ -150,12 +152,12 @@ def recommend(rows: list[dict[str, Any]]) -> Recommendation | None:
 
 
 def _preference(good):
-    """Order within a tie: time in steps of a tenth, then no parameter to choose, then the condition."""
+    """Order within a tie: sound conditions first, time in steps of a tenth, no parameter to choose, the condition."""
     least = min(cost(row) for row in good)
 
     def key(row):
         steps = int(np.log(cost(row) / least) / np.log1p(QUICKER))
-        return steps, bool(row["epsilon"]), row["condition"]
+        return row["condition"] > SOUND, steps, bool(row["epsilon"]), row["condition"]
 
     return key
 
@@ -174,6 +176,8 @@ def _reason(row, best, tie):
     parts = [f"{place}, {others}"]
     if cost(slow) > 1.5 * cost(row):
         parts.append(f"and up to {cost(slow) / cost(row):.1f} times as quick as they are")
+    if row["condition"] <= SOUND < min(tie, key=cost)["condition"]:
+        parts.append(f"of a condition of at most {SOUND:.0e}".replace("e+", "e"))
     if not row["epsilon"]:
         parts.append("without a shape parameter to choose")
     return ", ".join(parts)

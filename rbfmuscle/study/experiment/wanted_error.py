@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.arrays import MeshLike
-from rbfmuscle.implicit.kernels.table import get_kernel
+from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
 from rbfmuscle.implicit.placement.density import GREEDY_LARGEST
 from rbfmuscle.implicit.placement.refinement import FITTED
 from rbfmuscle.implicit.placement.sampling import PLACEMENTS, sample_surface
@@ -123,26 +123,44 @@ def reach_error(
     if not FEWEST <= most <= limit:
         raise UsageError(f"most must be from {FEWEST} to {limit} with placement {placement!r}, got {most}")
     vertices, faces = check_mesh(*(mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)))
-    search = _Search(vertices, faces, error, greatest, placement, int(most), progress)
+    search = Search((vertices, faces), error, greatest, placement, int(most), progress)
     for kernel in names:
         search.try_kernel(kernel)
     return search.confirmed()
 
 
-class _Search:
-    """Rows by kernel and number of centres, and the best so far."""
+class Search:
+    """Rows by kernel and number of centres, and the best so far.
 
-    def __init__(self, vertices, faces, error, greatest, placement, most, progress):
+    Parameters
+    ----------
+    mesh : (vertices, faces)
+    error, greatest, placement, most, progress
+        As in `reach_error`.
+    """
+
+    def __init__(
+        self,
+        mesh: tuple[Any, Any],
+        error: float,
+        greatest: bool,
+        placement: str,
+        most: int,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        vertices, faces = check_mesh(*mesh)
         self.surface, self.error, self.greatest, self.most = (vertices, faces), error, greatest, most
         self.ask, self.progress = Request("all", "held_out", placement, np.inf), progress
         self.base = "greedy" if placement == FITTED else placement
         self.cells = _cells(vertices, faces, error)
         self.judge = SurfaceJudge(vertices, faces, self.cells, CHOOSING)
-        self.samples, self.rows, self.tried = {}, {}, []
-        self.best = None
+        self.samples: dict[int, Any] = {}
+        self.rows: dict[tuple[str, int], dict[str, Any]] = {}
+        self.tried: list[dict[str, Any]] = []
+        self.best: tuple[Kernel, int] | None = None
 
-    def measure(self, kernel, count):
-        """Error of a kernel with so many centres, infinite where it broke."""
+    def measure(self, kernel: Kernel, count: int) -> float:
+        """Error of a kernel with so many centres [length], infinite where it broke."""
         key = kernel.name, count
         if key not in self.rows:
             if count not in self.samples:
@@ -161,7 +179,7 @@ class _Search:
     def _error(self, row):
         return math.inf if row["unfit"] else row["hausdorff" if self.greatest else "rms"]
 
-    def try_kernel(self, kernel):
+    def try_kernel(self, kernel: Kernel) -> None:
         """Bracket the number by the power law, then go down from the first that serves."""
         high = self.most
         if self.best is not None:  # only what needs fewer than the best is worth more fits
@@ -201,7 +219,7 @@ class _Search:
             if high is not None and low >= FEWEST and not low < count < high:
                 return low, high
 
-    def confirmed(self):
+    def confirmed(self) -> WantedError:
         """The best row where it holds at points that chose nothing; with more centres where it does not."""
         other = SurfaceJudge(*self.surface, self.cells, CONFIRMING)
         while self.best is not None:
