@@ -21,7 +21,7 @@ from rbfmuscle.sim.loop.simulate import simulate_frames
 from rbfmuscle.sim.scene.check import bone_collisions, bone_findings, check_initial
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.study.files.resume import left_behind
-from rbfmuscle.study.files.runinfo import Stages, build_info, frame_facts
+from rbfmuscle.study.files.runinfo import Clock, Stages, build_info, frame_facts
 from rbfmuscle.study.files.sinks import MemorySink, Sink
 from rbfmuscle.study.files.writer import RunWriter
 from rbfmuscle.study.measure.metrics import MetricsRecorder, Row
@@ -441,16 +441,12 @@ class Recording:
         compiled = {name: found[name] - self._compiled[name] for name in found}
         return build_info(
             self.scene,
-            started=self.started,
-            status=status or self.status,
-            message=self.message,
-            times=dict(self.times),
-            stages=self.stages,
+            ending=(status or self.status, self.message),
+            clock=Clock(self.started, dict(self.times), self.stages, compiled),
             frames=self.written,
             summary=self.summary.table(),
             limits={name: default_limit(name, self.scene) for name in LIMITS},
             options=self.options,
-            compiled=compiled,
         )
 
 

@@ -10,7 +10,7 @@ import platform
 from collections import defaultdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,32 +24,43 @@ FORMAT = 1
 _PACKAGES = ("numpy", "scipy", "numba", "scikit-image", "trimesh", "pyvista", "vtk", "libigl")
 
 
+class Clock(NamedTuple):
+    """When a run started, and what its time went into.
+
+    Attributes
+    ----------
+    started : datetime
+    times : dict of str to float
+        Wall time of the parts of the run [s].
+    stages : Stages
+    compiled : dict
+        Loops that this process compiled meanwhile and the processor time they took [s].
+    """
+
+    started: datetime
+    times: dict[str, float]
+    stages: Stages
+    compiled: dict[str, float]
+
+
 def build_info(
     scene: Scene,
     *,
-    started: Any,
-    status: str,
-    message: str,
-    times: dict[str, float],
-    stages: Stages,
+    ending: tuple[str, str],
+    clock: Clock,
     frames: list[Any],
     summary: dict[str, Any],
     limits: dict[str, float],
     options: dict[str, Any],
-    compiled: dict[str, float],
 ) -> dict[str, Any]:
     """Assemble ``run.json``.
 
     Parameters
     ----------
     scene : Scene
-    started : datetime
-    status : {"running", "complete", "interrupted", "failed"}
-    message : str
-        Why it ended, where it was not complete.
-    times : dict of str to float
-        Wall time of the parts of the run [s].
-    stages : Stages
+    ending : pair of str
+        "running", "complete", "interrupted" or "failed", and why it ended, where it was not complete.
+    clock : Clock
     frames : list of dict
         Frame number, coordinates [degree] and wall time of each written frame.
     summary : dict
@@ -58,18 +69,17 @@ def build_info(
         Quantity -> limit in the unit of ``metrics.csv``.
     options : dict
         What the caller asked for.
-    compiled : dict
-        Loops that this process compiled meanwhile and the processor time they took [s].
 
     Returns
     -------
     dict
     """
+    status, message = ending
     return {
         "format": FORMAT,
         "status": status,
         "message": message,
-        "started": started.isoformat(timespec="seconds"),
+        "started": clock.started.isoformat(timespec="seconds"),
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
         "scene": scene.resolved(),
         "options": options,
@@ -77,9 +87,9 @@ def build_info(
         "machine": machine(),
         "inputs": input_hashes(scene),
         "content": content_hash(scene),
-        "times": times,
-        "compiled": compiled,
-        "stages": stages.table(),
+        "times": clock.times,
+        "compiled": clock.compiled,
+        "stages": clock.stages.table(),
         "limits": limits,
         "muscles": {name: facts for name, facts in summary.items() if name != "all"},
         "frame_time": summary.get("all", {}).get("time_frame"),
