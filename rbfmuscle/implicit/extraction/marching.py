@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Array, Floats, Integers
 
 # Corner c of a cell sits at (c & 1, c >> 1 & 1, c >> 2). Edge e runs from its corner along its axis.
 EDGE_CORNER = np.array([c for axis in range(3) for c in range(8) if not c >> axis & 1])
@@ -57,11 +57,11 @@ class Samples(NamedTuple):
     """Values f of the field and c of what cuts it at the nodes of cells.
 
     A cell is the flat number of its lower node, ``strides`` are the steps of that number along the axes, and
-    ``index`` (all nodes of the grid,) tells where f and c of a node stand.
+    ``place`` (all nodes of the grid,) tells where f and c of a node stand.
     """
 
     strides: Integers
-    index: Integers
+    place: Array
     f: Floats
     c: Floats
 
@@ -71,7 +71,7 @@ class Made(NamedTuple):
     shift from there in cells; the triangles.
     """
 
-    of: Integers
+    of: Array
     node: Integers
     shift: Floats
     triangles: Integers

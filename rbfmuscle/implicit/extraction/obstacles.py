@@ -66,9 +66,9 @@ class Sorted(NamedTuple):
     middles in that order; ``cell`` (m,) is each triangle's own.
     """
 
-    cell: Integers
-    start: Integers
-    order: Integers
+    cell: Array
+    start: Array
+    order: Array
     middle: Floats
 
 
