@@ -32,6 +32,7 @@ class FaceTree:
                 code |= (cell[:, axis] >> bit & 1) << (3 * bit + axis)
         self.order = np.argsort(code, kind="stable")
         self.leaves = 1 << max(int(np.ceil(len(self.faces) / LEAF)) - 1, 0).bit_length()
+        self.closed = _is_closed(self.faces)
 
     def crossing(self, vertices: Floats, among: Booleans | None = None) -> Booleans:
         """Which triangles cross others, as `crossing_faces` says, for places of the vertices now."""
@@ -40,8 +41,21 @@ class FaceTree:
         _boxes_loop(vertices, self.faces, self.order, box, self.leaves, node)
         marked = np.zeros(len(self.faces), dtype=np.bool_)
         among = np.ones(len(self.faces), dtype=np.bool_) if among is None else among
-        _cross_loop(vertices, self.faces, self.order, box, self.leaves, node, among, marked)
+        plain = np.full(len(vertices), self.closed, dtype=np.bool_)
+        if self.closed:
+            _plain_loop(
+                vertices, self.faces, np.zeros_like(vertices), np.zeros(len(vertices), np.int64), plain
+            )
+        _cross_loop(vertices, self.faces, self.order, box, self.leaves, node, among, plain, marked)
         return marked
+
+
+def _is_closed(faces: Integers) -> bool:
+    """Whether every edge has two triangles that agree on their outside."""
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    span = int(ends.max(initial=0)) + 1
+    forth, back = np.sort(ends[:, 0] * span + ends[:, 1]), np.sort(ends[:, 1] * span + ends[:, 0])
+    return bool((np.diff(forth) > 0).all() and np.array_equal(forth, back))
 
 
 def crossing_faces(vertices: Floats, faces: Integers) -> Booleans:
@@ -93,7 +107,59 @@ def _apart(one, i, other, j):
 
 
 @compiled
-def _cross_loop(vertices, faces, order, box, leaves, node, among, marked):
+def _plain_loop(vertices, faces, normals, turns, plain):
+    """Unmark the vertices whose triangles do not lie side by side when seen along the mean normal there.
+
+    Of a closed surface these triangles are a ring around the vertex. Where all of them are seen from outside and
+    the ring goes round once, none covers another, so no two of them cross.
+    """
+    for f in range(len(faces)):
+        normal = _normal(vertices, faces, f)
+        for k in range(3):
+            for a in range(3):
+                normals[faces[f, k], a] += normal[a]
+    for f in range(len(faces)):
+        x, y, z = _normal(vertices, faces, f)
+        for k in range(3):
+            v, p, q = faces[f, k], faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
+            u = normals[v]
+            along = x * u[0] + y * u[1] + z * u[2]
+            least = 1e-12 * (x * x + y * y + z * z) * (u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
+            if along <= 0.0 or along * along <= least:
+                plain[v] = False
+            # The side of a plane through the normal that a neighbour lies on: once round, once from below to above.
+            a = (
+                0
+                if abs(u[0]) <= abs(u[1]) and abs(u[0]) <= abs(u[2])
+                else (1 if abs(u[1]) <= abs(u[2]) else 2)
+            )
+            b, c = (a + 1) % 3, (a + 2) % 3
+            below = u[c] * (vertices[p, b] - vertices[v, b]) - u[b] * (vertices[p, c] - vertices[v, c]) < 0.0
+            above = u[c] * (vertices[q, b] - vertices[v, b]) - u[b] * (vertices[q, c] - vertices[v, c]) >= 0.0
+            turns[v] += below and above
+    for v in range(len(plain)):
+        plain[v] &= turns[v] == 1
+
+
+@compiled
+def _normal(vertices, faces, f):
+    """Normal of a triangle, twice its area long."""
+    a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+    ux, uy, uz = (
+        vertices[b, 0] - vertices[a, 0],
+        vertices[b, 1] - vertices[a, 1],
+        vertices[b, 2] - vertices[a, 2],
+    )
+    vx, vy, vz = (
+        vertices[c, 0] - vertices[a, 0],
+        vertices[c, 1] - vertices[a, 1],
+        vertices[c, 2] - vertices[a, 2],
+    )
+    return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+
+
+@compiled
+def _cross_loop(vertices, faces, order, box, leaves, node, among, plain, marked):
     """All pairs of leaves whose boxes touch, from the root down."""
     waiting = np.empty((WAITING, 2), dtype=np.int64)
     waiting[0, 0], waiting[0, 1] = 1, 1
@@ -104,7 +170,9 @@ def _cross_loop(vertices, faces, order, box, leaves, node, among, marked):
         if i != j and _apart(node, i, node, j):
             continue
         if i >= leaves:
-            _leaf_loop(vertices, faces, order, box, LEAF * (i - leaves), LEAF * (j - leaves), among, marked)
+            _leaf_loop(
+                vertices, faces, order, box, LEAF * (i - leaves), LEAF * (j - leaves), among, plain, marked
+            )
             continue
         # Nodes of a pair are of one level.
         for a in range(2):
@@ -115,13 +183,16 @@ def _cross_loop(vertices, faces, order, box, leaves, node, among, marked):
 
 
 @compiled
-def _leaf_loop(vertices, faces, order, box, first, second, among, marked):
+def _leaf_loop(vertices, faces, order, box, first, second, among, plain, marked):
     for m in range(first, min(first + LEAF, len(order))):
         for n in range(max(second, m + 1), min(second + LEAF, len(order))):
             if _apart(box, m, box, n):
                 continue
             f, g = order[m], order[n]
-            if (marked[f] and marked[g]) or not (among[f] or among[g]) or _shared(faces, f, g) > 1:
+            if (marked[f] and marked[g]) or not (among[f] or among[g]):
+                continue
+            count, corner = _shared(faces, f, g)
+            if count > 1 or (count == 1 and plain[corner]):
                 continue
             if _cross(vertices, faces, f, g):
                 marked[f], marked[g] = True, True
@@ -129,12 +200,13 @@ def _leaf_loop(vertices, faces, order, box, first, second, among, marked):
 
 @compiled
 def _shared(faces, f, g):
-    """Corners that two triangles have in common."""
-    count = 0
+    """Number of corners that two triangles have in common, and one of them."""
+    count, corner = 0, 0
     for a in range(3):
         for b in range(3):
-            count += faces[f, a] == faces[g, b]
-    return count
+            if faces[f, a] == faces[g, b]:
+                count, corner = count + 1, faces[f, a]
+    return count, corner
 
 
 @compiled

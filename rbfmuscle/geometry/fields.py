@@ -16,7 +16,16 @@ class Field(Protocol):
 
 
 class Cut(Protocol):
-    """What cuts a surface: a signed distance, negative inside, that need not be exact far away."""
+    """What cuts a surface: a signed distance, negative inside, that need not be exact far away.
+
+    Attributes
+    ----------
+    steepest : float
+        No value changes by more than this for each unit of way, so that answers bound those nearby; infinity where
+        that is not known.
+    """
+
+    steepest: float
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Values (n,) at points (n, 3); a lower bound where they are farther than a surface comes."""
@@ -24,7 +33,7 @@ class Cut(Protocol):
     def value_and_gradient_below(
         self, points: np.ndarray, limit: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Values (n,) and gradients (n, 3), only sure where a value is below its limit (n,)."""
+        """Values (n,) and gradients (n, 3), only lower bounds where a value is beyond its limit (n,)."""
 
 
 class LevelField:

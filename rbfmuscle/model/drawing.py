@@ -206,6 +206,8 @@ class _BoneCut:
 
     def __init__(self, contacts: Any, reach: Any) -> None:
         self.contacts, self.reach = contacts, reach
+        # Distances to bones change as fast as one walks; half the difference of two muscles' fields is no distance.
+        self.steepest = np.inf if contacts.cuts else 1.0
 
     def __call__(self, points: Floats) -> Any:
         return self.contacts.nearest(points, self.reach)

@@ -44,6 +44,8 @@ class Two:
 class Bone:
     """A cut: outside of a sphere, exact everywhere."""
 
+    steepest = 1.0
+
     def __init__(self, radius, centre):
         self.sphere = Sphere(radius, centre)
 
@@ -158,3 +160,52 @@ def test_a_tree_made_at_rest_finds_crossings_later():
     some[np.flatnonzero(expected)[:1]] = True
     assert tree.crossing(moved, some)[some].all()
     assert not tree.crossing(np.asarray(BALL.vertices)).any()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05, 0.1, 0.3])
+def test_rings_that_lie_plain_spare_tests_and_miss_nothing(noise):
+    points = np.asarray(BALL.vertices) * [1.0, 0.6, 0.2]
+    tree = FaceTree(points, np.asarray(BALL.faces))
+    assert tree.closed
+    moved = points + noise * np.random.default_rng(3).normal(size=points.shape)
+    quick = tree.crossing(moved)
+    tree.closed = False  # every pair that shares a corner is tested
+    np.testing.assert_array_equal(quick, tree.crossing(moved))
+    assert quick.any() == (noise > 0.0)
+
+
+def test_a_ring_that_goes_round_twice_is_not_plain():
+    """A cone over a pentagram: all of it is seen from outside, and it covers itself."""
+    angles = np.arange(5) * 4.0 * np.pi / 5.0
+    rim = np.column_stack([np.cos(angles), np.sin(angles), 0.05 * np.arange(5)])
+    points = np.vstack([rim, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
+    turn = [(k, (k + 1) % 5) for k in range(5)]
+    faces = np.array([(a, b, 5) for a, b in turn] + [(b, a, 6) for a, b in turn])
+    tree = FaceTree(points, faces)
+    assert tree.closed
+    quick = tree.crossing(points)
+    tree.closed = False
+    assert quick.any()
+    np.testing.assert_array_equal(quick, tree.crossing(points))
+
+
+def test_open_surfaces_are_tested_pair_by_pair():
+    faces = np.asarray(BALL.faces)
+    assert not FaceTree(np.asarray(BALL.vertices), faces[1:]).closed
+    assert not FaceTree(np.asarray(BALL.vertices), np.vstack([faces, faces[:1]])).closed
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.1, -0.2])
+def test_what_is_known_of_the_cut_changes_nothing(shift):
+    """The same vertices as by asking the cut anew at every step."""
+    cut, asked = Bone(5.0, (5.6, 0.0, 0.0)), Bone(5.0, (5.6, 0.0, 0.0))
+    asked.steepest = np.inf
+    carried = np.asarray(BALL.vertices) + [shift, 0.0, 0.0]
+    spike = np.array([[0.6 + 1e-3, 0.0, 0.0], [0.62, 0.02, 0.01]])
+    bones = [(ObstaclePoints(spike), np.eye(4))]
+    found = [
+        fit_material(mesh_of(), carried, Sphere(), volume=VOLUME, cut=each, obstacles=bones)
+        for each in (cut, asked)
+    ]
+    np.testing.assert_allclose(found[0].vertices, found[1].vertices, rtol=0, atol=1e-12)
+    assert np.abs(cut(found[0].vertices)).min() < 1e-3

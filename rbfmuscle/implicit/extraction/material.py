@@ -17,8 +17,8 @@ from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.fields import Cut, Field
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction.band import BandGrid
-from rbfmuscle.implicit.extraction.obstacles import CHORD, ObstaclePoints, points_near_cells
-from rbfmuscle.implicit.extraction.projection import Projector
+from rbfmuscle.implicit.extraction.obstacles import CHORD, ObstaclePoints, faces_within, points_near_cells
+from rbfmuscle.implicit.extraction.projection import CutBounds, Projector
 from rbfmuscle.implicit.extraction.surface import ExtractedSurface
 from rbfmuscle.validation import check_finite
 
@@ -27,7 +27,7 @@ from rbfmuscle.validation import check_finite
 FARTHEST = 1.0
 UNSURE, SURE = 0.3, 0.7
 # What is within this many mean edges of the bones may come to lie on them.
-NEAR_CUT = 2.5
+NEAR_CUT = 1.5
 # Rounds of smoothing for triangles that cross others, and how the smoothed region grows with them.
 UNTANGLE, GROWTH = 24, 4
 # What the material takes so many mean edges deep into a bone, or a bone sent so
@@ -177,34 +177,39 @@ class _Fitting:
         self.mesh, self.carried, self.level = mesh, np.ascontiguousarray(vertices, dtype=np.float64), level
         self.field, self.cut = field, cut
         self.edge = mesh.edge(self.carried)
-        near = np.zeros(len(vertices), dtype=np.bool_)
-        if cut is not None:
-            near = cut(self.carried) < NEAR_CUT * self.edge
-        self.projector = Projector(field, cut if near.any() else None, self.carried.copy(), self.edge, near)
         self.sunk = np.zeros(len(vertices), dtype=np.bool_)
-        self.projector.clearance = self._clearance(near)
+        self._start(cut)
         self.left = np.zeros(len(vertices), dtype=np.bool_)
         self.evaluations = 0
         self.reach_of = None
         if mesh.slope is not None and field is not None:
-            _, gradient = field.value_and_gradient(self.carried)
+            self.projector.known = field.value_and_gradient(self.carried)
+            gradient = self.projector.known[1]
             share = np.sqrt(np.einsum("nd,nd->n", gradient, gradient)) / mesh.slope
             self.reach_of = FARTHEST * self.edge * np.clip((share - UNSURE) / (SURE - UNSURE), 0.0, 1.0)
 
-    def _clearance(self, near: Booleans) -> Floats | None:
+    def _start(self, cut: Cut | None) -> None:
+        """A projector of the vertices where the material takes them, that knows how far the bones are there."""
+        near, vertices = np.zeros(len(self.carried), dtype=np.bool_), self.carried.copy()
+        if cut is None:
+            self.projector = Projector(self.field, None, vertices, self.edge, near)
+            return
+        limit = np.full(len(vertices), NEAR_CUT * self.edge)
+        distance, outward = cut.value_and_gradient_below(self.carried, limit)
+        near = distance < limit
+        self.projector = Projector(self.field, cut if near.any() else None, vertices, self.edge, near)
+        if np.isfinite(cut.steepest):
+            self.projector.bounds = CutBounds(self.carried, np.minimum(distance, limit), cut.steepest)
+        if near.any():
+            self.projector.clearance = self._clearance(near, distance, outward)
+
+    def _clearance(self, near: Booleans, distance: Floats, outward: Floats) -> Floats:
         """How far from the bones vertices that sink into them end: those that look away keep off the others."""
-        rows = np.flatnonzero(near)
-        if self.cut is None or len(rows) == 0:
-            return None
-        normals = np.zeros_like(self.carried)
+        normals, clearance = np.zeros_like(self.carried), np.zeros(len(self.carried))
         _normals_loop(self.carried, self.mesh.faces, normals)
-        distance, outward = self.cut.value_and_gradient_below(
-            self.carried[rows], np.full(len(rows), NEAR_CUT * self.edge)
-        )
-        away = np.einsum("nd,nd->n", normals[rows], outward) > 0.0
-        clearance = np.zeros(len(self.carried))
-        clearance[rows[away]] = LAMELLA * self.edge
-        self.sunk[rows] = distance < -SUNK * self.edge
+        away = near & (np.einsum("nd,nd->n", normals, outward) > 0.0)
+        clearance[away] = LAMELLA * self.edge
+        self.sunk = near & (distance < -SUNK * self.edge)
         return clearance
 
     def project(self) -> None:
@@ -314,6 +319,11 @@ class _Fitting:
         spacing = max(self.edge, 0.52 * _edges_loop(vertices, faces)[1])
         size = float(np.ptp(vertices, axis=0).max())
         grid = BandGrid.around(vertices, resolution=max(int(size / spacing), 4), padding=2, axes=axes)
+        if self.projector.bounds is not None:
+            distance = self.projector.bounds.distance(vertices)
+            faces = faces[faces_within(vertices, faces, distance, 1.1 * CHORD * grid.spacing)]
+            if len(faces) == 0:
+                return
         state = np.zeros(int(np.prod(grid.shape)), dtype=np.uint8)
         cells = _touched_cells(grid, vertices, faces, state)
         points = points_near_cells(obstacles, grid, state, cells)
@@ -359,9 +369,10 @@ class _Fitting:
 
 def _touched_cells(grid: BandGrid, vertices: Floats, faces: Integers, state: Array) -> Integers:
     """Mark the cells that hold vertices or middles of triangles, and those beside them; their flat numbers."""
-    middles = (vertices[faces[:, 0]] + vertices[faces[:, 1]] + vertices[faces[:, 2]]) / 3.0
+    corners = vertices[faces]
+    holders = grid.cells(np.concatenate([corners.reshape(-1, 3), corners.mean(axis=1)]))
     cells = np.empty(len(state), dtype=np.int64)
-    return cells[: _touch_loop(grid.cells(np.concatenate([vertices, middles])), grid.strides, state, cells)]
+    return cells[: _touch_loop(np.unique(holders), grid.strides, state, cells)]
 
 
 @compiled(error_model="numpy")

@@ -164,6 +164,36 @@ def _near_points_loop(points, first, last, visited, index, count):
     return count
 
 
+def faces_within(vertices: Floats, faces: Integers, distance: Floats, reach: float) -> Booleans:
+    """Mask (m,) of the triangles that may come within reach of what their corners are at a distance from.
+
+    Parameters
+    ----------
+    vertices : (n, 3) ndarray
+    faces : (m, 3) ndarray of int
+    distance : (n,) ndarray
+        Of the vertices, at least.
+    reach : float
+    """
+    found = np.empty(len(faces), dtype=np.bool_)
+    _faces_within_loop(vertices, faces, distance, reach, found)
+    return found
+
+
+@compiled(error_model="numpy")
+def _faces_within_loop(vertices, faces, distance, reach, found):
+    """No point of a triangle is farther from a corner than its longest side over the root of three."""
+    for f in range(len(faces)):
+        longest = 0.0
+        for k in range(3):
+            a, b, square = faces[f, k], faces[f, (k + 1) % 3], 0.0
+            for c in range(3):
+                square += (vertices[a, c] - vertices[b, c]) ** 2
+            longest = max(longest, square)
+        nearest = min(distance[faces[f, 0]], distance[faces[f, 1]], distance[faces[f, 2]])
+        found[f] = nearest <= 0.578 * np.sqrt(longest) + reach
+
+
 def push_off_points(
     vertices: Floats, faces: Integers, points: Floats, grid: BandGrid, tolerance: float, rounds: int = 4
 ) -> Booleans:

@@ -16,6 +16,45 @@ if TYPE_CHECKING:
     from rbfmuscle.implicit.extraction.band import BandGrid
 
 
+class CutBounds:
+    """Answers of a cut at places where vertices were, from which lower bounds follow where they are now.
+
+    Parameters
+    ----------
+    places : (n, 3) ndarray
+    values : (n,) ndarray
+        Values there, or lower bounds.
+    steepest : float
+        Of the cut.
+    """
+
+    def __init__(self, places: Floats, values: Floats, steepest: float) -> None:
+        self.places, self.values, self.steepest = places.copy(), values.copy(), steepest
+
+    def below(self, vertices: Floats, rows: Integers | slice = slice(None)) -> Floats:
+        """Lower bounds (k,) at vertices (k, 3), those numbered ``rows``."""
+        away = vertices - self.places[rows]
+        found: Floats = self.values[rows] - self.steepest * np.sqrt(np.einsum("nd,nd->n", away, away))
+        return found
+
+    def distance(self, vertices: Floats) -> Floats:
+        """How far (n,) vertices (n, 3) are from the cut at least."""
+        return self.below(vertices) / self.steepest
+
+    def within(self, vertices: Floats, rows: Integers, limit: Floats) -> Booleans:
+        """Mask of the vertices that may lie below their limit (k,)."""
+        found: Booleans = self.below(vertices, rows) <= limit
+        return found
+
+    def keep(self, vertices: Floats, rows: Integers, values: Floats) -> None:
+        """Take over new answers."""
+        self.places[rows], self.values[rows] = vertices, values
+
+    def part(self, rows: Integers) -> CutBounds:
+        """The bounds of some of the vertices."""
+        return CutBounds(self.places[rows], self.values[rows], self.steepest)
+
+
 class Projector:
     """Vertices on their way to the zero set of max(f - level, -d).
 
@@ -35,6 +74,9 @@ class Projector:
         self._field = None if field is None else field.value_and_gradient
         self._cut = None if cut is None else cut.value_and_gradient_below
         self._near_cut = near_cut
+        # What is known before the first step: the field with its gradient, and the cut by values or lower bounds.
+        self.known: tuple[Floats, Floats] | None = None
+        self.bounds: CutBounds | None = None
         # Distance (n,) from the cut at which vertices that fall into it end; 0 where None.
         self.clearance: Floats | None = None
         self.slope = np.zeros(len(vertices))
@@ -49,7 +91,8 @@ class Projector:
         todo = np.arange(len(self.vertices))
         for _ in range(rounds):
             x = self.vertices[todo]
-            f, gradient = self._field(x)
+            f, gradient = self._field(x) if self.known is None else self.known
+            self.known = None
             step, slope = np.empty_like(x), np.empty(len(x))
             _newton_loop(f, np.ascontiguousarray(gradient), level, todo, step, slope, self._direction)
             self.slope[todo] = slope
@@ -70,9 +113,15 @@ class Projector:
     ) -> None:
         """Replace the steps of vertices that lie on the cut; marks which lie on the field's own surface."""
         rows = np.flatnonzero(self._near_cut[todo])
+        limit = self._limit(todo[rows]) - height[rows]
+        if self.bounds is not None:
+            within = self.bounds.within(x[rows], todo[rows], limit)
+            rows, limit = rows[within], limit[within]
         if self._cut is None or len(rows) == 0:
             return
-        distance, outward = self._cut(x[rows], self._limit(todo[rows]) - height[rows])
+        distance, outward = self._cut(x[rows], limit)
+        if self.bounds is not None:
+            self.bounds.keep(x[rows], todo[rows], distance)
         distance = distance - self._limit(todo[rows])
         on_cut = height[rows] < -distance
         on_field[todo[rows]] = ~on_cut
@@ -99,6 +148,7 @@ class Projector:
         part.vertices, part.spacing = self.vertices[rows], self.spacing
         part._field, part._cut, part._near_cut = self._field, self._cut, self._near_cut[rows]
         part.clearance = None if self.clearance is None else self.clearance[rows]
+        part.known, part.bounds = None, None if self.bounds is None else self.bounds.part(rows)
         part.slope, part._direction = np.zeros(len(rows)), np.zeros((len(rows), 3))
         return part
 
