@@ -20,6 +20,7 @@ def export(
     frames: str | None = None,
     ascii: Annotated[bool, Parameter(negative="")] = False,
     up: str = "z",
+    values: Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)] = None,
 ) -> None:
     """Write the surfaces of a run in other formats and units.
 
@@ -40,6 +41,8 @@ def export(
         VTP as text, as OpenSim reads it.
     up
         z or y: the scene's axis that points up, for usd and animated-glb.
+    values
+        stretch, activation or bone_distance of every vertex, in pvd, vtp, ply, usd and vtkhdf; several may be given.
     """
     with Progress(f"export {directory}"):
         from rbfmuscle.sim.scene.settings import parse_slice
@@ -47,7 +50,7 @@ def export(
 
         chosen = parse_slice(frames) if frames is not None else None
         written = export_run(
-            directory, formats, output=output, units=units, frames=chosen, ascii=ascii, up=up
+            directory, formats, output=output, units=units, frames=chosen, ascii=ascii, up=up, values=values
         )
     folders = sorted({str(path.parent) for path in written})
     print(f"{len(written)} file{'s'[: len(written) != 1]} in {', '.join(folders)}")

@@ -46,7 +46,7 @@ class FaceTree:
             _plain_loop(
                 vertices, self.faces, np.zeros_like(vertices), np.zeros(len(vertices), np.int64), plain
             )
-        _cross_loop(vertices, self.faces, self.order, box, self.leaves, node, among, plain, marked)
+        _cross_loop(vertices, self.faces, self.order, box, node, among, plain, marked)
         return marked
 
 
@@ -159,8 +159,9 @@ def _normal(vertices, faces, f):
 
 
 @compiled
-def _cross_loop(vertices, faces, order, box, leaves, node, among, plain, marked):
+def _cross_loop(vertices, faces, order, box, node, among, plain, marked):
     """All pairs of leaves whose boxes touch, from the root down."""
+    leaves = len(node) // 2
     waiting = np.empty((WAITING, 2), dtype=np.int64)
     waiting[0, 0], waiting[0, 1] = 1, 1
     count = 1
@@ -170,9 +171,7 @@ def _cross_loop(vertices, faces, order, box, leaves, node, among, plain, marked)
         if i != j and _apart(node, i, node, j):
             continue
         if i >= leaves:
-            _leaf_loop(
-                vertices, faces, order, box, LEAF * (i - leaves), LEAF * (j - leaves), among, plain, marked
-            )
+            _leaf_loop(vertices, faces, order, box, (i - leaves, j - leaves), among, plain, marked)
             continue
         # Nodes of a pair are of one level.
         for a in range(2):
@@ -183,7 +182,8 @@ def _cross_loop(vertices, faces, order, box, leaves, node, among, plain, marked)
 
 
 @compiled
-def _leaf_loop(vertices, faces, order, box, first, second, among, plain, marked):
+def _leaf_loop(vertices, faces, order, box, pair, among, plain, marked):
+    first, second = LEAF * pair[0], LEAF * pair[1]
     for m in range(first, min(first + LEAF, len(order))):
         for n in range(max(second, m + 1), min(second + LEAF, len(order))):
             if _apart(box, m, box, n):

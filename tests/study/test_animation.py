@@ -348,3 +348,81 @@ def test_blender_shows_every_vertex_where_it_is(folder, truth, tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.rstrip().endswith("as ours")
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory):
+    """A run with fibres whose muscle has an activation in its metrics."""
+    made = tmp_path_factory.mktemp("told")
+    scene = arm_scene(fibres={"count": 12, "segments": 6})
+    with pytest.MonkeyPatch.context() as patch:
+        use_blend_model(patch)
+        simulate(scene).save(made)
+    with open(made / "metrics.csv", "a", encoding="utf-8") as file:
+        file.writelines(f"{k},elbow.flexion,0,biceps,activation,{0.25 * k},1\n" for k in range(3))
+    return made
+
+
+class TestValues:
+    """What is told of every vertex."""
+
+    def test_bone_distance_is_that_of_the_bones_where_they_are(self, told, tmp_path):
+        import igl
+
+        export_run(told, "ply", output=tmp_path, units="cm", values=["bone_distance"])
+        found = trimesh.load(tmp_path / "ply" / "biceps_0002.ply", process=False)
+        saved, expected = SavedRun(told), np.inf
+        for bone in saved.bones:
+            pose = saved.poses[2][bone]
+            vertices, faces = saved.bone(bone)
+            local = (saved.surface("biceps", 2)[0] - pose[:3, 3]) @ pose[:3, :3]
+            signed = igl.signed_distance(local, vertices, faces.astype(np.int64))[0]
+            expected = np.minimum(expected, signed)
+        values = np.asarray(found.metadata["_ply_raw"]["vertex"]["data"]["bone_distance"]).ravel()
+        np.testing.assert_allclose(values, 0.1 * expected, atol=1e-5)  # single precision, [cm]
+
+    def test_stretch_and_activation_in_vtp_keep_to_their_vertices(self, told, tmp_path):
+        import pyvista
+
+        export_run(told, "pvd", output=tmp_path, values=["stretch", "activation"])
+        first, last = (pyvista.read(tmp_path / "pvd" / f"biceps_000{k}.vtp") for k in (0, 2))
+        np.testing.assert_allclose(first.point_data["stretch"], 1.0, atol=1e-12)
+        assert np.ptp(last.point_data["stretch"]) > 0.01
+        np.testing.assert_array_equal(last.point_data["activation"], 0.5)
+        points, _ = SavedRun(told).fibres("biceps", 2)
+        start, _ = SavedRun(told).fibres("biceps", 0)
+        ratio = np.linalg.norm(np.diff(points, axis=1), axis=2) / np.linalg.norm(
+            np.diff(start, axis=1), axis=2
+        )
+        assert ratio.min() - 1e-9 <= last.point_data["stretch"].min()
+        assert last.point_data["stretch"].max() <= ratio.max() + 1e-9
+
+    def test_usd_and_vtkhdf_hold_them_at_every_time(self, told, tmp_path):
+        import pyvista
+
+        pytest.importorskip("pxr.UsdGeom")
+        from pxr import Usd, UsdGeom
+
+        names = ["stretch", "bone_distance"]
+        usd, hdf, *_ = export_run(told, ["usd", "vtkhdf"], output=tmp_path, units="m", values=names)
+        export_run(told, "vtp", output=tmp_path, units="m", values=names)
+        stage = Usd.Stage.Open(str(usd))
+        mesh = next(p for p in stage.Traverse() if p.GetName() == "biceps" and p.GetTypeName() == "Mesh")
+        for frame in range(3):
+            expected = pyvista.read(tmp_path / "vtp" / f"biceps_000{frame}.vtp").point_data
+            for name in names:
+                primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar(name)
+                assert primvar.GetInterpolation() == "vertex"
+                np.testing.assert_allclose(primvar.Get(frame), expected[name], rtol=1e-6, atol=1e-8)
+        assert set(pyvista.read(hdf).point_data) == set(names)
+
+    def test_what_is_missing_is_said(self, folder, tmp_path):
+        for values, said in (
+            (["stretch"], "set output.fibres = true"),
+            (["activation"], "no muscle contracts"),
+            (["strech"], "did you mean 'stretch'"),
+        ):
+            with pytest.raises(UsageError, match=said):
+                export_run(folder, "vtp", output=tmp_path, values=values)
+        with pytest.raises(UsageError, match="not into animated-glb"):
+            export_run(folder, "animated-glb", output=tmp_path, values=["stretch"])

@@ -165,6 +165,9 @@ class Projector:
         rows = np.flatnonzero(self._near_cut)
         for _ in range(2):
             limit = self._limit(rows) * np.ones(len(rows))
+            if self.bounds is not None:
+                within = self.bounds.within(self.vertices[rows], rows, limit)
+                rows, limit = rows[within], limit[within]
             distance, outward = self._cut(self.vertices[rows], limit)
             distance = distance - limit
             rows, distance, outward = rows[distance < 0], distance[distance < 0], outward[distance < 0]

@@ -55,12 +55,7 @@ def parse_legacy(content: bytes) -> PolyData:
             raise BrokenFileError(f"not a readable VTK file: {_shown(words)} where a keyword should be")
     kept = {name: check_cells(found, len(points), name) for name, found in cells.items()}
     return PolyData(
-        points,
-        kept.get("lines", NO_CELLS),
-        kept.get("polygons", NO_CELLS),
-        kept.get("strips", NO_CELLS),
-        {},
-        {},
+        points, kept.get("lines", NO_CELLS), kept.get("polygons", NO_CELLS), kept.get("strips", NO_CELLS), {}
     )
 
 

@@ -29,14 +29,13 @@ class Cells(NamedTuple):
 
 
 class PolyData(NamedTuple):
-    """Points (n, 3), the cells that hold them, and values of the cells and of the points by name."""
+    """Points (n, 3), the cells that hold them, and values of the cells by name."""
 
     points: np.ndarray
     lines: Cells
     polygons: Cells
     strips: Cells
     values: dict
-    point_values: dict
 
 
 NO_CELLS = Cells(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
@@ -55,7 +54,7 @@ def read_polydata(path: str | Path, suffix: str | None = None, *, values: bool =
     suffix : str, optional
         In place of the file's own.
     values : bool
-        Also read the values of the cells and points (of XML files).
+        Also read the values of the cells (of XML files).
 
     Raises
     ------

@@ -88,21 +88,15 @@ def _read_piece(file, piece, values):
     elif count:
         raise BrokenFileError(f"{count} points are promised, none are given")
     cells = [_read_cells(file, piece, kind, count) for kind in ("Lines", "Polys", "Strips")]
-    if not values:
-        return PolyData(points, *cells, {}, {})
-    kinds = ("Verts", "Lines", "Polys", "Strips")
-    filled = sum(_number(piece, f"NumberOf{kind}", file.size) for kind in kinds)
-    return PolyData(
-        points,
-        *cells,
-        _named_values(file, piece, "CellData", filled),
-        _named_values(file, piece, "PointData", count),
+    return PolyData(points, *cells, _cell_values(file, piece) if values else {})
+
+
+def _cell_values(file, piece):
+    """Arrays of one number a cell by name."""
+    count = sum(
+        _number(piece, f"NumberOf{kind}", file.size) for kind in ("Verts", "Lines", "Polys", "Strips")
     )
-
-
-def _named_values(file, piece, part, count):
-    """Arrays of one number a cell or point by name."""
-    arrays = [array for array in piece.iterfind(f"./{part}/DataArray") if array.get("type") in _TYPES]
+    arrays = [array for array in piece.iterfind("./CellData/DataArray") if array.get("type") in _TYPES]
     return {
         array.get("Name", ""): _values(file, array, count)
         for array in arrays
@@ -264,4 +258,4 @@ def _joined(pieces):
         kind: Cells(np.concatenate([e for e, _ in found]), np.concatenate([n for _, n in found]))
         for kind, found in parts.items()
     }
-    return PolyData(np.vstack([piece.points for piece in pieces]), **cells, values={}, point_values={})
+    return PolyData(np.vstack([piece.points for piece in pieces]), **cells, values={})

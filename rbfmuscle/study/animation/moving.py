@@ -9,6 +9,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.sim.scene.scene import MM_PER_UNIT
+from rbfmuscle.study.animation.values import VertexValues
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.show.appearance import BONE_COLOUR, muscle_colours
 
@@ -30,7 +31,7 @@ class MovingMuscle:
     faces : list of (m, 3) ndarray of int
         One of each frame, all the same array where the surface keeps its vertices.
     values : dict of str to list of (n,) ndarray
-        What the run kept of each vertex in each frame.
+        What is told of each vertex in each frame.
     """
 
     name: str
@@ -98,7 +99,9 @@ class MovingRun:
     up: str
 
 
-def read_moving(saved: SavedRun, frames: list[int], *, unit: str, up: str = "z") -> MovingRun:
+def read_moving(
+    saved: SavedRun, frames: list[int], *, unit: str, up: str = "z", values: VertexValues | None = None
+) -> MovingRun:
     """All frames of a saved run at once.
 
     Parameters
@@ -109,14 +112,15 @@ def read_moving(saved: SavedRun, frames: list[int], *, unit: str, up: str = "z")
     unit : {"m", "cm", "mm"}
         Of the lengths returned.
     up : {"z", "y"}
+    values : VertexValues, optional
+        What to tell of the vertices.
 
     Returns
     -------
     MovingRun
     """
     factor = MM_PER_UNIT[saved.units] / MM_PER_UNIT[unit]
-    colours = muscle_colours(saved.muscles)
-    muscles = [_read_muscle(saved, name, frames, factor, colours[name]) for name in saved.muscles]
+    muscles = [_read_muscle(saved, name, frames, factor, values) for name in saved.muscles]
     bones = []
     for name in saved.bones:
         vertices, faces = saved.bone(name)
@@ -130,18 +134,17 @@ def read_moving(saved: SavedRun, frames: list[int], *, unit: str, up: str = "z")
     return MovingRun(str(scene.get("name") or Path(saved.directory).name), unit, times, muscles, bones, up)
 
 
-def _read_muscle(saved, name, frames, factor, colour):
+def _read_muscle(saved, name, frames, factor, told):
     vertices, faces, values = [], [], {}
     for frame in frames:
-        points, triangles, present = saved.surface_values(name, frame)
+        points, triangles = saved.surface(name, frame)
         if faces and faces[0].shape == triangles.shape and np.array_equal(faces[0], triangles):
             triangles = faces[0]
         vertices.append(points * factor)
         faces.append(triangles)
-        for key, value in present.items():
-            values.setdefault(key, []).append(value * factor if key in LENGTHS else value)
-    whole = {key: value for key, value in values.items() if len(value) == len(frames)}
-    return MovingMuscle(name, _rgb(colour), vertices, faces, whole)
+        for key, value in (told.of(name, frame, points, factor=factor) if told else {}).items():
+            values.setdefault(key, []).append(value)
+    return MovingMuscle(name, _rgb(muscle_colours(saved.muscles)[name]), vertices, faces, values)
 
 
 def _rgb(colour):
@@ -151,7 +154,3 @@ def _rgb(colour):
 def linear_rgb(colour: Floats) -> Floats:
     """A colour (3,) as screens show it in the linear light that USD and glTF count in."""
     return np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
-
-
-# Values of vertices that are lengths, and so are converted with the unit.
-LENGTHS = ("bone_distance",)

@@ -8,6 +8,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.sim.scene.scene import MM_PER_UNIT
+from rbfmuscle.study.animation.values import VertexValues
 from rbfmuscle.study.files.meshfiles import write_mesh
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.files.storage import export_lengths
@@ -18,6 +19,8 @@ from rbfmuscle.validation import SolveError, UsageError
 FORMATS = ("pvd", "vtp", "ply", "stl", "obj", "glb")
 ANIMATIONS = ("usd", "animated-glb", "vtkhdf")
 TABLES = ("sto",)
+# Those that hold values of vertices.
+WITH_VALUES = ("pvd", "vtp", "ply", "usd", "vtkhdf")
 
 
 def export_run(
@@ -29,6 +32,7 @@ def export_run(
     frames: slice | None = None,
     ascii: bool = False,
     up: str = "z",
+    values: list[str] | None = None,
 ) -> list[Path]:
     """Write the muscles and bones of a saved run in one or more formats.
 
@@ -51,6 +55,9 @@ def export_run(
         VTP as plain numbers, as OpenSim reads them.
     up : {"z", "y"}
         The axis of the scene that points up, for ``usd`` and ``animated-glb``.
+    values : list of str, optional
+        What to tell of every vertex of the muscles, of ``stretch``, ``activation`` and ``bone_distance``: in ``pvd``,
+        ``vtp``, ``ply``, ``usd`` and ``vtkhdf``.
 
     Returns
     -------
@@ -69,9 +76,14 @@ def export_run(
     saved = SavedRun(directory)
     formats = [formats] if isinstance(formats, str) else list(formats)
     _check_words(formats, units, up)
+    if values and not set(formats) & set(WITH_VALUES):
+        raise UsageError(
+            f"values of vertices go into {', '.join(WITH_VALUES)}, not into {', '.join(formats)}"
+        )
     chosen = saved.frames[frames] if frames is not None else saved.frames
     if not chosen or not (saved.has_surfaces() or set(formats) <= set(TABLES)):
         raise UsageError(f"{directory} has no surfaces to export")
+    told = VertexValues(saved, values) if values else None
     base = Path(output) if output is not None else saved.directory / "export"
     written = []
     try:
@@ -82,10 +94,11 @@ def export_run(
                 written += export_lengths(saved, base / name, chosen, factor)
                 continue
             if name in ANIMATIONS:
-                written += _export_animation(saved, base / name, name, chosen, wanted, up)
-                continue
-            act = _export_glb if name == "glb" else _export_meshes
-            written += act(saved, base / name, name, chosen, factor, ascii)
+                written += _export_animation(saved, base / name, name, chosen, (wanted, up, told))
+            elif name == "glb":
+                written += _export_glb(saved, base / name, chosen, factor)
+            else:
+                written += _export_meshes(saved, base / name, name, chosen, (factor, ascii, told))
     except OSError as error:
         raise SolveError(f"cannot write to {base}: {error.strerror}") from None
     return written
@@ -112,12 +125,13 @@ def posed(saved: SavedRun, bone: tuple[str, Floats], frame: int) -> Floats:
     return bone[1] @ pose[:3, :3].T + pose[:3, 3]
 
 
-def _export_animation(saved, folder, name, frames, unit, up):
+def _export_animation(saved, folder, name, frames, how):
     from rbfmuscle.study.animation.moving import read_moving
 
+    unit, up, told = how
     if name == "animated-glb" and unit != "m":
         raise UsageError(f"animated-glb is in metres by its standard; leave out --units {unit}")
-    run = read_moving(saved, frames, unit=unit, up=up)
+    run = read_moving(saved, frames, unit=unit, up=up, values=None if name == "animated-glb" else told)
     folder.mkdir(parents=True, exist_ok=True)
     if name == "vtkhdf":
         from rbfmuscle.study.animation.vtkhdf import write_vtkhdf
@@ -132,7 +146,8 @@ def _export_animation(saved, folder, name, frames, unit, up):
     return [path]
 
 
-def _export_meshes(saved, folder, name, frames, factor, ascii):
+def _export_meshes(saved, folder, name, frames, how):
+    factor, ascii, told = how
     folder.mkdir(parents=True, exist_ok=True)
     suffix = ".vtp" if name == "pvd" else f".{name}"
     rest = {bone: saved.bone(bone) for bone in saved.bones}
@@ -143,11 +158,13 @@ def _export_meshes(saved, folder, name, frames, factor, ascii):
         for group, items in (("surfaces", muscles), ("bones", bones)):
             entries = []
             for item, vertices, faces in items:
-                file = f"{item}_{frame:04d}{suffix}"
+                file, values = f"{item}_{frame:04d}{suffix}", None
+                if told is not None and group == "surfaces" and name in WITH_VALUES:
+                    values = told.of(item, frame, vertices, factor=factor)
                 if suffix == ".vtp":
-                    write_vtp(folder / file, vertices * factor, faces, ascii=ascii)
+                    write_vtp(folder / file, vertices * factor, faces, ascii=ascii, values=values)
                 else:
-                    write_mesh(folder / file, vertices * factor, faces)
+                    write_mesh(folder / file, vertices * factor, faces, values=values)
                 entries.append((item, file))
             groups[group].append((frame, entries))
         if suffix == ".vtp" and saved.has_fibres():
@@ -184,7 +201,7 @@ def _write_collection(path, steps, times):
     return path
 
 
-def _export_glb(saved, folder, _name, frames, factor, _ascii):
+def _export_glb(saved, folder, frames, factor):
     import trimesh
 
     folder.mkdir(parents=True, exist_ok=True)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.study.files.meshfiles import SUFFIXES, read_mesh, read_mesh_values
+from rbfmuscle.study.files.meshfiles import SUFFIXES, read_mesh
 from rbfmuscle.study.measure.metrics import Row
 from rbfmuscle.validation import MeshError, UsageError
 
@@ -94,10 +94,6 @@ class SavedRun:
     def surface(self, muscle: str, frame: int) -> tuple[Floats, Integers]:
         """Vertices and faces of a muscle in a frame."""
         return read_mesh(self._file("surfaces", muscle, frame))
-
-    def surface_values(self, muscle: str, frame: int) -> tuple[Floats, Integers, dict[str, Floats]]:
-        """Vertices and faces of a muscle in a frame, and what the run kept of each vertex by name."""
-        return read_mesh_values(self._file("surfaces", muscle, frame))
 
     def bone(self, name: str) -> tuple[Floats, Integers]:
         """Vertices and faces of a bone at rest."""

@@ -18,7 +18,13 @@ _TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32", "i8": "Int64"}
 
 
 def write_vtp(
-    path: str | Path, vertices: ArrayLike, faces: ArrayLike, *, ascii: bool = False, single: bool = False
+    path: str | Path,
+    vertices: ArrayLike,
+    faces: ArrayLike,
+    *,
+    ascii: bool = False,
+    single: bool = False,
+    values: dict[str, Any] | None = None,
 ) -> None:
     """Write a triangle mesh as VTK XML PolyData.
 
@@ -31,11 +37,13 @@ def write_vtp(
         Plain numbers, as OpenSim reads them; else compressed base64, for which no reader needs a setting.
     single : bool
         Positions in single precision.
+    values : dict of str to (n,) array_like, optional
+        Of the vertices.
     """
     vertices = np.ascontiguousarray(vertices, dtype=np.float32 if single else np.float64)
     faces = np.ascontiguousarray(faces, dtype=np.int32)
     ends = np.arange(3, 3 * len(faces) + 1, 3, dtype=np.int32)
-    _write_polydata(path, vertices, ("Polys", faces.ravel(), ends), {}, ascii)
+    _write_polydata(path, vertices, ("Polys", faces.ravel(), ends), ("PointData", values or {}), ascii)
 
 
 def write_vtp_lines(
@@ -56,18 +64,19 @@ def write_vtp_lines(
     count, each = points.shape[:2]
     numbers = np.arange(count * each, dtype=np.int32)
     ends = each * np.arange(1, count + 1, dtype=np.int32)
-    values = {name: np.ascontiguousarray(value, dtype=np.float64) for name, value in (cells or {}).items()}
     positions = np.ascontiguousarray(points.reshape(-1, 3))
-    _write_polydata(path, positions, ("Lines", numbers, ends), values, ascii)
+    _write_polydata(path, positions, ("Lines", numbers, ends), ("CellData", cells or {}), ascii)
 
 
 def _write_polydata(path, points, cells, values, ascii):
-    """Points, one kind of cells as (kind, point numbers, ends), and values of the cells by name."""
+    """Points, one kind of cells as (kind, point numbers, ends), and values of (whom, by name)."""
+    whose, values = values
     kind, numbers, ends = cells
     counts = {name: len(ends) * (name == kind) for name in ("Verts", "Lines", "Strips", "Polys")}
     numbered = " ".join(f'NumberOf{name}="{count}"' for name, count in counts.items())
     compressor = "" if ascii else ' compressor="vtkZLibDataCompressor"'
-    data = [_array(value, name, ascii) for name, value in values.items()]
+    numbered_values = {name: np.ascontiguousarray(value, dtype=np.float64) for name, value in values.items()}
+    data = [_array(value, name, ascii) for name, value in numbered_values.items()]
     parts = [
         '<?xml version="1.0"?>\n',
         '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt32"',
@@ -77,7 +86,7 @@ def _write_polydata(path, points, cells, values, ascii):
         _array(numbers, "connectivity", ascii),
         _array(ends, "offsets", ascii),
         f"</{kind}>\n",
-        *(["<CellData>\n", *data, "</CellData>\n"] if data else []),
+        *([f"<{whose}>\n", *data, f"</{whose}>\n"] if data else []),
         "</Piece>\n</PolyData>\n</VTKFile>\n",
     ]
     Path(path).write_text("".join(parts), encoding="ascii")
