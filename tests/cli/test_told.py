@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from blend_model import arm_files, arm_scene
+from blend_model import arm_files, arm_scene, use_blend_model
 from command_line import call
 
 import rbfmuscle as rm
@@ -98,6 +98,23 @@ class TestCommands:
         assert f"attached: {held}" in out and f"{len(scene.motion)} frames, lengths in mm" in out
         path.write_text(path.read_text().replace('units = "mm"', 'units = "cm"'))
         assert f"{muscle.mesh.volume:.4g} cm3" in call(capsys, "check", path)[1]
+
+    @pytest.mark.parametrize("report", [True, False])
+    def test_run_names_the_report_where_there_is_one(self, tmp_path, monkeypatch, capsys, report):
+        use_blend_model(monkeypatch)
+        path, out = arm_files(tmp_path), tmp_path / "out"
+        words = [
+            "--set",
+            f"output.report={str(report).lower()}",
+            "--set",
+            "output.surfaces=false",
+            "--frames",
+            "0:2",
+        ]
+        code, told, _ = call(capsys, "run", path, "-o", out, *words)
+        assert code == 0 and (out / "report.html").exists() == report
+        assert "2 frames in " in told and f"in {out}" in told
+        assert (f"open {out / 'report.html'}" in told) == report
 
 
 class TestFindings:

@@ -9,6 +9,7 @@ import pytest
 from numba.core import types
 
 from rbfmuscle.compiled.types import read_type, spell_type
+from rbfmuscle.compiled.watch import _watchers, current_stage, tell_stage
 from rbfmuscle.sim.distance.query import FieldData
 
 
@@ -64,3 +65,21 @@ def test_omitted_arguments_keep_their_value():
 def test_what_has_no_spelling_is_refused():
     with pytest.raises(ValueError, match="cannot be foretold"):
         spell_type(types.unicode_type)
+
+
+def test_watchers_are_told_of_stages_in_turn_and_only_what_they_listen_to():
+    class Stages:
+        def __init__(self):
+            self.told = []
+
+        def stage(self, stage):
+            self.told.append(stage.text if stage else None)
+
+    watcher, deaf = Stages(), object()
+    _watchers.extend([deaf, watcher])
+    try:
+        with tell_stage("outer"), tell_stage("inner") as inner:
+            assert current_stage() is inner
+    finally:
+        _watchers.remove(watcher), _watchers.remove(deaf)
+    assert watcher.told == ["outer", "inner", "outer", None]

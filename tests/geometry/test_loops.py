@@ -4,12 +4,14 @@ import igl
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from pbd_baseline.contraction import _stretch_loop
 from pbd_baseline.shapes import _scale_loop
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.fields import LevelField
 from rbfmuscle.geometry.mean_value import mean_value_weights
+from rbfmuscle.geometry.rest_frame import BoneFrame
 from rbfmuscle.implicit.placement.off_surface import _touching_ball_loop
 from rbfmuscle.study.measure.mesh_distance import _winding_loop
 
@@ -169,3 +171,24 @@ def test_winding_numbers_are_one_inside_none_outside_and_halves_add_up():
     parts = [_winding_loop(inside, vertices, np.ascontiguousarray(part)) for part in half]
     assert sum(parts) == pytest.approx(1.0) and 0.1 < parts[0] < 0.9
     assert _winding_loop(inside, vertices, np.ascontiguousarray(faces[:, ::-1])) == pytest.approx(-1.0)
+
+
+@pytest.mark.parametrize("scale", [1.0, 40.0])
+def test_local_units_are_the_same_wherever_a_bone_is_and_however_large(scale):
+    """A slab of three lengths, turned: its local vertices come back from every pose, and its box holds them."""
+    turn = Rotation.from_rotvec([0.7, -0.4, 1.1]).as_matrix()
+    vertices = scale * (np.array(trimesh.creation.box((5.0, 2.0, 1.0)).vertices) @ turn.T + [3.0, 1.0, -2.0])
+    frame = BoneFrame(vertices)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec([0.2, 0.9, -0.3]).as_matrix(), [10.0, -4.0, 7.0]
+    for at in (np.eye(4), pose):
+        placed = frame.placed(at)
+        world = vertices @ at[:3, :3].T + at[:3, 3]
+        np.testing.assert_allclose((world - placed[:3, 3]) @ placed[:3, :3], frame.local, atol=1e-7)
+    low, high = frame.box(np.array([vertices.min(axis=0), vertices.max(axis=0)]))
+    assert (frame.local >= low - 1e-7).all() and (frame.local <= high + 1e-7).all()
+    # Along its principal axes the slab fills its own box.
+    sides = np.sort(np.ptp(frame.local, axis=0)) * frame.size
+    np.testing.assert_allclose(sides, scale * np.array([1.0, 2.0, 5.0]), rtol=1e-5)
+    np.testing.assert_allclose(frame.axes @ frame.axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(frame.axes) == pytest.approx(1.0)

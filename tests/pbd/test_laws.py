@@ -5,13 +5,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
-from pbd_baseline.arap import ARAP, ARAPConstraint
+from pbd_baseline.arap import ARAP, ARAPConstraint, _turn_towards
+from pbd_baseline.constraints import _cubic_step
 from pbd_baseline.contact import ContactConstraint, _keep_deepest
 from pbd_baseline.motion import carry
 from pbd_baseline.muscle import _contact_carriers
 from pbd_baseline.topology import Topology
 from rbfmuscle.geometry.harmonic import blended_motion
+from rbfmuscle.geometry.rotations import quaternion_matrix
 from rbfmuscle.sim.loop.contact import HalfSpaces
 from rbfmuscle.sim.scene.motion import rotation_about
 
@@ -168,3 +173,49 @@ def test_nearest_response_keeps_the_deepest_of_each_point_alone():
     depth = np.array([0.2, 0.5, 0.1, 0.3])
     _keep_deepest(np.array([0, 0, 1, 3]), depth, 4)
     np.testing.assert_array_equal(depth, [0.0, 0.5, 0.1, 0.3])
+
+
+@settings(deadline=None, derandomize=True)
+@given(
+    st.floats(-2.0, 2.0),
+    st.floats(0.2, 3.0),
+    st.sampled_from([-1.0, 1.0]),
+    st.floats(-1.0, 1.0),
+    st.floats(-1.0, 1.0),
+)
+def test_step_to_a_volume_meets_it_or_is_none(error, slope, sign, bend, turn):
+    """c0 + c1 s + c2 s² + c3 s³ = wanted: the root that continues zero, or no step where there is none near."""
+    cubic = (1.0 + error, sign * slope, bend, turn)
+    s = _cubic_step(cubic, 1.0, 1e-13)
+    value = cubic[0] + s * (cubic[1] + s * (cubic[2] + s * cubic[3]))
+    assert s == 0.0 or value == pytest.approx(1.0, abs=1e-12)
+    assert abs(s) <= 4.0 * abs(error / slope)
+    if abs(error) < 0.05 * slope**2:  # so near that the first turn of the cubic lies far behind
+        assert cubic[0] == 1.0 or s != 0.0
+        assert s * sign * error <= 0.0
+
+
+def test_no_step_where_the_cubic_turns_back_or_its_root_lies_beyond_the_limit():
+    assert _cubic_step((2.0, -1.0, 1.0, 0.0), 1.0, 1e-13) == 0.0  # 2 - s + s² never reaches 1
+    assert _cubic_step((2.0, -1.0, 0.2, 0.0), 1.0, 1e-13) == pytest.approx((5.0 - np.sqrt(5.0)) / 2.0)
+    assert _cubic_step((2.0, -1.0, 0.0, 0.015), 1.0, 1e-13) == pytest.approx(1.0156, abs=1e-3)
+    assert _cubic_step((2.0, 1e-14, 0.0, 0.0), 1.0, 1e-13) == 0.0  # a slope of rounding
+    assert _cubic_step((1.0, -1.0, 0.3, 0.1), 1.0, 1e-13) == 0.0  # already there
+    assert _cubic_step((2.0, -1.0, 0.0, 0.0), 1.0, 1e-13) == 1.0
+
+
+@pytest.mark.parametrize("flat", [False, True], ids=["solid", "flat"])
+def test_newton_steps_find_the_rotation_of_a_stretched_ring_in_five(flat):
+    """A = R S: the rotation that maximises tr(R^T A) is R; steps converge quadratically, from 20 degrees off."""
+    rng = np.random.default_rng(8)
+    for _ in range(10):
+        basis = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        stretch = basis @ np.diag([3.0, 1.7, 0.0 if flat else 0.9]) @ basis.T
+        turn = Rotation.from_rotvec(rng.normal(size=3))
+        off = Rotation.from_rotvec(0.35 * basis[:, 0] * rng.choice([-1.0, 1.0])) * turn
+        q = np.roll(off.as_quat(), 1)
+        moment = turn.as_matrix() @ stretch
+        steps = [_turn_towards(moment, q) for _ in range(5)]
+        assert steps[-1] < 1e-18
+        found = np.array(quaternion_matrix(q))
+        np.testing.assert_allclose(found, turn.as_matrix(), atol=1e-9)
