@@ -1,13 +1,17 @@
 """Types of arguments as text, and back."""
 
 import json
+import os
+import time
 from typing import NamedTuple
 
 import numba
 import numpy as np
 import pytest
+from command_line import call
 from numba.core import types
 
+from rbfmuscle.compiled import store
 from rbfmuscle.compiled.types import read_type, spell_type
 from rbfmuscle.compiled.watch import _watchers, current_stage, tell_stage
 from rbfmuscle.sim.distance.query import FieldData
@@ -83,3 +87,49 @@ def test_watchers_are_told_of_stages_in_turn_and_only_what_they_listen_to():
     finally:
         _watchers.remove(watcher), _watchers.remove(deaf)
     assert watcher.told == ["outer", "inner", "outer", None]
+
+
+@pytest.fixture
+def loops(tmp_path, monkeypatch):
+    monkeypatch.setattr(store, "folders", lambda: (tmp_path,))
+    return tmp_path
+
+
+def test_clearing_tells_how_many_loops_and_bytes_there_were(loops, capsys):
+    for name, size in (
+        ("a.loop", 1_200_000),
+        ("b.loop", 300_000),
+        ("c.part", 50_000),
+        ("d.lock", 0),
+        ("swept", 9),
+    ):
+        (loops / name).write_bytes(b"x" * size)
+    code, out, _ = call(capsys, "cache", "clear", "--loops")
+    assert code == 0 and out.strip() == "2 loops removed, 1.6 MB"  # 1.55 MB
+    assert [path.name for path in loops.iterdir()] == ["swept"]
+
+
+def test_sweeping_removes_what_is_old_or_beyond_the_size_once_a_day(loops, monkeypatch):
+    monkeypatch.setattr(store, "KEEP_BYTES", 250)
+    now, day = time.time(), 86400.0
+    ages = {
+        "new.loop": 1,
+        "used.loop": 2,
+        "beyond.loop": 3,
+        "old.loop": 70,
+        "left.part": 2,
+        "going.part": 0,
+        "held.lock": 2,
+    }
+    for name, age in ages.items():
+        (loops / name).write_bytes(b"x" * 100)
+        os.utime(loops / name, (now - age * day, now - age * day))
+    store._sweep(loops)
+    assert {path.name for path in loops.iterdir()} == {"new.loop", "used.loop", "going.part", "swept"}
+    (loops / "late.part").write_bytes(b"x")
+    os.utime(loops / "late.part", (now - 2 * day, now - 2 * day))
+    store._sweep(loops)  # not again on the same day
+    assert (loops / "late.part").exists()
+    os.utime(loops / "swept", (now - 2 * day, now - 2 * day))
+    store._sweep(loops)
+    assert not (loops / "late.part").exists()
