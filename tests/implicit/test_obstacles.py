@@ -33,7 +33,7 @@ def test_points_near_visited_cells_are_those_found_one_by_one():
         shape=shape,
         strides=np.array([9 * 14, 14, 1]),
     )
-    cells = rng.choice(np.prod(shape), 60, replace=False)
+    cells = rng.choice(np.prod(shape), 300, replace=False)
     state = np.zeros(np.prod(shape), dtype=np.int8)
     state[cells] = 1
     pose = np.eye(4)
