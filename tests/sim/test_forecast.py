@@ -70,6 +70,10 @@ def test_more_centres_cells_and_iterations_take_more(scene):
     assert fine.shown == pytest.approx(4 * coarse.shown, abs=4) and fine.show > coarse.show
     twice = estimate_muscle(scene.muscles[0], scene, RATES, RBFOptions(centres=150, iterations=16))
     assert plain.step < twice.step < 2 * plain.step
+    unwatched = scene.copy()
+    unwatched.detect = None
+    watched = estimate_muscle(scene.muscles[0], scene, RATES, RBFOptions(centres=150))
+    assert estimate_muscle(scene.muscles[0], unwatched, RATES, RBFOptions(centres=150)).step < watched.step
 
 
 def test_mesh_muscle_whose_weights_are_on_disk_is_built_sooner(scene):
