@@ -68,7 +68,7 @@ class Limits:
         """What ran out, or empty."""
         if self.spent >= self.fits:
             return f"{self.fits} fits"
-        return "" if self.left() else f"{self.seconds:g} s"
+        return "" if self.left() else f"{self.seconds:.2g} s"
 
 
 def search_shape(
