@@ -113,6 +113,12 @@ class PBDMuscle:
         marked[self.contact.columns[which]] = True
         return marked
 
+    def transform(self, motion: np.ndarray) -> None:
+        """Go along with a rigid motion (4, 4), as the muscle is."""
+        for points in (self.points, self.before):
+            points[:] = points @ motion[:3, :3].T + motion[:3, 3]
+        self.shape.transform(motion)
+
     def snapshot(self) -> Any:
         """Everything that :meth:`restore` needs."""
         return self.points.copy(), self.before.copy(), self.shape.snapshot(), self.time, self.penetration

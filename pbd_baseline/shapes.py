@@ -23,6 +23,7 @@ from pbd_baseline.options import PBDOptions
 from pbd_baseline.rest import Rest
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.rotations import turned_quaternions
 
 
 class Shape:
@@ -54,6 +55,9 @@ class Shape:
     def restore_volume(self, points: np.ndarray, contact: ContactConstraint) -> None:
         """Bring the volume back, in place: where there is room, and out of the way of contacts."""
         self.volume.restore(points, self._swelling(points), clear_way=contact.clear_way)
+
+    def transform(self, motion: np.ndarray) -> None:
+        """Go along with a rigid motion (4, 4)."""
 
     def snapshot(self) -> np.ndarray | None:
         """What the shape remembers from sweep to sweep; None where that is nothing."""
@@ -156,6 +160,10 @@ class ARAPShape(Shape):
         self.constraint.reset()
         self.constraint.project(points, self.inverse_mass, time=time)
 
+    def transform(self, motion: np.ndarray) -> None:
+        """The rotations go along with a rigid motion (4, 4)."""
+        self.arap.quaternions[:] = turned_quaternions(self.arap.quaternions, motion[:3, :3])
+
     def snapshot(self) -> np.ndarray:
         """The rotations."""
         return self.arap.quaternions.copy()
@@ -194,6 +202,10 @@ class GlobalARAPShape(Shape):
         right = self.arap.targets()[self.free] + self.mass * points[self.free]
         right -= self.coupling @ points[self.held]
         points[self.free] = self.factor.solve(right)
+
+    def transform(self, motion: np.ndarray) -> None:
+        """The rotations go along with a rigid motion (4, 4)."""
+        self.arap.quaternions[:] = turned_quaternions(self.arap.quaternions, motion[:3, :3])
 
     def snapshot(self) -> np.ndarray:
         """The rotations."""

@@ -45,6 +45,9 @@ class BlendMuscle:
     def turn(self, which, transform):
         self.x[which] = self.x[which] @ transform[:3, :3].T + transform[:3, 3]
 
+    def transform(self, motion):
+        self.x = self.x @ motion[:3, :3].T + motion[:3, 3]
+
     def snapshot(self):
         return self.x.copy()
 

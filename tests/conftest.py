@@ -34,6 +34,15 @@ def hip_scene(hip_data):
 
 
 @pytest.fixture(scope="session")
+def leg_data():
+    """Folder of the whole leg; the test is skipped where it is absent."""
+    hip = _find_hip()
+    if hip is None or not (hip.parent / "leg").is_dir():
+        pytest.skip("the leg is not here (set RBFMUSCLE_DATA to the folder that holds leg/)")
+    return hip.parent / "leg"
+
+
+@pytest.fixture(scope="session")
 def graphics():
     """Skip where VTK cannot draw; asked in a process of its own, which it may end."""
     code = "import pyvista as p; q = p.Plotter(off_screen=True); q.add_mesh(p.Cube()); q.screenshot(None)"

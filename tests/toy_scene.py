@@ -150,6 +150,9 @@ class ToyMuscle:
     def turn(self, which, transform):
         self.x[which] = self.x[which] @ transform[:3, :3].T + transform[:3, 3]
 
+    def transform(self, motion):
+        self.x, self.target = (points @ motion[:3, :3].T + motion[:3, 3] for points in (self.x, self.target))
+
     def snapshot(self):
         return self.x.copy(), self.target.copy()
 

@@ -48,7 +48,8 @@ def _lines(made):
         lines.append(
             f"muscle {muscle['name']}: {muscle['model']}, {muscle['vertices']} vertices, can meet {meets}; "
             f"{_megabytes(muscle['memory'])}, {muscle['build']:.2g} s to build, "
-            f"{1e3 * muscle['step']:.2g} ms a sub-step, {1e3 * muscle['show']:.2g} ms a surface"
+            f"{1e3 * muscle['step']:.2g} ms a sub-step, {1e3 * muscle['show']:.2g} ms a surface; "
+            f"{_work(muscle['work'])}"
         )
     for field in made["fields"]:
         size = " x ".join(f"{length:.4g}" for length in field["size"])
@@ -59,6 +60,13 @@ def _lines(made):
     on = [name for name, used in made["features"].items() if used]
     lines.append(f"switched on: {', '.join(on) or 'nothing'}")
     return lines + _forecast_lines(made["memory"], made["time"])
+
+
+def _work(work):
+    frames = ", ".join(
+        f"{state} in {work[state]}" for state in ("solved", "carried", "skipped") if work[state]
+    )
+    return f"{frames or 'solved in 0'} frames ({work['reason']})"
 
 
 def _field_size(field):

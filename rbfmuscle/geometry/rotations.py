@@ -3,6 +3,16 @@
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats
+
+
+def turned_quaternions(quaternions: Floats, rotation: Floats) -> Floats:
+    """Unit quaternions (n, 4), each followed by a rotation (3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    return np.ascontiguousarray(quaternions @ left.T)
 
 
 @compiled(error_model="numpy", inline="always")

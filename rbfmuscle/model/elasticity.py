@@ -9,6 +9,7 @@ import numpy as np
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import diameter
+from rbfmuscle.geometry.rotations import turned_quaternions
 from rbfmuscle.model.constraints import ShapeConstraint, VolumeConstraint
 from rbfmuscle.model.contact import ContactConstraint
 from rbfmuscle.model.options import RBFOptions
@@ -140,6 +141,11 @@ class ElasticSolver:
         shape = self.shape
         shape.quaternion[:], shape.target[:], shape.deformation[:], forces = state
         self.contact.forces = forces.copy()
+
+    def transform(self, motion: np.ndarray, x: np.ndarray) -> None:
+        """Go along with a rigid motion (4, 4) that brought the centres to x (K, 3)."""
+        self.shape.quaternion[:] = turned_quaternions(self.shape.quaternion, motion[:3, :3])
+        self.shape.localise(x)
 
     def carry(self, x: np.ndarray) -> np.ndarray:
         """Contact points at centres x with the present targets, (K + S, 3)."""

@@ -23,6 +23,7 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.geometry.rest_frame import RestFrame, diameter
+from rbfmuscle.geometry.rotations import turned_quaternions
 from rbfmuscle.implicit.placement.lattice import Lattice, dense_points
 from rbfmuscle.model.fibres import fibre_directions
 from rbfmuscle.model.interior_loops import (
@@ -239,6 +240,16 @@ class Interior:
         np.add.at(every, self.columns, self.shares)
         share = (hit / np.maximum(every, 1e-12))[:, None]
         self.y = self.y + share * (self.y @ transform[:3, :3].T + transform[:3, 3] - self.y)
+
+    def transform(self, motion: Floats, centres: Floats | None = None) -> None:
+        """Go along with a rigid motion (4, 4)."""
+        turn = motion[:3, :3].T
+        self.y, self.anchor = self.y @ turn + motion[:3, 3], self.anchor @ turn + motion[:3, 3]
+        self.quaternion[:] = turned_quaternions(self.quaternion, motion[:3, :3])
+        self.begun = None
+        if self.trend is not None:
+            last, correction, pressed = self.trend
+            self.trend = (last.reshape(-1, 3) @ turn).ravel(), correction @ turn, pressed
 
     def snapshot(self) -> Any:
         """State that ``restore`` brings back."""

@@ -119,6 +119,11 @@ class RBFMuscle:
         hit[self.rest.held] = False
         self.points[hit] = self.points[hit] @ transform[:3, :3].T + transform[:3, 3]
 
+    def transform(self, motion: np.ndarray) -> None:
+        """Go along with a rigid motion (4, 4), as the muscle is."""
+        self.points = self.points @ motion[:3, :3].T + motion[:3, 3]
+        self.solver.transform(motion, self.points)
+
     def snapshot(self) -> Any:
         """Everything that :meth:`restore` needs."""
         return self.points.copy(), self.solver.snapshot()

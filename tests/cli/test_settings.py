@@ -15,7 +15,14 @@ from rbfmuscle.sim.scene import options
 TABLES = {
     "contact": (
         options.ContactOptions,
-        {"initial": "keep", "detector": "bvh", "tolerance": 0.1, "substep_angle": 4.0, "margin": 0.05},
+        {
+            "initial": "keep",
+            "detector": "bvh",
+            "tolerance": 0.1,
+            "substep_angle": 4.0,
+            "still_angle": 0.5,
+            "margin": 0.05,
+        },
     ),
     "sliding": (
         options.SlidingOptions,

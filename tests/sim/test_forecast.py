@@ -95,7 +95,13 @@ def test_time_and_memory_add_up(scene):
     bare = scene.with_options({"output.metrics": False, "output.surfaces": False}, frames="0:10:1")
     muscle = MuscleCost(build=2.0, step=0.1, show=0.5, memory=1e6, working=1e5, carried=10, shown=10)
     memory, time = forecast(
-        bare, [FieldCost(1e6, 4e6, False)], [muscle], substeps=20, rates=RATES, resident=5e7, threads=1
+        bare,
+        [FieldCost(1e6, 4e6, False)],
+        [muscle],
+        work=[{"substeps": 20, "solved": 5}],
+        rates=RATES,
+        resident=5e7,
+        threads=1,
     )
     # No surfaces and no metrics: nothing is shown.
     assert time["frame"] == {"muscles": 0.2, "metrics": 0.0, "write": 0.0, "total": 0.2}

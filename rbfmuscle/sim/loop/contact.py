@@ -180,6 +180,16 @@ class BoneContacts:
                 deepest = max(deepest, -float(distance.min()))
         return deepest
 
+    def comes_near(self, points: Floats, bone_index: int, reach: float) -> bool:
+        """Whether a bone is nearer than ``reach`` to any free contact point."""
+        free, limit = self.free(len(points)), np.full(len(points), reach)
+        near = self._near(points, free, bone_index, limit)
+        if len(near) == 0:
+            return False
+        distance, _ = self._query(points[near], bone_index, limit[near])
+        self._remember(points, near, distance, bone_index)
+        return bool(distance.min() < reach)
+
     def query(self, points: Floats, reach: ArrayLike) -> list[tuple[Integers, Floats, Floats]]:
         """Contacts of each bone: a list, one entry a bone, of ``(index, distance, direction)``."""
         points = check_points(points)

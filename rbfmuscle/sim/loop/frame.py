@@ -41,12 +41,32 @@ class ModelSurface:
         For example ``solver_penetration_max``, ``condition``, ``time_fit``, ``time_extract``.
     notes : list of (bone, count, action)
         What becomes events of the frame.
+    origin : tuple of (ModelSurface, (4, 4) ndarray) or None
+        The surface that this one is, moved, and the motion; of one that was not drawn anew.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     quantities: dict = field(default_factory=dict)
     notes: list = field(default_factory=list)
+    origin: Any = None
+
+    def origin_state(self) -> dict:
+        """What `from_state` makes the surface that was drawn of, and its motion since."""
+        drawn, motion = self.origin or (self, np.eye(4))
+        return {
+            "vertices": np.array(drawn.vertices),
+            "faces": np.array(drawn.faces),
+            "quantities": {name: float(value) for name, value in drawn.quantities.items()},
+            "notes": [list(note) for note in drawn.notes],
+            "motion": motion,
+        }
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> "ModelSurface":
+        """The surface that was drawn."""
+        notes = [tuple(note) for note in state["notes"]]
+        return cls(state["vertices"], state["faces"], dict(state["quantities"]), notes)
 
 
 @dataclass
@@ -80,6 +100,8 @@ class Frame:
         Of the muscles that contract.
     state : dict
         What a loop needs to go on from this frame; empty where it was not asked for.
+    work : dict of str to Work
+        Whether each muscle was solved for the frame, carried along as it was, or left where it was, and why.
     """
 
     index: int
@@ -94,6 +116,7 @@ class Frame:
     nudged: dict = field(default_factory=dict)
     activations: dict = field(default_factory=dict)
     state: dict = field(default_factory=dict)
+    work: dict = field(default_factory=dict)
 
 
 class Drawing(Protocol):
@@ -145,6 +168,9 @@ class MuscleModel(Protocol):
 
     def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
         """Move the contact points marked in a bool mask (n,) by a (4, 4) transform."""
+
+    def transform(self, motion: np.ndarray) -> None:
+        """Go along with a rigid motion (4, 4), as the muscle is."""
 
     def snapshot(self) -> Any:
         """Everything that :meth:`restore` needs to go back to this moment."""

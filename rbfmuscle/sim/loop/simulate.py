@@ -7,14 +7,15 @@ from concurrent.futures import Future, wait
 from contextlib import contextmanager
 
 from rbfmuscle.sim.contraction.course import Activations
+from rbfmuscle.sim.loop.carrying import Carrier
 from rbfmuscle.sim.loop.contact import BoneContacts
 from rbfmuscle.sim.loop.frame import Event, FinishedDrawing, Frame, ModelSurface, MuscleModel
 from rbfmuscle.sim.loop.overlap import settle_rest
 from rbfmuscle.sim.loop.stepper import MuscleStepper, TimedDrawing
-from rbfmuscle.sim.loop.substeps import SubSteps
+from rbfmuscle.sim.loop.substeps import PoseMemo, SubSteps
 from rbfmuscle.sim.loop.workers import Workers
 from rbfmuscle.sim.plan.reach import build_fields, reached_bones
-from rbfmuscle.sim.scene.motion import bone_poses, completed, rest_coordinates
+from rbfmuscle.sim.scene.motion import completed, rest_coordinates
 from rbfmuscle.sim.scene.scene import Scene
 
 __all__ = [
@@ -73,15 +74,20 @@ class FrameLoop:
         surfaces: bool = True,
     ) -> None:
         models = list(models.values()) if isinstance(models, Mapping) else list(models)
-        self.scene, self.surfaces = scene, surfaces
+        self.scene, self.surfaces, self._poses = scene, surfaces, PoseMemo(scene)
         self.steppers = [
-            MuscleStepper(model, contacts, scene)
+            MuscleStepper(model, contacts, scene, poses=self._poses)
             for model, contacts in zip(models, _obstacles(scene, models, fields))
         ]
         self.here: dict[str, float] = {}
         self.resumable = False
         self.activations = Activations(scene)
-        self._sub_steps, self._next_index, self._wall = SubSteps(scene), 0, 0.0
+        self._sub_steps, self._own_sub_steps = SubSteps(scene, poses=self._poses), {}
+        for stepper in self.steppers:
+            stepper.carrier = Carrier(stepper, scene)
+            if not stepper.carrier.never:
+                self._own_sub_steps[stepper.name] = self._cut_for(stepper)
+        self._next_index, self._wall = 0, 0.0
         self.workers = Workers(len(self.steppers))
         try:
             with self.clocked(), self.workers.one_thread_each():
@@ -114,14 +120,16 @@ class FrameLoop:
             If a muscle cannot be solved, naming muscle, frame and coordinates.
         """
         with self.clocked():
-            path = self._path_to(coordinates)
+            paths = self._path_to(coordinates)
             if self.surfaces and self._sliding is None and self.workers.parallel:
                 # Nothing waits for another muscle: each goes all the way, and no thread idles in between.
                 with self.workers.one_thread_each():
-                    drawn = self.workers.each(lambda stepper: stepper.go(*path).draw(), self.steppers)
+                    drawn = self.workers.each(
+                        lambda stepper: stepper.go(*paths[stepper.name]).draw(), self.steppers
+                    )
             else:
                 with self.workers.one_thread_each():
-                    self._solve(*path)
+                    self._solve(paths)
                     drawings = self._drawings() if self.surfaces else []
                 with self.workers.all_threads():
                     drawn = self.workers.each(TimedDrawing.draw, drawings)
@@ -131,12 +139,12 @@ class FrameLoop:
     def skip(self, coordinates: Mapping[str, float]) -> None:
         """Go on to a frame and show nothing: its times and events are in the next frame that is shown."""
         with self.clocked(), self.workers.one_thread_each():
-            self._solve(*self._path_to(coordinates))
+            self._solve(self._path_to(coordinates))
 
     def start(self, coordinates: Mapping[str, float]) -> list[Future]:
         """Set out for a frame: for each muscle what will be its `TimedDrawing`, for `run_ahead`."""
-        path = self._path_to(coordinates)
-        return self.workers.start(lambda stepper: stepper.go(*path), self.steppers)
+        paths = self._path_to(coordinates)
+        return self.workers.start(lambda stepper: stepper.go(*paths[stepper.name]), self.steppers)
 
     def collect(self) -> Frame:
         """The frame where the muscles are now, without its surfaces."""
@@ -146,12 +154,13 @@ class FrameLoop:
         for stepper in self.steppers:
             times[stepper.name], happened = stepper.collect()
             events.extend(happened)
-        poses = bone_poses(self.scene, self.here)
+        poses = dict(self._poses(self.here))
         frame = Frame(self._next_index - 1, dict(self.here), poses, {}, carried, events, times, 0.0)
         frame.nudged.update(nudged)
         frame.activations.update(self.activations.here)
         if self.resumable:
             frame.state.update(self._state())
+        frame.work.update({stepper.name: stepper.work for stepper in self.steppers})
         return frame
 
     def _state(self) -> dict:
@@ -163,7 +172,9 @@ class FrameLoop:
             "activations": dict(self.activations.here),
             "muscles": muscles,
             "links": {} if self._sliding is None else self._sliding.snapshot(),
+            "carriers": {s.name: s.carrier.snapshot() for s in self.steppers if s.carrier is not None},
             "shown": {},
+            "drawn": {},
         }
 
     def go_on(self, state: Mapping) -> None:
@@ -183,6 +194,7 @@ class FrameLoop:
             stepper.model.restore(model)
             stepper.contacts.restore(contacts)
             stepper.model.continue_drawing(state["shown"].get(stepper.name, {}))
+            stepper.go_on(state["carriers"].get(stepper.name), state["drawn"].get(stepper.name))
         if self._sliding is not None:
             self._sliding.restore(state["links"])
 
@@ -203,9 +215,11 @@ class FrameLoop:
             frame.surfaces[name] = surface
             if frame.state:
                 frame.state["shown"][name] = dict(surface.quantities)
+                if name in self._own_sub_steps:
+                    frame.state["drawn"][name] = surface.origin_state()
             frame.events.extend(Event(frame.index, name, *note) for note in surface.notes)
             for key in ("time_surface", "time_frame"):
-                frame.times[name][key] += seconds
+                frame.times[name][key] = frame.times[name].get(key, 0.0) + seconds
         frame.wall, self._wall = self._wall, 0.0
         return frame
 
@@ -228,22 +242,33 @@ class FrameLoop:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _path_to(self, coordinates: Mapping[str, float]) -> tuple[list[dict], list[dict]]:
-        """Coordinates of the sub-steps to the next frame, the first of which is where the muscles are; activations."""
+    def _cut_for(self, stepper: MuscleStepper) -> SubSteps:
+        """Sub-steps for one muscle: by what the bones do that hold it, and those that it can meet."""
+        met = [stepper.contacts.names[b] for b in stepper.contacts.reached]
+        return SubSteps(self.scene, self.scene.muscle(stepper.name), bones=met, poses=self._poses)
+
+    def _path_to(self, coordinates: Mapping[str, float]) -> dict[str, tuple[list[dict], list[dict]]]:
+        """For each muscle coordinates of its sub-steps to the next frame, from where it is on, and activations."""
         # Whatever a motion chooses to move starts at rest, which for most coordinates is zero.
         here = self.here or dict.fromkeys(coordinates, 0.0) | rest_coordinates(self.scene)
         self.here = completed(self.scene, coordinates)
         for stepper in self.steppers:
             stepper.frame = self._next_index
         self._next_index += 1
-        stops = [here, *self._sub_steps.split(here, self.here)]
-        return self.activations.refine(self._next_index - 1, stops)
+        found = {name: ([here, *cut.split(here, self.here)], []) for name, cut in self._own_sub_steps.items()}
+        if len(found) < len(self.steppers):
+            # Muscles that slide wait for each other, so all take what the fastest needs.
+            stops = [here, *self._sub_steps.split(here, self.here)]
+            shared = self.activations.refine(self._next_index - 1, stops)
+            found.update({s.name: shared for s in self.steppers if s.name not in found})
+        return found
 
-    def _solve(self, stops: list[dict], activations: list[dict]) -> None:
+    def _solve(self, paths: dict[str, tuple[list[dict], list[dict]]]) -> None:
         """Bring all muscles through sub-steps; those that slide take each together."""
         if self._sliding is None:
-            self.workers.each(lambda stepper: stepper.advance(stops, activations), self.steppers)
+            self.workers.each(lambda stepper: stepper.advance(*paths[stepper.name]), self.steppers)
             return
+        stops, activations = paths[self.steppers[0].name]
         for before, after, activation in itertools.zip_longest(stops[:-1], stops[1:], activations):
             for stepper in self.steppers:
                 stepper.excite(activation)

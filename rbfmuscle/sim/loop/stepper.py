@@ -7,12 +7,13 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rbfmuscle.sim.loop.frame import Drawing, Event, ModelSurface
+from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.sim.loop.carrying import SOLVED, Carrier, Work
+from rbfmuscle.sim.loop.frame import Drawing, Event, FinishedDrawing, ModelSurface
 from rbfmuscle.sim.loop.tunnelling import find_crossings, turn_back
 from rbfmuscle.sim.scene.motion import bone_poses, interpolate, shown_value, step_angle, unit_sign
 from rbfmuscle.validation import NotFiniteError, SolveError
@@ -27,27 +28,62 @@ if TYPE_CHECKING:
 TOUCH = 0.1
 
 
-@dataclass(frozen=True)
 class TimedDrawing:
     """A muscle's drawing with what was measured beside it.
 
-    Attributes
+    Parameters
     ----------
     stepper : MuscleStepper
     drawing : Drawing
     measured : dict of str to float
     """
 
-    stepper: MuscleStepper
-    drawing: Drawing
-    measured: dict
+    def __init__(self, stepper: MuscleStepper, drawing: Drawing, measured: dict) -> None:
+        self.stepper, self.drawing, self.measured = stepper, drawing, measured
+        self._finished: ModelSurface | None = None
+
+    @classmethod
+    def of(cls, stepper: MuscleStepper, surface: ModelSurface) -> TimedDrawing:
+        """The drawing of a surface that is at hand."""
+        found = cls(stepper, FinishedDrawing(surface), {})
+        found._finished = surface
+        return found
+
+    def surface(self) -> ModelSurface:
+        """The surface with what was measured; drawn once."""
+        if self._finished is None:
+            self._finished = self.drawing.surface()
+            self._finished.quantities.update(self.measured)
+        return self._finished
 
     def draw(self) -> tuple[ModelSurface, float]:
-        """The surface with what was measured, and the time that it took [s]; from any thread, once."""
+        """The surface, and the time that it took [s]; from any thread."""
         start = time.perf_counter()
-        surface = self.drawing.surface()
-        surface.quantities.update(self.measured)
-        return surface, time.perf_counter() - start
+        return self.surface(), time.perf_counter() - start
+
+
+class CarriedDrawing(TimedDrawing):
+    """A muscle that was carried along as it was when it was drawn.
+
+    Parameters
+    ----------
+    before : TimedDrawing
+    motion : (4, 4) ndarray
+        Since then.
+    """
+
+    def __init__(self, before: TimedDrawing, motion: Floats) -> None:
+        super().__init__(before.stepper, before.drawing, before.measured)
+        self._before, self._motion = before, motion
+
+    def surface(self) -> ModelSurface:
+        """The surface that was drawn then, moved."""
+        if self._finished is None:
+            then, motion = self._before.surface(), self._motion
+            vertices = then.vertices @ motion[:3, :3].T + motion[:3, 3]
+            taken = {name: 0.0 if name.startswith("time_") else v for name, v in then.quantities.items()}
+            self._finished = ModelSurface(vertices, then.faces, taken, list(then.notes), (then, motion))
+        return self._finished
 
 
 class MuscleStepper:
@@ -59,9 +95,20 @@ class MuscleStepper:
     contacts : BoneContacts
         Of this muscle alone.
     scene : Scene
+    poses : callable, optional
+        Poses of the bones for coordinates; those of the scene where not given.
+
+    Attributes
+    ----------
+    carrier : Carrier or None
+        What carries the muscle along where it need not be solved; none unless a loop gives one.
+    work : Work
+        What the frame that was collected last took.
     """
 
-    def __init__(self, model: MuscleModel, contacts: BoneContacts, scene: Scene) -> None:
+    def __init__(
+        self, model: MuscleModel, contacts: BoneContacts, scene: Scene, *, poses: Any = None
+    ) -> None:
         self.model, self.contacts, self.scene = model, contacts, scene
         self.name = model.name
         self.detect = scene.detect.tunnelling if scene.detect is not None else None
@@ -71,6 +118,11 @@ class MuscleStepper:
         self.path: Any = None
         self.saved: Any = None
         self.measured = {}
+        self.poses = poses or (lambda coordinates: bone_poses(scene, coordinates))
+        self.carrier: Carrier | None = None
+        self.solves, self.work = 0, Work(SOLVED, 0, "")
+        self._shown: TimedDrawing | None = None
+        self._since = np.eye(4)
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[Any]:
@@ -89,7 +141,16 @@ class MuscleStepper:
         """
         for before, after, activation in itertools.zip_longest(stops[:-1], stops[1:], activations):
             self.excite(activation)
-            self.step(before, after)
+            if not self._carries(before, after):
+                self.step(before, after)
+
+    def _carries(self, before: dict, after: dict) -> bool:
+        """Whether a step asks no more of the muscle than to be carried along, which is then done."""
+        return self.carrier is not None and self.carrier.try_carry(self.poses(before), self.poses(after))
+
+    def carried(self, motion: Floats) -> None:
+        """Note that the muscle was moved as it is, by a rigid motion (4, 4)."""
+        self._since = motion @ self._since
 
     def excite(self, activation: Any) -> None:
         """Give the model its activation, where it is among those (by muscle; None for no muscle at all)."""
@@ -103,8 +164,11 @@ class MuscleStepper:
 
     def begin(self, before: dict[str, float], after: dict[str, float]) -> None:
         """First half of a sub-step: the bones move, the muscle goes along."""
-        self.path, poses = (before, after), (bone_poses(self.scene, before), bone_poses(self.scene, after))
-        self.saved = None
+        start = self.poses(before)
+        if self.carrier is not None:
+            start = self.carrier.begin(start)
+        self.path, poses = (before, after), (start, self.poses(after))
+        self.saved, self._shown = None, None
         if self.detect is not None:
             self.saved = self.model.snapshot(), self.model.contact_points().copy(), poses
         self._predict(poses)
@@ -113,6 +177,9 @@ class MuscleStepper:
         """Second half: the muscle settles, and what passed through a bone is brought back."""
         before, after = self.path
         self.solve(after)
+        self.solves += 1
+        if self.carrier is not None:
+            self.carrier.solved = self.poses(after)
         if self.saved is not None:
             state, start, poses = self.saved
             crossings = self._crossings(start, poses)
@@ -146,8 +213,21 @@ class MuscleStepper:
 
     def drawing(self) -> TimedDrawing:
         """What draws the muscle as it is now, while it goes on."""
+        if self._shown is not None:
+            return CarriedDrawing(self._shown, self._since)
         with self.timed("surface"):
-            return TimedDrawing(self, self.model.drawing(self.contacts), self.measured)
+            shown = TimedDrawing(self, self.model.drawing(self.contacts), self.measured)
+        if self.carrier is not None and not self.carrier.never:
+            self._shown, self._since = shown, np.eye(4)
+        return shown
+
+    def go_on(self, carrier: Any, drawn: Any) -> None:
+        """Take over what another stepper's `Carrier.snapshot` and last surface were, to carry that one on."""
+        if carrier is not None and self.carrier is not None:
+            self.carrier.restore(carrier)
+        if drawn is not None:
+            self._shown = TimedDrawing.of(self, ModelSurface.from_state(drawn))
+            self._since = np.array(drawn["motion"])
 
     def report(self, bone: Any, count: int, action: Any) -> None:
         """Note an event of the present frame; of one kind the most points at one time are kept."""
@@ -159,7 +239,9 @@ class MuscleStepper:
         times = self.times
         events = [Event(k, self.name, bone, n, action) for (k, bone, action), n in self.events.items()]
         times["time_frame"] = sum(times.values())
-        self.times, self.events = {}, {}
+        if self.carrier is not None:
+            self.work = self.carrier.collect(self.solves)
+        self.times, self.events, self.solves = {}, {}, 0
         return times, events
 
     def _predict(self, poses):
@@ -196,7 +278,8 @@ class MuscleStepper:
         self._report_all(remaining, "halved")
         self.model.restore(state)
         middle = interpolate(before, after, 0.5)
-        self.advance([before, middle, after])
+        self.step(before, middle)
+        self.step(middle, after)
 
     def _report_all(self, crossings, action):
         for crossing in crossings:

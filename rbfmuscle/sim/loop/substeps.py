@@ -21,6 +21,8 @@ from rbfmuscle.sim.scene.motion import (
 from rbfmuscle.validation import SceneError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from rbfmuscle.sim.scene.scene import Scene
 
 
@@ -30,7 +32,7 @@ TRAVEL = 1.0 / 27.0
 PIECES = 8
 
 
-__all__ = ["SubSteps", "path_angle", "turned_angle"]
+__all__ = ["PoseMemo", "SubSteps", "path_angle", "turned_angle"]
 
 
 class SubSteps:
@@ -43,19 +45,38 @@ class SubSteps:
     Parameters
     ----------
     scene : Scene
+    muscle : Muscle, optional
+        Cut as this muscle's own bones move against each other; as the whole scene does where not given.
+    bones : sequence of str
+        Other bones that it can meet.
+    poses : callable, optional
+        Poses of the bones for coordinates; those of the scene where not given.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(
+        self, scene: Scene, muscle: Any = None, *, bones: Sequence[str] = (), poses: Any = None
+    ) -> None:
         self.scene = scene
+        self._poses = poses or (lambda coordinates: bone_poses(scene, coordinates))
+        muscles = scene.muscles if muscle is None else [muscle]
+        own = [attachment.bone for part in muscles for attachment in part.attachments]
+        known = [bone.name for bone in scene.bones]
+        #: The bones that count, the first of which the others are seen from: for a whole scene the world.
+        self.bones = known if muscle is None else [*dict.fromkeys([*own, *bones])]
+        self._root = None if muscle is None else own[0]
+        #: Coordinates that move these bones against each other.
+        self.relevant = set(all_coordinates(scene.joints))
+        if muscle is not None:
+            self.relevant = _moving_apart(scene, self.bones)
         self.limit = math.radians(scene.contact.substep_angle)
         self._facts = all_coordinates(scene.joints)
         self.most = scene.motion.options.max_substeps
-        names = [bone.name for bone in scene.bones]
+        names = self.bones
         owner, corners, size = [], [], []
-        for muscle in scene.muscles:
-            vertices = np.asarray(muscle.mesh.vertices)
+        for part in muscles:
+            vertices = np.asarray(part.mesh.vertices)
             frame = RestFrame(vertices)
-            for attachment in muscle.attachments:
+            for attachment in part.attachments:
                 owner.append(names.index(attachment.bone))
                 corners.append(frame.points(_corners(frame.local[attachment.vertices])))
                 size.append(diameter(vertices))
@@ -75,13 +96,18 @@ class SubSteps:
         moving = [k for k in {*before, *after} if before.get(k, 0.0) != after.get(k, 0.0)]
         if not moving:
             return []
+        moving = [k for k in moving if k in self.relevant]
+        if not moving:
+            return [dict(after)]
         if len(moving) == 1 and self._facts[moving[0]].motion == "rotation":
             return [*self._stops_on_grid(before, after, moving[0]), dict(after)]
         return self._even_stops(before, after)
 
     def _even_stops(self, before, after):
         """The fewest equal sub-steps that are short enough."""
-        count = max(1, math.ceil(path_angle(self.scene, before, after) / self.limit - 1e-9))
+        # What does not move these bones against each other does not count.
+        start = {**before, **{k: value for k, value in after.items() if k not in self.relevant}}
+        count = max(1, math.ceil(path_angle(self.scene, start, after) / self.limit - 1e-9))
         while True:
             if count > self.most:
                 raise SceneError(
@@ -122,11 +148,15 @@ class SubSteps:
             # Ends of neighbouring cells may differ by rounding.
             if (inner[-1] if inner else low) + margin < value < high - margin:
                 inner.append(value)
-        return [{**before, name: value} for value in (inner if end > start else inner[::-1])]
+        ordered = inner if end > start else inner[::-1]
+        return [
+            {**interpolate(before, after, (value - start) / (end - start)), name: value} for value in ordered
+        ]
 
     def _matrices(self, coordinates):
-        poses = bone_poses(self.scene, coordinates)
-        return np.array([poses[bone.name] for bone in self.scene.bones])
+        poses = self._poses(coordinates)
+        found = np.array([poses[name] for name in self.bones])
+        return found if self._root is None else np.linalg.inv(poses[self._root]) @ found
 
     def _excess(self, old, new):
         """How far a step between poses (b, 4, 4) goes beyond what one sub-step may do: 1 is just allowed."""
@@ -139,6 +169,49 @@ class SubSteps:
         moved = np.einsum("bkij,kcj->bkci", change[..., :3, :3], self._corners) + change[..., None, :3, 3]
         length = np.sqrt((moved**2).sum(axis=-1)).max(axis=(0, 2))
         return max(excess, float((length / self._travel).max(initial=0.0)))
+
+
+class PoseMemo:
+    """Poses of a scene's bones by coordinates, found once for all muscles that ask.
+
+    Parameters
+    ----------
+    scene : Scene
+    """
+
+    MOST = 256
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self._known: dict[Any, dict[str, Any]] = {}
+
+    def __call__(self, coordinates: dict[str, float]) -> dict[str, Any]:
+        """Poses (4, 4) by bone, as `bone_poses` gives them; shared, so not to be changed."""
+        key = tuple(sorted(coordinates.items()))
+        found = self._known.get(key)
+        if found is None:
+            if len(self._known) >= self.MOST:
+                self._known = {}
+            found = self._known[key] = bone_poses(self.scene, coordinates)
+        return found
+
+
+def _moving_apart(scene: Scene, bones: Sequence[str]) -> set[str]:
+    """Coordinates that move some of these bones against others: those of the joints not common to all their chains."""
+    joint_of = {joint.child: joint for joint in scene.joints}
+    chains = []
+    for bone in bones:
+        chain, name = set(), bone
+        while name in joint_of and joint_of[name].name not in chain:
+            chain.add(joint_of[name].name)
+            name = joint_of[name].parent
+        chains.append(chain)
+    apart = set.union(*chains) - set.intersection(*chains)
+    found = {f"{j.name}.{name}" for j in scene.joints if j.name in apart for name in j.coordinates}
+    for coupling in reversed(scene.couplings):
+        if coupling.coordinate in found:
+            found.update(coupling.of)
+    return found
 
 
 def check_substeps(scene: Any) -> None:

@@ -140,7 +140,7 @@ def forecast(
     fields: list[Any],
     costs: list[Any],
     *,
-    substeps: int,
+    work: list[Any],
     rates: dict[str, Any],
     resident: float,
     threads: int,
@@ -153,7 +153,8 @@ def forecast(
     fields : list of FieldCost
         Of the bones that are reached.
     costs : list of MuscleCost
-    substeps : int
+    work : list of dict
+        What the motion asks of each muscle, from `plan_work`.
     rates : dict of str to float
         From `measure_rates`.
     resident : float
@@ -165,7 +166,7 @@ def forecast(
     memory, time : dict
         Bytes and seconds.
     """
-    return _memory(scene, fields, costs, resident), _time(scene, fields, costs, substeps, rates, threads)
+    return _memory(scene, fields, costs, resident), _time(scene, fields, costs, work, rates, threads)
 
 
 def _memory(scene, fields, costs, resident):
@@ -182,7 +183,7 @@ def _memory(scene, fields, costs, resident):
     return {**parts, "program": program, "peak": parts["total"] + working + program}
 
 
-def _time(scene, fields, costs, substeps, rates, threads):
+def _time(scene, fields, costs, work, rates, threads):
     frames, output = max(len(scene.motion), 1), scene.output
     shows = bool(output.surfaces) or output.metrics
     visit, query = rates["visit"], rates["query"]
@@ -198,7 +199,12 @@ def _time(scene, fields, costs, substeps, rates, threads):
         "checks": query * CHECK_QUERIES * bones if moving else 0.0,
         "metrics": visit * LINE_VISITS * sum(cost.carried for cost in costs) if output.metrics else 0.0,
     }
-    each = [cost.step * substeps / frames + (cost.show if shows else 0.0) for cost in costs]
+    # A muscle is drawn where it was solved, and once for the first frame.
+    each = [
+        (cost.step * done["substeps"] + (cost.show * min(frames, done["solved"] + 1) if shows else 0.0))
+        / frames
+        for cost, done in zip(costs, work)
+    ]
     frame = {
         "muscles": side_by_side(each, threads),
         "metrics": visit * BONE_VISITS * bones * len(costs) + query * SHOWN_QUERIES * shown

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rbfmuscle.sim.loop.substeps import SubSteps
 from rbfmuscle.sim.plan.reach import reached_bones, sampled_poses, union_of
+from rbfmuscle.sim.plan.work import plan_work
 
 if TYPE_CHECKING:
     from rbfmuscle.sim.scene.scene import Scene
@@ -29,7 +29,8 @@ def plan_scene(scene: Scene, estimate: Callable[..., Any] | None = None) -> dict
     dict
         ``pairs``: muscles and bones that can meet. ``fields``: for each bone that any muscle can reach the
         size of the reached box [scene unit] and its share of the bone's own box. ``muscles``: model and size
-        of the input. ``frames``, ``substeps``: of the motion. ``features``: what the scene switches on. With
+        of the input, and its ``work``, see `plan_work`. ``frames`` of the motion; ``substeps`` of the muscle that
+        takes most. ``features``: what the scene switches on. With
         ``estimate`` also ``memory``, ``time`` and ``rates``, see `rbfmuscle.sim.plan.forecast`.
 
     Notes
@@ -39,6 +40,10 @@ def plan_scene(scene: Scene, estimate: Callable[..., Any] | None = None) -> dict
     """
     regions = reached_bones(scene)
     output = scene.output
+    work = plan_work(
+        scene,
+        {muscle.name: [bone for name, bone in regions if name == muscle.name] for muscle in scene.muscles},
+    )
     made = {
         "units": scene.units,
         "pairs": [{"muscle": muscle, "bone": bone} for muscle, bone in regions],
@@ -49,11 +54,12 @@ def plan_scene(scene: Scene, estimate: Callable[..., Any] | None = None) -> dict
                 "model": muscle.model,
                 "vertices": len(muscle.mesh.vertices),
                 "settings": dict(muscle.options),
+                "work": work[muscle.name],
             }
             for muscle in scene.muscles
         ],
         "frames": len(scene.motion),
-        "substeps": _substeps(scene),
+        "substeps": max((done["substeps"] for done in work.values()), default=0),
         "poses_sampled": len(sampled_poses(scene)),
         "features": {
             "sliding": scene.sliding is not None and len(scene.muscles) > 1,
@@ -87,7 +93,7 @@ def _forecast(scene, made, regions, estimate):
         field.update(cells=cost.cells, memory=cost.memory, kept=cost.kept)
         fields.append(cost)
     memory, time = forecast(
-        scene, fields, costs, substeps=made["substeps"], rates=rates,
+        scene, fields, costs, work=[muscle["work"] for muscle in made["muscles"]], rates=rates,
         resident=resident_memory(), threads=numba.get_num_threads(),
     )  # fmt: skip
     return {"memory": memory, "time": time, "rates": rates}
@@ -111,12 +117,3 @@ def _fields(scene, regions):
             }
         )
     return fields
-
-
-def _substeps(scene):
-    """Steps of the solver over the motion, from rest; tunnelling may halve some further."""
-    sub_steps, before, count = SubSteps(scene), {}, 0
-    for after in scene.motion.frames:
-        count += len(sub_steps.split(before, after))
-        before = after
-    return count

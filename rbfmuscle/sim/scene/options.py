@@ -142,7 +142,16 @@ class ContactOptions(Table):
     detector: Literal["sdf", "spline", "serendipity", "voxel", "bvh"] = "sdf"
     tolerance: Positive | None = None
     substep_angle: Annotated[float, Field(gt=0, le=90)] = 2.0
+    still_angle: Annotated[float, Field(ge=0, le=90)] = 0.0
     margin: NotNegative = 0.0
+
+    @model_validator(mode="after")
+    def _check_still(self):
+        if self.still_angle > self.substep_angle:
+            raise ValueError(
+                f"still_angle must not exceed substep_angle ({self.substep_angle:g}), got {self.still_angle:g}"
+            )
+        return self
 
 
 class SlidingOptions(Table):

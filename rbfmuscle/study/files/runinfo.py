@@ -7,7 +7,7 @@ import importlib.metadata
 import json
 import os
 import platform
-from collections import defaultdict
+from collections import Counter, defaultdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -90,6 +90,7 @@ def build_info(
         "times": clock.times,
         "compiled": clock.compiled,
         "stages": clock.stages.table(),
+        "work": clock.stages.work(),
         "limits": limits,
         "muscles": {name: facts for name, facts in summary.items() if name != "all"},
         "frame_time": summary.get("all", {}).get("time_frame"),
@@ -109,13 +110,18 @@ def frame_facts(scene: Scene, frame: Frame) -> dict:
 
 
 class Stages:
-    """Time of each stage of each muscle over the frames."""
+    """Time of each stage of each muscle over the frames, and what each frame took of it."""
 
     def __init__(self) -> None:
         self._values = defaultdict(lambda: defaultdict(list))
+        self._work = defaultdict(Counter)
+        self._reasons = defaultdict(Counter)
 
     def add(self, frame: Frame) -> None:
         """Take in a frame's times and those that its surfaces report."""
+        for name, work in frame.work.items():
+            self._work[name].update({work.state: 1, "substeps": work.substeps})
+            self._reasons[name, work.state][work.reason] += 1
         for name, times in frame.times.items():
             surface = frame.surfaces.get(name)
             inner = surface.quantities if surface is not None else {}
@@ -125,17 +131,38 @@ class Stages:
                         self._values[name][key].append(float(value))
 
     def state(self) -> dict[str, Any]:
-        """All times so far, for `go_on`."""
-        return {
+        """All times and work so far, for `go_on`."""
+        times = {
             name: {key: np.array(values) for key, values in found.items()}
             for name, found in self._values.items()
         }
+        work = {name: dict(count) for name, count in self._work.items()}
+        reasons = [[*key, reason, n] for key, found in self._reasons.items() for reason, n in found.items()]
+        return {"times": times, "work": work, "reasons": reasons}
 
     def go_on(self, state: dict[str, Any]) -> None:
-        """Take over the times of the frames before."""
-        for name, found in state.items():
+        """Take over the times and work of the frames before."""
+        for name, found in state["times"].items():
             for key, values in found.items():
                 self._values[name][key].extend(values.tolist())
+        for name, count in state["work"].items():
+            self._work[name].update(count)
+        for name, kind, reason, count in state["reasons"]:
+            self._reasons[name, kind][reason] += count
+
+    def work(self) -> dict[str, Any]:
+        """Nested dict: muscle -> frames ``solved``, ``carried``, ``skipped``; ``substeps``; commonest ``reasons``."""
+        return {
+            name: {
+                **{key: count[key] for key in ("solved", "carried", "skipped", "substeps")},
+                "reasons": {
+                    state: self._reasons[name, state].most_common(1)[0][0]
+                    for state in ("solved", "carried", "skipped")
+                    if count[state]
+                },
+            }
+            for name, count in self._work.items()
+        }
 
     def table(self) -> dict[str, Any]:
         """Nested dict: muscle -> stage -> total, median, 95th percentile and first [s]."""

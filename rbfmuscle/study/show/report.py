@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 _PICTURE_SIZE = (330, 400)
 _PREVIEW_SIZE = (330, 400)
 _MOST_EVENTS = 60
+# What frames took of a muscle.
+_WORK = ("solved", "carried", "skipped", "substeps")
 # Volume, moment arms and stage times have tables or plots of their own.
 _ELSEWHERE = ("volume", "moment_arm", "time_solve", "time_fit", "time_extract")
 _TABLE = [name for name in QUANTITIES if name not in _ELSEWHERE]
@@ -215,14 +217,24 @@ def _cell(name, facts):
 
 
 def _stages(saved):
-    stages = saved.info.get("stages") or {}
+    stages, work = saved.info.get("stages") or {}, saved.info.get("work") or {}
     names = list(dict.fromkeys(key for table in stages.values() for key in table))
     head = "".join(f"<th>{html.escape(name.removeprefix('time_'))}</th>" for name in names)
     rows = []
     for muscle, table in stages.items():
         cells = "".join(f"<td>{_milliseconds(table.get(name))}</td>" for name in names)
-        rows.append(f"<tr><th>{html.escape(muscle)}</th>{cells}</tr>")
-    return f"<table><tr><th></th>{head}</tr>{''.join(rows)}</table>"
+        rows.append(f"<tr><th>{html.escape(muscle)}</th>{cells}{_work(work.get(muscle))}</tr>")
+    done = "".join(f"<th>{name}</th>" for name in (*_WORK, "mostly for"))
+    return f"<table><tr><th></th>{head}{done}</tr>{''.join(rows)}</table>"
+
+
+def _work(done):
+    """Cells of what the frames took of a muscle."""
+    if not done:
+        return "<td>-</td>" * (len(_WORK) + 1)
+    most = max(done["reasons"], key=lambda state: done[state], default="")
+    counts = "".join(f"<td>{done[name]}</td>" for name in _WORK)
+    return f"{counts}<td>{html.escape(done['reasons'].get(most, ''))}</td>"
 
 
 def _milliseconds(facts):

@@ -1,0 +1,234 @@
+"""What a step asks of one muscle: to be solved, to be carried along as it is, or nothing at all.
+
+Bones that hold a muscle and do not move against each other leave it the shape that it has: it goes with them, rigidly.
+What counts is how these bones lie to each other now and lay when the muscle was solved last. A bone that it only
+touches counts where it comes near: then the muscle is solved as ever.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.rest_frame import RestFrame, diameter
+from rbfmuscle.sim.scene.motion import turned_angle
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from rbfmuscle.sim.scene.objects import Muscle
+    from rbfmuscle.sim.scene.scene import Scene
+
+
+# Bones farther than this [mm] from a muscle do not act on it: its samples are some millimetres apart.
+CLEAR = 2.0
+# Turns [radian] and ways (of the muscle's size) that are rounding.
+STILL = 1e-9
+# The way of an attachment that counts as much as a turn by one radian, in sizes of its muscle: an arc of half of it.
+ARC = 0.5
+
+SOLVED, CARRIED, SKIPPED = "solved", "carried", "skipped"
+
+
+class Work(NamedTuple):
+    """What a frame took of one muscle.
+
+    Attributes
+    ----------
+    state : {"solved", "carried", "skipped"}
+        Carried: moved as it is, with its bones. Skipped: nothing moved it at all.
+    substeps : int
+        In how many sub-steps it was solved.
+    reason : str
+        Why it was solved, or why it was not.
+    """
+
+    state: str
+    substeps: int
+    reason: str
+
+
+class OwnBones:
+    """How the bones that hold one muscle move against each other.
+
+    Parameters
+    ----------
+    muscle : Muscle
+    scene : Scene
+
+    Attributes
+    ----------
+    names : list of str
+        Bones that hold the muscle; the first holds most of it, and carries it.
+    still : float
+        A muscle whose bones have turned by no more than this since it was solved is not solved again [radian].
+    """
+
+    def __init__(self, muscle: Muscle, scene: Scene) -> None:
+        vertices = np.asarray(muscle.mesh.vertices, dtype=float)
+        frame, self.size = RestFrame(vertices), diameter(vertices)
+        held: dict[str, list[np.ndarray]] = {}
+        for attachment in muscle.attachments:
+            held.setdefault(attachment.bone, []).append(frame.local[attachment.vertices])
+        parts = {name: np.concatenate(found) for name, found in held.items()}
+        self.names = sorted(parts, key=lambda name: -len(parts[name]))
+        self._corners = {name: frame.points(_corners(parts[name])) for name in self.names}
+        self.still = math.radians(scene.contact.still_angle)
+
+    def apart(self, before: Mapping[str, Floats], after: Mapping[str, Floats]) -> tuple[float, str]:
+        """How far the bones turned and moved against the first, from one set of poses to another.
+
+        Returns
+        -------
+        angle : float
+            The largest turn [radian]; a way of an attachment counts as an arc of half the muscle's size.
+        bone : str
+            Which did.
+        """
+        root, worst, which = self.names[0], 0.0, ""
+        for name in self.names[1:]:
+            angle = relative_motion(before, after, root, name, self._corners[name], self.size)
+            if angle > worst:
+                worst, which = angle, name
+        return worst, which
+
+    def carriage(self, before: Mapping[str, Floats], after: Mapping[str, Floats]) -> Floats:
+        """The rigid motion (4, 4) of the bone that carries the muscle."""
+        root = self.names[0]
+        return after[root] @ np.linalg.inv(before[root])
+
+    def lagging(self, poses: Mapping[str, Floats], solved: Mapping[str, Floats]) -> dict[str, Floats]:
+        """Where a muscle that was carried takes its bones to be: as they lay to the first when it was solved."""
+        carried = self.carriage(solved, poses)
+        return {**poses, **{name: carried @ solved[name] for name in self.names[1:]}}
+
+
+def relative_motion(
+    before: Mapping[str, Floats],
+    after: Mapping[str, Floats],
+    root: str,
+    bone: str,
+    corners: Floats,
+    size: float,
+) -> float:
+    """How far a bone turned [radian] or places on it moved (over half a size) against another bone."""
+    old, new = (np.linalg.inv(poses[root]) @ poses[bone] for poses in (before, after))
+    if np.array_equal(old, new):
+        return 0.0
+    turn = turned_angle(new[:3, :3] @ old[:3, :3].T)
+    way = corners @ (new - old)[:3, :3].T + (new - old)[:3, 3]
+    return max(turn, float(np.sqrt((way**2).sum(axis=1)).max()) / (ARC * size))
+
+
+def why_never(muscle: Muscle, scene: Scene) -> str:
+    """Why a muscle is never carried as it is: what acts on it where its bones rest; empty where it may be."""
+    if scene.sliding is not None:
+        return "slides on neighbours"
+    return "contracts" if muscle.contraction is not None else ""
+
+
+class Carrier:
+    """Carries one muscle along as it is, where that is what a step asks.
+
+    Parameters
+    ----------
+    stepper : MuscleStepper
+    scene : Scene
+    """
+
+    def __init__(self, stepper: Any, scene: Scene) -> None:
+        muscle = scene.muscle(stepper.name)
+        self.own, self.stepper = OwnBones(muscle, scene), stepper
+        self.never = why_never(muscle, scene)
+        self.clear = scene.length(CLEAR) + scene.contact.margin
+        contacts = stepper.contacts
+        self.others = [b for b in contacts.reached if contacts.names[b] not in self.own.names]
+        self.solved: Mapping[str, Floats] | None = None
+        self.moved, self.reason = False, ""
+
+    def try_carry(self, before: Mapping[str, Floats], after: Mapping[str, Floats]) -> bool:
+        """Bring the muscle from one set of poses to the next if it need not be solved; say whether it was."""
+        if self.never:
+            return False
+        if self.solved is None:
+            self.solved = before
+        angle, bone = self.own.apart(self.solved, after)
+        if angle > max(self.own.still, STILL):
+            self.reason = f"{bone} against {self.own.names[0]}"
+            return False
+        near = [b for b in self.others if self._moves(b, before, after)]
+        if self._touched(near):
+            return False
+        self._carry(before, after, near)
+        return not self._taken_back(before, after, near)
+
+    def _carry(self, before, after, near):
+        motion, model = self.own.carriage(before, after), self.stepper.model
+        self._saved = model.snapshot() if near else None
+        if np.abs(motion - np.eye(4)).max() > STILL:
+            model.transform(motion)
+            self._motion = motion
+        else:
+            self._motion = None
+        self.stepper.contacts.move(after)
+
+    def _taken_back(self, before, after, near):
+        """Undo what brought the muscle to another bone."""
+        if self._touched(near):
+            self.stepper.model.restore(self._saved)
+            self.stepper.contacts.move(before)
+            return True
+        if self._motion is not None:
+            self.stepper.carried(self._motion)
+            self.moved = True
+        return False
+
+    def _touched(self, bones: Sequence[int]) -> bool:
+        """Whether one of these bones comes near the muscle where both are now."""
+        if not bones:
+            return False
+        contacts, points = self.stepper.contacts, self.stepper.model.contact_points()
+        for b in bones:
+            if contacts.comes_near(points, b, self.clear):
+                self.reason = f"{contacts.names[b]} comes near"
+                return True
+        return False
+
+    def _moves(self, b: int, before: Mapping[str, Floats], after: Mapping[str, Floats]) -> bool:
+        name, corners = self.stepper.contacts.names[b], self.own._corners[self.own.names[0]]
+        return relative_motion(before, after, name, self.own.names[0], corners, self.own.size) > STILL
+
+    def begin(self, before: Mapping[str, Floats]) -> Mapping[str, Floats]:
+        """Poses that a solve begins from: where the muscle takes its bones to be."""
+        if self.solved is None or self.own.still == 0.0:
+            return before
+        return self.own.lagging(before, self.solved)
+
+    def snapshot(self) -> dict[str, Floats]:
+        """Where its bones were when the muscle was solved last; empty before it ever was."""
+        return {name: np.array(self.solved[name]) for name in self.own.names} if self.solved else {}
+
+    def restore(self, state: Mapping[str, Floats]) -> None:
+        """Go back to a `snapshot`."""
+        self.solved = dict(state) or None
+
+    def collect(self, substeps: int) -> Work:
+        """What was done since the last call."""
+        moved, reason = self.moved, self.reason
+        self.moved, self.reason = False, ""
+        if substeps:
+            return Work(SOLVED, substeps, reason or self.never)
+        if moved:
+            names = self.own.names
+            return Work(
+                CARRIED, 0, f"moves with {names[0]}" if len(names) == 1 else f"{', '.join(names)} as one"
+            )
+        return Work(SKIPPED, 0, "its bones rest")
+
+
+def _corners(points: Floats) -> Floats:
+    low, high = np.min(points, axis=0), np.max(points, axis=0)
+    return np.array([[(low, high)[k >> a & 1][a] for a in range(3)] for k in range(8)])
