@@ -42,13 +42,22 @@ def check(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", nega
 
 def _findings(path):
     from rbfmuscle.models import check_models
+    from rbfmuscle.sim.plan.ahead import ahead_findings
+    from rbfmuscle.sim.scene.attachments import ExactMeshes
+    from rbfmuscle.sim.scene.check import check_scene
     from rbfmuscle.sim.scene.scene import Scene
 
     loaded = Scene.load(path, skeleton=True)
     check_models(loaded)
     compile_ahead(["check"])
+    exact = ExactMeshes()
     with tell_stage("fields of the bones"):
-        return loaded, [*loaded.check(), *_field_notes(loaded)]
+        findings = [*check_scene(loaded, exact), *_field_notes(loaded)]
+    if not any(finding.level == "error" for finding in findings):
+        with tell_stage("looking ahead along the motion"):
+            findings += ahead_findings(loaded, exact)
+    order = {"error": 0, "warning": 1, "note": 2}
+    return loaded, sorted(findings, key=lambda finding: order[finding.level])
 
 
 def _field_notes(scene):

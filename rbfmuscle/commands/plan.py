@@ -46,7 +46,8 @@ def _lines(made):
         bones = [pair["bone"] for pair in made["pairs"] if pair["muscle"] == muscle["name"]]
         meets = ", ".join(bones) or "no bone"
         lines.append(
-            f"muscle {muscle['name']}: {muscle['model']}, {muscle['vertices']} vertices, can meet {meets}; "
+            f"muscle {muscle['name']}: {muscle['model']}, {muscle['points'] or str(muscle['vertices']) + ' vertices'}, "
+            f"can meet {meets}; "
             f"{_megabytes(muscle['memory'])}, {muscle['build']:.2g} s to build, "
             f"{1e3 * muscle['step']:.2g} ms a sub-step, {1e3 * muscle['show']:.2g} ms a surface; "
             f"{_work(muscle['work'])}"
@@ -57,6 +58,7 @@ def _lines(made):
             f"field of {field['bone']}: {size} {made['units']}, {field['share']:.0%} of the bone's box, "
             f"{field['triangles']} triangles{_field_size(field)}"
         )
+    lines += made["ahead"]["messages"]
     on = [name for name, used in made["features"].items() if used]
     lines.append(f"switched on: {', '.join(on) or 'nothing'}")
     return lines + _forecast_lines(made["memory"], made["time"])

@@ -14,7 +14,7 @@ from rbfmuscle.implicit.fit.lapack import factor_cholesky
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.model.drawing import MARCHING_CELLS
 from rbfmuscle.model.options import RBFOptions
-from rbfmuscle.model.placement import MOST_WITH_ALL_DERIVATIVES, default_centres, sample_is_cached
+from rbfmuscle.model.placement import MOST_WITH_ALL_DERIVATIVES, choose_centres, sample_is_cached
 from rbfmuscle.model.shown import shown_vertices
 from rbfmuscle.sim.plan.forecast import MuscleCost
 from rbfmuscle.sim.plan.rates import shortest
@@ -61,7 +61,8 @@ def estimate_muscle(
     -------
     MuscleCost
     """
-    centres = options.centres or default_centres(muscle.mesh.area, scene)
+    chosen = choose_centres(muscle, scene, options, known_only=True)
+    centres = chosen.count
     points = centres + options.samples
     shown, nodes = _surface_size(muscle, options)
     unknowns = _unknowns(options, centres)
@@ -89,6 +90,7 @@ def estimate_muscle(
         working=16.0 * unknowns**2 + NODE_BYTES * nodes + VERTEX_BYTES * shown,
         carried=options.samples,
         shown=int(shown),
+        points=f"{centres} centres ({chosen.reason})",
     )
 
 

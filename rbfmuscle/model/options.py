@@ -21,8 +21,10 @@ def _known_kernel(name: str) -> str:
 class RBFOptions(Table):
     """``[muscle.model]`` of an RBF muscle.
 
-    ``centres`` follow from the muscle's area where none are given, and ``epsilon`` (a kernel's shape parameter) from
-    the error at rest, with a ``condition`` of at most so much, 0 for any. ``samples`` of the surface meet the bones;
+    ``centres``, where none are given, follow from the muscle's area, and are more where the surface at rest would
+    err by more than ``rest_error`` (RMS; 0 for 0.5 mm, or a tenth of the muscle's thickness where that is less), and
+    ``epsilon`` (a kernel's shape parameter) from the error at rest, with a ``condition`` of at most so much, 0 for
+    any. ``samples`` of the surface meet the bones;
     ``contacts`` of them join in one round. ``iterations`` a solve, ``acceleration`` of them remembered (Anderson). The
     fibre stretch is free from ``stretch_low`` to ``stretch_high`` but for the share ``stretch_hold`` that pulls it
     back to one; ``across`` links a centre go through the thickness, each counting ``across_weight``. ``surface`` is
@@ -34,6 +36,7 @@ class RBFOptions(Table):
     """
 
     centres: Annotated[int, Field(ge=0, le=20_000)] = 0
+    rest_error: NotNegative = 0.0
     samples: Annotated[int, Field(ge=50, le=200_000)] = 2000
     iterations: Annotated[int, Field(ge=1, le=1000)] = 8
     contacts: Annotated[int, Field(ge=1, le=10_000)] = 24

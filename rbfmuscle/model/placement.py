@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
 from rbfmuscle.implicit.placement.density import GREEDY_LARGEST
 from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
 from rbfmuscle.implicit.placement.sampling import SurfaceSample, sample_surface
+from rbfmuscle.implicit.selection import spacing, surface_miss
 from rbfmuscle.implicit.shape_search import Limits
 from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
 from rbfmuscle.model.options import RBFOptions
@@ -38,6 +39,12 @@ MOST_WITH_ALL_DERIVATIVES = 200
 # A field at rest that is looked at before it is used: cells along its longest side, and the share of the mesh's volume
 # by which its level zero may be off.
 CELLS, VOLUME_BOUND = 48, 0.2
+# What the surface at rest may err by where the scene says nothing: a length [mm], or a share of the muscle's thickness.
+REST_ERROR, REST_SHARE = 0.5, 0.1
+# How fast the error falls with the centres, taken low; trials of their number, and the most, in the usual number.
+FALL, TRIALS, MOST_CENTRES = 1.2, 5, 4.0
+# What is aimed at, in what is wanted: the shown mesh adds its own.
+AIM = 0.97
 # Part of the name under which samples are cached: raise it when they are made in another way.
 SAMPLING = 1
 
@@ -69,6 +76,93 @@ class FieldFit:
 def default_centres(area: float, scene: Scene) -> int:
     """Number of centres of a muscle of this area [scene unit squared]."""
     return max(LEAST_CENTRES, int(round(area / (AREA_FOR_EACH * scene.length(1.0) ** 2), -1)))
+
+
+def wanted_error(muscle: Muscle, scene: Scene, options: RBFOptions) -> float:
+    """What a muscle's surface at rest may err by, RMS [scene unit]: as asked for, or by its size."""
+    if options.rest_error:
+        return options.rest_error
+    thickness = 2.0 * float(muscle.mesh.volume) / float(muscle.mesh.area)
+    return min(scene.length(REST_ERROR), REST_SHARE * thickness)
+
+
+class Chosen(NamedTuple):
+    """Number of centres of a muscle, and why.
+
+    Attributes
+    ----------
+    count : int
+    error : float
+        Of the surface at rest with them, RMS [scene unit]; not a number where nothing was fitted.
+    reason : str
+    """
+
+    count: int
+    error: float
+    reason: str
+
+
+def choose_centres(muscle: Muscle, scene: Scene, options: RBFOptions, *, known_only: bool = False) -> Chosen:
+    """How many centres a muscle has.
+
+    As many as the scene says; else those that its area asks for, and more until the surface at rest errs by no more
+    than is wanted. The number is kept on disk.
+
+    Parameters
+    ----------
+    muscle : Muscle
+    scene : Scene
+    options : RBFOptions
+    known_only : bool
+        Fit nothing: where the number is not on disk, the least that it can be.
+    """
+    if options.centres:
+        return Chosen(options.centres, np.nan, "as given")
+    usual, wanted = default_centres(muscle.mesh.area, scene), wanted_error(muscle, scene, options)
+    frame, faces = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)), np.asarray(muscle.mesh.faces)
+    fit = (
+        options.kernel, options.epsilon, options.condition, options.derivatives, options.placement, options.seed,
+    )  # fmt: skip
+    key = content_key(frame.local, faces, ("centres", SAMPLING, usual, round(wanted / frame.size, 9), *fit))
+    found = load_arrays(key)
+    if found is None and known_only:
+        return Chosen(usual, np.nan, "by its area; more where the rest error asks for them")
+    if found is None:
+        count, error = _search_centres(muscle, frame, options, usual, wanted)
+        found = {"count": np.array(count), "error": np.array(error / frame.size)}
+        store_arrays(key, found)
+    count, error = int(found["count"]), float(found["error"]) * frame.size
+    how = "by its area" if count == usual else f"more than the {usual} of its area"
+    met = "met" if error <= wanted else "not met"
+    return Chosen(count, error, f"{how}, rest error {error:.2g}, {wanted:.2g} {scene.units} wanted: {met}")
+
+
+def _search_centres(
+    muscle: Muscle, frame: RestFrame, options: RBFOptions, usual: int, wanted: float
+) -> tuple[int, float]:
+    """The number of centres that errs little enough, or the best within reach, and its error."""
+    most, count, tried = int(MOST_CENTRES * usual), usual, []
+    if options.placement in ("greedy", FITTED):
+        most = min(most, GREEDY_LARGEST)
+    for _ in range(TRIALS):
+        centres, _, fit = place_points(muscle, frame, options, count)
+        error = _rest_miss(frame, centres, fit)
+        tried.append((error > wanted, count if error <= wanted else error, count, error))
+        if error <= AIM * wanted or count >= most:
+            break
+        grown = count * (error / (AIM * wanted)) ** (1.0 / FALL)
+        count = min(most, max(count + 20, 10 * int(np.ceil(grown / 10))))
+    return min(tried)[2:]
+
+
+def _rest_miss(frame: RestFrame, centres: SurfaceSample, fit: FieldFit) -> float:
+    """How far the mesh's vertices lie from the field's surface, RMS [scene unit]."""
+    points = frame.points(centres.points)
+    try:
+        field = fit.fit(points, frame.directions(centres.normals))
+    except (ValueError, np.linalg.LinAlgError):
+        return np.inf
+    return surface_miss(field, frame.points(frame.local), float(spacing(points).mean()))
 
 
 def place_points(

@@ -16,7 +16,7 @@ from rbfmuscle.implicit.placement.sampling import SurfaceSample
 from rbfmuscle.model.clusters import bind_samples, build_clusters
 from rbfmuscle.model.fibres import fibre_directions
 from rbfmuscle.model.options import RBFOptions
-from rbfmuscle.model.placement import FieldFit, default_centres, place_points
+from rbfmuscle.model.placement import FieldFit, choose_centres, default_centres, place_points
 from rbfmuscle.sim.scene.objects import Muscle
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.validation import SceneError
@@ -93,7 +93,7 @@ class Rest:
         """
         frame, faces = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)), np.asarray(muscle.mesh.faces)
         usual = default_centres(muscle.mesh.area, scene)
-        count = options.centres or usual
+        count = choose_centres(muscle, scene, options).count
         centres, samples, fit = place_points(muscle, frame, options, count)
         points = frame.points(centres.points)
         held_by = _Attachment(muscle, scene, frame, centres.points, samples.points)

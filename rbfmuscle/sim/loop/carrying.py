@@ -140,9 +140,9 @@ class Carrier:
     """
 
     def __init__(self, stepper: Any, scene: Scene) -> None:
-        muscle = scene.muscle(stepper.name)
+        muscle = next(muscle for muscle in scene.muscles if muscle.name == stepper.name)
         self.own, self.stepper = OwnBones(muscle, scene), stepper
-        self.never = why_never(muscle, scene)
+        self.muscle, self.never = muscle, why_never(muscle, scene)
         self.clear = scene.length(CLEAR) + scene.contact.margin
         contacts = stepper.contacts
         self.others = [b for b in contacts.reached if contacts.names[b] not in self.own.names]

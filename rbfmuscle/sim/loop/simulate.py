@@ -84,9 +84,9 @@ class FrameLoop:
         self.activations = Activations(scene)
         self._sub_steps, self._own_sub_steps = SubSteps(scene, poses=self._poses), {}
         for stepper in self.steppers:
-            stepper.carrier = Carrier(stepper, scene)
-            if not stepper.carrier.never:
-                self._own_sub_steps[stepper.name] = self._cut_for(stepper)
+            carrier = stepper.carrier = Carrier(stepper, scene)
+            if not carrier.never:
+                self._own_sub_steps[stepper.name] = self._cut_for(carrier)
         self._next_index, self._wall = 0, 0.0
         self.workers = Workers(len(self.steppers))
         try:
@@ -242,10 +242,11 @@ class FrameLoop:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _cut_for(self, stepper: MuscleStepper) -> SubSteps:
+    def _cut_for(self, carrier: Carrier) -> SubSteps:
         """Sub-steps for one muscle: by what the bones do that hold it, and those that it can meet."""
-        met = [stepper.contacts.names[b] for b in stepper.contacts.reached]
-        return SubSteps(self.scene, self.scene.muscle(stepper.name), bones=met, poses=self._poses)
+        contacts = carrier.stepper.contacts
+        met = [contacts.names[b] for b in contacts.reached]
+        return SubSteps(self.scene, carrier.muscle, bones=met, poses=self._poses)
 
     def _path_to(self, coordinates: Mapping[str, float]) -> dict[str, tuple[list[dict], list[dict]]]:
         """For each muscle coordinates of its sub-steps to the next frame, from where it is on, and activations."""

@@ -66,6 +66,8 @@ class MuscleCost:
         More while a frame is made [bytes].
     carried, shown : int
         Vertices of the carried mesh and of the surface.
+    points : str
+        How many points carry it, and why so many.
     """
 
     build: float
@@ -75,6 +77,7 @@ class MuscleCost:
     working: float
     carried: int
     shown: int
+    points: str = ""
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rbfmuscle.sim.plan.ahead import describe, look_ahead
 from rbfmuscle.sim.plan.reach import reached_bones, sampled_poses, union_of
 from rbfmuscle.sim.plan.work import plan_work
 
@@ -30,7 +31,8 @@ def plan_scene(scene: Scene, estimate: Callable[..., Any] | None = None) -> dict
         ``pairs``: muscles and bones that can meet. ``fields``: for each bone that any muscle can reach the
         size of the reached box [scene unit] and its share of the bone's own box. ``muscles``: model and size
         of the input, and its ``work``, see `plan_work`. ``frames`` of the motion; ``substeps`` of the muscle that
-        takes most. ``features``: what the scene switches on. With
+        takes most. ``ahead``: what the motion asks of held ends that no muscle can give. ``features``: what the
+        scene switches on. With
         ``estimate`` also ``memory``, ``time`` and ``rates``, see `rbfmuscle.sim.plan.forecast`.
 
     Notes
@@ -61,6 +63,7 @@ def plan_scene(scene: Scene, estimate: Callable[..., Any] | None = None) -> dict
         "frames": len(scene.motion),
         "substeps": max((done["substeps"] for done in work.values()), default=0),
         "poses_sampled": len(sampled_poses(scene)),
+        "ahead": _ahead(scene),
         "features": {
             "sliding": scene.sliding is not None and len(scene.muscles) > 1,
             "tunnelling": scene.detect is not None and scene.detect.tunnelling is not None,
@@ -73,6 +76,16 @@ def plan_scene(scene: Scene, estimate: Callable[..., Any] | None = None) -> dict
     return made if estimate is None else {**made, **_forecast(scene, made, regions, estimate)}
 
 
+def _ahead(scene):
+    driven, stretched = look_ahead(scene)
+    said = describe((driven, stretched), scene.units)
+    return {
+        "driven": [one._asdict() for one in driven],
+        "stretched": [one._asdict() for one in stretched],
+        "messages": [str(one) for one in said],
+    }
+
+
 def _forecast(scene, made, regions, estimate):
     """Memory and time; those of each field and muscle are written into ``made``."""
     import numba
@@ -83,7 +96,9 @@ def _forecast(scene, made, regions, estimate):
     rates = measure_rates()
     costs = [estimate(muscle, scene, rates) for muscle in scene.muscles]
     for muscle, cost in zip(made["muscles"], costs):
-        muscle.update(memory=cost.memory, build=cost.build, step=cost.step, show=cost.show)
+        muscle.update(
+            memory=cost.memory, build=cost.build, step=cost.step, show=cost.show, points=cost.points
+        )
     fields = []
     meshes = {bone.name: bone.mesh for bone in scene.bones}
     # Other detectors have fields of other kinds, or none.

@@ -111,12 +111,25 @@ def _select(table, read, bone, place):
 
 def signed_distances(points: Floats, mesh: trimesh.Trimesh) -> Floats:
     """Exact distance of points to a mesh, negative inside (by pseudonormals, or winding numbers if open)."""
-    points = np.ascontiguousarray(points, dtype=np.float64)
-    exact = ExactDistance(mesh.vertices, mesh.faces)
-    if mesh.is_watertight:
-        return exact.signed_distance(points)
-    inside = winding_test(exact)(points)
-    return np.where(inside, -1.0, 1.0) * np.abs(exact.signed_distance(points))
+    return ExactMeshes().distances(points, mesh)
+
+
+class ExactMeshes:
+    """Exact distances to meshes, each of which is sorted once for all questions."""
+
+    def __init__(self) -> None:
+        self._known: dict[int, Any] = {}
+
+    def distances(self, points: Floats, mesh: trimesh.Trimesh) -> Floats:
+        """Distance of points (n, 3) to a mesh, negative inside, (n,)."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        if id(mesh) not in self._known:
+            exact = ExactDistance(mesh.vertices, mesh.faces)
+            # The mesh is kept too, so that no other one takes its number.
+            self._known[id(mesh)] = mesh, exact, None if mesh.is_watertight else winding_test(exact)
+        _, exact, inside = self._known[id(mesh)]
+        distance = exact.signed_distance(points)
+        return distance if inside is None else np.where(inside(points), -1.0, 1.0) * np.abs(distance)
 
 
 def _listed_vertices(listed, read, place):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rbfmuscle.sim.scene.attachments import signed_distances
+from rbfmuscle.sim.scene.attachments import ExactMeshes
 from rbfmuscle.sim.scene.motion import bone_poses
 from rbfmuscle.validation import MeshError, RBFMuscleError, SceneError
 
@@ -38,9 +38,16 @@ class Finding:
         return f"{self.level}: {self.place}: {self.message}"
 
 
-def check_scene(scene: Scene) -> list[Any]:
-    """Return all findings about a scene, the worst first; nothing is solved or changed."""
-    findings = []
+def check_scene(scene: Scene, exact: ExactMeshes | None = None) -> list[Any]:
+    """Return all findings about a scene, the worst first; nothing is solved or changed.
+
+    Parameters
+    ----------
+    scene : Scene
+    exact : ExactMeshes, optional
+        Takes the distances to the bones' meshes, for further questions.
+    """
+    findings, exact = [], exact or ExactMeshes()
     for item in [*scene.bones, *scene.muscles]:
         findings.extend(Finding("note", item.name, note) for note in item.notes)
     findings.extend(
@@ -56,9 +63,9 @@ def check_scene(scene: Scene) -> list[Any]:
         except RBFMuscleError as error:
             findings.append(Finding("error", scene.name, str(error)))
     findings.extend(Finding("warning", "motion", note) for note in scene.motion.notes)
-    findings.extend(_rest_overlaps(scene))
+    findings.extend(_rest_overlaps(scene, exact))
     try:
-        findings.extend(bone_findings(bone_collisions(scene), scene.units))
+        findings.extend(bone_findings(bone_collisions(scene, exact=exact), scene.units))
     except SceneError as error:
         if all(str(error) != finding.message for finding in findings):
             findings.append(Finding("error", scene.name, str(error)))
@@ -123,7 +130,7 @@ def _likely_scale(millimetres):
     return f"{best:g} times the present one would make it {millimetres * best:.4g} mm"
 
 
-def _rest_overlaps(scene):
+def _rest_overlaps(scene, exact):
     """Muscle vertices inside bones at rest."""
     findings = []
     for muscle in scene.muscles:
@@ -132,7 +139,7 @@ def _rest_overlaps(scene):
         for attachment in muscle.attachments:
             held[attachment.vertices] = True
         for bone in scene.bones:
-            depth = _depths(points, bone.mesh)
+            depth = _depths(points, bone.mesh, exact)
             inside = (depth > 0) & ~held
             if not inside.any():
                 continue
@@ -156,24 +163,24 @@ def check_initial(scene: Scene) -> None:
     from rbfmuscle.sim.loop.substeps import check_substeps
 
     check_substeps(scene)
-    for finding in _rest_overlaps(scene):
+    for finding in _rest_overlaps(scene, ExactMeshes()):
         if finding.level == "error":
             raise SceneError(
                 f"muscle {finding.place!r}: {finding.message}; move it, or set [contact] initial"
             )
 
 
-def _depths(points, mesh):
+def _depths(points, mesh, exact):
     """Depth of points inside a mesh, zero outside; only points in its box are measured."""
     depth = np.zeros(len(points))
     low, high = mesh.bounds
     near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
     if len(near):
-        depth[near] = -np.minimum(signed_distances(points[near], mesh), 0.0)
+        depth[near] = -np.minimum(exact.distances(points[near], mesh), 0.0)
     return depth
 
 
-def bone_collisions(scene: Scene, frames: Any = None) -> list[Any]:
+def bone_collisions(scene: Scene, frames: Any = None, *, exact: ExactMeshes | None = None) -> list[Any]:
     """Return where a motion drives bones into each other.
 
     Parameters
@@ -181,6 +188,8 @@ def bone_collisions(scene: Scene, frames: Any = None) -> list[Any]:
     scene : Scene
     frames : iterable of int, optional
         Which frames to look at, about ten of the motion by default.
+    exact : ExactMeshes, optional
+        Distances to the bones' meshes.
 
     Returns
     -------
@@ -189,20 +198,21 @@ def bone_collisions(scene: Scene, frames: Any = None) -> list[Any]:
     """
     if frames is None:
         frames = np.unique(np.linspace(0, len(scene.motion) - 1, MOTION_SAMPLES).round().astype(int)).tolist()
+    exact = exact or ExactMeshes()
     rest: dict[Any, float] | None = None
     found = []
     for frame in frames:
         poses = bone_poses(scene, scene.motion.frames[frame])
-        depths = _pair_depths(scene, poses)
+        depths = _pair_depths(scene, poses, exact)
         if rest is None and depths:
-            rest = _pair_depths(scene, bone_poses(scene, {}))
+            rest = _pair_depths(scene, bone_poses(scene, {}), exact)
         for pair, depth in depths.items():
             if depth - (rest or {}).get(pair, 0.0) > scene.length(COUNTED_DEPTH_MM):
                 found.append((frame, *pair, depth))
     return found
 
 
-def _pair_depths(scene, poses):
+def _pair_depths(scene, poses, exact):
     """Deepest vertex of either bone in the other, for the pairs that move against each other and overlap."""
     depths = {}
     for k, first in enumerate(scene.bones):
@@ -211,12 +221,21 @@ def _pair_depths(scene, poses):
             if np.allclose(relative, np.eye(4), atol=1e-12):
                 continue
             back = np.linalg.inv(relative)
+            if _boxes_part(first.mesh.bounds, relative, second.mesh.bounds):
+                continue
             one = np.asarray(first.mesh.vertices) @ relative[:3, :3].T + relative[:3, 3]
             two = np.asarray(second.mesh.vertices) @ back[:3, :3].T + back[:3, 3]
-            deepest = max(_depths(one, second.mesh).max(), _depths(two, first.mesh).max())
+            deepest = max(_depths(one, second.mesh, exact).max(), _depths(two, first.mesh, exact).max())
             if deepest > 0:
                 depths[first.name, second.name] = float(deepest)
     return depths
+
+
+def _boxes_part(bounds, place, others):
+    """Whether a box, moved, does not meet another one."""
+    centre, half = bounds.mean(axis=0), 0.5 * (bounds[1] - bounds[0])
+    middle, reach = place[:3, :3] @ centre + place[:3, 3], np.abs(place[:3, :3]) @ half
+    return bool(np.any(middle - reach > others[1]) or np.any(middle + reach < others[0]))
 
 
 def bone_findings(collisions: list[Any], units: str) -> list[Any]:
