@@ -62,7 +62,7 @@ def estimate_muscle(
     MuscleCost
     """
     chosen = choose_centres(muscle, scene, options, known_only=True)
-    centres = chosen.count
+    centres = chosen.centres
     points = centres + options.samples
     shown, nodes = _surface_size(muscle, options)
     unknowns = _unknowns(options, centres)

@@ -91,13 +91,13 @@ class Chosen(NamedTuple):
 
     Attributes
     ----------
-    count : int
+    centres : int
     error : float
         Of the surface at rest with them, RMS [scene unit]; not a number where nothing was fitted.
     reason : str
     """
 
-    count: int
+    centres: int
     error: float
     reason: str
 

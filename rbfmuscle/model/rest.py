@@ -93,7 +93,7 @@ class Rest:
         """
         frame, faces = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)), np.asarray(muscle.mesh.faces)
         usual = default_centres(muscle.mesh.area, scene)
-        count = choose_centres(muscle, scene, options).count
+        count = choose_centres(muscle, scene, options).centres
         centres, samples, fit = place_points(muscle, frame, options, count)
         points = frame.points(centres.points)
         held_by = _Attachment(muscle, scene, frame, centres.points, samples.points)

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
+
+import numpy as np
+
+# Muscles nearer to each other than this share of the scene's extent are neighbours.
+NEXT_TO = 0.008
 
 BONE_COLOUR = "#ece2cb"
 BACKGROUND = "#ffffff"
@@ -20,3 +26,29 @@ def muscle_colours(names: list[str]) -> dict[str, str]:
 def line_colours(names: dict[str, Any] | list[str]) -> dict[str, str]:
     """Dict of muscle name to its colour in plots."""
     return {name: LINE_COLOURS[k % len(LINE_COLOURS)] for k, name in enumerate(names)}
+
+
+def neighbour_colours(saved: Any) -> dict[str, str]:
+    """Dict of muscle name to its colour; of many muscles those that lie next to each other differ."""
+    from scipy.spatial import cKDTree
+
+    plain = muscle_colours(saved.muscles)
+    if len(plain) <= len(MUSCLE_COLOURS):
+        return plain
+    trees = {}
+    for name in saved.muscles:
+        points = saved.surface(name, saved.frames[0])[0]
+        trees[name] = cKDTree(points[:: max(1, len(points) // 600)])
+    size = float(np.linalg.norm(np.ptp(np.concatenate([tree.data for tree in trees.values()]), axis=0)))
+    near: dict[str, set[str]] = {name: set() for name in trees}
+    for one, two in itertools.combinations(trees, 2):
+        if trees[one].count_neighbors(trees[two], NEXT_TO * size):
+            near[one].add(two)
+            near[two].add(one)
+    found: dict[str, str] = {}
+    for name in sorted(near, key=lambda name: -len(near[name])):
+        taken = [found[other] for other in near[name] if other in found]
+        found[name] = min(
+            MUSCLE_COLOURS, key=lambda colour: (taken.count(colour), list(found.values()).count(colour))
+        )
+    return {name: found[name] for name in saved.muscles}

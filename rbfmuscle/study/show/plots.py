@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rbfmuscle.study.measure.metrics import ALL
-from rbfmuscle.study.show.appearance import line_colours
+from rbfmuscle.study.show.appearance import LINE_COLOURS, line_colours
 
 if TYPE_CHECKING:
     from rbfmuscle.study.files.saved import SavedRun
 
 
+# From so many lines on a plot names only those that go furthest, so many of them.
+MANY, NAMED = 9, 6
 PLOT_STYLE = {
     "font.size": 9,
     "axes.spines.top": False,
@@ -125,9 +127,17 @@ def _draw_lines(axes, saved, quantity, factor, axis, coordinate=None):
     if quantity == "time_frame":
         tracks.append(("all together", saved.series(ALL, quantity), "#222222"))
     tracks = [(name, *series, colour) for name, series, colour in tracks if len(series[0])]
+    named = _furthest(tracks) if len(tracks) > MANY else None
     for name, frames, values, colour in tracks:
         places = [axis[frame] for frame in frames]
-        axes.plot(places, values * factor, color=colour, lw=1.6, label=name, marker="o", ms=2.2)
+        if named is None:
+            axes.plot(places, values * factor, color=colour, lw=1.6, label=name, marker="o", ms=2.2)
+        elif name not in named:
+            axes.plot(places, values * factor, color="#d4d2cd", lw=0.8, zorder=1)
+        else:
+            axes.plot(places, values * factor, color=named[name], lw=1.6, label=name, zorder=2)
+    if named:
+        axes.legend(fontsize=6.5, frameon=False, loc="best", handlelength=1.2)
     if quantity == "time_frame" and tracks:
         # The first frame loads and compiles, and so may a later one that meets something new; it would flatten
         # all others, so it ends at the edge, and the edge says how high it goes.
@@ -137,6 +147,13 @@ def _draw_lines(axes, saved, quantity, factor, axis, coordinate=None):
             axes.set_ylim(0, top)
             _name_hidden(axes, tracks[-1], axis, factor, top)
     return bool(tracks)
+
+
+def _furthest(tracks):
+    """Colours of the muscles that go furthest, and of all together: what a plot of many names."""
+    reach = {name: np.nanmax(np.abs(values), initial=0.0) for name, _, values, _ in tracks}
+    chosen = sorted(reach, key=lambda name: -reach[name])[:NAMED]
+    return dict(zip(chosen, LINE_COLOURS))
 
 
 def _name_hidden(axes, track, axis, factor, top):

@@ -18,7 +18,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Integers
 from rbfmuscle.study.files.saved import SavedRun
-from rbfmuscle.study.show.appearance import BACKGROUND, BONE_COLOUR, muscle_colours
+from rbfmuscle.study.show.appearance import BACKGROUND, BONE_COLOUR, MUSCLE_COLOURS, neighbour_colours
 from rbfmuscle.study.show.paint import PAINT_COLOURS, check_colouring, painting
 from rbfmuscle.validation import MissingPartError, RBFMuscleError, UsageError
 
@@ -38,6 +38,8 @@ _BONE_TRIANGLES = 12_000
 # Coordinates that a caption names at most.
 MOST_SHOWN = 4
 _TIMEOUT = 1800
+# Code of a child that could draw and could not save, and the least and greatest height of a panel for its width.
+_REFUSED, _SHAPES = 3, (0.6, 3.0)
 
 
 def render_run(
@@ -131,9 +133,13 @@ def draw(
     if done.returncode != 0:
         words = [line.strip() for line in done.stderr.splitlines() if line.strip()]
         reason = words[-1][-160:] if words else f"the drawing process ended with code {done.returncode}"
-        raise MissingPartError(
-            f"no pictures: {reason}; drawing needs OpenGL (a display, or Mesa's libegl1 and libgl1)"
+        # What Python itself refuses is no want of graphics.
+        blame = (
+            ""
+            if done.returncode == _REFUSED
+            else "; drawing needs OpenGL (a display, or Mesa's libegl1 and libgl1)"
         )
+        raise MissingPartError(f"no pictures: {reason}{blame}")
 
 
 def draw_pictures(directory: str | Path, make_jobs: Callable[..., Any], **how: Any) -> tuple[Any, ...]:
@@ -191,7 +197,7 @@ class Stage:
         self.plotter = pyvista.Plotter(off_screen=True, shape=shape, border=False, window_size=window)
         self.plotter.set_background(BACKGROUND)
         first = rows[0][0][0]
-        self.first, self.colours = first, muscle_colours(first.muscles)
+        self.first, self.colours = first, neighbour_colours(first)
         self.bones = [(name, self._add_bone(first.bone(name))) for name in first.bones]
         self.skins = []
         bounds = _path_bounds({id(saved): saved for row in rows for saved, _ in row}.values())
@@ -261,21 +267,25 @@ class Stage:
     def _aim(self, direction, bounds, size):
         """Parallel projection that holds the box in this view."""
         centre = bounds.mean(axis=0)
-        ahead = np.asarray(direction) / np.linalg.norm(direction)
-        right = np.cross([0.0, 0.0, 1.0], ahead)
-        right /= np.linalg.norm(right)
-        up = np.cross(ahead, right)
-        corners = (
-            np.array([[x, y, z] for x in bounds[:, 0] for y in bounds[:, 1] for z in bounds[:, 2]]) - centre
-        )
-        tall = np.ptp(corners @ up) / 2
-        wide = np.ptp(corners @ right) / 2 * size[1] / size[0]
+        corners, ahead, up = _projected(direction, bounds)
+        wide, tall = np.ptp(corners, axis=0) / 2
+        wide *= size[1] / size[0]
         camera = self.plotter.camera
         camera.focal_point = centre
         camera.position = centre + ahead * 4.0 * np.linalg.norm(bounds[1] - bounds[0])
         camera.up = up
         camera.parallel_projection = True
         camera.parallel_scale = 1.04 * max(tall, wide)
+
+
+def _projected(direction, bounds):
+    """Corners of a box (8, 2) as a view sees them, to the right and up; the view's direction, and up."""
+    ahead = np.asarray(direction) / np.linalg.norm(direction)
+    right = np.cross([0.0, 0.0, 1.0], ahead)
+    right /= np.linalg.norm(right)
+    up = np.cross(ahead, right)
+    corners = np.array([[x, y, z] for x in bounds[:, 0] for y in bounds[:, 1] for z in bounds[:, 2]])
+    return (corners - bounds.mean(axis=0)) @ np.stack([right, up], axis=1), ahead, up
 
 
 def _path_bounds(runs):
@@ -359,20 +369,49 @@ def labelled(image: Integers, text: str, titles: list[Any], chips: dict[str, Any
 
 
 def _draw_job(saved, job, seconds, stages):
-    views, colour = tuple(job["views"]), job.get("colour", "muscle")
+    views, size, colour = tuple(job["views"]), tuple(job["size"]), job.get("colour", "muscle")
     paint, chips = painting(saved, colour, job["frames"])
-    if (views, *job["size"], colour) not in stages:
-        stages[views, *job["size"], colour] = Stage([[(saved, view) for view in views]], job["size"], paint)
-    stage = stages[views, *job["size"], colour]
+    if job.get("fit"):
+        size = fitted_size(_path_bounds([saved]), views, size)
+    if (views, *size, colour) not in stages:
+        stages[views, *size, colour] = Stage([[(saved, view) for view in views]], size, paint)
+    stage = stages[views, *size, colour]
     titles = [f"{view} ({VIEWS[view][1]})" for view in job["views"]]
+    if paint is None:
+        # A legend of dozens says nothing that the table does not say better.
+        chips = stage.colours if len(saved.muscles) <= len(MUSCLE_COLOURS) else {}
     images = [labelled(stage.show(frame), caption(saved, frame), titles, chips) for frame in job["frames"]]
     save_images(images, job["file"], seconds)
 
 
+def fitted_size(bounds: Any, views: Any, size: Any) -> tuple[int, int]:
+    """A panel as large as asked for, in the proportions of what it shows.
+
+    Parameters
+    ----------
+    bounds : (2, 3) ndarray
+    views : sequence of str
+    size : (width, height)
+        Pixels.
+    """
+    spans = [np.ptp(_projected(VIEWS[view][0], bounds)[0], axis=0) for view in views]
+    wide, tall = np.max(spans, axis=0)
+    shape = float(np.clip(tall / max(wide, 1e-12), *_SHAPES))
+    area = float(size[0] * size[1])
+    # Even numbers: films ask for them.
+    return 2 * round(0.5 * (area / shape) ** 0.5), 2 * round(0.5 * (area * shape) ** 0.5)
+
+
 def save_images(images: list[Any], path: str, seconds: float) -> None:
-    """Save one picture, or several as an animation of so many seconds."""
+    """Save one picture, or several as an animation of so many seconds; all on sheets of one size."""
     from PIL import Image
 
+    width, height = (max(image.size[k] for image in images) for k in range(2))
+    for k, image in enumerate(images):
+        if image.size != (width, height):
+            sheet = Image.new("RGB", (width, height), BACKGROUND)
+            sheet.paste(image, (0, 0))
+            images[k] = sheet
     if len(images) == 1:
         images[0].save(path)
         return
@@ -397,9 +436,9 @@ def main(arguments: Any, opened: Any = SavedRun, draw_job: Any = _draw_job) -> A
             draw_job(found, job, task["seconds"], stages)
         for stage in stages.values():
             stage.close()
-    except (RBFMuscleError, OSError) as error:
+    except (RBFMuscleError, OSError, ValueError) as error:
         print(error, file=sys.stderr)
-        return 1
+        return _REFUSED
     return 0
 
 

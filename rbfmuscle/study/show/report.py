@@ -12,7 +12,18 @@ from rbfmuscle.study.measure.metrics import QUANTITIES
 from rbfmuscle.study.measure.summary import LEAST, within
 from rbfmuscle.study.show.appearance import line_colours
 from rbfmuscle.study.show.model_paths import beside_section
-from rbfmuscle.study.show.page import EXPLANATION, PAGE, STYLE, embedded_image
+from rbfmuscle.study.show.page import (
+    EXPLANATION,
+    MANY,
+    PAGE,
+    SORTING,
+    STYLE,
+    embedded_image,
+    find_field,
+    folded_events,
+    sortable_table,
+    worst_first,
+)
 from rbfmuscle.study.show.plots import plot_panels
 from rbfmuscle.study.show.render import USUAL_VIEWS, chosen_frames, draw_pictures
 from rbfmuscle.validation import SolveError
@@ -23,7 +34,7 @@ if TYPE_CHECKING:
 
 _PICTURE_SIZE = (330, 400)
 _PREVIEW_SIZE = (330, 400)
-_MOST_EVENTS = 60
+_MOST_EVENTS, _MOST_NAMED = 60, 16
 # What frames took of a muscle.
 _WORK = ("solved", "carried", "skipped", "substeps")
 # Volume, moment arms and stage times have tables or plots of their own.
@@ -85,14 +96,14 @@ def _jobs(saved, folder, animation, pictures, preview):
     if pictures:
         for frame in key_frames(saved):
             job = {"file": str(folder / f"{frame:06d}.png"), "frames": [frame], "views": list(USUAL_VIEWS)}
-            jobs.append({**job, "size": _PICTURE_SIZE})
+            jobs.append({**job, "size": _PICTURE_SIZE, "fit": True})
     if preview and len(saved.frames) > 1:
         job = {
             "file": str(animation.resolve()),
             "frames": chosen_frames(saved.frames),
             "views": ["front", "side"],
         }
-        jobs.append({**job, "size": _PREVIEW_SIZE})
+        jobs.append({**job, "size": _PREVIEW_SIZE, "fit": True})
     return jobs
 
 
@@ -113,6 +124,7 @@ def _page(saved, images, moving, reason):
         stages=_stages(saved),
         events=_events(saved),
         explanation=EXPLANATION,
+        script=SORTING,
         quantities="".join(
             f"<dt>{name}</dt><dd>{html.escape(meaning)}</dd>" for name, (_, meaning) in QUANTITIES.items()
         ),
@@ -164,7 +176,8 @@ def _verdict(saved):
     found = sorted(_beyond(saved))
     if not found:
         return '<p class="good">Every muscle stays within every limit in every frame.</p>'
-    listed = ", ".join(f"{muscle}: {name}" for muscle, name in found)
+    listed = ", ".join(f"{muscle}: {name}" for muscle, name in found[:_MOST_NAMED])
+    listed += f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
     return f'<p class="bad">Beyond a limit: {html.escape(listed)}. See the table below.</p>'
 
 
@@ -180,6 +193,10 @@ def _pictures(images, moving, reason):
 
 
 def _legend(saved):
+    if len(saved.muscles) >= MANY:
+        return "In each plot the muscles that go furthest are named; all others are grey. <span>" + (
+            '<i class="limit"></i>limit</span>'
+        )
     chips = "".join(
         f'<span><i style="background:{colour}"></i>{html.escape(name)}</span>'
         for name, colour in line_colours(saved.muscles).items()
@@ -190,19 +207,47 @@ def _legend(saved):
 def _summary(saved):
     muscles, beyond = saved.info["muscles"], _beyond(saved)
     used = [name for name in _TABLE if any(name in found for found in muscles.values())]
+    if len(muscles) >= MANY:
+        return _by_muscle(saved, muscles, beyond, used)
     head = "".join(f"<th>{html.escape(name)}</th>" for name in muscles)
     rows = []
     for name in used:
-        limit = saved.info["limits"].get(name)
-        unit = next(found[name]["unit"] for found in muscles.values() if name in found)
         cells = []
         for muscle, found in muscles.items():
             mark = ' class="bad"' if (muscle, name) in beyond else ""
             cells.append(f"<td{mark}>{_cell(name, found.get(name))}</td>")
-        shown = "" if limit is None else f"{'≥' if name in LEAST else '≤'} {limit:g}"
-        label = name if unit in ("1", "s") else f"{name} <small>{unit}</small>"
-        rows.append(f"<tr><th>{label}</th>{''.join(cells)}<td>{shown}</td></tr>")
+        rows.append(
+            f"<tr><th>{_named(name, muscles)}</th>{''.join(cells)}<td>{_shown_limit(saved, name)}</td></tr>"
+        )
     return f"<table><tr><th></th>{head}<th>limit</th></tr>{''.join(rows)}</table>"
+
+
+def _by_muscle(saved, muscles, beyond, used):
+    """A row a muscle, the worst first, for a report of many."""
+    head = [
+        "muscle",
+        *(f"{_named(name, muscles)}<br><small>{_shown_limit(saved, name)}</small>" for name in used),
+    ]
+    rows = []
+    for muscle in worst_first(muscles, beyond, saved.info["limits"]):
+        found = muscles[muscle]
+        cells = [(html.escape(muscle), muscle, False)]
+        for name in used:
+            facts = found.get(name) or {}
+            value = facts.get("median" if name == "time_frame" else "worst")
+            cells.append((_cell(name, facts), value, (muscle, name) in beyond))
+        rows.append(cells)
+    return find_field() + sortable_table(head, rows)
+
+
+def _named(name, muscles):
+    unit = next(found[name]["unit"] for found in muscles.values() if name in found)
+    return name if unit in ("1", "s") else f"{name} <small>{unit}</small>"
+
+
+def _shown_limit(saved, name):
+    limit = saved.info["limits"].get(name)
+    return "" if limit is None else f"{'≥' if name in LEAST else '≤'} {limit:g}"
 
 
 def _cell(name, facts):
@@ -217,24 +262,29 @@ def _cell(name, facts):
 
 
 def _stages(saved):
+    """What each stage took of each muscle, the most expensive first, and what its frames took."""
     stages, work = saved.info.get("stages") or {}, saved.info.get("work") or {}
     names = list(dict.fromkeys(key for table in stages.values() for key in table))
-    head = "".join(f"<th>{html.escape(name.removeprefix('time_'))}</th>" for name in names)
     rows = []
-    for muscle, table in stages.items():
-        cells = "".join(f"<td>{_milliseconds(table.get(name))}</td>" for name in names)
-        rows.append(f"<tr><th>{html.escape(muscle)}</th>{cells}{_work(work.get(muscle))}</tr>")
-    done = "".join(f"<th>{name}</th>" for name in (*_WORK, "mostly for"))
-    return f"<table><tr><th></th>{head}{done}</tr>{''.join(rows)}</table>"
+    for muscle, table in sorted(stages.items(), key=lambda row: -(_median(row[1].get("time_frame")) or 0.0)):
+        cells = [(html.escape(muscle), muscle, False)]
+        cells += [(_milliseconds(table.get(name)), _median(table.get(name)), False) for name in names]
+        rows.append(cells + _work(work.get(muscle)))
+    return sortable_table(["", *(name.removeprefix("time_") for name in names), *_WORK, "mostly for"], rows)
+
+
+def _median(facts):
+    value = facts and facts["median"]
+    return value if value is not None and math.isfinite(value) else None
 
 
 def _work(done):
     """Cells of what the frames took of a muscle."""
     if not done:
-        return "<td>-</td>" * (len(_WORK) + 1)
+        return [("-", None, False)] * len(_WORK) + [("-", "", False)]
     most = max(done["reasons"], key=lambda state: done[state], default="")
-    counts = "".join(f"<td>{done[name]}</td>" for name in _WORK)
-    return f"{counts}<td>{html.escape(done['reasons'].get(most, ''))}</td>"
+    counts = [(str(done[name]), done[name], False) for name in _WORK]
+    return [*counts, (html.escape(done["reasons"].get(most, "")), "", False)]
 
 
 def _milliseconds(facts):
@@ -244,13 +294,4 @@ def _milliseconds(facts):
 
 
 def _events(saved):
-    if not saved.events:
-        return '<p class="note">None.</p>'
-    head = "<tr><th>frame</th><th>muscle</th><th>bone</th><th>count</th><th>action</th></tr>"
-    rows = "".join(
-        "<tr>" + "".join(f"<td>{html.escape(str(value))}</td>" for value in event) + "</tr>"
-        for event in saved.events[:_MOST_EVENTS]
-    )
-    left = len(saved.events) - _MOST_EVENTS
-    more = f'<p class="note">and {left} more in events.csv</p>' if left > 0 else ""
-    return f"<table>{head}{rows}</table>{more}"
+    return folded_events(saved.events, _MOST_EVENTS) if saved.events else '<p class="note">None.</p>'
