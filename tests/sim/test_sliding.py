@@ -117,6 +117,25 @@ def test_pressed_muscles_do_not_overlap():
     assert "time_sliding" in frames[-1].times["upper"]
 
 
+def test_pairs_say_how_they_overlap_and_come_apart():
+    pressed, parts = _run(PRESS, SlidingOptions())
+    assert list(pressed[-1].neighbours) == [("lower", "upper")]
+    overlap, _ = pressed[-1].neighbours["lower", "upper"]
+    # The judge measures faces, the loop interpolated vertex normals: a tenth of a millimetre apart.
+    assert overlap == pytest.approx(_overlap(parts), abs=0.1)
+    assert pressed[0].neighbours["lower", "upper"][1] == 0.0
+    lifted, _ = _run([{"lift": a} for a in (0, 6, 12)], SlidingOptions(release=0.1))
+    gaps = [frame.neighbours["lower", "upper"][1] for frame in lifted]
+    assert gaps[0] == 0.0 and 0.5 < gaps[1] < gaps[2]
+
+
+def test_muscles_far_apart_are_told_by_their_boxes_alone():
+    near, far = CarriedSurface(_ball(), reach=3.0), CarriedSurface(_ball(), reach=3.0)
+    assert not near.apart(far, 3.0)
+    far.reach_box = far.reach_box + [0, 0, 30.0]
+    assert near.apart(far, 3.0)
+
+
 def test_both_give_way():
     _, parts = _run(PRESS, SlidingOptions())
     _, alone = _run(PRESS, None)

@@ -4,10 +4,12 @@ import base64
 import io
 import re
 from html.parser import HTMLParser
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 from blend_model import arm_scene, use_blend_model
 from PIL import Image
 
@@ -15,6 +17,7 @@ import rbfmuscle.study.show.render as render
 from rbfmuscle.run import simulate, stream_run
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.summary import within
+from rbfmuscle.study.show.page import folded_events
 from rbfmuscle.study.show.plots import motion_axis, plot_panels
 from rbfmuscle.study.show.report import write_report
 from rbfmuscle.validation import MissingPartError, UsageError
@@ -39,7 +42,7 @@ class Balance(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.sources += [value for name, value in attrs if name in ("src", "href")]
-        if tag not in ("meta", "img", "br"):
+        if tag not in ("meta", "img", "br", "input"):
             self.open.append(tag)
 
     def handle_endtag(self, tag):
@@ -152,3 +155,71 @@ def test_axis_is_the_frame_on_the_way_there_and_back():
     places, label = motion_axis(SimpleNamespace(info={"frames": rows}, frames=[0, 1, 2]))
     assert label == "frame"
     assert places == {0: 0, 1: 1, 2: 2}
+
+
+@pytest.fixture(scope="module")
+def crowd(tmp_path_factory):
+    """Folder of a saved run of twelve muscles, one of which goes beyond a limit."""
+    place = tmp_path_factory.mktemp("crowd")
+    with pytest.MonkeyPatch.context() as patch:
+        use_blend_model(patch)
+        scene = arm_scene(end=20)
+        one = scene.muscles[0]
+        for k in range(1, 12):
+            mesh = one.mesh.copy()
+            mesh.apply_translation([0.0, 11.0 * k, 0.0])
+            # The last lies partly in a bone of its own.
+            attach = [{"bone": a.bone, "vertices": np.asarray(a.vertices).tolist()} for a in one.attachments]
+            scene.add_muscle(f"muscle_{k:02d}", mesh, attach=attach)
+        # It runs through the seventh.
+        nail = trimesh.creation.box((4, 4, 40))
+        nail.apply_translation([0.0, 11.0 * 7, 9.5])
+        scene.add_bone("nail", nail)
+        simulate(scene).save(place)
+    return place
+
+
+def test_dozens_of_muscles_have_a_row_each_the_worst_first(crowd):
+    write_report(crowd, preview=False, pictures=False)
+    text, _ = read(crowd)
+    table = text[text.index("<h2>Summary") : text.index("<h2>Events")]
+    names = re.findall(r"<tr><th>([a-z_0-9]+)</th>", table[table.index("</thead>") :])
+    assert len(names) == 12 and names[0] == "muscle_07"
+    assert 'class="find"' in table and 'class="sortable"' in table
+    first = table[table.index("<tr><th>muscle_07") : table.index("</tr>", table.index("<tr><th>muscle_07"))]
+    assert first.count('class="bad"') >= 1
+    assert sum('class="bad"' in row for row in table.split("<tr>")) == 1
+    assert "muscle_07" in text[: text.index("<h2>Motion")]
+
+
+def test_events_are_folded_by_kind():
+    events = [(k, "one", "bone", 1, "halved") for k in range(70)] + [(3, "", "bone", 1, "bones_overlap")]
+    text = folded_events(events, 60)
+    assert text.count("<details>") == 2 and "and 10 more" in text
+    assert text.index("halved") < text.index("bones_overlap") and "one 70" in text
+
+
+def test_neighbours_of_many_have_different_colours(crowd):
+    colours = render.neighbour_colours(SavedRun(crowd))
+    names = sorted(name for name in colours if name.startswith("muscle"))
+    # They lie 11 mm apart and are 10 mm wide: each touches the next, none the one after.
+    assert all(colours[one] != colours[two] for one, two in pairwise(names))
+    assert len(set(colours.values())) > 4
+
+
+@pytest.mark.parametrize(("spans", "taller"), [((10, 10, 100), True), ((100, 10, 20), False)])
+def test_panels_have_the_proportions_of_what_they_show(spans, taller):
+    bounds = np.array([[0.0, 0.0, 0.0], spans])
+    width, height = render.fitted_size(bounds, ["front", "side"], (330, 400))
+    assert (height > 2 * width) == taller and (height > width) == taller
+    assert width * height == pytest.approx(330 * 400, rel=0.02)
+    assert width % 2 == height % 2 == 0
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".gif"])
+def test_frames_of_different_heights_make_one_animation(tmp_path, suffix):
+    path = str(tmp_path / f"moving{suffix}")
+    images = [Image.new("RGB", (80, height), "#aa3333") for height in (60, 75, 60)]
+    render.save_images(images, path, 1.0)
+    with Image.open(path) as made:
+        assert (made.size, made.n_frames) == ((80, 75), 3) or suffix == ".gif"

@@ -57,7 +57,8 @@ class CarriedSurface:
     vertices : (n, 3) ndarray
     fixed : (n,) ndarray of bool
         Vertices that a bone holds.
-    box : (2, 3) ndarray
+    box, reach_box : (2, 3) ndarray
+        About the surface, and about the model's contact points.
     field : Field or None
         The field whose zero set is shown, for models that have one.
     """
@@ -82,10 +83,20 @@ class CarriedSurface:
         self.vertices = np.ascontiguousarray(self.model.carried_mesh()[0], dtype=np.float64)
         self.normals = vertex_normals(self.vertices, self.faces)
         self.box = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+        points = self.model.contact_points()
+        #: Box about all that the model meets others with.
+        self.reach_box = np.array([points.min(axis=0), points.max(axis=0)])
         shape = (np.ceil((self.box[1] - self.box[0]) / self.cell).astype(np.int64) + 1).clip(1)
         first = np.zeros(int(np.prod(shape)) + 1, dtype=np.int64)
         self.cells = Cells(self.box, self.cell, shape, first, np.empty(len(self.vertices), dtype=np.int64))
         _fill_loop(self.vertices, self.cells)
+
+    def apart(self, other: CarriedSurface, reach: float) -> bool:
+        """Whether no point of the other muscle can be nearer than ``reach`` to this surface, by their boxes."""
+        return bool(
+            np.any(other.reach_box[0] > self.box[1] + reach)
+            or np.any(other.reach_box[1] < self.box[0] - reach)
+        )
 
     def query(self, points: Floats, which: Booleans, reach: float) -> Any:
         """Distances of those points that are nearer than ``reach``.

@@ -102,6 +102,8 @@ class Frame:
         What a loop needs to go on from this frame; empty where it was not asked for.
     work : dict of str to Work
         Whether each muscle was solved for the frame, carried along as it was, or left where it was, and why.
+    neighbours : dict of (str, str) to (float, float)
+        Of muscles that slide, by pair: their overlap, and the gap opened where they touched at rest (RMS).
     """
 
     index: int
@@ -117,6 +119,7 @@ class Frame:
     activations: dict = field(default_factory=dict)
     state: dict = field(default_factory=dict)
     work: dict = field(default_factory=dict)
+    neighbours: dict = field(default_factory=dict)
 
 
 class Drawing(Protocol):

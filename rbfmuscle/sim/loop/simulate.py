@@ -88,6 +88,7 @@ class FrameLoop:
             if not carrier.never:
                 self._own_sub_steps[stepper.name] = self._cut_for(carrier)
         self._next_index, self._wall = 0, 0.0
+        self._pairs: dict[tuple[str, str], tuple[float, float]] = {}
         self.workers = Workers(len(self.steppers))
         try:
             with self.clocked(), self.workers.one_thread_each():
@@ -160,6 +161,7 @@ class FrameLoop:
         frame.activations.update(self.activations.here)
         if self.resumable:
             frame.state.update(self._state())
+        frame.neighbours.update(self._pairs)
         frame.work.update({stepper.name: stepper.work for stepper in self.steppers})
         return frame
 
@@ -287,6 +289,7 @@ class FrameLoop:
             self.workers.each(self._sliding.refresh, self.steppers)
             for stepper, found in zip(self.steppers, self.workers.each(self._sliding.measure, self.steppers)):
                 stepper.measured = found
+            self._pairs = self._sliding.pairs()
         drawings = [stepper.drawing() for stepper in self.steppers]
         if self._sliding is not None:
             self.workers.each(self._sliding.show, drawings)

@@ -11,8 +11,9 @@ does not depend on the order in which muscles are solved, nor on how many run at
 
 from __future__ import annotations
 
+import math
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -31,6 +32,31 @@ THRESHOLD, STRIP, RELEASE = 2.0, 1.0, 2.0
 SEARCH = 5.0
 # Distance [mm] between the surfaces as solved below which they are cut, and how deep an overlap may be.
 CUT_FROM, CUT_DEPTH = 4.0, 6.0
+
+
+# The answer for muscles that are nowhere near each other.
+_FAR = (np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, dtype=np.int64))
+
+
+class Met(NamedTuple):
+    """How a muscle lies to a neighbour.
+
+    Attributes
+    ----------
+    overlap : float
+        Its deepest point in the neighbour, 0 where none is.
+    touching : int
+        Points that touch the neighbour at rest.
+    opened : float
+        Sum of the squares of how much farther these are now.
+    """
+
+    overlap: float
+    touching: int
+    opened: float
+
+
+_NOTHING = Met(0.0, 0, 0.0)
 
 
 class Planes:
@@ -77,6 +103,10 @@ class Link:
         self.zone = None
         index, distance, _, _ = self._near()
         self.linked[index[distance < limits.threshold]] = True
+        near = distance < limits.threshold
+        #: Points that touch the neighbour at rest, and how far they are from it there.
+        self.touching, self.gap = index[near], distance[near]
+        self.found = _NOTHING
 
     def update(self) -> None:
         """Planes from both muscles' predicted states."""
@@ -99,6 +129,7 @@ class Link:
         points = self.stepper.model.contact_points()
         index, distance, normal, nearest = self._near()
         held = self.linked[index]
+        self.found = self._met(index, distance)
         close = distance < self.limits.cut_from
         self.zone = _box(points[index[close]], self.limits.cut_depth) if close.any() else None
         found = {
@@ -108,6 +139,13 @@ class Link:
         }
         self.before = points.copy(), self.other.vertices.copy()
         return found
+
+    def _met(self, index: Any, distance: Any) -> Met:
+        """How deep the muscle is in the neighbour, and how far what touched it at rest has come away."""
+        apart = np.full(len(self.free), self.limits.search)
+        apart[index] = distance
+        opened = np.maximum(apart[self.touching] - np.maximum(self.gap, 0.0), 0.0)
+        return Met(max(0.0, -float(distance.min(initial=0.0))), len(opened), float((opened**2).sum()))
 
     def cut(self, points: Floats) -> Any:
         """Half the difference of both muscles' distances near where they meet, infinity elsewhere."""
@@ -138,6 +176,8 @@ class Link:
         return value, gradient
 
     def _near(self):
+        if self.other.apart(self.own, self.limits.search):
+            return _FAR
         return self.other.query(self.stepper.model.contact_points(), self.free, self.limits.search)
 
     def _slip(self, points, index, normal, nearest):
@@ -225,6 +265,25 @@ class Sliding:
                 self.bone_links[stepper.name] = held
                 stepper.contacts.neighbours += [link.pull for link in held]
 
+    def pairs(self) -> dict[tuple[str, str], tuple[float, float]]:
+        """Overlap, and gap opened where they touched (RMS), of each pair that touches or touched, when measured last.
+
+        Both muscles are asked; a pair that never met is left out.
+        """
+        met: dict[tuple[str, str], list[Met]] = {}
+        for name, links in self.links.items():
+            for link in links:
+                one, other = sorted((name, link.other.model.name))
+                met.setdefault((one, other), []).append(link.found)
+        return {
+            pair: (
+                max(m.overlap for m in found),
+                _rms(sum(m.opened for m in found), sum(m.touching for m in found)),
+            )
+            for pair, found in met.items()
+            if any(m.touching or m.overlap for m in found)
+        }
+
     def refresh(self, stepper: Any) -> None:
         """Take over a muscle's surface as it is now."""
         if stepper.name in self.surfaces:
@@ -292,6 +351,10 @@ def sliding_pairs(scene: Scene, names: list[str], reach: float) -> set[frozenset
         (i, k, frozenset((muscles[i].name, muscles[k].name))) for i in range(len(muscles)) for k in range(i)
     ]
     return {pair for i, k, pair in pairs if (not wanted or pair in wanted) and meet(i, k)}
+
+
+def _rms(squares, count):
+    return math.sqrt(squares / count) if count else 0.0
 
 
 def _box(points, pad):

@@ -91,6 +91,7 @@ def build_info(
         "compiled": clock.compiled,
         "stages": clock.stages.table(),
         "work": clock.stages.work(),
+        **({"neighbours": clock.stages.neighbours()} if clock.stages.pairs else {}),
         "limits": limits,
         "muscles": {name: facts for name, facts in summary.items() if name != "all"},
         "frame_time": summary.get("all", {}).get("time_frame"),
@@ -116,9 +117,16 @@ class Stages:
         self._values = defaultdict(lambda: defaultdict(list))
         self._work = defaultdict(Counter)
         self._reasons = defaultdict(Counter)
+        #: Pairs of neighbours: worst overlap and its frame, worst gap and its frame.
+        self.pairs: dict[tuple[str, str], tuple[float, int, float, int]] = {}
 
     def add(self, frame: Frame) -> None:
         """Take in a frame's times and those that its surfaces report."""
+        for pair, (overlap, gap) in frame.neighbours.items():
+            deepest, at, widest, there = self.pairs.get(pair, (-1.0, 0, -1.0, 0))
+            deepest, at = max((deepest, at), (overlap, frame.index), key=lambda found: found[0])
+            widest, there = max((widest, there), (gap, frame.index), key=lambda found: found[0])
+            self.pairs[pair] = deepest, at, widest, there
         for name, work in frame.work.items():
             self._work[name].update({work.state: 1, "substeps": work.substeps})
             self._reasons[name, work.state][work.reason] += 1
@@ -138,7 +146,8 @@ class Stages:
         }
         work = {name: dict(count) for name, count in self._work.items()}
         reasons = [[*key, reason, n] for key, found in self._reasons.items() for reason, n in found.items()]
-        return {"times": times, "work": work, "reasons": reasons}
+        pairs = [[*pair, *found] for pair, found in self.pairs.items()]
+        return {"times": times, "work": work, "reasons": reasons, "pairs": pairs}
 
     def go_on(self, state: dict[str, Any]) -> None:
         """Take over the times and work of the frames before."""
@@ -149,6 +158,14 @@ class Stages:
             self._work[name].update(count)
         for name, kind, reason, count in state["reasons"]:
             self._reasons[name, kind][reason] += count
+        for one, other, *found in state["pairs"]:
+            self.pairs[one, other] = tuple(found)
+
+    def neighbours(self) -> list[dict[str, Any]]:
+        """Pairs of neighbours, the deepest overlap first [scene unit]."""
+        names = ("overlap_max", "overlap_frame", "gap_rms", "gap_frame")
+        found = [{"muscles": list(pair), **dict(zip(names, worst))} for pair, worst in self.pairs.items()]
+        return sorted(found, key=lambda row: -row["overlap_max"])
 
     def work(self) -> dict[str, Any]:
         """Nested dict: muscle -> frames ``solved``, ``carried``, ``skipped``; ``substeps``; commonest ``reasons``."""

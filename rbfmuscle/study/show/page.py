@@ -90,7 +90,7 @@ PAGE = """<!doctype html>
 <h2>Motion</h2>{pictures}
 <h2>Over the motion</h2><p class="legend">{legend}</p><div class="plots">{plots}</div>{beside}
 <h2>Summary</h2><div class="wide">{table}</div>
-<h2>Events</h2>{events}
+{neighbours}<h2>Events</h2>{events}
 <h2>Time of each stage</h2><p class="note">Milliseconds a frame: median, and the 95th percentile in grey; then in
 how many frames a muscle was solved, carried along as it was, or left where it was, in how many sub-steps, and why.</p>
 <div class="wide">{stages}</div>

@@ -125,6 +125,7 @@ def _page(saved, images, moving, reason):
         events=_events(saved),
         explanation=EXPLANATION,
         script=SORTING,
+        neighbours=_neighbours(saved),
         quantities="".join(
             f"<dt>{name}</dt><dd>{html.escape(meaning)}</dd>" for name, (_, meaning) in QUANTITIES.items()
         ),
@@ -291,6 +292,28 @@ def _milliseconds(facts):
     if not facts or facts["median"] is None or not math.isfinite(facts["median"]):
         return "-"
     return f"{1000 * facts['median']:.1f} <small>{1000 * facts['p95']:.1f}</small>"
+
+
+def _neighbours(saved):
+    """Pairs of muscles that slide on each other, the deepest overlap first."""
+    pairs = saved.info.get("neighbours") or []
+    if not pairs:
+        return ""
+    rows = [
+        [
+            (html.escape(" and ".join(pair["muscles"])), "", False),
+            (
+                f"{pair['overlap_max']:.3g} <small>frame {pair['overlap_frame']}</small>",
+                pair["overlap_max"],
+                False,
+            ),
+            (f"{pair['gap_rms']:.3g} <small>frame {pair['gap_frame']}</small>", pair["gap_rms"], False),
+        ]
+        for pair in pairs
+    ]
+    unit = html.escape(saved.units)
+    head = ["pair", f"overlap <small>{unit}</small>", f"gap opened, RMS <small>{unit}</small>"]
+    return f'<h2>Neighbours</h2><div class="wide">{sortable_table(head, rows)}</div>'
 
 
 def _events(saved):

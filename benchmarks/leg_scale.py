@@ -1,0 +1,137 @@
+"""How the cost of a frame grows with the muscles, on the whole leg in a squat.
+
+    python benchmarks/leg_scale.py [--model rbf] [--frames 5] [--counts 1,4,10,20,38] [--hip]
+
+Processor time of frames with surfaces, one thread, each number of muscles in turn within every round, so that whatever
+else the machine does meets all of them alike; muscles are taken in an order in which every beginning has the area of
+the whole on average. The exponent is the slope of log time over log number. With ``--hip`` the four muscles of
+``data/hip`` are measured in the same rounds. ``--threads`` measures wall time of all muscles on one and on two threads.
+"""
+
+import argparse
+import os
+import time
+from pathlib import Path
+
+import numba
+import numpy as np
+
+from rbfmuscle.models import build_models
+from rbfmuscle.sim.loop.simulate import FrameLoop
+from rbfmuscle.sim.plan.reach import build_fields, reached_bones
+from rbfmuscle.sim.scene.scene import Scene
+
+FIRST = 2  # frames that are gone to before any is measured
+
+
+def data_folder():
+    """Where ``leg`` and ``hip`` are."""
+    for place in (os.environ.get("RBFMUSCLE_DATA"), Path(__file__).resolve().parents[2] / "shared" / "data"):
+        if place and (Path(place) / "leg").is_dir():
+            return Path(place)
+    raise SystemExit("data/leg is not here; set RBFMUSCLE_DATA to the folder that holds leg/")
+
+
+def evenly_mixed(scene):
+    """Names of the muscles, each beginning of the list with the mean area of all."""
+    area = {muscle.name: float(muscle.mesh.area) for muscle in scene.muscles}
+    mean, chosen, total = np.mean(list(area.values())), [], 0.0
+    while area:
+        name = min(area, key=lambda name: abs((total + area[name]) / (len(chosen) + 1) - mean))
+        total += area.pop(name)
+        chosen.append(name)
+    return chosen
+
+
+class Track:
+    """Some muscles of a scene on their way through its motion."""
+
+    def __init__(self, scene, names, models, fields):
+        self.scene = scene.copy()
+        self.scene.muscles = [muscle for muscle in scene.muscles if names is None or muscle.name in names]
+        self.models = [models[muscle.name] for muscle in self.scene.muscles]
+        self.rest = [model.snapshot() for model in self.models]
+        self.fields = fields
+
+    def times(self, frames):
+        """Processor and wall time of some frames, one after the other [s]."""
+        for model, state in zip(self.models, self.rest):
+            model.restore(state)
+        path = self.scene.motion.frames
+        with FrameLoop(self.scene, self.models, fields=self.fields) as loop:
+            for coordinates in path[:FIRST]:
+                loop.advance(coordinates)
+            found = []
+            for coordinates in path[FIRST : FIRST + frames]:
+                start = time.process_time(), time.perf_counter()
+                loop.advance(coordinates)
+                found.append((time.process_time() - start[0], time.perf_counter() - start[1]))
+        return np.array(found)
+
+
+def loaded(path, model):
+    scene = Scene.load(path).with_options({}, model=model)
+    models = {built.name: built for built in build_models(scene)}
+    return scene, models, build_fields(scene, reached_bones(scene))
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--model", default=None)
+    parser.add_argument("--frames", type=int, default=5)
+    parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument("--counts", default="1,4,10,20,38")
+    parser.add_argument("--hip", action="store_true")
+    parser.add_argument("--threads", action="store_true")
+    arguments = parser.parse_args()
+    folder = data_folder()
+    scene, models, fields = loaded(folder / "leg" / "squat.toml", arguments.model)
+    order = evenly_mixed(scene)
+    tracks = {
+        f"{count}": Track(scene, set(order[:count]), models, fields)
+        for count in map(int, arguments.counts.split(","))
+    }
+    if arguments.hip:
+        tracks["hip"] = Track(*_with_names(loaded(folder / "hip" / "flexion.toml", arguments.model)))
+    if arguments.threads:
+        _threads(Track(scene, None, models, fields), arguments)
+        return
+    numba.set_num_threads(1)
+    found = {name: [] for name in tracks}
+    for _ in range(arguments.rounds):
+        for name, track in tracks.items():
+            found[name].append(track.times(arguments.frames))
+    medians = {name: float(np.median(np.concatenate(rounds)[:, 0])) for name, rounds in found.items()}
+    for name, seconds in medians.items():
+        print(f"{name:>4} muscles: {1e3 * seconds:8.1f} ms of processor time a frame")
+    counts = [name for name in medians if name != "hip"]
+    slope = np.polyfit(np.log([int(c) for c in counts]), np.log([medians[c] for c in counts]), 1)[0]
+    print(f"exponent {slope:.3f}")
+    if arguments.hip:
+        print(f"squat beside the hip's four muscles: {medians[counts[-1]] / medians['hip']:.2f} times")
+
+
+def _with_names(parts):
+    scene, models, fields = parts
+    return scene, None, models, fields
+
+
+def _threads(track, arguments):
+    walls = {1: [], 2: []}
+    for _ in range(arguments.rounds):
+        for threads, wall in walls.items():
+            numba.set_num_threads(threads)
+            wall.append(track.times(arguments.frames))
+    one, two = (np.concatenate(walls[threads]) for threads in (1, 2))
+    print(
+        f"one thread:  {1e3 * np.median(one[:, 1]):.0f} ms a frame, processor {1e3 * np.median(one[:, 0]):.0f}"
+    )
+    print(
+        f"two threads: {1e3 * np.median(two[:, 1]):.0f} ms a frame, processor {1e3 * np.median(two[:, 0]):.0f}"
+    )
+    print(f"two against one: {np.median(two[:, 1]) / np.median(one[:, 1]):.2f} of the wall time, "
+          f"{np.median(two[:, 0]) / np.median(one[:, 0]):.2f} of the processor time")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
