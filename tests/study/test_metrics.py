@@ -12,7 +12,7 @@ from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
 from rbfmuscle.sim.joints.joint import Coordinate
 from rbfmuscle.sim.loop.simulate import Event, Frame, ModelSurface
 from rbfmuscle.sim.scene.motion import Motion
-from rbfmuscle.study.measure.centreline import Centreline, slice_operator
+from rbfmuscle.study.measure.centreline import Centreline, slice_operator, split_ends
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.measure.metrics import (
     MetricsRecorder,
@@ -245,6 +245,18 @@ class TestLength:
         start[1, 3] = radius
         # 17 chords of an arc of 95 degrees are 0.04 % short.
         assert line.length(bent, {"trunk": start, "limb": pose}) == pytest.approx(100, rel=3e-3)
+
+    def test_bones_whose_joint_rests_are_one_end(self):
+        rows = [("tibiofibular", "tibia", "fibula"), ("ankle", "tibia", "talus"), ("knee", "femur", "tibia")]
+        joints = [SimpleNamespace(name=n, parent=p, child=c, coordinates=BEND) for n, p, c in rows]
+        soleus = SimpleNamespace(attachments=[SimpleNamespace(bone=b) for b in ("fibula", "tibia", "talus")])
+
+        def ends(moving):
+            return [[a.bone for a in group] for group in split_ends(soleus, joints, moving)]
+
+        assert ends({"ankle"}) == ends({"ankle", "knee"}) == [["fibula", "tibia"], ["talus"]]
+        # Where nothing moves its ends against each other, they are those of joints that all might move.
+        assert ends({"knee"}) == ends(None) == [["fibula"], ["tibia", "talus"]]
 
     def test_slice_rows_sum_to_one_and_hit_the_level(self):
         mesh = rod()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import harmonic_weights
+from rbfmuscle.sim.joints.skeleton import all_coordinates
 
 _FINE, _SLICES = 120, 16
 
@@ -32,12 +34,21 @@ class Centreline:
         The carried mesh at rest [scene unit].
     slices : int
         Points of the line between its ends.
+    moving : collection of str, optional
+        Names of the joints that move; all where not given.
     """
 
     def __init__(
-        self, muscle: Any, joints: list[Any], vertices: Floats, faces: Integers, *, slices: int = _SLICES
+        self,
+        muscle: Any,
+        joints: list[Any],
+        vertices: Floats,
+        faces: Integers,
+        *,
+        slices: int = _SLICES,
+        moving: Collection[str] | None = None,
     ) -> None:
-        self.ends = end_groups(muscle, joints)
+        self.ends = end_groups(muscle, joints, moving)
         sides = _sides(muscle, self.ends, vertices)
         field = harmonic_weights(vertices, faces, sides)[:, 1]
         levels = np.linspace(0.0, 1.0, _FINE + 2)[1:-1]
@@ -68,11 +79,13 @@ class Centreline:
         return float(np.linalg.norm(np.diff(self.points(vertices, poses), axis=0), axis=1).sum())
 
 
-def end_groups(muscle: Any, joints: list[Any]) -> list[list[tuple[Any, ...]]]:
+def end_groups(
+    muscle: Any, joints: list[Any], moving: Collection[str] | None = None
+) -> list[list[tuple[Any, ...]]]:
     """Split the attachments into origin and insertion.
 
-    The origin is every attachment on the same rigid body as the first one; the rest is the insertion. Where
-    all are on one body, the first attachment is the origin.
+    The origin is every attachment on the same rigid body as the first one; the rest is the insertion. Bones whose
+    joint does not move are one body with its parent. Where all are on one body, the first attachment is the origin.
 
     Returns
     -------
@@ -81,17 +94,40 @@ def end_groups(muscle: Any, joints: list[Any]) -> list[list[tuple[Any, ...]]]:
     """
     vertices = np.asarray(muscle.mesh.vertices, dtype=float)
     return [
-        [(a.bone, vertices[np.asarray(a.vertices)]) for a in group] for group in split_ends(muscle, joints)
+        [(a.bone, vertices[np.asarray(a.vertices)]) for a in group]
+        for group in split_ends(muscle, joints, moving)
     ]
 
 
-def split_ends(muscle: Any, joints: list[Any]) -> list[Any]:
+def split_ends(muscle: Any, joints: list[Any], moving: Collection[str] | None = None) -> list[Any]:
     """The attachments of the origin and those of the insertion, as `end_groups` tells them apart."""
-    children = {joint.child for joint in joints}
-    body = [a.bone if a.bone in children else None for a in muscle.attachments]
-    origin = [a for a, owner in zip(muscle.attachments, body) if owner == body[0]]
-    insertion = [a for a, owner in zip(muscle.attachments, body) if owner != body[0]]
-    return [origin, insertion] if insertion else [muscle.attachments[:1], muscle.attachments[1:]]
+    joint_of = {joint.child: joint for joint in joints}
+
+    def body(bone):
+        while moving is not None and bone in joint_of and joint_of[bone].name not in moving:
+            bone = joint_of[bone].parent
+        return bone if bone in joint_of else None
+
+    bodies = [body(a.bone) for a in muscle.attachments]
+    origin = [a for a, owner in zip(muscle.attachments, bodies) if owner == bodies[0]]
+    insertion = [a for a, owner in zip(muscle.attachments, bodies) if owner != bodies[0]]
+    if insertion:
+        return [origin, insertion]
+    if moving is not None:
+        return split_ends(muscle, joints)
+    return [muscle.attachments[:1], muscle.attachments[1:]]
+
+
+def moving_joints(scene: Any) -> set[str]:
+    """Names of the joints that a scene's motion moves, those that follow others among them."""
+    facts = all_coordinates(scene.joints)
+    names = {
+        name for frame in scene.motion.frames for name, value in frame.items() if value != facts[name].rest
+    }
+    for coupling in scene.couplings:  # in an order in which what they follow is known
+        if names & set(coupling.of):
+            names.add(coupling.coordinate)
+    return {name.rpartition(".")[0] for name in names}
 
 
 def slice_operator(vertices: Floats, faces: Integers, field: Floats, levels: Floats) -> Any:

@@ -14,7 +14,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
 from rbfmuscle.sim.joints.skeleton import all_coordinates
 from rbfmuscle.sim.scene.motion import shown_value
-from rbfmuscle.study.measure.centreline import Centreline
+from rbfmuscle.study.measure.centreline import Centreline, moving_joints
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.measure.penetration import BoneProbe, bone_depth, surface_depth
 from rbfmuscle.study.measure.topology import euler_characteristic, self_crossing
@@ -208,7 +208,9 @@ class _Tracker:
         self.edges = unique_edges(faces)
         self.rest_lengths = edge_lengths(vertices, self.edges)
         has_line = len(muscle.attachments) > 1
-        self.line = Centreline(muscle, scene.joints, vertices, faces) if has_line else None
+        self.line = None
+        if has_line:
+            self.line = Centreline(muscle, scene.joints, vertices, faces, moving=moving_joints(scene))
         self.contraction = _contraction(muscle, scene, vertices, faces)
         self.length = math.nan
         self.rest_measured = False
