@@ -223,3 +223,13 @@ def test_frames_of_different_heights_make_one_animation(tmp_path, suffix):
     render.save_images(images, path, 1.0)
     with Image.open(path) as made:
         assert (made.size, made.n_frames) == ((80, 75), 3) or suffix == ".gif"
+
+
+def test_long_captions_take_more_lines():
+    picture = np.full((50, 300, 3), 255, dtype=np.uint8)
+    text = "frame 12, " + ", ".join(f"joint_{k}.coordinate {k}°" for k in range(4))
+    sheet = render.labelled(picture, text, ["front"], {"muscle": "#aa0000"})
+    short = render.labelled(picture, "frame 12", ["front"], {"muscle": "#aa0000"})
+    assert sheet.size[0] == 300 and sheet.size[1] > short.size[1]
+    # Nothing of the caption is cut off by the right edge.
+    assert (np.asarray(sheet)[50:, -4:] == 255).all()

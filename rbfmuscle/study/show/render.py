@@ -350,8 +350,9 @@ def labelled(image: Integers, text: str, titles: list[Any], chips: dict[str, Any
     pen = ImageDraw.Draw(Image.new("RGB", (1, 1)))
     # Where each word begins: side by side, and in another line where there is no room.
     x, y, places = 8, height + 7, []
-    for name in [text, *chips]:
-        wide = int(pen.textlength(name, font=font)) + (17 if places else 0)
+    parts = [text] if pen.textlength(text, font=font) <= width - 16 else text.split(", ")
+    for name in [*parts, *chips]:
+        wide = int(pen.textlength(name, font=font)) + (17 if len(places) >= len(parts) else 0)
         if places and x + wide > width:
             x, y = 8, y + _STRIP - 8
         places.append((x, y))
@@ -361,8 +362,9 @@ def labelled(image: Integers, text: str, titles: list[Any], chips: dict[str, Any
     pen = ImageDraw.Draw(sheet)
     for k, title in enumerate(titles):
         pen.text((k * width // len(titles) + 8, 6), title, fill="#8a8a8a", font=font)
-    pen.text(places[0], text, fill="#333333", font=font)
-    for (x, y), (name, colour) in zip(places[1:], chips.items()):
+    for place, part in zip(places, parts):
+        pen.text(place, part, fill="#333333", font=font)
+    for (x, y), (name, colour) in zip(places[len(parts) :], chips.items()):
         pen.rectangle((x, y + 2, x + 12, y + 14), fill=colour)
         pen.text((x + 17, y), name, fill="#333333", font=font)
     return sheet
