@@ -16,28 +16,50 @@ from rbfmuscle.compiled.watch import tell_stage
 from rbfmuscle.validation import SceneError
 
 
-def check(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False) -> int:
+def check(
+    scene: Path,
+    *,
+    picture: Annotated[bool, Parameter(negative="")] = False,
+    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+) -> int:
     """Check a scene file and its meshes; nothing is solved.
 
     Parameters
     ----------
     scene
         Scene file (TOML).
+    picture
+        Draw patches, joint axes, far ends and overlaps to a PNG beside the scene file.
     as_json
         Print JSON and nothing else.
     """
     with Progress(f"check {scene.name}"):
         loaded, findings = _findings(scene)
+    drawn = _draw(loaded, scene) if picture else None
     errors = [finding for finding in findings if finding.level == "error"]
     if as_json:
         shown = [{"level": f.level, "place": f.place, "message": f.message} for f in findings]
-        print(json.dumps({"scene": loaded.resolved(), "findings": shown}, indent=1))
+        facts = {"scene": loaded.resolved(), "findings": shown}
+        print(json.dumps(facts if drawn is None else {**facts, "picture": drawn}, indent=1))
     else:
         _print_scene(loaded)
         for finding in findings:
             print(finding)
+        if drawn is not None:
+            print(
+                f"{drawn['file']}: {drawn['far_ends']} ends far from their bone, {drawn['overlaps']} overlaps"
+            )
         print("not usable" if errors else "usable", file=sys.stderr)
     return SceneError.exit_code if errors else 0
+
+
+def _draw(scene, path):
+    """Draw a scene beside its file; where that is and what is marked."""
+    from rbfmuscle.study.show.scene.picture import draw_scene
+
+    file = path.with_suffix(".png")
+    with Progress(f"picture of {path.name}"):
+        return {"file": str(file), **draw_scene(scene, file)}
 
 
 def _findings(path):

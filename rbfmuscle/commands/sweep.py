@@ -23,8 +23,7 @@ Texts = Annotated[list[str] | None, Parameter(negative="", consume_multiple=True
 
 
 def sweep(
-    scene: str | None = None,
-    *,
+    *scene: str,
     output: Output,
     grid: Texts = None,
     model: str | None = None,
@@ -36,16 +35,18 @@ def sweep(
     merge: Annotated[list[Path] | None, Parameter(negative="", consume_multiple=True)] = None,
     error: str = "error_rms",
     retry: Annotated[bool, Parameter(negative="")] = False,
+    settings: Annotated[list[str] | None, Parameter(name="--set", negative="")] = None,
     as_json: Json = False,
 ) -> None:
-    """Run a scene under a grid of settings: errors, time a frame, Pareto front.
+    """Run a scene under a grid of settings: errors, time a frame, Pareto front; or the scenes of a cohort.
 
-    Points that the folder holds already are not run again, so a sweep that was ended goes on where it stood.
+    What the folder holds already is not run again, so a sweep that was ended goes on where it stood.
 
     Parameters
     ----------
     scene
-        Scene file (TOML), or "phantom" for the embedded hip.
+        Scene file (TOML), or "phantom" for the embedded hip; for a cohort a table of subjects and trials (CSV with the
+        columns subject, trial, scene, motion, model, frames and settings), a pattern in quotes, or several files.
     output
         Folder for the results; with --merge, of the merged sweep.
     grid
@@ -69,26 +70,38 @@ def sweep(
     error
         The quantity that the front trades against time.
     retry
-        Run points again that failed before.
+        Run points or jobs again that failed before.
+    settings
+        KEY=VALUE for all jobs of a cohort, as for run --set; a column of the table goes before it.
     as_json
         Print JSON and nothing else.
     """
+    from rbfmuscle.study.cohort.jobs import is_cohort
     from rbfmuscle.study.experiment.sweep import SweepFolder, check_key, parse_task
     from rbfmuscle.study.experiment.sweep_points import VALUES
 
     check_key(error, VALUES)
+    if jobs is not None and jobs < 1:
+        raise UsageError(f"--jobs must be 1 or more, got {jobs}")
+    if is_cohort(scene):
+        from rbfmuscle.commands.cohort import check_options, cohort_settings, sweep_cohort
+
+        check_options(grid=grid, reference=reference, task=task, merge=merge)
+        asked = {"model": model, "frames": frames, "settings": cohort_settings(settings)}
+        how: dict[str, Any] = {"jobs": jobs, "scheduler": scheduler, "retry": retry, "as_json": as_json}
+        return sweep_cohort(scene, output, asked=asked, **how)
+    if settings:
+        raise UsageError("--set is for a cohort; settings of one scene belong into its --grid or its file")
     if merge:
         from rbfmuscle.study.experiment.sweep_table import merge_sweeps
 
         if scene or grid or task:
             raise UsageError("--merge takes the folders of a sweep, no scene, grid or task")
         return _finish(merge_sweeps(merge, output), output, error, as_json)
-    if scene is None:
+    if not scene:
         raise UsageError("give a scene file, or --merge with the folders of a sweep")
-    if jobs is not None and jobs < 1:
-        raise UsageError(f"--jobs must be 1 or more, got {jobs}")
     part = parse_task(task) if task else None
-    plan, ready = _measure(scene, output, grid, model, frames, reference, jobs, scheduler, part, retry)
+    plan, ready = _measure(scene[0], output, grid, model, frames, reference, jobs, scheduler, part, retry)
     if part and any(SweepFolder(output).read(point.key) is None for point in plan.points):
         return _finish_task(plan, ready, output, as_json)
     return _finish(plan, output, error, as_json)

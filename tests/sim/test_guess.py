@@ -7,15 +7,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from conftest import ROOT
+from conftest import ROOT, benchmark_script
 
+from rbfmuscle.app import run_command
 from rbfmuscle.sim.guess.anatomy import bone_class, muscle_facts, says_muscle, side_of
 from rbfmuscle.sim.guess.guess import guess_scene, write_scene
-from rbfmuscle.sim.guess.holds import Ends
-from rbfmuscle.sim.guess.joints import fit_ball, fit_hinge
+from rbfmuscle.sim.guess.holds import Ends, Hold, MuscleGuess
+from rbfmuscle.sim.guess.joints import JointGuess, fit_ball, fit_hinge
 from rbfmuscle.sim.guess.parts import Part
+from rbfmuscle.sim.guess.tendons import ANGLES, guess_tendons
 from rbfmuscle.sim.scene.phantom import phantom_scene
 from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.validation import UsageError
 
 
@@ -216,3 +219,82 @@ def test_side_of_the_body_is_kept(tmp_path):
 
     muscle = SimpleNamespace(side="r")
     assert _best_of(("femur",), muscle, bones, [np.zeros(3), np.ones(3)]) == 1
+
+
+def test_muscles_without_the_bones_of_their_names_still_make_a_scene(tmp_path):
+    """Of a folder where anatomy finds nothing, the nearest bones are taken and every muscle is doubtful."""
+    for item in phantom_scene().bones:
+        item.mesh.export(tmp_path / f"{'radius' if item.name == 'pelvis' else 'ulna'}.ply")
+    for item, name in zip(phantom_scene().muscles, ("soleus", "plantaris", "popliteus", "sartorius")):
+        item.mesh.export(tmp_path / f"{name}.ply")
+    guess = guess_scene(tmp_path, "mm", tmp_path)
+    scene = write_scene(guess, tmp_path / "scene.toml")
+    assert len(scene.muscles) == 4
+    assert all(muscle.confidence <= 0.2 and "are not here" in muscle.reasons[0] for muscle in guess.muscles)
+    assert len(guess.doubts()) >= 4
+
+
+@pytest.mark.parametrize("how", ["mirrored", "metres", "plain names"])
+def test_what_is_written_of_changed_meshes_passes_check_and_runs(how, tmp_path, capsys):
+    scene = phantom_scene(spacing=6.0)
+    units = benchmark_script("guesses").changed(
+        [(item.name, item.mesh) for item in scene.bones + scene.muscles[:2]], tmp_path, how
+    )
+    file = tmp_path / "scene.toml"
+    assert run_command(["new", str(tmp_path), "--units", units]) == 0
+    assert run_command(["check", str(file)]) == 0
+    quick = ["--set", "output.report=false", "--set", "output.preview=false", "--model", "pbd"]
+    assert run_command(["run", str(file), "-o", str(tmp_path / "out"), "--frames", "0:5", *quick]) == 0
+    assert len(SavedRun(tmp_path / "out").frames) == 5
+
+
+def test_tendon_of_a_far_end_follows_its_hinge_by_a_closed_form(tmp_path):
+    """A belly above a hinge, its end 60 mm from the bone beyond: the stub slides as the straight tendon's length."""
+    upper, lower = (trimesh.creation.cylinder(radius=8, height=100, sections=48) for _ in range(2))
+    upper.apply_translation([0, 0, 55])
+    lower.apply_translation([0, 0, -55])
+    belly = trimesh.creation.capsule(height=30, radius=4)
+    belly.apply_translation([40, 0, 45])
+    parts = {"upper": upper, "lower": lower, "belly": belly}
+    for name, mesh in parts.items():
+        mesh.export(tmp_path / f"{name}.ply")
+    bones = [
+        Part(name, f"{name}.ply", SimpleNamespace(mesh=parts[name]), facts=None)
+        for name in ("upper", "lower")
+    ]
+    hinge = JointGuess(bones[0], bones[1], "hinge", np.zeros(3), np.array([0.0, 1, 0]), 8.0, 0.0, 0.9, "")
+    muscle = Part("belly", "belly.ply", SimpleNamespace(mesh=belly))
+    z = belly.vertices[:, 2]
+    holds = [
+        Hold(bones[0], np.flatnonzero(z > z.max() - 3), 5.0, ""),
+        Hold(bones[1], np.flatnonzero(z < z.min() + 3), 60.0, ""),
+    ]
+    made = SimpleNamespace(bones=bones, joints=[hinge], muscles=[MuscleGuess(muscle, holds, 0.5)])
+    guess_tendons(made, 1.0)
+    tendon = holds[1].tendon
+    assert holds[0].tendon is None and holds[1].holder == "belly_lower_tendon" and tendon.guide is bones[0]
+    end = belly.vertices[holds[1].vertices].mean(axis=0)
+    target = lower.vertices[np.argmin(((lower.vertices - end) ** 2).sum(axis=1))]
+    for angle, slide in zip(ANGLES, tendon.slides):
+        c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+        turned = np.array([c * target[0] + s * target[2], target[1], -s * target[0] + c * target[2]])
+        assert slide == pytest.approx(np.linalg.norm(turned - end) - np.linalg.norm(target - end), abs=1e-9)
+    np.testing.assert_allclose(tendon.direction, (target - end) / np.linalg.norm(target - end))
+    assert tendon.place.min() > np.max([mesh.bounds[1] for mesh in parts.values()]) - 100.0
+
+
+def test_tendons_of_the_leg_slide_as_those_set_by_hand(leg_guess):
+    """Against the carriers of data/leg, at 30 degrees, where the tendon runs straight; signs as the hinges turn."""
+    holds = [hold for muscle in leg_guess[0].muscles for hold in muscle.holds if hold.tendon]
+    found = {hold.tendon.name: hold.tendon for hold in holds}
+    at = ANGLES.index(30)
+    for name, known in (
+        ("soleus_calcaneus_tendon", 23.9),
+        ("gastrocnemius_medial_calcaneus_tendon", 23.9),
+        ("rectus_femoris_patella_tendon", 21.7),
+        ("gracilis_tibia_tendon", 13.4),
+        ("tibialis_anterior_foot_tendon", 16.7),
+    ):
+        slides = found[name].slides
+        # The hinge's sense is free: the greater of both sides is the one that the table gives.
+        assert max(abs(slides[at]), abs(slides[-1 - at])) == pytest.approx(known, abs=3.0), name

@@ -16,6 +16,7 @@ from rbfmuscle.sim.scene.motion import Motion
 from rbfmuscle.sim.scene.phantom import phantom_scene
 from rbfmuscle.study.files import writer as writing
 from rbfmuscle.study.files.checkpoint import NAME, read_checkpoint, write_checkpoint
+from rbfmuscle.study.files.resume import OtherRunError
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.validation import SceneWarning, SolveError, UsageError
 
@@ -145,7 +146,7 @@ class TestBlend:
     def test_other_scene_is_refused(self, changed, message, complete, tmp_path):
         left = killed(arm_scene(), tmp_path / "whole", 2)
         folder = tmp_path / "whole" if complete else left
-        with pytest.raises(UsageError, match=message):
+        with pytest.raises(OtherRunError, match=f"^{folder} holds a run of another scene .*: {message}"):
             stream_run(arm_scene(**changed), folder, resume=True)
 
     def test_other_vertices_and_versions_are_refused(self, tmp_path):

@@ -12,6 +12,7 @@ import numpy as np
 from rbfmuscle.sim.guess.holds import MuscleGuess, guess_holds
 from rbfmuscle.sim.guess.joints import JointGuess, guess_joints
 from rbfmuscle.sim.guess.parts import Part, read_parts
+from rbfmuscle.sim.guess.tendons import guess_tendons, write_stubs
 from rbfmuscle.sim.guess.text import scene_text
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.validation import MeshError, SceneError, UsageError
@@ -85,6 +86,11 @@ def guess_scene(folder: Path, units: str, base: Path) -> SceneGuess:
     guess = SceneGuess(f"the meshes in {folder.name or folder}", name, units, bones, root, joints)
     bodies = _bodies(bones, joints)
     guess.muscles = [guess_holds(muscle, bones, bodies, millimetre) for muscle in muscles]
+    if all(
+        muscle.wrong for muscle in guess.muscles
+    ):  # the bones that names ask for are not here: take what is
+        guess.muscles = [guess_holds(muscle, bones, bodies, millimetre, named=False) for muscle in muscles]
+    guess_tendons(guess, millimetre)
     rank = {id(joint.child): k for k, joint in enumerate(joints, start=1)}
     for muscle in guess.muscles:  # from the bone that stands still outwards
         muscle.holds.sort(key=lambda hold: rank.get(id(hold.bone), 0))
@@ -126,6 +132,7 @@ def write_scene(guess: SceneGuess, path: Path) -> Scene:
         for muscle in guess.muscles:
             for hold in muscle.holds:
                 np.savetxt(folder / hold_file(muscle, hold), _in_file(muscle.muscle, hold.vertices), fmt="%d")
+        write_stubs(guess, path.parent, MILLIMETRE[guess.units])
         while True:
             path.write_text(scene_text(guess, hold_file), encoding="utf-8")
             if all(muscle.wrong for muscle in guess.muscles):

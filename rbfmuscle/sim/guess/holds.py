@@ -47,12 +47,20 @@ class Hold:
     gap : float
         Least distance of the patch to the bone [mm].
     reason : str
+    tendon : TendonGuess or None
+        What carries an end far from its bone.
     """
 
     bone: Any
     vertices: np.ndarray
     gap: float
     reason: str
+    tendon: Any = None
+
+    @property
+    def holder(self) -> str:
+        """Name of the bone in the scene that holds the vertices."""
+        return self.tendon.name if self.tendon is not None else self.bone.name
 
 
 @dataclass
@@ -106,7 +114,9 @@ def _farthest(distance):
     return int(np.argmax(np.where(np.isfinite(distance), distance, -1.0)))
 
 
-def guess_holds(muscle: Any, bones: list[Any], bodies: dict[str, Any], millimetre: float) -> MuscleGuess:
+def guess_holds(
+    muscle: Any, bones: list[Any], bodies: dict[str, Any], millimetre: float, *, named: bool = True
+) -> MuscleGuess:
     """Find the bones that hold a muscle and the vertices that they hold.
 
     Parameters
@@ -117,17 +127,21 @@ def guess_holds(muscle: Any, bones: list[Any], bodies: dict[str, Any], millimetr
         Which bones move as one: the body of each bone, by its place in the list.
     millimetre : float
         Length of a millimetre in scene units.
+    named : bool
+        Look at what the muscle's name tells; the nearest bones where it tells nothing.
     """
     ends = Ends(muscle.mesh)
     distances = [signed_distances(muscle.points, bone.mesh) / millimetre for bone in bones]
     reasons: list[str] = []
-    if muscle.facts is not None:
+    places, confidence = [], 0.9
+    if named and muscle.facts is not None:
         places = _named_places(muscle, bones, distances, ends, reasons)
-        confidence = 0.9
-    else:
+    if not places:
         places = _nearest_places(muscle, bones, bodies, distances, ends)
-        reasons.append("its name tells nothing; the bones are the nearest to its two ends")
-        confidence = 0.4
+        known = muscle.facts is not None
+        told = "the bones of its name are not here" if known else "its name tells nothing"
+        reasons[:] = [f"{told}; the bones are the nearest to its two ends"]
+        confidence = 0.2 if known else 0.4
     holds = [_hold(bones[k], distances[k], ends, end, millimetre) for k, end in places]
     holds = _disjoint(
         [hold for hold in holds if len(hold.vertices)], {id(b): d for b, d in zip(bones, distances)}
@@ -152,7 +166,7 @@ def _named_places(muscle, bones, distances, ends, reasons):
     cost = [sum(_tip_cost(groups, distances, ends, way)) for way in (0, 1)]
     way = int(np.argmin(cost))
     places = [(k, way) for k in groups[0]] + [(k, 1 - way) for k in groups[1] if k not in groups[0]]
-    return places or _nearest_places(muscle, bones, {}, distances, ends)
+    return places
 
 
 def _best_of(kinds, muscle, bones, distances):

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    pass
-
+from rbfmuscle.sim.guess.tendons import ANGLES, stub_file, tendons_of
 
 _TAIL = """[contact]
 initial = "resolve"   # muscles that start inside a bone are pushed out; or "keep", "error"
@@ -29,7 +27,9 @@ def scene_text(guess: Any, hold_file: Callable[..., Any]) -> str:
     hold_file : callable
         Name of the file of a muscle's hold.
     """
-    parts = [_head(guess), *(_bone(bone) for bone in guess.bones), *(_joint(joint) for joint in guess.joints)]
+    tendons = tendons_of(guess)
+    parts = [_head(guess), *(_bone(bone) for bone in guess.bones), *(_stub(tendon) for tendon in tendons)]
+    parts += [_joint(joint) for joint in guess.joints] + [_slider(tendon) for tendon in tendons]
     movable = [joint for joint in guess.joints if joint.kind != "fixed"]
     if movable:
         parts.append(_motion(movable))
@@ -82,6 +82,25 @@ def _joint(joint):
     return "\n".join([*lines, ""])
 
 
+def _stub(tendon):
+    return (
+        f"[[bone]]   # GUESS: holds an end that stops short of its bone; a stub put aside, where nothing meets it\n"
+        f'name = "{tendon.name}"\nmesh = "{stub_file(tendon)}"\n'
+    )
+
+
+def _slider(tendon):
+    """The joint of a tendon's stub, and what drives it."""
+    hinge = joint_name(tendon.joint)
+    points = f"{{ x = {list(ANGLES)}, y = [{', '.join(f'{slide:.6g}' for slide in tendon.slides)}] }}"
+    return (
+        f"[[joint]]   # GUESS: slides along the missing tendon as {hinge} changes its length, straight to its bone\n"
+        f'name = "{tendon.name}"\nparent = "{tendon.guide.name}"\nchild = "{tendon.name}"\ntype = "slider"\n'
+        f"centre = {_vector(tendon.place, 6)}\naxes = {{ slide = {_vector(tendon.direction, 6)} }}\n\n"
+        f'[[coupling]]\ncoordinate = "{tendon.name}.slide"\nof = ["{hinge}.angle"]\nnatural_spline = {points}\n'
+    )
+
+
 def _motion(movable):
     joint = movable[0]
     coordinate = "rotation_x" if joint.kind == "ball" else "angle"
@@ -94,7 +113,7 @@ def _muscle(guess, hold_file):
     mark = "" if part.sure else f"   # GUESS: {part.reason}"
     lines = ["[[muscle]]", f'name = "{part.name}"{mark}', f'mesh = "{part.file}"', "attach = ["]
     for hold in guess.holds:
-        entry = f'{{ bone = "{hold.bone.name}", vertices = "attachments/{hold_file(guess, hold)}" }}'
+        entry = f'{{ bone = "{hold.holder}", vertices = "attachments/{hold_file(guess, hold)}" }}'
         lines.append(
             f"  {entry},   # GUESS {guess.confidence:.1f}: {len(hold.vertices)} vertices, {hold.reason}"
         )

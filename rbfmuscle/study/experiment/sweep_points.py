@@ -96,7 +96,7 @@ def measure_point(
     marker = folder.points / f"{point.key}.running"
     marker.touch()
     try:
-        with _threads(threads):
+        with threads_limited(threads):
             run = runner(scene, point.settings, frames)
             result["values"] = _values_of(run)
             _compare(run, point, folder, result)
@@ -147,7 +147,7 @@ def _take_error(shown, point, folder, result):
     result["values"] = {"error_rms": rms, "error_max": worst, **result["values"]}
 
 
-class _threads:
+class threads_limited:
     """Context in which loops and BLAS use so many threads."""
 
     def __init__(self, count: int) -> None:
@@ -370,28 +370,38 @@ class SweepRunner:
 
     def _cluster(self):
         """Context of a connection to the scheduler, of None where there is none."""
-        if not self.scheduler:
-            return nullcontext()
-        try:
-            from distributed import Client
-        except ImportError as error:
-            raise MissingPartError(
-                "Dask is not installed, which --scheduler needs: pip install 'rbfmuscle[cluster]'"
-            ) from error
-        try:
-            client = Client(self.scheduler, timeout=CONNECT_WITHIN)
-            # With one thread in all, joblib would not send anything away.
-            client.wait_for_workers(2, timeout=CONNECT_WITHIN)
-        except (OSError, ValueError) as error:
-            raise UsageError(
-                f"no Dask scheduler with two workers answers at {self.scheduler!r} ({error})"
-            ) from None
-        return client
+        # With one thread in all, joblib would not send anything away.
+        return connect_cluster(self.scheduler, 2) if self.scheduler else nullcontext()
 
     def _advance(self):
         self.done += 1
         if self.progress is not None:
             self.progress(self.done, self.total)
+
+
+def connect_cluster(scheduler: str, least: int) -> Any:
+    """A client of a Dask scheduler, as soon as so many workers are there.
+
+    Raises
+    ------
+    MissingPartError
+        If Dask is not installed.
+    UsageError
+        If no scheduler with workers answers.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise MissingPartError(
+            "Dask is not installed, which --scheduler needs: pip install 'rbfmuscle[cluster]'"
+        ) from error
+    try:
+        client = Client(scheduler, timeout=CONNECT_WITHIN)
+        client.wait_for_workers(least, timeout=CONNECT_WITHIN)
+    except (OSError, ValueError) as error:
+        many = "two workers" if least == 2 else "a worker"
+        raise UsageError(f"no Dask scheduler with {many} answers at {scheduler!r} ({error})") from None
+    return client
 
 
 def delayed_calls(function: Callable[..., Any], calls: Iterator[Any], **options: Any) -> Iterator[Any]:

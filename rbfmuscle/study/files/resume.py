@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 _NOT_COMPARED = {"file", "mesh", "report", "preview"}
 
 
+class OtherRunError(UsageError):
+    """A folder holds the run of another scene, of other settings or of another version."""
+
+
 class LeftBehind(NamedTuple):
     """A run in a folder.
 
@@ -52,7 +56,7 @@ def left_behind(directory: str | Path, scene: Scene) -> LeftBehind | None:
 
     Raises
     ------
-    UsageError
+    OtherRunError
         If the run is that of another scene, of other settings or of another version.
     """
     directory = Path(directory)
@@ -62,6 +66,8 @@ def left_behind(directory: str | Path, scene: Scene) -> LeftBehind | None:
         _require_same(info, scene, directory)
     except FileNotFoundError:
         return None
+    except OtherRunError:
+        raise
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UsageError(
             f"{path} is not the run.json of a run that can be resumed ({error!r}); run without --resume"
@@ -84,7 +90,7 @@ def _require_same(info, scene, directory):
     here = versions()
     for name, version in info["versions"].items():
         if here.get(name, version) != version:
-            raise UsageError(
+            raise OtherRunError(
                 f"{directory} was begun with {name} {version}, and this is {here[name]}: "
                 f"the frames to come would not be the same; {remedy}"
             )
@@ -92,7 +98,7 @@ def _require_same(info, scene, directory):
     if found is None and info["content"] != content_hash(scene):
         found = "attached vertices, fibres, activations or the motion differ"
     if found is not None:
-        raise UsageError(f"{directory} holds a run of another scene or other settings: {found}; {remedy}")
+        raise OtherRunError(f"{directory} holds a run of another scene or other settings: {found}; {remedy}")
 
 
 def _difference(there, here, place=""):

@@ -1,0 +1,110 @@
+"""``rbfmuscle sweep`` over many scenes: a cohort of subjects and trials."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rbfmuscle.compiled.progress import Progress
+from rbfmuscle.validation import SolveError, UsageError
+
+if TYPE_CHECKING:
+    from rbfmuscle.study.cohort.jobs import CohortJob
+
+
+def sweep_cohort(
+    sources: tuple[str, ...],
+    output: Path,
+    *,
+    asked: dict[str, Any],
+    jobs: int | None,
+    scheduler: str | None,
+    retry: bool,
+    as_json: bool,
+) -> None:
+    """Run every job of a cohort that is not done, and write its table and its page."""
+    from rbfmuscle import interruption
+    from rbfmuscle.study.cohort.jobs import read_cohort
+    from rbfmuscle.study.cohort.page import write_cohort_page
+    from rbfmuscle.study.cohort.runs import CohortRunner
+    from rbfmuscle.study.cohort.table import write_cohort
+
+    chosen = read_cohort(sources, asked)
+    with (
+        Progress(f"cohort of {len(chosen)} jobs", what="job") as progress,
+        interruption.keeping(lambda: True),
+    ):
+        runner = CohortRunner(run_job, chosen, output, count=jobs, scheduler=scheduler, progress=progress)
+        try:
+            runner.run(retry=retry)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                f"interrupted; frames and finished jobs are kept in {output}, the same command goes on"
+            ) from None
+    table = write_cohort(chosen, output)
+    write_cohort_page(table, output, title=f"Cohort of {Path(output).resolve().name}")
+    _tell(table, output, as_json)
+
+
+def run_job(job: CohortJob, directory: Path) -> dict[str, Any]:
+    """One run of a cohort into its folder, behind what is there of it; module-level, so that it can be sent away."""
+    from rbfmuscle.commands.scenes import load_scene
+    from rbfmuscle.run import stream_run
+    from rbfmuscle.study.files.resume import OtherRunError
+
+    scene = load_scene(job.scene)
+    if job.motion:
+        scene.set_motion(file=job.motion)
+    options: dict[str, Any] = {
+        "model": job.model or None,
+        "frames": job.frames or None,
+        "settings": job.settings,
+        "pictures": False,
+    }
+    try:
+        return stream_run(scene, directory, resume=True, **options)
+    except OtherRunError:
+        return stream_run(scene, directory, **options)
+
+
+def _tell(table, output, as_json):
+    if as_json:
+        facts = {key: value for key, value in table.items() if key != "values"}
+        print(json.dumps({"directory": str(output), **facts}, indent=1))
+    else:
+        for one in table["outliers"][:5]:
+            job = " ".join(part for part in (one["subject"], one["trial"]) if part)
+            print(
+                f"apart: {job}, {one['muscle']}: {one['quantity']} = {one['value']:.4g} {one['unit']}, "
+                f"median {one['median']:.4g}"
+            )
+        print(
+            f"{table['done']} jobs done, {table['failed']} failed, {len(table['outliers'])} values apart, "
+            f"in {output}, open {output / 'cohort.html'}"
+        )
+    bad = [row for row in table["jobs"] if row["status"] != "done"]
+    if bad:
+        for row in bad[:5]:
+            name = " ".join(part for part in (row["subject"], row["trial"]) if part)
+            print(f"rbfmuscle: {name}: {row['error'] or row['status']}", file=sys.stderr)
+        raise SolveError(
+            f"{len(bad)} of {len(table['jobs'])} jobs failed; the others are kept, --retry runs these again"
+        )
+
+
+def cohort_settings(texts: list[str] | None) -> dict[str, Any]:
+    """Settings for all jobs, of "KEY=VALUE"."""
+    from rbfmuscle.sim.scene.settings import parse_setting
+
+    return dict(parse_setting(text) for text in texts or [])
+
+
+def check_options(**given: Any) -> None:
+    """Refuse what goes with a grid over one scene only."""
+    for name, value in given.items():
+        if value:
+            raise UsageError(
+                f"--{name} belongs to a sweep over one scene; a cohort takes its settings from a table"
+            )

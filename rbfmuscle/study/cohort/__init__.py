@@ -1,0 +1,1 @@
+"""Many scenes as one study: subjects and trials."""
