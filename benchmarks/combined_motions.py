@@ -63,6 +63,7 @@ def main() -> None:
     parser.add_argument("scene", help="phantom, or a scene whose joint is called hip")
     parser.add_argument("--muscles", nargs="*")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--seeds", nargs="*", type=int, help="random walks of these seeds, and nothing else")
     arguments = parser.parse_args()
     scene = phantom_scene() if arguments.scene == "phantom" else rm.Scene.load(Path(arguments.scene))
     settings = dict(text.split("=", 1) for text in arguments.set)
@@ -71,6 +72,11 @@ def main() -> None:
         scene.muscles = [scene.muscle(name) for name in arguments.muscles]
     motions = {name: {"ramp": ramp(ends)} for name, ends in RAMPS.items()}
     motions[f"random walk of {WALK} stops"] = {"waypoints": walk(WALK), "step": FARTHEST}
+    if arguments.seeds:
+        motions = {
+            f"random walk of {WALK} stops, seed {seed}": {"waypoints": walk(WALK, seed), "step": FARTHEST}
+            for seed in arguments.seeds
+        }
     for title, motion in motions.items():
         moved = scene.copy()
         moved.set_motion(**motion)

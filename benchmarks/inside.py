@@ -67,24 +67,35 @@ def closed_forms(part):
 
 
 def ripple(path):
-    """Moment arms by one degree: RMS about a smooth curve, greatest change in a degree [mm]."""
+    """Moment arms by one degree, as differences and through the equilibrium, about a smooth curve [mm].
+
+    RMS and greatest departure, greatest change of it in a degree, and the sum rule: how far the arms' integral strays
+    from the change of length.
+    """
     from scipy.signal import savgol_filter
 
     scene = phantom_scene(step=1.0) if path is None else Scene.load(path)
     (coordinate,) = scene.motion.frames[-1]
     end = np.degrees(scene.motion.frames[-1][coordinate])
     scene.set_motion(ramp={coordinate: {"to": float(end), "step": 1.0}})
-    for nodes in (0, INSIDE):
-        run = simulate(scene, model="rbf", settings={"model.inside": nodes})
+    for nodes, asked in ((0, False), (INSIDE, False), (INSIDE, True)):
+        settings = {"model.inside": nodes, "output.moment_arms": asked, "output.surfaces": False}
+        run = simulate(scene, model="rbf", settings=settings)
         for muscle in scene.muscles:
             arm = np.array([
-                row.value for row in run.metrics if row.muscle == muscle.name and row.quantity == "moment_arm"
+                row.value
+                for row in run.metrics
+                if (row.muscle, row.quantity, row.coordinate) == (muscle.name, "moment_arm", coordinate)
             ])  # fmt: skip
             away = arm - savgol_filter(arm, WINDOW, 3)
+            length, step = run.values(muscle.name, "length"), np.radians(1.0)
+            summed = length[0] - np.concatenate([[0.0], np.cumsum(0.5 * (arm[1:] + arm[:-1]) * step)])
             print(
-                f"inside {nodes}, {muscle.name}: {len(arm)} arms {arm.min():.1f} to {arm.max():.1f}, "
+                f"inside {nodes}, {'equilibrium' if asked else 'differences'}, {muscle.name}: "
+                f"{len(arm)} arms {arm.min():.1f} to {arm.max():.1f}, "
                 f"ripple {np.sqrt((away**2).mean()):.2f} RMS {np.abs(away).max():.1f} greatest, "
-                f"jump {np.abs(np.diff(arm)).max():.1f}",
+                f"jump {np.abs(np.diff(away)).max():.1f}, sum rule {np.abs(summed - length).max():.2f} "
+                f"of {np.ptp(length):.1f}",
                 flush=True,
             )
 

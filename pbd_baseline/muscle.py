@@ -99,6 +99,9 @@ class PBDMuscle:
                 self.shape.restore_volume(self.points, self.contact)
         self._finish(contacts)
 
+    def respond(self, contacts: BoneContacts, before: Mapping, after: Mapping) -> None:
+        """None: a mesh muscle has no linearised equilibrium, and is nudged."""
+
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next `solve` settles under."""
         self.fibres.law.activate(activation)

@@ -28,6 +28,7 @@ from rbfmuscle.commands.show import export, render
 from rbfmuscle.commands.surface import surface
 from rbfmuscle.commands.sweep import sweep
 from rbfmuscle.commands.view import view
+from rbfmuscle.commands.ways import ways
 from rbfmuscle.interruption import INTERRUPTED
 from rbfmuscle.validation import RBFMuscleError, SolveError, UsageError
 
@@ -36,7 +37,22 @@ LONGEST_LINE = 1000  # characters of a message: what a hostile file holds is not
 app = App(
     name="rbfmuscle", help="Muscles as implicit RBF surfaces that move with the bones.", version=__version__
 )
-for command in (demo, check, plan, run, compare, sweep, export, render, new, view, sdf, kernels, surface):
+for command in (
+    demo,
+    check,
+    plan,
+    run,
+    compare,
+    sweep,
+    export,
+    render,
+    new,
+    view,
+    ways,
+    sdf,
+    kernels,
+    surface,
+):
     app.command(command)
 app.command(import_, name="import")
 app.command(paths)

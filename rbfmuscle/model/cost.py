@@ -12,6 +12,7 @@ from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit.lapack import factor_cholesky
 from rbfmuscle.implicit.kernels.table import get_kernel
+from rbfmuscle.implicit.placement.lattice import AREA_A_POINT, MOST_HALVINGS
 from rbfmuscle.model.drawing import MARCHING_CELLS
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.model.placement import MOST_WITH_ALL_DERIVATIVES, choose_centres, sample_is_cached
@@ -42,6 +43,10 @@ FIT_CALLS, EXTRACT_CALLS, ENTRY_PAIRS, BONE_VISITS, SURFACE_VISITS, SURFACE_PAIR
 )
 # Contact points hang on so many centres: an index and a share of eight bytes each.
 HANGING_BYTES = 6 * 16
+# With an inside: calls of a sub-step, visits for a node; bytes of a contact point, and of a pair of nodes (the matrix,
+# its inverse, and a region's response for eight nodes).
+INSIDE_CALLS, NODE_VISITS = 6000, 90_000
+DENSE_BYTES, PAIR_BYTES = 27 * 40, 19
 
 
 def estimate_muscle(
@@ -63,7 +68,7 @@ def estimate_muscle(
     """
     chosen = choose_centres(muscle, scene, options, known_only=True)
     centres = chosen.centres
-    points = centres + options.samples
+    points = centres + (dense_count(muscle, options) if options.inside else options.samples)
     shown, nodes = _surface_size(muscle, options)
     unknowns = _unknowns(options, centres)
     pair, flop = _field_rates(options.kernel)
@@ -80,18 +85,34 @@ def estimate_muscle(
         placing *= KEPT
     search = CROSSING_VISITS * points if scene.detect is not None else 0
     iteration = ITERATION_CALLS * call + visit * (SOLVE_VISITS * centres + CONTACT_VISITS * points)
+    solve = options.iterations * iteration
+    held = 8.0 * centres * points + 16.0 * centres**2 + HANGING_BYTES * points
+    if options.inside:
+        solve = INSIDE_CALLS * call + visit * NODE_VISITS * options.inside
+        held += DENSE_BYTES * points + PAIR_BYTES * options.inside**2 - 8.0 * centres * points
     fit = FIT_CALLS * call + flop * unknowns**3 / 3.0 + pair * ENTRY_PAIRS * unknowns**2
     surface = visit * (BONE_VISITS * bones + SURFACE_VISITS * shown) + pair * SURFACE_PAIRS * shown * centres
     return MuscleCost(
         build=visit * (sampling + placing),
-        step=PREDICT_CALLS * call + options.iterations * iteration + visit * search,
+        step=PREDICT_CALLS * call + solve + visit * search,
         show=fit + EXTRACT_CALLS * call + surface,
-        memory=8.0 * centres * points + 16.0 * centres**2 + HANGING_BYTES * points + 24.0 * bones,
+        memory=held + 24.0 * bones,
         working=16.0 * unknowns**2 + NODE_BYTES * nodes + VERTEX_BYTES * shown,
         carried=options.samples,
         shown=int(shown),
         points=f"{centres} centres ({chosen.reason})",
     )
+
+
+def dense_count(muscle: Muscle, options: RBFOptions) -> int:
+    """Contact points of a muscle with an inside that are no centres: its samples, halved as `dense_points` does."""
+    size = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)).size
+    wanted, count = float(muscle.mesh.area) / (AREA_A_POINT * size**2), options.samples
+    for _ in range(MOST_HALVINGS):
+        if count >= wanted:
+            break
+        count *= 4
+    return count
 
 
 def _surface_size(muscle: Muscle, options: Any) -> Any:

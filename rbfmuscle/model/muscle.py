@@ -10,13 +10,12 @@ from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.model.contraction import contracting
 from rbfmuscle.model.drawing import Moment, RBFDrawing, SurfaceDrawer
 from rbfmuscle.model.elasticity import SETTLED, SETTLED_STILL, ElasticSolver
-from rbfmuscle.model.interior import build_interior
+from rbfmuscle.model.inside.build import build_interior
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.model.rest import Rest
 from rbfmuscle.sim.loop.contact import BoneContacts
 from rbfmuscle.sim.scene.objects import Muscle
 from rbfmuscle.sim.scene.scene import Scene
-from rbfmuscle.validation import SceneError
 
 
 class RBFMuscle:
@@ -38,7 +37,7 @@ class RBFMuscle:
     rest : Rest
     solver : ElasticSolver or Interior
         An `Interior` where ``inside`` asks for one.
-    law : FibreLaw or None
+    law : FibreLaw, FibrePull or None
         Of a muscle that contracts.
 
     Raises
@@ -60,14 +59,11 @@ class RBFMuscle:
         self.options = options or RBFOptions()
         self.rest = Rest.from_muscle(muscle, scene, self.options)
         self.law: Any = None
-        if muscle.contraction is not None:
-            if self.options.inside:
-                raise SceneError(
-                    f"muscle {muscle.name!r}: a muscle with an inside does not contract yet; leave out "
-                    "its activation and other keys of contraction, or model.inside"
-                )
+        self.interior = None
+        if self.options.inside:
+            self.interior, self.law = build_interior(muscle, self.rest, self.options)
+        elif muscle.contraction is not None:
             self.rest, self.law = contracting(muscle, self.rest, self.options)
-        self.interior = build_interior(muscle, self.rest, self.options) if self.options.inside else None
         self.solver: Any = self.interior or ElasticSolver(self.rest, self.options, self.law)
         self.drawer = SurfaceDrawer(muscle, scene, self.rest, self.options)
         names = [bone.name for bone in scene.bones]
@@ -89,7 +85,7 @@ class RBFMuscle:
         """Go along with the bones; held centres arrive exactly."""
         rest = self.rest
         motions = np.array([after[bone] @ np.linalg.inv(before[bone]) for bone in rest.bones])
-        if self.law is not None:
+        if self.law is not None and self.interior is None:
             still = all(np.array_equal(before[bone], after[bone]) for bone in rest.bones)
             self.solver.settled = SETTLED_STILL if still else SETTLED
         self.points = blended_motion(self.points, rest.weights, motions)
@@ -103,6 +99,17 @@ class RBFMuscle:
     def solve(self, contacts: BoneContacts) -> None:
         """Settle the centres under shape, volume and contact at the contacts' present poses."""
         self.points = self.solver.solve(self.points, contacts)
+
+    def respond(
+        self, contacts: BoneContacts, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]
+    ) -> np.ndarray | None:
+        """Vertices of the carried mesh at poses near the present ones, by the linearised equilibrium of an inside."""
+        if self.interior is None:
+            return None
+        motions = {bone: after[bone] @ np.linalg.inv(before[bone]) for bone in after}
+        points = self.interior.respond(contacts, motions, [after[bone] for bone in self.rest.bones])
+        first = len(self.points)
+        return points[first : first + len(self.rest.samples)]
 
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next `solve` settles under."""

@@ -22,6 +22,7 @@ from fuzz.meshes import write_damaged  # noqa: E402
 from fuzz.scenes import scene_text, to_toml  # noqa: E402
 
 MODELS = ("rbf", "pbd")
+WANTED = 5  # seconds of processor time after which a clean error is late
 KINDS = {"scene": 1, "mesh": 2, "frames": 3}  # and what seeds them apart
 
 
@@ -185,31 +186,39 @@ def main() -> int:
         show_only(cases, options.only)
         return 0
     warm_up(cases, MODELS if options.frames else ())
-    start, table, slowest = time.monotonic(), {}, 0.0
+    start, table, times = time.monotonic(), {}, {}
     for kind in KINDS:
-        table[kind] = Counter()
+        table[kind], times[kind] = Counter(), []
         for number in range(options.first, options.first + getattr(options, kind)):
-            begun = time.monotonic()
-            outcome, said = harness.run_case(cases.action(kind, number), folder / "case")
-            slowest = max(slowest, time.monotonic() - begun)
+            outcome, said, seconds = harness.run_case(cases.action(kind, number), folder / "case")
             table[kind][outcome] += 1
+            if outcome == harness.CLEAN:
+                times[kind].append(seconds)
             if outcome not in (harness.FINE, harness.CLEAN):
                 print(
                     f"{kind}:{number}: {outcome}: {' / '.join(said.strip().splitlines()[-4:])[:600]}",
                     flush=True,
                 )
-    return show_table(table, time.monotonic() - start, slowest)
+    return show_table(table, time.monotonic() - start, times)
 
 
-def show_table(table, seconds, slowest):
-    """Print the counts of each outcome; 1 if any is neither fine nor a clean error."""
-    width = max(len(outcome) for outcome in harness.OUTCOMES)
-    print(f"{'':{width}}" + "".join(f"{kind:>10}" for kind in table) + f"{'all':>10}")
+def show_table(table, seconds, times):
+    """Print the counts of each outcome, and how soon clean errors came; 1 if any is neither fine nor a clean error."""
+    late, slowest = f"clean errors after more than {WANTED} s", "the slowest clean error, s"
+    width = max(map(len, (*harness.OUTCOMES, late)))
+
+    def line(name, values):
+        print(f"{name:{width}}" + "".join(f"{value:>10}" for value in values))
+
+    line("", (*table, "all"))
     for outcome in harness.OUTCOMES:
-        counts = [table[kind][outcome] for kind in table]
-        print(f"{outcome:{width}}" + "".join(f"{count:>10}" for count in (*counts, sum(counts))))
-    print(f"{sum(map(Counter.total, table.values()))} cases in {seconds:.0f} s, the slowest {slowest:.1f} s")
-    return int(any(counts[o] for counts in table.values() for o in harness.OUTCOMES[2:]))
+        counts = [found[outcome] for found in table.values()]
+        line(outcome, (*counts, sum(counts)))
+    every = [*times.values(), [t for taken in times.values() for t in taken]]
+    line(late, (sum(t > WANTED for t in taken) for taken in every))
+    line(slowest, (f"{max(taken, default=0.0):.2f}" for taken in every))
+    print(f"{sum(map(Counter.total, table.values()))} cases in {seconds:.0f} s; times are of the processor")
+    return int(any(found[o] for found in table.values() for o in harness.OUTCOMES[2:]))
 
 
 sys.exit(main())

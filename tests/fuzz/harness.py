@@ -30,15 +30,16 @@ HANG = 300
 MOST_MEMORY = 2_000_000  # KB
 LONGEST = 1200  # characters of a message
 WRONG_CODE = 99
-EXPECTED = re.compile(r"rbfmuscle: warning: |.*: frame \d+ of \d+$")  # beside the one line of an error
+# Beside the one line of an error: warnings, frames, and, where it takes long, what goes on and since when.
+EXPECTED = re.compile(r"rbfmuscle: warning: |\w+: (frame \d+ of \d+|[a-z ]+ \(\d+ s\))( \(\d+ s\))?$")
 
 
 class WrongResult(Exception):
     """A case passed for fine whose result is not."""
 
 
-def run_case(action: Callable[[], int], folder: Path) -> tuple[str, str]:
-    """Run one case in a forked process; its outcome, and what it said.
+def run_case(action: Callable[[], int], folder: Path) -> tuple[str, str, float]:
+    """Run one case in a forked process; its outcome, what it said, and the processor time it took [s].
 
     Parameters
     ----------
@@ -56,7 +57,7 @@ def run_case(action: Callable[[], int], folder: Path) -> tuple[str, str]:
     _, status, usage = os.wait4(pid, 0)
     text = said.read_text(errors="replace") if said.exists() else ""
     shutil.rmtree(folder, ignore_errors=True)
-    return _judge(status, usage, text), text
+    return _judge(status, usage, text), text, usage.ru_utime + usage.ru_stime
 
 
 def _be_case(action, folder, said):

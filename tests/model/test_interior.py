@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import benchmark_script
+from elastic_bar import NO_BONES, bar, settle, shift
 
-from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.implicit.placement.lattice import Lattice
-from rbfmuscle.model.interior import Interior
 from rbfmuscle.model.muscle import RBFMuscle
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.sim.loop.contact import BoneContacts
@@ -18,36 +17,6 @@ from rbfmuscle.sim.scene.motion import rotation_about
 from rbfmuscle.sim.scene.phantom import phantom_scene
 
 DATA = Path(__file__).resolve().parents[1] / "data" / "fe_reference.npz"
-NO_BONES = [], []
-
-
-def bar(nodes=150, regions=12, iterations=100, size=(40.0, 10.0, 8.0)):
-    """A block whose ends two bones hold, with its surface's vertices as contact points."""
-    block = trimesh.creation.box(extents=size)
-    for _ in range(4):
-        block = block.subdivide()
-    frame = RestFrame(block.vertices)
-    points = np.asarray(block.vertices)
-    half = 0.5 * size[0] - 1e-9
-    owner = np.select([points[:, 0] <= -half, points[:, 0] >= half], [0, 1], -1)
-    lattice = Lattice(frame.local, np.asarray(block.faces), nodes)
-    held = np.flatnonzero(owner >= 0)
-    return Interior(
-        lattice, frame, points, owner, held, count=len(points), free=np.flatnonzero(owner < 0),
-        regions=regions, iterations=iterations, contacts=24, memory=5,
-    )  # fmt: skip
-
-
-def settle(solid, motion):
-    """The second bone moves by a 4x4 transform."""
-    solid.move(np.array([np.eye(4), motion]), {0: np.eye(4), 1: motion})
-    solid.settle(BoneContacts(*NO_BONES, contact_bone=solid.owner))
-
-
-def shift(x):
-    motion = np.eye(4)
-    motion[0, 3] = x
-    return motion
 
 
 def test_quadrature_gives_volume_middle_and_moments():

@@ -7,7 +7,8 @@ from scipy.spatial.transform import Rotation
 from rbfmuscle.geometry.rotations import quaternion_matrix
 from rbfmuscle.model.contact import ROUNDS, SWEEPS, ContactConstraint, solve_contact_forces
 from rbfmuscle.model.elasticity import _Anderson, _carry_all_loop, _gather_loop, _move_loop
-from rbfmuscle.model.interior_loops import (
+from rbfmuscle.model.inside.loops import (
+    Fibres,
     Mixer,
     carry_loop,
     mobility_loop,
@@ -201,18 +202,22 @@ class Cells:
         self.node = self.columns.ravel()
         self.slot = np.arange(8).reshape(2, 4)
 
-    def turn(self, y, stretch=(1.0, 1.0)):
+    def turn(self, y):
         q, f, target = np.tile([1.0, 0, 0, 0], (2, 1)), np.empty((2, 3, 3)), np.empty((2, 3, 3))
         for _ in range(20):
-            turn_loop(y, self.columns, self.slopes, self.fibre, np.array(stretch), q, f, target)
+            turn_loop(y, self.columns, self.slopes, q, f, target)
         return q, f, target
 
-    def stress(self, y, stiff=0.0, stretch=(1.0, 1.0)):
-        _, f, target = self.turn(y, stretch)
+    def stress(self, y, passive=0.0, active=0.0, content=1.0, slack=(1.0, 1.0)):
+        _, f, target = self.turn(y)
+        one = np.ones(2)
+        fibres = Fibres(
+            self.fibre, passive * one, active * one, slack[0] * one, slack[1] * one, content * one
+        )
         out, gradient, volume = np.empty((5, 3)), np.empty((8, 3)), np.empty(2)
         stress_loop(
-            f, target, self.fibre, np.array(stretch), stiff, self.weights, self.columns, self.slopes,
-            self.region, self.slot, out, gradient, volume,
+            f, target, fibres, self.weights, self.columns, self.slopes, self.region, self.slot, out,
+            gradient, volume,
         )  # fmt: skip
         return out, gradient, volume
 
@@ -232,13 +237,15 @@ def test_deformation_of_an_affine_map_is_its_matrix_and_the_target_its_rotation(
         np.testing.assert_allclose(np.array(quaternion_matrix(q[i])), turn, atol=1e-9)
 
 
-def test_target_of_a_stretched_fibre_keeps_the_volume_and_stretches_along_it_alone(cells):
-    _, _, target = cells.turn(cells.rest, stretch=(1.3, 0.8))
-    for i, t in enumerate((1.3, 0.8)):
-        assert np.linalg.det(target[i]) == pytest.approx(1.0)
-        np.testing.assert_allclose(target[i] @ cells.fibre[i], t * cells.fibre[i], atol=1e-12)
-        across = np.cross(cells.fibre[i], [1.0, 0.0, 0.0])
-        np.testing.assert_allclose(target[i] @ across, across / np.sqrt(t), atol=1e-12)
+def test_a_slack_fibre_asks_for_the_length_it_has_and_a_taut_one_for_the_nearest_end(cells):
+    # Both cells at rest: the fibres' length is 1.
+    def asked(slack):
+        return cells.stress(cells.rest, passive=2.0, slack=slack)[0] - cells.stress(cells.rest)[0]
+
+    taut = asked((1.0, 1.0))
+    np.testing.assert_allclose(asked((0.9, 1.2)), taut, atol=1e-12)
+    np.testing.assert_allclose(asked((0.7, 0.8)), 0.8 * taut, atol=1e-12)
+    np.testing.assert_allclose(asked((1.1, 1.2)), 1.1 * taut, atol=1e-12)
 
 
 def test_volumes_are_determinants_and_their_gradients_differences(rng, cells):
@@ -269,13 +276,13 @@ def test_right_side_balances_the_laplacian_at_rest_and_carries_the_fibres(rng, c
         laplacian[np.ix_(nodes, nodes)] += cells.weights[q] * cells.slopes[q] @ cells.slopes[q].T
     np.testing.assert_allclose(out, laplacian @ cells.rest, atol=1e-12)
     y = cells.rest + 0.1 * rng.normal(size=(5, 3))
-    stiff, stretch = 2.5, (1.1, 0.9)
-    fibres = cells.stress(y, stiff, stretch)[0] - cells.stress(y, 0.0, stretch)[0]
+    given = {"passive": 2.5, "active": 1.5, "content": 0.6}
+    fibres = cells.stress(y, **given)[0] - cells.stress(y)[0]
     _, f, _ = cells.turn(y)
     expected = np.zeros((5, 3))
     for q, nodes in enumerate(cells.columns):
         along = f[q] @ cells.fibre[q]
-        pull = cells.weights[q] * stiff * stretch[q] * along / np.linalg.norm(along)
+        pull = cells.weights[q] * (2.5 + 1.5 * 0.6) * along / np.linalg.norm(along)
         expected[nodes] += np.outer(cells.slopes[q] @ cells.fibre[q], pull)
     np.testing.assert_allclose(fibres, expected, atol=1e-11)
 

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
+from rbfmuscle.model.cost import dense_count
 from rbfmuscle.models import build_model, estimate_model
 from rbfmuscle.sim.distance.sdf import BoneSDF
+from rbfmuscle.sim.loop.contact import BoneContacts
 from rbfmuscle.sim.plan.forecast import FieldCost, MuscleCost, estimate_field, forecast, side_by_side
 from rbfmuscle.sim.plan.plan import plan_scene
 from rbfmuscle.sim.plan.rates import _bumpy_sphere, measure_rates
@@ -74,6 +76,22 @@ def test_more_centres_cells_and_iterations_take_more(scene):
     unwatched.detect = None
     watched = estimate_muscle(scene.muscles[0], scene, RATES, RBFOptions(centres=150))
     assert estimate_muscle(scene.muscles[0], unwatched, RATES, RBFOptions(centres=150)).step < watched.step
+
+
+@pytest.mark.parametrize("nodes", [150, 300])
+def test_an_inside_has_the_foretold_contact_points_and_memory(scene, nodes):
+    changed = scene.with_options({"model.inside": nodes})
+    plain, foretold = (estimate_model(made.muscles[1], made, RATES) for made in (scene, changed))
+    model = build_model(changed.muscles[1], changed)
+    solid = model.interior
+    solid.settle(BoneContacts([], [], contact_bone=solid.owner))
+    arrays = (solid.columns, solid.shares, solid.slopes_at, solid.inverse, solid.matrix, solid.response)
+    # A third: cells are whole numbers, so nodes are fewer than asked for; centres are left out.
+    assert sum(array.nbytes for array in arrays) == pytest.approx(foretold.memory, rel=0.33)
+    assert dense_count(changed.muscles[1], model.options) == pytest.approx(
+        len(solid.points) - len(model.points), rel=0.05
+    )
+    assert foretold.step > plain.step * 0.5 and foretold.memory > plain.memory
 
 
 def test_mesh_muscle_whose_weights_are_on_disk_is_built_sooner(scene):

@@ -181,6 +181,22 @@ def test_correction_leaves_no_point_behind_the_plate(action):
     assert "unresolved" not in actions
 
 
+def test_what_cannot_be_turned_back_is_held_on_its_side(monkeypatch):
+    monkeypatch.setattr("rbfmuscle.sim.loop.stepper.turn_back", lambda *given: None)
+    # As the step may not be halved, all depends on the planes.
+    stepper, crossed = _swing("substep", smallest_step=40.0)
+    assert crossed == 0
+    assert {event.action for event in stepper.collect()[1]} == {"held_back", "angle_flag"}
+
+
+def test_a_path_tells_how_deep_it_can_have_been():
+    sweep = sweep_paths(
+        box((9.0, 9.0, 0.2)), np.array([[0.0, 0.0, 0.3]]), np.array([[0.0, 0.0, -0.5]]), tolerance=TOLERANCE
+    )
+    assert sweep.through.tolist() == [True]
+    assert sweep.most == pytest.approx([0.2])
+
+
 def test_without_detection_no_tunnelling_code_runs():
     stepper, crossed = _swing(None)
     assert crossed > 0

@@ -15,7 +15,8 @@ class Event:
     """Something a user should know of: ``count`` points of a muscle at a bone, and what was done.
 
     ``action`` is ``"angle_flag"`` (the angle test spoke), ``"reported"`` (crossed, nothing done),
-    ``"rotated"``, ``"halved"`` (the step was), ``"unresolved"`` (crossed, and no correction helped),
+    ``"rotated"``, ``"halved"`` (the step was), ``"held_back"`` (kept on its side of a plane), ``"grazed"``
+    (crossed less bone than its field resolves, 0.2 mm deep at most), ``"unresolved"`` (crossed, and nothing helped),
     ``"carried_stretched"``, ``"carried_held_end"`` or ``"carried_sheets"`` (no level set could be shown, so the surface
     is where the material is: it is stretched too far, an end is held inside the bone named, or sheets have met),
     ``"overlap_kept"`` or ``"overlap_resolved"`` (at rest, before the first frame), or, with no muscle,
@@ -186,6 +187,11 @@ class MuscleModel(Protocol):
 
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next :meth:`solve` settles under; for muscles that contract."""
+
+    def respond(
+        self, contacts: BoneContacts, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]
+    ) -> np.ndarray | None:
+        """Vertices of the carried mesh when the bones go a little from their present poses; None where unknown."""
 
     def carried_mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and faces of a surface that moves with the material, of constant topology."""

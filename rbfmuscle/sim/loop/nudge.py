@@ -102,11 +102,14 @@ def nudge(stepper: MuscleStepper, coordinates: Mapping[str, float]) -> dict[str,
             for value in values:
                 there = {**coordinates, name: value}
                 poses = bone_poses(scene, there)
-                model.restore(state)
-                stepper.contacts.move(poses)
-                model.predict(here, poses)
-                settle(stepper, there)
-                sides.append((np.array(model.carried_mesh()[0]), poses))
+                vertices = model.respond(stepper.contacts, here, poses)
+                if vertices is None:
+                    model.restore(state)
+                    stepper.contacts.move(poses)
+                    model.predict(here, poses)
+                    settle(stepper, there)
+                    vertices = np.array(model.carried_mesh()[0])
+                sides.append((vertices, poses))
             found[name] = Nudged(values[1] - values[0], *sides)
         model.restore(state)
         stepper.contacts.move(here)

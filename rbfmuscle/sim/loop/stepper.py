@@ -14,7 +14,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.sim.loop.carrying import SOLVED, Carrier, Work
 from rbfmuscle.sim.loop.frame import Drawing, Event, FinishedDrawing, ModelSurface
-from rbfmuscle.sim.loop.tunnelling import find_crossings, turn_back
+from rbfmuscle.sim.loop.tunnelling import fence, find_crossings, turn_back
 from rbfmuscle.sim.scene.motion import bone_poses, interpolate, shown_value, step_angle, unit_sign
 from rbfmuscle.validation import NotFiniteError, SolveError
 
@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 
 # Depth [mm] below which a path through a bone counts as touching it; above the error of a bone's field.
 TOUCH = 0.1
+# Rounds in which what still crosses at the smallest step is fenced off, together with what crosses then.
+FENCES = 4
+# In tolerances: bone of which a path can have met no more than this is thinner than a field of distances resolves.
+GRAZE = 2.0
 
 
 class TimedDrawing:
@@ -273,13 +277,35 @@ class MuscleStepper:
             return
         angle = step_angle(self.scene, before, after)
         if self.detect.action == "rotate" or angle <= 2.0 * math.radians(self.detect.smallest_step):
-            self._report_all(remaining, "unresolved")
+            if max(crossing.most for crossing in remaining) > GRAZE * self.tolerance:
+                remaining = self._held_back(state, start, poses, after, remaining)
+            for crossing in remaining:
+                action = "unresolved" if crossing.most > GRAZE * self.tolerance else "grazed"
+                self.report(self.contacts.names[crossing.bone], len(crossing.index), action)
             return
         self._report_all(remaining, "halved")
         self.model.restore(state)
         middle = interpolate(before, after, 0.5)
         self.step(before, middle)
         self.step(middle, after)
+
+    def _held_back(self, state, start, poses, after, crossings):
+        """Solve with what crosses kept on its side of a plane; return what crosses all the same."""
+        fences = [*self.contacts.neighbours], []
+        try:
+            for _ in range(FENCES):
+                fences[1].extend(fence(self.contacts, crossing, start, *poses) for crossing in crossings)
+                self.contacts.neighbours = fences[0] + fences[1]
+                self.model.restore(state)
+                self._predict(poses)
+                self.solve(after)
+                held, crossings = crossings, self._crossings(start, poses, flag=False)
+                self._report_all(held, "held_back")
+                if not crossings:
+                    break
+        finally:
+            self.contacts.neighbours = fences[0]
+        return crossings
 
     def _report_all(self, crossings, action):
         for crossing in crossings:

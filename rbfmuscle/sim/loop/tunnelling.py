@@ -16,6 +16,7 @@ import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.sim.loop.sliding import Planes
 
 if TYPE_CHECKING:
     from rbfmuscle.sim.distance.sdf import BoneSDF
@@ -49,22 +50,26 @@ class Sweep:
         Went in deeper than the tolerance, and came out (or ended) facing another way than it went in.
     flagged : (c,) ndarray of bool
         The angle test's answer: directions at the two ends differ by more than its angle.
+    most : (c,) ndarray
+        Depth that such a path can reach at most, from its length and the distances at its ends.
     """
 
     index: np.ndarray
     lowest: np.ndarray
     through: np.ndarray
     flagged: np.ndarray
+    most: np.ndarray
 
 
 @dataclass(frozen=True)
 class Crossing:
-    """Points that passed through one bone in a step."""
+    """Points that passed through one bone in a step: how deep they were by its field, and can have been at most."""
 
     bone: int
     index: np.ndarray
     depth: float
     flagged: int
+    most: float
 
 
 def sweep_paths(
@@ -94,8 +99,8 @@ def sweep_paths(
     index, last = index[near], last[near]
     if len(index) == 0:
         nothing = np.zeros(0, dtype=bool)
-        return Sweep(index, np.zeros(0), nothing, nothing)
-    start, end = start[index], end[index]
+        return Sweep(index, np.zeros(0), nothing, nothing, np.zeros(0))
+    start, end, last_distance = start[index], end[index], last
     lowest = _halve(field, start, end, distance[index], last, tolerance)
     through = np.zeros(len(index), dtype=bool)
     # What halving leaves open.
@@ -108,7 +113,8 @@ def sweep_paths(
         turned = np.einsum("ij,ij->i", entry, leave) < SLIDING_COSINE
         through[deep] = turned & (lowest[deep] < -tolerance)
     cosine = np.einsum("ij,ij->i", _directions(field, start), _directions(field, end))
-    return Sweep(index, lowest, through, cosine < math.cos(angle))
+    most = 0.5 * (length[index] - distance[index] - last_distance)
+    return Sweep(index, lowest, through, cosine < math.cos(angle), most)
 
 
 def find_crossings(
@@ -156,7 +162,8 @@ def find_crossings(
         crossed = sweep.through if options.swept else sweep.flagged
         if crossed.any() or sweep.flagged.any():
             depth = float(max(0.0, -sweep.lowest[crossed].min())) if crossed.any() else 0.0
-            crossings.append(Crossing(b, index[sweep.index[crossed]], depth, int(sweep.flagged.sum())))
+            most = float(sweep.most[crossed].max(initial=0.0))
+            crossings.append(Crossing(b, index[sweep.index[crossed]], depth, int(sweep.flagged.sum()), most))
     return crossings
 
 
@@ -173,6 +180,22 @@ def turn_back(model: Any, crossings: Any, start: Any, before: Any, after: Any, n
         which = np.zeros(len(start), dtype=bool)
         which[crossing.index] = True
         model.turn(which, rigid_fit(model.contact_points()[crossing.index], wanted))
+
+
+def fence(contacts: Any, crossing: Crossing, start: Any, before: Any, after: Any) -> Planes:
+    """Planes that keep points which crossed on the side of the bone where they were, a half-space for each.
+
+    The plane lies between the point and the bone, square to the way out, and goes along with the bone.
+    """
+    name = contacts.names[crossing.bone]
+    back, motion = np.linalg.inv(before[name]), after[name] @ np.linalg.inv(before[name])
+    points = start[crossing.index]
+    local = points @ back[:3, :3].T + back[:3, 3]
+    distance = contacts.fields[crossing.bone].distance(local)
+    way = _directions(contacts.fields[crossing.bone], local) @ after[name][:3, :3].T
+    planes = Planes()
+    planes.set(crossing.index, distance, way, points @ motion[:3, :3].T + motion[:3, 3])
+    return planes
 
 
 def rigid_fit(points: Floats, targets: Any) -> Any:

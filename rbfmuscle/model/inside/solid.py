@@ -4,7 +4,7 @@ With y the nodes of a `Lattice` and F = Σ y_k ∇N_k the deformation gradient a
 
     E(y) = μ Σ_q w_q (|F_q - T_q|² + c (|F_q a| - t)²),    V_r(y) = Σ_{q in r} w_q det F_q = V_r at rest,
 
-with T the rotation of F, stretched by t along the fibre a where a muscle contracts (1: passive), r the regions of
+with T the rotation of F, a the fibre, t the stretch that its spring is content at (1: passive), r the regions of
 the lattice, one pressure each, and c = 3/2 (fibre_ratio - 1). For small strains and more and more nodes this is the
 incompressible solid of shear modulus μ, Young's modulus 3 μ across and 3 μ · fibre_ratio along the fibres.
 
@@ -18,15 +18,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import blended_motion
-from rbfmuscle.geometry.rest_frame import RestFrame, diameter
+from rbfmuscle.geometry.rest_frame import diameter
 from rbfmuscle.geometry.rotations import turned_quaternions
-from rbfmuscle.implicit.placement.lattice import Lattice, dense_points
-from rbfmuscle.model.fibres import fibre_directions
-from rbfmuscle.model.interior_loops import (
+from rbfmuscle.implicit.placement.lattice import Lattice
+from rbfmuscle.model.inside.loops import (
+    Fibres,
     Mixer,
     carry_loop,
     mobility_loop,
@@ -37,9 +36,7 @@ from rbfmuscle.model.interior_loops import (
     touch_loop,
     turn_loop,
 )
-from rbfmuscle.model.options import RBFOptions
-from rbfmuscle.model.rest import LEAST_ATTACHED, Rest
-from rbfmuscle.sim.scene.objects import Muscle
+from rbfmuscle.model.inside.response import Response
 
 LEAST_ROUNDS = (
     3  # times the iterations of a muscle without an inside: they end by the residual, mostly sooner
@@ -52,7 +49,6 @@ CONTACT_TOLERANCE = 2e-5  # of the muscle's size
 REACH_MARGIN = 0.003
 NEAR = 0.03  # points nearer to an obstacle than this take part in a solve
 SETTLED = 2e-5
-NODES_A_REGION = 8
 CONTACT_ROUNDS, CONTACT_SWEEPS = 10, 400
 
 
@@ -106,7 +102,7 @@ class Interior:
     ) -> None:
         self.rest = frame.points(lattice.rest)
         self.points, self.owner, self.held = points, owner, held
-        self.count, self.free, self._carried, self._followed = count, free, None, None
+        self.count, self.free, self._carried, self._followed, self._response = count, free, None, None, None
         self.lattice, self.frame = lattice, frame
         self.iterations, self.batch, self.memory = LEAST_ROUNDS * iterations, contacts, memory
         self.scale, self.side = diameter(points), float(np.prod(lattice.spacing)) ** (1 / 3) * frame.size
@@ -118,11 +114,13 @@ class Interior:
         self.weights = lattice.weights * frame.size**3
         self.quad_points = frame.points(lattice.points)
         count = len(self.weights)
-        self.fibre, self.stretch = np.tile([1.0, 0.0, 0.0], (count, 1)), np.ones(count)
+        one = np.ones(count)
+        self.fibres = Fibres(np.tile([1.0, 0.0, 0.0], (count, 1)), 0.0 * one, 0.0 * one, one, one, one)
         self.quaternion = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
         self.f, self.target = np.empty((2, count, 3, 3))
         self._number_regions(lattice.regions(regions))
         self._assemble(lattice)
+        self.reach = NEAR * self.scale
         self.y, self.pressure = self.rest.copy(), np.zeros(len(self.rest_volumes))
         self.forces = np.zeros((len(points), 1))
         self.anchor, self.history = points[held], [0.0]
@@ -139,7 +137,8 @@ class Interior:
         hangs = np.zeros((size, len(self.held)))
         np.add.at(hangs, (self.columns[self.held].T, np.arange(len(self.held))), self.shares[self.held].T)
         self.spring = HOLD * self.side * hangs
-        self.matrix, self.stiff = matrix + self.spring @ hangs.T, 0.0
+        self.without_springs, self.without_fibres = matrix, matrix + self.spring @ hangs.T
+        self.matrix = self.without_fibres
         self._invert()
         own = self.owner[self.held]
         self.bones = sorted(set(own.tolist()))
@@ -156,13 +155,27 @@ class Interior:
         slope = np.einsum("qk,qka->qa", height[self.quad_columns], self.slopes)
         return slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-300)
 
+    def flux(self) -> Floats:
+        """Gradient (Q, 3) of what flows, a unit in all, from the first bone's held points to the others'."""
+        first = self.owner[self.held] == self.bones[0]
+        source = np.where(first, -1.0 / max(first.sum(), 1), 1.0 / max((~first).sum(), 1))
+        height = np.linalg.lstsq(self.without_springs, self.spring @ source / (HOLD * self.side), rcond=None)[
+            0
+        ]
+        return np.einsum("qk,qka->qa", height[self.quad_columns], self.slopes)
+
     def reinforce(self, fibre: Floats, ratio: float) -> None:
         """Make the solid stiffer along unit directions (Q, 3), by a ratio of Young's moduli."""
-        self.fibre, self.stiff = np.ascontiguousarray(fibre), 1.5 * (ratio - 1.0)
+        passive = np.full(len(self.weights), 1.5 * (ratio - 1.0))
+        self.take_fibres(self.fibres._replace(direction=np.ascontiguousarray(fibre), passive=passive))
+
+    def take_fibres(self, fibres: Fibres) -> None:
+        """Take springs along the fibres; their stiffness becomes part of the matrix."""
+        self.fibres, stiff = fibres, fibres.passive + fibres.active
         along = np.zeros((len(self.weights), len(self.rest)))
-        slopes = np.einsum("qka,qa->qk", self.slopes, self.fibre)
+        slopes = np.einsum("qka,qa->qk", self.slopes, fibres.direction)
         np.add.at(along, (np.arange(len(self.weights))[:, None], self.quad_columns), slopes)
-        self.matrix = self.matrix + self.stiff * (along * self.weights[:, None]).T @ along
+        self.matrix = self.without_fibres + (along * (stiff * self.weights)[:, None]).T @ along
         self._invert()
 
     def hardly_move(self) -> Any:
@@ -218,10 +231,7 @@ class Interior:
     def move(self, motions: Any, poses: Any) -> None:
         """Nodes take their share of the bones' motions (b, 4, 4); held points go with the poses (by bone)."""
         self.y = blended_motion(self.y, self.motion_weights, motions)
-        own, anchor = self.owner[self.held], np.empty_like(self.anchor)
-        for bone in self.bones:
-            here, pose = own == bone, poses[bone]
-            anchor[here] = self.points[self.held[here]] @ pose[:3, :3].T + pose[:3, 3]
+        anchor = self._ends(poses)
         step = (anchor - self.anchor).ravel()
         self.anchor, self.begun = anchor, (step, self.y, self.pressure.copy())
         if self.trend is not None:
@@ -231,6 +241,20 @@ class Interior:
             share = float(np.clip(share, -MOST_TREND, MOST_TREND))
             self.y = self.y + share * correction
             self.pressure = self.pressure + share * pressed
+
+    def _ends(self, poses: Any) -> Floats:
+        """Held points (h, 3) where the bones' poses take them."""
+        own, ends = self.owner[self.held], np.empty_like(self.anchor)
+        for bone in self.bones:
+            here, pose = own == bone, poses[bone]
+            ends[here] = self.points[self.held[here]] @ pose[:3, :3].T + pose[:3, 3]
+        return ends
+
+    def respond(self, contacts: Any, motions: Any, poses: Any) -> Floats:
+        """Contact points (n, 3) at other poses (by bone), to first order in all bones' motions (by name) to there."""
+        if self._response is None or self._response[0] is not self.y:
+            self._response = self.y, Response(self, contacts)
+        return self.carry() + self._response[1].carried(self._ends(poses) - self.anchor, motions)
 
     def turn(self, which: Any, transform: Floats) -> None:
         """Nodes go along with a rigid transform as far as they carry free points of the mask ``which``."""
@@ -278,12 +302,12 @@ class Interior:
         size = self.y.size
         mixer = Mixer(self.memory, self.y.size)
         self.history = []
-        self._localise()
+        self.localise()
         self._respond()
         near, self.pull = None, self.spring @ self.anchor
         for step in range(self.iterations):
             if step:
-                self._localise()
+                self.localise()
             if near is None or np.abs(self.y - near.y).max() > 0.4 * near.reach:
                 near = self._near(contacts, near)
             new, pressure = self._iterate(near)
@@ -311,7 +335,7 @@ class Interior:
         sources = max(1, len(contacts.names) + len(contacts.neighbours))
         if self.forces.shape[1] != sources:
             self.forces = np.zeros((len(self.points), sources))
-        reach = NEAR * self.scale
+        reach = self.reach
         index = np.arange(len(self.points))
         if not contacts.neighbours:
             index = np.unique(contacts.half_spaces(self.carry(), reach).index)
@@ -323,37 +347,32 @@ class Interior:
     def elastic(self, y: Floats) -> Floats:
         """Matrix of the elastic energy times places y, targets frozen, (N, 3)."""
         f = np.einsum("qka,qkb->qab", y[self.quad_columns], self.slopes)
-        along = np.einsum("qab,qb->qa", f, self.fibre)
-        f = f + self.stiff * along[:, :, None] * self.fibre[:, None, :]
+        fibre, stiff = self.fibres.direction, self.fibres.passive + self.fibres.active
+        along = np.einsum("qab,qb->qa", f, fibre)
+        f = f + (stiff[:, None] * along)[:, :, None] * fibre[:, None, :]
         out = np.zeros_like(y)
         np.add.at(out, self.quad_columns, np.einsum("q,qab,qkb->qka", self.weights, f, self.slopes))
         return out
 
     def energy(self) -> float:
         """Elastic energy over 2 μ at the present nodes."""
-        self._localise()
+        self.localise()
         gap = self.f - self.target
         total = 0.5 * float(self.weights @ (gap**2).sum(axis=(1, 2)))
-        if self.stiff:
-            along = np.linalg.norm(np.einsum("qab,qb->qa", self.f, self.fibre), axis=1)
-            total += 0.5 * self.stiff * float(self.weights @ (along - self.stretch) ** 2)
+        given = self.fibres
+        along = np.linalg.norm(np.einsum("qab,qb->qa", self.f, given.direction), axis=1)
+        slack = along - np.clip(along, given.lower, given.upper)
+        springs = given.passive * slack**2 + given.active * (along - given.content) ** 2
+        total += 0.5 * float(self.weights @ springs)
         return total
 
-    def _localise(self) -> Any:
-        turn_loop(
-            self.y,
-            self.quad_columns,
-            self.slopes,
-            self.fibre,
-            self.stretch,
-            self.quaternion,
-            self.f,
-            self.target,
-        )
+    def localise(self) -> None:
+        """Deformation gradients, targets, volumes and forces of the present nodes."""
+        turn_loop(self.y, self.quad_columns, self.slopes, self.quaternion, self.f, self.target)
         self.right = np.empty_like(self.y)
         stress_loop(
-            self.f, self.target, self.fibre, self.stretch, self.stiff, self.weights, self.quad_columns,
-            self.slopes, self.region, self.slot, self.right, self.gradient, self.volumes,
+            self.f, self.target, self.fibres, self.weights, self.quad_columns, self.slopes, self.region,
+            self.slot, self.right, self.gradient, self.volumes,
         )  # fmt: skip
 
     def _respond(self) -> Any:
@@ -393,42 +412,3 @@ class Interior:
             self.factor, change, lower=True, trans=1, check_finite=False
         )
         return step + push, pressure
-
-
-def build_interior(muscle: Muscle, rest: Rest, options: RBFOptions) -> Interior:
-    """The solid that carries the centres.
-
-    Parameters
-    ----------
-    muscle : Muscle
-    rest : Rest
-    options : RBFOptions
-
-    Returns
-    -------
-    Interior
-        Its contact points are the centres, the samples, then denser ones of the surface.
-    """
-    frame, faces = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)), np.asarray(muscle.mesh.faces)
-    samples = np.round((rest.samples - frame.origin) @ frame.axes.T / frame.size, 8)
-    denser = dense_points(frame.local, faces, samples, rest.sample_faces)
-    points, centres = np.concatenate([rest.contact_points(), frame.points(denser)]), len(rest.centres)
-    of_samples = rest.holder[centres:]
-    owner = np.concatenate([rest.holder, of_samples[cKDTree(samples).query(denser)[1]]])
-    held = centres + np.flatnonzero(of_samples >= 0)
-    for bone in range(len(rest.bones)):
-        if (owner[held] == bone).sum() < LEAST_ATTACHED:
-            held = np.concatenate([held, np.flatnonzero(rest.holder[:centres] == bone)])
-    lattice = Lattice(frame.local, faces, options.inside)
-    interior = Interior(
-        lattice, frame, points, owner, held, count=centres, free=rest.free,
-        regions=max(1, len(lattice.rest) // NODES_A_REGION), iterations=options.iterations,
-        contacts=options.contacts, memory=options.acceleration,
-    )  # fmt: skip
-    if options.fibre_ratio > 1.0:
-        axis = points[held].mean(axis=0) - points.mean(axis=0)
-        along = fibre_directions(interior.quad_points, interior.rise(), muscle.fibres, fallback=axis)
-        interior.reinforce(along, options.fibre_ratio)
-    stuck, fixed = np.flatnonzero(interior.hardly_move() & (owner < 0)), np.flatnonzero(owner >= 0)
-    interior.owner[stuck] = owner[fixed[cKDTree(points[fixed]).query(points[stuck])[1]]]
-    return interior

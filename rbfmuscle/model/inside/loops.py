@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,9 +15,30 @@ from rbfmuscle.model.contact import solve_contact_forces
 LEAST_VOLUME = 0.05
 
 
+class Fibres(NamedTuple):
+    """Springs along the fibres at the quadrature points, stiffnesses over twice the shear modulus.
+
+    Attributes
+    ----------
+    direction : (Q, 3) ndarray
+        At rest, unit.
+    passive, active : (Q,) ndarray
+        Stiffness of a spring that is slack from ``lower`` to ``upper``, and of one that is content at ``content``.
+    lower, upper, content : (Q,) ndarray
+        Stretches against rest.
+    """
+
+    direction: np.ndarray
+    passive: np.ndarray
+    active: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    content: np.ndarray
+
+
 @compiled(error_model="numpy")
-def turn_loop(y, columns, slopes, fibre, stretch, q, f, target):
-    """Deformation gradients F and targets T = R (t aaᵀ + t^(-1/2) (I - aaᵀ)) at all points."""
+def turn_loop(y, columns, slopes, q, f, target):
+    """Deformation gradients F and their rotations at all points."""
     for i in range(len(columns)):
         for a in range(3):
             for b in range(3):
@@ -35,19 +56,10 @@ def turn_loop(y, columns, slopes, fibre, stretch, q, f, target):
         r[0, 0], r[0, 1], r[0, 2] = 1 - 2 * (yy * yy + z * z), 2 * (x * yy - w * z), 2 * (x * z + w * yy)
         r[1, 0], r[1, 1], r[1, 2] = 2 * (x * yy + w * z), 1 - 2 * (x * x + z * z), 2 * (yy * z - w * x)
         r[2, 0], r[2, 1], r[2, 2] = 2 * (x * z - w * yy), 2 * (yy * z + w * x), 1 - 2 * (x * x + yy * yy)
-        t = stretch[i]
-        if t != 1.0:
-            s = 1.0 / np.sqrt(t)
-            for a in range(3):
-                along = r[a, 0] * fibre[i, 0] + r[a, 1] * fibre[i, 1] + r[a, 2] * fibre[i, 2]
-                for b in range(3):
-                    r[a, b] = s * r[a, b] + (t - s) * along * fibre[i, b]
 
 
 @compiled(error_model="numpy")
-def stress_loop(
-    f, target, fibre, stretch, stiff, weights, columns, slopes, region, slot, out, gradient, volume
-):
+def stress_loop(f, target, fibres, weights, columns, slopes, region, slot, out, gradient, volume):
     """Right side Σ w T ∇N of the fibres and the rest, volumes of the regions and their gradients.
 
     ``slot`` (Q, k) says where node k of point q stands in the rows of ``gradient``.
@@ -73,15 +85,18 @@ def stress_loop(
             for b in range(3):
                 v[a, b] = w * target[i, a, b]
                 c[a, b] *= w
+        stiff = fibres.passive[i] + fibres.active[i]
         if stiff > 0.0:
-            length = 1e-12
+            fibre, length = fibres.direction[i], 1e-12
             for a in range(3):
-                length += (m[a, 0] * fibre[i, 0] + m[a, 1] * fibre[i, 1] + m[a, 2] * fibre[i, 2]) ** 2
-            share = w * stiff * stretch[i] / np.sqrt(length)
+                length += (m[a, 0] * fibre[0] + m[a, 1] * fibre[1] + m[a, 2] * fibre[2]) ** 2
+            length = np.sqrt(length)
+            slack = min(max(length, fibres.lower[i]), fibres.upper[i])
+            share = w * (fibres.passive[i] * slack + fibres.active[i] * fibres.content[i]) / length
             for a in range(3):
-                along = m[a, 0] * fibre[i, 0] + m[a, 1] * fibre[i, 1] + m[a, 2] * fibre[i, 2]
+                along = m[a, 0] * fibre[0] + m[a, 1] * fibre[1] + m[a, 2] * fibre[2]
                 for b in range(3):
-                    v[a, b] += share * along * fibre[i, b]
+                    v[a, b] += share * along * fibre[b]
         for k in range(columns.shape[1]):
             j, s = columns[i, k], slot[i, k]
             for a in range(3):
