@@ -22,13 +22,13 @@ from rbfmuscle.commands.new import new
 from rbfmuscle.commands.opensim.import_model import import_
 from rbfmuscle.commands.opensim.paths import paths
 from rbfmuscle.commands.plan import plan
+from rbfmuscle.commands.poses.ways import ways
 from rbfmuscle.commands.run import demo, run
 from rbfmuscle.commands.sdf import sdf
 from rbfmuscle.commands.show import export, render
 from rbfmuscle.commands.surface import surface
 from rbfmuscle.commands.sweep import sweep
 from rbfmuscle.commands.view import view
-from rbfmuscle.commands.ways import ways
 from rbfmuscle.interruption import INTERRUPTED
 from rbfmuscle.validation import RBFMuscleError, SolveError, UsageError
 

@@ -7,7 +7,7 @@ import pytest
 
 import rbfmuscle as rm
 from rbfmuscle.app import run_command
-from rbfmuscle.commands.ways import compare_ways
+from rbfmuscle.commands.poses.ways import compare_ways
 from rbfmuscle.study.experiment.ways import spread, ways_to
 from rbfmuscle.validation import UsageError
 

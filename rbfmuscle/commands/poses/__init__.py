@@ -1,0 +1,1 @@
+"""Commands that ask where muscles rest in a pose."""
