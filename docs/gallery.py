@@ -13,6 +13,7 @@ from pathlib import Path
 EXAMPLES = (
     "first_muscle",
     "own_meshes",
+    "from_labels",
     "choosing_a_kernel",
     "rbf_against_pbd",
     "tunnelling",

@@ -46,8 +46,13 @@ class TestCommands:
             "pairs": [{"muscle": "strap", "bone": "arm"}, {"muscle": "fan", "bone": "trunk"}],
             "muscles": [
                 {"name": "strap", "model": "rbf", "vertices": 1201, "memory": 11e6, "build": 1.3, "step": 0.0017,
-                 "show": 0.019}
+                 "show": 0.019, "points": "",
+                 "work": {"solved": 17, "carried": 14, "skipped": 0, "reason": "arm turns"}},
+                {"name": "fan", "model": "rbf", "vertices": 1, "memory": 19e6, "build": 2.7, "step": 0.0037,
+                 "show": 0.041, "points": "172 centres",
+                 "work": {"solved": 0, "carried": 0, "skipped": 0, "reason": "none"}},
             ],
+            "ahead": {"messages": ["strap will be driven into the trunk"]},
             "fields": [
                 {"bone": "arm", "size": [2.0, 3.0, 5.0], "share": 0.37, "triangles": 701, "memory": 13e6, "kept": True},
                 {"bone": "trunk", "size": [7.0, 11.0, 13.0], "share": 0.41, "triangles": 709},
@@ -61,9 +66,13 @@ class TestCommands:
         }  # fmt: skip
         assert plan_lines(made) == [
             "31 frames in 67 sub-steps",
-            "muscle strap: rbf, 1201 vertices, can meet arm; 11 MB, 1.3 s to build, 1.7 ms a sub-step, 19 ms a surface",
+            "muscle strap: rbf, 1201 vertices, can meet arm; 11 MB, 1.3 s to build, 1.7 ms a sub-step, "
+            "19 ms a surface; solved in 17, carried in 14 frames (arm turns)",
+            "muscle fan: rbf, 172 centres, can meet trunk; 19 MB, 2.7 s to build, 3.7 ms a sub-step, 41 ms a surface; "
+            "solved in 0 frames (none)",
             "field of arm: 2 x 3 x 5 cm, 37% of the bone's box, 701 triangles; 13 MB, in the cache",
             "field of trunk: 7 x 11 x 13 cm, 41% of the bone's box, 709 triangles",
+            "strap will be driven into the trunk",
             "switched on: tunnelling",
             "expected memory: 23 MB of the scene (fields 29 MB, muscles 31 MB, metrics 37 MB), "
             "peak of the process 41 MB",
@@ -235,6 +244,12 @@ class TestPages:
                     "fan": {"penetration_max": {"worst": 0.0, "worst_frame": 0, "unit": "mm"}},
                 },
                 "stages": {"strap": {"time_solve": {"median": 0.0171, "p95": 0.0192}, "time_fit": None}},
+                "work": {
+                    "strap": {
+                        "solved": 17, "carried": 14, "skipped": 3, "substeps": 41,
+                        "reasons": {"carried": "its bones move as one", "solved": "femur against pelvis"},
+                    }
+                },
             },
         )  # fmt: skip
         assert "Beyond a limit: strap: penetration_max." in _verdict(saved)
@@ -242,7 +257,10 @@ class TestPages:
         assert rows["penetration_max"] == [["0.61", "frame", "7"], ["0"], ["≤", "0.5"]]
         assert rows["length"] == [["11.1", "…", "13.3"], ["-"], []]
         assert rows["volume_error"] == [["-0.002", "frame", "4"], ["-"], ["≤", "0.01"]]
-        assert texts(_stages(saved)) == [[[], ["solve"], ["fit"]], [["strap"], ["17.1", "19.2"], ["-"]]]
+        work = [["17"], ["14"], ["3"], ["41"], ["femur", "against", "pelvis"]]
+        titles = [["solved"], ["carried"], ["skipped"], ["substeps"], ["mostly", "for"]]
+        stages = texts(_stages(saved))
+        assert stages == [[[], ["solve"], ["fit"], *titles], [["strap"], ["17.1", "19.2"], ["-"], *work]]
         facts = dict(
             (name, html.unescape(value))
             for value, name in re.findall(r"<div><b>(.*?)</b><span>(.*?)</span></div>", _facts(saved))
