@@ -91,7 +91,7 @@ def energy_matrix(points: Floats, kernel: str = KERNEL) -> Floats:
     if failed:
         raise np.linalg.LinAlgError("the points all but coincide; thin them out")
     n = len(points)
-    block = np.array(inverse[n:, n:], order="F")
+    block = np.tril(inverse[n:, n:])  # above the diagonal stands whatever was in memory
     directions = factor.directions[n:]
     block -= directions @ directions.T / factor.gamma
     return np.tril(block)
@@ -105,9 +105,8 @@ def _least_energy(points: Floats, start: Floats | None) -> Floats:
     del lower  # a second matrix of the size
     try:
         return _descend(energy_matrix(points, SMOOTHER), found)[1]
-    except (
-        np.linalg.LinAlgError
-    ):  # of higher degree, which points on a quadric or in a part of a plane do not determine
+    except np.linalg.LinAlgError:
+        # Of higher degree, which points on a quadric or in a part of a plane do not determine.
         return found
 
 
