@@ -239,11 +239,13 @@ def main():
     parser.add_argument("--activation", type=float, default=1.0)
     parser.add_argument("--cases", default=",".join(CASES), help="some of the cases, by commas")
     given = parser.parse_args()
+    unknown = sorted(set(given.cases.split(",")) - set(CASES))
+    if unknown:
+        parser.error(f"no case {', '.join(unknown)}; known: {', '.join(CASES)}")
     if given.action == "surface":
         import trimesh
 
         kept = np.load(DATA)
-
         mesh = trimesh.load(given.names[0], process=False)
         print(compare_spindle(np.asarray(mesh.vertices), np.asarray(mesh.faces), given.activation, kept))
         return
