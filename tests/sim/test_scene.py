@@ -296,6 +296,9 @@ class TestOptions:
                 parse_slice(text)
         with pytest.raises(UsageError, match="KEY=VALUE"):
             parse_setting("centres")
+        for value in ("nan", "-inf", "{a=[inf]}", "99999999999999999999"):
+            with pytest.raises(UsageError, match=r"^model\.rest_error"):
+                parse_setting(f"model.rest_error={value}")
 
     def test_pickle_and_resolved(self, folder):
         import json

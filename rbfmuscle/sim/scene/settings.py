@@ -114,21 +114,30 @@ def parse_setting(text: str) -> tuple[Any, ...]:
     Raises
     ------
     UsageError
-        If there is no "=".
+        If there is no "=", or the value is a number or a nesting that nothing takes.
     """
     key, found, value = text.partition("=")
     if not found or not key.strip():
         raise UsageError(f"{text!r} is not KEY=VALUE, for instance model.centres=200")
-    return key.strip(), parse_value(value.strip())
+    return key.strip(), parse_value(value.strip(), place=key.strip())
 
 
-def parse_value(text: str) -> dict[str, Any] | int | str:
-    """Return the value of a TOML literal (number, true, list, table), or the text itself."""
+def parse_value(text: str, *, place: str) -> dict[str, Any] | int | str:
+    """Return the value of a TOML literal (number, true, list, table), or the text itself.
+
+    Raises
+    ------
+    UsageError
+        For NaN, infinity, numbers beyond 2^53 and deep nesting; ``place`` begins the message.
+    """
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):
         return text
-    check_plain(value, place="value")
+    try:
+        check_plain(value, place=place)
+    except SceneError as error:
+        raise UsageError(str(error)) from None
     return value
 
 

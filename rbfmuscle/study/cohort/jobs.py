@@ -149,7 +149,11 @@ def _job(path, number, row, common):
     for wanted in ("subject", "scene"):
         if not row[wanted]:
             raise UsageError(f"{path} line {number}: {wanted} is empty")
-    own = {key: parse_value(text) for key, text in row.items() if key not in COLUMNS and text}
+    own = {
+        key: parse_value(text, place=f"{path} line {number}: {key}")
+        for key, text in row.items()
+        if key not in COLUMNS and text
+    }
     scene = row["scene"]
     if scene != PHANTOM:
         scene = str((path.parent / scene).resolve())

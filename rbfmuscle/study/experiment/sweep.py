@@ -82,7 +82,7 @@ def parse_grid(texts: list[Any]) -> list[tuple[str, str, list[Any]]]:
             raise UsageError(f"{text!r} is not KEY=a,b,c, for instance model.centres=100,200,300")
         if any(key == other and model in ("", m) for m, other, _ in grid):
             raise UsageError(f"{key} is given twice in the grid")
-        grid.append((model, key, list(dict.fromkeys(_values(values)))))
+        grid.append((model, key, list(dict.fromkeys(_values(key, values)))))
     if not grid:
         raise UsageError("a sweep needs a grid, for instance --grid model.centres=100,200,300")
     models = next((values for _, key, values in grid if key == "model"), [])
@@ -92,11 +92,11 @@ def parse_grid(texts: list[Any]) -> list[tuple[str, str, list[Any]]]:
     return grid
 
 
-def _values(text):
+def _values(key, text):
     try:
         return tomllib.loads(f"value = [{text}]")["value"]
     except tomllib.TOMLDecodeError:
-        return [parse_value(part.strip()) for part in text.split(",") if part.strip()]
+        return [parse_value(part.strip(), place=key) for part in text.split(",") if part.strip()]
 
 
 @dataclass(frozen=True)
