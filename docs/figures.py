@@ -79,12 +79,14 @@ TABLES = {"headline": headline_table}
 
 def span(rows, key):
     """The least and the greatest of a key over all muscles, as text."""
-    values = [f"{row[key]:.2f}" for row in rows.values()]
-    return f"{min(values)} to {max(values)}"
+    values = [row[key] for row in rows.values()]
+    return f"{min(values):.2f} to {max(values):.2f}"
 
 
 VALUES = {
-    ("headline", "steps_apart"): lambda facts: max(f"{r['steps_apart']:.2f}" for r in facts["rows"].values()),
+    ("headline", "steps_apart"): lambda facts: (
+        f"{largest(r['steps_apart'] for r in facts['rows'].values()):.2f}"
+    ),
     ("headline", "there_and_back"): lambda facts: span(facts["rows"], "there_and_back"),
     ("headline", "solver_penetration"): lambda facts: bound(
         largest(r["solver_penetration_max"] for r in facts["rows"].values()), 2
