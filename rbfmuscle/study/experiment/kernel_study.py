@@ -27,6 +27,7 @@ from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
 from rbfmuscle.study.experiment.kernel_choice import Bootstrap, Recommendation, mark_unfit, recommend
 from rbfmuscle.study.experiment.sweep_table import pareto_front
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
+from rbfmuscle.study.measure.metrics import count_components
 from rbfmuscle.study.measure.worst_places import worst_places
 from rbfmuscle.validation import NumericalWarning, UsageError, check_mesh
 
@@ -150,9 +151,9 @@ def study_kernels(
         raise UsageError(f"placement must be one of {', '.join((*PLACEMENTS, FITTED))}, got {placement!r}")
     if min(centres, default=0) < 8:
         raise UsageError(f"centres must be numbers of at least 8, got {list(centres)}")
-    judge = SurfaceJudge(vertices, faces, resolution, seed)
     if not condition >= 1.0:
         raise UsageError(f"condition must be a bound of at least 1, got {condition:g}")
+    judge = SurfaceJudge(vertices, faces, resolution, seed)
     study, found = KernelStudy([], units=units), []
     ask = Request(derivatives, criterion, placement, float(condition))
     total = len(kernels) * len(centres)
@@ -206,7 +207,7 @@ class SurfaceJudge:
         which = rng.choice(len(area), JUDGES, p=area / area.sum())
         self.points = np.einsum("nk,nkj->nj", rng.dirichlet(np.ones(3), JUDGES), corners[which])
         self.normals = normal[which] / area[which, None]
-        self.sheets = _sheets(faces)
+        self.sheets = count_components(len(vertices), faces)
         self.bootstrap = Bootstrap(JUDGES, seed)
 
     def apart(self, vertices: Floats, faces: Integers) -> tuple[float, float, Floats, tuple[float, float]]:
@@ -241,18 +242,6 @@ class SurfaceJudge:
         faces = np.asarray(small.regular_faces)
         rms, hausdorff, *_ = self.apart(vertices, faces)
         return {"vertices": len(vertices), "rms": rms, "hausdorff": hausdorff}
-
-
-def _sheets(faces):
-    """Parts of a mesh."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
-    size = int(faces.max()) + 1
-    graph = coo_matrix((np.ones(len(ends)), ends.T), shape=(size, size))
-    used = np.unique(faces)
-    return len(np.unique(connected_components(graph, directed=False)[1][used]))
 
 
 def _fit(sample, kernel, epsilon, derivatives):

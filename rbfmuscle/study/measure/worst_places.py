@@ -44,8 +44,8 @@ def worst_places(
     list of dict
         ``point, distance, thickness, gap, radius, spacing`` [length] and ``cause, remedy``, the worst first.
     """
-    near = cKDTree(centres).query(centres, k=min(5, len(centres)))[0][:, 1:].mean(axis=1)
     tree, others = cKDTree(centres), cKDTree(points)
+    near = tree.query(centres, k=min(5, len(centres)))[0][:, 1:].mean(axis=1)
     left, found = np.array(distance, dtype=float), []
     for _ in range(PLACES):
         at = int(np.argmax(left))
