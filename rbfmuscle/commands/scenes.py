@@ -12,6 +12,11 @@ if TYPE_CHECKING:
 PHANTOM = "phantom"
 
 
+def is_mesh(source: str) -> bool:
+    """Whether what a command is given is one mesh, not a scene."""
+    return source != PHANTOM and Path(source).suffix.lower() != ".toml"
+
+
 def load_scene(scene: str) -> Scene:
     """The scene of a file, or the embedded hip for "phantom" where there is no file of that name."""
     from rbfmuscle.sim.scene.scene import Scene

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from rbfmuscle.commands.scenes import is_mesh, load_scene
 from rbfmuscle.compiled.progress import Progress
 from rbfmuscle.validation import UsageError
 
@@ -76,11 +77,9 @@ def find_wanted(
 def _meshes(source, muscle, units):
     """Meshes by name, and their unit."""
     from rbfmuscle.sim.scene.meshes import read_mesh
-    from rbfmuscle.sim.scene.phantom import phantom_scene
-    from rbfmuscle.sim.scene.scene import Scene
 
-    if source != "phantom" and Path(source).suffix.lower() != ".toml":
+    if is_mesh(source):
         return {Path(source).stem: read_mesh(source).mesh}, units
-    scene = phantom_scene() if source == "phantom" else Scene.load(source)
+    scene = load_scene(source)
     chosen = [scene.muscle(muscle)] if muscle else scene.muscles
     return {each.name: each.mesh for each in chosen}, scene.units

@@ -131,7 +131,7 @@ def test_sampling_goes_on_where_it_ended_and_is_fitted(scene, tmp_path):
 
 def test_ranges_are_checked(scene):
     assert parse_ranges(scene, ["flexion=0:90"])["hip.flexion"] == pytest.approx((0.0, np.pi / 2))
-    for text in ("flexion", "flexion=1", "flexion=9:1", "flexion=a:b"):
+    for text in ("flexion", "flexion=1", "flexion=9:1", "flexion=a:b", "flexion=0:inf"):
         with pytest.raises(UsageError, match="--range"):
             parse_ranges(scene, [text])
 

@@ -37,8 +37,8 @@ def parse_ranges(scene: Scene, texts: list[str]) -> dict[str, tuple[float, float
                 f"--range {text!r} is not COORDINATE=LOW:HIGH, for instance hip.flexion=0:60"
             ) from None
         full = full_name(name, known, place="--range")
-        if not low < high:
-            raise UsageError(f"--range {text!r}: the range must go upwards")
+        if not -np.inf < low < high < np.inf:
+            raise UsageError(f"--range {text!r}: the range must go upwards between two numbers")
         found[full] = (inner_value(scene, full, low), inner_value(scene, full, high))
     return found
 
