@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -71,8 +70,10 @@ def run_job(job: CohortJob, directory: Path) -> dict[str, Any]:
 
 def _tell(table, output, as_json):
     if as_json:
+        from rbfmuscle.study.files.writer import json_text
+
         facts = {key: value for key, value in table.items() if key != "values"}
-        print(json.dumps({"directory": str(output), **facts}, indent=1))
+        print(json_text({"directory": str(output), **facts}))
     else:
         for one in table["outliers"][:5]:
             job = " ".join(part for part in (one["subject"], one["trial"]) if part)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Annotated
 
 from cyclopts import Parameter
@@ -65,6 +64,7 @@ def compare(
     from rbfmuscle.compare import compare_models
     from rbfmuscle.models import MODEL_NAMES
     from rbfmuscle.sim.scene.settings import parse_setting
+    from rbfmuscle.study.files.writer import json_text
 
     names = [name.strip() for name in models.split(",") if name.strip()] if models else list(MODEL_NAMES)
     changes = dict(parse_setting(text) for text in settings or [])
@@ -89,7 +89,7 @@ def compare(
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"interrupted; finished runs are kept in {output}") from None
     if as_json:
-        print(json.dumps({"directory": str(output), **table}, indent=1))
+        print(json_text({"directory": str(output), **table}))
     else:
         _print_table(table, output)
     if table["failed"]:

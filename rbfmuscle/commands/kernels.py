@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
+from rbfmuscle.commands.scenes import is_mesh, load_scene
 from rbfmuscle.compiled.progress import Progress
 from rbfmuscle.compiled.warm import compile_ahead
 from rbfmuscle.compiled.watch import tell_stage
@@ -84,6 +84,7 @@ def kernels(
     """
     from rbfmuscle.implicit.selection import CRITERIA
     from rbfmuscle.study.experiment.kernel_study import study_kernels
+    from rbfmuscle.study.files.writer import json_text
     from rbfmuscle.study.show.kernel_page import write_study
 
     if derivatives not in ("all", "normal") or criterion not in CRITERIA:
@@ -119,7 +120,7 @@ def kernels(
         except OSError as error:
             raise UsageError(f"cannot write to {output}: {error.strerror}; choose another --output") from None
     if as_json:
-        print(json.dumps({"rows": study.rows, "motion": moved}, indent=1))
+        print(json_text({"rows": study.rows, "motion": moved}))
     else:
         _print(study, moved, output)
     if missing is not None:
@@ -134,23 +135,22 @@ def _split(texts):
 
 def _extremes(names, output, as_json):
     from rbfmuscle.study.experiment.extremes import extremes_matrix, study_extremes, write_extremes
+    from rbfmuscle.study.files.writer import json_text
 
     with Progress("extremes", what="fit") as bar:
         rows = study_extremes(kernels=names, progress=bar)
     write_extremes(rows, output)
-    print(json.dumps(rows, indent=1) if as_json else extremes_matrix(rows))
+    print(json_text(rows) if as_json else extremes_matrix(rows))
     return 0
 
 
 def _surface(source, muscle):
     """Scene or None, the mesh to fit, and its name."""
     from rbfmuscle.sim.scene.meshes import read_mesh
-    from rbfmuscle.sim.scene.phantom import phantom_scene
-    from rbfmuscle.sim.scene.scene import Scene
 
-    if source != "phantom" and Path(source).suffix.lower() != ".toml":
+    if is_mesh(source):
         return None, read_mesh(source).mesh, Path(source).stem
-    scene = phantom_scene() if source == "phantom" else Scene.load(source)
+    scene = load_scene(source)
     chosen = scene.muscle(muscle) if muscle else scene.muscles[0]
     return scene, chosen.mesh, chosen.name
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from pathlib import Path
@@ -147,7 +146,9 @@ def _run_scene(load, output, *, as_json, title, resume=False, **asked):
                 raise type(error)(f"{error}; {done} frames are kept in {output}") from None
             raise
     if as_json:
-        print(json.dumps({"directory": str(output), **info}, indent=1, default=str))
+        from rbfmuscle.study.files.writer import json_text
+
+        print(json_text({"directory": str(output), **info}))
     else:
         _print_summary(info["muscles"], scene.units)
         report = output / "report.html"

@@ -151,12 +151,13 @@ def _finish_task(plan, measured, output, as_json):
 
 def _finish(plan, output, error, as_json):
     from rbfmuscle.study.experiment.sweep_table import write_table
+    from rbfmuscle.study.files.writer import json_text
     from rbfmuscle.study.show.sweep_page import write_page
 
     table = write_table(plan, output, quantity=error)
     write_page(table, output)
     if as_json:
-        print(json.dumps({"directory": str(output), **table}, indent=1))
+        print(json_text({"directory": str(output), **table}))
     else:
         for verdict in table["verdicts"]:
             print(verdict["text"])

@@ -2,6 +2,7 @@
 
 import json
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from command_line import call
 
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.study.experiment.wanted_error import reach_error
+from rbfmuscle.study.experiment.wanted_files import write_wanted
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.validation import UsageError
 
@@ -48,16 +50,25 @@ def test_a_coarser_kernel_is_given_up_after_one_fit(found):
     assert sum(t["kernel"] == "linear" for t in found.tried) == 1 and get_kernel("linear").smoothness == 0
 
 
+def test_rows_that_broke_leave_a_file_that_every_reader_takes(found, tmp_path):
+    """Their error is infinite, which JSON does not know."""
+    broken = replace(found, tried=[{"kernel": "gaussian", "centres": 20, "error": np.inf}])
+    write_wanted({"muscle": broken}, tmp_path)
+    text = (tmp_path / "error.json").read_text()
+    facts = json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
+    assert facts["muscle"]["tried"][0]["error"] is None and facts["muscle"]["reached"]
+
+
 def test_what_cannot_be_reached_names_the_best(ellipsoid):
     found = reach_error(ellipsoid, 1e-4, kernels=["cubic"], placement="even", most=30)
     assert not found.reached and found.row["centres"] == 30 and found.error > 1e-4
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"error": -1.0}, {"error": 0.1, "most": 5}, {"error": 0.1, "placement": "x"}]
+    "wrong", [{"error": -1.0}, {"error": np.nan}, {"error": 0.1, "most": 5}, {"error": 0.1, "placement": "x"}]
 )
 def test_wrong_requests_are_answered(ellipsoid, wrong):
-    with pytest.raises((UsageError, ValueError)):
+    with pytest.raises(UsageError):
         reach_error(ellipsoid, **wrong)
 
 

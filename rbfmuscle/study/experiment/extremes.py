@@ -6,7 +6,6 @@ A fit that is wrong and says nothing is the one outcome that must not occur; the
 from __future__ import annotations
 
 import csv
-import json
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +18,7 @@ from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
 from rbfmuscle.implicit.placement.off_surface import off_surface_points
 from rbfmuscle.implicit.selection import spacing
+from rbfmuscle.study.files.writer import json_text
 from rbfmuscle.validation import NumericalWarning, RBFMuscleError
 
 # Shape parameters, in units of 1 / (mean distance to the nearest centre).
@@ -188,7 +188,7 @@ def write_extremes(rows: list[dict[str, Any]], directory: Path) -> None:
         writer = csv.DictWriter(file, fieldnames=HEADER)
         writer.writeheader()
         writer.writerows(rows)
-    (directory / "extremes.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
+    (directory / "extremes.json").write_text(json_text(rows), encoding="utf-8")
     (directory / "extremes.md").write_text(extremes_matrix(rows), encoding="utf-8")
 
 

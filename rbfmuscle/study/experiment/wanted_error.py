@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.arrays import MeshLike
+from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
 from rbfmuscle.implicit.placement.density import GREEDY_LARGEST
 from rbfmuscle.implicit.placement.refinement import FITTED
 from rbfmuscle.implicit.placement.sampling import PLACEMENTS, sample_surface
 from rbfmuscle.study.experiment.kernel_choice import mark_unfit
 from rbfmuscle.study.experiment.kernel_study import KernelStudy, Request, SurfaceJudge, measure_row
-from rbfmuscle.validation import UsageError, check_mesh, check_positive
+from rbfmuscle.validation import UsageError, check_mesh
 
 # Kernels that take part by default, the quickest first.
 CANDIDATES = ("cubic", "quintic", "skala_cervenka", "matern_52")
@@ -115,15 +116,16 @@ def reach_error(
     >>> found.reached, found.row["kernel"], found.error <= 0.1
     (True, 'cubic', True)
     """
-    error = check_positive(error, name="error")
+    if not 0.0 < error < np.inf:
+        raise UsageError(f"error must be a positive length, got {error}")
     names = [get_kernel(name) for name in (kernels or CANDIDATES)]
     if placement not in (*PLACEMENTS, FITTED):
         raise UsageError(f"placement must be one of {', '.join((*PLACEMENTS, FITTED))}, got {placement!r}")
     limit = GREEDY_LARGEST if placement in (FITTED, "greedy") else 20_000
     if not FEWEST <= most <= limit:
         raise UsageError(f"most must be from {FEWEST} to {limit} with placement {placement!r}, got {most}")
-    vertices, faces = check_mesh(*(mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)))
-    search = Search((vertices, faces), error, greatest, placement, int(most), progress)
+    arrays = mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)
+    search = Search(arrays, float(error), greatest, placement, int(most), progress)
     for kernel in names:
         search.try_kernel(kernel)
     return search.confirmed()
@@ -231,14 +233,12 @@ class Search:
             self.best, more = None, math.ceil(count * (1.0 + STEP))
             while more <= self.most and self.measure(kernel, more) > self.error:
                 more = math.ceil(more * (1.0 + STEP))
-        rows = sorted(self.rows.values(), key=self._error)
-        return WantedError(False, rows[0], self._error(rows[0]), self.error, self.greatest, self.tried)
+        row = min(self.rows.values(), key=self._error)
+        return WantedError(False, row, self._error(row), self.error, self.greatest, self.tried)
 
 
 def _cells(vertices, faces, error):
     """Cells along the longest side whose chords, c^2 / 8R with R the mean thickness, take little of the error."""
-    from rbfmuscle.geometry.surfaces import mesh_volume
-
     corners = vertices[faces]
     area = (
         0.5

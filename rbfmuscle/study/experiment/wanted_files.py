@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from rbfmuscle.study.experiment.wanted_error import WantedError
+from rbfmuscle.study.files.writer import json_text
 
 
 def describe_wanted(name: str, found: WantedError, units: str = "") -> str:
@@ -50,4 +50,4 @@ def write_wanted(results: dict[str, WantedError], directory: str | Path, *, unit
                "row": r.row, "toml": r.toml(), "tried": r.tried}
         for name, r in results.items()
     }  # fmt: skip
-    (directory / "error.json").write_text(json.dumps(facts, indent=1), encoding="utf-8")
+    (directory / "error.json").write_text(json_text(facts), encoding="utf-8")

@@ -302,11 +302,16 @@ def write_json(path: Path, data: dict[str, Any]) -> None:
     path = Path(path)
     part = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        part.write_text(json.dumps(plain(data), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        part.write_text(json_text(data) + "\n", encoding="utf-8")
         os.replace(part, path)
     except OSError as error:
         part.unlink(missing_ok=True)
         raise SolveError(f"cannot write {path}: {error.strerror}") from None
+
+
+def json_text(data: Any) -> str:
+    """JSON that every reader takes: NaN and infinity become null."""
+    return json.dumps(plain(data), indent=1, allow_nan=False)
 
 
 def plain(value: Any) -> Any:

@@ -6,7 +6,6 @@ import base64
 import csv
 import html
 import io
-import json
 import math
 import subprocess
 import sys
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rbfmuscle.study.experiment.kernel_choice import named
+from rbfmuscle.study.files.writer import json_text
 from rbfmuscle.study.show.page import STYLE
 from rbfmuscle.validation import MissingPartError
 
@@ -102,7 +102,7 @@ def write_study(
         writer.writeheader()
         writer.writerows(study.rows)
     facts = {"title": title, "units": study.units, "rows": study.rows, "scan": study.scan}
-    (directory / "kernels.json").write_text(json.dumps(facts, indent=1), encoding="utf-8")
+    (directory / "kernels.json").write_text(json_text(facts), encoding="utf-8")
     fronts = _save(directory / "fronts.png", _draw_fronts, study)
     maps = _save(directory / "map.png", _draw_maps, study) if study.scan else None
     missing, drawn = None, None
