@@ -182,13 +182,14 @@ class MuscleStepper:
         before, after = self.path
         self.solve(after)
         self.solves += 1
-        if self.carrier is not None:
-            self.carrier.solved = self.poses(after)
         if self.saved is not None:
             state, start, poses = self.saved
             crossings = self._crossings(start, poses)
             if crossings:
                 self._correct(state, start, poses, before, after, crossings)
+        # Last: a step that is halved begins again from where the muscle was solved before.
+        if self.carrier is not None:
+            self.carrier.solved = self.poses(after)
 
     def solve(self, coordinates: dict[str, float]) -> None:
         """Solve, and refuse what is not finite.
