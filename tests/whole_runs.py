@@ -5,6 +5,7 @@ with it. ``python -m whole_runs --compare`` tells how far this machine is from w
 """
 
 import json
+import math
 import sys
 from pathlib import Path
 
@@ -124,8 +125,10 @@ def _compare(kept, found, place, kind, worst):
             _compare(a, b, f"{place} {k}", kind, worst)
     elif (kept is None) != (found is None):
         raise AssertionError(f"{place}: {kept} is kept, {found} is there")
-    elif kept is not None and (kind not in worst or abs(kept - found) > worst[kind][0]):
-        worst[kind] = abs(kept - found), place
+    elif kept is not None:
+        gap = abs(kept - found) if math.isfinite(found) else math.inf
+        if kind not in worst or gap > worst[kind][0]:
+            worst[kind] = gap, place
 
 
 def write(name):
