@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -90,8 +91,6 @@ def _installed():
 
 def _environment():
     """The child finds this package where the parent does, though it starts in another folder."""
-    import os
-
     here = str(Path(__file__).resolve().parents[2])
     return {
         **os.environ,

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rbfmuscle.opensim.model import GROUND, ModelPath
+from rbfmuscle.opensim.model import ModelPath
 from rbfmuscle.opensim.paths import active_points
 from rbfmuscle.opensim.scene import Imported
 from rbfmuscle.sim.scene.attachments import signed_distances
@@ -89,6 +89,14 @@ def name_score(muscle: str, words: list[str], side: str) -> float:
     return max(likeness(form, tuple(words)) for form in forms if form)
 
 
+def mesh_files(folder: Path, option: str) -> list[Path]:
+    """Return the meshes of a folder that an option names, or raise UsageError where it has none."""
+    files = sorted(file for file in folder.glob("*") if file.suffix.lower() in MESH_SUFFIXES)
+    if not files:
+        raise UsageError(f"{option} {folder}: no meshes there ({', '.join(MESH_SUFFIXES)})")
+    return files
+
+
 def match_meshes(found: Imported, folder: Path, table: Path | None = None) -> list[Match]:
     """Match the meshes of a folder to a model's muscles by name, or as a table says.
 
@@ -97,9 +105,7 @@ def match_meshes(found: Imported, folder: Path, table: Path | None = None) -> li
     UsageError
         If the folder has no meshes, or the table names a mesh or a muscle that is not there.
     """
-    files = sorted(file for file in folder.glob("*") if file.suffix.lower() in MESH_SUFFIXES)
-    if not files:
-        raise UsageError(f"--muscles {folder}: no meshes there ({', '.join(MESH_SUFFIXES)})")
+    files = mesh_files(folder, "--muscles")
     matches = [Match(file, re.sub(r"[^A-Za-z0-9_-]+", "_", file.stem)) for file in files]
     if table is not None:
         _from_table(matches, found, table)
@@ -119,9 +125,15 @@ def _from_table(matches, found, table):
     paths = {path.name: path for path in found.model.paths}
     by_mesh = {match.file.name: match for match in matches}
     try:
-        rows = list(csv.DictReader(table.read_text(encoding="utf-8").splitlines()))
+        # Spreadsheets write a mark before the first column's name.
+        text = table.read_text(encoding="utf-8-sig", errors="replace")
+        rows = list(csv.DictReader(text.splitlines()))
     except OSError as error:
         raise UsageError(f"--matches {table}: {error.strerror}") from None
+    except csv.Error as error:
+        raise UsageError(
+            f"--matches {table}: {error}; give a table like the matches.csv of an import"
+        ) from None
     for row in rows:
         if row.get("mesh") not in by_mesh:
             raise UsageError(f"--matches {table}: no mesh {row.get('mesh')!r} in the folder; correct the row")
@@ -165,7 +177,7 @@ def _ends(found, path):
     metre = found.scene.length(1000.0)
     out = []
     for point, place in (points[0], points[-1]):
-        pose = found.places[point.body] if point.body != GROUND else found.places[GROUND]
+        pose = found.places[point.body]
         out.append((point.body, pose[:3, :3] @ (place * metre) + pose[:3, 3]))
     return out
 
@@ -192,14 +204,6 @@ def _nearest(points, held, bones):
             mine = np.array([table[k].argmin()])
         found.append((name, np.sort(mine[np.argsort(table[k][mine], kind="stable")[:count]])))
     return found
-
-
-def write_rows(rows: list[dict], file: Path) -> None:
-    """Write the residuals of a fit to own bones: of joints, the columns are the gap [mm] and the turn left [degree]."""
-    with file.open("w", encoding="utf-8", newline="") as out:
-        writer = csv.DictWriter(out, fieldnames=list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def write_table(matches: list[Match], file: Path) -> None:

@@ -1,5 +1,6 @@
 """A generic model brought to own bones: similarity transforms body by body, and the joints that come along."""
 
+import csv
 import itertools
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,11 +11,11 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.opensim.match import name_score, split_name
+from rbfmuscle.opensim.match import mesh_files, name_score, split_name
 from rbfmuscle.opensim.scene import Imported
 from rbfmuscle.sim.joints.joint import Joint, frame_at
 from rbfmuscle.sim.joints.skeleton import ordered, resolve
-from rbfmuscle.sim.scene.meshes import MESH_SUFFIXES, read_mesh
+from rbfmuscle.sim.scene.meshes import read_mesh
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.validation import UsageError
 
@@ -96,11 +97,8 @@ def _spread(mesh):
 
 def match_bones(found: Imported, folder: Path) -> dict[str, Path]:
     """Return the own bone of each of a scene's bones, by name."""
-    files = sorted(file for file in folder.glob("*") if file.suffix.lower() in MESH_SUFFIXES)
-    if not files:
-        raise UsageError(f"--bones {folder}: no meshes there ({', '.join(MESH_SUFFIXES)})")
     chosen = {}
-    for file in files:
+    for file in mesh_files(folder, "--bones"):
         words, side = split_name(file.stem)
         scores = {bone.name: name_score(bone.name, words, side) for bone in found.scene.bones}
         top = max(scores, key=lambda name: scores[name], default=None)
@@ -167,6 +165,14 @@ def bring_to_bones(found: Imported, folder: Path) -> list[dict]:
     return rows
 
 
+def write_rows(rows: list[dict], file: Path) -> None:
+    """Write the residuals: of joints, the columns are the gap [mm] and the turn left [degree]."""
+    with file.open("w", encoding="utf-8", newline="") as out:
+        writer = csv.DictWriter(out, fieldnames=list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
 def _spread_fits(scene, fits):
     """A body without an own bone goes with its nearest relative that has one."""
     ties = [(joint.parent, joint.child) for joint in scene.joints]
@@ -184,11 +190,9 @@ def _spread_fits(scene, fits):
 def _moved(joint, scene, fits, millimetre):
     """A joint between registered bones: axes with the parent, midway, at rest as the child was scanned."""
     parent, child = fits[joint.parent], fits[joint.child]
-    start = {
-        name: resolve({}, scene.joints, scene.couplings)[f"{joint.name}.{name}"] for name in joint.coordinates
-    }
-    there = joint.displacement(start)
-    there = np.eye(4) if there is None else there
+    resting = resolve({}, scene.joints, scene.couplings)
+    start = {name: resting[f"{joint.name}.{name}"] for name in joint.coordinates}
+    there = _displacement(joint, start)
     at_rest = np.linalg.inv(there) if joint.backward else there
     # The joint's frame on the child's side, as the model has it at rest and as the child's own bone puts it.
     onward = at_rest @ joint.frame
@@ -201,8 +205,7 @@ def _moved(joint, scene, fits, millimetre):
     straight = Joint(joint.name, "", "", frame, joint.coordinates, joint.rotations, (), joint.kind)
 
     def misfit(values):
-        moved = straight.displacement({**start, **dict(zip(free, values))})
-        got = (np.eye(3) if moved is None else moved[:3, :3]) @ frame[:3, :3]
+        got = _displacement(straight, {**start, **dict(zip(free, values))})[:3, :3] @ frame[:3, :3]
         return Rotation.from_matrix(got.T @ turn).as_rotvec()
 
     rest = dict(start)
@@ -219,14 +222,18 @@ def _moved(joint, scene, fits, millimetre):
         name: replace(facts, rest=rest[name], default=None) for name, facts in joint.coordinates.items()
     }
     made = replace(joint, frame=frame, coordinates=coordinates, translations=translations, _rest=(None, None))
-    reached = made.displacement(rest)
-    reached = (np.eye(4) if reached is None else reached) @ frame
+    reached = _displacement(made, rest) @ frame
     gap = child(onward[:3, 3]) - reached[:3, 3]
     before, made.frame = frame[:3, 3].copy(), frame.copy()
     made.frame[:3, 3] += 0.5 * gap
     row = {"what": f"joint {joint.name}", "file": "", "scale": parent.scale,
            "rms_mm": float(np.linalg.norm(gap)) / millimetre, "max_mm": np.degrees(left), "before": before}  # fmt: skip
     return made, row
+
+
+def _displacement(joint, values):
+    found = joint.displacement(values)
+    return np.eye(4) if found is None else found
 
 
 def _scaled(axis, joint, scale):

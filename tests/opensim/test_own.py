@@ -93,10 +93,16 @@ def test_own_muscles_get_first_attachments_marked_as_guesses(own, tmp_path):
         writer = csv.DictWriter(file, rows[0])
         writer.writeheader()
         writer.writerows(rows)
-    again = match_meshes(found, folder, tmp_path / "corrected.csv")
-    assert [path.name for path in again[1].paths] == ["hamstring"]
+    marked = b"\xef\xbb\xbf" + (tmp_path / "corrected.csv").read_bytes()  # as a spreadsheet writes it
+    (tmp_path / "marked.csv").write_bytes(marked)
+    for table in ("corrected.csv", "marked.csv"):
+        again = match_meshes(found, folder, tmp_path / table)
+        assert [path.name for path in again[1].paths] == ["hamstring"]
     (tmp_path / "wrong.csv").write_text("mesh,muscles\nmasseter.ply,nobody\n")
     with pytest.raises(UsageError, match="no muscle 'nobody'"):
+        match_meshes(found, folder, tmp_path / "wrong.csv")
+    (tmp_path / "wrong.csv").write_bytes(b"PK\x03\x04\xff\xfe\n\xff\n")
+    with pytest.raises(UsageError, match="no mesh None in the folder; correct the row"):
         match_meshes(found, folder, tmp_path / "wrong.csv")
 
 

@@ -49,7 +49,7 @@ def import_(
         Replace a scene file that exists.
     """
     from rbfmuscle.opensim.folder import write_scene
-    from rbfmuscle.opensim.match import write_rows, write_table
+    from rbfmuscle.opensim.match import write_table
     from rbfmuscle.opensim.scene import import_osim
 
     target = output / "scene.toml"
@@ -63,6 +63,8 @@ def import_(
     held = _match(found, muscles, matches)
     written = write_scene(found, output, motion=motion, matches=held)
     if rows:
+        from rbfmuscle.opensim.register import write_rows
+
         write_rows(rows, output / "bones.csv")
     if held:
         write_table(held, output / "matches.csv")
