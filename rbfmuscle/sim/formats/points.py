@@ -9,8 +9,6 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.validation import MeshError, is_file, shown_path
 
-POINT_SUFFIXES = (".xyz", ".npy", ".ply")
-
 
 def read_points(path: str | Path) -> tuple[Floats, Floats | None]:
     """Points of a file, and their normals where it has them.
@@ -18,7 +16,7 @@ def read_points(path: str | Path) -> tuple[Floats, Floats | None]:
     Parameters
     ----------
     path : path
-        ``.xyz`` or ``.txt``: three or six numbers a line (what follows ``#`` is left out); ``.npy``: an array (n, 3) or
+        ``.xyz``: three or six numbers a line (what follows ``#`` is left out); ``.npy``: an array (n, 3) or
         (n, 6); ``.ply``: vertices, whose faces are left out.
 
     Returns
@@ -38,7 +36,7 @@ def read_points(path: str | Path) -> tuple[Floats, Floats | None]:
     if suffix not in POINT_SUFFIXES:
         raise MeshError(f"{shown_path(path)}: points are read from {', '.join(POINT_SUFFIXES)}")
     try:
-        table = {".xyz": _read_text, ".npy": _read_array, ".ply": _read_ply}[suffix](path)
+        table = _READERS[suffix](path)
     except (ValueError, OSError, EOFError, KeyError, IndexError, TypeError) as error:
         raise MeshError(f"{path}: not readable as points ({' '.join(str(error).split())[:120]})") from None
     if table.ndim != 2 or table.shape[1] not in (3, 6):
@@ -82,3 +80,7 @@ def _read_ply(path: Path) -> Floats:
         )
         return np.hstack([points, normals])
     return points
+
+
+_READERS = {".xyz": _read_text, ".npy": _read_array, ".ply": _read_ply}
+POINT_SUFFIXES = tuple(_READERS)
