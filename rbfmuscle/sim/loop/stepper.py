@@ -292,11 +292,12 @@ class MuscleStepper:
 
     def _held_back(self, state, start, poses, after, crossings):
         """Solve with what crosses kept on its side of a plane; return what crosses all the same."""
-        fences = [*self.contacts.neighbours], []
+        neighbours = self.contacts.neighbours
+        fenced = [*neighbours]
         try:
             for _ in range(FENCES):
-                fences[1].extend(fence(self.contacts, crossing, start, *poses) for crossing in crossings)
-                self.contacts.neighbours = fences[0] + fences[1]
+                fenced += [fence(self.contacts, crossing, start, *poses) for crossing in crossings]
+                self.contacts.neighbours = fenced
                 self.model.restore(state)
                 self._predict(poses)
                 self.solve(after)
@@ -305,7 +306,7 @@ class MuscleStepper:
                 if not crossings:
                     break
         finally:
-            self.contacts.neighbours = fences[0]
+            self.contacts.neighbours = neighbours
         return crossings
 
     def _report_all(self, crossings, action):
