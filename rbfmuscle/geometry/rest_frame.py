@@ -7,12 +7,24 @@ from typing import Any
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, Integers
 
 
 def diameter(points: Floats) -> float:
     """Twice the greatest distance from the mean: a size that does not change when the scene is turned."""
     return 2.0 * float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
+
+
+def box_corners(bounds: Any) -> Floats:
+    """Corners (8, 3) of a box (2, 3)."""
+    return np.array(np.meshgrid(*np.transpose(bounds))).reshape(3, -1).T
+
+
+def moved_box(bounds: Floats, pose: Floats) -> Floats:
+    """Box (2, 3) along the axes that holds a box after a pose (4, 4)."""
+    centre, half = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
+    middle, reach = pose[:3, :3] @ centre + pose[:3, 3], np.abs(pose[:3, :3]) @ half
+    return np.array([middle - reach, middle + reach])
 
 
 class RestFrame:
@@ -48,6 +60,11 @@ class RestFrame:
     def points(self, local: Floats) -> Floats:
         """World positions of local points."""
         return local @ self.axes * self.size + self.origin
+
+    def corners(self, chosen: Integers) -> Floats:
+        """World corners (8, 3) of the box about some of the vertices, along the frame's axes."""
+        some = self.local[chosen]
+        return self.points(box_corners([some.min(axis=0), some.max(axis=0)]))
 
     def directions(self, local: Floats) -> Floats:
         """World directions of local ones."""
@@ -99,8 +116,7 @@ class BoneFrame:
 
     def box(self, bounds: Any) -> Any:
         """Local box (2, 3) that holds a box given in bone coordinates."""
-        corners = np.array(np.meshgrid(*np.transpose(bounds))).reshape(3, -1).T
-        local = (corners - self.origin) @ self.axes.T / self.size
+        local = (box_corners(bounds) - self.origin) @ self.axes.T / self.size
         return np.array([local.min(axis=0), local.max(axis=0)])
 
     def placed(self, pose: Floats) -> Floats:

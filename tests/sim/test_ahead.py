@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 import rbfmuscle as rm
-from rbfmuscle.sim.plan.ahead import ahead_findings, look_ahead
+from rbfmuscle.sim.plan.ahead import Stretched, ahead_findings, describe, look_ahead
 from rbfmuscle.sim.plan.plan import plan_scene
 
 
@@ -70,6 +70,11 @@ def test_ends_taken_apart_or_brought_together(far, how):
     assert one.distance - one.rest == pytest.approx(far, rel=1e-9)
     assert how in str(ahead_findings(scene)[0])
     assert how in plan_scene(scene)["ahead"]["messages"][0]
+
+
+def test_ends_that_meet_are_told_first():
+    near, met = (Stretched(name, ("a", "b"), 10.0, d, 3, 2) for name, d in (("near", 4.0), ("met", 0.0)))
+    assert [found.place for found in describe(([], [near, met]), "mm")] == ["met", "near"]
 
 
 def test_slender_muscles_of_the_leg_are_named_with_what_is_wrong(leg_data):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, joint, muscle, scene, sphere
 
-from rbfmuscle.sim.loop.contact import BoneContacts, moved_box
+from rbfmuscle.geometry.rest_frame import moved_box
+from rbfmuscle.sim.loop.contact import BoneContacts
 from rbfmuscle.sim.loop.overlap import rest_overlap, settle_rest
 from rbfmuscle.sim.loop.simulate import simulate_frames
 from rbfmuscle.sim.loop.stepper import MuscleStepper

@@ -72,10 +72,10 @@ class OwnBones:
         frame, self.size = RestFrame(vertices), diameter(vertices)
         held: dict[str, list[np.ndarray]] = {}
         for attachment in muscle.attachments:
-            held.setdefault(attachment.bone, []).append(frame.local[attachment.vertices])
+            held.setdefault(attachment.bone, []).append(attachment.vertices)
         parts = {name: np.concatenate(found) for name, found in held.items()}
         self.names = sorted(parts, key=lambda name: -len(parts[name]))
-        self._corners = {name: frame.points(_corners(parts[name])) for name in self.names}
+        self._corners = {name: frame.corners(parts[name]) for name in self.names}
         self.still = math.radians(scene.contact.still_angle)
 
     def apart(self, before: Mapping[str, Floats], after: Mapping[str, Floats]) -> tuple[float, str]:
@@ -162,29 +162,24 @@ class Carrier:
         near = [b for b in self.others if self._moves(b, before, after)]
         if self._touched(near):
             return False
-        self._carry(before, after, near)
-        return not self._taken_back(before, after, near)
+        return self._carry(before, after, near)
 
     def _carry(self, before, after, near):
+        """Carry the muscle; undone, and False, where that brings it to another bone."""
         motion, model = self.own.carriage(before, after), self.stepper.model
-        self._saved = model.snapshot() if near else None
-        if np.abs(motion - np.eye(4)).max() > STILL:
+        saved = model.snapshot() if near else None
+        moves = np.abs(motion - np.eye(4)).max() > STILL
+        if moves:
             model.transform(motion)
-            self._motion = motion
-        else:
-            self._motion = None
         self.stepper.contacts.move(after)
-
-    def _taken_back(self, before, after, near):
-        """Undo what brought the muscle to another bone."""
         if self._touched(near):
-            self.stepper.model.restore(self._saved)
+            model.restore(saved)
             self.stepper.contacts.move(before)
-            return True
-        if self._motion is not None:
-            self.stepper.carried(self._motion)
+            return False
+        if moves:
+            self.stepper.carried(motion)
             self.moved = True
-        return False
+        return True
 
     def _touched(self, bones: Sequence[int]) -> bool:
         """Whether one of these bones comes near the muscle where both are now."""
@@ -227,8 +222,3 @@ class Carrier:
                 CARRIED, 0, f"moves with {names[0]}" if len(names) == 1 else f"{', '.join(names)} as one"
             )
         return Work(SKIPPED, 0, "its bones rest")
-
-
-def _corners(points: Floats) -> Floats:
-    low, high = np.min(points, axis=0), np.max(points, axis=0)
-    return np.array([[(low, high)[k >> a & 1][a] for a in range(3)] for k in range(8)])

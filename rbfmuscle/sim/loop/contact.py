@@ -269,13 +269,6 @@ class BoneContacts:
         _remember_loop(points, self.poses[self.names[b]], near, distance, *self._known[b])
 
 
-def moved_box(bounds: Floats, pose: Floats) -> Floats:
-    """World box (2, 3) that holds a box given in bone coordinates, after a pose."""
-    centre, half = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
-    middle, reach = pose[:3, :3] @ centre + pose[:3, 3], np.abs(pose[:3, :3]) @ half
-    return np.array([middle - reach, middle + reach])
-
-
 @compiled(error_model="numpy")
 def _direction_loop(points, gradient, middle, out):
     """Unit gradients; away from the middle where there is none."""

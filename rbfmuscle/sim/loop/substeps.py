@@ -60,16 +60,16 @@ class SubSteps:
         self._poses = poses or (lambda coordinates: bone_poses(scene, coordinates))
         muscles = scene.muscles if muscle is None else [muscle]
         own = [attachment.bone for part in muscles for attachment in part.attachments]
-        known = [bone.name for bone in scene.bones]
-        #: The bones that count, the first of which the others are seen from: for a whole scene the world.
-        self.bones = known if muscle is None else [*dict.fromkeys([*own, *bones])]
-        self._root = None if muscle is None else own[0]
-        #: Coordinates that move these bones against each other.
-        self.relevant = set(all_coordinates(scene.joints))
-        if muscle is not None:
+        self._facts = all_coordinates(scene.joints)
+        #: The bones that count, and the coordinates that move them against each other. A muscle's are seen from the
+        #: first that holds it, a whole scene's from the world.
+        if muscle is None:
+            self._root, self.bones = None, [bone.name for bone in scene.bones]
+            self.relevant = set(self._facts)
+        else:
+            self._root, self.bones = own[0], [*dict.fromkeys([*own, *bones])]
             self.relevant = _moving_apart(scene, self.bones)
         self.limit = math.radians(scene.contact.substep_angle)
-        self._facts = all_coordinates(scene.joints)
         self.most = scene.motion.options.max_substeps
         names = self.bones
         owner, corners, size = [], [], []
@@ -78,7 +78,7 @@ class SubSteps:
             frame = RestFrame(vertices)
             for attachment in part.attachments:
                 owner.append(names.index(attachment.bone))
-                corners.append(frame.points(_corners(frame.local[attachment.vertices])))
+                corners.append(frame.corners(attachment.vertices))
                 size.append(diameter(vertices))
         # Of each attachment: its bone, a box about it, and how far that may move in one sub-step.
         self._owner, self._travel = np.array(owner, dtype=int), TRAVEL * np.array(size)
@@ -264,8 +264,3 @@ def path_angle(scene: Scene, before: Any, after: Any) -> Any:
         return angle
     stops = [interpolate(before, after, k / PIECES) for k in range(PIECES + 1)]
     return max(angle, sum(step_angle(scene, a, b, shifts=False) for a, b in itertools.pairwise(stops)))
-
-
-def _corners(points):
-    low, high = np.min(points, axis=0), np.max(points, axis=0)
-    return np.array([[(low, high)[k >> a & 1][a] for a in range(3)] for k in range(8)])

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.sim.loop.contact import moved_box
+from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.sim.scene.attachments import ExactMeshes
 from rbfmuscle.sim.scene.check import Finding
 from rbfmuscle.sim.scene.motion import bone_poses
@@ -172,7 +172,8 @@ def describe(found: tuple[Sequence[Driven], Sequence[Stretched]], units: str) ->
         )
         for one in sorted(driven, key=lambda one: -one.depth)
     ]
-    for one in sorted(stretched, key=lambda one: -abs(math.log(one.distance / one.rest))):
+    # Ends that meet are the worst of all.
+    for one in sorted(stretched, key=lambda one: -abs(math.log(max(one.distance / one.rest, 1e-12)))):
         how = "take apart" if one.distance > one.rest else "bring together"
         said.append(
             Finding(

@@ -11,8 +11,8 @@ import numba
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.sim.distance.detectors import build_detector
-from rbfmuscle.sim.loop.contact import moved_box
 from rbfmuscle.sim.loop.substeps import check_substeps, path_angle
 from rbfmuscle.sim.scene.motion import bone_poses, completed, interpolate, rest_coordinates
 

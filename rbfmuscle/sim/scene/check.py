@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.sim.scene.attachments import ExactMeshes
 from rbfmuscle.sim.scene.motion import bone_poses
 from rbfmuscle.validation import MeshError, RBFMuscleError, SceneError
@@ -221,7 +222,8 @@ def _pair_depths(scene, poses, exact):
             if np.allclose(relative, np.eye(4), atol=1e-12):
                 continue
             back = np.linalg.inv(relative)
-            if _boxes_part(first.mesh.bounds, relative, second.mesh.bounds):
+            (low, high), other = moved_box(first.mesh.bounds, relative), second.mesh.bounds
+            if np.any(low > other[1]) or np.any(high < other[0]):
                 continue
             one = np.asarray(first.mesh.vertices) @ relative[:3, :3].T + relative[:3, 3]
             two = np.asarray(second.mesh.vertices) @ back[:3, :3].T + back[:3, 3]
@@ -229,13 +231,6 @@ def _pair_depths(scene, poses, exact):
             if deepest > 0:
                 depths[first.name, second.name] = float(deepest)
     return depths
-
-
-def _boxes_part(bounds, place, others):
-    """Whether a box, moved, does not meet another one."""
-    centre, half = bounds.mean(axis=0), 0.5 * (bounds[1] - bounds[0])
-    middle, reach = place[:3, :3] @ centre + place[:3, 3], np.abs(place[:3, :3]) @ half
-    return bool(np.any(middle - reach > others[1]) or np.any(middle + reach < others[0]))
 
 
 def bone_findings(collisions: list[Any], units: str) -> list[Any]:
