@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +16,7 @@ from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField, frame, hermite_system
 from rbfmuscle.implicit.fit.condition import largest_eigenvalue
 from rbfmuscle.implicit.fit.fitting import DOUBTFUL, Basis
-from rbfmuscle.implicit.kernels.table import get_kernel
+from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
 from rbfmuscle.implicit.placement.off_surface import off_surface_points
 from rbfmuscle.implicit.selection import (
     SPAN,
@@ -28,10 +28,6 @@ from rbfmuscle.implicit.selection import (
 )
 from rbfmuscle.implicit.shape_search import RIDGE, TRUNCATED, Limits, search_shape
 from rbfmuscle.validation import NumericalWarning, check_points
-
-if TYPE_CHECKING:
-    from rbfmuscle.implicit.kernels.table import Kernel
-
 
 # Evaluations of the scan and of the refinement. Flat Gaussians close their surface in spans of a factor of 1.3 only.
 COARSE, REFINE = 25, 6
@@ -177,13 +173,15 @@ def _look_at_zero_sets(
         # The distance both ways is at least this, and twice the error has never been the better surface.
         if looks > LOOKS or missed > 2.0 * least or missed / np.sqrt(2.0) > least or not np.isfinite(missed):
             break
-        both = float(np.sqrt(0.5 * (missed**2 + _back(fit, epsilon, points, distance) ** 2)))
+        field = _fitted(fit, epsilon)
+        if field is None:
+            continue
+        both = float(np.sqrt(0.5 * (missed**2 + _back(field, points, distance) ** 2)))
         if both >= least:
             continue
-        sheets, now = (
-            _sheets(fit, epsilon, points),
-            replace(choice, epsilon=epsilon, objective=both, condition=condition),
-        )
+        now = replace(choice, epsilon=epsilon, objective=both, condition=condition)
+        # In the whole box of the points, open ones included.
+        sheets = extract_surface(field, points=points, resolution=BOX, search="box").components
         if sheets > 1:
             if condition < DOUBTFUL:
                 narrow = epsilon / FLATTER
@@ -196,19 +194,20 @@ def _look_at_zero_sets(
     return found or spare
 
 
-def _sheets(fit: Callable[..., Any], epsilon: float, points: Floats) -> int:
-    """Sheets of the zero set in the whole box of the points, open ones included."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NumericalWarning)
-        return extract_surface(fit(epsilon), points=points, resolution=BOX, search="box").components
-
-
-def _back(fit: Callable[..., Any], epsilon: float, points: Floats, distance: Callable[..., Any]) -> float:
-    """Root mean square distance of the zero set's vertices from the surface, infinite where it is open."""
+def _fitted(fit: Callable[..., RBFField], epsilon: float) -> RBFField | None:
+    """The field of an epsilon, None where it fails."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NumericalWarning)
         try:
-            found = extract_surface(fit(epsilon), points=points, resolution=RESOLUTION)
-        except (ValueError, np.linalg.LinAlgError):
-            return np.inf
+            return fit(epsilon)
+        except np.linalg.LinAlgError:
+            return None
+
+
+def _back(field: RBFField, points: Floats, distance: Callable[..., Any]) -> float:
+    """Root mean square distance of the zero set's vertices from the surface, infinite where it is open."""
+    try:
+        found = extract_surface(field, points=points, resolution=RESOLUTION)
+    except ValueError:
+        return np.inf
     return float(np.sqrt((np.asarray(distance(found.vertices)) ** 2).mean()))
