@@ -154,7 +154,7 @@ class ElasticSolver:
     def solve(self, x: np.ndarray, contacts: BoneContacts) -> np.ndarray:
         """Return the settled centres, (K, 3)."""
         x = x.copy()
-        mixer = _Anderson(self.memory)
+        mixer = Anderson(self.memory)
         for step in range(self.iterations):
             new = self._iterate(x, contacts)
             moved = float(np.sqrt(((new - x) ** 2).sum(axis=1).max()))
@@ -187,29 +187,38 @@ class ElasticSolver:
         return new + push + response * (pressure - lost / stiffness)
 
 
-class _Anderson:
-    """Anderson acceleration of a fixed-point map (Walker & Ni 2011), with plain steps until it has memory."""
+class Anderson:
+    """Anderson acceleration of a fixed-point map (Walker & Ni 2011), with plain steps until it has memory.
 
-    def __init__(self, memory: int) -> None:
-        self.memory = memory
-        self.values: list[Any] = []
-        self.residuals: list[Any] = []
+    Parameters
+    ----------
+    memory : int
+        Steps that are remembered; with 0 every step is plain.
+    measured : int, optional
+        The first so many numbers of a state tell how near it is; all by default.
+    """
 
-    def mix(self, x: Floats, g: Floats) -> Floats:
-        """Next iterate from x and its image g."""
+    def __init__(self, memory: int, measured: int | None = None) -> None:
+        self.memory, self.measured = memory, measured
+        self.residuals: list[Floats] = []  # how they and the images changed from step to step
+        self.images: list[Floats] = []
+        self.last: tuple[Floats, Floats] | None = None
+
+    def mix(self, state: Floats, image: Floats) -> Floats:
+        """Next state from one and its image."""
         if self.memory == 0:
-            return g
-        residual = (g - x).ravel()
-        self.values.append(g.ravel().copy())
-        self.residuals.append(residual)
-        if len(self.values) > self.memory + 1:
-            del self.values[0], self.residuals[0]
-        if len(self.values) == 1:
-            return g
-        df = np.diff(np.array(self.residuals), axis=0)
-        dg = np.diff(np.array(self.values), axis=0)
+            return image
+        flat = image.ravel()
+        residual = (flat - state.ravel())[: self.measured]
+        if self.last is not None:
+            self.residuals.append(residual - self.last[0])
+            self.images.append(flat - self.last[1])
+            del self.residuals[: -self.memory], self.images[: -self.memory]
+        self.last = residual, flat.copy()
+        if not self.residuals:
+            return image
+        df, dg = np.array(self.residuals), np.array(self.images)
         gram = df @ df.T
         gram[np.diag_indices_from(gram)] *= 1.0 + 1e-8
         gram[np.diag_indices_from(gram)] += 1e-300
-        share = np.linalg.solve(gram, df @ residual)
-        return (g.ravel() - share @ dg).reshape(g.shape)
+        return (flat - np.linalg.solve(gram, df @ residual) @ dg).reshape(image.shape)

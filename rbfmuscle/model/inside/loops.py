@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.rotations import quaternion_matrix
 from rbfmuscle.model.constraints import _rotation_loop
 from rbfmuscle.model.contact import solve_contact_forces
 
@@ -51,11 +51,9 @@ def turn_loop(y, columns, slopes, q, f, target):
                 f[i, a, 1] += v * slopes[i, k, 1]
                 f[i, a, 2] += v * slopes[i, k, 2]
         _rotation_loop(f[i], q[i])
-        w, x, yy, z = q[i, 0], q[i, 1], q[i, 2], q[i, 3]
-        r = target[i]
-        r[0, 0], r[0, 1], r[0, 2] = 1 - 2 * (yy * yy + z * z), 2 * (x * yy - w * z), 2 * (x * z + w * yy)
-        r[1, 0], r[1, 1], r[1, 2] = 2 * (x * yy + w * z), 1 - 2 * (x * x + z * z), 2 * (yy * z - w * x)
-        r[2, 0], r[2, 1], r[2, 2] = 2 * (x * z - w * yy), 2 * (yy * z + w * x), 1 - 2 * (x * x + yy * yy)
+        first, second, third = quaternion_matrix(q[i])
+        for b in range(3):
+            target[i, 0, b], target[i, 1, b], target[i, 2, b] = first[b], second[b], third[b]
 
 
 @compiled(error_model="numpy")
@@ -284,29 +282,3 @@ def touch_loop(
             lacking[c] = value
     for c in chosen:
         table[index[c], source[c]] = force[c]
-
-
-class Mixer:
-    """Anderson acceleration (Walker & Ni 2011) of a state whose first ``measured`` numbers tell how near it is."""
-
-    def __init__(self, memory: int, measured: Any) -> None:
-        self.memory, self.measured = memory, measured
-        self.df, self.dg, self.last = [], [], None
-
-    def mix(self, state: Any, image: Floats) -> Floats:
-        """Next state from one and its image."""
-        if self.memory == 0:
-            return image
-        residual = (image - state)[: self.measured]
-        if self.last is not None:
-            self.df.append(residual - self.last[0])
-            self.dg.append(image - self.last[1])
-            del self.df[: -self.memory], self.dg[: -self.memory]
-        self.last = residual, image.copy()
-        if not self.df:
-            return image
-        df, dg = np.array(self.df), np.array(self.dg)
-        gram = df @ df.T
-        gram[np.diag_indices_from(gram)] *= 1.0 + 1e-8
-        gram[np.diag_indices_from(gram)] += 1e-300
-        return image - np.linalg.solve(gram, df @ residual) @ dg

@@ -145,9 +145,8 @@ def _yielding(solid: Any, found: _Pushing) -> Floats:
 
 def _softening(solid: Any) -> Floats:
     """What the moving targets and the pressures take from the stiffness of the fixed matrix, (Q, 9, 9)."""
-    f, count = solid.f, len(solid.f)
+    f, turn, count = solid.f, solid.target, len(solid.f)
     basis = np.eye(9).reshape(9, 3, 3)
-    turn = rotations(solid.quaternion)
     inward = np.einsum("qca,qcb->qab", turn, f)
     inward = 0.5 * (inward + inward.transpose(0, 2, 1))
     spin = np.linalg.inv(np.trace(inward, axis1=1, axis2=2)[:, None, None] * np.eye(3) - inward)
@@ -189,16 +188,6 @@ def _cofactor_change(f: Floats, basis: Floats) -> Floats:
         first = np.cross(basis[None, :, :, a], f[:, None, :, b])
         out[..., c] = first + np.cross(f[:, None, :, a], basis[None, :, :, b])
     return out
-
-
-def rotations(quaternion: Floats) -> Floats:
-    """Matrices (n, 3, 3) of unit quaternions (n, 4), the real part first."""
-    w, x, y, z = quaternion.T
-    return np.stack([
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ], -1).reshape(-1, 3, 3)  # fmt: skip
 
 
 @compiled(error_model="numpy")

@@ -24,9 +24,9 @@ from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.geometry.rest_frame import diameter
 from rbfmuscle.geometry.rotations import turned_quaternions
 from rbfmuscle.implicit.placement.lattice import Lattice
+from rbfmuscle.model.elasticity import Anderson
 from rbfmuscle.model.inside.loops import (
     Fibres,
-    Mixer,
     carry_loop,
     mobility_loop,
     press_loop,
@@ -38,9 +38,8 @@ from rbfmuscle.model.inside.loops import (
 )
 from rbfmuscle.model.inside.response import Response
 
-LEAST_ROUNDS = (
-    3  # times the iterations of a muscle without an inside: they end by the residual, mostly sooner
-)
+# Times the iterations of a muscle without an inside: they end by the residual, mostly sooner.
+LEAST_ROUNDS = 3
 HOLD = 25.0  # stiffness of the spring at a held point, in that of a cell
 GHOST = 1e-3  # of a cell's stiffness: what carries nodes that hold hardly any material
 MOST_TREND = 1.5  # of the last sub-step's correction that the next one starts with
@@ -59,7 +58,7 @@ class _Near(NamedTuple):
     columns: np.ndarray
     shares: np.ndarray
     forces: np.ndarray
-    contacts: object
+    contacts: Any
     y: np.ndarray
     reach: float
 
@@ -300,7 +299,7 @@ class Interior:
         """Bring the nodes to balance under pressures and contacts."""
         state = np.concatenate([self.y.ravel(), self.pressure])
         size = self.y.size
-        mixer = Mixer(self.memory, self.y.size)
+        mixer = Anderson(self.memory, size)
         self.history = []
         self.localise()
         self._respond()
@@ -327,7 +326,7 @@ class Interior:
                 self.trend = motion, self.y - start, self.pressure - pressure
             self.begun = None
 
-    def _near(self, contacts: Any, before: Floats) -> Any:
+    def _near(self, contacts: Any, before: _Near | None) -> _Near:
         """The contact points near an obstacle, with what pushed them until now."""
         if before is not None:
             self.forces[:] = 0.0
@@ -385,7 +384,7 @@ class Interior:
         white = solve_triangular(self.factor, response.reshape(count, -1), lower=True, check_finite=False)
         self.response = np.ascontiguousarray(white.reshape(response.shape))
 
-    def _iterate(self, near: Any) -> Any:
+    def _iterate(self, near: _Near) -> tuple[Floats, Floats]:
         right = self.right
         press_loop(self.pressure, self.start, self.touched, self.gradient, right)
         free = self.inverse @ (right + self.pull)
