@@ -18,9 +18,8 @@ from rbfmuscle.geometry.exact_distance import ExactDistance
 FINE = 6  # points along a side of a cell that tell how much of it is muscle
 GROUPS = 8  # quadrature points in a cell
 LEAST_FILLED = 1e-3  # of a cell: the weight of one that only touches the surface
-MOST_WIDENED = (
-    1.3  # quadrature points move apart at most by this factor to give the material's second moments
-)
+# Quadrature points move apart at most by this factor to give the material's second moments.
+MOST_WIDENED = 1.3
 
 # Contact points: one for so much of the muscle's surface, in shares of its square size. A ridge of a bone that fits
 # between points would hold them like a ratchet, and one pose would have several shapes.
