@@ -15,7 +15,7 @@ from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Array, Booleans, Floats, Integers
 from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.fields import Cut, Field
-from rbfmuscle.geometry.surfaces import mesh_volume
+from rbfmuscle.geometry.surfaces import mesh_volume, vertex_normals
 from rbfmuscle.implicit.extraction.band import BandGrid
 from rbfmuscle.implicit.extraction.obstacles import CHORD, ObstaclePoints, faces_within, points_near_cells
 from rbfmuscle.implicit.extraction.projection import CutBounds, Projector
@@ -205,8 +205,7 @@ class _Fitting:
 
     def _clearance(self, near: Booleans, distance: Floats, outward: Floats) -> Floats:
         """How far from the bones vertices that sink into them end: those that look away keep off the others."""
-        normals, clearance = np.zeros_like(self.carried), np.zeros(len(self.carried))
-        _normals_loop(self.carried, self.mesh.faces, normals)
+        normals, clearance = vertex_normals(self.carried, self.mesh.faces), np.zeros(len(self.carried))
         away = near & (np.einsum("nd,nd->n", normals, outward) > 0.0)
         clearance[away] = LAMELLA * self.edge
         self.sunk = near & (distance < -SUNK * self.edge)
@@ -245,10 +244,7 @@ class _Fitting:
         if volume is None:
             return
         for _ in range(20):
-            normals = np.zeros_like(self.carried)
-            _normals_loop(projector.vertices, faces, normals)
-            length = np.linalg.norm(normals, axis=1)[:, None]
-            projector.move_along(normals / np.maximum(length, np.finfo(float).tiny))
+            projector.move_along(vertex_normals(projector.vertices, faces))
             step = float(np.clip(projector.volume_step(faces, volume), -0.5 * self.edge, 0.5 * self.edge))
             projector.shift(step)
             projector.lift()
@@ -446,18 +442,3 @@ def _bound_loop(vertices, carried, reach, on_field, left):
             for a in range(3):
                 way = share * (vertices[v, a] - carried[v, a]) if share > 0.0 else 0.0
                 vertices[v, a] = carried[v, a] + way
-
-
-@compiled(error_model="numpy")
-def _normals_loop(vertices, faces, normals):
-    """Area-weighted normals at the vertices, of any length."""
-    for f in range(len(faces)):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        for k in range(3):
-            i, j = (k + 1) % 3, (k + 2) % 3
-            area = (vertices[b, i] - vertices[a, i]) * (vertices[c, j] - vertices[a, j]) - (
-                vertices[b, j] - vertices[a, j]
-            ) * (vertices[c, i] - vertices[a, i])
-            normals[a, k] += area
-            normals[b, k] += area
-            normals[c, k] += area
