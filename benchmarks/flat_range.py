@@ -17,9 +17,10 @@ import warnings
 import numpy as np
 from scipy import linalg
 
-from rbfmuscle.implicit.field import RBFField, collocation, frame
+from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit.fitting import solve_least_squares
 from rbfmuscle.implicit.fit.flat_limit import FlatField
+from rbfmuscle.implicit.fit.systems import collocation, frame
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.validation import NumericalWarning, UsageError
 

@@ -14,12 +14,13 @@ from scipy.interpolate import RBFInterpolator
 from scipy.linalg import blas
 from table import ROUNDS, Table, machine
 
-from rbfmuscle.implicit.field import RBFField, hermite_system
+from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit.banded import factorise_band
 from rbfmuscle.implicit.fit.condition import largest_eigenvalue, probe
 from rbfmuscle.implicit.fit.cross_validation import leave_one_out
 from rbfmuscle.implicit.fit.fitting import Basis, factorise, solve
 from rbfmuscle.implicit.fit.lapack import solve_cholesky
+from rbfmuscle.implicit.fit.systems import hermite_system
 from rbfmuscle.implicit.kernels.table import KERNELS
 from rbfmuscle.validation import NumericalWarning
 

@@ -17,8 +17,8 @@ from followed import record
 from scipy.linalg import blas, lapack
 from threadpoolctl import threadpool_limits
 
-from rbfmuscle.implicit.field import hermite_system
 from rbfmuscle.implicit.fit import fitting
+from rbfmuscle.implicit.fit.systems import hermite_system
 from rbfmuscle.sim.scene.scene import Scene
 
 MOST = 80

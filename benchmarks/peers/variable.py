@@ -11,8 +11,9 @@ import numpy as np
 from scipy import linalg
 from scipy.optimize import differential_evolution
 
-from rbfmuscle.implicit.field import RBFField, collocation, frame
+from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit.fitting import solve_least_squares
+from rbfmuscle.implicit.fit.systems import collocation, frame
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.selection import spacing
 from rbfmuscle.validation import NumericalWarning, UsageError, check_points, check_positive, check_values

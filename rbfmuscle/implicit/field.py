@@ -6,12 +6,11 @@ f(x) = sum_j a_j phi(|x - c_j|) - B_j . grad phi(x - c_j) + p(x), with B = 0 for
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.implicit.evaluation import evaluate
@@ -19,7 +18,8 @@ from rbfmuscle.implicit.fit import assembly
 from rbfmuscle.implicit.fit.cross_validation import LeastSquaresPath
 from rbfmuscle.implicit.fit.fitting import Basis, solve, solve_least_squares
 from rbfmuscle.implicit.fit.regularisation import basis_smoothing, resolve_smoothing
-from rbfmuscle.implicit.kernels.table import get_kernel
+from rbfmuscle.implicit.fit.systems import check_degree, collocation, frame, hermite_system, hermite_weights
+from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
 from rbfmuscle.implicit.placement.off_surface import off_surface_points
 from rbfmuscle.validation import (
     NumericalWarning,
@@ -29,9 +29,6 @@ from rbfmuscle.validation import (
     check_values,
     check_vectors,
 )
-
-if TYPE_CHECKING:
-    from rbfmuscle.implicit.kernels.table import Kernel
 
 
 class RBFField:
@@ -133,7 +130,7 @@ class RBFField:
         points = check_points(points)
         values = check_values(values, len(points))
         kernel, epsilon = get_kernel(kernel), check_positive(epsilon, name="epsilon")
-        degree = _check_degree(kernel, degree, len(points))
+        degree = check_degree(kernel, degree, len(points))
         origin, scale = frame(points)
         shape = epsilon * scale if kernel.has_epsilon else 1.0
         basis = Basis((points - origin) / scale, kernel, shape, degree)
@@ -194,9 +191,7 @@ class RBFField:
         weights, rest = hermite_weights(basis, weights), (basis.powers, condition, smoothing)
         fitted = cls(points, origin, scale, kernel, epsilon, weights, coefficients, *rest)
         if kernel.has_epsilon:
-            _warn_if_narrow(
-                fitted, np.asarray(points, dtype=np.float64), np.asarray(normals, dtype=np.float64)
-            )
+            _warn_if_narrow(fitted, points, normals)
         return fitted
 
     @classmethod
@@ -238,9 +233,7 @@ class RBFField:
             truncate=truncate,
         )  # fmt: skip
         if kernel.has_epsilon:
-            _warn_if_narrow(
-                fitted, np.asarray(points, dtype=np.float64), np.asarray(normals, dtype=np.float64)
-            )
+            _warn_if_narrow(fitted, points, normals)
         return fitted
 
     @classmethod
@@ -283,7 +276,7 @@ class RBFField:
         points, centres = check_points(points), check_points(centres, name="centres")
         values = check_values(values, len(points))
         kernel, epsilon = get_kernel(kernel), check_positive(epsilon, name="epsilon")
-        degree = _check_degree(kernel, degree, len(points))
+        degree = check_degree(kernel, degree, len(points))
         if len(points) < len(centres):
             raise UsageError(
                 f"least squares needs at least {len(centres)} points (one a centre), got {len(points)}"
@@ -357,34 +350,7 @@ class RBFField:
         )  # fmt: skip
 
 
-def frame(points: Floats) -> tuple[Floats, float]:
-    """Origin (3,) and scale: the points lie in the unit ball of (x - origin) / scale."""
-    if not len(points):
-        raise UsageError("a fit needs at least one point, got none")
-    origin = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    scale = float(np.sqrt(((points - origin) ** 2).sum(axis=1).max()))
-    return origin, scale if scale > 0 else 1.0
-
-
-def hermite_system(
-    points: Floats, normals: Floats, kernel: Kernel, epsilon: float, derivatives: str
-) -> tuple[Basis, Floats, Floats, float]:
-    """Basis, right side, origin and scale of a Hermite fit (arguments as in `RBFField.fit_hermite`)."""
-    origin, scale = frame(points)
-    shape = epsilon * scale if kernel.has_epsilon else 1.0
-    scaled = (points - origin) / scale
-    if derivatives == "all":
-        basis = Basis(scaled, kernel, shape, kernel.degree, kind="gradient")
-        return basis, np.concatenate([np.zeros(len(points)), normals.T.ravel()]) * scale, origin, scale
-    lengths = np.linalg.norm(normals, axis=1)
-    if not lengths.all():
-        raise UsageError(f"normals must not be zero, row {int(np.argmin(lengths))} is")
-    unit = normals / lengths[:, None]
-    basis = Basis(scaled, kernel, shape, kernel.degree, kind="normal", normals=unit)
-    return basis, np.concatenate([np.zeros(len(points)), lengths]) * scale, origin, scale
-
-
-def _warn_if_narrow(fitted: RBFField, points: Floats, normals: Floats) -> None:
+def _warn_if_narrow(fitted: RBFField, points: ArrayLike, normals: ArrayLike) -> None:
     """Warn where the field does not rise outwards between its centres: the kernel does not reach that far."""
     points, normals = check_points(points), check_vectors(normals, len(points))
     if len(points) < 20:
@@ -410,42 +376,3 @@ def _warn_if_truncated(kernel: Kernel, rank: int, size: int) -> None:
         NumericalWarning,
         stacklevel=3,
     )
-
-
-def hermite_weights(basis: Basis, weights: Floats) -> Floats:
-    """Rows (a, B) for each centre from the solution of a Hermite system: (K, 4)."""
-    if basis.kind == "gradient":
-        return weights.reshape(4, -1).T.copy()
-    value, along = weights.reshape(2, -1)
-    return np.column_stack([value, along[:, None] * basis.normals])
-
-
-def collocation(
-    points: Floats,
-    centres: Floats,
-    kernel: Kernel,
-    epsilon: Floats | float,
-    degree: int,
-    origin: Floats,
-    scale: float,
-) -> tuple[Floats, Integers]:
-    """Matrix (n, K + q) that maps weights and polynomial coefficients to values at points, and the powers."""
-    shape = epsilon * scale if kernel.has_epsilon else 1.0
-    at, centred = (points - origin) / scale, (centres - origin) / scale
-    powers = assembly.exponents(degree)
-    radial = kernel.phi(cdist(at, centred) * shape)
-    return np.hstack([radial, assembly.monomials(at, powers).T]), powers
-
-
-def _check_degree(kernel: Kernel, degree: int | None, count: int) -> int:
-    least = kernel.degree
-    degree = least if degree is None else int(degree)
-    if degree < least:
-        raise UsageError(f"degree of kernel '{kernel.name}' must be at least {least}, got {degree}")
-    terms = (degree + 1) * (degree + 2) * (degree + 3) // 6
-    if terms > count:
-        raise np.linalg.LinAlgError(
-            f"degree {degree} has {terms} polynomial terms, more than the {count} points; "
-            "degree too high: lower it or add points"
-        )
-    return degree

@@ -20,8 +20,9 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.implicit.field import RBFField, frame
+from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit.fitting import Basis, factorise, raise_if_singular
+from rbfmuscle.implicit.fit.systems import frame
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.partition import split_points
 from rbfmuscle.validation import UsageError, check_points

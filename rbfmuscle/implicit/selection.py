@@ -13,10 +13,11 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.implicit.field import RBFField, _check_degree, collocation, frame, hermite_system
+from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit.cross_validation import LeastSquaresPath, SmoothingPath, leave_one_out
 from rbfmuscle.implicit.fit.fitting import DOUBTFUL, Basis, solve
 from rbfmuscle.implicit.fit.regularisation import check_criterion, search_smoothing
+from rbfmuscle.implicit.fit.systems import check_degree, collocation, frame, hermite_system
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.validation import (
     NumericalWarning,
@@ -242,7 +243,7 @@ def choose_smoothing(
             SmoothingPath(*hermite_system(points, normals, kernel, epsilon, derivatives)[:2]), criterion
         )
     values = check_values(np.asarray(values), len(points))
-    degree = _check_degree(kernel, degree, len(points))
+    degree = check_degree(kernel, degree, len(points))
     if centres is None:
         origin, scale = frame(points)
         basis = Basis(

@@ -13,9 +13,10 @@ from scipy.linalg import blas
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.extraction.surface import extract_surface
-from rbfmuscle.implicit.field import RBFField, frame, hermite_system
+from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit.condition import largest_eigenvalue
 from rbfmuscle.implicit.fit.fitting import DOUBTFUL, Basis
+from rbfmuscle.implicit.fit.systems import frame, hermite_system
 from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
 from rbfmuscle.implicit.placement.off_surface import off_surface_points
 from rbfmuscle.implicit.selection import (

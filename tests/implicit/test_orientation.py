@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.implicit.field import hermite_system
 from rbfmuscle.implicit.fit.fitting import solve
+from rbfmuscle.implicit.fit.systems import hermite_system
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.orientation import energy_matrix, orient_points
 from rbfmuscle.validation import UsageError

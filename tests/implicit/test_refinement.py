@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.implicit.field import RBFField, hermite_system
+from rbfmuscle.implicit.field import RBFField
+from rbfmuscle.implicit.fit.systems import hermite_system
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.placement.refinement import _rows, fit_centres, fit_sample
 from rbfmuscle.implicit.placement.sampling import sample_surface, spread_points

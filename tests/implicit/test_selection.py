@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from peers.variable import FAMILIES, fit_variable, search_variable, variable_epsilon
 
-from rbfmuscle.implicit.field import RBFField, collocation, frame, hermite_system
+from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit.cross_validation import least_squares_residuals, leave_one_out
 from rbfmuscle.implicit.fit.fitting import Basis
+from rbfmuscle.implicit.fit.systems import collocation, frame, hermite_system
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.selection import (
     CRITERIA,

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from rbfmuscle.implicit.field import RBFField, collocation, frame, hermite_system
+from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit.cross_validation import LeastSquaresPath, SmoothingPath, leave_one_out
 from rbfmuscle.implicit.fit.fitting import Basis
+from rbfmuscle.implicit.fit.systems import collocation, frame, hermite_system
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.selection import choose_epsilon, choose_smoothing
 from rbfmuscle.validation import NumericalWarning, UsageError

@@ -25,9 +25,9 @@ from scipy import linalg
 from scipy.spatial.distance import cdist
 
 from rbfmuscle.geometry.arrays import Array, Floats
-from rbfmuscle.implicit.field import _check_degree, frame
 from rbfmuscle.implicit.fit import assembly
 from rbfmuscle.implicit.fit.fitting import raise_if_singular
+from rbfmuscle.implicit.fit.systems import check_degree, frame
 from rbfmuscle.implicit.kernels import radial
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.validation import UsageError
@@ -71,7 +71,7 @@ class System:
             raise UsageError(
                 f"a flat fit takes at most {_MOST_CENTRES} centres (beyond, none of it is sound), got {len(points)}"
             )
-        degree = _check_degree(kernel, degree, len(points))
+        degree = check_degree(kernel, degree, len(points))
         origin, scale = frame(points)
         return cls((points - origin) / scale, kernel, degree, reach), (origin, scale)
 

@@ -17,8 +17,9 @@ from scipy import linalg
 from scipy.spatial.distance import cdist
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.implicit.field import RBFField, hermite_system
+from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit import assembly
+from rbfmuscle.implicit.fit.systems import hermite_system
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.placement.sampling import spread_points
 from rbfmuscle.implicit.selection import spacing, surface_miss
