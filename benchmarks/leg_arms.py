@@ -9,10 +9,10 @@ range; positive where the muscle flexes hip or knee, or dorsiflexes the ankle.
 """
 
 import argparse
-import os
 from pathlib import Path
 
 import numpy as np
+from leg_joints import leg_folder
 
 from rbfmuscle.run import simulate
 from rbfmuscle.sim.scene.motion import Motion
@@ -68,14 +68,6 @@ PUBLISHED = {
     ("ankle", "gastrocnemius_lateral"): (-57, -35, "Achilles tendon, 17 studies in Manal et al. 2013"),
     ("ankle", "tibialis_anterior"): (29, 45, "Maganaris 2000"),
 }
-
-
-def data_folder():
-    """Where ``leg`` and ``osim`` are."""
-    for place in (os.environ.get("RBFMUSCLE_DATA"), Path(__file__).resolve().parents[2] / "shared" / "data"):
-        if place and (Path(place) / "leg").is_dir():
-            return Path(place)
-    raise SystemExit("data/leg is not here; set RBFMUSCLE_DATA to the folder that holds leg/")
 
 
 def joint_scene(folder, joint):
@@ -149,7 +141,7 @@ def main():
     parser.add_argument("--osim", type=Path)
     parser.add_argument("--joints", default="hip,knee,ankle")
     arguments = parser.parse_args()
-    folder, models = data_folder(), arguments.models.split(",")
+    folder, models = leg_folder().parent, arguments.models.split(",")
     osim = arguments.osim or folder / "osim" / "gait2392" / "gait2392_thelen2003muscle.osim"
     print(
         f"| joint | muscle | {' | '.join(models)} | gait2392 | published | source | {models[0]}: mean outside by |"

@@ -9,12 +9,11 @@ the whole on average. The exponent is the slope of log time over log number. Wit
 """
 
 import argparse
-import os
 import time
-from pathlib import Path
 
 import numba
 import numpy as np
+from leg_joints import leg_folder
 
 from rbfmuscle.models import build_models
 from rbfmuscle.sim.loop.simulate import FrameLoop
@@ -22,14 +21,6 @@ from rbfmuscle.sim.plan.reach import build_fields, reached_bones
 from rbfmuscle.sim.scene.scene import Scene
 
 FIRST = 2  # frames that are gone to before any is measured
-
-
-def data_folder():
-    """Where ``leg`` and ``hip`` are."""
-    for place in (os.environ.get("RBFMUSCLE_DATA"), Path(__file__).resolve().parents[2] / "shared" / "data"):
-        if place and (Path(place) / "leg").is_dir():
-            return Path(place)
-    raise SystemExit("data/leg is not here; set RBFMUSCLE_DATA to the folder that holds leg/")
 
 
 def evenly_mixed(scene):
@@ -84,7 +75,7 @@ def main():
     parser.add_argument("--hip", action="store_true")
     parser.add_argument("--threads", action="store_true")
     arguments = parser.parse_args()
-    folder = data_folder()
+    folder = leg_folder().parent
     scene, models, fields = loaded(folder / "leg" / "squat.toml", arguments.model)
     order = evenly_mixed(scene)
     tracks = {
