@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, Integers
 
 # A half-space counts as violated below this share of the search reach.
 TOUCHING = 1e-9
@@ -29,7 +29,7 @@ class ContactConstraint:
         the authors' earlier papers.
     """
 
-    def __init__(self, columns: Floats, shares: Floats, *, reach: float, response: str = "sum") -> None:
+    def __init__(self, columns: Integers, shares: Floats, *, reach: float, response: str = "sum") -> None:
         self.columns, self.shares = columns, shares
         self.reach = float(reach)
         self.nearest_only = response == "nearest"

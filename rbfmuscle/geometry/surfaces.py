@@ -1,12 +1,9 @@
 """Normals, edges and enclosed volumes of triangle meshes."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rbfmuscle.compiled.loop import compiled
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from rbfmuscle.geometry.arrays import Floats, Integers
 
 
 def face_normals(vertices: Floats, faces: Integers) -> Floats:

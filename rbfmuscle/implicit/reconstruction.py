@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.orientation import orient_points
 from rbfmuscle.implicit.partition import PartitionField, fit_points_with_normals
+from rbfmuscle.implicit.selection import spacing
 from rbfmuscle.validation import MeshError, UsageError, check_points, check_vectors
 
 # Points closer than this share of the median spacing are one.
@@ -98,8 +98,8 @@ def reconstruct_surface(
     else:
         normals = check_vectors(normals, len(keep))[keep]
     field = fit_points_with_normals(points, normals, most=DENSE)
-    spacing = float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))
-    cells = resolution or int(np.clip(CELLS * np.ptp(points, axis=0).max() / spacing, *RANGE))
+    between = float(np.median(spacing(points)))
+    cells = resolution or int(np.clip(CELLS * np.ptp(points, axis=0).max() / between, *RANGE))
     try:
         found = extract_surface(field, points=points, resolution=cells)
     except ValueError as error:
@@ -109,14 +109,14 @@ def reconstruct_surface(
     return Reconstruction(found.vertices, found.faces, points, np.asarray(normals), field, found.spurious)
 
 
-def _without_repeats(points: Floats) -> Any:
+def _without_repeats(points: Floats) -> Booleans:
     """A mask (n,) that leaves out points all but on an earlier one."""
     keep = np.ones(len(points), dtype=bool)
     if len(points) < 2:
         return keep
     tree = cKDTree(points)
-    spacing = float(np.median(tree.query(points, k=2)[0][:, 1]))
-    for first, second in tree.query_pairs(SAME * spacing, output_type="ndarray"):
+    between = float(np.median(tree.query(points, k=2)[0][:, 1]))
+    for first, second in tree.query_pairs(SAME * between, output_type="ndarray"):
         if keep[first]:
             keep[second] = False
     return keep

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.rest_frame import diameter
 from rbfmuscle.geometry.rotations import turned_quaternions
 from rbfmuscle.model.constraints import ShapeConstraint, VolumeConstraint
@@ -66,7 +66,7 @@ def _carry_all_loop(x, target, rest, points, columns, shares, out):
                 out[s, a] += shares[s, k] * (x[j, a] + t[a, 0] * dx + t[a, 1] * dy + t[a, 2] * dz)
 
 
-def carry_points(x: Floats, shape: Any, points: Floats, columns: Floats, shares: Floats) -> Any:
+def carry_points(x: Floats, shape: Any, points: Floats, columns: Integers, shares: Floats) -> Floats:
     """Where centres carry points that hang on them.
 
     Parameters

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,10 +26,6 @@ from rbfmuscle.sim.cache import content_key, has_arrays, load_arrays, store_arra
 from rbfmuscle.sim.scene.objects import Muscle
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.validation import NumericalWarning, SceneError
-
-if TYPE_CHECKING:
-    pass
-
 
 # Area for each centre [mm²], from which their number follows where the scene names none, and the least number.
 AREA_FOR_EACH = 212.0

@@ -7,7 +7,7 @@ crosses, so it follows the surface wherever it went, and the field is evaluated 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,10 +24,6 @@ from rbfmuscle.implicit.extraction.marching import (
     marching_tables,
 )
 from rbfmuscle.validation import check_points
-
-if TYPE_CHECKING:
-    pass
-
 
 # More nodes than this are refused: 2 bytes of state and 8 of index each.
 MAX_NODES = 50_000_000

@@ -72,7 +72,7 @@ class Lattice:
         self._number_nodes()
         self._integrate()
 
-    def _choose_spacing(self, surface: Any, wanted: float) -> Any:
+    def _choose_spacing(self, surface: Floats, wanted: float) -> None:
         """The coarsest cells that give the wanted nodes, by bisection."""
         small, large = 0.01 * self.extent.max(), self.extent.max()
         for _ in range(25):
@@ -82,7 +82,7 @@ class Lattice:
             small, large = (small, side) if len(self.rest) < wanted else (side, large)
         self._lay_cells(surface, large)
 
-    def _lay_cells(self, surface: Any, side: float) -> Any:
+    def _lay_cells(self, surface: Floats, side: float) -> None:
         self.count = np.maximum(1, np.ceil(self.extent / side - 1e-9).astype(int))
         self.spacing = self.extent / self.count
         every = np.stack(np.meshgrid(*(np.arange(n) for n in self.count), indexing="ij"), -1).reshape(-1, 3)
@@ -98,7 +98,7 @@ class Lattice:
     def _key(self, cells: Integers) -> Any:
         return (cells[:, 0] * self.count[1] + cells[:, 1]) * self.count[2] + cells[:, 2]
 
-    def _number_nodes(self) -> Any:
+    def _number_nodes(self) -> None:
         width = self.degree + 1
         steps = np.stack(np.meshgrid(*[np.arange(width)] * 3, indexing="ij"), -1).reshape(-1, 3)
         corner = self.cells[:, None, :] + steps
@@ -110,7 +110,7 @@ class Lattice:
         self.rest = (self.low + (self.place - 0.5 * (self.degree - 1)) * self.spacing) @ self.axes
         self.tree = cKDTree(self.cells + 0.5)
 
-    def embed(self, points: Floats) -> Any:
+    def embed(self, points: Floats) -> Embedding:
         """Shape functions at points; beyond the cells, those of the nearest cell."""
         local = (points @ self.axes.T - self.low) / self.spacing
         key = np.full(int(np.prod(self.count)), -1)
@@ -121,7 +121,7 @@ class Lattice:
             cell[lost] = self.tree.query(local[lost])[1]
         return self._at(cell, local - self.cells[cell])
 
-    def _at(self, cell: Integers, s: Floats) -> Any:
+    def _at(self, cell: Integers, s: Floats) -> Embedding:
         value, slope = _basis(s, self.degree)
         shares = np.einsum("na,nb,nc->nabc", value[:, 0], value[:, 1], value[:, 2])
         parts = [
@@ -136,7 +136,7 @@ class Lattice:
             np.ascontiguousarray(slopes),
         )  # fmt: skip
 
-    def _integrate(self) -> Any:
+    def _integrate(self) -> None:
         """Eight points a cell with the volume, the middle and the spread of the material in it."""
         fine = (np.stack(np.meshgrid(*[np.arange(FINE)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5) / FINE
         # Those of a full cell are Gauss's.

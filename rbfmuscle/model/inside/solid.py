@@ -125,7 +125,7 @@ class Interior:
         self.anchor, self.history = points[held], [0.0]
         self.trend, self.begun = None, None
 
-    def _assemble(self, lattice: Lattice) -> Any:
+    def _assemble(self, lattice: Lattice) -> None:
         """Matrix of the energy with frozen targets, springs and all, its inverse, and the bones' weights."""
         size, rows = len(self.rest), np.arange(len(self.weights))[:, None]
         matrix = GHOST * self.side * lattice.second_differences()
@@ -144,7 +144,7 @@ class Interior:
         weights = np.stack([self.inverse @ self.spring[:, own == bone].sum(axis=1) for bone in self.bones], 1)
         self.motion_weights = weights / weights.sum(axis=1, keepdims=True)
 
-    def _invert(self) -> Any:
+    def _invert(self) -> None:
         inverse = np.linalg.inv(self.matrix)
         self.inverse = np.ascontiguousarray(0.5 * (inverse + inverse.T))
 
@@ -183,7 +183,7 @@ class Interior:
         mobility_loop(self.columns, self.shares, self.inverse, mobility)
         return mobility < MOBILE * np.median(mobility[self.owner < 0])
 
-    def _number_regions(self, region: Integers) -> Any:
+    def _number_regions(self, region: Integers) -> None:
         self.region = region
         count = int(region.max()) + 1
         size = len(self.rest)
@@ -374,7 +374,7 @@ class Interior:
             self.slot, self.right, self.gradient, self.volumes,
         )  # fmt: skip
 
-    def _respond(self) -> Any:
+    def _respond(self) -> None:
         """How the nodes answer to pressures, at the present shape: the metric of this solve's corrections."""
         count = len(self.pressure)
         response, gram = np.empty((count, 3, len(self.y))), np.empty((count, count))
