@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.sim.scene.scene import MM_PER_UNIT
 from rbfmuscle.study.animation.moving import (
     FRAMES_A_SECOND,
     MovingBone,
@@ -16,8 +17,6 @@ from rbfmuscle.study.animation.moving import (
     linear_rgb,
 )
 from rbfmuscle.validation import MissingPartError
-
-METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
 def check_usd() -> None:
@@ -53,7 +52,7 @@ def write_usd(path: Path, run: MovingRun) -> None:
     stage = Usd.Stage.CreateInMemory()
     with Sdf.ChangeBlock():
         UsdGeom.SetStageUpAxis(stage, run.up.upper())
-        UsdGeom.SetStageMetersPerUnit(stage, METRES[run.unit])
+        UsdGeom.SetStageMetersPerUnit(stage, MM_PER_UNIT[run.unit] / 1000.0)
         stage.SetTimeCodesPerSecond(FRAMES_A_SECOND)
         stage.SetFramesPerSecond(FRAMES_A_SECOND)
         stage.SetStartTimeCode(float(codes[0]))

@@ -5,20 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.measure.penetration import bone_coordinates
-from rbfmuscle.study.show.paint import local_stretch
+from rbfmuscle.study.show.paint import local_stretch, near_segments
 from rbfmuscle.validation import UsageError, did_you_mean
 
 NAMES = ("stretch", "activation", "bone_distance")
 # Those that are lengths, and so are converted with the unit.
 LENGTHS = ("bone_distance",)
-# Segments of fibres that a vertex takes its stretch from, by nearness; as in pictures.
-NEAREST = 4
 
 
 class VertexValues:
@@ -82,16 +79,11 @@ class VertexValues:
         known = self._shares.get(muscle)
         # A surface that keeps its vertices keeps their fibres, so that no colour wanders.
         if known is None or known[0] != len(vertices):
-            known = self._shares[muscle] = (len(vertices), *self._nearest(muscle, frame, vertices))
+            known = self._shares[muscle] = (
+                len(vertices),
+                *near_segments(self.saved, muscle, frame, vertices),
+            )
         return (local_stretch(self.saved, muscle, frame).ravel()[known[1]] * known[2]).sum(axis=1)
-
-    def _nearest(self, muscle, frame, vertices):
-        """Segments of fibres (n, k) near each vertex, and their shares."""
-        points = self.saved.fibres(muscle, frame)[0]
-        middles = (0.5 * (points[:, 1:] + points[:, :-1])).reshape(-1, 3)
-        away, nearest = cKDTree(middles).query(vertices, k=[*range(1, min(NEAREST, len(middles)) + 1)])
-        weight = 1.0 / np.maximum(away, 1e-9)
-        return nearest, weight / weight.sum(axis=1, keepdims=True)
 
 
 def _distance_to(vertices, faces):

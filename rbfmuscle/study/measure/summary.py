@@ -139,7 +139,8 @@ def exceeded(table: dict[str, Any], limits: dict[str, Any]) -> list[Any]:
             limit = limits.get(name.partition(":")[0])
             if limit is None or muscle == ALL:
                 continue
-            worst = facts.get("worst", math.nan)
+            worst = facts.get("worst")
+            worst = math.nan if worst is None else worst  # as a file has it
             if not within(name, worst, limit):
                 found.append((muscle, name, worst, limit, facts.get("worst_frame")))
     return found

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.show.appearance import muscle_colours
 from rbfmuscle.validation import UsageError
@@ -18,6 +18,8 @@ PAINT_COLOURS = "viridis"
 CHIPS = 5
 # Stretch of 1 is the middle of its colours; they end so far from it where no fibre goes farther.
 LEAST_SPAN = 0.05
+# Segments of fibres that a point takes its stretch from. Over a few: one fibre's edge beside another's would be a
+# pattern of the fibres, not of the muscle.
 NEAREST = 4
 
 Paint = Callable[[SavedRun, str, int, Floats], Floats]
@@ -87,6 +89,15 @@ def local_stretch(saved: SavedRun, muscle: str, frame: int) -> Floats:
     return ends[1] / ends[0]
 
 
+def near_segments(saved: SavedRun, muscle: str, frame: int, vertices: Floats) -> tuple[Integers, Floats]:
+    """Segments of fibres (n, k) near each of some points (n, 3) of a muscle, by their place, and their shares."""
+    points = saved.fibres(muscle, frame)[0]
+    middles = (0.5 * (points[:, 1:] + points[:, :-1])).reshape(-1, 3)
+    away, nearest = cKDTree(middles).query(vertices, k=[*range(1, min(NEAREST, len(middles)) + 1)])
+    weight = 1.0 / np.maximum(away, 1e-9)
+    return nearest, weight / weight.sum(axis=1, keepdims=True)
+
+
 class _Stretch:
     """Each point by the stretch of the nearest segment of a fibre."""
 
@@ -94,11 +105,6 @@ class _Stretch:
         self.span = span
 
     def __call__(self, saved: SavedRun, muscle: str, frame: int, vertices: Floats) -> Floats:
-        points = saved.fibres(muscle, frame)[0]
-        middles = 0.5 * (points[:, 1:] + points[:, :-1])
-        # Over a few segments: one fibre's edge beside another's would be a pattern of the fibres, not of the muscle.
-        away, nearest = cKDTree(middles.reshape(-1, 3)).query(vertices, k=min(NEAREST, middles[..., 0].size))
-        weight = 1.0 / np.maximum(away, 1e-9)
-        stretch = local_stretch(saved, muscle, frame).ravel()[nearest]
-        mean = (weight * stretch).sum(axis=1) / weight.sum(axis=1)
+        nearest, shares = near_segments(saved, muscle, frame, vertices)
+        mean = (local_stretch(saved, muscle, frame).ravel()[nearest] * shares).sum(axis=1)
         return np.clip(0.5 + 0.5 * (mean - 1.0) / self.span, 0.0, 1.0)

@@ -203,7 +203,7 @@ class Stage:
         bounds = _path_bounds({id(saved): saved for row in rows for saved, _ in row}.values())
         for i, j, _, view in self.panels:
             self.plotter.subplot(i, j)
-            self._aim(VIEWS[view][0], bounds, size)
+            aim_camera(self.plotter.camera, VIEWS[view][0], bounds, size)
             self.plotter.enable_anti_aliasing("ssaa")
 
     def show(self, frame: int) -> Any:
@@ -264,18 +264,28 @@ class Stage:
             reset_camera=False,
         )
 
-    def _aim(self, direction, bounds, size):
-        """Parallel projection that holds the box in this view."""
-        centre = bounds.mean(axis=0)
-        corners, ahead, up = _projected(direction, bounds)
-        wide, tall = np.ptp(corners, axis=0) / 2
-        wide *= size[1] / size[0]
-        camera = self.plotter.camera
-        camera.focal_point = centre
-        camera.position = centre + ahead * 4.0 * np.linalg.norm(bounds[1] - bounds[0])
-        camera.up = up
-        camera.parallel_projection = True
-        camera.parallel_scale = 1.04 * max(tall, wide)
+
+def aim_camera(camera: Any, direction: Any, bounds: Any, size: tuple[int, int]) -> None:
+    """Let a camera look along a direction, in a parallel projection that holds a box.
+
+    Parameters
+    ----------
+    camera : pyvista.Camera
+    direction : (3,) sequence of float
+        From the box to the camera.
+    bounds : (2, 3) ndarray
+    size : (width, height)
+        Of the view [pixel].
+    """
+    centre = bounds.mean(axis=0)
+    corners, ahead, up = _projected(direction, bounds)
+    wide, tall = np.ptp(corners, axis=0) / 2
+    wide *= size[1] / size[0]
+    camera.focal_point = centre
+    camera.position = centre + ahead * 4.0 * np.linalg.norm(bounds[1] - bounds[0])
+    camera.up = up
+    camera.parallel_projection = True
+    camera.parallel_scale = 1.04 * max(tall, wide)
 
 
 def _projected(direction, bounds):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.metrics import QUANTITIES
-from rbfmuscle.study.measure.summary import LEAST, within
+from rbfmuscle.study.measure.summary import LEAST, exceeded
 from rbfmuscle.study.show.appearance import line_colours
 from rbfmuscle.study.show.model_paths import beside_section
 from rbfmuscle.study.show.page import (
@@ -160,14 +160,7 @@ def _compiling(info):
 
 def _beyond(saved):
     """Set of (muscle, quantity) beyond the limits in run.json."""
-    found = set()
-    for muscle, quantities in saved.info["muscles"].items():
-        for name, facts in quantities.items():
-            limit = saved.info["limits"].get(name)
-            worst = facts.get("worst")
-            if limit is not None and (worst is None or not within(name, worst, limit)):
-                found.add((muscle, name))
-    return found
+    return {(muscle, name) for muscle, name, *_ in exceeded(saved.info["muscles"], saved.info["limits"])}
 
 
 def _verdict(saved):

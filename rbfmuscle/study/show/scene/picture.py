@@ -15,7 +15,7 @@ import numpy as np
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.study.show.appearance import BACKGROUND, LINE_COLOURS
-from rbfmuscle.study.show.render import VIEWS, draw, main
+from rbfmuscle.study.show.render import VIEWS, aim_camera, draw, main
 
 if TYPE_CHECKING:
     from rbfmuscle.sim.scene.scene import Scene
@@ -148,12 +148,12 @@ class ScenePicture:
         )
         self.plotter.set_background(BACKGROUND)
         points = np.vstack([part for name, part in self.parts.items() if name[-1].isdigit()])
-        self.bounds = np.array([points.min(axis=0), points.max(axis=0)])
+        bounds = np.array([points.min(axis=0), points.max(axis=0)])
         self.size = float(np.linalg.norm(np.ptp(points, axis=0)))
         for column, (direction, _) in enumerate(VIEWS.values()):
             self.plotter.subplot(0, column)
             self._add_all()
-            self._aim(direction)
+            aim_camera(self.plotter.camera, direction, bounds, SIZE)
             self.plotter.enable_anti_aliasing("ssaa")
 
     def picture(self) -> Any:
@@ -225,19 +225,6 @@ class ScenePicture:
                 [place for place, _ in groups], ["\n".join(names) for _, names in groups], font_size=13,
                 text_color=AXIS, shape=None, always_visible=True, show_points=False, render=False, reset_camera=False,
             )  # fmt: skip
-
-    def _aim(self, direction):
-        centre = self.bounds.mean(axis=0)
-        ahead = np.asarray(direction) / np.linalg.norm(direction)
-        right = np.cross([0.0, 0.0, 1.0], ahead)
-        right /= np.linalg.norm(right)
-        up = np.cross(ahead, right)
-        grid = np.array(np.meshgrid(*self.bounds.T)).reshape(3, -1).T - centre
-        tall, wide = np.ptp(grid @ up) / 2, np.ptp(grid @ right) / 2 * SIZE[1] / SIZE[0]
-        camera = self.plotter.camera
-        camera.focal_point, camera.position = centre, centre + 4.0 * self.size * ahead
-        camera.up, camera.parallel_projection = up, True
-        camera.parallel_scale = 1.04 * max(tall, wide)
 
 
 def _bone_colour(k):
