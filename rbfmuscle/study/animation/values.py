@@ -10,7 +10,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.measure.penetration import bone_coordinates
-from rbfmuscle.study.show.paint import local_stretch, near_segments
+from rbfmuscle.study.show.paint import activations, local_stretch, near_segments
 from rbfmuscle.validation import UsageError, did_you_mean
 
 NAMES = ("stretch", "activation", "bone_distance")
@@ -44,12 +44,11 @@ class VertexValues:
             raise UsageError(
                 f"{saved.directory} has no fibres to take stretch from: set output.fibres = true in the run's scene"
             )
-        rows = [row for row in saved.metrics if row.quantity == "activation"] if "activation" in names else []
-        if "activation" in names and not rows:
+        self._activation = activations(saved) if "activation" in names else {}
+        if "activation" in names and not self._activation:
             raise UsageError(
                 f"{saved.directory} has no activation: no muscle contracts, or output.metrics = false"
             )
-        self._activation = {(row.muscle, row.frame): row.value for row in rows}
         self._bones: dict[str, MeshDistance] = {}
         self._shares: dict[str, tuple[int, Integers, Floats]] = {}
 

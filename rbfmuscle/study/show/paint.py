@@ -29,7 +29,7 @@ def check_colouring(saved: SavedRun, colour: str) -> None:
     """Raise UsageError where a run has not what its muscles shall be coloured by."""
     if colour not in COLOURINGS:
         raise UsageError(f"unknown colouring {colour!r}; known: {', '.join(COLOURINGS)}")
-    if colour == "activation" and not any(len(saved.series(m, "activation")[0]) for m in saved.muscles):
+    if colour == "activation" and not activations(saved):
         raise UsageError(f"{saved.directory} has no activation: none of its muscles contracts")
     if colour == "stretch" and not saved.has_fibres():
         raise UsageError(f"{saved.directory} has no fibres: set output.fibres = true in the run's scene")
@@ -54,7 +54,9 @@ def painting(saved: SavedRun, colour: str, frames: list[int]) -> tuple[Paint | N
         The legend.
     """
     if colour == "activation":
-        return _activation, scale_chips([f"activation {share:g}" for share in np.linspace(0, 1, CHIPS)])
+        return _Activation(saved), scale_chips(
+            [f"activation {share:g}" for share in np.linspace(0, 1, CHIPS)]
+        )
     if colour == "stretch":
         away = [
             np.abs(saved.fibres(m, frame)[1]["stretch"] - 1.0).max()
@@ -76,9 +78,19 @@ def scale_chips(texts: list[str]) -> dict[str, Any]:
     return {text: to_hex(colormaps[PAINT_COLOURS](share)) for text, share in zip(texts, shares)}
 
 
-def _activation(saved, muscle, frame, vertices):
-    frames, values = saved.series(muscle, "activation")
-    return np.full(len(vertices), float(values[frames == frame][0]) if frame in frames else 0.0)
+def activations(saved: SavedRun) -> dict[tuple[str, int], float]:
+    """Activation of each muscle that contracts, by muscle and frame."""
+    return {(row.muscle, row.frame): row.value for row in saved.metrics if row.quantity == "activation"}
+
+
+class _Activation:
+    """Each muscle by its activation, 0 where it does not contract."""
+
+    def __init__(self, saved: SavedRun) -> None:
+        self.known = activations(saved)
+
+    def __call__(self, _saved: SavedRun, muscle: str, frame: int, vertices: Floats) -> Floats:
+        return np.full(len(vertices), self.known.get((muscle, frame), 0.0))
 
 
 def local_stretch(saved: SavedRun, muscle: str, frame: int) -> Floats:
