@@ -167,6 +167,19 @@ class TestRuns:
         info = CohortFolder(folder).info(jobs[0])
         assert info["scene"]["contact"]["substep_angle"] == 1
 
+    def test_a_motion_file_that_has_changed_is_run_again(self, tmp_path):
+        write_subject(tmp_path / "ann")
+        head = "bend\nversion=1\nnRows=2\nnColumns=2\ninDegrees=yes\nendheader\ntime\tflexion\n"
+        (tmp_path / "bend.mot").write_text(f"{head}0\t0\n1\t5\n")
+        rows = [{"subject": "ann", "scene": "ann/scene.toml", "motion": "bend.mot"}]
+        jobs, folder = read_cohort((write_table(tmp_path / "t.csv", rows),), {}), tmp_path / "out"
+        assert CohortRunner(run_job, jobs, folder, count=1).run() == 1
+        assert CohortRunner(run_job, jobs, folder, count=1).run() == 0
+        (tmp_path / "bend.mot").write_text(f"{head}0\t0\n1\t8\n")
+        assert CohortRunner(run_job, jobs, folder, count=1).run() == 1
+        last = CohortFolder(folder).info(jobs[0])["frames"][-1]
+        assert last["coordinates"]["elbow.flexion"] == pytest.approx(8.0)
+
     def test_failed_jobs_run_again_only_when_asked(self, finished):
         jobs, folder = finished
         assert CohortRunner(run_job, jobs, folder, count=1).run() == 0
