@@ -69,6 +69,8 @@ def run_job(job: CohortJob, directory: Path) -> dict[str, Any]:
 
 
 def _tell(table, output, as_json):
+    from rbfmuscle.study.cohort.table import shown_name
+
     if as_json:
         from rbfmuscle.study.files.writer import json_text
 
@@ -76,9 +78,8 @@ def _tell(table, output, as_json):
         print(json_text({"directory": str(output), **facts}))
     else:
         for one in table["outliers"][:5]:
-            job = " ".join(part for part in (one["subject"], one["trial"]) if part)
             print(
-                f"apart: {job}, {one['muscle']}: {one['quantity']} = {one['value']:.4g} {one['unit']}, "
+                f"apart: {shown_name(one)}, {one['muscle']}: {one['quantity']} = {one['value']:.4g} {one['unit']}, "
                 f"median {one['median']:.4g}"
             )
         print(
@@ -88,18 +89,10 @@ def _tell(table, output, as_json):
     bad = [row for row in table["jobs"] if row["status"] != "done"]
     if bad:
         for row in bad[:5]:
-            name = " ".join(part for part in (row["subject"], row["trial"]) if part)
-            print(f"rbfmuscle: {name}: {row['error'] or row['status']}", file=sys.stderr)
+            print(f"rbfmuscle: {shown_name(row)}: {row['error'] or row['status']}", file=sys.stderr)
         raise SolveError(
             f"{len(bad)} of {len(table['jobs'])} jobs failed; the others are kept, --retry runs these again"
         )
-
-
-def cohort_settings(texts: list[str] | None) -> dict[str, Any]:
-    """Settings for all jobs, of "KEY=VALUE"."""
-    from rbfmuscle.sim.scene.settings import parse_setting
-
-    return dict(parse_setting(text) for text in texts or [])
 
 
 def check_options(**given: Any) -> None:

@@ -63,11 +63,11 @@ def compare(
     from rbfmuscle import interruption
     from rbfmuscle.compare import compare_models
     from rbfmuscle.models import MODEL_NAMES
-    from rbfmuscle.sim.scene.settings import parse_setting
+    from rbfmuscle.sim.scene.settings import parse_settings
     from rbfmuscle.study.files.writer import json_text
 
     names = [name.strip() for name in models.split(",") if name.strip()] if models else list(MODEL_NAMES)
-    changes = dict(parse_setting(text) for text in settings or [])
+    changes = parse_settings(settings)
     with Progress("compare") as progress, interruption.keeping(lambda: output.exists()):
 
         def advance(model, done, total):

@@ -93,9 +93,9 @@ def run(
     as_json
         Print JSON and nothing else.
     """
-    from rbfmuscle.sim.scene.settings import parse_setting
+    from rbfmuscle.sim.scene.settings import parse_settings
 
-    changes = dict(parse_setting(text) for text in settings or [])
+    changes = parse_settings(settings)
 
     def load():
         from rbfmuscle.sim.scene.scene import Scene

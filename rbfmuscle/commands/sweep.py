@@ -84,10 +84,11 @@ def sweep(
     if jobs is not None and jobs < 1:
         raise UsageError(f"--jobs must be 1 or more, got {jobs}")
     if is_cohort(scene):
-        from rbfmuscle.commands.cohort import check_options, cohort_settings, sweep_cohort
+        from rbfmuscle.commands.cohort import check_options, sweep_cohort
+        from rbfmuscle.sim.scene.settings import parse_settings
 
         check_options(grid=grid, reference=reference, task=task, merge=merge)
-        asked = {"model": model, "frames": frames, "settings": cohort_settings(settings)}
+        asked = {"model": model, "frames": frames, "settings": parse_settings(settings)}
         how: dict[str, Any] = {"jobs": jobs, "scheduler": scheduler, "retry": retry, "as_json": as_json}
         return sweep_cohort(scene, output, asked=asked, **how)
     if settings:
@@ -117,13 +118,13 @@ def run_point(scene: Scene, settings: dict[str, Any], frames: str | None) -> Run
 def _measure(scene, output, grid, model, frames, reference, jobs, scheduler, part, retry):
     from rbfmuscle import interruption
     from rbfmuscle.models import configure_scene
-    from rbfmuscle.sim.scene.settings import parse_setting
+    from rbfmuscle.sim.scene.settings import parse_settings
     from rbfmuscle.study.experiment.sweep import parse_grid, plan_sweep
     from rbfmuscle.study.experiment.sweep_points import SweepRunner
 
     axes = parse_grid(grid or [])
     loaded = configure_scene(load_scene(scene), model=model)
-    chosen = dict(parse_setting(text) for text in reference or [])
+    chosen = parse_settings(reference)
     plan = plan_sweep(loaded, axes, frames=frames, reference=chosen)
     for point in plan.points:  # a mistyped key is told now, not after the first point
         configure_scene(loaded, point.settings)

@@ -49,11 +49,11 @@ def paths(
     from rbfmuscle.compiled.progress import Progress
     from rbfmuscle.models import configure_scene
     from rbfmuscle.sim.scene.scene import Scene
-    from rbfmuscle.sim.scene.settings import parse_setting
+    from rbfmuscle.sim.scene.settings import parse_settings
 
     if samples < 10:
         raise UsageError(f"--samples {samples} is too few to fit anything, give 10 or more")
-    changes = dict(parse_setting(text) for text in settings or [])
+    changes = parse_settings(settings)
     loaded = configure_scene(Scene.load(scene), changes, model=model)
     if muscles is not None:
         chosen = [loaded.muscle(name.strip()).name for name in muscles.split(",")]

@@ -44,10 +44,10 @@ def ways(
     as_json
         Print JSON and nothing else.
     """
-    from rbfmuscle.sim.scene.settings import parse_setting
+    from rbfmuscle.sim.scene.settings import parse_settings
     from rbfmuscle.study.experiment.ways import ways_to
 
-    changes = dict(parse_setting(text) for text in settings or [])
+    changes = parse_settings(settings)
     end, aside = _values(pose, "--pose"), _values(through or [], "--through")
     ways_to(end, aside)
     with Progress("ways") as progress:

@@ -122,6 +122,11 @@ def parse_setting(text: str) -> tuple[Any, ...]:
     return key.strip(), parse_value(value.strip(), place=key.strip())
 
 
+def parse_settings(texts: list[str] | None) -> dict[str, Any]:
+    """Return the settings of several "KEY=VALUE", of which the last of a key counts."""
+    return dict(parse_setting(text) for text in texts or [])
+
+
 def parse_value(text: str, *, place: str) -> dict[str, Any] | int | str:
     """Return the value of a TOML literal (number, true, list, table), or the text itself.
 

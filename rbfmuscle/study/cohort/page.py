@@ -11,6 +11,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from rbfmuscle.study.cohort.table import APART, LEAST_JOBS, shown_name
 from rbfmuscle.study.show.appearance import LINE_COLOURS
 from rbfmuscle.study.show.page import STYLE, embedded_image
 from rbfmuscle.study.show.plots import PLOT_STYLE
@@ -46,8 +47,6 @@ def write_cohort_page(table: dict[str, Any], directory: str | Path, title: str =
     directory : path
     title : str
     """
-    from rbfmuscle.study.cohort.table import APART, LEAST_JOBS
-
     subjects = len({row["subject"] for row in table["jobs"]})
     counts = f"{subjects} subjects, {len(table['jobs'])} jobs: {table['done']} done"
     for status in ("failed", "missing"):
@@ -67,7 +66,7 @@ def write_cohort_page(table: dict[str, Any], directory: str | Path, title: str =
 
 
 def _link(row):
-    name = html.escape(" ".join(part for part in (row["subject"], row["trial"]) if part))
+    name = html.escape(shown_name(row))
     target = row["report"] or row["folder"]
     return f'<a href="{quote(target)}">{name}</a>'
 

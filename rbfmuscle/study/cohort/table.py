@@ -101,6 +101,11 @@ def write_cohort(jobs: list[CohortJob], directory: str | Path) -> dict[str, Any]
     return {**facts, "values": values}
 
 
+def shown_name(row: dict[str, Any]) -> str:
+    """Subject and trial of a row, as texts name a job."""
+    return " ".join(part for part in (row["subject"], row["trial"]) if part)
+
+
 def outliers(values: list[Value]) -> list[Outlier]:
     """Values far from the median of their muscle and quantity over the cohort, the farthest first."""
     groups = defaultdict(list)
