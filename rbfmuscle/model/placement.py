@@ -146,7 +146,8 @@ def _search_centres(
         tried.append((error > wanted, count if error <= wanted else error, count, error))
         if error <= AIM * wanted or count >= most:
             break
-        grown = count * (error / (AIM * wanted)) ** (1.0 / FALL)
+        # Infinite where no fit is to be had, or next to nothing is wanted.
+        grown = min(count * (error / (AIM * wanted)) ** (1.0 / FALL), float(most))
         count = min(most, max(count + 20, 10 * int(np.ceil(grown / 10))))
     return min(tried)[2:]
 

@@ -9,7 +9,9 @@ import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
+from rbfmuscle.model import placement
 from rbfmuscle.model.muscle import RBFMuscle
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.models import build_model
@@ -252,3 +254,13 @@ def test_more_centres_than_greedy_placement_takes_are_a_scene_error():
     scene = phantom_scene().with_options({"model.centres": 1200})
     with pytest.raises(SceneError, match=r"at most 1000 centres, got 1200; take placement 'adaptive'"):
         build_model(scene.muscles[0], scene)
+
+
+def test_centres_are_as_many_as_allowed_at_most_where_no_fit_is_to_be_had(monkeypatch):
+    scene = phantom_scene()
+    muscle = scene.muscle("abductor")
+    frame, asked = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)), []
+    monkeypatch.setattr(placement, "place_points", lambda *given: (asked.append(given[-1]), None, None))
+    monkeypatch.setattr(placement, "_rest_miss", lambda *given: np.inf)
+    count, error = placement._search_centres(muscle, frame, RBFOptions(placement="even"), 150, 0.5)
+    assert asked == [150, 600] and (count, error) == (150, np.inf)
