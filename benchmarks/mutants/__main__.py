@@ -11,6 +11,7 @@ import dataclasses
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -80,7 +81,7 @@ def run(count: int, seed: int, minutes: float, rooms: list[str], loops: bool | N
         with (WORK / "results.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
         print(f"{row['outcome']:9} {fault.path}:{fault.line} {row['after'].strip()[:90]}", flush=True)
-    subprocess.run(["rm", "-rf", str(tree)], check=False)
+    shutil.rmtree(tree, ignore_errors=True)
 
 
 def kept_sample(count: int, seed: int, rooms: list[str], loops: bool | None) -> list:
@@ -106,11 +107,16 @@ def describe(fault, seed: int, tree: Path) -> dict | None:
     if not changed:
         return None
     before, after = changed[0]
-    text = "\n".join([fault.path, fault.function, before.strip(), after.strip()])
     return {
-        "key": hashlib.sha256(text.encode()).hexdigest()[:16], "seed": seed, "group": fault.group, "path": fault.path,
-        "line": fault.line, "function": fault.function, "before": before, "after": after,
+        "key": key_of(fault.path, fault.function, before.strip(), after.strip()), "seed": seed,
+        "group": fault.group, "path": fault.path, "line": fault.line, "function": fault.function,
+        "before": before, "after": after,
     }  # fmt: skip
+
+
+def key_of(*facts: str) -> str:
+    """A short name for a path, a function, and a line before and after."""
+    return hashlib.sha256("\n".join(facts).encode()).hexdigest()[:16]
 
 
 def judge(fault, tree: Path, reach: dict, sound: Sound) -> dict:
@@ -170,12 +176,7 @@ def results() -> list[dict]:
 def equivalent() -> dict[str, str]:
     """Faults that change nothing that could be told, with the reason, by key."""
     named = tomllib.loads((HERE / "equivalent.toml").read_text(encoding="utf-8")).get("fault", [])
-    return {
-        hashlib.sha256("\n".join([f["path"], f["function"], f["before"], f["after"]]).encode()).hexdigest()[
-            :16
-        ]: f["why"]
-        for f in named
-    }
+    return {key_of(f["path"], f["function"], f["before"], f["after"]): f["why"] for f in named}
 
 
 def table(seed: int | None) -> str:

@@ -59,13 +59,13 @@ class Recorder:
         if self.limit and self.slow.get(file, 0) >= self.patience:
             pytest.skip("too many slow tests in this file")
         self.coverage.switch_context(file)
-        with self._alarm():
+        with _Alarm(self.limit):
             return (yield)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self, item):
         self.coverage.switch_context(item.nodeid)
-        with self._alarm():
+        with _Alarm(self.limit):
             return (yield)
 
     @pytest.hookimpl(wrapper=True)
@@ -104,9 +104,6 @@ class Recorder:
         tests = {name: round(seconds, 3) for name, seconds in self.seconds.items() if name not in self.bad}
         self.output.parent.mkdir(parents=True, exist_ok=True)
         self.output.write_text(json.dumps({"tests": tests, "files": files}), encoding="utf-8")
-
-    def _alarm(self):
-        return _Alarm(self.limit)
 
 
 class _Alarm:

@@ -40,7 +40,7 @@ OPERATORS = (
 class Fault:
     """One fault: the operator's occurrence in a file, and what it makes of a line.
 
-    ``loop`` says that the place lies in a loop that is compiled; ``outside`` that it lies in no function.
+    ``loop`` says that the place lies in a loop that is compiled; ``function`` is empty where it lies in none.
     """
 
     path: str
@@ -112,7 +112,8 @@ def _spans(tree):
             if isinstance(child, ast.FunctionDef):
                 loop = any("compiled" in ast.unparse(d) for d in child.decorator_list)
                 functions.append((*span(child), name.rstrip("."), loop))
-                left_out.extend(span(child.returns) for _ in [0] if child.returns is not None)
+                if child.returns is not None:
+                    left_out.append(span(child.returns))
             if isinstance(child, ast.arg | ast.AnnAssign) and child.annotation is not None:
                 left_out.append(span(child.annotation))
             if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
