@@ -86,9 +86,8 @@ def guess_scene(folder: Path, units: str, base: Path) -> SceneGuess:
     guess = SceneGuess(f"the meshes in {folder.name or folder}", name, units, bones, root, joints)
     bodies = _bodies(bones, joints)
     guess.muscles = [guess_holds(muscle, bones, bodies, millimetre) for muscle in muscles]
-    if all(
-        muscle.wrong for muscle in guess.muscles
-    ):  # the bones that names ask for are not here: take what is
+    # Where the bones that names ask for are not here, what is there is taken.
+    if all(muscle.wrong for muscle in guess.muscles):
         guess.muscles = [guess_holds(muscle, bones, bodies, millimetre, named=False) for muscle in muscles]
     guess_tendons(guess, millimetre)
     rank = {id(joint.child): k for k, joint in enumerate(joints, start=1)}

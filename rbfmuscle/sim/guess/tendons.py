@@ -90,7 +90,7 @@ def _tendon(guess, muscle, hold):
     movable = [k for k in range(1, len(path)) if _between(guess.joints, path[k - 1], path[k]).kind != "fixed"]
     if not movable:
         return None
-    beside = [k for k in range(movable[0], len(path))]
+    beside = range(movable[0], len(path))
     k = min(beside, key=lambda k: float(((path[k].points - end) ** 2).sum(axis=1).min()))
     crossed = [_between(guess.joints, a, b) for a, b in itertools.pairwise(path[: k + 1])]
     moving = [joint for joint in crossed if joint.kind != "fixed"]
@@ -100,7 +100,7 @@ def _tendon(guess, muscle, hold):
     way = target - end
     length = float(np.linalg.norm(way))
     joint, guide = moving[0], path[k]
-    outward = _is_below(guess.joints, hold.bone, joint.child)
+    outward = any(bone is joint.child for bone in _way_up(guess.joints, hold.bone))
     slides = [_excursion(end, target, joint, angle if outward else -angle) - length for angle in ANGLES]
     name = f"{muscle.muscle.name}_{hold.bone.name}_tendon"
     return TendonGuess(name, guide, joint, way / length, end, np.array(slides))
@@ -122,15 +122,7 @@ def _between(joints, one, other):
 
 def _path(joints, start, end):
     """Bones from one to another through the tree, None where there is no way."""
-    above = {id(joint.child): joint.parent for joint in joints}
-
-    def way_up(bone):
-        found = [bone]
-        while id(found[-1]) in above:
-            found.append(above[id(found[-1])])
-        return found
-
-    first, second = way_up(start), way_up(end)
+    first, second = _way_up(joints, start), _way_up(joints, end)
     known = {id(bone): k for k, bone in enumerate(second)}
     for k, bone in enumerate(first):
         if id(bone) in known:
@@ -138,14 +130,12 @@ def _path(joints, start, end):
     return None
 
 
-def _is_below(joints, bone, above):
-    """Whether a bone is another one or hangs on it."""
-    parents = {id(joint.child): joint.parent for joint in joints}
-    while bone is not above:
-        if id(bone) not in parents:
-            return False
-        bone = parents[id(bone)]
-    return True
+def _way_up(joints, bone):
+    """A bone, the one that it hangs on, and so on to the root."""
+    parents, found = {id(joint.child): joint.parent for joint in joints}, [bone]
+    while id(found[-1]) in parents:
+        found.append(parents[id(found[-1])])
+    return found
 
 
 def tendons_of(guess: Any) -> list[TendonGuess]:
