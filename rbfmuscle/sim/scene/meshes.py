@@ -14,7 +14,15 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.sim.scene.mesh_repair import repair
-from rbfmuscle.validation import MeshError, check_mesh, is_file, shown, shown_path
+from rbfmuscle.validation import (
+    MeshError,
+    SceneError,
+    check_mesh,
+    check_positive,
+    is_file,
+    shown,
+    shown_path,
+)
 
 # In any unit: beyond it, squares of squares of lengths leave the range in which volumes are exact.
 LARGEST_COORDINATE = 1e12
@@ -115,6 +123,22 @@ def prepare_mesh(
     result = repair(vertices, faces, place=place, may_be_open=may_be_open)
     mesh = trimesh.Trimesh(result.vertices, result.faces, process=False)
     return ReadMesh(mesh, result.vertex_map, result.notes, result.closed)
+
+
+def as_mesh(mesh: Any, name: str, scale: float, *, may_be_open: bool) -> ReadMesh:
+    """Return the ReadMesh of a path, a trimesh.Trimesh, (vertices, faces) or of what is read already."""
+    if isinstance(mesh, ReadMesh):
+        return mesh
+    try:
+        scale = check_positive(scale, name="scale")
+    except (ValueError, TypeError) as error:
+        raise SceneError(f"{name!r}: {error}") from None
+    if isinstance(mesh, (str, Path)):
+        return read_mesh(mesh, name=name, scale=scale, may_be_open=may_be_open)
+    vertices, faces = mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)
+    vertices = np.asarray(vertices, dtype=np.float64) * scale
+    place = f"mesh {name!r}"
+    return prepare_mesh(vertices, np.asarray(faces), place=place, name=name, may_be_open=may_be_open)
 
 
 def read_arrays(path: Path) -> Any:

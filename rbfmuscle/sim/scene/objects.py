@@ -1,11 +1,16 @@
-"""What a scene is made of: bones, joints and muscles."""
+"""What a scene is made of: bones, joints and muscles, and how they are named."""
+
+from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Any
 
 from rbfmuscle.sim.joints.joint import Joint
+from rbfmuscle.validation import SceneError, did_you_mean, shown
 
-__all__ = ["Bone", "Joint", "Muscle"]
+__all__ = ["Bone", "Joint", "Muscle", "check_new_name", "find_named", "split_model"]
+
+_NAME_CHARACTERS = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-")
 
 
 @dataclass
@@ -35,3 +40,34 @@ class Muscle:
     source: str = ""
     notes: list = field(default_factory=list)
     contraction: object = None
+
+
+def split_model(model: dict[str, Any] | str, *, place: str) -> tuple[Any, ...]:
+    """Return (name, options) of a model given as a name or as a table with ``name``."""
+    if isinstance(model, str):
+        return model, {}
+    if isinstance(model, dict):
+        options = dict(model)
+        name = options.pop("name", "rbf")
+        if isinstance(name, str):
+            return name, options
+    raise SceneError(f"{place}: model must be a name or a table with a name, got {shown(model)}")
+
+
+def find_named(items: list[Any], name: str, what: str, *, place: str = "") -> Any:
+    """Return the item of that name, or raise SceneError naming the nearest."""
+    for item in items:
+        if item.name == name:
+            return item
+    hint = did_you_mean(name, [item.name for item in items])
+    raise SceneError(f"{place + ': ' if place else ''}unknown {what} {name!r}, {hint}")
+
+
+def check_new_name(items: list[Any], name: str, what: str) -> None:
+    """Raise SceneError if a name is no name for a file, or taken."""
+    if not isinstance(name, str) or not name or not set(name) <= _NAME_CHARACTERS:
+        raise SceneError(
+            f"{what} name {shown(repr(name))} may hold letters, digits, '_' and '-' only (it becomes a file name)"
+        )
+    if any(item.name == name for item in items):
+        raise SceneError(f"{what} {name!r} is given twice")

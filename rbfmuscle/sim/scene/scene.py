@@ -18,15 +18,11 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.sim.joints.skeleton import ordered
 from rbfmuscle.sim.scene.attachments import Attachment, resolve_attachments
 from rbfmuscle.sim.scene.joint_tables import CouplingTable, JointTable, make_coupling
-from rbfmuscle.sim.scene.meshes import ReadMesh, prepare_mesh, read_mesh
+from rbfmuscle.sim.scene.meshes import ReadMesh, as_mesh
 from rbfmuscle.sim.scene.motion import Motion, coordinate_names
-from rbfmuscle.sim.scene.objects import Bone, Joint, Muscle
-from rbfmuscle.sim.scene.options import (
-    ContactOptions,
-    MotionOptions,
-    OutputOptions,
-)
-from rbfmuscle.validation import SceneError, check_points, check_positive, did_you_mean, shown
+from rbfmuscle.sim.scene.objects import Bone, Joint, Muscle, check_new_name, find_named, split_model
+from rbfmuscle.sim.scene.options import ContactOptions, MotionOptions, OutputOptions
+from rbfmuscle.validation import SceneError, check_points, did_you_mean, shown
 
 if TYPE_CHECKING:
     import trimesh
@@ -140,11 +136,11 @@ class Scene:
 
     def bone(self, name: str) -> Any:
         """Return the bone of that name, or raise SceneError naming the nearest."""
-        return _find(self.bones, name, "bone")
+        return find_named(self.bones, name, "bone")
 
     def muscle(self, name: str) -> Muscle:
         """Return the muscle of that name, or raise SceneError naming the nearest."""
-        return _find(self.muscles, name, "muscle")
+        return find_named(self.muscles, name, "muscle")
 
     def add_bone(
         self, name: str, mesh: ReadMesh | trimesh.Trimesh | tuple[Any, ...], *, scale: float = 1.0
@@ -160,12 +156,12 @@ class Scene:
             Factor from the mesh's unit to the scene's.
         """
         self._check_new_bone(name)
-        read = _as_mesh(mesh, name, scale, may_be_open=True)
+        read = as_mesh(mesh, name, scale, may_be_open=True)
         self.bones.append(Bone(name, read.mesh, read.source, read.closed, read.notes))
         return self
 
     def _check_new_bone(self, name):
-        _check_new_name(self.bones, name, "bone")
+        check_new_name(self.bones, name, "bone")
         if name in self.links:
             raise SceneError(f"bone {name!r} is given twice")
 
@@ -208,11 +204,11 @@ class Scene:
 
     def place_joint(self, joint: Any) -> Any:
         """Add a `Joint` and return the scene; bones and joints form a tree."""
-        _check_new_name(self.joints, joint.name, "joint")
+        check_new_name(self.joints, joint.name, "joint")
         place, child = f"joint {joint.name!r}", joint.child
         for bone in (joint.parent, child):
             if bone not in self.links:
-                _find(self.bones, bone, "bone", place=place)
+                find_named(self.bones, bone, "bone", place=place)
         if any(other.child == child for other in self.joints):
             raise SceneError(f"{place}: bone {child!r} is already the child of another joint")
         ancestor = joint.parent
@@ -279,8 +275,8 @@ class Scene:
         from rbfmuscle.sim.contraction.resolve import contraction_keys
         from rbfmuscle.sim.scene.fibres import read_fibres
 
-        _check_new_name(self.muscles, name, "muscle")
-        read = _as_mesh(mesh, name, scale, may_be_open=False)
+        check_new_name(self.muscles, name, "muscle")
+        read = as_mesh(mesh, name, scale, may_be_open=False)
         model_name, options = split_model(model, place=f"muscle {name!r}")
         attachments = resolve_attachments(attach, read, self.bones, muscle=name)
         lines = None if fibres is None else read_fibres(fibres, scale=scale, muscle=name)
@@ -327,7 +323,7 @@ class Scene:
             if muscle.contraction is not None:
                 self._check_contraction(muscle)
         for name in self.opensim.muscles if self.opensim else ():
-            _find(self.muscles, name, "muscle", place="[opensim]")
+            find_named(self.muscles, name, "muscle", place="[opensim]")
         return self
 
     def _check_contraction(self, muscle: Muscle) -> None:
@@ -404,38 +400,6 @@ class Scene:
         return f"<Scene {self.name!r}, {self.units}: {counts}>"
 
 
-def split_model(model: dict[str, Any] | str, *, place: str) -> tuple[Any, ...]:
-    """Return (name, options) of a model given as a name or as a table with ``name``."""
-    if isinstance(model, str):
-        return model, {}
-    if isinstance(model, dict):
-        options = dict(model)
-        name = options.pop("name", "rbf")
-        if isinstance(name, str):
-            return name, options
-    raise SceneError(f"{place}: model must be a name or a table with a name, got {shown(model)}")
-
-
-def _find(items, name, what, *, place=""):
-    for item in items:
-        if item.name == name:
-            return item
-    hint = did_you_mean(name, [item.name for item in items])
-    raise SceneError(f"{place + ': ' if place else ''}unknown {what} {name!r}, {hint}")
-
-
-def _check_new_name(items, name, what):
-    if not isinstance(name, str) or not name or not set(name) <= _NAME_CHARACTERS:
-        raise SceneError(
-            f"{what} name {shown(repr(name))} may hold letters, digits, '_' and '-' only (it becomes a file name)"
-        )
-    if any(item.name == name for item in items):
-        raise SceneError(f"{what} {name!r} is given twice")
-
-
-_NAME_CHARACTERS = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-")
-
-
 def _vector(values, name, *, unit=False):
     try:
         vector = check_points([values], name=name)[0]
@@ -448,21 +412,6 @@ def _vector(values, name, *, unit=False):
         raise SceneError(f"{name} must not be the zero vector")
     vector = vector / largest  # the squares of very long or short ones leave the range of numbers
     return vector / np.linalg.norm(vector)
-
-
-def _as_mesh(mesh, name, scale, *, may_be_open):
-    if isinstance(mesh, ReadMesh):
-        return mesh
-    try:
-        scale = check_positive(scale, name="scale")
-    except (ValueError, TypeError) as error:
-        raise SceneError(f"{name!r}: {error}") from None
-    if isinstance(mesh, (str, Path)):
-        return read_mesh(mesh, name=name, scale=scale, may_be_open=may_be_open)
-    vertices, faces = mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)
-    vertices = np.asarray(vertices, dtype=np.float64) * scale
-    place = f"mesh {name!r}"
-    return prepare_mesh(vertices, np.asarray(faces), place=place, name=name, may_be_open=may_be_open)
 
 
 __all__ = ["Attachment", "Bone", "Joint", "Muscle", "Scene"]

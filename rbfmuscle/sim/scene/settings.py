@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rbfmuscle.sim.contraction.keys import KEYS
+from rbfmuscle.sim.scene.objects import split_model
 from rbfmuscle.sim.scene.options import DetectOptions, SlidingOptions, check_plain
 from rbfmuscle.validation import SceneError, UsageError, did_you_mean
 
@@ -20,8 +21,6 @@ TABLES = ("contact", "sliding", "detect", "output", "motion")
 
 def apply_model(scene: Scene, model: dict[str, Any] | str, *, muscles: Any = None) -> None:
     """Give muscles (all by default) another model; options of a different model are dropped."""
-    from rbfmuscle.sim.scene.scene import split_model
-
     name, options = split_model(model, place="model")
     for muscle in scene.muscles if muscles is None else muscles:
         if muscle.model != name:
