@@ -93,7 +93,7 @@ def arm_scene(*, end=20, step=10, units="mm", **output):
 ARM_FILE = """[scene]
 format = 1
 name = "arm"
-units = "mm"
+units = "{units}"
 [[bone]]
 name = "upper"
 mesh = "upper.ply"
@@ -116,21 +116,24 @@ preview = false
 """
 
 
-def arm_files(folder, *, end=10, step=5, muscles=(("biceps", 0.0),), defaults=""):
+def arm_files(
+    folder, name="arm.toml", *, end=10, step=5, muscles=(("biceps", 0.0),), defaults="", scale=1.0, units="mm"
+):
     """Write `arm_scene` as files, its muscle once for each name and shift sideways; return the scene file's path."""
     scene = arm_scene()
     for bone in scene.bones:
-        bone.mesh.export(folder / f"{bone.name}.ply")
-    text = ARM_FILE.format(end=end, step=step, defaults=defaults)
-    for name, shift in muscles:
+        bone.mesh.copy().apply_scale(scale).export(folder / f"{bone.name}.ply")
+    text = ARM_FILE.format(end=end, step=step, defaults=defaults, units=units)
+    for muscle, shift in muscles:
         mesh = scene.muscles[0].mesh.copy()
         mesh.apply_translation([0, shift, 0])
-        mesh.export(folder / f"{name}.ply")
-        text += f'[[muscle]]\nname = "{name}"\nmesh = "{name}.ply"\n'
+        mesh.apply_scale(scale)
+        mesh.export(folder / f"{muscle}.ply")
+        text += f'[[muscle]]\nname = "{muscle}"\nmesh = "{muscle}.ply"\n'
     for attachment in scene.muscles[0].attachments:
         np.savetxt(folder / f"{attachment.bone}.txt", attachment.vertices, fmt="%d")
-    (folder / "arm.toml").write_text(text)
-    return folder / "arm.toml"
+    (folder / name).write_text(text)
+    return folder / name
 
 
 def use_blend_model(monkeypatch, fail_at=None):

@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 import pytest
-from blend_model import arm_scene
+from blend_model import arm_files
 
 from rbfmuscle.app import run_command as command
 from rbfmuscle.commands.cohort import run_job
@@ -20,49 +20,13 @@ from rbfmuscle.study.cohort.runs import CohortRunner
 from rbfmuscle.study.cohort.table import Value, outliers, write_cohort
 from rbfmuscle.validation import UsageError
 
-SCENE = """
-[scene]
-format = 1
-name = "arm"
-units = "{units}"
-[defaults]
-model = {{ name = "pbd", iterations = 3 }}
-[[bone]]
-name = "upper"
-mesh = "upper.ply"
-[[bone]]
-name = "fore"
-mesh = "fore.ply"
-[[joint]]
-name = "elbow"
-parent = "upper"
-child = "fore"
-centre = [0, 0, 0]
-axes = {{ flexion = [0, -1, 0] }}
-[motion]
-ramp = {{ "elbow.flexion" = {{ to = 10, step = 5 }} }}
-[[muscle]]
-name = "biceps"
-mesh = "biceps.ply"
-attach = [{{ bone = "upper", vertices = "upper.txt" }}, {{ bone = "fore", vertices = "fore.txt" }}]
-[output]
-report = false
-preview = false
-"""
+MODEL = 'model = { name = "pbd", iterations = 3 }\n'
 
 
 def write_subject(folder, scale=1.0, units="mm"):
     """A subject's scene with meshes of their own size."""
     folder.mkdir(parents=True)
-    scene = arm_scene()
-    for item in [*scene.bones, *scene.muscles]:
-        mesh = item.mesh.copy()
-        mesh.apply_scale(scale)
-        mesh.export(folder / f"{item.name}.ply")
-    for held in scene.muscles[0].attachments:
-        np.savetxt(folder / f"{held.bone}.txt", held.vertices, fmt="%d")
-    (folder / "scene.toml").write_text(SCENE.format(units=units), encoding="utf-8")
-    return folder / "scene.toml"
+    return arm_files(folder, "scene.toml", scale=scale, units=units, defaults=MODEL)
 
 
 def write_table(path, rows):
