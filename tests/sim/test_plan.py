@@ -62,7 +62,7 @@ def test_without_surfaces_and_metrics_nothing_is_extracted_or_measured(monkeypat
         raise AssertionError("called")
 
     monkeypatch.setattr(BlendMuscle, "drawing", refuse)
-    monkeypatch.setattr("rbfmuscle.run.MetricsRecorder", refuse)
+    monkeypatch.setattr("rbfmuscle.recording.MetricsRecorder", refuse)
     run = simulate(arm_scene(surfaces=False, metrics=False))
     assert len(run.frames) == 3 and run.metrics == []
 
