@@ -18,21 +18,25 @@ demo: $(STAMP)
 	$(BIN)/rbfmuscle demo --model pbd -o demo_output/pbd
 	@echo "Open demo_output/rbf/report.html and demo_output/pbd/report.html"
 
+# A worker for each core (WORKERS=0 for none, as plain pytest has it); whoever is done takes tests from the others.
+WORKERS ?= auto
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+
 test: $(STAMP)
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 # What each list holds, and why, stands at its top.
 test-fast: $(STAMP)
-	$(BIN)/python -m pytest -q $$(grep -v '^#' tests/fast.txt)
+	$(PYTEST) -q $$(grep -v '^#' tests/fast.txt)
 
 test-nojit: $(STAMP)
-	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q $$(grep -v '^#' tests/nojit.txt)
+	NUMBA_DISABLE_JIT=1 $(PYTEST) -q $$(grep -v '^#' tests/nojit.txt)
 
 ROOMS := $(patsubst %/,%,$(sort $(dir $(wildcard rbfmuscle/*/__init__.py)))) pbd_baseline
 # Loops count as covered where they run as Python: without compiler; the rest by the quick tests.
 coverage: $(STAMP)
-	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q --cov --cov-report= $$(grep -v '^#' tests/nojit.txt)
-	$(BIN)/python -m pytest -q --cov --cov-append --cov-report=term:skip-covered $$(grep -v '^#' tests/fast.txt)
+	NUMBA_DISABLE_JIT=1 $(PYTEST) -q --cov --cov-report= $$(grep -v '^#' tests/nojit.txt)
+	$(PYTEST) -q --cov --cov-append --cov-report=term:skip-covered $$(grep -v '^#' tests/fast.txt)
 	@for room in $(ROOMS); do echo "$$room $$($(BIN)/python -m coverage report --include="$$room/*" --format=total) %"; done
 
 # Damaged scenes and meshes by the thousand; ends with a table of what became of them.

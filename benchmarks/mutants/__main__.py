@@ -27,33 +27,29 @@ UNCOMPILED = ("geometry", "implicit", "model", "pbd", "sim", "study")
 
 
 def record(files: list[str]) -> None:
-    """Run test files with and without compiler, each in a process of its own; those recorded already are left."""
-    todo = files or sorted(str(p.relative_to(ROOT)) for p in (ROOT / "tests").rglob("test_*.py"))
+    """Run test files with and without compiler, in a worker for each core; those recorded already are left."""
+    every = sorted(str(p.relative_to(ROOT)) for p in (ROOT / "tests").rglob("test_*.py"))
     for kind in ("plain", "compiled"):
-        for file in todo:
-            target = WORK / kind / (file.replace("/", "_") + ".json")
-            if (target.exists() and not files) or (kind == "plain" and file.split("/")[1] not in UNCOMPILED):
-                continue
-            extra = {"MUTANTS_RECORD": str(target), "PYTHONPATH": str(HERE.parent)}
-            if kind == "plain":
-                extra |= {
-                    "NUMBA_DISABLE_JIT": "1",
-                    "MUTANTS_LIMIT": str(LIMIT),
-                    "MUTANTS_PATIENCE": str(PATIENCE),
-                }
-            command = [
-                sys.executable,
-                "-m",
-                "pytest",
-                "-q",
-                "-p",
-                "mutants.contexts",
-                "-p",
-                "no:cacheprovider",
-                file,
-            ]
-            subprocess.run(command, cwd=ROOT, env={**os.environ, **extra}, capture_output=True, check=False)
-            print(f"{kind}: {file}", flush=True)
+        kept = WORK / kind
+        todo = [
+            file
+            for file in files or every
+            if (kind == "compiled" or file.split("/")[1] in UNCOMPILED)
+            and (files or not (kept / (file.replace("/", "_") + ".json")).exists())
+        ]
+        if not todo:
+            continue
+        print(f"{kind}: {len(todo)} files", flush=True)
+        extra = {"MUTANTS_RECORD": str(kept), "PYTHONPATH": str(HERE.parent)}
+        if kind == "plain":
+            extra |= {
+                "NUMBA_DISABLE_JIT": "1",
+                "MUTANTS_LIMIT": str(LIMIT),
+                "MUTANTS_PATIENCE": str(PATIENCE),
+            }
+        command = [sys.executable, "-m", "pytest", "-q", "-p", "mutants.contexts", "-p", "no:cacheprovider"]
+        workers = ["-n", os.environ.get("WORKERS", "auto"), "--dist", "loadfile"]
+        subprocess.run([*command, *workers, *todo], cwd=ROOT, env={**os.environ, **extra}, check=False)
 
 
 def run(count: int, seed: int, minutes: float, rooms: list[str], loops: bool | None) -> None:

@@ -1,16 +1,18 @@
 """A pytest plugin that records which test runs which line, and how long each test takes.
 
 Loaded by ``python -m mutants record``. What a fixture of a module runs belongs to all tests of the file, not only to
-the first that asks for it, so lines of a set-up are kept under the file's name.
+the first that asks for it, so lines of a set-up are kept under the file's name. Each test file is written as soon as
+its last test has run, so that a recording may be broken off; workers of pytest-xdist write the files they are given.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
+import re
 import signal
-import time
 from pathlib import Path
 
 import coverage
@@ -29,19 +31,20 @@ class Recorder:
 
     Parameters
     ----------
-    output : path
-        JSON file to write at the end.
+    folder : path
+        Takes a JSON file for each test file.
     limit : float
         Seconds a test may take, 0 for any number; slower ones are left out.
     patience : int
         So many slow tests end the file.
     """
 
-    def __init__(self, output: Path, limit: float, patience: int) -> None:
-        self.output, self.limit, self.patience = output, limit, patience
+    def __init__(self, folder: Path, limit: float, patience: int) -> None:
+        self.folder, self.limit, self.patience = folder, limit, patience
         self.seconds: dict[str, float] = {}
         self.bad: set[str] = set()
         self.slow: dict[str, int] = {}
+        self.ended = ""
         self.coverage = coverage.Coverage(
             data_file=None, source=[str(ROOT / room) for room in ROOMS], config_file=False, messages=False
         )
@@ -50,60 +53,87 @@ class Recorder:
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item):
         self.seconds[item.nodeid] = 0.0
-        self.began = time.perf_counter()
         return (yield)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_setup(self, item):
-        file = item.nodeid.split("::")[0]
+        file = _file_of(item)
         if self.limit and self.slow.get(file, 0) >= self.patience:
             pytest.skip("too many slow tests in this file")
         self.coverage.switch_context(file)
-        with _Alarm(self.limit):
+        with self.timed(item), _Alarm(self.limit):
             return (yield)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self, item):
         self.coverage.switch_context(item.nodeid)
-        with _Alarm(self.limit):
+        with self.timed(item), _Alarm(self.limit):
             return (yield)
 
+    @contextlib.contextmanager
+    def timed(self, item):
+        """Add up processor time, with that of children that have ended: others may load the machine."""
+        began = os.times()[:4]
+        try:
+            yield
+        finally:
+            self.seconds[item.nodeid] += sum(os.times()[:4]) - sum(began)
+
     @pytest.hookimpl(wrapper=True)
-    def pytest_runtest_teardown(self, item):
+    def pytest_runtest_teardown(self, item, nextitem):
         self.coverage.switch_context("")
+        self.ended = _file_of(item) if nextitem is None or _file_of(nextitem) != _file_of(item) else ""
         return (yield)
 
+    def pytest_runtest_logfinish(self, nodeid):
+        if self.ended:
+            self.coverage.stop()
+            self.write(self.ended)
+            self.coverage.start()
+            self.ended = ""
+
     def pytest_runtest_logreport(self, report):
-        if report.when != "teardown":
-            self.seconds[report.nodeid] += report.duration
         if not report.passed:
             self.bad.add(report.nodeid)
         if report.failed and "TooSlow" in str(report.longrepr):
             file = report.nodeid.split("::")[0]
             self.slow[file] = self.slow.get(file, 0) + 1
 
-    def pytest_sessionfinish(self, session):
-        self.coverage.stop()
-        data = self.coverage.get_data()
-        files = {}
+    def write(self, file: str) -> None:
+        """What the tests of one file ran."""
+        data, files = self.coverage.get_data(), {}
+        data.set_query_contexts([f"^{re.escape(file)}(::|$)"])
         for name in data.measured_files():
-            path = Path(name)
-            source = path.read_text(encoding="utf-8")
-            digest = hashlib.sha256(source.encode()).hexdigest()
-            kept = self.output.parent / "sources" / digest
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            kept.write_text(source, encoding="utf-8")
             lines = {
-                line: sorted(c for c in contexts if c not in self.bad and c)
+                line: sorted(c for c in contexts if c not in self.bad)
                 for line, contexts in data.contexts_by_lineno(name).items()
             }
-            files[str(path.relative_to(ROOT))] = {
-                "digest": digest,
-                "lines": {line: tests for line, tests in lines.items() if tests},
-            }
-        tests = {name: round(seconds, 3) for name, seconds in self.seconds.items() if name not in self.bad}
-        self.output.parent.mkdir(parents=True, exist_ok=True)
-        self.output.write_text(json.dumps({"tests": tests, "files": files}), encoding="utf-8")
+            lines = {line: tests for line, tests in lines.items() if tests}
+            if lines:
+                path = Path(name)
+                files[str(path.relative_to(ROOT))] = {"digest": self.kept(path), "lines": lines}
+        passed = {
+            name: round(seconds, 3)
+            for name, seconds in self.seconds.items()
+            if name not in self.bad and name.split("::")[0] == file
+        }
+        self.folder.mkdir(parents=True, exist_ok=True)
+        target = self.folder / (file.replace("/", "_") + ".json")
+        target.write_text(json.dumps({"tests": passed, "files": files}), encoding="utf-8")
+
+    def kept(self, path: Path) -> str:
+        """Keep the text that was run, under a name of its own."""
+        source = path.read_text(encoding="utf-8")
+        digest = hashlib.sha256(source.encode()).hexdigest()
+        copy = self.folder / "sources" / digest
+        if not copy.exists():
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_text(source, encoding="utf-8")
+        return digest
+
+
+def _file_of(item):
+    return item.nodeid.split("::")[0]
 
 
 class _Alarm:
@@ -127,10 +157,11 @@ class _Alarm:
 
 def pytest_configure(config):
     """Start to follow."""
-    output = os.environ.get("MUTANTS_RECORD")
-    if output:
+    folder = os.environ.get("MUTANTS_RECORD")
+    leads_workers = bool(config.getoption("numprocesses", None)) and "PYTEST_XDIST_WORKER" not in os.environ
+    if folder and not leads_workers:
         limit, patience = (
             float(os.environ.get("MUTANTS_LIMIT", "0")),
             int(os.environ.get("MUTANTS_PATIENCE", "8")),
         )
-        config.pluginmanager.register(Recorder(Path(output), limit, patience), "mutants-recorder")
+        config.pluginmanager.register(Recorder(Path(folder), limit, patience), "mutants-recorder")

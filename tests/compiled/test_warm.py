@@ -109,7 +109,7 @@ class Count(event.Listener):
 event.register('numba:compile', Count())
 from rbfmuscle.compiled.warm import compile_ahead
 told = []
-missing = compile_ahead(['sdf'], progress=lambda done, total: told.append((done, total)))
+missing = compile_ahead(['plan'], progress=lambda done, total: told.append((done, total)))
 print(json.dumps([missing, told[-1:], Count.n]))
 """
 
@@ -129,7 +129,7 @@ def finish(process):
 def test_two_cold_processes_share_the_work_and_a_third_has_none(tmp_path):
     both = [start(tmp_path), start(tmp_path)]
     (first, told, own), (second, also, other) = (finish(process) for process in both)
-    wanted = len(needs.loops_needed(["sdf"]))
+    wanted = len(needs.loops_needed(["plan"]))
     assert wanted <= first + second <= 2 * wanted
     assert told == [[first, first]] * (first > 0) and also == [[second, second]] * (second > 0)
     entries = len(list(tmp_path.glob("*.loop")))

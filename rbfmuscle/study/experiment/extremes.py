@@ -24,6 +24,7 @@ from rbfmuscle.validation import NumericalWarning, RBFMuscleError
 # Shape parameters, in units of 1 / (mean distance to the nearest centre).
 SHAPES = (1e-3, 1e-2, 0.1, 1.0, 10.0, 1e3)
 CENTRES = 200
+COUNTS = (4, 10, 50, 1000)
 # Centres of a fit to values on the surface and off it, three a point; with normals as many would be 16,000 unknowns.
 MOST_VALUES = 4002
 OF_VALUES = f"{MOST_VALUES} centres, of values"
@@ -95,7 +96,7 @@ def _cases():
     for size in (1e-6, 1e-3, 1e3, 1e6):
         yield f"coordinates of {size:g}", _ellipsoid(CENTRES, size=size), 0.1
     yield "1e6 from the origin", _ellipsoid(CENTRES, shift=1e6), 0.1
-    for count in (4, 10, 50, 1000):
+    for count in COUNTS:
         yield f"{count} centres", _ellipsoid(count), {4: 1.0, 10: 1.0, 50: 0.5}.get(count, 0.05)
     yield OF_VALUES, _ellipsoid(MOST_VALUES // 3), 0.05
     for noise in (0.01, 0.1):
