@@ -1,11 +1,15 @@
 """Choices of `rbfmuscle kernels` against a brute force of 40 shape parameters, on surfaces of all kinds.
 
-``python benchmarks/kernel_table.py DATA [--surfaces a,b] [--kernels a,b] [--centres 150] [--placements fitted]``:
-DATA holds ``hip`` and ``leg``. Prints for each case the error of the choice over the best of the scan (both ways, by
+``python benchmarks/kernel_table.py DATA [--surfaces a,b] [--kernels a,b] [--centres 150] [--placements fitted]
+[--log cases.jsonl] [--minutes 30] [--shuffle 0]``: DATA holds ``hip`` and ``leg``. What is logged is not done again.
+Prints for each case the error of the choice over the best of the scan (both ways, by
 the same judge, unfit ones left out), the condition, fits and processor seconds of the row; then the share within 5 %.
 """
 
 import argparse
+import functools
+import json
+import random
 import time
 import warnings
 from pathlib import Path
@@ -13,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels.table import KERNELS
 from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
@@ -22,12 +27,13 @@ from rbfmuscle.study.experiment import kernel_study
 from rbfmuscle.study.experiment.kernel_choice import mark_unfit
 
 SCANNED, LIMIT = 40, 1.05
+KEYS = ("surface", "centres", "placement", "kernel")
 HIP = ("gluteus_maximus", "gluteus_medius", "iliacus", "adductor_brevis")
 LEG = ("sartorius", "semimembranosus", "tibialis_anterior", "popliteus")
 
 
 def surfaces(data):
-    """Name -> (vertices, faces): hip, leg, and shapes that a script makes."""
+    """Name, vertices, faces: hip, leg, and shapes that a script makes."""
     from rbfmuscle.sim.scene.meshes import read_mesh
 
     made = {f"hip/{name}": data / "hip" / f"{name}.ply" for name in HIP}
@@ -35,7 +41,7 @@ def surfaces(data):
     for name, path in made.items():
         if path.exists():
             mesh = read_mesh(path).mesh
-            yield name, (np.asarray(mesh.vertices, float), np.asarray(mesh.faces))
+            yield name, np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
     ball = trimesh.creation.icosphere(subdivisions=4)
     bumps = np.array(ball.vertices)
     bumps *= (1.0 + 0.15 * np.sin(5 * bumps[:, 0]) * np.sin(5 * bumps[:, 1]) * np.sin(5 * bumps[:, 2]))[
@@ -47,7 +53,7 @@ def surfaces(data):
     rod = trimesh.creation.capsule(120.0, 6.0, count=[40, 40])
     for name, mesh in (("bumps", (30 * bumps, ball.faces)), ("bent plate", (plate, ball.faces)),
                        ("torus", (torus.vertices, torus.faces)), ("rod", (rod.vertices, rod.faces))):  # fmt: skip
-        yield name, (np.asarray(mesh[0], float), np.asarray(mesh[1]))
+        yield name, np.asarray(mesh[0], float), np.asarray(mesh[1])
 
 
 def brute_force(judge, sample, kernel, derivatives):
@@ -63,22 +69,29 @@ def brute_force(judge, sample, kernel, derivatives):
             continue
     best = (np.inf, np.nan)
     for missed, epsilon in sorted(scan):
-        if missed > 2.0 * best[0]:
+        if missed > np.sqrt(2.0) * best[0]:  # half of the square of the error both ways is this one's
             break
-        row = blank_row(kernel, sample, epsilon)
-        try:
-            kernel_study.fill_row(row, judge, sample, kernel, derivatives)
-        except (ValueError, np.linalg.LinAlgError):
-            continue
-        mark_unfit([row], sheets=judge.sheets)
-        if not row["unfit"]:
-            best = min(best, (row["rms"], epsilon * h))
+        rms = both_ways(judge, sample, kernel, derivatives, epsilon)
+        best = min(best, (rms, epsilon * h))
     return best
 
 
-def blank_row(kernel, sample, epsilon):
-    """A row before it is measured."""
-    return {"kernel": kernel.name, "centres": len(sample.points), "epsilon": epsilon, "note": "", "rms": None}
+def both_ways(judge, sample, kernel, derivatives, epsilon):
+    """Error as `fill_row` measures it, infinite where the field is unfit."""
+    try:
+        fitted = RBFField.fit_surface(
+            sample.points, sample.normals, kernel=kernel, epsilon=epsilon, derivatives=derivatives
+        )
+        found = extract_surface(
+            fitted, points=sample.points, resolution=judge.resolution, search="box", keep="largest"
+        )
+    except (ValueError, np.linalg.LinAlgError):
+        return np.inf
+    rms, *_ = judge.apart(found.vertices, found.faces)
+    row = {"centres": 0, "rms": rms, "components": found.components, "spurious": found.spurious, "note": "",
+           "volume_error": found.volume / judge.volume - 1.0, "condition": fitted.condition}  # fmt: skip
+    mark_unfit([row], sheets=judge.sheets)
+    return np.inf if row["unfit"] else rms
 
 
 def case(judge, sample, kernel, placement):
@@ -95,36 +108,88 @@ def case(judge, sample, kernel, placement):
     return row, best, seconds
 
 
+def said(found):
+    """One line of a case."""
+    ratio = np.nan if found["ratio"] is None else found["ratio"]
+    unfit = f"unfit: {found['unfit'][:60]} (scan: {found['scan']})" if found["unfit"] else ""
+    return (
+        f"{found['surface']:22s} {found['centres']} {found['placement']:7s} {found['kernel']:26s} ratio {ratio:.3f} "
+        f"condition {found['condition'] or np.nan:.1e} fits {found['fits']} {found['seconds']:.1f} s {unfit}"
+    )
+
+
+def measured(judge, sample, kernel, placement):
+    """What one case found, as it is logged."""
+    row, best, seconds = case(judge, sample, kernel, placement)
+    scan = float(best[0]) if np.isfinite(best[0]) else None
+    ratio = None if row["unfit"] or scan is None else float(row["rms"] / best[0])
+    return {"ratio": ratio, "scan": scan, "condition": row["condition"], "fits": row["fits"], "seconds": seconds,
+            "unfit": row["unfit"], "rms": row["rms"], "shape": row["shape"], "best": float(best[1])}  # fmt: skip
+
+
+def summary(logged):
+    """How many cases are within the limit, and those that are not."""
+    beyond = [found for found in logged if not found["unfit"] and not (found["ratio"] or np.inf) <= LIMIT]
+    unfit = [found for found in logged if found["unfit"]]
+    missed = [found for found in unfit if found["scan"] is not None]
+    good = len(logged) - len(beyond) - len(unfit)
+    print(f"{good} within 5 %, {len(unfit)} named unfit, {len(beyond)} beyond, of {len(logged)}")
+    print(f"of the unfit ones {len(missed)} where the scan has a fit one")
+    for found in beyond + missed:
+        print(said(found))
+    sound = [found for found in logged if not found["unfit"] and found["condition"] <= 1e10]
+    print(f"condition at most 1e10: {len(sound)} of {len(logged) - len(unfit)} that are fit")
+
+
 def main():
-    """Run the cases and print the table."""
+    """Run the cases that the log does not have yet, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("data", type=Path)
     parser.add_argument("--surfaces", default="")
     parser.add_argument("--kernels", default=",".join(KERNELS))
     parser.add_argument("--centres", default="150,300,600")
     parser.add_argument("--placements", default="greedy,fitted")
+    parser.add_argument(
+        "--log", type=Path, help="lines of JSON; cases that stand there are not measured again"
+    )
+    parser.add_argument(
+        "--shuffle", type=int, help="seed of another order, so that a part stands for the whole"
+    )
+    parser.add_argument("--minutes", type=float, default=np.inf, help="begin no case after so many")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    wanted, good, unfit, beyond = options.surfaces.split(",") if options.surfaces else None, 0, 0, []
-    for name, (vertices, faces) in surfaces(options.data):
-        if wanted and name not in wanted:
+    logged = []
+    if options.log and options.log.exists():
+        logged = [json.loads(line) for line in options.log.read_text(encoding="utf-8").splitlines()]
+    known = {tuple(found[key] for key in KEYS) for found in logged}
+    wanted, until = (
+        options.surfaces.split(",") if options.surfaces else None,
+        time.monotonic() + 60 * options.minutes,
+    )
+    shapes = {name: arrays for name, *arrays in surfaces(options.data) if not wanted or name in wanted}
+    cases = [
+        (name, count, placement, kernel)
+        for count in map(int, options.centres.split(","))
+        for name in shapes
+        for placement in options.placements.split(",")
+        for kernel in options.kernels.split(",")
+    ]
+    if options.shuffle is not None:
+        random.Random(options.shuffle).shuffle(cases)
+    judges = functools.cache(lambda name: kernel_study.SurfaceJudge(*shapes[name], 64, 0))
+    samples = functools.cache(lambda name, count: sample_surface(*shapes[name], count, placement="greedy"))
+    for name, count, placement, kernel in cases:
+        if (name, count, placement, kernel) in known or time.monotonic() > until:
             continue
-        judge = kernel_study.SurfaceJudge(vertices, faces, 64, 0)
-        for count in map(int, options.centres.split(",")):
-            sample = sample_surface(vertices, faces, count, placement="greedy")
-            for placement in options.placements.split(","):
-                for kernel in map(KERNELS.get, options.kernels.split(",")):
-                    row, best, seconds = case(judge, sample, kernel, placement)
-                    ratio = np.nan if row["unfit"] else row["rms"] / best[0]
-                    unfit, good = unfit + bool(row["unfit"]), good + bool(ratio <= LIMIT)
-                    if not row["unfit"] and not ratio <= LIMIT:
-                        beyond.append((name, kernel.name, count, placement, round(ratio, 3)))
-                    print(f"{name:22s} {count} {placement:7s} {kernel.name:26s} ratio {ratio:.3f} "
-                          f"condition {row['condition'] or np.nan:.1e} fits {row['fits']} {seconds:.1f} s "
-                          f"{row['unfit'] and 'unfit: ' + row['unfit'][:60]}"
-                          f"{f' (scan: {best[0]:.3g})' if row['unfit'] and np.isfinite(best[0]) else ''}",
-                          flush=True)  # fmt: skip
-    print(f"{good} within 5 %, {unfit} named unfit, {len(beyond)} beyond: {beyond}")
+        found = dict(zip(KEYS, (name, count, placement, kernel)))
+        found |= measured(judges(name), samples(name, count), KERNELS[kernel], placement)
+        logged.append(found)
+        print(said(found), flush=True)
+        if options.log:
+            with options.log.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(found) + "\n")
+    print(f"{len(logged)} of {len(cases)} cases")
+    summary(logged)
 
 
 if __name__ == "__main__":

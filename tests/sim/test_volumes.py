@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from command_line import call
 
+from rbfmuscle.geometry.crossing import crossing_faces
+from rbfmuscle.sim.volumes import surfaces
 from rbfmuscle.sim.volumes.read import LabelVolume, read_labels, read_names
 from rbfmuscle.sim.volumes.surfaces import label_surface, smooth_mask
 from rbfmuscle.validation import MeshError, UsageError
@@ -96,6 +98,28 @@ def test_directions_and_units_are_honoured(tmp_path, turn):
         assert both == pytest.approx(centre, abs=0.05)  # voxels of a ball are not quite symmetric
         above = (meshes[1].center_mass - meshes[0].center_mass) @ affine[:3, 2]
         assert above > 10.0
+
+
+def cup_labels(thickness):
+    """Voxels of a part of a hollow ball, as thin as the wing of a pelvis."""
+    grid = np.stack(np.meshgrid(*[np.arange(40.0)] * 3, indexing="ij"), axis=-1) - 19.7
+    wall = np.abs(np.linalg.norm(grid, axis=-1) - 15.2) < thickness / 2
+    return (wall & (grid @ [0.5, 0.6, 0.62] > -8.0)).astype(np.int32)
+
+
+def test_thin_walls_do_not_go_through_themselves(monkeypatch):
+    """Two voxels thick: triangles cross where edges collapsed, and are drawn apart; thinner ones are full of holes."""
+
+    def crossings(thickness):
+        mesh = label_surface(LabelVolume(cup_labels(thickness), np.eye(4), {}, "cup.nii"), 1).mesh
+        return crossing_faces(mesh.vertices, mesh.faces).sum(), mesh
+
+    mended, mesh = crossings(2.0)
+    hopeless, _ = crossings(1.2)
+    assert mended == 0 and mesh.is_watertight and mesh.euler_number == 2
+    assert mesh.volume == pytest.approx(cup_labels(2.0).sum(), rel=5e-3)
+    monkeypatch.setattr(surfaces, "UNTANGLE", 1)
+    assert crossings(2.0)[0] > 0 and hopeless <= crossings(1.2)[0]
 
 
 def test_islands_and_holes_are_told():

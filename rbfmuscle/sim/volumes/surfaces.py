@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.ndimage import label as connected
 
+from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.validation import MeshError
 
@@ -26,8 +27,8 @@ MARGIN = 6
 MOST_SHIFT = 0.35
 # Share of the largest piece from which on a piece belongs to a bone of several parts.
 PIECE = 0.01
-# Edge of the surface's triangles [voxels].
-EDGE = 2.2
+# Edge of the surface's triangles [voxels], and rounds in which triangles that cross are drawn apart.
+EDGE, UNTANGLE = 2.2, 20
 
 
 @dataclass
@@ -76,8 +77,9 @@ def label_surface(volume: Any, label: int, *, edge: float = EDGE, pieces: bool =
     size = float(np.prod(volume.spacing))
     wanted = float(mask.sum()) * size
     field = smooth_mask(mask)
-    vertices, faces = _level_of_volume(field, wanted / size)
+    level, vertices, faces = _level_of_volume(field, wanted / size)
     vertices, faces = _decimate(vertices, faces, edge)
+    vertices = _untangled(vertices, faces, field - level)
     vertices = _to_volume(vertices, faces, wanted / size)
     world = (vertices + corner) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
     return LabelSurface(int(label), name, _outward(world, faces), wanted, notes)
@@ -137,12 +139,12 @@ def _level_of_volume(field, wanted):
         vertices, faces = _contour(field, level)
         volume, area = _volume_and_area(vertices, faces)
         if best is None or abs(volume - wanted) < best[0]:
-            best = (abs(volume - wanted), vertices, faces)
+            best = (abs(volume - wanted), level, vertices, faces)
         if abs(volume - wanted) < 1e-4 * wanted:
             break
         slope = 0.5  # of the field across a face: from 1/2 to -1/2 over about two voxels
         level = float(np.clip(level - slope * (wanted - volume) / area, -MOST_SHIFT, MOST_SHIFT))
-    return best[1], best[2]
+    return best[1:]
 
 
 def _contour(field, level):
@@ -168,6 +170,46 @@ def _decimate(vertices, faces, edge):
         return vertices, faces
     found = igl.qslim(vertices, faces, target)
     return np.asarray(found[0], dtype=np.float64), np.asarray(found[1], dtype=np.int64)
+
+
+def _untangled(vertices, faces, field):
+    """Vertices where no triangle goes through another: beside such places evened out, and put back on the zero set.
+
+    Edges that collapse on either side of a wall thinner than a triangle fold it, or bring its sides through each other.
+    """
+    heads, tails = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    degree = np.bincount(heads, minlength=len(vertices))
+    least, best = np.inf, vertices
+    for _ in range(UNTANGLE):
+        crossing = crossing_faces(vertices, faces)
+        if crossing.sum() < least:
+            least, best = crossing.sum(), vertices
+        if least == 0:
+            break
+        near = np.zeros(len(vertices), dtype=bool)
+        near[faces[crossing]] = True
+        near[faces[near[faces].any(axis=1)]] = True  # and their neighbours
+        means = np.stack([np.bincount(heads, vertices[tails, k]) / degree for k in range(3)], axis=1)
+        vertices = vertices.copy()
+        vertices[near] = _on_zero_set(0.5 * (vertices[near] + means[near]), field)
+    return best
+
+
+def _on_zero_set(points, field):
+    """Points moved along the gradient of a field on a grid to where it is zero, by a voxel at most."""
+    start = points
+    for _ in range(3):
+        value = map_coordinates(field, points.T, order=1, mode="nearest")
+        slope = np.empty_like(points)
+        for k in range(3):
+            step = 0.5 * np.eye(3)[k]
+            ahead, behind = (
+                map_coordinates(field, (points + s).T, order=1, mode="nearest") for s in (step, -step)
+            )
+            slope[:, k] = ahead - behind
+        points = points - (value / np.maximum((slope**2).sum(axis=1), 0.01))[:, None] * slope
+    moved = points - start
+    return start + moved * np.minimum(1.0, 1.0 / np.maximum(np.linalg.norm(moved, axis=1), 1e-12))[:, None]
 
 
 def _to_volume(vertices, faces, wanted):
