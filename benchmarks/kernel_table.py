@@ -88,8 +88,8 @@ def both_ways(judge, sample, kernel, derivatives, epsilon):
     except (ValueError, np.linalg.LinAlgError):
         return np.inf
     rms, *_ = judge.apart(found.vertices, found.faces)
-    row = {"centres": 0, "rms": rms, "components": found.components, "spurious": found.spurious, "note": "",
-           "volume_error": found.volume / judge.volume - 1.0, "condition": fitted.condition}  # fmt: skip
+    row = {"kernel": kernel.name, "centres": 0, "rms": rms, "components": found.components, "spurious": found.spurious,
+           "note": "", "volume_error": found.volume / judge.volume - 1.0, "condition": fitted.condition}  # fmt: skip
     mark_unfit([row], sheets=judge.sheets)
     return np.inf if row["unfit"] else rms
 
