@@ -52,7 +52,9 @@ SIGNED = (
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">
 <title>{title}</title><style>{style} tr.front td:first-child{{font-weight:650}} td.text{{text-align:left}}
-.plots{{grid-template-columns:1fr}} pre{{overflow-x:auto}}</style>
+.plots{{grid-template-columns:1fr}} pre{{overflow-x:auto}}
+td{{white-space:nowrap}} td.text{{min-width:19em;white-space:normal}}
+@media(max-width:760px){{figure{{overflow-x:auto}}figure img{{width:860px;max-width:none}}}}</style>
 </head><body><main><h1>{title}</h1>
 <p class="sub">Each kernel with as many centres, its shape parameter chosen by the error at other points of the mesh</p>
 <p>Recommended: <b>{best}</b>: {reason}.{others} Distances{units} are measured both ways between the mesh and the
@@ -195,7 +197,8 @@ def _motion(moved, units):
     """A table of the runs through the motion."""
     if not moved:
         return ""
-    names = list(dict.fromkeys(name for facts in moved for name in facts))
+    names = list(dict.fromkeys(name for facts in moved for name in facts if name != "error"))
+    names += ["error"] if any(facts.get("error") for facts in moved) else []
     words = {name: text.format(unit=units or "mesh units") for name, text in MOTION.items()}
     head = "".join(f"<th>{html.escape(words.get(name, name))}</th>" for name in names)
     body = "".join(
