@@ -53,6 +53,13 @@ def edge_lengths(vertices: Floats, edges: Integers) -> Floats:
     return np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
 
 
+def vertex_areas(vertices: Floats, faces: Integers) -> Floats:
+    """Area that each vertex stands for: a third of its triangles' (n,)."""
+    corners = vertices[faces]
+    twice = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return np.bincount(faces.ravel(), np.repeat(twice / 6.0, 3), minlength=len(vertices))
+
+
 def barycentric_weights(points: Floats, corners: Floats) -> Floats:
     """Weights (n, 3) in [0, 1] of the corners (n, 3, 3) of one triangle for each point (n, 3) in or near it."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]

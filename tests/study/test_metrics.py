@@ -224,6 +224,21 @@ class TestLength:
             100, abs=1e-6
         )
 
+    def test_ends_do_not_follow_small_triangles(self):
+        """One side of the end's cap has sixteen times as many triangles; the line ends in the middle all the same."""
+        mesh = rod()
+        vertices, faces = arrays(mesh)
+        for _ in range(2):
+            middle = vertices[faces].mean(axis=1)
+            cap = np.flatnonzero((middle[:, 0] == 100) & (middle[:, 1] > 0))
+            vertices, faces = trimesh.remesh.subdivide(vertices, faces, face_index=cap)
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        held = vertices[vertices[:, 0] == 100, 1]
+        assert held.mean() > 2  # where there are more
+        line = Centreline(rod_muscle(mesh), JOINTS, *arrays(mesh))
+        last = line.points(vertices, {"trunk": EYE, "limb": EYE})[-1]
+        assert last == pytest.approx([100, 0, 0], abs=0.6)  # the new ones on the rim have no side faces
+
     def test_stretch_is_followed(self):
         mesh = rod()
         line = Centreline(rod_muscle(mesh), JOINTS, *arrays(mesh))

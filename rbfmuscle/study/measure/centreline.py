@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import harmonic_weights
+from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.sim.joints.skeleton import all_coordinates
 
 _FINE, _SLICES = 120, 16
@@ -21,8 +22,8 @@ class Centreline:
 
     The harmonic field is 0 on the origin and 1 on the insertion. Slices are taken at levels whose centroids
     lie evenly along the muscle at rest. Each centroid is a fixed linear combination of the vertices, so
-    the line costs one sparse product a frame. Its ends are the centroids of the attached vertices of the
-    input mesh, carried by their bones.
+    the line costs one sparse product a frame. Its ends are the centroids of the attached patches of the
+    input mesh, by area, carried by their bones.
 
     Parameters
     ----------
@@ -71,7 +72,7 @@ class Centreline:
         -------
         (k, 3) ndarray
         """
-        first, last = (_carried(end, poses) for end in self.ends)
+        first, last = (carried_middle(end, poses) for end in self.ends)
         return np.vstack([first, self.operator @ vertices, last])
 
     def length(self, vertices: Floats, poses: dict[str, Floats]) -> float:
@@ -89,12 +90,14 @@ def end_groups(
 
     Returns
     -------
-    list of two lists of (bone, points)
-        ``points`` (k, 3) are the attached vertices at rest.
+    list of two lists of (bone, points, areas)
+        ``points`` (k, 3) are the attached vertices at rest, ``areas`` (k,) what each stands for: where triangles are
+        small there are more of them, which must not draw the end of a line there.
     """
     vertices = np.asarray(muscle.mesh.vertices, dtype=float)
+    areas = vertex_areas(vertices, np.asarray(muscle.mesh.faces))
     return [
-        [(a.bone, vertices[np.asarray(a.vertices)]) for a in group]
+        [(a.bone, vertices[np.asarray(a.vertices)], areas[np.asarray(a.vertices)]) for a in group]
         for group in split_ends(muscle, joints, moving)
     ]
 
@@ -175,7 +178,7 @@ def _sides(muscle, ends, vertices):
     nearest = cKDTree(mesh).query(vertices)[1]
     sides = []
     for end in ends:
-        attached = np.concatenate([points for _, points in end])
+        attached = np.concatenate([points for _, points, _ in end])
         on_end = cKDTree(attached).query(mesh[nearest])[0] == 0.0
         if not on_end.any():
             on_end[cKDTree(vertices).query(attached.mean(axis=0))[1]] = True
@@ -183,7 +186,11 @@ def _sides(muscle, ends, vertices):
     return [np.setdiff1d(sides[0], sides[1]), sides[1]]
 
 
-def _carried(end, poses):
-    total = sum(len(points) for _, points in end)
-    moved = [points @ poses[bone][:3, :3].T + poses[bone][:3, 3] for bone, points in end]
-    return np.concatenate(moved).sum(axis=0) / total
+def carried_middle(end: list[tuple[Any, ...]], poses: dict[str, Floats]) -> Any:
+    """Middle (3,) of an end's patches where its bones (their poses (4, 4)) carry them."""
+    total = sum(areas.sum() for _, _, areas in end)
+    moved = [
+        poses[bone][:3, :3] @ (areas @ points) + areas.sum() * poses[bone][:3, 3]
+        for bone, points, areas in end
+    ]
+    return np.sum(moved, axis=0) / total

@@ -13,7 +13,7 @@ from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.mean_value import mean_value_weights
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.sim.contraction.resolve import resolve_contraction
-from rbfmuscle.study.measure.centreline import end_groups, split_ends
+from rbfmuscle.study.measure.centreline import carried_middle, end_groups, split_ends
 from rbfmuscle.study.measure.fibre_lines import grow_fibres, resampled
 from rbfmuscle.validation import SolveError
 
@@ -86,7 +86,7 @@ class ContractionStudy:
         lengths = _segments(lines)
         counted = self.belly.any(axis=1)
         stretch = (lengths / self.rest_lengths)[self.belly]
-        first, last = (_carried(end, poses) for end in self.ends)
+        first, last = (carried_middle(end, poses) for end in self.ends)
         axis = (last - first) / np.linalg.norm(last - first)
         found = {
             "fibre_length": float((lengths * self.belly).sum(axis=1)[counted].mean()),
@@ -205,8 +205,3 @@ def _kept_inside(lines, vertices, faces):
 
 def _segments(lines):
     return np.linalg.norm(np.diff(lines, axis=1), axis=2)
-
-
-def _carried(end, poses):
-    moved = [points @ poses[bone][:3, :3].T + poses[bone][:3, 3] for bone, points in end]
-    return np.concatenate(moved).mean(axis=0)
