@@ -12,6 +12,7 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.fields import LevelField
 from rbfmuscle.implicit.extraction.band import box_along
 from rbfmuscle.implicit.extraction.material import FittedMesh, carry_material, fit_material
+from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
 from rbfmuscle.implicit.extraction.obstacles import ObstaclePoints
 from rbfmuscle.implicit.extraction.surface import ExtractedSurface, extract_surface
 from rbfmuscle.implicit.field import RBFField
@@ -114,9 +115,18 @@ class SurfaceDrawer:
         try:
             result = fit_material(mesh, carried, fit(), volume=volume, level=self.level, **where)
         except (ValueError, np.linalg.LinAlgError):
-            return carry_material(mesh, carried, volume=volume, **where)
+            return self._carry(mesh, carried, volume, where)
         self.level = result.level
         return result
+
+    def _carry(self, mesh: MaterialMesh, carried: Floats, volume: float, where: dict[str, Any]) -> FittedMesh:
+        try:
+            return carry_material(mesh, carried, volume=volume, **where)
+        except ValueError as error:
+            raise SolveError(
+                f"muscle {self.name!r}: no surface outside the bones holds its volume of {volume:.6g} ({error}); "
+                "check where its attachments lie and what the motion drives into it"
+            ) from error
 
     def _march(self, fit: Callable[[], RBFField], now: Moment, contacts: BoneContacts) -> ExtractedSurface:
         axes, resolution = self._axes(contacts), self.options.resolution or MARCHING_CELLS

@@ -8,7 +8,8 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import RestFrame
-from rbfmuscle.implicit.extraction.material import MaterialMesh, fit_material
+from rbfmuscle.implicit.extraction.material import fit_material
+from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
 from rbfmuscle.model.clusters import bind_samples
 from rbfmuscle.model.elasticity import ElasticSolver, carry_points
 from rbfmuscle.model.options import RBFOptions

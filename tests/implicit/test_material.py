@@ -6,8 +6,10 @@ import trimesh
 
 from rbfmuscle.geometry.crossing import FaceTree, crossing_faces
 from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.implicit.extraction.material import MaterialMesh, _Fitting, carry_material, fit_material
+from rbfmuscle.implicit.extraction.material import _Fitting, carry_material, fit_material
+from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
 from rbfmuscle.implicit.extraction.obstacles import ObstaclePoints
+from rbfmuscle.implicit.extraction.projection import Projector
 
 BALL = trimesh.creation.icosphere(3)
 VOLUME = 4.0 / 3.0 * np.pi
@@ -141,6 +143,33 @@ def test_a_carried_surface_keeps_volume_and_leaves_the_bone():
     assert mesh_volume(found.vertices, found.faces) == pytest.approx(VOLUME, rel=1e-12)
     assert cut(found.vertices).min() > -1e-3
     assert found.left == len(BALL.vertices) and found.crossing == 0
+
+
+@pytest.mark.parametrize("cut", [None, Bone(0.5, (1.3, 0.0, 0.0)), Bone(0.9, (0.0, 0.0, 0.9))])
+def test_a_carried_surface_that_was_smoothed_all_over_keeps_its_volume(cut):
+    """Vertices that were smoothed stay when the level changes: nothing of it was left to be blown up."""
+    carried = BALL.vertices + 0.15 * np.random.default_rng(5).normal(size=BALL.vertices.shape)
+    found = carry_material(mesh_of(), carried, volume=VOLUME, cut=cut)
+    assert found.crossing == 0 and (cut is None or cut(found.vertices).min() > -1e-9)
+    assert mesh_volume(found.vertices, found.faces) == pytest.approx(VOLUME, rel=1e-12)
+
+
+def test_what_falls_on_a_fold_of_the_field_does_not_leap():
+    class Fold:
+        """x squared: its gradient fades at 0, and points either way from there."""
+
+        def value_and_gradient(self, points):
+            return points[:, 0] ** 2 - 1.0, np.column_stack([2.0 * points[:, 0], np.zeros((len(points), 2))])
+
+    places = np.array([[1e-4, 0.0, 0.0], [-1e-4, 0.0, 0.0], [0.9, 0.0, 0.0]])
+    ends = []
+    for least in (None, np.full(3, 0.7)):
+        projector = Projector(Fold(), None, places.copy(), 0.5, np.zeros(3, dtype=bool))
+        projector.least = least
+        projector.project(0.0, rounds=2)
+        ends.append(projector.vertices[:, 0])
+    assert np.ptp(ends[0][:2]) > 0.5 and np.ptp(ends[1][:2]) < 0.01
+    assert ends[0][2] == ends[1][2]
 
 
 def test_a_volume_that_no_level_reaches_is_an_error():

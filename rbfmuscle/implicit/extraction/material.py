@@ -13,10 +13,10 @@ import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Array, Booleans, Floats, Integers
-from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.fields import Cut, Field
 from rbfmuscle.geometry.surfaces import mesh_volume, vertex_normals
 from rbfmuscle.implicit.extraction.band import BandGrid
+from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
 from rbfmuscle.implicit.extraction.obstacles import CHORD, ObstaclePoints, faces_within, points_near_cells
 from rbfmuscle.implicit.extraction.projection import CutBounds, Projector
 from rbfmuscle.implicit.extraction.surface import ExtractedSurface
@@ -30,6 +30,8 @@ UNSURE, SURE = 0.3, 0.7
 NEAR_CUT = 1.5
 # Rounds of smoothing for triangles that cross others, and how the smoothed region grows with them.
 UNTANGLE, GROWTH = 24, 4
+# Rounds before them in which what crosses is taken back to where the material is, by this share of the way.
+RETURN, BACK = 12, 0.15
 # What the material takes so many mean edges deep into a bone, or a bone sent so
 # far away, is drawn as a skin over the place where it goes in: so many sweeps of smoothing first, and in each of some
 # rounds after, each followed by the way out of the bone.
@@ -39,45 +41,6 @@ FILL_SWEEPS, GATHER, GATHER_SWEEPS = 150, 4, 12
 MEET = 4
 # Where both sides of a muscle sink into a bone, the far one stays above it by this share of a mean edge.
 LAMELLA = 0.02
-
-
-class MaterialMesh:
-    """A closed triangulation of fixed topology.
-
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-        At rest.
-    faces : (m, 3) ndarray of int
-        Closed, outward.
-
-    Attributes
-    ----------
-    start, other : CSR lists of neighbours.
-    slope : (n,) ndarray or None
-        The field's slope at the vertices at rest; where it sinks, sheets have met and the field is not to be trusted.
-    """
-
-    def __init__(self, vertices: Floats, faces: Integers) -> None:
-        self.slope: Floats | None = None
-        self.tree = FaceTree(vertices, faces)
-        self.faces = np.ascontiguousarray(faces, dtype=np.int64)
-        ends = np.concatenate([self.faces[:, :2], self.faces[:, 1:], self.faces[:, ::2]])
-        pairs = np.unique(np.concatenate([ends, ends[:, ::-1]]), axis=0)
-        self.other = np.ascontiguousarray(pairs[:, 1])
-        self.start = np.searchsorted(pairs[:, 0], np.arange(len(vertices) + 1))
-
-    def edge(self, vertices: Floats) -> float:
-        """Mean length of an edge [scene unit]."""
-        return _edges_loop(vertices, self.faces)[0]
-
-    def around(self, marked: Booleans, rings: int) -> Booleans:
-        """Mask (n,) of the vertices within some rings of marked ones."""
-        for _ in range(rings):
-            grown = marked.copy()
-            _grow_loop(marked, self.start, self.other, grown)
-            marked = grown
-        return marked
 
 
 @dataclass(frozen=True)
@@ -157,6 +120,11 @@ def carry_material(
     -------
     FittedMesh
         All of its vertices are ``left``.
+
+    Raises
+    ------
+    ValueError
+        Where so much of it is in the bones that nothing can be blown up to the volume.
     """
     fitting = _Fitting(mesh, vertices, None, cut, 0.0)
     fitting.inflate(volume)
@@ -178,12 +146,14 @@ class _Fitting:
         self.field, self.cut = field, cut
         self.edge = mesh.edge(self.carried)
         self.sunk = np.zeros(len(vertices), dtype=np.bool_)
+        self.outside = np.ones(len(vertices), dtype=np.bool_)
         self._start(cut)
         self.left = np.zeros(len(vertices), dtype=np.bool_)
         self.evaluations = 0
         self.reach_of = None
         if mesh.slope is not None and field is not None:
             self.projector.known = field.value_and_gradient(self.carried)
+            self.projector.least = SURE * mesh.slope
             gradient = self.projector.known[1]
             share = np.sqrt(np.einsum("nd,nd->n", gradient, gradient)) / mesh.slope
             self.reach_of = FARTHEST * self.edge * np.clip((share - UNSURE) / (SURE - UNSURE), 0.0, 1.0)
@@ -196,7 +166,7 @@ class _Fitting:
             return
         limit = np.full(len(vertices), NEAR_CUT * self.edge)
         distance, outward = cut.value_and_gradient_below(self.carried, limit)
-        near = distance < limit
+        near, self.outside = distance < limit, distance >= 0.0
         self.projector = Projector(self.field, cut if near.any() else None, vertices, self.edge, near)
         if np.isfinite(cut.steepest):
             self.projector.bounds = CutBounds(self.carried, np.minimum(distance, limit), cut.steepest)
@@ -218,7 +188,9 @@ class _Fitting:
         self.evaluations += len(projector.vertices)
         if self.reach_of is None:
             return
-        _bound_loop(projector.vertices, self.carried, self.reach_of, projector.on_field, self.left)
+        # A way to a bone from outside it, which the field asked for, is as long as the field is to be trusted.
+        bounded = projector.on_field | (self.outside & (self.reach_of < FARTHEST * self.edge))
+        _bound_loop(projector.vertices, self.carried, self.reach_of, bounded, self.left)
         rows = np.flatnonzero(self.left)
         if len(rows):
             self._lift(rows)
@@ -263,6 +235,10 @@ class _Fitting:
             self.push_off(obstacles, 0.01 * self.edge, axes)
         smoothed, crossing = self.untangle()
         if volume is not None:
+            if self.field is None:
+                # What was smoothed or filled stays put otherwise, and that may be all of it.
+                self.projector.move_along(vertex_normals(self.projector.vertices, self.mesh.faces))
+                self.projector.lift()
             self.meet(volume)
         vertices, faces = self.projector.vertices, self.mesh.faces
         check_finite(vertices, name="fitted vertices")
@@ -290,8 +266,7 @@ class _Fitting:
             return
         rows = np.flatnonzero(self.mesh.around(lost, 1))
         for turn in range(GATHER):
-            for _ in range(GATHER_SWEEPS if turn else FILL_SWEEPS):
-                _smooth_loop(projector.vertices, rows, self.mesh.start, self.mesh.other)
+            self.mesh.smooth(projector.vertices, rows, GATHER_SWEEPS if turn else FILL_SWEEPS)
             if self.field is None:
                 self._lift(rows)
                 continue
@@ -312,7 +287,7 @@ class _Fitting:
         """Move the corners of triangles that a bone's vertices came through."""
         vertices, faces = self.projector.vertices, self.mesh.faces
         # So large that no corner is farther than 1.3 cells from its triangle's middle.
-        spacing = max(self.edge, 0.52 * _edges_loop(vertices, faces)[1])
+        spacing = max(self.edge, 0.52 * self.mesh.longest(vertices))
         size = float(np.ptp(vertices, axis=0).max())
         grid = BandGrid.around(vertices, resolution=max(int(size / spacing), 4), padding=2, axes=axes)
         if self.projector.bounds is not None:
@@ -332,7 +307,7 @@ class _Fitting:
         projector, faces = self.projector, self.mesh.faces
         touched, crossing = np.zeros(len(self.carried), dtype=np.bool_), 0
         among: Booleans | None = None
-        for turn in range(UNTANGLE + 1):
+        for turn in range(0 if self.field is None else -RETURN, UNTANGLE + 1):
             # What was not moved does not begin to cross.
             bad = self.mesh.tree.crossing(projector.vertices, among)
             crossing = int(bad.sum())
@@ -340,19 +315,29 @@ class _Fitting:
                 break
             marked = np.zeros(len(self.carried), dtype=np.bool_)
             marked[faces[bad].ravel()] = True
-            region = self.mesh.around(marked, 1 + turn // GROWTH)
+            region = self.mesh.around(marked, 1 + max(turn, 0) // GROWTH)
             among = np.asarray(region[faces].any(axis=1), dtype=np.bool_)
             touched |= region
-            onto_field = self.field is not None and turn < UNTANGLE // 2
-            self._smooth(np.flatnonzero(region), onto_field)
+            if turn < 0:
+                self._return(np.flatnonzero(region))
+            else:
+                self._smooth(np.flatnonzero(region), self.field is not None and turn < UNTANGLE // 2)
         return int(touched.sum()), crossing
+
+    def _return(self, rows: Integers) -> None:
+        """Take vertices back towards where the material is, which smoothing would shorten; not those on bones."""
+        projector = self.projector
+        away = projector.vertices[rows] - self.carried[rows]
+        strayed = np.einsum("nd,nd->n", away, away) > (STRAYED * self.edge) ** 2
+        free = projector.on_field[rows] & ~strayed
+        projector.vertices[rows[free]] -= BACK * away[free]
+        self._lift(rows[free])
 
     def _smooth(self, rows: Integers, onto_field: bool) -> None:
         """Move vertices towards their neighbours, then back onto the surface, or out of the bones at least."""
         projector = self.projector
         before = projector.vertices[rows]
-        for _ in range(3):
-            _smooth_loop(projector.vertices, rows, self.mesh.start, self.mesh.other)
+        self.mesh.smooth(projector.vertices, rows, 3)
         if not onto_field:
             self._lift(rows)
             return
@@ -388,55 +373,14 @@ def _touch_loop(holders, strides, state, cells):
 
 
 @compiled(error_model="numpy")
-def _edges_loop(vertices, faces):
-    """Mean and greatest length of the edges."""
-    total, greatest = 0.0, 0.0
-    for f in range(len(faces)):
-        for k in range(3):
-            a, b = faces[f, k], faces[f, (k + 1) % 3]
-            x, y, z = (
-                vertices[a, 0] - vertices[b, 0],
-                vertices[a, 1] - vertices[b, 1],
-                vertices[a, 2] - vertices[b, 2],
-            )
-            length = np.sqrt(x * x + y * y + z * z)
-            total += length
-            greatest = max(greatest, length)
-    return total / (3.0 * len(faces)), greatest
-
-
-@compiled(error_model="numpy")
-def _grow_loop(marked, start, other, out):
-    for v in range(len(marked)):
-        if marked[v]:
-            for n in range(start[v], start[v + 1]):
-                out[other[n]] = True
-
-
-@compiled(error_model="numpy")
-def _smooth_loop(vertices, rows, start, other):
-    """Half the way to the mean of the neighbours, one vertex after the other."""
-    for v in rows:
-        x, y, z = 0.0, 0.0, 0.0
-        for n in range(start[v], start[v + 1]):
-            x += vertices[other[n], 0]
-            y += vertices[other[n], 1]
-            z += vertices[other[n], 2]
-        count = start[v + 1] - start[v]
-        vertices[v, 0] = 0.5 * (vertices[v, 0] + x / count)
-        vertices[v, 1] = 0.5 * (vertices[v, 1] + y / count)
-        vertices[v, 2] = 0.5 * (vertices[v, 2] + z / count)
-
-
-@compiled(error_model="numpy")
-def _bound_loop(vertices, carried, reach, on_field, left):
-    """Bring back vertices on the field that went beyond their reach, and mark them."""
+def _bound_loop(vertices, carried, reach, bounded, left):
+    """Bring back bounded vertices that went beyond their reach, and mark them."""
     for v in range(len(vertices)):
         square = 0.0
         for a in range(3):
             square += (vertices[v, a] - carried[v, a]) ** 2
         # NaN counts as beyond.
-        left[v] = on_field[v] and not square <= reach[v] ** 2
+        left[v] = bounded[v] and not square <= reach[v] ** 2
         if left[v]:
             share = reach[v] / np.sqrt(square) if square < np.inf else 0.0
             for a in range(3):

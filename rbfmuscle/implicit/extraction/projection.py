@@ -79,6 +79,8 @@ class Projector:
         self.bounds: CutBounds | None = None
         # Distance (n,) from the cut at which vertices that fall into it end; 0 where None.
         self.clearance: Floats | None = None
+        # Steepness (n,) of the field below which steps are shortened, not lengthened by a gradient that fades.
+        self.least: Floats | None = None
         self.slope = np.zeros(len(vertices))
         self.on_field = np.ones(len(vertices), dtype=bool)
         self._direction = np.zeros_like(vertices)
@@ -94,7 +96,8 @@ class Projector:
             f, gradient = self._field(x) if self.known is None else self.known
             self.known = None
             step, slope = np.empty_like(x), np.empty(len(x))
-            _newton_loop(f, np.ascontiguousarray(gradient), level, todo, step, slope, self._direction)
+            least = np.zeros(len(x)) if self.least is None else self.least[todo]
+            _newton_loop(f, np.ascontiguousarray(gradient), level, least, todo, step, slope, self._direction)
             self.slope[todo] = slope
             if self._cut is not None:
                 self._turn_to_cut(x, todo, (f - level) * slope, step, on_field)
@@ -148,6 +151,7 @@ class Projector:
         part.vertices, part.spacing = self.vertices[rows], self.spacing
         part._field, part._cut, part._near_cut = self._field, self._cut, self._near_cut[rows]
         part.clearance = None if self.clearance is None else self.clearance[rows]
+        part.least = None if self.least is None else self.least[rows]
         part.known, part.bounds = None, None if self.bounds is None else self.bounds.part(rows)
         part.slope, part._direction = np.zeros(len(rows)), np.zeros((len(rows), 3))
         return part
@@ -221,11 +225,14 @@ class Projector:
 
 
 @compiled(error_model="numpy")
-def _newton_loop(f, gradient, level, rows, step, slope, direction):
-    """Newton steps onto f = level, 1 / |g|, and the vertices' motions g / |g|^2 for a change of level."""
+def _newton_loop(f, gradient, level, least, rows, step, slope, direction):
+    """Newton steps onto f = level, 1 / |g|, and the vertices' motions g / |g|^2 for a change of level.
+
+    |g| counts as no less than ``least``: what falls on a fold of the field would else leap, elsewhere in each frame.
+    """
     for n in range(len(rows)):
         square = gradient[n, 0] ** 2 + gradient[n, 1] ** 2 + gradient[n, 2] ** 2
-        square = max(square, 2.3e-308)
+        square = max(square, least[n] ** 2, 2.3e-308)
         slope[n] = 1.0 / np.sqrt(square)
         for a in range(3):
             direction[rows[n], a] = gradient[n, a] / square
