@@ -10,6 +10,7 @@ from rbfmuscle.sim.contraction.course import Activations
 from rbfmuscle.sim.loop.carrying import Carrier
 from rbfmuscle.sim.loop.contact import BoneContacts
 from rbfmuscle.sim.loop.frame import Event, FinishedDrawing, Frame, ModelSurface, MuscleModel
+from rbfmuscle.sim.loop.from_rest import Trail
 from rbfmuscle.sim.loop.overlap import settle_rest
 from rbfmuscle.sim.loop.stepper import MuscleStepper, TimedDrawing
 from rbfmuscle.sim.loop.substeps import PoseMemo, SubSteps
@@ -94,6 +95,7 @@ class FrameLoop:
             with self.clocked(), self.workers.one_thread_each():
                 self.workers.each(settle_rest, self.steppers)
                 self._sliding = _sliding(scene, self.steppers)
+            self._links = self._from_rest() if scene.contact.from_rest else None
         except BaseException:
             self.close()
             raise
@@ -250,6 +252,13 @@ class FrameLoop:
         met = [contacts.names[b] for b in contacts.reached]
         return SubSteps(self.scene, carrier.muscle, bones=met, poses=self._poses)
 
+    def _from_rest(self) -> dict:
+        """Keep all muscles as they are at rest; the links between them."""
+        rest, idle = completed(self.scene, {}), dict(self.activations.here)
+        for stepper in self.steppers:
+            stepper.trail = Trail(stepper, rest, idle)
+        return {} if self._sliding is None else self._sliding.snapshot()
+
     def _path_to(self, coordinates: Mapping[str, float]) -> dict[str, tuple[list[dict], list[dict]]]:
         """For each muscle coordinates of its sub-steps to the next frame, from where it is on, and activations."""
         # Whatever a motion chooses to move starts at rest, which for most coordinates is zero.
@@ -258,10 +267,16 @@ class FrameLoop:
         for stepper in self.steppers:
             stepper.frame = self._next_index
         self._next_index += 1
-        found = {name: ([here, *cut.split(here, self.here)], []) for name, cut in self._own_sub_steps.items()}
+        split = SubSteps.split
+        if self._links is not None:
+            split, here = SubSteps.from_rest, completed(self.scene, {})
+            self.activations.here = dict.fromkeys(self.activations.here, 0.0)
+        found = {
+            name: ([here, *split(cut, here, self.here)], []) for name, cut in self._own_sub_steps.items()
+        }
         if len(found) < len(self.steppers):
             # Muscles that slide wait for each other, so all take what the fastest needs.
-            stops = [here, *self._sub_steps.split(here, self.here)]
+            stops = [here, *split(self._sub_steps, here, self.here)]
             shared = self.activations.refine(self._next_index - 1, stops)
             found.update({s.name: shared for s in self.steppers if s.name not in found})
         return found
@@ -272,6 +287,10 @@ class FrameLoop:
             self.workers.each(lambda stepper: stepper.advance(*paths[stepper.name]), self.steppers)
             return
         stops, activations = paths[self.steppers[0].name]
+        if self._links is not None:
+            for stepper in self.steppers:
+                stepper.trail.rewind(stops[:1])
+            self._sliding.restore(self._links)
         for before, after, activation in itertools.zip_longest(stops[:-1], stops[1:], activations):
             for stepper in self.steppers:
                 stepper.excite(activation)

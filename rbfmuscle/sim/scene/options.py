@@ -143,6 +143,7 @@ class ContactOptions(Table):
     tolerance: Positive | None = None
     substep_angle: Annotated[float, Field(gt=0, le=90)] = 2.0
     still_angle: Annotated[float, Field(ge=0, le=90)] = 0.0
+    from_rest: bool = False
     margin: NotNegative = 0.0
 
     @model_validator(mode="after")
