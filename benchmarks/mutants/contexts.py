@@ -3,12 +3,15 @@
 Loaded by ``python -m mutants record``. What a fixture of a module runs belongs to all tests of the file, not only to
 the first that asks for it, so lines of a set-up are kept under the file's name. Each test file is written as soon as
 its last test has run, so that a recording may be broken off; workers of pytest-xdist write the files they are given.
+What a child process runs (drawing, windows, commands) is recorded too, by what coverage starts in any Python that finds
+``COVERAGE_PROCESS_START``.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import json
 import os
 import re
@@ -48,7 +51,23 @@ class Recorder:
         self.coverage = coverage.Coverage(
             data_file=None, source=[str(ROOT / room) for room in ROOMS], config_file=False, messages=False
         )
+        self.children = self.folder / "children" / os.environ.get("PYTEST_XDIST_WORKER", "alone")
+        self.children.mkdir(parents=True, exist_ok=True)
+        settings = self.children / "settings.ini"
+        settings.write_text(
+            "[run]\nparallel = true\npatch = _exit\n"
+            f"data_file = {self.children / 'data'}\n"
+            f"source =\n{''.join(f'    {ROOT / room}{chr(10)}' for room in ROOMS)}"
+            "context = ${MUTANTS_TEST}\n",
+            encoding="utf-8",
+        )
+        os.environ["COVERAGE_PROCESS_START"] = str(settings)
         self.coverage.start()
+
+    def contexts_are(self, name):
+        """What runs from now on belongs to a test, or to a file."""
+        self.coverage.switch_context(name)
+        os.environ["MUTANTS_TEST"] = name
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item):
@@ -60,13 +79,13 @@ class Recorder:
         file = _file_of(item)
         if self.limit and self.slow.get(file, 0) >= self.patience:
             pytest.skip("too many slow tests in this file")
-        self.coverage.switch_context(file)
+        self.contexts_are(file)
         with self.timed(item), _Alarm(self.limit):
             return (yield)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self, item):
-        self.coverage.switch_context(item.nodeid)
+        self.contexts_are(item.nodeid)
         with self.timed(item), _Alarm(self.limit):
             return (yield)
 
@@ -101,14 +120,18 @@ class Recorder:
 
     def write(self, file: str) -> None:
         """What the tests of one file ran."""
-        data, files = self.coverage.get_data(), {}
+        data = self.coverage.get_data()
         data.set_query_contexts([f"^{re.escape(file)}(::|$)"])
-        for name in data.measured_files():
-            lines = {
-                line: sorted(c for c in contexts if c not in self.bad)
-                for line, contexts in data.contexts_by_lineno(name).items()
-            }
-            lines = {line: tests for line, tests in lines.items() if tests}
+        found: dict[str, dict[int, set[str]]] = {}
+        for part in itertools.chain([data], self.of_children()):
+            for name in part.measured_files():
+                lines = found.setdefault(name, {})
+                with contextlib.suppress(coverage.exceptions.DataError):  # a child that ended while it wrote
+                    for line, contexts in part.contexts_by_lineno(name).items():
+                        lines.setdefault(line, set()).update(c for c in contexts if c not in self.bad)
+        files = {}
+        for name, lines in found.items():
+            lines = {line: sorted(tests) for line, tests in sorted(lines.items()) if tests}
             if lines:
                 path = Path(name)
                 files[str(path.relative_to(ROOT))] = {"digest": self.kept(path), "lines": lines}
@@ -120,6 +143,15 @@ class Recorder:
         self.folder.mkdir(parents=True, exist_ok=True)
         target = self.folder / (file.replace("/", "_") + ".json")
         target.write_text(json.dumps({"tests": passed, "files": files}), encoding="utf-8")
+
+    def of_children(self):
+        """What the child processes of this file's tests left."""
+        for path in sorted(self.children.glob("data.*")):
+            part = coverage.CoverageData(basename=str(path))
+            with contextlib.suppress(coverage.exceptions.DataError):
+                part.read()
+                yield part
+            path.unlink(missing_ok=True)
 
     def kept(self, path: Path) -> str:
         """Keep the text that was run, under a name of its own."""
