@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import compileall
 import importlib
+import math
 import os
+import resource
 import shutil
 import signal
 import sys
@@ -54,20 +56,23 @@ def run_tests(tree: Path, tests: list[str], *, compiler: bool, seconds: float) -
     """What became of the tests, and the first that failed.
 
     "noticed", "unnoticed", "slow" (noticed by the time it takes), or "wrong" where no test could be run. The test is ""
-    where not a test failed but what comes before it: the import of a module, say.
+    where not a test failed but what comes before it: the import of a module, say. ``seconds`` are of the processor, so
+    that a crowded machine makes nothing slow; a fault that waits for ever is ended by the clock, ten times later.
     """
     told = tree / ".failed"
     told.unlink(missing_ok=True)
     child = os.fork()
     if child == 0:
+        resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(seconds), math.ceil(seconds) + 1))
         _be_child(tree, tests, compiler, Failures(told))
-    end = time.monotonic() + seconds
+    end = time.monotonic() + 10.0 * seconds
     while time.monotonic() < end:
         done, status = os.waitpid(child, os.WNOHANG)
         if done:
             code = os.waitstatus_to_exitcode(status)
             first = told.read_text(encoding="utf-8") if told.exists() else ""
-            return {0: "unnoticed", 5: "wrong"}.get(code, "noticed"), first
+            outcomes = {0: "unnoticed", 5: "wrong", -signal.SIGXCPU: "slow", -signal.SIGKILL: "slow"}
+            return outcomes.get(code, "noticed"), first
         time.sleep(0.05)
     os.killpg(child, signal.SIGKILL)
     os.waitpid(child, 0)
