@@ -1,5 +1,6 @@
 """Own muscles and own bones beside a model's: names, first attachments, registration, joints that come along."""
 
+import copy
 import csv
 
 import numpy as np
@@ -104,6 +105,25 @@ def test_own_muscles_get_first_attachments_marked_as_guesses(own, tmp_path):
     (tmp_path / "wrong.csv").write_bytes(b"PK\x03\x04\xff\xfe\n\xff\n")
     with pytest.raises(UsageError, match="no mesh None in the folder; correct the row"):
         match_meshes(found, folder, tmp_path / "wrong.csv")
+
+
+@pytest.mark.parametrize("far", ["r", "l"])
+def test_of_paths_of_both_sides_those_beside_the_mesh_hold_it(own, far):
+    """A mesh without a side in its name lies beside one of two legs: in this model the other is 300 mm off."""
+    found, folder = own
+    (path,) = found.model.paths
+    path.points[0].body = "thigh"
+    other = copy.deepcopy(path)
+    path.name, other.name = "hamstring_r", "hamstring_l"
+    for point in (path if far == "r" else other).points:
+        point.place = point.place + np.array([0.0, 0.0, 0.3])
+    found.model.paths.append(other)
+    (folder / "hamstring_right.ply").rename(folder / "hamstring.ply")
+    match = match_meshes(found, folder)[0]
+    assert {p.name for p in match.paths} == {"hamstring_r", "hamstring_l"}
+    attach(found, match)
+    assert [p.name for p in match.paths] == [f"hamstring_{'l' if far == 'r' else 'r'}"]
+    assert match.distance < 100.0
 
 
 def test_end_on_a_bone_without_a_mesh_is_said(own):

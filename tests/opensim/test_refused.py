@@ -202,3 +202,14 @@ def test_a_frame_is_the_same_wherever_it_stands(small, where):
         assert (one.name, one.parent, one.child) == (other.name, other.parent, other.child)
         for place in ("parent_frame", "child_frame"):
             np.testing.assert_allclose(getattr(one, place), getattr(other, place), atol=1e-15)
+
+
+def test_meshes_of_the_ground_are_the_grounds_and_come_once(small):
+    before = [(mesh.body, mesh.file) for mesh in read_osim(small).meshes]
+    geometry = '<attached_geometry><Mesh name="g"><mesh_file>floor.obj</mesh_file></Mesh></attached_geometry>'
+    found = read_osim(
+        changed(small, ('<Ground name="ground"/>', f'<Ground name="ground">{geometry}</Ground>'))
+    )
+    assert sorted((mesh.body, mesh.file) for mesh in found.meshes) == sorted(
+        [*before, ("ground", "floor.obj")]
+    )
