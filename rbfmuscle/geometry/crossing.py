@@ -9,6 +9,9 @@ from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 LEAF, BITS = 4, 10
 # Pairs of nodes that wait at a time: less than four for each level of the tree.
 WAITING = 512
+# Triangles close together whose normals are all within this of one direction [radian] are taken for one sheet: less
+# than an eighth of a turn, as what goes through a sheet looks a right angle away from it on one of its sides.
+ONE_SHEET, ALONG = 0.5, np.cos(2 * 0.5)
 
 
 class FaceTree:
@@ -34,19 +37,37 @@ class FaceTree:
         self.leaves = 1 << max(int(np.ceil(len(self.faces) / LEAF)) - 1, 0).bit_length()
         self.closed = _is_closed(self.faces)
 
-    def crossing(self, vertices: Floats, among: Booleans | None = None) -> Booleans:
-        """Which triangles cross others, as `crossing_faces` says, for places of the vertices now."""
+    def crossing(
+        self, vertices: Floats, among: Booleans | None = None, *, by_sheets: bool = False
+    ) -> Booleans:
+        """Which triangles cross others, as `crossing_faces` says, for places of the vertices now.
+
+        Parameters
+        ----------
+        vertices : (n, 3) ndarray
+        among : (m,) ndarray of bool, optional
+            Only pairs with one of these triangles.
+        by_sheets : bool
+            Leave out pairs whose normals are less than a right angle apart: of a closed surface, what goes through a
+            sheet has another side, which is seen. It takes a third of the time, and may miss single triangles.
+        """
         vertices = np.ascontiguousarray(vertices, dtype=np.float64)
         box, node = np.empty((len(self.faces), 6)), np.empty((2 * self.leaves, 6))
         _boxes_loop(vertices, self.faces, self.order, box, self.leaves, node)
         marked = np.zeros(len(self.faces), dtype=np.bool_)
         among = np.ones(len(self.faces), dtype=np.bool_) if among is None else among
-        plain = np.full(len(vertices), self.closed, dtype=np.bool_)
-        if self.closed:
+        cone, units = np.zeros((2 * self.leaves, 4)), np.zeros((len(self.faces), 3))
+        if by_sheets and self.closed:
+            _cones_loop(vertices, self.faces, self.order, self.leaves, (units, cone))
+        wanted = np.zeros(2 * self.leaves, dtype=np.bool_)
+        _wanted_loop(among, self.order, self.leaves, wanted)
+        plain = np.full(len(vertices), self.closed and not by_sheets, dtype=np.bool_)
+        if plain.any():
             _plain_loop(
                 vertices, self.faces, np.zeros_like(vertices), np.zeros(len(vertices), np.int64), plain
             )
-        _cross_loop(vertices, self.faces, self.order, box, node, among, plain, marked)
+        tree = (box, node, units, cone, wanted)
+        _cross_loop(vertices, self.faces, self.order, tree, among, plain, marked)
         return marked
 
 
@@ -95,6 +116,62 @@ def _boxes_loop(vertices, faces, order, box, leaves, node):
         for a in range(3):
             node[k, a] = min(node[2 * k, a], node[2 * k + 1, a])
             node[k, 3 + a] = max(node[2 * k, 3 + a], node[2 * k + 1, 3 + a])
+
+
+@compiled
+def _wanted_loop(among, order, leaves, wanted):
+    """Mark the nodes that hold triangles among which crossings are sought."""
+    for m in range(len(order)):
+        wanted[leaves + m // LEAF] |= among[order[m]]
+    for k in range(leaves - 1, 0, -1):
+        wanted[k] = wanted[2 * k] or wanted[2 * k + 1]
+
+
+@compiled
+def _cones_loop(vertices, faces, order, leaves, out):
+    """Unit normals, and a cone around those of each node: its axis, and how far another may be from it."""
+    units, cone = out
+    for m in range(len(order)):
+        x, y, z = _normal(vertices, faces, order[m])
+        length = max(np.sqrt(x * x + y * y + z * z), 1e-300)
+        units[m, 0], units[m, 1], units[m, 2] = x / length, y / length, z / length
+        for a in range(3):
+            cone[leaves + m // LEAF, a] += units[m, a]
+    for k in range(leaves, 2 * leaves):
+        _normalise(cone, k)
+        first = LEAF * (k - leaves)
+        least = 1.0
+        for m in range(first, min(first + LEAF, len(order))):
+            along = units[m, 0] * cone[k, 0] + units[m, 1] * cone[k, 1] + units[m, 2] * cone[k, 2]
+            least = min(least, along)
+        cone[k, 3] = np.arccos(max(least, -1.0))
+    for k in range(leaves - 1, 0, -1):
+        for a in range(3):
+            cone[k, a] = cone[2 * k, a] + cone[2 * k + 1, a]
+        _normalise(cone, k)
+        for c in range(2 * k, 2 * k + 2):
+            if cone[c, 0] != 0.0 or cone[c, 1] != 0.0 or cone[c, 2] != 0.0:
+                along = cone[k, 0] * cone[c, 0] + cone[k, 1] * cone[c, 1] + cone[k, 2] * cone[c, 2]
+                cone[k, 3] = max(cone[k, 3], cone[c, 3] + np.arccos(min(max(along, -1.0), 1.0)))
+    # What the axes of two nodes may differ by: the square of the chord of twice what is left of the angle.
+    for k in range(2 * leaves):
+        cone[k, 3] = (2.0 * np.sin(max(ONE_SHEET - cone[k, 3], 0.0))) ** 2
+
+
+@compiled
+def _normalise(cone, k):
+    length = max(np.sqrt(cone[k, 0] ** 2 + cone[k, 1] ** 2 + cone[k, 2] ** 2), 1e-300)
+    for a in range(3):
+        cone[k, a] /= length
+
+
+@compiled
+def _one_sheet(cone, i, j):
+    """Whether all normals of two nodes are near one direction, the mean of the nodes' axes."""
+    square = 0.0
+    for a in range(3):
+        square += (cone[i, a] - cone[j, a]) ** 2
+    return square < min(cone[i, 3], cone[j, 3])
 
 
 @compiled
@@ -159,8 +236,9 @@ def _normal(vertices, faces, f):
 
 
 @compiled
-def _cross_loop(vertices, faces, order, box, node, among, plain, marked):
+def _cross_loop(vertices, faces, order, tree, among, plain, marked):
     """All pairs of leaves whose boxes touch, from the root down."""
+    box, node, units, cone, wanted = tree
     leaves = len(node) // 2
     waiting = np.empty((WAITING, 2), dtype=np.int64)
     waiting[0, 0], waiting[0, 1] = 1, 1
@@ -168,25 +246,27 @@ def _cross_loop(vertices, faces, order, box, node, among, plain, marked):
     while count > 0:
         count -= 1
         i, j = waiting[count, 0], waiting[count, 1]
-        if i != j and _apart(node, i, node, j):
-            continue
         if i >= leaves:
-            _leaf_loop(vertices, faces, order, box, (i - leaves, j - leaves), among, plain, marked)
+            _leaf_loop(vertices, faces, order, (box, units), (i - leaves, j - leaves), among, plain, marked)
             continue
         # Nodes of a pair are of one level.
-        for a in range(2):
-            for b in range(2):
-                if i != j or a <= b:
-                    waiting[count, 0], waiting[count, 1] = 2 * i + a, 2 * j + b
+        for p in range(2 * i, 2 * i + 2):
+            for q in range(2 * j, 2 * j + 2):
+                if p > q or _apart(node, p, node, q) or not (wanted[p] or wanted[q]):
+                    continue
+                if not _one_sheet(cone, p, q):
+                    waiting[count, 0], waiting[count, 1] = p, q
                     count += 1
 
 
 @compiled
-def _leaf_loop(vertices, faces, order, box, pair, among, plain, marked):
+def _leaf_loop(vertices, faces, order, tree, pair, among, plain, marked):
+    box, units = tree
     first, second = LEAF * pair[0], LEAF * pair[1]
     for m in range(first, min(first + LEAF, len(order))):
         for n in range(max(second, m + 1), min(second + LEAF, len(order))):
-            if _apart(box, m, box, n):
+            along = units[m, 0] * units[n, 0] + units[m, 1] * units[n, 1] + units[m, 2] * units[n, 2]
+            if along > ALONG or _apart(box, m, box, n):
                 continue
             f, g = order[m], order[n]
             if (marked[f] and marked[g]) or not (among[f] or among[g]):

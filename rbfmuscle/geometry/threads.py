@@ -25,7 +25,8 @@ def in_chunks(count: int, work: Callable[..., Any], *, least: int = LEAST_SHARE)
     The number of threads is the caller's own (numba keeps it for each thread), so what already runs in
     parallel sets it to one and stays serial here.
     """
-    workers = min(numba.get_num_threads(), count // least)
+    # Small questions are asked by the dozen in a frame, and asking for the number of threads takes longer than they do.
+    workers = min(numba.get_num_threads(), count // least) if count >= 2 * least else 1
     if workers < 2:
         work(0, count)
         return

@@ -60,8 +60,9 @@ class Terms(NamedTuple):
 
 def run_in_chunks(loop: Callable[..., Any], count: int, cost: int) -> None:
     """Call ``loop(start, stop)`` over 0 ... count, on threads where ``cost`` (pairs) is worth it."""
-    threads = min(numba.get_num_threads(), -(-count // _BLOCK))
-    if threads < 2 or cost < _SERIAL:
+    # Asked for last: it takes longer than a small question.
+    threads = 1 if cost < _SERIAL else min(numba.get_num_threads(), -(-count // _BLOCK))
+    if threads < 2:
         loop(0, count)
         return
     if threads not in _POOLS:

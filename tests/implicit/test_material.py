@@ -191,6 +191,25 @@ def test_a_tree_made_at_rest_finds_crossings_later():
     assert not tree.crossing(np.asarray(BALL.vertices)).any()
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.02, 0.05, 0.1, 0.3])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_look_by_sheets_sees_whether_anything_crosses(noise, seed):
+    points = np.asarray(BALL.vertices) * [1.0, 0.6, 0.2]
+    tree = FaceTree(points, np.asarray(BALL.faces))
+    moved = points + noise * np.random.default_rng(seed).normal(size=points.shape)
+    quick, exact = tree.crossing(moved, by_sheets=True), tree.crossing(moved)
+    assert quick.any() == exact.any()
+    assert not (quick & ~exact).any()
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.5, 1.0])
+def test_a_look_by_sheets_sees_a_bump_that_goes_through_the_other_side(tilt):
+    points, away = np.asarray(BALL.vertices) * [1.0, 1.0, 0.2], np.array([np.sin(tilt), 0.0, -np.cos(tilt)])
+    near = np.exp(-(((points[:, :2]) ** 2).sum(axis=1)) / 0.05) * (points[:, 2] > 0)
+    tree = FaceTree(points, np.asarray(BALL.faces))
+    assert tree.crossing(points + 0.8 * near[:, None] * away, by_sheets=True).any()
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.05, 0.1, 0.3])
 def test_rings_that_lie_plain_spare_tests_and_miss_nothing(noise):
     points = np.asarray(BALL.vertices) * [1.0, 0.6, 0.2]

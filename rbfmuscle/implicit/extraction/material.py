@@ -37,6 +37,8 @@ RETURN, BACK = 12, 0.15
 # rounds after, each followed by the way out of the bone.
 SUNK, STRAYED = 1.0, 1.5
 FILL_SWEEPS, GATHER, GATHER_SWEEPS = 150, 4, 12
+# A level that moves vertices by less than this share of a mean edge is met, as what is left is of second order.
+SETTLED = 0.01
 # Rounds in which the volume is met and what that drove into a bone is brought out.
 MEET = 4
 # Where both sides of a muscle sink into a bone, the far one stays above it by this share of a mean edge.
@@ -204,7 +206,7 @@ class _Fitting:
             step = float(np.clip(step, -self.edge / largest, self.edge / largest))
             self.level += step
             self.projector.shift(step)
-            if abs(step) * largest < 2e-3 * self.edge:
+            if abs(step) * largest < SETTLED * self.edge:
                 return
         raise ValueError(f"no level gives a volume of {volume:g}; is it the volume of the surface fitted?")
 
@@ -308,7 +310,9 @@ class _Fitting:
         touched, crossing = np.zeros(len(self.carried), dtype=np.bool_), 0
         among: Booleans | None = None
         for turn in range(0 if self.field is None else -RETURN, UNTANGLE + 1):
-            # What was not moved does not begin to cross.
+            # What was not moved does not begin to cross; where nothing crosses, a quick look is enough.
+            if among is None and not self.mesh.tree.crossing(projector.vertices, by_sheets=True).any():
+                break
             bad = self.mesh.tree.crossing(projector.vertices, among)
             crossing = int(bad.sum())
             if crossing == 0 or turn == UNTANGLE:

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from rbfmuscle.implicit.extraction.band import BandGrid
 
 
+# What is no deeper in the cut than this share of a cell counts as out of it.
+OUT = 1e-5
+
+
 class CutBounds:
     """Answers of a cut at places where vertices were, from which lower bounds follow where they are now.
 
@@ -172,9 +176,12 @@ class Projector:
             if self.bounds is not None:
                 within = self.bounds.within(self.vertices[rows], rows, limit)
                 rows, limit = rows[within], limit[within]
+            if len(rows) == 0:
+                break
             distance, outward = self._cut(self.vertices[rows], limit)
             distance = distance - limit
-            rows, distance, outward = rows[distance < 0], distance[distance < 0], outward[distance < 0]
+            inside = distance < -OUT * self.spacing
+            rows, distance, outward = rows[inside], distance[inside], outward[inside]
             if len(rows) == 0:
                 break
             moved = max(moved, len(rows))

@@ -163,8 +163,7 @@ class BoneContacts:
         answers = [self._query(points, b, limit) for b in self.reached]
         answers += [neighbour.cut_with_gradient(points) for neighbour in self.cuts]
         for distance, direction in answers:
-            closer = distance < smallest
-            smallest[closer], gradient[closer] = distance[closer], direction[closer]
+            _closer_loop(distance, direction, smallest, gradient)
         return smallest, gradient
 
     def depth(self, points: Floats) -> float:
@@ -254,9 +253,8 @@ class BoneContacts:
         pose = self.poses[self.names[b]]
         distance, gradient = self.fields[b].distance_and_gradient(points, pose=pose, reach=reach)
         # On the medial surface the field has no direction; away from the bone's middle is as good as any.
-        middle = pose[:3, :3] @ self._middles[b] + pose[:3, 3]
         direction = np.empty_like(gradient)
-        _direction_loop(points, gradient, middle, direction)
+        _direction_loop(points, gradient, pose, self._middles[b], direction)
         return distance, direction
 
     def _near(self, points, free, b, reach):
@@ -270,8 +268,8 @@ class BoneContacts:
 
 
 @compiled(error_model="numpy")
-def _direction_loop(points, gradient, middle, out):
-    """Unit gradients; away from the middle where there is none."""
+def _direction_loop(points, gradient, pose, middle, out):
+    """Unit gradients; away from the bone's middle where there is none."""
     for i in range(len(points)):
         square = 0.0
         for a in range(3):
@@ -280,11 +278,23 @@ def _direction_loop(points, gradient, middle, out):
         if square < 1e-18:
             square = 0.0
             for a in range(3):
-                out[i, a] = points[i, a] - middle[a] + 1e-12
+                out[i, a] = points[i, a] - pose[a, 3] + 1e-12
+                for b in range(3):
+                    out[i, a] -= pose[a, b] * middle[b]
                 square += out[i, a] ** 2
         length = np.sqrt(square)
         for a in range(3):
             out[i, a] /= length
+
+
+@compiled(error_model="numpy")
+def _closer_loop(distance, direction, smallest, gradient):
+    """Take over the distances that are smaller, with their directions."""
+    for i in range(len(distance)):
+        if distance[i] < smallest[i]:
+            smallest[i] = distance[i]
+            for a in range(3):
+                gradient[i, a] = direction[i, a]
 
 
 @compiled(error_model="numpy")
