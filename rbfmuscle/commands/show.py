@@ -30,17 +30,17 @@ def export(
         Folder of the run.
     formats
         pvd, vtp, ply, stl, obj or glb: files for each frame; usd, animated-glb or vtkhdf: all frames as an
-        animation; sto: lengths and moment arms. Several may be given.
+        animation; html: a page that turns and scrubs it; sto: lengths and moment arms. Several may be given.
     output
         Folder to write to, DIR/export by default.
     units
-        m, cm or mm; the scene's by default (glb, animated-glb: m).
+        m, cm or mm; the scene's by default (glb, animated-glb, html: m).
     frames
         Of the written frames, as A:B:S.
     ascii
         VTP as text, as OpenSim reads it.
     up
-        z or y: the scene's axis that points up, for usd and animated-glb.
+        z or y: the scene's axis that points up, for usd, animated-glb and html.
     values
         stretch, activation or bone_distance of every vertex, in pvd, vtp, ply, usd and vtkhdf; several may be given.
     """

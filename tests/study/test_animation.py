@@ -268,6 +268,14 @@ class TestAnimatedGlb:
             export_run(folder, "animated-glb", output=tmp_path, units="mm")
 
 
+def test_a_page_of_a_run_says_frame_and_coordinates(folder, tmp_path):
+    (path,) = export_run(folder, "html", output=tmp_path)
+    text = path.read_text(encoding="utf-8")
+    assert path.suffix == ".html" and path.parent.name == "html" and '"frame 1: ' in text
+    with pytest.raises(UsageError, match="html is in metres by its standard"):
+        export_run(folder, "html", output=tmp_path, units="mm")
+
+
 def test_vtkhdf_holds_every_time(folder, changing, truth, tmp_path):
     hdf = pytest.importorskip("vtkmodules.vtkIOHDF")
     if not hasattr(hdf, "vtkHDFWriter"):

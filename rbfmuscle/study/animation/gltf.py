@@ -40,10 +40,15 @@ def write_animated_glb(path: Path, run: MovingRun) -> None:
     UsageError
         If a muscle's surface has other vertices in other frames.
     """
+    path.write_bytes(animated_glb(run))
+
+
+def animated_glb(run: MovingRun, name: str = "animated-glb") -> bytes:
+    """The whole of such a file; ``name`` is what messages call the format, the rest as for `write_animated_glb`."""
     changing = [muscle.name for muscle in run.muscles if not muscle.keeps_vertices]
     if changing:
         raise UsageError(
-            f"animated-glb needs surfaces that keep their vertices, those of {changing[0]!r} do not; "
+            f"{name} needs surfaces that keep their vertices, those of {changing[0]!r} do not; "
             "run with surface = 'material', or export to usd, vtkhdf or glb"
         )
     file = _File()
@@ -53,7 +58,7 @@ def write_animated_glb(path: Path, run: MovingRun) -> None:
     if run.up == "z":
         root["rotation"] = [float(x) for x in _TURN_Z_UP]
     scene = {"name": run.name, "nodes": [file.node(root)]}
-    path.write_bytes(file.content(scene))
+    return file.content(scene)
 
 
 def _add_bone(file: _File, bone: MovingBone) -> int:

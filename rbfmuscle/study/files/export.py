@@ -17,7 +17,9 @@ from rbfmuscle.study.show.appearance import BONE_COLOUR, muscle_colours
 from rbfmuscle.validation import SolveError, UsageError
 
 FORMATS = ("pvd", "vtp", "ply", "stl", "obj", "glb")
-ANIMATIONS = ("usd", "animated-glb", "vtkhdf")
+ANIMATIONS = ("usd", "animated-glb", "vtkhdf", "html")
+IN_METRES = ("glb", "animated-glb", "html")
+SUFFIX_OF = {"usd": ".usdc", "animated-glb": ".glb", "html": ".html"}
 TABLES = ("sto",)
 # Those that hold values of vertices.
 WITH_VALUES = ("pvd", "vtp", "ply", "usd", "vtkhdf")
@@ -43,18 +45,19 @@ def export_run(
     formats : str or list of str
         Of `FORMATS`, `ANIMATIONS` and `TABLES`. ``glb`` gives one file a frame with all muscles and bones as
         named, coloured nodes; the others of `FORMATS` one file a muscle (or bone) and frame. ``pvd`` is ``vtp`` and
-        a collection over the frames. ``usd`` and ``animated-glb`` give one file of all frames, ``vtkhdf`` one a
-        muscle and bone. ``sto`` gives lengths and moment arms for OpenSim and needs no surfaces.
+        a collection over the frames. ``usd``, ``animated-glb`` and ``html`` (a page that turns and scrubs) give one
+        file of all frames, ``vtkhdf`` one a muscle and bone. ``sto`` gives lengths and moment arms for OpenSim and
+        needs no surfaces.
     output : path, optional
         ``DIR/export`` where not given; each format has its own folder there.
     units : {"m", "cm", "mm"}, optional
-        The scene's unit where not given; metres for ``glb`` and ``animated-glb``, which know no other.
+        The scene's unit where not given; metres for ``glb``, ``animated-glb`` and ``html``, which know no other.
     frames : slice, optional
         Of the written frames; all where not given.
     ascii : bool
         VTP as plain numbers, as OpenSim reads them.
     up : {"z", "y"}
-        The axis of the scene that points up, for ``usd`` and ``animated-glb``.
+        The axis of the scene that points up, for ``usd``, ``animated-glb`` and ``html``.
     values : list of str, optional
         What to tell of every vertex of the muscles, of ``stretch``, ``activation`` and ``bone_distance``: in ``pvd``,
         ``vtp``, ``ply``, ``usd`` and ``vtkhdf``.
@@ -88,7 +91,7 @@ def export_run(
     written = []
     try:
         for name in formats:
-            wanted = units or ("m" if name in ("glb", "animated-glb") else saved.units)
+            wanted = units or ("m" if name in IN_METRES else saved.units)
             factor = MM_PER_UNIT[saved.units] / MM_PER_UNIT[wanted]
             if name == "sto":
                 written += export_lengths(saved, base / name, chosen, factor)
@@ -129,15 +132,25 @@ def _export_animation(saved, folder, name, frames, how):
     from rbfmuscle.study.animation.moving import read_moving
 
     unit, up, told = how
-    if name == "animated-glb" and unit != "m":
-        raise UsageError(f"animated-glb is in metres by its standard; leave out --units {unit}")
-    run = read_moving(saved, frames, unit=unit, up=up, values=None if name == "animated-glb" else told)
+    gltf = name in ("animated-glb", "html")
+    if gltf and unit != "m":
+        raise UsageError(f"{name} is in metres by its standard; leave out --units {unit}")
+    run = read_moving(saved, frames, unit=unit, up=up, values=None if gltf else told)
     folder.mkdir(parents=True, exist_ok=True)
     if name == "vtkhdf":
         from rbfmuscle.study.animation.vtkhdf import write_vtkhdf
 
         return write_vtkhdf(folder, run)
-    path = folder / f"{run.name}{'.usdc' if name == 'usd' else '.glb'}"
+    path = folder / f"{run.name}{SUFFIX_OF[name]}"
+    if name == "html":
+        from rbfmuscle.study.animation.page import write_animated_page
+        from rbfmuscle.study.show.render import coordinate_texts
+
+        told_of = {
+            entry["frame"]: ", ".join(coordinate_texts(saved.info, entry)) for entry in saved.info["frames"]
+        }
+        write_animated_page(path, run, [f"frame {frame}: {told_of[frame]}" for frame in frames])
+        return [path]
     if name == "usd":
         from rbfmuscle.study.animation.usd import write_usd as write
     else:
