@@ -67,7 +67,7 @@ class Spindle:
 
     def surface(self):
         """Outward triangles of the outer surface over the nodes, (m, 3)."""
-        a, b, c, d = self.solid.surface_quads().T
+        a, b, c, d = self.solid.surface_faces().T
         # scikit-fem numbers a facet's corners around it or crosswise; the longer pair is the diagonal.
         faces = []
         for corners in zip(a, b, c, d):

@@ -119,7 +119,7 @@ class Course:
     def _attach(self, rest, u):
         """Bone of each surface node by the phantom's own rule, -1 where free."""
         owner = np.full(len(rest), -1)
-        skin = np.unique(self.solid.surface_quads())
+        skin = np.unique(self.solid.surface_faces())
         first, last = ATTACHED_ENDS[MUSCLE]
         for index, (bone, place) in enumerate(zip(self.scene.bones, (u <= first, u >= last))):
             near = signed_distances(rest[skin], bone.mesh) <= ATTACHED_WITHIN

@@ -14,7 +14,7 @@ import time
 
 import numpy as np
 from fe_reference import DATA, distances
-from known_answers import EVEN, apart, bent, flexed, stretched, wrapped
+from known_answers import EVEN, bent, stretched, wrapped
 from peers.known_answers import observed_order
 
 from rbfmuscle.models import build_model
@@ -22,6 +22,7 @@ from rbfmuscle.run import simulate
 from rbfmuscle.sim.loop.simulate import simulate_frames
 from rbfmuscle.sim.scene.phantom import phantom_scene
 from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.study.measure.metrics import surface_distance
 
 NODES, CENTRES = (150, 300, 600, 1200), (150, 300, 600, 1200)
 INSIDE = 300
@@ -40,15 +41,34 @@ def solid():
         print(f"{name:28}" + "".join(f"{rms:7.2f} ({worst:4.1f})" for _, rms, worst, _ in found), flush=True)
 
 
-def centres():
-    """Neighbouring numbers of centres on the extensor: distance of their surfaces."""
-    for nodes in (0, INSIDE):
-        runs = [flexed({**EVEN, "centres": k, "inside": nodes, "resolution": 64}) for k in CENTRES]
-        for angle in (0, 1):
-            steps = [apart(a[angle], b[angle], same_mesh=False)[0] for a, b in itertools.pairwise(runs)]
-            order = observed_order(np.array(CENTRES[:-1]) ** -0.5, steps)
-            found = " / ".join(f"{step:.2f}" for step in steps)
-            print(f"inside {nodes}, {(30, 60)[angle]} degrees: {found}, order {order:.1f}", flush=True)
+def centres(path):
+    """Neighbouring numbers of centres: RMS distance of their surfaces at rest, 30 and 60 degrees of flexion.
+
+    Of the phantom's extensor, or of each muscle of a scene.
+    """
+    cases = [(phantom_scene(end=60.0, step=30.0), "extensor")]
+    if path is not None:
+        cases = [(Scene.load(path), muscle.name) for muscle in Scene.load(path).muscles]
+    for scene, name in cases:
+        scene.muscles = [scene.muscle(name)]
+        (coordinate,) = scene.motion.frames[-1]
+        scene.set_motion(ramp={coordinate: {"to": 60.0, "step": 30.0}})
+        for nodes in (0, INSIDE):
+            runs = []
+            for k in CENTRES:
+                settings = {"model.placement": "even", "model.resolution": 64}
+                part = scene.with_options({**settings, "model.centres": k, "model.inside": nodes})
+                runs.append(
+                    [f.surfaces[name] for f in simulate_frames(part, [build_model(part.muscles[0], part)])]
+                )
+            for frame, angle in enumerate((0, 30, 60)):
+                steps = [
+                    surface_distance(a[frame].vertices, a[frame].faces, b[frame].vertices, b[frame].faces)[0]
+                    for a, b in itertools.pairwise(runs)
+                ]
+                order = observed_order(np.array(CENTRES[:-1]) ** -0.5, steps)
+                found = " / ".join(f"{step:.2f}" for step in steps)
+                print(f"{name}, inside {nodes}, {angle} degrees: {found}, order {order:.1f}", flush=True)
 
 
 def closed_forms(part):
@@ -132,10 +152,10 @@ def main():
     for part in given.parts:
         if part in ("stretched", "bent", "wrapped"):
             closed_forms(part)
-        elif part in ("ripple", "time"):
-            {"ripple": ripple, "time": times}[part](given.scene)
+        elif part == "solid":
+            solid()
         else:
-            {"solid": solid, "centres": centres}[part]()
+            {"centres": centres, "ripple": ripple, "time": times}[part](given.scene)
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ _VALUE = re.compile(r"<!-- value: ([\w]+)\.([\w]+) -->.*?<!-- end -->", re.S)
 # Name: what measures it. DATA stands for the folder of the real hip.
 COMMANDS = {
     "headline": ["benchmarks/headline.py", "DATA/hip/flexion.toml", "-o", "OUT"],
+    "real_solids": ["benchmarks/real_solids.py", "compare", "gluteus_maximus", "rectus_femoris", "-o", "OUT"],
 }
 
 
@@ -74,7 +75,19 @@ def headline_table(facts):
     return lines
 
 
-TABLES = {"headline": headline_table}
+def real_solids_table(facts):
+    """Distance of the models to finite elements on real muscles: a column a muscle and pose."""
+    rows = facts["rows"]
+    muscles = list(next(iter(rows.values())))
+    head = [f"{name.replace('_', ' ')}, {angle}°" for name in muscles for angle in (30, 60)]
+    lines = [f"| model | {' | '.join(head)} |", "|---" * (len(head) + 1) + "|"]
+    for title, found in rows.items():
+        cells = [f"{rms:.2f} ({worst:.1f})" for name in muscles for rms, worst in found[name]]
+        lines.append(f"| {title} | {' | '.join(cells)} |")
+    return lines
+
+
+TABLES = {"headline": headline_table, "real_solids": real_solids_table}
 
 
 def span(rows, key):

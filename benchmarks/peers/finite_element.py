@@ -1,8 +1,9 @@
 """A volumetric finite-element solid, nearly incompressible, quasi-static, against bones: a reference for models.
 
-Eight-node bricks with a constant pressure each (mean dilatation: Simo, Taylor and Pister 1985), neo-Hookean,
+Eight-node bricks, or tetrahedra of ten nodes, with a constant pressure each (mean dilatation: Simo, Taylor and Pister
+1985), neo-Hookean,
 
-    W = mu/2 (J^(-2/3) tr(F'F) - 3) + kappa/2 (Jm - 1)^2,   Jm = mean of J over the brick,
+    W = mu/2 (J^(-2/3) tr(F'F) - 3) + kappa/2 (Jm - 1)^2,   Jm = mean of J over the cell,
 
 with fibres, where a `peers.fibre_material.FibreMaterial` is given, whose energy along the stretch |F a| is added;
 solved by Newton's method with a line search on the energy. Bones push by a penalty on the surface's quadrature
@@ -13,14 +14,17 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
-from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
 
+from peers.dissection import Dissection
 from rbfmuscle.validation import MissingPartError, SolveError
 
 MOST_ITERATIONS = 60
 # A step that would lower the energy by a smaller share than this changes nothing that is looked at; facets of bones
 # have edges, at which the forces themselves need not settle.
 ENERGY_TOLERANCE = 2e-6
+# Least stiffness of a point where the true ones are not all positive [shear modulus].
+LEAST_STIFF = 0.01
 
 
 def _skfem():
@@ -48,8 +52,8 @@ class HexSolid:
     Parameters
     ----------
     points : (n, 3) ndarray
-        Nodes at rest [scene unit].
-    bricks : (m, 8) ndarray of int
+        Corners at rest [scene unit].
+    cells : (m, 8) ndarray of int
         In scikit-fem's order, as `brick_grid` gives them.
     shear : float
         Shear modulus; the unit of stress.
@@ -57,9 +61,14 @@ class HexSolid:
         Poisson's ratio; 0.495 makes the bulk modulus a hundred times the shear modulus.
     fibres : FibreMaterial, optional
     stiffer : (m,) ndarray, optional
-        Factor of the shear and bulk moduli of each brick.
+        Factor of the shear and bulk moduli of each cell.
     penalty : float
         Contact pressure for each unit of depth [shear modulus / scene unit].
+
+    Attributes
+    ----------
+    rest : (N, 3) ndarray
+        Nodes, of which the first are the corners.
 
     Raises
     ------
@@ -67,17 +76,23 @@ class HexSolid:
         If scikit-fem is not installed.
     """
 
-    def __init__(self, points, bricks, *, shear=1.0, poisson=0.495, penalty=30.0, fibres=None, stiffer=None):
+    kind, integrated = (
+        ("MeshHex", "ElementHex1"),
+        3,
+    )  # in scikit-fem, and the degree that is integrated exactly
+
+    def __init__(self, points, cells, *, shear=1.0, poisson=0.495, penalty=30.0, fibres=None, stiffer=None):
         skfem = _skfem()
         self.shear, self.penalty = shear, penalty
         self.fibres, self.activation = fibres, 0.0
-        self.stiffer = np.ones(len(bricks)) if stiffer is None else np.asarray(stiffer, dtype=float)
+        self.stiffer = np.ones(len(cells)) if stiffer is None else np.asarray(stiffer, dtype=float)
         self.bulk = 2.0 * shear * (1.0 + poisson) / (3.0 * (1.0 - 2.0 * poisson))
-        mesh = skfem.MeshHex(np.ascontiguousarray(points.T), np.ascontiguousarray(bricks.T))
-        self.mesh, self.rest = mesh, np.asarray(points, dtype=float)
-        element = skfem.ElementHex1()
-        basis = skfem.Basis(mesh, element, intorder=3)
-        # (brick, quadrature point, node, direction): derivatives of the shape functions at rest.
+        mesh, element = (getattr(skfem, name) for name in self.kind)
+        mesh = mesh(np.ascontiguousarray(points.T), np.ascontiguousarray(cells.T))
+        element = element()
+        basis = skfem.Basis(mesh, element, intorder=self.integrated)
+        self.mesh, self.rest = mesh, np.ascontiguousarray(basis.doflocs.T)
+        # (cell, quadrature point, node, direction): derivatives of the shape functions at rest.
         self.slopes = np.stack([np.moveaxis(b[0].grad, 0, -1) for b in basis.basis], axis=2)
         self.weights, self.nodes = basis.dx, basis.element_dofs.T
         self.facets = mesh.boundary_facets()
@@ -85,11 +100,13 @@ class HexSolid:
         self.side_shape = np.stack(
             [np.broadcast_to(np.asarray(b[0]), side.dx.shape) for b in side.basis], axis=-1
         )
-        self.side_weights, self.side_nodes = side.dx, side.element_dofs.T
+        self.side_weights, self.side_nodes = np.abs(side.dx), side.element_dofs.T
+        self.side_cells = mesh.f2t[0, self.facets]
         self.obstacles = ()
+        self.order, self.places = None, None
 
-    def surface_quads(self):
-        """Corner nodes of the boundary, (k, 4), in scikit-fem's order."""
+    def surface_faces(self):
+        """Corner nodes of the boundary, (k, 4) or (k, 3), in scikit-fem's order."""
         return self.mesh.facets[:, self.facets].T
 
     def set_obstacles(self, obstacles, attached):
@@ -103,10 +120,11 @@ class HexSolid:
             Nodes on bones; faces with any of them take no contact.
         """
         self.obstacles = obstacles
-        self.touching = ~attached[self.surface_quads()].any(axis=1)
+        on_face = np.abs(self.side_shape).max(axis=1) > 1e-9
+        self.touching = ~(attached[self.side_nodes] & on_face).any(axis=1)
 
     def volume(self, displacement):
-        """Volume of the deformed bricks [scene unit cubed]."""
+        """Volume of the deformed cells [scene unit cubed]."""
         return float((np.linalg.det(self._gradient(displacement)) * self.weights).sum())
 
     def solve(self, displacement, held, wanted, *, tolerance=1e-6, settled=ENERGY_TOLERANCE):
@@ -131,7 +149,7 @@ class HexSolid:
         Raises
         ------
         SolveError
-            If Newton's method does not get there, for instance because bricks turn inside out.
+            If Newton's method does not get there, for instance because cells turn inside out.
         """
         held = np.broadcast_to(held.reshape(len(held), -1), displacement.shape)
         free = ~held.ravel()
@@ -143,41 +161,40 @@ class HexSolid:
             residual = float(np.abs(force[free]).max() / scale)
             if not first.any() and residual < tolerance:
                 return SolidState(u, iteration, residual)
-            step = self._direction(force, matrix, free, first)
+            step = self._direction(u, force, matrix, free, first)
             if not first.any() and abs(force @ step) < settled * self.energy(u):
                 return SolidState(u, iteration, residual)
             u = self._walk(u, step.reshape(-1, 3), force, moving=first.any())
             first = np.zeros_like(first)
         raise SolveError(f"no equilibrium after {MOST_ITERATIONS} iterations, residual {residual:.1e}")
 
-    def _direction(self, force, matrix, free, first):
-        """Newton's step; where the stiffness is not positive, with a share of its diagonal added."""
+    def _direction(self, u, force, matrix, free, first):
+        """Newton's step; where the stiffness is not positive, with that of each cell made so."""
         step = first.copy()
-        right = -(force + matrix @ first)[free]
-        inner = matrix[free][:, free].tocsc()
-        added = 0.0
-        for _ in range(8):
+        for positive in (False, True):
+            if positive:
+                matrix = self._assemble(u, positive=True)[1]
+            inner = matrix[free][:, free]
             try:
-                shifted = inner + sparse.diags_array(added * np.abs(inner.diagonal())) if added else inner
-                factor = splu(
-                    shifted.tocsc(),
-                    permc_spec="MMD_AT_PLUS_A",
-                    diag_pivot_thresh=0.0,
-                    options={"SymmetricMode": True},
-                )
-                step[free] = factor.solve(right)
-            except RuntimeError:  # singular
-                step[free] = np.nan
+                factor = self._elimination(free, inner).factor(inner)
+            except np.linalg.LinAlgError:
+                continue
+            step[free] = factor.solve(-(force + matrix @ first)[free])
             if np.isfinite(step).all() and (first.any() or force @ step < 0.0):
                 return step
-            added = max(10 * added, 1e-4)
-        raise SolveError("the stiffness of the bricks is singular, take smaller steps")
+        raise SolveError("the stiffness of the cells is singular, take smaller steps")
+
+    def _elimination(self, free, inner):
+        """Order in which the free unknowns are eliminated, found once."""
+        if self.order is None or (self.order[0] != free).any():
+            self.order = free.copy(), Dissection(np.repeat(self.rest, 3, axis=0)[free], inner)
+        return self.order[1]
 
     def _walk(self, u, step, force, *, moving):
         """Longest of the halved steps that lowers the energy; one that moves held nodes must only stay valid."""
         if moving:
             if not np.isfinite(self.energy(u + step)):
-                raise SolveError("bricks turn inside out, take smaller steps")
+                raise SolveError("cells turn inside out, take smaller steps")
             return u + step
         here, slope = self.energy(u), float(force @ step.ravel())
         share = 1.0
@@ -188,7 +205,7 @@ class HexSolid:
         raise SolveError("no step lowers the energy, take smaller steps")
 
     def energy(self, displacement):
-        """Elastic and contact energy; infinite where a brick is turned inside out."""
+        """Elastic and contact energy; infinite where a cell is turned inside out."""
         f = self._gradient(displacement)
         j = np.linalg.det(f)
         if j.min() <= 0.0:
@@ -205,12 +222,12 @@ class HexSolid:
         return float(total)
 
     def _along(self, f):
-        """F a (brick, point, 3) and its length, the stretch of the fibres."""
+        """F a (cell, point, 3) and its length, the stretch of the fibres."""
         along = np.einsum("eqij,ej->eqi", f, self.fibres.direction)
         return along, np.linalg.norm(along, axis=-1)
 
     def _fibre_stress(self, f):
-        """Stress (brick, point, 3, 3) of the fibres, and its derivative by F (brick, point, 9, 9)."""
+        """Stress (cell, point, 3, 3) of the fibres, and its derivative by F (brick, point, 9, 9)."""
         along, stretch = self._along(f)
         _, slope, bend = self.fibres.evaluate(stretch, self.activation)
         a = self.fibres.direction
@@ -231,24 +248,33 @@ class HexSolid:
         gap, direction = self.obstacles(points.reshape(-1, 3))
         return gap.reshape(points.shape[:2]), direction.reshape(points.shape)
 
-    def _assemble(self, displacement):
-        """Forces (3 n,) and their derivative, a sparse (3 n, 3 n) matrix."""
-        rows = [self._elastic(displacement)]
+    def _assemble(self, displacement, *, positive=False):
+        """Forces (3 n,) and their derivative, a sparse (3 n, 3 n) matrix, or one near it that is positive."""
+        local, stiffness = self._elastic(displacement, positive)
         if self.obstacles:
-            rows.append(self._contact(displacement))
-        size = 3 * len(self.rest)
-        force = np.zeros(size)
-        entries = []
-        for nodes, local, stiffness in rows:
-            index = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1)
-            np.add.at(force, index, local)
-            here = np.broadcast_to(index[:, :, None], stiffness.shape).ravel()
-            there = np.broadcast_to(index[:, None, :], stiffness.shape).ravel()
-            entries.append((stiffness.ravel(), here, there))
-        value, here, there = (np.concatenate(parts) for parts in zip(*entries))
-        return force, sparse.coo_matrix((value, (here, there)), shape=(size, size)).tocsr()
+            # A face's nodes are those of its cell.
+            cells, pushed, hard = self._contact(displacement)
+            np.add.at(local, cells, pushed)
+            np.add.at(stiffness, cells, hard)
+        index, pattern, place = self._pattern()
+        force = np.bincount(index.ravel(), local.ravel(), 3 * len(self.rest))
+        data = np.bincount(place, stiffness.ravel(), len(pattern.data))
+        return force, sparse.csr_array((data, pattern.indices, pattern.indptr), shape=pattern.shape)
 
-    def _elastic(self, displacement):
+    def _pattern(self):
+        """Unknowns of each cell, the matrix's pattern, and where each entry of the cells' stiffnesses goes in it."""
+        if self.places is None:
+            index = (3 * self.nodes[:, :, None] + np.arange(3)).reshape(len(self.nodes), -1)
+            size, width = 3 * len(self.rest), index.shape[1]
+            key = np.repeat(index, width, axis=1).ravel() * size + np.tile(index, width).ravel()
+            known, place = np.unique(key, return_inverse=True)
+            pattern = sparse.csr_array(
+                (np.ones(len(known)), (known // size, known % size)), shape=(size, size)
+            )
+            self.places = index, pattern, place.ravel()
+        return self.places
+
+    def _elastic(self, displacement, positive):
         f = self._gradient(displacement)
         j = np.linalg.det(f)
         inverse = np.swapaxes(np.linalg.inv(f), -1, -2)  # F^-T
@@ -264,20 +290,25 @@ class HexSolid:
         if self.fibres is not None:
             pull, bend = self._fibre_stress(f)
             stress, tangent = stress + pull, tangent + bend
+        if positive:
+            value, vector = np.linalg.eigh(tangent)
+            tangent = (vector * np.maximum(value, LEAST_STIFF * self.shear)[..., None, :]) @ np.swapaxes(
+                vector, -1, -2
+            )
         weighted = self.slopes * self.weights[..., None, None]
-        count = len(self.nodes)
-        force = np.einsum("eqij,eqnj->eni", stress, weighted, optimize=True).reshape(count, 24)
-        stiffness = np.zeros((count, 24, 24))
+        count, size = len(self.nodes), 3 * self.nodes.shape[1]
+        force = np.einsum("eqij,eqnj->eni", stress, weighted, optimize=True).reshape(count, size)
+        stiffness = np.zeros((count, size, size))
         for q in range(self.slopes.shape[1]):
-            b = np.einsum("enj,ik->eijnk", self.slopes[:, q], np.eye(3)).reshape(count, 9, 24)
+            b = np.einsum("enj,ik->eijnk", self.slopes[:, q], np.eye(3)).reshape(count, 9, size)
             stiffness += np.swapaxes(b, 1, 2) @ (tangent[:, q] * self.weights[:, q, None, None]) @ b
-        mean = np.einsum("eqij,eqnj->eni", cofactor, weighted, optimize=True).reshape(count, 24)
+        mean = np.einsum("eqij,eqnj->eni", cofactor, weighted, optimize=True).reshape(count, size)
         stiffness += (bulk / volume)[:, None, None] * mean[:, :, None] * mean[:, None, :]
-        return self.nodes, force, stiffness
+        return force, stiffness
 
     @staticmethod
     def _tangent(f, inverse, factor, trace, pressure):
-        """Derivative of the stress by F at fixed mean dilatation, (brick, point, 9, 9)."""
+        """Derivative of the stress by F at fixed mean dilatation, (cell, point, 9, 9)."""
         count = f.shape[:2]
         g, h = f.reshape(*count, 9), inverse.reshape(*count, 9)
         crossed = np.einsum("eqil,eqkj->eqijkl", inverse, inverse, optimize=True).reshape(*count, 9, 9)
@@ -292,10 +323,38 @@ class HexSolid:
         shape = self.side_shape[self.touching]
         depth = np.minimum(gap, 0.0) * self.side_weights[self.touching] * self.penalty
         active = (gap < 0.0) * self.side_weights[self.touching] * self.penalty
-        pushed = np.einsum("fqn,fqi->fqni", shape, direction).reshape(*shape.shape[:2], 24)
+        pushed = np.einsum("fqn,fqi->fqni", shape, direction).reshape(*shape.shape[:2], -1)
         force = np.einsum("fq,fqa->fa", depth, pushed)
         stiffness = np.einsum("fq,fqa,fqb->fab", active, pushed, pushed, optimize=True)
-        return self.side_nodes[self.touching], force, stiffness
+        return self.side_cells[self.touching], force, stiffness
+
+
+class TetSolid(HexSolid):
+    """A solid of tetrahedra of ten nodes, edges straight at rest; ``cells`` (m, 4)."""
+
+    kind, integrated = ("MeshTet", "ElementTetP2"), 2
+
+    def skin(self):
+        """Numbers of the nodes of the boundary, those of its edges' middles among them."""
+        on_face = np.abs(self.side_shape).max(axis=1) > 1e-9
+        return np.unique(self.side_nodes[on_face])
+
+    def at(self, points):
+        """Nodes (n, 10) and their shares (n, 10) at points of the solid at rest, or just outside of it."""
+        corners = self.rest[self.nodes[:, :4]]
+        inverse = np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2))
+        _, near = cKDTree(corners.mean(axis=1)).query(points, k=min(NEAR, len(corners)))
+        part = np.einsum("nkij,nkj->nki", inverse[near], points[:, None] - corners[near, 0])
+        shares = np.concatenate([1.0 - part.sum(axis=-1, keepdims=True), part], axis=-1)
+        row, best = np.arange(len(points)), np.argmax(shares.min(axis=-1), axis=1)
+        b = shares[row, best]
+        middles = [4.0 * b[:, i] * b[:, j] for i, j in EDGES]
+        return self.nodes[near[row, best]], np.stack([*(b * (2.0 * b - 1.0)).T, *middles], axis=1)
+
+
+# Cells around a point that are asked whether they hold it; corners of a tetrahedron's edges, in scikit-fem's order.
+NEAR = 60
+EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
 
 
 def brick_grid(cells):

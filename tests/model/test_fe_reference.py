@@ -93,6 +93,95 @@ class TestSolid:
         assert solid.volume(state.displacement) == pytest.approx(4000, rel=5e-3)
 
 
+def cut_block(half=(5.0, 5.0, 20.0), cells=(2, 2, 5), **options):
+    skfem = pytest.importorskip("skfem")
+    from peers.finite_element import TetSolid
+
+    mesh = skfem.MeshTet.init_tensor(*(np.linspace(-h, h, n + 1) for h, n in zip(half, cells)))
+    return TetSolid(mesh.p.T, mesh.t.T, **options)
+
+
+class TestTetrahedra:
+    @pytest.mark.parametrize("stretch", [0.8, 1.4])
+    def test_uniaxial_stretch_is_the_closed_form(self, stretch):
+        solid = cut_block()
+        x = solid.rest
+        held = np.zeros(x.shape, dtype=bool)
+        held[np.abs(x[:, 2]) > 19.99, 2] = True
+        corner = np.argmin(x.sum(axis=1))
+        held[corner] = True
+        held[np.argmin(np.linalg.norm(x - x[corner] - [10, 0, 0], axis=1)), 1] = True
+        side, u = side_stretch(stretch, solid), np.zeros_like(x)
+        for part in np.linspace(1.0, stretch, 5)[1:]:
+            wanted = u.copy()
+            wanted[:, 2] = (part - 1) * x[:, 2]
+            u = solid.solve(u, held, wanted, tolerance=1e-9).displacement
+        exact = (x - x[corner]) * [side, side, stretch]
+        # As for bricks: the energy's tolerance ends Newton's steps.
+        assert np.abs((x + u) - (x + u)[corner] - exact).max() < 1e-3
+
+    def test_places_within_are_those_of_a_quadratic_motion(self):
+        solid = cut_block()
+        rng = np.random.default_rng(1)
+        bend = rng.normal(size=(3, 3, 3))
+
+        def motion(x):
+            return np.einsum("ni,nj,ijk->nk", x, x, bend)
+
+        points = rng.uniform(-1, 1, (200, 3)) * [5, 5, 20]
+        nodes, shares = solid.at(points)
+        np.testing.assert_allclose(
+            np.einsum("nk,nki->ni", shares, motion(solid.rest)[nodes]), motion(points), atol=1e-9
+        )
+
+    def test_stiffness_made_positive_is_so_where_the_true_one_is_not(self):
+        solid = cut_block()
+        squeezed = solid.rest * [0.0, 0.0, -0.3]
+        true, made = (solid._assemble(squeezed, positive=way)[1].toarray() for way in (False, True))
+        assert np.linalg.eigvalsh(true)[0] < -1e-3
+        assert np.linalg.eigvalsh(made)[0] > -1e-9 * np.abs(made).max()
+
+    def test_skin_is_the_boundary(self):
+        solid = cut_block()
+        on = (np.abs(np.abs(solid.rest) - [5, 5, 20]) < 1e-9).any(axis=1)
+        np.testing.assert_array_equal(solid.skin(), np.flatnonzero(on))
+
+
+class TestDissection:
+    @staticmethod
+    def _problem(size=9):
+        import scipy.sparse as sparse
+
+        line = sparse.diags_array([-1.0, 2.1, -1.0], offsets=[-1, 0, 1], shape=(size, size))
+        one = sparse.eye_array(size)
+        matrix = sum(
+            sparse.kron(sparse.kron(a, b), c)
+            for a, b, c in ((line, one, one), (one, line, one), (one, one, line))
+        )
+        points = np.stack(np.meshgrid(*[np.arange(size)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        return points.astype(float), sparse.csr_array(matrix)
+
+    def test_solves_what_a_dense_solver_does(self):
+        from peers.dissection import Dissection
+
+        points, matrix = self._problem()
+        order = Dissection(points, matrix)
+        assert len(order.fronts) > 10
+        right = np.random.default_rng(2).normal(size=len(points))
+        np.testing.assert_allclose(
+            order.factor(matrix).solve(right), np.linalg.solve(matrix.toarray(), right)
+        )
+
+    def test_matrix_that_is_not_positive_is_told(self):
+        import scipy.sparse as sparse
+        from peers.dissection import Dissection
+
+        points, matrix = self._problem()
+        order = Dissection(points, matrix)
+        with pytest.raises(np.linalg.LinAlgError):
+            order.factor(matrix - 1.0 * sparse.eye_array(len(points)))
+
+
 class TestReference:
     def test_grid_holds_the_tube_and_its_surface(self, study):
         pytest.importorskip("skfem")
