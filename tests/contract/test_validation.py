@@ -1,0 +1,138 @@
+"""Checks that every public function shares: what passes is returned whole, what does not is told with its place."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rbfmuscle import validation
+from rbfmuscle.validation import (
+    MeshError,
+    NotFiniteError,
+    check_mesh,
+    check_points,
+    check_positive,
+    check_values,
+    check_vectors,
+    did_you_mean,
+    is_file,
+    shown,
+    shown_path,
+)
+
+CODES = {
+    "RBFMuscleError": 1, "UsageError": 2, "SceneError": 3, "MeshError": 4, "SolveError": 5, "LimitExceededError": 6,
+    "MissingPartError": 7,
+}  # fmt: skip
+TETRAHEDRON = np.vstack([np.zeros(3), np.eye(3)]), [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
+
+
+def test_exit_codes_are_those_promised():
+    errors = {name: kind for name, kind in vars(validation).items() if hasattr(kind, "exit_code")}
+    assert {name: kind.exit_code for name, kind in errors.items()} == CODES
+
+
+@given(st.text(max_size=200), st.integers(16, 90))
+def test_what_is_shown_is_whole_or_its_beginning_and_end(text, longest):
+    found = shown(text, longest=longest)
+    if len(text) <= longest:
+        assert found == text
+    else:
+        begin, end = found[: longest - 15], found[-10:]
+        assert found == f"{begin} ... {end}"
+        assert text.startswith(begin) and text.endswith(end) and len(found) == longest
+
+
+def test_values_are_shown_as_they_are_written_and_texts_plainly():
+    assert shown("plain") == "plain" and shown(["a", 1]) == "['a', 1]"
+    assert len(shown("x" * 81)) == 80 and shown("x" * 80) == "x" * 80
+    assert shown(10**5000) == "a int too long to show"
+    assert shown_path("/" + "p" * 399) == "/" + "p" * 399 and len(shown_path("p" * 401)) == 400
+
+
+def test_points_come_back_as_contiguous_doubles():
+    points = check_points(np.asfortranarray(np.arange(12, dtype=np.int32).reshape(4, 3)))
+    assert points.dtype == np.float64 and points.flags.c_contiguous
+    np.testing.assert_array_equal(points, np.arange(12).reshape(4, 3))
+    assert check_points(np.zeros((0, 3))).shape == (0, 3)
+
+
+@pytest.mark.parametrize("shape", [(3,), (2, 2), (2, 4), (1, 3, 3), (2, 3, 1)])
+def test_points_of_another_shape_are_refused(shape):
+    with pytest.raises(ValueError, match=r"dots must have shape \(n, 3\), got \("):
+        check_points(np.zeros(shape), name="dots")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_first_row_that_is_not_finite_is_named(value):
+    points = np.zeros((5, 3))
+    points[3, 1] = points[4, 0] = value
+    with pytest.raises(NotFiniteError, match="points must be finite, row 3 is"):
+        check_points(points)
+    with pytest.raises(NotFiniteError, match="values must be finite, row 3 is"):
+        check_values(points[:, 1], 5)
+
+
+def test_one_vector_or_value_a_point():
+    assert check_vectors(np.ones((2, 3)), 2).shape == (2, 3) and check_values([1, 2], 2).tolist() == [
+        1.0,
+        2.0,
+    ]
+    with pytest.raises(ValueError, match=r"one row a point \(3\), got 2"):
+        check_vectors(np.ones((2, 3)), 3)
+    for wrong in ([1.0], [[1.0, 2.0]], 1.0):
+        with pytest.raises(ValueError, match=r"must have shape \(2,\)"):
+            check_values(wrong, 2)
+    with pytest.raises(ValueError, match="must be an array of numbers"):
+        check_values(["a", "b"], 2)
+
+
+def test_positive_numbers():
+    assert check_positive("0.5", name="x") == 0.5
+    for wrong in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="x must be a positive number"):
+            check_positive(wrong, name="x")
+
+
+def test_mesh_comes_back_in_kind():
+    vertices, faces = check_mesh(*TETRAHEDRON)
+    assert vertices.dtype == np.float64 and faces.dtype == np.int64
+    assert faces.tolist() == TETRAHEDRON[1]
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "words"),
+    [
+        (TETRAHEDRON[0], [[0, 1, 4]], "point outside its 4 vertices"),
+        (TETRAHEDRON[0], [[0, 1, -1]], "point outside its 4 vertices"),
+        (TETRAHEDRON[0], [[0, 1, 2, 3]], r"faces of rod must have shape \(m, 3\), got \(1, 4\)"),
+        (TETRAHEDRON[0], [0, 1, 2], r"faces of rod must have shape \(m, 3\), got \(3,\)"),
+        (TETRAHEDRON[0], [[[0, 1, 2]] * 3], r"faces of rod must have shape \(m, 3\), got \(1, 3, 3\)"),
+        (TETRAHEDRON[0], np.zeros((0, 3), int), r"rod is empty \(4 vertices, 0 faces\)"),
+        (np.zeros((0, 3)), [[0, 1, 2]], r"rod is empty \(0 vertices, 1 faces\)"),
+        (np.zeros((4, 2)), TETRAHEDRON[1], r"vertices of rod must have shape \(n, 3\)"),
+    ],
+)
+def test_meshes_that_are_none_are_refused(vertices, faces, words):
+    with pytest.raises(MeshError, match=words):
+        check_mesh(vertices, faces, name="rod")
+
+
+def test_nearest_name_or_all_names():
+    assert did_you_mean("GAUSIAN", ["cubic", "gaussian"]) == "did you mean 'gaussian'?"
+    assert did_you_mean("zzz", ["cubic", "linear"]) == "known: cubic, linear"
+    assert did_you_mean("zzz", []) == "there are none"
+    for count, more in ((40, ""), (41, " and 1 more"), (43, " and 3 more")):
+        names = [f"n{k:02d}" for k in range(count)]
+        assert did_you_mean("zzz", names) == "known: " + ", ".join(names[:40]) + more
+
+
+def test_only_regular_files_are_files(tmp_path):
+    (tmp_path / "a").write_text("")
+    assert is_file(tmp_path / "a")
+    assert (
+        not is_file(tmp_path)
+        and not is_file(tmp_path / "b")
+        and not is_file("a\0b")
+        and not is_file("/dev/null")
+    )
