@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from itertools import pairwise
@@ -16,7 +16,18 @@ LEAST_SHARE = 1024
 
 @lru_cache(maxsize=4)
 def _pool(workers: int) -> Any:
-    return ThreadPoolExecutor(workers, thread_name_prefix="rbfmuscle")
+    # What runs in these threads has one of them: a loop inside that splits itself stays serial.
+    return ThreadPoolExecutor(
+        workers, thread_name_prefix="rbfmuscle", initializer=numba.set_num_threads, initargs=(1,)
+    )
+
+
+def each(act: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
+    """``[act(item) for item in items]``, on at most ``numba.get_num_threads()`` threads."""
+    workers = min(numba.get_num_threads(), len(items))
+    if workers < 2:
+        return [act(item) for item in items]
+    return list(_pool(workers).map(act, items))
 
 
 def in_chunks(count: int, work: Callable[..., Any], *, least: int = LEAST_SHARE) -> None:

@@ -7,8 +7,9 @@ import trimesh
 from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, joint, muscle, scene, sphere
 
 from rbfmuscle.sim.loop.carried_surface import CarriedSurface
-from rbfmuscle.sim.loop.simulate import simulate_frames
+from rbfmuscle.sim.loop.simulate import FrameLoop, simulate_frames
 from rbfmuscle.sim.loop.sliding import sliding_pairs
+from rbfmuscle.sim.loop.substeps import SubSteps
 from rbfmuscle.sim.scene.motion import rotation_about
 from rbfmuscle.sim.scene.options import SlidingOptions
 from rbfmuscle.validation import SceneError
@@ -115,6 +116,22 @@ def test_pressed_muscles_do_not_overlap():
     frames, parts = _run(PRESS, SlidingOptions())
     assert _overlap(parts) < 0.1
     assert "time_sliding" in frames[-1].times["upper"]
+
+
+def test_each_muscle_takes_its_own_sub_steps_and_all_meet_at_the_frame():
+    path = [{"hinge.press": np.radians(angle)} for angle in (0, 5)]
+    made, fields = _neighbours([{"press": 5}], sliding=SlidingOptions())
+    parts = {m.name: ToyMuscle(m, made, sweeps=4, reach=2.0) for m in made.muscles}
+    with FrameLoop(made, parts, fields=fields) as loop:
+        # As for a muscle that cannot meet the arm: nothing that moves is its own.
+        loop._together.cuts["lower"] = SubSteps(made, made.muscles[0])
+        for coordinates in path:
+            work = loop.advance(coordinates).work
+    assert work["lower"].substeps == 1 < work["upper"].substeps
+    assert _overlap(parts) < 0.1
+    _, fine = _run([{"press": a} for a in np.linspace(0, 5, 11)], SlidingOptions())
+    for name in parts:
+        assert np.sqrt(np.square(parts[name].x - fine[name].x).sum(axis=1).mean()) < 0.1
 
 
 def test_pairs_say_how_they_overlap_and_come_apart():

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from rbfmuscle.study.files.export import export_run
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.fibre_field import FibreField, attachment_points
 from rbfmuscle.study.measure.fibre_lines import grow_fibres, resampled, spread
-from rbfmuscle.study.measure.fibre_study import FibreBundle, line_lengths
+from rbfmuscle.study.measure.fibre_study import FibreBundle, FibreStudy, line_lengths
 from rbfmuscle.validation import SolveError, UsageError
 
 LENGTH, RADIUS = 60.0, 8.0
@@ -189,6 +190,22 @@ class TestCarried:
         np.testing.assert_allclose(
             lines.points.reshape(-1, 3), trimesh.transform_points(made.rest.reshape(-1, 3), move), atol=1e-4
         )
+
+    def test_bones_that_move_as_one_are_one_end(self):
+        scene = arm_scene(fibres=True)
+        muscle = scene.muscles[0]
+        scene.add_bone("cuff", trimesh.creation.box((4, 4, 4)))
+        scene.add_joint("clasp", "upper", "cuff", (-20, 0, 0), {"twist": (1, 0, 0)})
+        x = muscle.mesh.vertices[:, 0]
+        ends = {"upper": x < -22, "cuff": (x > -22) & (x < -17), "fore": x > 19}
+        muscle.attachments = [
+            replace(muscle.attachments[0], bone=bone, vertices=np.flatnonzero(held))
+            for bone, held in ends.items()
+        ]
+        carried = {muscle.name: (np.array(muscle.mesh.vertices), np.array(muscle.mesh.faces))}
+        first, last = FibreStudy(scene, carried).bundles[muscle.name].holders
+        assert set(first) <= {"upper", "cuff"}
+        assert set(last) == {"fore"}
 
     def test_ends_go_with_their_bones(self, bundle):
         scene, made = bundle

@@ -16,13 +16,19 @@ from rbfmuscle.study.measure.centreline import Centreline, slice_operator, split
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.measure.metrics import (
     MetricsRecorder,
-    count_components,
     edge_strain,
     moment_arms,
     surface_distance,
 )
 from rbfmuscle.study.measure.occupancy import OccupancyGrid
-from rbfmuscle.study.measure.penetration import BoneProbe, bone_depth, faces_near, surface_depth
+from rbfmuscle.study.measure.penetration import (
+    BoneProbe,
+    bone_depth,
+    bones_about,
+    faces_near,
+    surface_depth,
+)
+from rbfmuscle.study.measure.topology import SurfaceForm, count_components
 
 EYE = np.eye(4)
 
@@ -147,8 +153,25 @@ class TestPenetration:
         v, f = arrays(blob)
         expected = max(0, -igl.signed_distance(np.array(moved.vertices), v, f)[0].min())
         assert bone_depth(v, f, probes, {"bone": pose}) == pytest.approx(expected, rel=1e-9)
+        known = MeshDistance(v, f)
+        assert bone_depth(v, f, probes, {"bone": pose}, distance=known) == pytest.approx(expected, rel=1e-9)
         expected = np.maximum(0, -igl.signed_distance(v, *arrays(moved))[0])
         np.testing.assert_allclose(surface_depth(v, probes, {"bone": pose}), expected, atol=1e-9)
+
+    def test_bones_elsewhere_are_not_asked(self):
+        rng = np.random.default_rng(8)
+        probes = [BoneProbe(f"bone {k}", trimesh.creation.box((30, 4, 8))) for k in range(40)]
+        poses = {}
+        for probe in probes:
+            poses[probe.name] = turned(rng.uniform(0, 3), rng.normal(size=3))
+            poses[probe.name][:3, 3] = rng.uniform(-25, 25, 3)
+        ball = trimesh.creation.icosphere(subdivisions=3, radius=7.0)
+        near = bones_about(*ball.bounds, probes, poses)
+        assert 0 < len(near) < len(probes)
+        for probe in probes:
+            moved = trimesh.Trimesh(probe.vertices, probe.faces).apply_transform(poses[probe.name])
+            inside = moved.contains(np.array(ball.vertices)).any()
+            assert probe in near or not inside
 
     def test_deep_points_look_beyond_their_neighbourhood(self):
         ball = trimesh.creation.icosphere(subdivisions=5, radius=50.0)
@@ -173,6 +196,20 @@ class TestMeshMeasures:
         two = np.vstack([faces, faces + len(vertices)])
         assert count_components(len(vertices), faces) == 1
         assert count_components(2 * len(vertices) + 3, two) == 2
+
+    def test_form_is_looked_for_again_where_it_can_have_changed(self):
+        ball = trimesh.creation.icosphere(subdivisions=2)
+        one = ModelSurface(np.array(ball.vertices), np.array(ball.faces))
+        folded = ModelSurface(one.vertices * np.where(one.vertices[:, :1] > 0.3, -1.0, 1.0), one.faces)
+        torus = trimesh.creation.torus(3.0, 1.0)
+        other = ModelSurface(np.array(torus.vertices), np.array(torus.faces))
+        moved = ModelSurface(folded.vertices + 5.0, one.faces, origin=(folded, np.eye(4)))
+        form = SurfaceForm()
+        found = [form.measure(surface) for surface in (one, folded, moved, other)]
+        assert [m["euler"] for m in found] == [2, 2, 2, 0]
+        assert found[0]["self_crossing"] == 0 < found[1]["self_crossing"]
+        assert found[2] == found[1]
+        assert found[3]["self_crossing"] == 0
 
     def test_strain_of_a_stretch(self):
         vertices, faces = arrays(trimesh.creation.icosphere(subdivisions=2))

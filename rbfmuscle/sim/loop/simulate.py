@@ -1,6 +1,5 @@
 """The frame loop: any muscle model against any bones."""
 
-import itertools
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
@@ -14,6 +13,7 @@ from rbfmuscle.sim.loop.from_rest import Trail
 from rbfmuscle.sim.loop.overlap import settle_rest
 from rbfmuscle.sim.loop.stepper import MuscleStepper, TimedDrawing
 from rbfmuscle.sim.loop.substeps import PoseMemo, SubSteps
+from rbfmuscle.sim.loop.together import Together
 from rbfmuscle.sim.loop.workers import Workers
 from rbfmuscle.sim.plan.reach import build_fields, reached_bones
 from rbfmuscle.sim.scene.motion import completed, rest_coordinates
@@ -95,6 +95,7 @@ class FrameLoop:
             with self.clocked(), self.workers.one_thread_each():
                 self.workers.each(settle_rest, self.steppers)
                 self._sliding = _sliding(scene, self.steppers)
+                self._together = self._side_by_side()
             self._links = self._from_rest() if scene.contact.from_rest else None
         except BaseException:
             self.close()
@@ -259,6 +260,15 @@ class FrameLoop:
             stepper.trail = Trail(stepper, rest, idle)
         return {} if self._sliding is None else self._sliding.snapshot()
 
+    def _side_by_side(self) -> Together | None:
+        """What brings muscles that slide through a frame; those that contract take every sub-step."""
+        if self._sliding is None:
+            return None
+        contract = {muscle.name for muscle in self.scene.muscles if muscle.contraction is not None}
+        carriers = [stepper.carrier for stepper in self.steppers if stepper.name not in contract]
+        cuts = {carrier.stepper.name: self._cut_for(carrier) for carrier in carriers if carrier is not None}
+        return Together(self.steppers, self._sliding, cuts)
+
     def _path_to(self, coordinates: Mapping[str, float]) -> dict[str, tuple[list[dict], list[dict]]]:
         """For each muscle coordinates of its sub-steps to the next frame, from where it is on, and activations."""
         # Whatever a motion chooses to move starts at rest, which for most coordinates is zero.
@@ -275,15 +285,15 @@ class FrameLoop:
             name: ([here, *split(cut, here, self.here)], []) for name, cut in self._own_sub_steps.items()
         }
         if len(found) < len(self.steppers):
-            # Muscles that slide wait for each other, so all take what the fastest needs.
+            # Muscles that slide see each other on the way, at stops of the fastest.
             stops = [here, *split(self._sub_steps, here, self.here)]
             shared = self.activations.refine(self._next_index - 1, stops)
             found.update({s.name: shared for s in self.steppers if s.name not in found})
         return found
 
     def _solve(self, paths: dict[str, tuple[list[dict], list[dict]]]) -> None:
-        """Bring all muscles through sub-steps; those that slide take each together."""
-        if self._sliding is None:
+        """Bring all muscles through sub-steps; those that slide see each other there."""
+        if self._together is None:
             self.workers.each(lambda stepper: stepper.advance(*paths[stepper.name]), self.steppers)
             return
         stops, activations = paths[self.steppers[0].name]
@@ -291,16 +301,7 @@ class FrameLoop:
             for stepper in self.steppers:
                 stepper.trail.rewind(stops[:1])
             self._sliding.restore(self._links)
-        for before, after, activation in itertools.zip_longest(stops[:-1], stops[1:], activations):
-            for stepper in self.steppers:
-                stepper.excite(activation)
-            self.workers.each(lambda stepper: self._begin(stepper, before, after), self.steppers)  # noqa: B023
-            self.workers.each(self._sliding.update, self.steppers)
-            self.workers.each(MuscleStepper.finish, self.steppers)
-
-    def _begin(self, stepper: MuscleStepper, before: dict, after: dict) -> None:
-        stepper.begin(before, after)
-        self._sliding.refresh(stepper)
+        self._together.go(stops, activations, self.workers, all_stops=self._links is not None)
 
     def _drawings(self) -> list[TimedDrawing]:
         """What draws all muscles as they are now."""

@@ -27,7 +27,7 @@ from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
 from rbfmuscle.study.experiment.kernel_choice import Bootstrap, Recommendation, mark_unfit, recommend
 from rbfmuscle.study.experiment.sweep_table import pareto_front
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
-from rbfmuscle.study.measure.metrics import count_components
+from rbfmuscle.study.measure.topology import count_components
 from rbfmuscle.study.measure.worst_places import worst_places
 from rbfmuscle.validation import NumericalWarning, UsageError, check_mesh
 

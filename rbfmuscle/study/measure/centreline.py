@@ -150,26 +150,35 @@ def slice_operator(vertices: Floats, faces: Integers, field: Floats, levels: Flo
     (k, n) scipy.sparse.csr_matrix
         Rows sum to one.
     """
-    rows = [_slice_row(vertices, faces, field, level) for level in levels]
-    return sparse.vstack(rows).tocsr()
-
-
-def _slice_row(vertices, faces, field, level):
-    above = field[faces] > level
-    crossed = faces[above.any(axis=1) & ~above.all(axis=1)]
-    above = field[crossed] > level
+    levels = np.asarray(levels, dtype=float)
+    at_corner = field[faces]
+    face, row = _crossings(at_corner, levels)
+    level = levels[row]
+    crossed, above = faces[face], at_corner[face] > level[:, None]
     # The corner that is alone on its side: both crossing points lie on its edges.
     lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
-    row = np.arange(len(crossed))
-    a, b, c = (crossed[row, (lone + k) % 3] for k in range(3))
+    each = np.arange(len(crossed))
+    a, b, c = (crossed[each, (lone + k) % 3] for k in range(3))
     s, t = (level - field[a]) / (field[b] - field[a]), (level - field[a]) / (field[c] - field[a])
     p = vertices[a] + s[:, None] * (vertices[b] - vertices[a])
     q = vertices[a] + t[:, None] * (vertices[c] - vertices[a])
     share = np.linalg.norm(p - q, axis=1)
-    share = share / share.sum() / 2
+    share = share / np.bincount(row, share, minlength=len(levels))[row] / 2
     values = np.concatenate([share * (2 - s - t), share * s, share * t])
-    columns = np.concatenate([a, b, c])
-    return sparse.csr_matrix((values, (np.zeros(len(columns), int), columns)), shape=(1, len(vertices)))
+    where = np.tile(row, 3), np.concatenate([a, b, c])
+    return sparse.csr_matrix((values, where), shape=(len(levels), len(vertices)))
+
+
+def _crossings(at_corner, levels):
+    """Face and level of every isoline in every face: levels not below a face's least value and below its greatest."""
+    order = np.argsort(levels, kind="stable")
+    first, last = (
+        np.searchsorted(levels[order], end) for end in (at_corner.min(axis=1), at_corner.max(axis=1))
+    )
+    count = last - first
+    face = np.repeat(np.arange(len(at_corner)), count)
+    place = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count) + first[face]
+    return face, order[place]
 
 
 def _sides(muscle, ends, vertices):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -35,15 +36,25 @@ class ContractionStudy:
     joints : list of Joint
     vertices, faces : (n, 3) and (m, 3) ndarray
         The model's carried mesh at rest [scene unit].
+    moving : collection of str, optional
+        Names of the joints that move, as for `split_ends`; all where not given.
     """
 
-    def __init__(self, muscle: Any, joints: list[Any], vertices: Floats, faces: Integers) -> None:
+    def __init__(
+        self,
+        muscle: Any,
+        joints: list[Any],
+        vertices: Floats,
+        faces: Integers,
+        *,
+        moving: Collection[str] | None = None,
+    ) -> None:
         self.name = muscle.name
         mesh = np.asarray(muscle.mesh.vertices, dtype=np.float64)
         if muscle.fibres:
             lines = np.array([resampled(np.asarray(line, dtype=float), SEGMENTS) for line in muscle.fibres])
         else:
-            groups = split_ends(muscle, joints)
+            groups = split_ends(muscle, joints, moving)
             ends = [np.concatenate([np.asarray(a.vertices) for a in group]) for group in groups]
             lines = grow_fibres(mesh, np.asarray(muscle.mesh.faces), ends, count=COUNT, segments=SEGMENTS)
         lines = _kept_inside(lines, vertices, faces)
@@ -53,7 +64,7 @@ class ContractionStudy:
         # A segment is belly where neither end is tendon; a line of tendon alone counts for nothing.
         self.belly = ~(tendon[:, 1:] | tendon[:, :-1])
         self.rest_lengths = _segments(self.lines(vertices))
-        self.ends = end_groups(muscle, joints)
+        self.ends = end_groups(muscle, joints, moving)
 
     def lines(self, vertices: NDArray[np.float64]) -> NDArray[np.float64]:
         """The fibres (n, k, 3) that a carried mesh with these vertices holds."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -9,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.mean_value import mean_value_weights
-from rbfmuscle.study.measure.centreline import split_ends
+from rbfmuscle.study.measure.centreline import moving_joints, split_ends
 from rbfmuscle.study.measure.fibre_lines import grow_fibres
 from rbfmuscle.validation import MeshError
 
@@ -52,6 +53,8 @@ class FibreBundle:
     vertices, faces : (n, 3) and (m, 3) ndarray
         The carried mesh at rest [scene unit].
     count, segments : int
+    moving : collection of str, optional
+        Names of the joints that move, as for `split_ends`; all where not given.
 
     Raises
     ------
@@ -68,9 +71,10 @@ class FibreBundle:
         *,
         count: int = 100,
         segments: int = 15,
+        moving: Collection[str] | None = None,
     ) -> None:
         mesh = np.asarray(muscle.mesh.vertices, dtype=np.float64)
-        groups = split_ends(muscle, joints)
+        groups = split_ends(muscle, joints, moving)
         ends = [np.concatenate([np.asarray(a.vertices) for a in group]) for group in groups]
         self.rest = grow_fibres(mesh, np.asarray(muscle.mesh.faces), ends, count=count, segments=segments)
         self.rest_lengths = line_lengths(self.rest)
@@ -120,9 +124,15 @@ class FibreStudy:
 
     def __init__(self, scene: Scene, carried: dict[str, Any]) -> None:
         options: Any = scene.output.fibres
+        moving = moving_joints(scene)
         self.bundles = {
             muscle.name: FibreBundle(
-                muscle, scene.joints, *carried[muscle.name], count=options.count, segments=options.segments
+                muscle,
+                scene.joints,
+                *carried[muscle.name],
+                count=options.count,
+                segments=options.segments,
+                moving=moving,
             )
             for muscle in scene.muscles
         }

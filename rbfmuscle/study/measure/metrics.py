@@ -7,17 +7,16 @@ from collections import defaultdict
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import scipy.sparse as sparse
-from scipy.sparse.csgraph import connected_components
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
+from rbfmuscle.geometry.threads import each
 from rbfmuscle.sim.joints.skeleton import all_coordinates
 from rbfmuscle.sim.scene.motion import shown_value
 from rbfmuscle.study.measure.centreline import Centreline, moving_joints
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.measure.penetration import BoneProbe, bone_depth, surface_depth
-from rbfmuscle.study.measure.topology import euler_characteristic, self_crossing
+from rbfmuscle.study.measure.topology import SurfaceForm
 
 if TYPE_CHECKING:
     from rbfmuscle.sim.loop.frame import Frame
@@ -128,8 +127,9 @@ class MetricsRecorder:
         coordinate, angle = self._leading(frame)
         at_rest = all(np.abs(pose - np.eye(4)).max() < 1e-9 for pose in frame.poses.values())
         rows = []
-        for name, tracker in self.trackers.items():
-            found = tracker.measure(frame, self.probes, at_rest)
+        trackers = list(self.trackers.values())
+        measured = each(lambda tracker: tracker.measure(frame, self.probes, at_rest), trackers)
+        for name, found in zip(self.trackers, measured):
             rows += [self._row(frame, coordinate, angle, name, q, v) for q, v in found.items()]
         if self.motion.times is not None:
             now = self.motion.times[frame.index]
@@ -220,6 +220,7 @@ class _Tracker:
         self.arms = {}
         self.scene = scene
         self.offset = None
+        self.form = SurfaceForm()
 
     def state(self) -> tuple[Any, ...]:
         return self.length, self.rest_measured, self.offset, list(self.arms.items())
@@ -275,27 +276,26 @@ class _Tracker:
     def _of_surface(self, surface, frame, probes, first_rest):
         vertices, faces = surface.vertices, np.asarray(surface.faces)
         volume = mesh_volume(vertices, faces)
+        distance = MeshDistance(vertices, faces)
         depth = surface_depth(vertices, probes, frame.poses)
         found = {
             "volume": volume,
             "volume_error": volume / self.rest_volume - 1.0,
             "penetration_max": depth.max(),
             "penetration_fraction": np.mean(depth > 0.0),
-            "bone_penetration_max": bone_depth(vertices, faces, probes, frame.poses),
-            "components": count_components(len(vertices), faces),
-            "euler": euler_characteristic(faces),
+            "bone_penetration_max": bone_depth(vertices, faces, probes, frame.poses, distance=distance),
+            **self.form.measure(surface),
         }
-        found["self_crossing"], found["self_crossing_area"] = self_crossing(vertices, faces)
-        found["flicker_rms"], found["flicker_max"] = self._flicker(surface, frame.carried[self.name][0])
+        found["flicker_rms"], found["flicker_max"] = self._flicker(distance, frame.carried[self.name][0])
         if first_rest:
             rms, worst = surface_distance(vertices, faces, self.mesh.vertices, self.mesh.faces)
             found.update(rest_error_rms=rms, rest_error_max=worst)
         return found
 
-    def _flicker(self, surface, carried):
+    def _flicker(self, distance, carried):
         """Change of the signed distances of the carried mesh's vertices to the surface since the last frame."""
         before = self.offset
-        self.offset = MeshDistance(surface.vertices, surface.faces).signed(carried)
+        self.offset = distance.signed(carried)
         change = self.offset - before if before is not None else np.zeros(1)
         return float(np.sqrt(np.mean(change**2))), float(np.abs(change).max())
 
@@ -305,20 +305,12 @@ def _contraction(muscle, scene, vertices, faces):
         return None
     from rbfmuscle.study.measure.contraction import ContractionStudy
 
-    return ContractionStudy(muscle, scene.joints, vertices, faces)
+    return ContractionStudy(muscle, scene.joints, vertices, faces, moving=moving_joints(scene))
 
 
 def unit_text(kind: str, units: str) -> str:
     """Unit of a quantity as written in tables: ``length`` and ``volume`` take the scene's unit."""
     return {"length": units, "area": f"{units}^2", "volume": f"{units}^3"}.get(kind, kind)
-
-
-def count_components(count: int, faces: Integers) -> int:
-    """Number of connected pieces among ``count`` vertices; vertices that no face uses do not count."""
-    ends = np.concatenate([faces[:, :2], faces[:, 1:]])
-    graph = sparse.coo_matrix((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), shape=(count, count))
-    _, label = connected_components(graph, directed=False)
-    return len(np.unique(label[faces[:, 0]]))
 
 
 def edge_strain(vertices: Floats, edges: Integers, rest_lengths: Floats) -> float:

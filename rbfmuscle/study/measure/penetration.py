@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from threading import Lock
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,6 +34,7 @@ class BoneProbe:
         self.closed = bool(mesh.is_watertight)
         self._distance: MeshDistance | None = None
         self._grid: OccupancyGrid | None = None
+        self._making = Lock()
 
     def depth(self, points: Floats) -> Floats:
         """How deep points lie inside the bone.
@@ -51,13 +53,19 @@ class BoneProbe:
         near = np.flatnonzero(np.all((points > self.bounds[0]) & (points < self.bounds[1]), axis=1))
         if len(near) == 0:
             return out
-        if self._distance is None:
-            self._distance = MeshDistance(self.vertices, self.faces, closed=self.closed)
-            self._grid = OccupancyGrid(self.vertices, self.faces) if self.closed else None
-        if self._grid is not None:
-            near = near[self._grid.candidates(points[near])]
-        out[near] = self._distance.depth(points[near])
+        distance, grid = self._prepared()
+        if grid is not None:
+            near = near[grid.candidates(points[near])]
+        out[near] = distance.depth(points[near])
         return out
+
+    def _prepared(self) -> tuple[MeshDistance, OccupancyGrid | None]:
+        """What answers, made when a point first comes near, by whichever thread brings it."""
+        with self._making:
+            if self._distance is None:
+                self._grid = OccupancyGrid(self.vertices, self.faces) if self.closed else None
+                self._distance = MeshDistance(self.vertices, self.faces, closed=self.closed)
+            return self._distance, self._grid
 
 
 def bone_coordinates(points: Floats, pose: Floats) -> Floats:
@@ -81,12 +89,35 @@ def surface_depth(vertices: Floats, probes: list[BoneProbe], poses: dict[str, Fl
         The greatest depth over all bones; 0 where a vertex is in none.
     """
     out = np.zeros(len(vertices))
-    for probe in probes:
+    if len(vertices) == 0:
+        return out
+    for probe in bones_about(vertices.min(axis=0), vertices.max(axis=0), probes, poses):
         np.maximum(out, probe.depth(bone_coordinates(vertices, poses[probe.name])), out=out)
     return out
 
 
-def bone_depth(vertices: Floats, faces: Integers, probes: list[BoneProbe], poses: dict[str, Floats]) -> float:
+def bones_about(
+    low: Floats, high: Floats, probes: list[BoneProbe], poses: dict[str, Floats]
+) -> list[BoneProbe]:
+    """The bones whose boxes, where they are now, meet the box from ``low`` to ``high`` (3,)."""
+    if not probes:
+        return []
+    placed = np.array([poses[probe.name] for probe in probes])
+    ends = np.array([probe.bounds for probe in probes])
+    middle = np.einsum("bij,bj->bi", placed[:, :3, :3], ends.mean(axis=1)) + placed[:, :3, 3]
+    half = np.einsum("bij,bj->bi", np.abs(placed[:, :3, :3]), 0.5 * (ends[:, 1] - ends[:, 0]))
+    met = np.all((middle - half < high) & (middle + half > low), axis=1)
+    return [probe for probe, near in zip(probes, met) if near]
+
+
+def bone_depth(
+    vertices: Floats,
+    faces: Integers,
+    probes: list[BoneProbe],
+    poses: dict[str, Floats],
+    *,
+    distance: MeshDistance | None = None,
+) -> float:
     """Greatest depth of any bone vertex inside a muscle's closed surface.
 
     Parameters
@@ -95,6 +126,8 @@ def bone_depth(vertices: Floats, faces: Integers, probes: list[BoneProbe], poses
         Closed, outward surface in world coordinates.
     probes : list of BoneProbe
     poses : dict of str to (4, 4) ndarray
+    distance : MeshDistance, optional
+        Of the surface, where it is at hand.
 
     Returns
     -------
@@ -103,7 +136,7 @@ def bone_depth(vertices: Floats, faces: Integers, probes: list[BoneProbe], poses
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     near = []
-    for probe in probes:
+    for probe in bones_about(low, high, probes, poses):
         pose = poses[probe.name]
         moved = probe.vertices @ pose[:3, :3].T + pose[:3, 3]
         near.append(moved[np.all((moved > low) & (moved < high), axis=1)])
@@ -111,6 +144,8 @@ def bone_depth(vertices: Floats, faces: Integers, probes: list[BoneProbe], poses
     if len(points) == 0:
         return 0.0
     points = points[OccupancyGrid(vertices, faces).candidates(points)]
+    if distance is not None:
+        return float(distance.depth(points).max(initial=0.0))
     return _depth_nearby(vertices, faces, points) if len(points) else 0.0
 
 

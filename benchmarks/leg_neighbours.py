@@ -1,0 +1,217 @@
+"""Muscles that slide on each other over a squat of the whole leg: overlap, gaps, cost, order.
+
+    python benchmarks/leg_neighbours.py cost order pairs [--frames 0:37:6] [--model rbf] [--muscles A,B]
+    python benchmarks/leg_neighbours.py pairs --without
+
+``pairs`` runs ``data/leg/squat.toml`` with ``[sliding]`` through its whole motion and measures the shown surfaces of
+the chosen frames by exact distances, which the solver does not use: how deep a vertex of one muscle lies in another,
+and for vertices nearer than the threshold at rest how much farther they are now (RMS by pair). Both are listed by pair,
+the worst first. ``--without`` measures the same run without sliding. ``cost`` compares processor time of a frame with
+surfaces, one thread, with and without sliding in turn; ``order`` solves with the file's order of muscles and with its
+reverse, and compares the surfaces.
+"""
+
+import argparse
+import itertools
+import time
+
+import numba
+import numpy as np
+from leg_joints import leg_folder
+
+from rbfmuscle.models import build_models
+from rbfmuscle.sim.loop.simulate import FrameLoop
+from rbfmuscle.sim.plan.reach import build_fields, reached_bones
+from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.study.measure.mesh_distance import MeshDistance
+
+THRESHOLD = 2.0  # mm: nearer at rest is touching, as `[sliding]` has it
+FIRST = 2  # frames gone to before the cost is measured
+
+
+class Bench:
+    """The scene with and without sliding; models and bones' fields are built once for all runs."""
+
+    def __init__(self, arguments):
+        scene = Scene.load(leg_folder() / arguments.scene)
+        asked = dict(pair.split("=") for pair in arguments.set)
+        self.scenes = {
+            True: scene.with_options({"sliding.threshold": THRESHOLD, **asked}, model=arguments.model),
+            False: scene.with_options({}, model=arguments.model),
+        }
+        self.scenes[False].sliding = None
+        named = arguments.muscles.split(",") if arguments.muscles else [m.name for m in scene.muscles]
+        for one in self.scenes.values():
+            one.muscles = [muscle for muscle in one.muscles if muscle.name in named]
+        self.models = build_models(self.scenes[True])
+        self.rest = [model.snapshot() for model in self.models]
+        self.fields = build_fields(self.scenes[True], reached_bones(self.scenes[True]))
+
+    def loop(self, *, sliding=True, reverse=False):
+        """A loop at rest, to be closed."""
+        for model, state in zip(self.models, self.rest):
+            model.restore(state)
+        scene, models = self.scenes[sliding].copy(), list(self.models)
+        if reverse:
+            scene.muscles, models = scene.muscles[::-1], models[::-1]
+        return FrameLoop(scene, models, fields=self.fields)
+
+    @property
+    def path(self):
+        return self.scenes[True].motion.frames
+
+
+def chosen(text, count):
+    parts = [int(p) if p else None for p in text.split(":")]
+    return list(range(count))[slice(*parts)] if len(parts) > 1 else list(range(parts[0]))
+
+
+class Touching:
+    """Vertices of the surfaces at rest that touch another muscle, by ordered pair of names."""
+
+    def __init__(self, surfaces):
+        self.found = {}
+        for one, other in itertools.permutations(surfaces, 2):
+            near = _near(surfaces[one], surfaces[other], THRESHOLD)
+            if len(near):
+                distance = MeshDistance(*surfaces[other]).signed(surfaces[one][0][near])
+                touch = distance < THRESHOLD
+                if touch.any():
+                    self.found[one, other] = near[touch], np.maximum(distance[touch], 0.0)
+
+    def opened(self, surfaces):
+        """RMS of how much farther these are, by pair of sorted names."""
+        squares = {}
+        for (one, other), (index, rest) in self.found.items():
+            now = MeshDistance(*surfaces[other]).signed(surfaces[one][0][index])
+            pair = tuple(sorted((one, other)))
+            squares.setdefault(pair, []).append(np.maximum(now - rest, 0.0) ** 2)
+        return {pair: float(np.sqrt(np.concatenate(all_).mean())) for pair, all_ in squares.items()}
+
+
+def overlaps(surfaces):
+    """Deepest vertex of one in the other, by pair of sorted names; those that meet."""
+    found = {}
+    for one, other in itertools.permutations(surfaces, 2):
+        near = _near(surfaces[one], surfaces[other], 0.0)
+        if len(near):
+            depth = float(MeshDistance(*surfaces[other]).depth(surfaces[one][0][near]).max(initial=0.0))
+            pair = tuple(sorted((one, other)))
+            found[pair] = max(depth, found.get(pair, 0.0))
+    return found
+
+
+def _near(one, other, reach):
+    low, high = other[0].min(axis=0) - reach, other[0].max(axis=0) + reach
+    return np.flatnonzero(np.all((one[0] > low) & (one[0] < high), axis=1))
+
+
+def _surfaces(frame):
+    return {name: (surface.vertices, np.asarray(surface.faces)) for name, surface in frame.surfaces.items()}
+
+
+def pairs(bench, arguments):
+    wanted = {0, *chosen(arguments.frames, len(bench.path))}
+    worst, touching = {}, None
+    with bench.loop(sliding=not arguments.without) as loop:
+        for k, coordinates in enumerate(bench.path[: max(wanted) + 1]):
+            if k not in wanted:
+                loop.skip(coordinates)
+                continue
+            frame = loop.advance(coordinates)
+            surfaces = _surfaces(frame)
+            touching = touching or Touching(surfaces)
+            deep, opened = overlaps(surfaces), touching.opened(surfaces)
+            for place, found in ((0, deep), (2, opened)):
+                for pair, value in found.items():
+                    row = worst.setdefault(pair, [0.0, 0, 0.0, 0])
+                    if value > row[place]:
+                        row[place : place + 2] = value, k
+            _tell_frame(k, frame, deep, opened)
+    print(f"{len(touching.found) // 2} pairs touch at rest, {len(worst)} pairs meet")
+    print(f"{'pair':60} overlap at  opened at")
+    for pair, (deep, at, wide, there) in sorted(
+        worst.items(), key=lambda row: -max(row[1][0] / 0.3, row[1][2])
+    ):
+        if deep > 0.01 or wide > 0.1:
+            print(f"{' and '.join(pair):60} {deep:7.3f} {at:2d} {wide:7.3f} {there:2d}")
+    deep, wide = (np.array([row[k] for row in worst.values()]) for k in (0, 2))
+    print(f"overlap: {(deep > 0.3).sum()} of {len(deep)} pairs beyond 0.3 mm, worst {deep.max():.3f}")
+    print(
+        f"opened: {(wide > 1.0).sum()} of {len(wide)} pairs beyond 1 mm RMS, worst {wide.max():.3f}",
+        flush=True,
+    )
+
+
+def _tell_frame(k, frame, deep, opened):
+    lost = sum(event.count for event in frame.events if event.action in ("unresolved", "reported"))
+    print(f"frame {k:2d}: unresolved {lost}", end="")
+    for found, name in ((deep, "overlap"), (opened, "opened")):
+        listed = sorted(found, key=found.get)[:-4:-1]
+        print(f"; {name} " + ", ".join(f"{found[p]:.2f} ({' + '.join(p)})" for p in listed), end="")
+    print(flush=True)
+
+
+def cost(bench, arguments):
+    numba.set_num_threads(1)
+    found = {False: [], True: []}
+    for _ in range(arguments.rounds):
+        for sliding, seconds in found.items():
+            with bench.loop(sliding=sliding) as loop:
+                for coordinates in bench.path[:FIRST]:
+                    loop.advance(coordinates)
+                for coordinates in bench.path[FIRST : FIRST + arguments.measured]:
+                    start = time.process_time()
+                    frame = loop.advance(coordinates)
+                    seconds.append(time.process_time() - start)
+    without, together = (np.array(found[sliding]) for sliding in (False, True))
+    stages = {}
+    for times in frame.times.values():
+        for name, seconds in times.items():
+            stages[name] = stages.get(name, 0.0) + seconds
+    print(
+        f"without {1e3 * np.median(without):.0f} ms, with {1e3 * np.median(together):.0f} ms of processor time a frame"
+    )
+    print(f"cost of neighbours: {np.median(together / without):.2f} times")
+    print("last frame, wall: " + ", ".join(f"{n} {1e3 * s:.0f} ms" for n, s in stages.items()))
+    steps = [work.substeps for work in frame.work.values()]
+    print(f"sub-steps in it: {min(steps)} to {max(steps)}, mean {np.mean(steps):.1f}", flush=True)
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+
+
+def order(bench, arguments):
+    shapes = []
+    for reverse in (False, True):
+        with bench.loop(reverse=reverse) as loop:
+            for coordinates in bench.path[: arguments.until]:
+                loop.skip(coordinates)
+            shapes.append(_surfaces(loop.advance(bench.path[arguments.until])))
+    apart = {}
+    for name, one in shapes[0].items():
+        other = shapes[1][name]
+        ways = [MeshDistance(*b).unsigned(a[0]) for a, b in ((one, other), (other, one))]
+        apart[name] = float(np.sqrt(np.mean([np.mean(way**2) for way in ways])))
+    worst = max(apart, key=apart.get)
+    print(f"order reversed, frame {arguments.until}: worst {apart[worst]:.2e} mm RMS ({worst})", flush=True)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("what", nargs="+", choices=("pairs", "cost", "order"))
+    parser.add_argument("--scene", default="squat.toml")
+    parser.add_argument("--model", default=None)
+    parser.add_argument("--muscles", default="", help="some of them, by comma")
+    parser.add_argument("--frames", default="0:1000:6", help="of pairs: A:B:S")
+    parser.add_argument("--measured", type=int, default=4, help="frames whose cost is measured")
+    parser.add_argument("--rounds", type=int, default=2, help="of the cost")
+    parser.add_argument("--until", type=int, default=4, help="frame at which orders are compared")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of the scene")
+    parser.add_argument("--without", action="store_true", help="pairs of a run without sliding")
+    arguments = parser.parse_args()
+    bench = Bench(arguments)
+    for what in arguments.what:
+        {"pairs": pairs, "cost": cost, "order": order}[what](bench, arguments)
+
+
+if __name__ == "__main__":
+    main()
