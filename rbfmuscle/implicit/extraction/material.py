@@ -28,8 +28,9 @@ FARTHEST = 1.0
 UNSURE, SURE = 0.3, 0.7
 # What is within this many mean edges of the bones may come to lie on them.
 NEAR_CUT = 1.5
-# Rounds of smoothing for triangles that cross others, and how the smoothed region grows with them.
-UNTANGLE, GROWTH = 24, 4
+# Rounds of smoothing for triangles that cross others, and how the smoothed region grows with them; as the way back to
+# the volume can make others cross, all of it is done up to so many times.
+UNTANGLE, GROWTH, AGAIN = 24, 4, 8
 # Rounds before them in which what crosses is taken back to where the material is, by this share of the way.
 RETURN, BACK = 12, 0.15
 # What the material takes so many mean edges deep into a bone, or a bone sent so
@@ -235,19 +236,35 @@ class _Fitting:
         self.gather()
         if obstacles:
             self.push_off(obstacles, 0.01 * self.edge, axes)
-        smoothed, crossing = self.untangle()
-        if volume is not None:
-            if self.field is None:
-                # What was smoothed or filled stays put otherwise, and that may be all of it.
-                self.projector.move_along(vertex_normals(self.projector.vertices, self.mesh.faces))
-                self.projector.lift()
-            self.meet(volume)
+        smoothed, crossing = self.settle(volume)
         vertices, faces = self.projector.vertices, self.mesh.faces
         check_finite(vertices, name="fitted vertices")
         return FittedMesh(
             vertices, faces, self.level, mesh_volume(vertices, faces), 1, 0, self.edge,
             self.evaluations, int(self.left.sum()), smoothed, crossing,
         )  # fmt: skip
+
+    def settle(self, volume: float | None) -> tuple[int, int]:
+        """The volume met and nothing smoothed since; vertices that were, and triangles that cross all the same."""
+        smoothed = 0
+        for _ in range(AGAIN):
+            self.fill(volume)
+            touched = self.untangle()
+            if touched == 0:
+                return smoothed, 0
+            smoothed = max(smoothed, touched)
+        self.fill(volume)
+        return smoothed, int(self.mesh.tree.crossing(self.projector.vertices).sum())
+
+    def fill(self, volume: float | None) -> None:
+        """The volume, where one is to be met."""
+        if volume is None:
+            return
+        if self.field is None:
+            # What was smoothed or filled stays put otherwise, and that may be all of it.
+            self.projector.move_along(vertex_normals(self.projector.vertices, self.mesh.faces))
+            self.projector.lift()
+        self.meet(volume)
 
     def meet(self, volume: float) -> None:
         """The volume to the last digit; what its last step drove into a bone is brought out and stays there."""
@@ -304,18 +321,17 @@ class _Fitting:
             points = points[self.field(points) - self.level < CHORD * grid.spacing]
         self.projector.push_off(faces, points, grid, tolerance)
 
-    def untangle(self) -> tuple[int, int]:
-        """Smooth what crosses itself; numbers of vertices that were smoothed and of triangles that still cross."""
+    def untangle(self) -> int:
+        """Smooth what crosses itself; return how many vertices were moved for it."""
         projector, faces = self.projector, self.mesh.faces
-        touched, crossing = np.zeros(len(self.carried), dtype=np.bool_), 0
+        touched = np.zeros(len(self.carried), dtype=np.bool_)
         among: Booleans | None = None
         for turn in range(0 if self.field is None else -RETURN, UNTANGLE + 1):
             # What was not moved does not begin to cross; where nothing crosses, a quick look is enough.
             if among is None and not self.mesh.tree.crossing(projector.vertices, by_sheets=True).any():
                 break
             bad = self.mesh.tree.crossing(projector.vertices, among)
-            crossing = int(bad.sum())
-            if crossing == 0 or turn == UNTANGLE:
+            if turn == UNTANGLE or not bad.any():
                 break
             marked = np.zeros(len(self.carried), dtype=np.bool_)
             marked[faces[bad].ravel()] = True
@@ -326,7 +342,7 @@ class _Fitting:
                 self._return(np.flatnonzero(region))
             else:
                 self._smooth(np.flatnonzero(region), self.field is not None and turn < UNTANGLE // 2)
-        return int(touched.sum()), crossing
+        return int(touched.sum())
 
     def _return(self, rows: Integers) -> None:
         """Take vertices back towards where the material is, which smoothing would shorten; not those on bones."""
