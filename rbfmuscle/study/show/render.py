@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Integers
+from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.show.appearance import BACKGROUND, BONE_COLOUR, MUSCLE_COLOURS, neighbour_colours
 from rbfmuscle.study.show.paint import PAINT_COLOURS, check_colouring, painting
@@ -199,7 +200,8 @@ class Stage:
         first = rows[0][0][0]
         self.first, self.colours = first, neighbour_colours(first)
         self.bones = [(name, self._add_bone(first.bone(name))) for name in first.bones]
-        self.skins = []
+        # Of each run's muscle: its mesh, shared by the panels, and its actors there.
+        self.skins: dict[Any, tuple[Any, list[Any]]] = {}
         bounds = _path_bounds({id(saved): saved for row in rows for saved, _ in row}.values())
         for i, j, _, view in self.panels:
             self.plotter.subplot(i, j)
@@ -211,14 +213,9 @@ class Stage:
         for name, actors in self.bones:
             for actor in actors:
                 actor.user_matrix = self.first.poses[frame][name]
-        for actor in self.skins:
-            self.plotter.remove_actor(actor, render=False)
-        self.skins, meshes = [], {}
-        for i, j, saved, _ in self.panels:
+        for saved in {id(saved): saved for _, _, saved, _ in self.panels}.values():
             for muscle in saved.muscles:
-                if (id(saved), muscle) not in meshes:
-                    meshes[id(saved), muscle] = self._skin(saved, muscle, frame)
-                self.skins.append(self._add(i, j, meshes[id(saved), muscle], self.colours[muscle]))
+                self._show_skin(saved, muscle, frame)
         for renderer in self.plotter.renderers:
             renderer.ResetCameraClippingRange()
         self.plotter.render()  # a screenshot alone shows what was drawn last
@@ -237,14 +234,28 @@ class Stage:
         mesh = mesh.compute_normals(split_vertices=False, auto_orient_normals=False)
         return [self._add(i, j, mesh, BONE_COLOUR) for i, j, _, _ in self.panels]
 
-    def _skin(self, saved, muscle, frame):
+    def _show_skin(self, saved, muscle, frame):
+        """A muscle in all panels of its run: moved where its faces are those of the frame before, else made anew."""
         import pyvista
 
-        mesh = pyvista.make_tri_mesh(*saved.surface(muscle, frame))
-        mesh = mesh.compute_normals(split_vertices=False, auto_orient_normals=False)
+        vertices, faces = saved.surface(muscle, frame)
+        mesh, actors = self.skins.get((id(saved), muscle), (None, []))
+        known = mesh is not None and np.array_equal(mesh.regular_faces, faces)
+        if known:
+            mesh.points = vertices
+        else:
+            mesh = pyvista.make_tri_mesh(vertices, faces)
+        # Set and not computed by the plotter, which would do it again for every panel.
+        mesh.point_data.active_normals = vertex_normals(vertices, np.asarray(faces)).astype(np.float32)
         if self.paint is not None:
             mesh.point_data[_PAINT] = self.paint(saved, muscle, frame, np.asarray(mesh.points))
-        return mesh
+        if known:
+            return
+        for actor in actors:
+            self.plotter.remove_actor(actor, render=False)
+        panels = [(i, j) for i, j, shown, _ in self.panels if shown is saved]
+        actors = [self._add(i, j, mesh, self.colours[muscle]) for i, j in panels]
+        self.skins[id(saved), muscle] = mesh, actors
 
     def _add(self, row, column, mesh, colour):
         self.plotter.subplot(row, column)
@@ -300,15 +311,8 @@ def _projected(direction, bounds):
 
 def _path_bounds(runs):
     """Box around the muscles of all runs in the first, middle and last frame."""
-    points = [
-        saved.surface(muscle, frame)[0]
-        for saved in runs
-        for frame in sorted({saved.frames[0], saved.frames[len(saved.frames) // 2], saved.frames[-1]})
-        for muscle in saved.muscles
-    ]
-    return np.array(
-        [np.min([p.min(axis=0) for p in points], axis=0), np.max([p.max(axis=0) for p in points], axis=0)]
-    )
+    boxes = np.array([saved.path_bounds for saved in runs])
+    return np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
 
 
 def chosen_frames(frames: list[int], most: int = 24) -> list[int]:

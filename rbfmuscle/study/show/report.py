@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import math
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -68,15 +69,21 @@ def write_report(
     """
     saved = SavedRun(directory)
     animation = saved.directory / "preview.webp"
-    images, missing = draw_pictures(
-        saved.directory, lambda folder: _jobs(saved, folder, animation, report and pictures, preview)
-    )
+    with ThreadPoolExecutor(1) as beside:
+        # The child that draws leaves a core to the plots.
+        drawing = beside.submit(
+            draw_pictures,
+            saved.directory,
+            lambda folder: _jobs(saved, folder, animation, report and pictures, preview),
+        )
+        plots = plot_panels(saved) if report else []
+        images, missing = drawing.result()
     if report:
         moving = animation.read_bytes() if animation.is_file() else None
         reason = str(missing) if missing else ("" if pictures else "pictures were switched off")
         try:
             (saved.directory / "report.html").write_text(
-                _page(saved, images, moving, reason), encoding="utf-8"
+                _page(saved, plots, (images, moving, reason)), encoding="utf-8"
             )
         except OSError as error:
             raise SolveError(f"cannot write the report: {error.strerror}") from None
@@ -107,18 +114,16 @@ def _jobs(saved, folder, animation, pictures, preview):
     return jobs
 
 
-def _page(saved, images, moving, reason):
+def _page(saved, plots, drawn):
     info = saved.info
     return PAGE.format(
         style=STYLE,
         title=html.escape(info["scene"]["name"]),
         facts=_facts(saved),
         verdict=_verdict(saved),
-        pictures=_pictures(images, moving, reason),
+        pictures=_pictures(*drawn),
         legend=_legend(saved),
-        plots="".join(
-            f"<figure>{embedded_image(data, 'svg+xml', title)}</figure>" for title, data in plot_panels(saved)
-        ),
+        plots="".join(f"<figure>{embedded_image(data, 'svg+xml', title)}</figure>" for title, data in plots),
         beside=beside_section({"run": saved}),
         table=_summary(saved),
         stages=_stages(saved),
