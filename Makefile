@@ -33,10 +33,10 @@ test-nojit: $(STAMP)
 	NUMBA_DISABLE_JIT=1 $(PYTEST) -q $$(grep -v '^#' tests/nojit.txt)
 
 ROOMS := $(patsubst %/,%,$(sort $(dir $(wildcard rbfmuscle/*/__init__.py)))) pbd_baseline
-# Loops count as covered where they run as Python: without compiler; the rest by the quick tests.
+# Loops count as covered where they run as Python: without compiler; the rest by all tests, child processes included.
 coverage: $(STAMP)
 	NUMBA_DISABLE_JIT=1 $(PYTEST) -q --cov --cov-report= $$(grep -v '^#' tests/nojit.txt)
-	$(PYTEST) -q --cov --cov-append --cov-report=term:skip-covered $$(grep -v '^#' tests/fast.txt)
+	$(PYTEST) -q --cov --cov-append --cov-report=term:skip-covered
 	@for room in $(ROOMS); do echo "$$room $$($(BIN)/python -m coverage report --include="$$room/*" --format=total) %"; done
 
 # Damaged scenes and meshes by the thousand; ends with a table of what became of them.
