@@ -42,17 +42,6 @@ def test_typed_marker_and_table_of_loops_travel_with_the_packages():
     assert data == {"rbfmuscle": ["py.typed", "compiled/needs.json"], "pbd_baseline": ["py.typed"]}
 
 
-def test_lists_of_tests_name_what_exists_and_every_room():
-    for name in ("fast.txt", "nojit.txt"):
-        lines = (ROOT / "tests" / name).read_text(encoding="utf-8").splitlines()
-        paths = [line.split("::")[0] for line in lines if line and not line.startswith("#")]
-        assert all((ROOT / path).exists() for path in paths), name
-        if name == "fast.txt":
-            rooms = {path.split("/")[1] for path in paths}
-            wanted = {path.parent.name for path in (ROOT / "tests").glob("*/test_*.py")}
-            assert wanted <= rooms
-
-
 def run(*command, **options):
     done = subprocess.run(command, capture_output=True, text=True, timeout=1800, check=False, **options)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
