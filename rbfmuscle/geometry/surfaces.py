@@ -57,7 +57,7 @@ def vertex_areas(vertices: Floats, faces: Integers) -> Floats:
     """Area that each vertex stands for: a third of its triangles' (n,)."""
     corners = vertices[faces]
     twice = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    return np.bincount(faces.ravel(), np.repeat(twice / 6.0, 3), minlength=len(vertices))
+    return np.bincount(faces.ravel(), np.repeat(twice / 6.0, 3), minlength=len(vertices)).astype(np.float64)
 
 
 def barycentric_weights(points: Floats, corners: Floats) -> Floats:

@@ -299,7 +299,8 @@ class FrameLoop:
         stops, activations = paths[self.steppers[0].name]
         if self._links is not None:
             for stepper in self.steppers:
-                stepper.trail.rewind(stops[:1])
+                if stepper.trail is not None:
+                    stepper.trail.rewind(stops[:1])
             self._sliding.restore(self._links)
         self._together.go(stops, activations, self.workers, all_stops=self._links is not None)
 

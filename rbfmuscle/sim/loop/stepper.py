@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -156,7 +156,7 @@ class MuscleStepper:
             if self.trail is not None:
                 self.trail.passed(after, activation)
 
-    def _carries(self, before: dict, after: dict) -> bool:
+    def _carries(self, before: Mapping[str, float], after: Mapping[str, float]) -> bool:
         """Whether a step asks no more of the muscle than to be carried along, which is then done."""
         return self.carrier is not None and self.carrier.try_carry(self.poses(before), self.poses(after))
 
@@ -169,7 +169,7 @@ class MuscleStepper:
         if activation is not None and self.name in activation:
             self.model.activate(activation[self.name])
 
-    def step(self, before: dict[str, float], after: dict[str, float]) -> None:
+    def step(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
         """One sub-step, watched for tunnelling where the scene asks for it."""
         self.begin(before, after)
         self.finish()

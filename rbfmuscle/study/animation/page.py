@@ -14,6 +14,7 @@ import zipfile
 from importlib import resources
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 from rbfmuscle.study.animation.gltf import animated_glb
 from rbfmuscle.study.animation.moving import FRAMES_A_SECOND, MovingRun
@@ -137,9 +138,10 @@ def write_animated_page(path: Path, run: MovingRun, captions: list[str]) -> None
     """
     library = viewer_library()
     times = [float(t) for t in run.times - run.times[0]]
+    shown: list[Any] = [*run.muscles, *run.bones]
     parts = [
         {"name": part.name, "colour": "#" + "".join(f"{round(255 * float(c)):02x}" for c in part.colour)}
-        for part in [*run.muscles, *run.bones]
+        for part in shown
     ]
     told = {"times": times, "captions": captions, "parts": parts, "rate": FRAMES_A_SECOND / 2.0}
     page = _PAGE.format(
