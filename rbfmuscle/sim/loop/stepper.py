@@ -174,7 +174,7 @@ class MuscleStepper:
         self.begin(before, after)
         self.finish()
 
-    def begin(self, before: dict[str, float], after: dict[str, float]) -> None:
+    def begin(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
         """First half of a sub-step: the bones move, the muscle goes along."""
         start = self.poses(before)
         if self.carrier is not None:
