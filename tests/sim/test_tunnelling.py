@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+import trimesh
 from toy_scene import ToyMuscle, attach, bone, box, cylinder, ellipsoid, joint, muscle, scene, sphere
 
 from rbfmuscle.sim.loop.contact import BoneContacts
 from rbfmuscle.sim.loop.stepper import MuscleStepper
-from rbfmuscle.sim.loop.tunnelling import find_crossings, rigid_fit, sweep_paths
+from rbfmuscle.sim.loop.tunnelling import Crossing, find_crossings, only_grazed, rigid_fit, sweep_paths
 from rbfmuscle.sim.scene.motion import bone_poses, rotation_about
 from rbfmuscle.sim.scene.options import TunnellingOptions
 
@@ -217,12 +218,17 @@ def test_what_cannot_be_turned_back_is_held_on_its_side(monkeypatch):
     assert {event.action for event in stepper.collect()[1]} == {"held_back", "angle_flag"}
 
 
-def test_a_path_tells_how_deep_it_can_have_been():
-    sweep = sweep_paths(
-        box((9.0, 9.0, 0.2)), np.array([[0.0, 0.0, 0.3]]), np.array([[0.0, 0.0, -0.5]]), tolerance=TOLERANCE
-    )
-    assert sweep.through.tolist() == [True]
-    assert sweep.most == pytest.approx([0.2])
+@pytest.mark.parametrize("thickness, touched", [(0.15, True), (0.25, False), (3.0, False)])
+def test_only_a_path_that_the_triangles_call_shallow_has_grazed(thickness, touched):
+    """Straight through a plate: half its thickness is how deep a path was. What the field says plays no part."""
+    mesh = trimesh.creation.box((9.0, 9.0, thickness))
+    turn = rotation_about([1, 2, 0], 0.7, np.zeros(3))
+    start, end = np.array([[9.0, 9.0, 9.0], [0.3, 0.1, 2.0]]), np.array([[9.0, 9.0, 9.0], [0.3, 0.1, -2.0]])
+    crossing = Crossing(0, np.array([1]), 5.0, 0)
+    paths = start, end @ turn[:3, :3].T
+    assert only_grazed(crossing, mesh, paths, np.eye(4), turn, 0.1) is touched
+    mesh.update_faces(np.arange(len(mesh.faces)) > 0)
+    assert not only_grazed(crossing, mesh, paths, np.eye(4), turn, 0.1)
 
 
 def test_without_detection_no_tunnelling_code_runs():

@@ -38,6 +38,8 @@ RETURN, BACK = 12, 0.15
 # rounds after, each followed by the way out of the bone.
 SUNK, STRAYED = 1.0, 1.5
 FILL_SWEEPS, GATHER, GATHER_SWEEPS = 150, 4, 12
+# A bone's vertex may lie so many mean edges within the surface; after so many of these rounds bones are looked at again.
+PUSHED, CLEAR = 0.01, 2
 # A level that moves vertices by less than this share of a mean edge is met, as what is left is of second order.
 SETTLED = 0.01
 # Rounds in which the volume is met and what that drove into a bone is brought out.
@@ -151,7 +153,10 @@ class _Fitting:
         self.sunk = np.zeros(len(vertices), dtype=np.bool_)
         self.outside = np.ones(len(vertices), dtype=np.bool_)
         self._start(cut)
-        self.left = np.zeros(len(vertices), dtype=np.bool_)
+        self.left, self.pushed = (
+            np.zeros(len(vertices), dtype=np.bool_),
+            np.zeros(len(vertices), dtype=np.bool_),
+        )
         self.evaluations = 0
         self.reach_of = None
         if mesh.slope is not None and field is not None:
@@ -234,9 +239,8 @@ class _Fitting:
     ) -> FittedMesh:
         """Bone vertices pushed off, crossings smoothed, the volume met: the mesh."""
         self.gather()
-        if obstacles:
-            self.push_off(obstacles, 0.01 * self.edge, axes)
-        smoothed, crossing = self.settle(volume)
+        self.push_off(obstacles, axes)
+        smoothed, crossing = self.settle(volume, obstacles, axes)
         vertices, faces = self.projector.vertices, self.mesh.faces
         check_finite(vertices, name="fitted vertices")
         return FittedMesh(
@@ -244,15 +248,23 @@ class _Fitting:
             self.evaluations, int(self.left.sum()), smoothed, crossing,
         )  # fmt: skip
 
-    def settle(self, volume: float | None) -> tuple[int, int]:
+    def settle(
+        self,
+        volume: float | None,
+        obstacles: list[tuple[ObstaclePoints, Floats]] | None,
+        axes: Floats | None,
+    ) -> tuple[int, int]:
         """The volume met and nothing smoothed since; vertices that were, and triangles that cross all the same."""
         smoothed = 0
-        for _ in range(AGAIN):
+        for turn in range(AGAIN):
             self.fill(volume)
             touched = self.untangle()
             if touched == 0:
                 return smoothed, 0
             smoothed = max(smoothed, touched)
+            if turn < CLEAR:
+                # What was smoothed may lie over a bone's vertex again.
+                self.push_off(obstacles, axes)
         self.fill(volume)
         return smoothed, int(self.mesh.tree.crossing(self.projector.vertices).sum())
 
@@ -300,10 +312,10 @@ class _Fitting:
         part.hold(slice(None))
         self.projector.take(part, rows)
 
-    def push_off(
-        self, obstacles: list[tuple[ObstaclePoints, Floats]], tolerance: float, axes: Floats | None
-    ) -> None:
+    def push_off(self, obstacles: list[tuple[ObstaclePoints, Floats]] | None, axes: Floats | None) -> None:
         """Move the corners of triangles that a bone's vertices came through."""
+        if not obstacles:
+            return
         vertices, faces = self.projector.vertices, self.mesh.faces
         # So large that no corner is farther than 1.3 cells from its triangle's middle.
         spacing = max(self.edge, 0.52 * self.mesh.longest(vertices))
@@ -319,7 +331,9 @@ class _Fitting:
         points = points_near_cells(obstacles, grid, state, cells)
         if self.field is not None:
             points = points[self.field(points) - self.level < CHORD * grid.spacing]
-        self.projector.push_off(faces, points, grid, tolerance)
+        before = vertices.copy()
+        self.projector.push_off(faces, points, grid, PUSHED * self.edge)
+        self.pushed |= (self.projector.vertices != before).any(axis=1)
 
     def untangle(self) -> int:
         """Smooth what crosses itself; return how many vertices were moved for it."""
@@ -349,7 +363,7 @@ class _Fitting:
         projector = self.projector
         away = projector.vertices[rows] - self.carried[rows]
         strayed = np.einsum("nd,nd->n", away, away) > (STRAYED * self.edge) ** 2
-        free = projector.on_field[rows] & ~strayed
+        free = projector.on_field[rows] & ~strayed & ~self.pushed[rows]
         projector.vertices[rows[free]] -= BACK * away[free]
         self._lift(rows[free])
 

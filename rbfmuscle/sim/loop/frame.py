@@ -16,7 +16,7 @@ class Event:
 
     ``action`` is ``"angle_flag"`` (the angle test spoke), ``"reported"`` (crossed, nothing done),
     ``"rotated"``, ``"halved"`` (the step was), ``"held_back"`` (kept on its side of a plane), ``"grazed"``
-    (crossed less bone than its field resolves, 0.2 mm deep at most), ``"unresolved"`` (crossed, and nothing helped),
+    (crossed by the bone's field, by its triangles less than 0.1 mm deep), ``"unresolved"`` (and nothing helped),
     ``"carried_stretched"``, ``"carried_held_end"`` or ``"carried_sheets"`` (no level set could be shown, so the surface
     is where the material is: it is stretched too far, an end is held inside the bone named, or sheets have met),
     ``"overlap_kept"`` or ``"overlap_resolved"`` (at rest, before the first frame), or, with no muscle,

@@ -14,7 +14,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.sim.loop.carrying import SOLVED, Carrier, Work
 from rbfmuscle.sim.loop.frame import Drawing, Event, FinishedDrawing, ModelSurface
-from rbfmuscle.sim.loop.tunnelling import fence, find_crossings, turn_back
+from rbfmuscle.sim.loop.tunnelling import fence, find_crossings, only_grazed, turn_back
 from rbfmuscle.sim.scene.motion import bone_poses, interpolate, shown_value, step_angle, unit_sign
 from rbfmuscle.validation import NotFiniteError, SolveError
 
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 TOUCH = 0.1
 # Rounds in which what still crosses at the smallest step is fenced off, together with what crosses then.
 FENCES = 4
-# In tolerances: bone of which a path can have met no more than this is thinner than a field of distances resolves.
-GRAZE = 2.0
 
 
 class TimedDrawing:
@@ -287,11 +285,11 @@ class MuscleStepper:
             return
         angle = step_angle(self.scene, before, after)
         if self.detect.action == "rotate" or angle <= 2.0 * math.radians(self.detect.smallest_step):
-            if max(crossing.most for crossing in remaining) > GRAZE * self.tolerance:
-                remaining = self._held_back(state, start, poses, after, remaining)
-            for crossing in remaining:
-                action = "unresolved" if crossing.most > GRAZE * self.tolerance else "grazed"
-                self.report(self.contacts.names[crossing.bone], len(crossing.index), action)
+            for crossing in self._held_back(state, start, poses, after, remaining):
+                name = self.contacts.names[crossing.bone]
+                paths, ends = (start, self.model.contact_points()), (poses[0][name], poses[1][name])
+                touched = only_grazed(crossing, self.scene.bone(name).mesh, paths, *ends, self.tolerance)
+                self.report(name, len(crossing.index), "grazed" if touched else "unresolved")
             return
         self._report_all(remaining, "halved")
         self.model.restore(state)

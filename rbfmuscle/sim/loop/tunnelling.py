@@ -16,6 +16,7 @@ import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.sim.loop.sliding import Planes
 
 if TYPE_CHECKING:
@@ -34,6 +35,8 @@ SLIDING_COSINE = 0.0
 HALVINGS = 5
 # Rounds of tracing after which what is still under way counts as traced to where it is.
 MAX_ROUNDS = 10_000
+# Share of the tolerance between places of a path that are held against a bone's triangles.
+GRAZE_STRIDE = 0.2
 
 
 @dataclass(frozen=True)
@@ -50,26 +53,22 @@ class Sweep:
         Went in deeper than the tolerance, and came out (or ended) facing another way than it went in.
     flagged : (c,) ndarray of bool
         The angle test's answer: directions at the two ends differ by more than its angle.
-    most : (c,) ndarray
-        Depth that such a path can reach at most, from its length and the distances at its ends.
     """
 
     index: np.ndarray
     lowest: np.ndarray
     through: np.ndarray
     flagged: np.ndarray
-    most: np.ndarray
 
 
 @dataclass(frozen=True)
 class Crossing:
-    """Points that passed through one bone in a step: how deep they were by its field, and can have been at most."""
+    """Points that passed through one bone in a step, and how deep they were by its field."""
 
     bone: int
     index: np.ndarray
     depth: float
     flagged: int
-    most: float
 
 
 def sweep_paths(
@@ -99,8 +98,8 @@ def sweep_paths(
     index, last = index[near], last[near]
     if len(index) == 0:
         nothing = np.zeros(0, dtype=bool)
-        return Sweep(index, np.zeros(0), nothing, nothing, np.zeros(0))
-    start, end, last_distance = start[index], end[index], last
+        return Sweep(index, np.zeros(0), nothing, nothing)
+    start, end = start[index], end[index]
     lowest = _halve(field, start, end, distance[index], last, tolerance)
     through = np.zeros(len(index), dtype=bool)
     # What halving leaves open.
@@ -113,8 +112,7 @@ def sweep_paths(
         turned = np.einsum("ij,ij->i", entry, leave) < SLIDING_COSINE
         through[deep] = turned & (lowest[deep] < -tolerance)
     cosine = np.einsum("ij,ij->i", _directions(field, start), _directions(field, end))
-    most = 0.5 * (length[index] - distance[index] - last_distance)
-    return Sweep(index, lowest, through, cosine < math.cos(angle), most)
+    return Sweep(index, lowest, through, cosine < math.cos(angle))
 
 
 def find_crossings(
@@ -162,8 +160,7 @@ def find_crossings(
         crossed = sweep.through if options.swept else sweep.flagged
         if crossed.any() or sweep.flagged.any():
             depth = float(max(0.0, -sweep.lowest[crossed].min())) if crossed.any() else 0.0
-            most = float(sweep.most[crossed].max(initial=0.0))
-            crossings.append(Crossing(b, index[sweep.index[crossed]], depth, int(sweep.flagged.sum()), most))
+            crossings.append(Crossing(b, index[sweep.index[crossed]], depth, int(sweep.flagged.sum())))
     return crossings
 
 
@@ -196,6 +193,46 @@ def fence(contacts: Any, crossing: Crossing, start: Any, before: Any, after: Any
     planes = Planes()
     planes.set(crossing.index, distance, way, points @ motion[:3, :3].T + motion[:3, 3])
     return planes
+
+
+def only_grazed(
+    crossing: Crossing,
+    mesh: Any,
+    paths: tuple[Floats, Floats],
+    before: Floats,
+    after: Floats,
+    tolerance: float,
+) -> bool:
+    """Whether the bone's own triangles say that no path was deeper in it than the tolerance; its field said more.
+
+    Parameters
+    ----------
+    crossing : Crossing
+    mesh : trimesh.Trimesh
+        Of the bone, in its coordinates.
+    paths : pair of (n, 3) ndarray
+        Contact points before and after the step, world coordinates.
+    before, after : (4, 4) ndarray
+        Poses of the bone.
+    tolerance : float
+        [scene unit].
+    """
+    exact = ExactDistance(mesh.vertices, mesh.faces)
+    if not exact.closed:
+        return False
+    for n in crossing.index:
+        first, last = (
+            np.linalg.solve(pose, np.append(points[n], 1.0))[:3]
+            for points, pose in zip(paths, (before, after))
+        )
+        count = int(np.linalg.norm(last - first) / (GRAZE_STRIDE * tolerance)) + 2
+        if count > MAX_ROUNDS:
+            return False
+        places = first + np.linspace(0.0, 1.0, count)[:, None] * (last - first)
+        # Between two places no depth is greater than there by more than half their distance.
+        if exact.signed_distance(places).min() < -(1.0 - 0.5 * GRAZE_STRIDE) * tolerance:
+            return False
+    return True
 
 
 def rigid_fit(points: Floats, targets: Any) -> Any:
