@@ -275,27 +275,35 @@ def _halve(field, start, end, distance, last, tolerance):
 
 
 def _trace(field, start, end, tolerance):
-    """Smallest distance along each path, and the first and last place (fraction) that was inside."""
+    """Smallest distance along each path, and the places (fraction) right before it first went in and after it came out.
+
+    Directions to the bone are told apart outside of it: within a crest, near its middle, they are either side's.
+    """
     length = np.linalg.norm(end - start, axis=1)
     lowest = np.full(len(start), np.inf)
-    first, last, at = np.ones(len(start)), np.zeros(len(start)), np.zeros(len(start))
+    entry, leave, at, before = (np.zeros(len(start)) for _ in range(4))
+    entered, within = np.zeros(len(start), dtype=bool), np.zeros(len(start), dtype=bool)
     under_way = np.arange(len(start))
     for _ in range(MAX_ROUNDS):
         t = at[under_way]
         distance = field.distance(start[under_way] + t[:, None] * (end[under_way] - start[under_way]))
         lowest[under_way] = np.minimum(lowest[under_way], distance)
-        inside = under_way[distance < 0.0]
-        first[inside] = np.minimum(first[inside], at[inside])
-        last[inside] = at[inside]
+        inside = distance < 0.0
+        first = under_way[inside & ~entered[under_way]]
+        entry[first] = before[first]
+        entered[first] = True
+        crossed = under_way[inside | within[under_way]]
+        leave[crossed] = at[crossed]
+        within[under_way], before[under_way] = inside, t
         # Between two places outside, d and d' from the bone and s apart, no place is deeper than (s - d - d') / 2:
         # with s = d + tolerance that is less than the tolerance where the second place is not itself that deep.
         outside = STEP_SHARE * distance + 0.9 * tolerance
-        stride = np.where(distance < 0.0, np.maximum(-0.5 * distance, 0.5 * tolerance), outside)
+        stride = np.where(inside, np.maximum(-0.5 * distance, 0.5 * tolerance), outside)
         at[under_way] = np.minimum(t + stride / np.maximum(length[under_way], 1e-300), 1.0)
         under_way = under_way[t < 1.0]
         if len(under_way) == 0:
             break
-    return lowest, first, last
+    return lowest, entry, leave
 
 
 def _directions(field, points):
