@@ -38,7 +38,7 @@ RETURN, BACK = 12, 0.15
 # rounds after, each followed by the way out of the bone.
 SUNK, STRAYED = 1.0, 1.5
 FILL_SWEEPS, GATHER, GATHER_SWEEPS = 150, 4, 12
-# A bone's vertex may lie so many mean edges within the surface; after so many of these rounds bones are looked at again.
+# Mean edges that a bone's vertex may lie within the surface; rounds of smoothing after which bones are looked at again.
 PUSHED, CLEAR = 0.01, 2
 # A level that moves vertices by less than this share of a mean edge is met, as what is left is of second order.
 SETTLED = 0.01
