@@ -1,6 +1,6 @@
 """Finite elements on real muscles: a gluteus maximus and a quadriceps as nearly incompressible solids, and the models.
 
-    python benchmarks/real_solids.py solve NAME [--edges 14 10] [-o FILE]   the reference, a small .npz file
+    python benchmarks/real_solids.py solve NAME [--edges 18 14] [--coarser FILE] [-o FILE]   the reference, a small .npz
     python benchmarks/real_solids.py compare NAME ... [--models rbf,pbd,arap-volume] [-o FILE.json]
 
 Names are those of ``CASES``. ``solve`` needs scikit-fem (the extra ``fem``) and pytetwild (fTetWild, MPL-2.0), which
@@ -157,9 +157,16 @@ class Course:
             yield goal, u, depth, self.solid.volume(u) / volume - 1.0
 
 
-def solve(name, edges, path):
+def kept_level(path):
+    """A level that is kept in a file, as `keep` takes it."""
+    with np.load(path) as kept:
+        found = [(UNIT * moved, 0.0, 0.0) for moved in kept["moved"]]
+        return float(kept["edges"][-1]), int(kept["cells"][-1]), found
+
+
+def solve(name, edges, path, coarser=None):
     """Run the reference on each level, coarse to fine, and keep the finest so far."""
-    scene, levels = case_scene(name), []
+    scene, levels = case_scene(name), [] if coarser is None else [kept_level(coarser)]
     mesh = scene.muscles[0].mesh
     for edge in edges:
         course = Course(scene, edge)
@@ -217,7 +224,7 @@ def distances(name, model, settings=None):
     """Distance of a model's surfaces to the solid, ``[(rms, worst)]`` for each of ``FRAMES`` [mm]."""
     scene = case_scene(name)
     places, faces = reference(name, scene), np.asarray(scene.muscles[0].mesh.faces)
-    run = simulate(scene, model=model, settings={"output.every": 1, **(settings or {})})
+    run = simulate(scene, model=model, settings=settings or {})
     found = []
     for frame, place in zip(FRAMES, places):
         skin = run.frames[frame].surfaces[scene.muscles[0].name]
@@ -251,12 +258,13 @@ def main():
     parser.add_argument("action", choices=("solve", "compare"))
     parser.add_argument("names", nargs="+", choices=sorted(CASES), metavar="NAME")
     parser.add_argument("--edges", nargs="+", type=float)
+    parser.add_argument("--coarser", type=Path, help="file of a coarser level that was solved before")
     parser.add_argument("--models", default=",".join(MODELS))
     parser.add_argument("-o", "--output", type=Path)
     given = parser.parse_args()
     if given.action == "solve":
         for name in given.names:
-            solve(name, given.edges or CASES[name][2], given.output or reference_file(name))
+            solve(name, given.edges or CASES[name][2], given.output or reference_file(name), given.coarser)
         return
     found = {
         "command": f"python benchmarks/real_solids.py compare {' '.join(given.names)}",
