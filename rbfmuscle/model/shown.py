@@ -10,6 +10,7 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.implicit.extraction.material import fit_material
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
+from rbfmuscle.implicit.extraction.slivers import mend_slivers
 from rbfmuscle.model.clusters import bind_samples
 from rbfmuscle.model.elasticity import ElasticSolver, carry_points
 from rbfmuscle.model.options import RBFOptions
@@ -78,12 +79,16 @@ class ShownMesh:
         """The vertices on the level set at rest, where they stay as part of the material."""
         try:
             field = rest.fit.fit(rest.centres, rest.normals)
-            fitted = fit_material(self.mesh, points, field, volume=rest.mesh_volume)
+
+            def onto(mesh: MaterialMesh, vertices: Floats) -> Floats:
+                return fit_material(mesh, vertices, field, volume=rest.mesh_volume).vertices
+
+            self.mesh, vertices = mend_slivers(self.mesh, onto(self.mesh, points), onto)
         except (ValueError, np.linalg.LinAlgError):
             # What the input mesh holds is a surface too; the frames say what is wrong with the field.
             return points
-        self.mesh.slope = np.linalg.norm(field.value_and_gradient(fitted.vertices)[1], axis=1)
-        return fitted.vertices
+        self.mesh.slope = np.linalg.norm(field.value_and_gradient(vertices)[1], axis=1)
+        return vertices
 
     def carried(self, centres: np.ndarray, solver: ElasticSolver) -> np.ndarray:
         """Where the material takes the vertices (n, 3) for centres (K, 3) and the solver's present targets."""
