@@ -4,7 +4,8 @@ python benchmarks/followed.py .../hip/flexion.toml .../hip/extension.toml [...] 
 
 For each motion and muscle, the same fields for both surfaces: time of the fit and of either surface (medians over the
 frames, in turns on one thread); distance of the vertices from the surface extracted with so many cells where no bone
-is near, and back; error of the volume; triangles that look inwards, and smallest angles; greatest way of a vertex
+is near, and back, and from the surface extracted at the same level (what is left of it where both have one level, so no
+longer one volume); error of the volume; triangles that look inwards, and smallest angles; greatest way of a vertex
 from frame to frame beside the bone that it follows best, as the worst frame's over the median frame's.
 """
 
@@ -18,6 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.surfaces import face_normals, mesh_volume, vertex_normals
+from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.model import drawing
 from rbfmuscle.models import build_models
 from rbfmuscle.sim.loop.simulate import simulate_frames
@@ -27,8 +29,8 @@ from rbfmuscle.sim.scene.scene import Scene
 CUT = 1.0
 HEAD = (
     "motion", "muscle", "fit ms", "kept surface ms", "48 cells ms", "with fit, kept : 48 cells",
-    "to the fine surface, RMS / max mm",
-    "back", "volume", "inverted", "angle, 1st percentile, worst frame", "greatest way, worst / median frame mm",
+    "to the fine surface, RMS / max mm", "back", "to the fine surface of its own level", "volume", "inverted",
+    "angle, 1st percentile, worst frame", "greatest way, worst / median frame mm",
 )  # fmt: skip
 
 
@@ -69,17 +71,21 @@ def times_of(kept: list) -> np.ndarray:
     return np.median(rows, axis=0)
 
 
-def away_from(kept: tuple, surface: object, cells: int) -> tuple:
-    """Distances of vertices from marching cubes at so many cells, and back, where no bone is near (mm in, mm out)."""
+def away_from(kept: tuple, surface: object, level: float, cells: int) -> tuple:
+    """Distances [mm] where no bone is near: to so many cells, back, and to the same of the surface's own level."""
     drawer, now, contacts = kept
-    fine = drawing.SurfaceDrawer.__new__(drawing.SurfaceDrawer)
-    fine.__dict__.update(
-        drawer.__dict__, options=drawer.options.model_copy(update={"resolution": cells}), shown=None
-    )
-    marched = fine._march(lambda: drawer.rest.fit.fit(now.centres, now.normals), now, contacts)
+    field = drawer.rest.fit.fit(now.centres, now.normals)
     edge = drawer.shown.mesh.edge(surface.vertices)
+    where = {"axes": drawer._axes(contacts), "obstacles": drawer._obstacles(contacts)}
+    cut = drawing._BoneCut(contacts, 2.0 * edge)
+    marched = [
+        extract_surface(
+            field, points=now.points, resolution=cells, cut=cut, volume=volume, level=level, **where
+        )
+        for volume in (drawer.rest.mesh_volume, None)
+    ]
     found = []
-    for one, other in ((surface, marched), (marched, surface)):
+    for one, other in ((surface, marched[0]), (marched[0], surface), (surface, marched[1])):
         free = contacts.nearest(one.vertices, 2 * edge) > CUT * edge
         found.append(np.abs(ExactDistance(other.vertices, other.faces).signed_distance(one.vertices[free])))
     return tuple(found)
@@ -125,8 +131,9 @@ def measure(path: Path, every: int, cells: int) -> None:
         kept = [row for row in made if row[0].name == muscle.name][-len(frames) :]
         fit, surface_time, marched = times_of(kept)
         surfaces = [frame.surfaces[muscle.name] for frame in frames]
-        apart = [away_from(kept[k], surfaces[k], cells) for k in range(0, len(frames), every)]
-        there, back = (np.concatenate([row[side] for row in apart]) for side in range(2))
+        levels = [surface.quantities["level"] for surface in surfaces]
+        apart = [away_from(kept[k], surfaces[k], levels[k], cells) for k in range(0, len(frames), every)]
+        there, back, alike = (np.concatenate([row[side] for row in apart]) for side in range(3))
         rest = kept[0][0].rest.mesh_volume
         volume = max(abs(mesh_volume(s.vertices, s.faces) / rest - 1.0) for s in surfaces)
         angles = [angles_of(s.vertices, s.faces) for s in surfaces]
@@ -135,7 +142,8 @@ def measure(path: Path, every: int, cells: int) -> None:
         cells_of_row = (
             path.stem, muscle.name, f"{fit:.1f}", f"{surface_time:.1f}", f"{marched:.1f}",
             f"{(fit + surface_time) / (fit + marched):.2f}", f"{np.sqrt((there**2).mean()):.3f} / {there.max():.2f}",
-            f"{np.sqrt((back**2).mean()):.3f} / {back.max():.2f}", f"{volume:.0e}",
+            f"{np.sqrt((back**2).mean()):.3f} / {back.max():.2f}",
+            f"{np.sqrt((alike**2).mean()):.3f} / {alike.max():.2f}", f"{volume:.0e}",
             f"{sum(inverted(s.vertices, s.faces) for s in surfaces)}", f"{min(percentiles):.1f}",
             f"{ways.max():.2f} / {np.median(ways):.2f} = {ways.max() / np.median(ways):.1f}",
         )  # fmt: skip

@@ -42,7 +42,8 @@ def export(
     up
         z or y: the scene's axis that points up, for usd, animated-glb and html.
     values
-        stretch, activation or bone_distance of every vertex, in pvd, vtp, ply, usd and vtkhdf; several may be given.
+        stretch, activation or bone_distance of every vertex, in pvd, vtp, ply, usd and vtkhdf, or normals, in usd;
+        several may be given.
     """
     with Progress(f"export {directory}"):
         from rbfmuscle.sim.scene.settings import parse_slice

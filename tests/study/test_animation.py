@@ -102,6 +102,32 @@ class TestUsd:
         assert bone.GetOrderedXformOps()[0].GetNumTimeSamples() == 3
         assert UsdGeom.Mesh(meshes["upper"]).GetOrderedXformOps()[0].GetNumTimeSamples() == 0
 
+    def test_normals_of_bones_once_and_of_muscles_where_asked_for(self, folder, truth, tmp_path):
+        from pxr import UsdGeom
+
+        (plain,) = export_run(folder, "usd", output=tmp_path / "plain")
+        (smooth,) = export_run(folder, "usd", output=tmp_path / "smooth", values=["normals"])
+        assert plain.stat().st_size < smooth.stat().st_size
+        before, rough = self.read(plain)
+        assert before and not UsdGeom.Mesh(rough["biceps"]).GetNormalsAttr().HasAuthoredValue()
+        stage, meshes = self.read(smooth)
+        assert set(meshes) == set(NAMES) and stage
+        for name in NAMES:
+            mesh = UsdGeom.Mesh(meshes[name])
+            normals = mesh.GetNormalsAttr()
+            assert normals.GetNumTimeSamples() == (3 if name == "biceps" else 0)
+            assert mesh.GetNormalsInterpolation() == UsdGeom.Tokens.vertex
+            points = np.array(mesh.GetPointsAttr().Get(2), dtype=float)
+            faces = np.array(mesh.GetFaceVertexIndicesAttr().Get(2)).reshape(-1, 3)
+            crossed = np.cross(
+                points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]]
+            )
+            expected = np.zeros_like(points)
+            for corner in range(3):
+                np.add.at(expected, faces[:, corner], crossed)
+            expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+            assert np.einsum("nd,nd->n", np.array(normals.Get(2)), expected).min() > 0.95
+
     def test_changing_surface_has_its_topology_at_every_time(self, changing, tmp_path):
         from pxr import UsdGeom
 
@@ -432,5 +458,7 @@ class TestValues:
         ):
             with pytest.raises(UsageError, match=said):
                 export_run(folder, "vtp", output=tmp_path, values=values)
+        with pytest.raises(UsageError, match="normals of vertices go into usd, not into ply"):
+            export_run(folder, "ply", output=tmp_path, values=["normals"])
         with pytest.raises(UsageError, match="not into animated-glb"):
             export_run(folder, "animated-glb", output=tmp_path, values=["stretch"])

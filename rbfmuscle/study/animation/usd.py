@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.sim.scene.scene import MM_PER_UNIT
 from rbfmuscle.study.animation.moving import (
     FRAMES_A_SECOND,
@@ -27,13 +28,15 @@ def check_usd() -> None:
         raise MissingPartError("export to usd needs usd-core: pip install 'rbfmuscle[usd]'") from None
 
 
-def write_usd(path: Path, run: MovingRun) -> None:
+def write_usd(path: Path, run: MovingRun, *, normals: bool = False) -> None:
     """Write a run as one ``.usdc`` file.
 
     Parameters
     ----------
     path : pathlib.Path
     run : MovingRun
+    normals : bool
+        Of the muscles' vertices at every time, which makes the file twice as large; bones have theirs always.
 
     Raises
     ------
@@ -66,7 +69,7 @@ def write_usd(path: Path, run: MovingRun) -> None:
         _paint(stage, mesh, bone, place)
     for muscle in run.muscles:
         mesh = UsdGeom.Mesh.Define(stage, f"{place}/{_identifier(muscle.name, used)}")
-        _fill_muscle(mesh, muscle, codes)
+        _fill_muscle(mesh, muscle, codes, normals)
         _paint(stage, mesh, muscle, place)
     stage.GetRootLayer().Export(str(path))
 
@@ -76,6 +79,7 @@ def _fill_bone(mesh: Any, bone: MovingBone, codes: Floats) -> None:
 
     _set_topology(mesh, bone.faces, None)
     _set_points(mesh, bone.vertices, None)
+    _set_normals(mesh, bone.vertices, bone.faces, None)
     place = mesh.AddTransformOp()
     if not bone.moves:
         place.Set(Gf.Matrix4d(bone.poses[0].T))
@@ -84,7 +88,7 @@ def _fill_bone(mesh: Any, bone: MovingBone, codes: Floats) -> None:
         place.Set(Gf.Matrix4d(pose.T), float(code))
 
 
-def _fill_muscle(mesh: Any, muscle: MovingMuscle, codes: Floats) -> None:
+def _fill_muscle(mesh: Any, muscle: MovingMuscle, codes: Floats, normals: bool) -> None:
     from pxr import Sdf, UsdGeom, Vt
 
     if muscle.keeps_vertices:
@@ -98,6 +102,8 @@ def _fill_muscle(mesh: Any, muscle: MovingMuscle, codes: Floats) -> None:
         if not muscle.keeps_vertices:
             _set_topology(mesh, muscle.faces[k], code)
         _set_points(mesh, muscle.vertices[k], code)
+        if normals:
+            _set_normals(mesh, muscle.vertices[k], muscle.faces[k], code)
         for key, primvar in values.items():
             numbers = np.ascontiguousarray(muscle.values[key][k], dtype=np.float32)
             primvar.Set(Vt.FloatArray.FromNumpy(numbers), code)
@@ -124,6 +130,15 @@ def _set_points(mesh: Any, vertices: Floats, code: float | None) -> None:
     at = () if code is None else (code,)
     mesh.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(points), *at)
     mesh.CreateExtentAttr().Set(Vt.Vec3fArray.FromNumpy(extent), *at)
+
+
+def _set_normals(mesh: Any, vertices: Floats, faces: Integers, code: float | None) -> None:
+    """Normals of the vertices: without them a surface that is no subdivision surface is drawn facet by facet."""
+    from pxr import UsdGeom, Vt
+
+    rows = np.ascontiguousarray(vertex_normals(vertices, faces), dtype=np.float32)
+    mesh.CreateNormalsAttr().Set(Vt.Vec3fArray.FromNumpy(rows), *(() if code is None else (code,)))
+    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
 
 
 def _paint(stage: Any, mesh: Any, item: MovingBone | MovingMuscle, place: str) -> None:

@@ -60,7 +60,7 @@ def export_run(
         The axis of the scene that points up, for ``usd``, ``animated-glb`` and ``html``.
     values : list of str, optional
         What to tell of every vertex of the muscles, of ``stretch``, ``activation`` and ``bone_distance``: in ``pvd``,
-        ``vtp``, ``ply``, ``usd`` and ``vtkhdf``.
+        ``vtp``, ``ply``, ``usd`` and ``vtkhdf``; and ``normals`` at every time, in ``usd`` alone.
 
     Returns
     -------
@@ -83,6 +83,10 @@ def export_run(
         raise UsageError(
             f"values of vertices go into {', '.join(WITH_VALUES)}, not into {', '.join(formats)}"
         )
+    smooth = "normals" in (values or ())
+    if smooth and "usd" not in formats:
+        raise UsageError(f"normals of vertices go into usd, not into {', '.join(formats)}")
+    values = [name for name in values or () if name != "normals"]
     chosen = saved.frames[frames] if frames is not None else saved.frames
     if not chosen or not (saved.has_surfaces() or set(formats) <= set(TABLES)):
         raise UsageError(f"{directory} has no surfaces to export")
@@ -97,7 +101,7 @@ def export_run(
                 written += export_lengths(saved, base / name, chosen, factor)
                 continue
             if name in ANIMATIONS:
-                written += _export_animation(saved, base / name, name, chosen, (wanted, up, told))
+                written += _export_animation(saved, base / name, name, chosen, (wanted, up, told, smooth))
             elif name == "glb":
                 written += _export_glb(saved, base / name, chosen, factor)
             else:
@@ -131,7 +135,7 @@ def posed(saved: SavedRun, bone: tuple[str, Floats], frame: int) -> Floats:
 def _export_animation(saved, folder, name, frames, how):
     from rbfmuscle.study.animation.moving import read_moving
 
-    unit, up, told = how
+    unit, up, told, smooth = how
     gltf = name in ("animated-glb", "html")
     if gltf and unit != "m":
         raise UsageError(f"{name} is in metres by its standard; leave out --units {unit}")
@@ -152,10 +156,13 @@ def _export_animation(saved, folder, name, frames, how):
         write_animated_page(path, run, [f"frame {frame}: {told_of[frame]}" for frame in frames])
         return [path]
     if name == "usd":
-        from rbfmuscle.study.animation.usd import write_usd as write
+        from rbfmuscle.study.animation.usd import write_usd
+
+        write_usd(path, run, normals=smooth)
     else:
-        from rbfmuscle.study.animation.gltf import write_animated_glb as write
-    write(path, run)
+        from rbfmuscle.study.animation.gltf import write_animated_glb
+
+        write_animated_glb(path, run)
     return [path]
 
 
