@@ -34,7 +34,7 @@ class Bench:
 
     def __init__(self, arguments):
         scene = Scene.load(leg_folder() / arguments.scene)
-        asked = dict(pair.split("=") for pair in arguments.set)
+        asked = {key: float(value) for key, value in (pair.split("=") for pair in arguments.set)}
         self.scenes = {
             True: scene.with_options({"sliding.threshold": THRESHOLD, **asked}, model=arguments.model),
             False: scene.with_options({}, model=arguments.model),

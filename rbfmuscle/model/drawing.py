@@ -151,7 +151,10 @@ class SurfaceDrawer:
         return self.rest.axes @ contacts.poses[self.rest.bones[0]][:3, :3].T
 
     def _obstacles(self, contacts: BoneContacts) -> list[tuple[ObstaclePoints, np.ndarray]]:
-        return [(self.bone_points[b], contacts.poses[contacts.names[b]]) for b in contacts.reached]
+        bones = [(self.bone_points[b], contacts.poses[contacts.names[b]]) for b in contacts.reached]
+        points = contacts.neighbour_points()
+        # A neighbour thinner than the surface's edges would stick through its faces: their corners alone are cut.
+        return [*bones, (ObstaclePoints(points), np.eye(4))] if len(points) else bones
 
     def _cause(self, now: Moment, contacts: BoneContacts) -> tuple[str, str]:
         """Bone and cause of a surface that cannot be fitted: a held end in a bone, stretch, or sheets that met."""

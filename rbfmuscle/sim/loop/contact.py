@@ -166,6 +166,10 @@ class BoneContacts:
             _closer_loop(distance, direction, smallest, gradient)
         return smallest, gradient
 
+    def neighbour_points(self) -> Floats:
+        """Points (k, 3) of sliding neighbours where these meet the muscle [scene unit]."""
+        return np.concatenate([np.zeros((0, 3)), *(neighbour.points() for neighbour in self.cuts)])
+
     def depth(self, points: Floats) -> float:
         """How deep the deepest free contact point is in a bone, 0 where none is [scene unit]."""
         points = check_points(points)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rbfmuscle.sim.scene.scene import Scene
 
 
-# Defaults [mm]: nearer than THRESHOLD at rest is linked; STRIP beyond is free; RELEASE beyond that lets go.
+# Defaults [mm]: nearer than THRESHOLD at rest is linked; STRIP beyond its gap there is free; RELEASE beyond lets go.
 THRESHOLD, STRIP, RELEASE = 2.0, 1.0, 2.0
 # Neighbours are looked for within this distance [mm] of the predicted points.
 SEARCH = 5.0
@@ -98,12 +98,15 @@ class Link:
         self.stepper, self.own, self.other, self.limits = stepper, own, other, limits
         self.push, self.pull = Planes(), Planes()
         self.free = stepper.contacts.free(len(stepper.model.contact_points()))
+        #: Which points are linked, and how far each may be from the neighbour.
         self.linked = np.zeros(len(self.free), dtype=bool)
+        self.hold = np.full(len(self.free), limits.hold)
         self.before: Any = None
         self.zone = None
         index, distance, _, _ = self._near()
         self.linked[index[distance < limits.threshold]] = True
         near = distance < limits.threshold
+        self.hold[index[near]] = np.maximum(distance[near], 0.0) + limits.strip
         #: Points that touch the neighbour at rest, and how far they are from it there.
         self.touching, self.gap = index[near], distance[near]
         self.found = _NOTHING
@@ -114,14 +117,14 @@ class Link:
         points = self.stepper.model.contact_points()
         index, distance, normal, nearest = self._near()
         far = np.ones(len(points), dtype=bool)
-        far[index] = distance > limits.hold + limits.release
+        far[index] = distance > self.hold[index] + limits.release
         self.linked &= ~far
         if limits.join:
             self.linked[index[distance < limits.threshold]] = True
         share = np.where(self.other.fixed[nearest], 1.0, 0.5)
         self.push.set(index, share * distance, normal, points[index])
         held = self.linked[index]
-        slack = share[held] * (limits.hold - distance[held])
+        slack = share[held] * (self.hold[index[held]] - distance[held])
         self.pull.set(index[held], slack, -normal[held], points[index[held]])
 
     def measure(self) -> Any:
@@ -175,6 +178,13 @@ class Link:
         gradient[both] = 0.5 * (normal[match] - own)
         return value, gradient
 
+    def points(self) -> Floats:
+        """Points (k, 3) of the neighbour where the two meet, which the faces of a surface have to leave outside."""
+        if self.zone is None or not self.limits.cut:
+            return np.zeros((0, 3))
+        found, (low, high) = self.other.vertices, self.zone
+        return found[np.all((found > low) & (found < high), axis=1)]
+
     def _near(self):
         if self.other.apart(self.own, self.limits.search):
             return _FAR
@@ -218,7 +228,8 @@ class SlidingLimits:
             return scene.length(default) if value is None else float(value)
 
         self.threshold = length(options.threshold, THRESHOLD)
-        self.hold = self.threshold + length(options.strip, STRIP)
+        self.strip = length(options.strip, STRIP)
+        self.hold = self.threshold + self.strip
         self.release = length(options.release, RELEASE)
         self.search = max(scene.length(SEARCH), self.hold + self.release)
         self.cut_from, self.cut_depth = scene.length(CUT_FROM), scene.length(CUT_DEPTH)
