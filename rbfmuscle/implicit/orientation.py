@@ -28,7 +28,7 @@ from rbfmuscle.implicit.partition import split_points
 from rbfmuscle.validation import UsageError, check_points
 
 # The kernel whose energy is made small, and that whose energy settles directions: normals at thin rims turn by less.
-KERNEL, SMOOTHER = "cubic", "quintic"
+KERNEL, SMOOTHER = "cubic", "septic"
 # Points that are oriented together; a matrix of (4 x 2,000)^2 numbers takes 0.5 GB.
 TOGETHER, FEWEST = 2000, 10
 # Eigenvectors from which the energy is made small, and points up to which more than one is.

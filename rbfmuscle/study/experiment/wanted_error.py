@@ -1,8 +1,8 @@
 """The fewest centres that meet a surface to a wanted error, with the kernel and the setting.
 
 The error falls with the number of centres, by a power, but for some per cent of chance: a bisection of the power law
-brackets the number, and numbers a little below are tried until two fail. Kernels take part while they may need
-fewer centres than the best so far. The row is confirmed at points that chose nothing.
+brackets the number, and numbers a little below are tried until two fail and the law promises no more. Kernels take
+part while they may need fewer centres than the best so far. The row is confirmed at points that chose nothing.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from rbfmuscle.validation import UsageError, check_mesh
 # Kernels that take part by default, the quickest first.
 CANDIDATES = ("cubic", "quintic", "skala_cervenka", "matern_52")
 FEWEST = 20
-# Numbers of centres closer than this share are alike; of those below the first that serves, so many may fail.
+# Numbers of centres closer than this share are alike; of those below the first that serves, so many may fail. On long,
+# thin muscles a field in two pieces may stand between numbers that serve.
 STEP, FAILURES = 0.04, 2
 # Power of the number of centres by which the error falls, before two numbers tell.
 POWER = 1.4
@@ -194,11 +195,22 @@ class Search:
         while high > low + max(1, STEP * low):
             middle = round(math.sqrt(low * high))
             low, high = (low, middle) if self.measure(kernel, middle) <= self.error else (middle, high)
+        self._go_down(kernel, high)
+
+    def _go_down(self, kernel: Kernel, high: int) -> None:
+        """Smaller numbers from one that serves on, past single ones that fail, as long as the power law promises."""
         failed = 0
-        while failed < FAILURES and high > FEWEST:
+        while high > FEWEST:
+            promised = high * (self._error(self.rows[kernel.name, high]) / self.error) ** (1.0 / POWER)
             lower = max(int((1.0 - STEP) ** (failed + 1) * high), FEWEST)
-            served = self.measure(kernel, lower) <= self.error
-            high, failed = (lower, 0) if served else (high, failed + 1)
+            if failed >= FAILURES and lower < promised:
+                return
+            if self.measure(kernel, lower) <= self.error:
+                high, failed = lower, 0
+            elif lower == FEWEST:
+                return
+            else:
+                failed += 1
 
     def _bracket(self, kernel, most):
         """Numbers of which the lower misses the error and the higher meets it (None where none does)."""
