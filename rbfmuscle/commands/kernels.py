@@ -27,7 +27,7 @@ def kernels(
     placement: str = "fitted",
     criterion: str = "held_out",
     condition: float = float("inf"),
-    resolution: int = 128,
+    resolution: int = 0,
     best: int = 3,
     frames: str | None = None,
     units: str = "",
@@ -61,7 +61,7 @@ def kernels(
     condition
         None beyond it is chosen, as 1e10.
     resolution
-        Cells along the longest side.
+        Cells along the longest side; 128, more for slender muscles, by default.
     best
         Of a scene, so many of the best also run the motion.
     frames

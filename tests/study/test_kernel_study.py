@@ -11,6 +11,8 @@ import trimesh
 from command_line import call
 
 import rbfmuscle as rm
+from rbfmuscle.study.experiment.kernel_choice import recommend
+from rbfmuscle.study.experiment.kernel_study import SurfaceJudge
 from rbfmuscle.study.show.kernel_page import named, write_study
 from rbfmuscle.validation import MeshError, UsageError
 
@@ -95,6 +97,25 @@ def test_files_hold_the_table(study, tmp_path):
     assert "An ellipsoid" in page and "http" not in page.replace("http-equiv", "")
     assert (tmp_path / "kernels.csv").read_text().count("\n") == len(study.rows) + 1
     assert (tmp_path / "fronts.png").stat().st_size > 5000
+
+
+def test_slender_muscles_are_looked_at_with_finer_cells(ellipsoid):
+    """With 128 cells along it a rod of 40 times its width is three cells thick."""
+    rod = trimesh.creation.capsule(400.0, 5.0, count=[24, 24])
+    assert SurfaceJudge(np.array(rod.vertices), np.asarray(rod.faces), 0, 0).resolution == 320
+    assert SurfaceJudge(ellipsoid.vertices, ellipsoid.faces, 0, 0).resolution == 128
+
+
+@pytest.mark.parametrize("left", [0, 1])
+def test_page_of_few_fit_rows_is_written(study, tmp_path, left):
+    """With none that is fit the plot had no limits of its own, and the command ended as a bug."""
+    rows = [{**row, "unfit": "" if k < left else "too few centres"} for k, row in enumerate(study.rows)]
+    write_study(
+        replace(study, rows=rows, decimated={}, recommended=recommend(rows)), tmp_path, pictures=False
+    )
+    page = (tmp_path / "kernels.html").read_text()
+    assert page.count("too few centres") == len(rows) - left
+    assert ("every field is unfit" in page) is (left == 0)
 
 
 def test_wrong_requests_are_answered(ellipsoid):

@@ -228,6 +228,9 @@ def _draw_fronts(study, figure):
     good = [row for row in study.rows if not row["unfit"]]
     figure.set_size_inches(11, 4.6)
     left, right = figure.subplots(1, 2, sharey=True, gridspec_kw={"wspace": 0.32})
+    sizes = sorted((n, d["rms"]) for n, d in study.decimated.items())
+    errors = [row["rms"] for row in good] + [rms for _, rms in sizes]
+    span = min(errors, default=1.0) / 1.2, 1.2 * max(errors, default=1.0)
     for axes, cost, front in (
         (left, lambda r: 1e3 * (r["fit_time"] + r["evaluation_time"]), "front_time"),
         (right, lambda r: r["numbers"], "front_size"),
@@ -240,10 +243,10 @@ def _draw_fronts(study, figure):
         axes.plot([b[0] for b in best], [b[1] for b in best], "-", color="0.3", lw=1.0, zorder=0)
         axes.set_xscale("log")
         axes.set_yscale("log")
+        axes.set_ylim(*span)
         _plain_ticks(axes)
         if axes is left:
             _name_beside(axes, best)
-    sizes = sorted((n, d["rms"]) for n, d in study.decimated.items())
     right.plot(
         [s[0] for s in sizes], [s[1] for s in sizes], "s--", color="#a63d38", ms=4, label="decimated mesh"
     )
@@ -333,13 +336,8 @@ def _draw_surfaces(study, directory):
         arrays |= {f"e{k}": -away, f"t{k}": np.array(f"{named(other)}: {other['rms']:.2g} {unit} RMS")}
     np.savez(directory / "surfaces.npz", **arrays)
     picture = directory / "surfaces.png"
-    command = [
-        sys.executable,
-        "-m",
-        "rbfmuscle.study.show.kernel_page",
-        str(directory / "surfaces.npz"),
-        str(picture),
-    ]
+    module = "rbfmuscle.study.show.kernel_page"
+    command = [sys.executable, "-m", module, str(directory / "surfaces.npz"), str(picture)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
     if done.returncode != 0 or not picture.exists():
         words = [line.strip() for line in done.stderr.splitlines() if line.strip()]
