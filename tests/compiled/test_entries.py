@@ -51,6 +51,11 @@ class TestEntries:
         assert [path.name for path in places[0].iterdir()] == ["a.loop"]
         assert not list(places[1].iterdir())
 
+    def test_the_first_folder_is_enough_to_write(self, places, caplog):
+        places[1].rmdir()
+        store.write_entry("a", b"loop")
+        assert store.read_entry("a") == b"loop" and not caplog.records
+
     def test_second_folder_is_read_where_the_first_has_none(self, places):
         store.write_entry("a", b"of the first")
         (places[0] / "a.loop").rename(places[1] / "a.loop")

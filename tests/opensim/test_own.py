@@ -113,16 +113,20 @@ def test_of_paths_of_both_sides_those_beside_the_mesh_hold_it(own, far):
     found, folder = own
     (path,) = found.model.paths
     path.points[0].body = "thigh"
-    other = copy.deepcopy(path)
-    path.name, other.name = "hamstring_r", "hamstring_l"
-    for point in (path if far == "r" else other).points:
-        point.place = point.place + np.array([0.0, 0.0, 0.3])
-    found.model.paths.append(other)
+    found.model.paths[:] = [copy.deepcopy(path) for _ in range(4)]
+    for each, name in zip(
+        found.model.paths, ("hamstring1_r", "hamstring2_r", "hamstring1_l", "hamstring2_l")
+    ):
+        each.name = name
+        for point in each.points:
+            aside = (0.3 if name.endswith(far) else 0.0) + (0.01 if "2" in name else 0.0)
+            point.place = point.place + np.array([0.0, 0.0, aside])
     (folder / "hamstring_right.ply").rename(folder / "hamstring.ply")
     match = match_meshes(found, folder)[0]
-    assert {p.name for p in match.paths} == {"hamstring_r", "hamstring_l"}
+    assert len(match.paths) == 4
     attach(found, match)
-    assert [p.name for p in match.paths] == [f"hamstring_{'l' if far == 'r' else 'r'}"]
+    near = "l" if far == "r" else "r"
+    assert [p.name for p in match.paths] == [f"hamstring1_{near}", f"hamstring2_{near}"]
     assert match.distance < 100.0
 
 
