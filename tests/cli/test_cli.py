@@ -271,7 +271,8 @@ class TestErrors:
 class TestOtherCommands:
     def test_check_tells_what_is_there(self, phantom_folder, capsys):
         code, out, err = call(capsys, "check", phantom_folder / "hip.toml")
-        assert code == 0 and "muscle adductor: model rbf" in out and err.strip() == "usable"
+        assert code == 0 and "muscle adductor: model rbf" in out
+        assert err.splitlines()[-1] == "usable"  # a slow machine says before what it is at
         code, out, _ = call(capsys, "check", phantom_folder / "hip.toml", "--json")
         assert code == 0 and json.loads(out)["scene"]["units"] == "mm"
 
