@@ -110,14 +110,19 @@ class SurfaceDrawer:
         """The material's mesh on the level set, or where the material is if there is no fit."""
         mesh = self.shown.mesh
         cut = _BoneCut(contacts, REACH * mesh.edge(carried)) if contacts.names else None
-        where = {"cut": cut, "obstacles": self._obstacles(contacts), "axes": self._axes(contacts)}
+        where: dict[str, Any] = {"cut": cut, "axes": self._axes(contacts)}
         volume = self.rest.mesh_volume
-        try:
-            result = fit_material(mesh, carried, fit(), volume=volume, level=self.level, **where)
-        except (ValueError, np.linalg.LinAlgError):
-            return self._carry(mesh, carried, volume, where)
-        self.level = result.level
-        return result
+        # Pushed off on all sides a surface may have nothing left to move: then the neighbours' points may stand in it.
+        ways = [self._obstacles(contacts, neighbours=wanted) for wanted in (True, False)]
+        for obstacles in ways if len(ways[0]) > len(ways[1]) else ways[1:]:
+            where["obstacles"] = obstacles
+            try:
+                result = fit_material(mesh, carried, fit(), volume=volume, level=self.level, **where)
+            except (ValueError, np.linalg.LinAlgError):
+                continue
+            self.level = result.level
+            return result
+        return self._carry(mesh, carried, volume, where)
 
     def _carry(self, mesh: MaterialMesh, carried: Floats, volume: float, where: dict[str, Any]) -> FittedMesh:
         try:
@@ -150,11 +155,14 @@ class SurfaceDrawer:
         """Axes that turn with the scene: what is sorted by them then falls out alike."""
         return self.rest.axes @ contacts.poses[self.rest.bones[0]][:3, :3].T
 
-    def _obstacles(self, contacts: BoneContacts) -> list[tuple[ObstaclePoints, np.ndarray]]:
-        bones = [(self.bone_points[b], contacts.poses[contacts.names[b]]) for b in contacts.reached]
-        points = contacts.neighbour_points()
+    def _obstacles(
+        self, contacts: BoneContacts, *, neighbours: bool = True
+    ) -> list[tuple[ObstaclePoints, np.ndarray]]:
+        """Points that faces have to leave outside: those of bones, and of sliding neighbours where they meet."""
+        found = [(self.bone_points[b], contacts.poses[contacts.names[b]]) for b in contacts.reached]
+        points = contacts.neighbour_points() if neighbours else np.zeros((0, 3))
         # A neighbour thinner than the surface's edges would stick through its faces: their corners alone are cut.
-        return [*bones, (ObstaclePoints(points), np.eye(4))] if len(points) else bones
+        return [*found, (ObstaclePoints(points), np.eye(4))] if len(points) else found
 
     def _cause(self, now: Moment, contacts: BoneContacts) -> tuple[str, str]:
         """Bone and cause of a surface that cannot be fitted: a held end in a bone, stretch, or sheets that met."""
