@@ -1,0 +1,78 @@
+"""Area vectors, normals, edges and areas of triangle meshes: known answers, and laws under motion."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from rbfmuscle.geometry.surfaces import (
+    barycentric_weights,
+    edge_lengths,
+    face_normals,
+    mesh_volume,
+    unique_edges,
+    vertex_areas,
+    vertex_normals,
+)
+
+BOX = trimesh.creation.box((2.0, 3.0, 4.0)).subdivide()
+VERTICES, FACES = np.array(BOX.vertices), np.array(BOX.faces)
+
+
+def test_area_vectors_are_the_sides_of_a_box_and_sum_to_nothing():
+    area = face_normals(VERTICES, FACES)
+    np.testing.assert_allclose(area.sum(axis=0), 0.0, atol=1e-12)
+    for axis, side in enumerate((12.0, 8.0, 6.0)):
+        assert area[area[:, axis] > 1e-9, axis].sum() == pytest.approx(side)
+    middle = VERTICES[FACES].mean(axis=1)
+    assert (np.einsum("ij,ij->i", area, middle) > 0.0).all()
+    assert np.einsum("ij,ij->", area, middle) / 3.0 == pytest.approx(24.0) == mesh_volume(VERTICES, FACES)
+
+
+def test_everything_turns_and_scales_with_the_mesh():
+    turn, scale, shift = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix(), 2.5, np.array([50.0, -20.0, 7.0])
+    moved = scale * VERTICES @ turn.T + shift
+    np.testing.assert_allclose(
+        face_normals(moved, FACES), scale**2 * face_normals(VERTICES, FACES) @ turn.T, atol=1e-11
+    )
+    np.testing.assert_allclose(
+        vertex_normals(moved, FACES), vertex_normals(VERTICES, FACES) @ turn.T, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        vertex_areas(moved, FACES), scale**2 * vertex_areas(VERTICES, FACES), rtol=1e-10
+    )
+    edges = unique_edges(FACES)
+    np.testing.assert_allclose(edge_lengths(moved, edges), scale * edge_lengths(VERTICES, edges), rtol=1e-11)
+    assert mesh_volume(moved, FACES) == pytest.approx(scale**3 * 24.0)
+    assert mesh_volume(VERTICES, FACES[:, ::-1]) == pytest.approx(-24.0)
+
+
+def test_areas_of_vertices_are_those_of_the_faces():
+    areas = vertex_areas(VERTICES, FACES)
+    assert areas.sum() == pytest.approx(52.0)
+    slow = [
+        sum(BOX.area_faces[f] / 3.0 for f in range(len(FACES)) if v in FACES[f]) for v in range(len(VERTICES))
+    ]
+    np.testing.assert_allclose(areas, slow)
+
+
+def test_each_edge_comes_once():
+    edges = unique_edges(FACES)
+    assert len(edges) == 3 * len(FACES) // 2 == len({tuple(e) for e in edges.tolist()})
+    assert (edges[:, 0] < edges[:, 1]).all()
+    assert {tuple(e) for e in edges.tolist()} == {
+        tuple(e) for e in np.sort(BOX.edges_unique, axis=1).tolist()
+    }
+
+
+def test_weights_give_the_point_back_inside_and_the_nearest_side_weighs_nothing_outside():
+    corners = np.array([[[0.0, 0, 0], [4.0, 0, 1], [1.0, 3, 0]]])
+    rng = np.random.default_rng(0)
+    weights = rng.dirichlet(np.ones(3), size=20)
+    points = weights @ corners[0]
+    np.testing.assert_allclose(
+        barycentric_weights(points, np.repeat(corners, 20, axis=0)), weights, atol=1e-12
+    )
+    beyond = corners[0].mean(axis=0) + 3.0 * (corners[0, 1] + corners[0, 2] - 2.0 * corners[0, 0])
+    found = barycentric_weights(beyond[None], corners)[0]
+    assert found[0] == 0.0 and found.sum() == pytest.approx(1.0)
