@@ -3,16 +3,18 @@
 python benchmarks/combined_motions.py phantom            # the embedded hip
 python benchmarks/combined_motions.py path/to/flexion.toml --muscles gluteus_maximus --set model.surface=marching
 python benchmarks/combined_motions.py path/to/flexion.toml --seeds 7 8 9 10 11 --model pbd
+python benchmarks/combined_motions.py phantom --write FOLDER     # the motions as scene files, nothing run
 """
 
 import argparse
+import re
 import time
 from pathlib import Path
 
 import numpy as np
 
 import rbfmuscle as rm
-from rbfmuscle.sim.scene.phantom import phantom_scene
+from rbfmuscle.sim.scene.phantom import AXES, phantom_scene
 from rbfmuscle.sim.scene.settings import parse_settings
 
 # Degrees from rest to the end of each coordinate, all together, or angles of stops on a way.
@@ -45,6 +47,69 @@ def walk(stops: int, seed: int = SEED) -> list[dict]:
             here[name] = float(np.clip(here[name] + rng.uniform(-FARTHEST, FARTHEST), low, high))
         path.append({f"hip.{name}": angle for name, angle in here.items()})
     return path
+
+
+def motion_text(motion: dict) -> str:
+    """The table of a motion as a scene file says it."""
+
+    def table(pairs: dict) -> str:
+        return (
+            "{ "
+            + ", ".join(f'"{k}" = {v if not isinstance(v, dict) else table(v)}' for k, v in pairs.items())
+            + " }"
+        )
+
+    if "ramp" in motion:
+        return f"[motion]\nramp = {table(motion['ramp'])}\n"
+    stops = ",\n  ".join(table(stop) for stop in motion["waypoints"])
+    return f"[motion]\nwaypoints = [\n  {stops},\n]\nstep = {motion['step']}\n"
+
+
+def phantom_files(folder: Path) -> Path:
+    """The embedded hip as a scene file with meshes and attachments beside it."""
+    scene = phantom_scene()
+    (joint,) = scene.joints
+    lines = [f'[scene]\nformat = 1\nname = "{scene.name}"\nunits = "{scene.units}"\n']
+    for bone in scene.bones:
+        bone.mesh.export(folder / f"{bone.name}.ply")
+        lines.append(f'[[bone]]\nname = "{bone.name}"\nmesh = "{bone.name}.ply"\n')
+    axes = ", ".join(f"{name} = {list(map(float, axis))}" for name, axis in AXES.items())
+    lines.append(
+        f'[[joint]]\nname = "hip"\nparent = "{joint.parent}"\nchild = "{joint.child}"\ncentre = [0, 0, 0]\n'
+        f"axes = {{ {axes} }}\n"
+    )
+    lines.append('[motion]\nramp = { "hip.flexion" = { from = 0, to = 90, step = 2 } }\n')
+    for muscle in scene.muscles:
+        muscle.mesh.export(folder / f"{muscle.name}.ply")
+        ends = []
+        for number, end in enumerate(muscle.attachments):
+            held = f"{muscle.name}_{number}.txt"
+            (folder / held).write_text("\n".join(str(v) for v in end.vertices) + "\n")
+            ends.append(f'{{ bone = "{end.bone}", vertices = "{held}" }}')
+        lines.append(
+            f'[[muscle]]\nname = "{muscle.name}"\nmesh = "{muscle.name}.ply"\nattach = [{", ".join(ends)}]\n'
+        )
+    lines.append("[detect]\ntunnelling = {}\n")
+    path = folder / "phantom.toml"
+    path.write_text("\n".join(lines))
+    return path
+
+
+def write_scenes(source: Path, motions: dict, folder: Path) -> list[Path]:
+    """Scene files of a scene with other motions; its meshes stay where they are and are named by their whole path."""
+    text = re.sub(
+        r'((?:mesh|vertices|fibres) = ")([^"]+)"',
+        lambda found: f'{found[1]}{(source.parent / found[2]).resolve()}"',
+        source.read_text(),
+    )
+    written = []
+    for title, motion in motions.items():
+        path = folder / (re.sub(r"[^a-z0-9]+", "_", title.lower()) + ".toml")
+        path.write_text(
+            re.sub(r"\[motion\]\n.*?(?=\n\[)", lambda _, m=motion: motion_text(m), text, flags=re.S)
+        )
+        written.append(path)
+    return written
 
 
 def measure(scene: rm.Scene, model: str | None) -> tuple[list[tuple], float]:
@@ -92,6 +157,9 @@ def main() -> None:
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE")
     parser.add_argument("--own", action="store_true", help="the scene's own motion, whatever its joints")
     parser.add_argument("--seeds", nargs="*", type=int, help="random walks of these seeds, and nothing else")
+    parser.add_argument(
+        "--write", type=Path, metavar="FOLDER", help="write the motions as scene files, and run none"
+    )
     arguments = parser.parse_args()
     scene = phantom_scene() if arguments.scene == "phantom" else rm.Scene.load(Path(arguments.scene))
     settings = parse_settings(arguments.set)
@@ -107,6 +175,11 @@ def main() -> None:
             f"random walk of {WALK} stops, seed {seed}": {"waypoints": walk(WALK, seed), "step": FARTHEST}
             for seed in arguments.seeds
         }
+    if arguments.write:
+        arguments.write.mkdir(parents=True, exist_ok=True)
+        source = phantom_files(arguments.write) if arguments.scene == "phantom" else Path(arguments.scene)
+        print(*write_scenes(source, motions, arguments.write), sep="\n")
+        return
     for title, motion in motions.items():
         moved = scene.copy()
         if motion:
