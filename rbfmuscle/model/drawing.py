@@ -51,6 +51,13 @@ class Moment(NamedTuple):
     carried: np.ndarray | None
 
 
+class _Neighbours(NamedTuple):
+    """Whether points of sliding neighbours push faces off, and whether neighbours cut the surface at all."""
+
+    points: bool
+    cut: bool
+
+
 class SurfaceDrawer:
     """Draws the surface of one muscle, from frame to frame.
 
@@ -96,7 +103,7 @@ class SurfaceDrawer:
             result: ExtractedSurface = self._march(fit, now, contacts)
             left = 0.0
         else:
-            result = self._of_material(fit, now.carried, contacts)
+            result, notes = self._of_material(fit, now.carried, contacts)
             left = result.left / len(now.carried)
             if left == 1.0:
                 bone, cause = self._cause(now, contacts)
@@ -106,23 +113,41 @@ class SurfaceDrawer:
 
     def _of_material(
         self, fit: Callable[[], RBFField], carried: np.ndarray, contacts: BoneContacts
-    ) -> FittedMesh:
-        """The material's mesh on the level set, or where the material is if there is no fit."""
+    ) -> tuple[FittedMesh, list[tuple[str, int, str]]]:
+        """The material's mesh on the level set, or where the material is if there is no fit; notes for events."""
         mesh = self.shown.mesh
-        cut = _BoneCut(contacts, REACH * mesh.edge(carried)) if contacts.names else None
-        where: dict[str, Any] = {"cut": cut, "axes": self._axes(contacts)}
-        volume = self.rest.mesh_volume
-        # Pushed off on all sides a surface may have nothing left to move: then the neighbours' points may stand in it.
-        ways = [self._obstacles(contacts, neighbours=wanted) for wanted in (True, False)]
-        for obstacles in ways if len(ways[0]) > len(ways[1]) else ways[1:]:
-            where["obstacles"] = obstacles
+        volume, notes = self.rest.mesh_volume, []
+        for neighbours in self._neighbours_met(contacts):
+            where = self._surroundings(mesh, carried, contacts, neighbours)
             try:
                 result = fit_material(mesh, carried, fit(), volume=volume, level=self.level, **where)
             except (ValueError, np.linalg.LinAlgError):
                 continue
             self.level = result.level
-            return result
-        return self._carry(mesh, carried, volume, where)
+            break
+        else:
+            result = self._carry(mesh, carried, volume, where)
+        if contacts.cuts and not neighbours.cut:
+            notes.append(("", len(carried), "neighbours_let_in"))
+        return result, notes
+
+    def _neighbours_met(self, contacts: BoneContacts) -> list[_Neighbours]:
+        """What sliding neighbours do to the surface, the first that leaves one: on all sides they may leave nothing."""
+        less = [_Neighbours(points=False, cut=True), _Neighbours(points=False, cut=False)]
+        if not contacts.cuts:
+            return less[1:]
+        return [_Neighbours(points=True, cut=True), *less] if len(contacts.neighbour_points()) else less
+
+    def _surroundings(
+        self, mesh: MaterialMesh, carried: Floats, contacts: BoneContacts, neighbours: _Neighbours
+    ) -> dict[str, Any]:
+        """Cut, obstacles and axes, as `fit_material` takes them."""
+        reach = REACH * mesh.edge(carried)
+        return {
+            "cut": _BoneCut(contacts, reach, neighbours=neighbours.cut) if contacts.names else None,
+            "obstacles": self._obstacles(contacts, neighbours=neighbours.points),
+            "axes": self._axes(contacts),
+        }
 
     def _carry(self, mesh: MaterialMesh, carried: Floats, volume: float, where: dict[str, Any]) -> FittedMesh:
         try:
@@ -225,13 +250,13 @@ class RBFDrawing:
 class _BoneCut:
     """What the bones cut away: their smallest distance, a lower bound where it is beyond ``reach``."""
 
-    def __init__(self, contacts: Any, reach: Any) -> None:
-        self.contacts, self.reach = contacts, reach
+    def __init__(self, contacts: Any, reach: Any, *, neighbours: bool = True) -> None:
+        self.contacts, self.reach, self.neighbours = contacts, reach, neighbours
         # Distances to bones change as fast as one walks; half the difference of two muscles' fields is no distance.
-        self.steepest = np.inf if contacts.cuts else 1.0
+        self.steepest = np.inf if contacts.cuts and neighbours else 1.0
 
     def __call__(self, points: Floats) -> Any:
-        return self.contacts.nearest(points, self.reach)
+        return self.contacts.nearest(points, self.reach, neighbours=self.neighbours)
 
     def value_and_gradient_below(self, points: Floats, limit: Any) -> Any:
-        return self.contacts.nearest_with_gradient(points, limit)
+        return self.contacts.nearest_with_gradient(points, limit, neighbours=self.neighbours)

@@ -15,7 +15,7 @@ from rbfmuscle.model import placement
 from rbfmuscle.model.muscle import RBFMuscle
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.models import build_model
-from rbfmuscle.sim.loop.simulate import simulate_frames
+from rbfmuscle.sim.loop.simulate import FrameLoop, simulate_frames
 from rbfmuscle.sim.scene.motion import Motion
 from rbfmuscle.sim.scene.phantom import phantom_scene
 from rbfmuscle.sim.scene.scene import Scene
@@ -207,6 +207,34 @@ def test_where_no_level_set_can_be_shown_the_material_is_and_an_event_says_so():
     assert np.sqrt(near.max()) < 0.5
     assert [(e.muscle, e.action) for e in frame.events] == [(model.name, "carried_sheets")]
     assert surface.quantities["unfitted_fraction"] == 1.0
+
+
+class _Everywhere:
+    """A neighbour that fills all of space."""
+
+    def cut(self, points):
+        return np.full(len(points), -5.0)
+
+    def cut_with_gradient(self, points):
+        return self.cut(points), np.tile([1.0, 0.0, 0.0], (len(points), 1))
+
+    def points(self):
+        return np.zeros((0, 3))
+
+
+def test_neighbours_that_leave_no_surface_are_let_in_and_an_event_says_so():
+    scene = phantom_scene()
+    scene.muscles = [scene.muscle("adductor_posterior")]
+    shown, told = [], []
+    for cuts in ([], [_Everywhere()]):
+        model = build_model(scene.muscles[0], scene, "rbf")
+        with FrameLoop(scene, [model]) as loop:
+            loop.steppers[0].contacts.cuts += cuts
+            frame = loop.advance(scene.motion.frames[0])
+        shown.append(frame.surfaces[model.name].vertices)
+        told.append([(e.muscle, e.bone, e.action) for e in frame.events])
+    assert told == [[], [(model.name, "", "neighbours_let_in")]]
+    assert np.array_equal(*shown)
 
 
 def test_a_chosen_epsilon_never_gives_a_broken_field():

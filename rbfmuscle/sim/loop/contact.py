@@ -127,7 +127,7 @@ class BoneContacts:
         points = check_points(points)
         return self._query(points, bone_index)
 
-    def nearest(self, points: ArrayLike, reach: float = np.inf) -> Floats:
+    def nearest(self, points: ArrayLike, reach: float = np.inf, *, neighbours: bool = True) -> Floats:
         """Smallest distance over all bones and neighbours at any points: what an extracted surface is cut by.
 
         Parameters
@@ -135,6 +135,8 @@ class BoneContacts:
         points : (n, 3) array_like
         reach : float
             Where a bone is farther than this, a lower bound beyond ``reach`` suffices [scene unit].
+        neighbours : bool
+            Count sliding neighbours.
 
         Returns
         -------
@@ -148,12 +150,14 @@ class BoneContacts:
             pose = self.poses[self.names[b]]
             distance = self.fields[b].distance(points, pose=pose, reach=reach)
             np.minimum(smallest, distance, out=smallest)
-        for neighbour in self.cuts:
+        for neighbour in self.cuts if neighbours else ():
             np.minimum(smallest, neighbour.cut(points), out=smallest)
         return smallest
 
-    def nearest_with_gradient(self, points: Floats, limit: Floats | float = np.inf) -> tuple[Floats, Floats]:
-        """Smallest distance (n,) over bones and neighbours, exact, and its gradient (n, 3), world axes.
+    def nearest_with_gradient(
+        self, points: Floats, limit: Floats | float = np.inf, *, neighbours: bool = True
+    ) -> tuple[Floats, Floats]:
+        """Smallest distance (n,) over bones and, where wanted, neighbours, exact, and its gradient (n, 3), world axes.
 
         Where the smallest distance is beyond ``limit``, a number or (n,), any value beyond it may stand, without
         a gradient.
@@ -161,7 +165,7 @@ class BoneContacts:
         points = check_points(points)
         smallest, gradient = np.full(len(points), np.inf), np.zeros((len(points), 3))
         answers = [self._query(points, b, limit) for b in self.reached]
-        answers += [neighbour.cut_with_gradient(points) for neighbour in self.cuts]
+        answers += [neighbour.cut_with_gradient(points) for neighbour in self.cuts if neighbours]
         for distance, direction in answers:
             _closer_loop(distance, direction, smallest, gradient)
         return smallest, gradient

@@ -19,6 +19,7 @@ class Event:
     (crossed by the bone's field, by its triangles less than 0.1 mm deep), ``"unresolved"`` (and nothing helped),
     ``"carried_stretched"``, ``"carried_held_end"`` or ``"carried_sheets"`` (no level set could be shown, so the surface
     is where the material is: it is stretched too far, an end is held inside the bone named, or sheets have met),
+    ``"neighbours_let_in"`` (sliding neighbours on all sides left no surface, so it was fitted without them),
     ``"overlap_kept"`` or ``"overlap_resolved"`` (at rest, before the first frame), or, with no muscle,
     ``"bones_overlap"`` (the motion drives two bones into each other).
     """
