@@ -98,8 +98,9 @@ def test_frames_that_are_not_written_and_drawing_ahead_change_nothing(ahead):
     assert [frame.index for frame in some] == [0, 3, 4]
     for frame in some:
         for muscle in ("brachialis", "deltoid"):
+            # mm: where the search for the level began shows by a millionth of the muscle's length.
             np.testing.assert_allclose(
-                frame.surfaces[muscle].vertices, every[frame.index].surfaces[muscle].vertices, atol=1e-5
+                frame.surfaces[muscle].vertices, every[frame.index].surfaces[muscle].vertices, atol=1e-4
             )
     # Solved in between, so what was left out counts.
     assert some[1].work["brachialis"].state == "solved" and every[3].work["brachialis"].state == "carried"
