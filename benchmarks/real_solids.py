@@ -42,7 +42,7 @@ ENVELOPE = 0.7  # how far the tetrahedra's surface may leave the mesh [mm]
 STEP, SMALLEST_STEP = 1.0, 0.02  # frames of 2 degrees
 SETTLED, ON_THE_WAY = 2e-6, 1e-3  # share of the energy that a step must save
 UNIT = 0.01  # of the kept displacements [mm]
-MODELS = ("rbf", "pbd", "xpbd", "arap-volume")
+MODELS = ("rbf", "pbd", "arap-volume")
 
 
 def data_folder():
