@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from peers.finite_element import HexSolid, brick_grid, follow, nearest_bone
 
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.models import MODEL_NAMES
@@ -21,7 +22,6 @@ from rbfmuscle.sim.scene.attachments import signed_distances
 from rbfmuscle.sim.scene.motion import bone_poses
 from rbfmuscle.sim.scene.phantom import ATTACHED_ENDS, ATTACHED_WITHIN, MUSCLES, phantom_scene
 from rbfmuscle.study.measure.metrics import surface_distance
-from rbfmuscle.validation import SolveError
 
 MUSCLE = "extensor"
 COORDINATE = "hip.flexion"
@@ -91,8 +91,6 @@ class Course:
     """The solid on its way through the motion."""
 
     def __init__(self, cells):
-        from peers.finite_element import HexSolid, brick_grid
-
         self.scene = phantom_scene(end=max(ANGLES), step=STEP, spacing=SPACING)
         tube = MUSCLES[MUSCLE]
         self.cells = cells
@@ -127,15 +125,7 @@ class Course:
         return owner
 
     def _distance(self, points):
-        found = [
-            self.fields[b.name].distance_and_gradient(points, self.poses[b.name]) for b in self.scene.bones
-        ]
-        distance = np.stack([d for d, _ in found])
-        which = np.argmin(distance, axis=0)
-        here = np.arange(len(points))
-        direction = np.stack([g for _, g in found])[which, here]
-        length = np.linalg.norm(direction, axis=1, keepdims=True)
-        return distance[which, here], direction / np.maximum(length, 1e-12)
+        return nearest_bone(self.fields, self.poses, points)
 
     def advance(self, displacement, before, angle):
         """Solve at an angle [degree]: nodes start where their share of the bone's motion takes them."""
@@ -155,23 +145,9 @@ class Course:
         """Yield (angle, displacement, greatest depth, volume error) at each of ``ANGLES``."""
         u = np.zeros_like(self.solid.rest)
         rest_volume = self.solid.volume(u)
-        angle, step = 0.0, STEP
-        for goal in ANGLES:
-            while angle < goal:
-                target = min(angle + step, goal)
-                try:
-                    state = self.advance(u, angle, target)
-                except SolveError as error:
-                    step *= 0.5
-                    if step < SMALLEST_STEP:
-                        raise SolveError(f"{error} (on the way to {target} degrees)") from None
-                    continue
-                u, angle, step = state.displacement, target, min(STEP, 2 * step)
-                print(
-                    f"{angle:7.3f} degrees, {state.iterations} iterations, {state.residual:.1e}", flush=True
-                )
-            depth = max(0.0, -float(self.solid.gaps(u)[0].min()))
-            yield angle, u, depth, self.solid.volume(u) / rest_volume - 1.0
+        for goal, moved in follow(self.advance, u, ANGLES, (STEP, SMALLEST_STEP)):
+            depth = max(0.0, -float(self.solid.gaps(moved)[0].min()))
+            yield goal, moved, depth, self.solid.volume(moved) / rest_volume - 1.0
 
 
 def carried(course, displacement):

@@ -15,11 +15,11 @@ import itertools
 import json
 import os
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
 from headline import commit
+from peers.finite_element import TetSolid, follow, nearest_bone
 from scipy.spatial import cKDTree
 from table import machine
 
@@ -90,8 +90,6 @@ class Course:
     """A real muscle as a solid of tetrahedra, on its way through a scene's motion."""
 
     def __init__(self, scene, edge):
-        from peers.finite_element import TetSolid
-
         self.scene, self.muscle = scene, scene.muscles[0]
         self.solid = TetSolid(*tetrahedra(self.muscle.mesh, edge))
         self.fields = build_fields(scene, reached_bones(scene))
@@ -110,12 +108,7 @@ class Course:
         return owner
 
     def _distance(self, points):
-        found = [field.distance_and_gradient(points, self.poses[name]) for name, field in self.fields.items()]
-        distance = np.stack([d for d, _ in found])
-        which, here = np.argmin(distance, axis=0), np.arange(len(points))
-        direction = np.stack([g for _, g in found])[which, here]
-        length = np.linalg.norm(direction, axis=1, keepdims=True)
-        return distance[which, here], direction / np.maximum(length, 1e-12)
+        return nearest_bone(self.fields, self.poses, points)
 
     def coordinates(self, place):
         """Coordinates at a place among the frames, which need not be whole."""
@@ -135,26 +128,14 @@ class Course:
     def run(self):
         """Yield (frame, displacement, greatest depth, volume error) at each of ``FRAMES``."""
         u = self.advance(np.zeros_like(self.solid.rest), 0.0, SETTLED).displacement
-        volume, place, step = self.solid.volume(np.zeros_like(u)), 0.0, STEP
-        for goal in FRAMES:
-            while place < goal:
-                target = min(place + step, goal)
-                began = time.process_time()
-                try:
-                    state = self.advance(u, target, SETTLED if target in FRAMES else ON_THE_WAY)
-                except SolveError as error:
-                    step *= 0.5
-                    if step < SMALLEST_STEP:
-                        raise SolveError(f"{error} (on the way to frame {target})") from None
-                    continue
-                u, place, step = state.displacement, target, min(STEP, 2 * step)
-                spent = time.process_time() - began
-                print(
-                    f"  {place:7.3f}: {state.iterations} iterations, {state.residual:.1e}, {spent:.0f} s",
-                    flush=True,
-                )
-            depth = max(0.0, -float(self.solid.gaps(u)[0].min()))
-            yield goal, u, depth, self.solid.volume(u) / volume - 1.0
+        volume = self.solid.volume(np.zeros_like(u))
+
+        def advance(displacement, _, target):
+            return self.advance(displacement, target, SETTLED if target in FRAMES else ON_THE_WAY)
+
+        for goal, moved in follow(advance, u, FRAMES, (STEP, SMALLEST_STEP)):
+            depth = max(0.0, -float(self.solid.gaps(moved)[0].min()))
+            yield goal, moved, depth, self.solid.volume(moved) / volume - 1.0
 
 
 def kept_level(path):
