@@ -23,8 +23,6 @@ class MeshDistance:
     faces : (m, 3) array_like of int
     closed : bool
         False for a mesh with holes.
-    whole : (k, 3) array_like of int, optional
-        All faces of the mesh, where ``faces`` are those of a part of it that surrounds the closest points.
 
     Notes
     -----
@@ -34,13 +32,10 @@ class MeshDistance:
     winding number decides (Jacobson et al. 2013; Barill et al. 2018): inside where it exceeds one half.
     """
 
-    def __init__(
-        self, vertices: ArrayLike, faces: ArrayLike, *, closed: bool = True, whole: ArrayLike | None = None
-    ) -> None:
+    def __init__(self, vertices: ArrayLike, faces: ArrayLike, *, closed: bool = True) -> None:
         self.closed = closed
         self.vertices, self.faces = check_mesh(vertices, faces)
         self._exact = ExactDistance(self.vertices, self.faces)
-        self._whole = self.faces if whole is None else np.ascontiguousarray(whole, dtype=np.int64)
 
     def unsigned(self, points: ArrayLike) -> Floats:
         """Distance to the surface.
@@ -74,13 +69,13 @@ class MeshDistance:
         if not self.closed:
             import igl
 
-            inside = igl.fast_winding_number(self.vertices, self._whole, points) > 0.5
+            inside = igl.fast_winding_number(self.vertices, self.faces, points) > 0.5
             return np.where(inside, -1.0, 1.0) * self.unsigned(points)
         out, closest, _, normal = self._exact.nearest(points)
         # At a face the normal points along the way; elsewhere it may be nearly square to it.
         unsure = np.abs(np.einsum("ij,ij->i", points - closest, normal)) < 0.1 * np.abs(out)
         for n in np.flatnonzero(unsure):
-            inside = _winding_loop(points[n], self.vertices, self._whole) > 0.5
+            inside = _winding_loop(points[n], self.vertices, self.faces) > 0.5
             out[n] = -abs(out[n]) if inside else abs(out[n])
         return out
 
@@ -103,7 +98,7 @@ class MeshDistance:
         depth = np.maximum(-self.signed(points), 0.0)
         while depth.any():
             deepest = int(depth.argmax())
-            if _winding_loop(points[deepest], self.vertices, self._whole) > 0.5:
+            if _winding_loop(points[deepest], self.vertices, self.faces) > 0.5:
                 break
             depth[deepest] = 0.0
         return depth

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.measure.occupancy import OccupancyGrid
 
@@ -144,69 +143,5 @@ def bone_depth(
     if len(points) == 0:
         return 0.0
     points = points[OccupancyGrid(vertices, faces).candidates(points)]
-    if distance is not None:
-        return float(distance.depth(points).max(initial=0.0))
-    return _depth_nearby(vertices, faces, points) if len(points) else 0.0
-
-
-def _depth_nearby(vertices, faces, points):
-    """Greatest depth of points, from the faces near them; from all faces for points that lie deeper."""
-    corners = vertices[faces]
-    longest = np.sqrt(max(np.square(corners[:, k] - corners[:, k - 1]).sum(axis=1).max() for k in range(3)))
-    reach = max(float(longest), 0.02 * float(np.ptp(vertices, axis=0).max()))
-    kept = faces_near(vertices, faces, points, reach)
-    deepest = 0.0
-    if kept.any():
-        part = MeshDistance(vertices, faces[kept], whole=faces)
-        sure = part.unsigned(points) < reach
-        deepest = part.depth(points[sure]).max(initial=0.0)
-        points = points[~sure]
-    if len(points):
-        deepest = max(deepest, MeshDistance(vertices, faces).depth(points).max())
-    return float(deepest)
-
-
-def faces_near(vertices: Floats, faces: Integers, points: Floats, reach: float) -> Booleans:
-    """Which faces may come nearer than ``reach`` to any of the points.
-
-    Parameters
-    ----------
-    vertices, faces : (n, 3) and (m, 3) ndarray
-    points : (k, 3) ndarray
-    reach : float
-        At least the longest edge [scene unit].
-
-    Returns
-    -------
-    (m,) ndarray of bool
-        Never False for a face that does.
-    """
-    origin = points.min(axis=0) - 3.0 * reach
-    shape = ((points.max(axis=0) - origin) / reach).astype(np.int64) + 4
-    cells = np.zeros(shape, dtype=np.bool_)
-    kept = np.zeros(len(faces), dtype=np.bool_)
-    _near_loop(vertices, faces, points, origin, reach, cells, kept)
-    return kept
-
-
-@compiled
-def _near_loop(vertices, faces, points, origin, reach, cells, kept):
-    # A face within reach of a point has its nearest spot at most one cell away and its corners one further.
-    for n in range(len(points)):
-        i = int((points[n, 0] - origin[0]) / reach)
-        j = int((points[n, 1] - origin[1]) / reach)
-        k = int((points[n, 2] - origin[2]) / reach)
-        cells[i, j, k] = True
-    wide = np.zeros_like(cells)
-    for i in range(cells.shape[0]):
-        for j in range(cells.shape[1]):
-            for k in range(cells.shape[2]):
-                if cells[i, j, k]:
-                    wide[max(i - 2, 0) : i + 3, max(j - 2, 0) : j + 3, max(k - 2, 0) : k + 3] = True
-    for f in range(len(faces)):
-        v = vertices[faces[f, 0]]
-        i = int(np.floor((v[0] - origin[0]) / reach))
-        j = int(np.floor((v[1] - origin[1]) / reach))
-        k = int(np.floor((v[2] - origin[2]) / reach))
-        if 0 <= i < cells.shape[0] and 0 <= j < cells.shape[1] and 0 <= k < cells.shape[2]:
-            kept[f] = wide[i, j, k]
+    distance = MeshDistance(vertices, faces) if distance is None else distance
+    return float(distance.depth(points).max(initial=0.0))
