@@ -17,6 +17,7 @@ import rbfmuscle.study.show.render as render
 from rbfmuscle.run import simulate, stream_run
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.summary import within
+from rbfmuscle.study.show.appearance import fitted_size
 from rbfmuscle.study.show.page import folded_events
 from rbfmuscle.study.show.plots import motion_axis, plot_panels
 from rbfmuscle.study.show.report import write_report
@@ -209,7 +210,7 @@ def test_neighbours_of_many_have_different_colours(crowd):
 @pytest.mark.parametrize(("spans", "taller"), [((10, 10, 100), True), ((100, 10, 20), False)])
 def test_panels_have_the_proportions_of_what_they_show(spans, taller):
     bounds = np.array([[0.0, 0.0, 0.0], spans])
-    width, height = render.fitted_size(bounds, ["front", "side"], (330, 400))
+    width, height = fitted_size(bounds, ["front", "side"], (330, 400))
     assert (height > 2 * width) == taller and (height > width) == taller
     assert width * height == pytest.approx(330 * 400, rel=0.02)
     assert width % 2 == height % 2 == 0

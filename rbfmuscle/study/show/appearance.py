@@ -1,4 +1,4 @@
-"""Colours shared by pictures, plots and exported files."""
+"""Colours and views shared by pictures, plots and exported files."""
 
 from __future__ import annotations
 
@@ -16,6 +16,17 @@ BACKGROUND = "#ffffff"
 MUSCLE_COLOURS = ("#b5443f", "#dd8468", "#7f2638", "#c96a80", "#e9b39a", "#a1562f", "#94404f", "#d2505a")
 # Plots need more distance between lines than flesh tones give.
 LINE_COLOURS = ("#b5443f", "#2f6f8f", "#d99a2b", "#4f8a5b", "#7a5aa6", "#8c6d5a", "#c86fa0", "#5d6d7e")
+# Where the camera stands; z is up, as in the medical axes (left, posterior, superior).
+VIEWS = {
+    "front": ((0.0, -1.0, 0.12), "from -y"),
+    "side": ((-1.0, -0.12, 0.12), "from -x"),
+    "back": ((0.0, 1.0, 0.12), "from +y"),
+    "far": ((1.0, -0.12, 0.12), "from +x"),
+}
+# What is drawn where nothing else is asked for.
+USUAL_VIEWS = ("front", "side", "back")
+# The least and greatest height of a panel for its width.
+_SHAPES = (0.6, 3.0)
 
 
 def muscle_colours(names: list[str]) -> dict[str, str]:
@@ -52,3 +63,54 @@ def neighbour_colours(saved: Any) -> dict[str, str]:
             MUSCLE_COLOURS, key=lambda colour: (taken.count(colour), list(found.values()).count(colour))
         )
     return {name: found[name] for name in saved.muscles}
+
+
+def aim_camera(camera: Any, direction: Any, bounds: Any, size: tuple[int, int]) -> None:
+    """Let a camera look along a direction, in a parallel projection that holds a box.
+
+    Parameters
+    ----------
+    camera : pyvista.Camera
+    direction : (3,) sequence of float
+        From the box to the camera.
+    bounds : (2, 3) ndarray
+    size : (width, height)
+        Of the view [pixel].
+    """
+    centre = bounds.mean(axis=0)
+    corners, ahead, up = _projected(direction, bounds)
+    wide, tall = np.ptp(corners, axis=0) / 2
+    wide *= size[1] / size[0]
+    camera.focal_point = centre
+    camera.position = centre + ahead * 4.0 * np.linalg.norm(bounds[1] - bounds[0])
+    camera.up = up
+    camera.parallel_projection = True
+    camera.parallel_scale = 1.04 * max(tall, wide)
+
+
+def _projected(direction, bounds):
+    """Corners of a box (8, 2) as a view sees them, to the right and up; the view's direction, and up."""
+    ahead = np.asarray(direction) / np.linalg.norm(direction)
+    right = np.cross([0.0, 0.0, 1.0], ahead)
+    right /= np.linalg.norm(right)
+    up = np.cross(ahead, right)
+    corners = np.array([[x, y, z] for x in bounds[:, 0] for y in bounds[:, 1] for z in bounds[:, 2]])
+    return (corners - bounds.mean(axis=0)) @ np.stack([right, up], axis=1), ahead, up
+
+
+def fitted_size(bounds: Any, views: Any, size: Any) -> tuple[int, int]:
+    """A panel as large as asked for, in the proportions of what it shows.
+
+    Parameters
+    ----------
+    bounds : (2, 3) ndarray
+    views : sequence of str
+    size : (width, height)
+        Pixels.
+    """
+    spans = [np.ptp(_projected(VIEWS[view][0], bounds)[0], axis=0) for view in views]
+    wide, tall = np.max(spans, axis=0)
+    shape = float(np.clip(tall / max(wide, 1e-12), *_SHAPES))
+    area = float(size[0] * size[1])
+    # Even numbers: films ask for them.
+    return 2 * round(0.5 * (area / shape) ** 0.5), 2 * round(0.5 * (area * shape) ** 0.5)

@@ -19,19 +19,19 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.study.files.saved import SavedRun
-from rbfmuscle.study.show.appearance import BACKGROUND, BONE_COLOUR, MUSCLE_COLOURS, neighbour_colours
+from rbfmuscle.study.show.appearance import (
+    BACKGROUND,
+    BONE_COLOUR,
+    MUSCLE_COLOURS,
+    USUAL_VIEWS,
+    VIEWS,
+    aim_camera,
+    fitted_size,
+    neighbour_colours,
+)
 from rbfmuscle.study.show.paint import PAINT_COLOURS, check_colouring, painting
 from rbfmuscle.validation import MissingPartError, RBFMuscleError, UsageError
 
-# Where the camera stands; z is up, as in the medical axes (left, posterior, superior).
-VIEWS = {
-    "front": ((0.0, -1.0, 0.12), "from -y"),
-    "side": ((-1.0, -0.12, 0.12), "from -x"),
-    "back": ((0.0, 1.0, 0.12), "from +y"),
-    "far": ((1.0, -0.12, 0.12), "from +x"),
-}
-# What is drawn where nothing else is asked for.
-USUAL_VIEWS = ("front", "side", "back")
 ANIMATIONS = (".webp", ".gif")
 _STRIP = 30
 _PAINT = "paint"
@@ -39,8 +39,8 @@ _BONE_TRIANGLES = 12_000
 # Coordinates that a caption names at most.
 MOST_SHOWN = 4
 _TIMEOUT = 1800
-# Code of a child that could draw and could not save, and the least and greatest height of a panel for its width.
-_REFUSED, _SHAPES = 3, (0.6, 3.0)
+# Code of a child that could draw and could not save.
+_REFUSED = 3
 
 
 def render_run(
@@ -276,39 +276,6 @@ class Stage:
         )
 
 
-def aim_camera(camera: Any, direction: Any, bounds: Any, size: tuple[int, int]) -> None:
-    """Let a camera look along a direction, in a parallel projection that holds a box.
-
-    Parameters
-    ----------
-    camera : pyvista.Camera
-    direction : (3,) sequence of float
-        From the box to the camera.
-    bounds : (2, 3) ndarray
-    size : (width, height)
-        Of the view [pixel].
-    """
-    centre = bounds.mean(axis=0)
-    corners, ahead, up = _projected(direction, bounds)
-    wide, tall = np.ptp(corners, axis=0) / 2
-    wide *= size[1] / size[0]
-    camera.focal_point = centre
-    camera.position = centre + ahead * 4.0 * np.linalg.norm(bounds[1] - bounds[0])
-    camera.up = up
-    camera.parallel_projection = True
-    camera.parallel_scale = 1.04 * max(tall, wide)
-
-
-def _projected(direction, bounds):
-    """Corners of a box (8, 2) as a view sees them, to the right and up; the view's direction, and up."""
-    ahead = np.asarray(direction) / np.linalg.norm(direction)
-    right = np.cross([0.0, 0.0, 1.0], ahead)
-    right /= np.linalg.norm(right)
-    up = np.cross(ahead, right)
-    corners = np.array([[x, y, z] for x in bounds[:, 0] for y in bounds[:, 1] for z in bounds[:, 2]])
-    return (corners - bounds.mean(axis=0)) @ np.stack([right, up], axis=1), ahead, up
-
-
 def _path_bounds(runs):
     """Box around the muscles of all runs in the first, middle and last frame."""
     boxes = np.array([saved.path_bounds for saved in runs])
@@ -398,24 +365,6 @@ def _draw_job(saved, job, seconds, stages):
         chips = stage.colours if len(saved.muscles) <= len(MUSCLE_COLOURS) else {}
     images = [labelled(stage.show(frame), caption(saved, frame), titles, chips) for frame in job["frames"]]
     save_images(images, job["file"], seconds)
-
-
-def fitted_size(bounds: Any, views: Any, size: Any) -> tuple[int, int]:
-    """A panel as large as asked for, in the proportions of what it shows.
-
-    Parameters
-    ----------
-    bounds : (2, 3) ndarray
-    views : sequence of str
-    size : (width, height)
-        Pixels.
-    """
-    spans = [np.ptp(_projected(VIEWS[view][0], bounds)[0], axis=0) for view in views]
-    wide, tall = np.max(spans, axis=0)
-    shape = float(np.clip(tall / max(wide, 1e-12), *_SHAPES))
-    area = float(size[0] * size[1])
-    # Even numbers: films ask for them.
-    return 2 * round(0.5 * (area / shape) ** 0.5), 2 * round(0.5 * (area * shape) ** 0.5)
 
 
 def save_images(images: list[Any], path: str, seconds: float) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.metrics import QUANTITIES
 from rbfmuscle.study.measure.summary import LEAST, exceeded
-from rbfmuscle.study.show.appearance import line_colours
+from rbfmuscle.study.show.appearance import USUAL_VIEWS, line_colours
 from rbfmuscle.study.show.model_paths import beside_section
 from rbfmuscle.study.show.page import (
     EXPLANATION,
@@ -26,7 +26,7 @@ from rbfmuscle.study.show.page import (
     worst_first,
 )
 from rbfmuscle.study.show.plots import plot_panels
-from rbfmuscle.study.show.render import USUAL_VIEWS, chosen_frames, draw_pictures
+from rbfmuscle.study.show.render import chosen_frames, draw_pictures
 from rbfmuscle.validation import SolveError
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.study.show.appearance import BACKGROUND, LINE_COLOURS
-from rbfmuscle.study.show.render import VIEWS, aim_camera, draw, main
+from rbfmuscle.study.show.appearance import BACKGROUND, LINE_COLOURS, VIEWS, aim_camera
+from rbfmuscle.study.show.render import draw, main
 
 if TYPE_CHECKING:
     from rbfmuscle.sim.scene.scene import Scene
