@@ -9,8 +9,9 @@ from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 LEAF, BITS = 4, 10
 # Pairs of nodes that wait at a time: less than four for each level of the tree.
 WAITING = 512
-# Triangles close together whose normals are all within this of one direction [radian] are taken for one sheet: less
-# than an eighth of a turn, as what goes through a sheet looks a right angle away from it on one of its sides.
+# Triangles close together whose normals are all within this of one direction [radian] are taken for one sheet, so
+# that two of them are less than twice that apart (ALONG is its cosine): well below the right angle by which what goes
+# through a sheet looks away from it on one of its sides.
 ONE_SHEET, ALONG = 0.5, np.cos(2 * 0.5)
 
 
@@ -48,7 +49,7 @@ class FaceTree:
         among : (m,) ndarray of bool, optional
             Only pairs with one of these triangles.
         by_sheets : bool
-            Leave out pairs whose normals are less than a right angle apart: of a closed surface, what goes through a
+            Leave out pairs whose normals are less than a radian apart: of a closed surface, what goes through a
             sheet has another side, which is seen. It takes a third of the time, and may miss single triangles.
         """
         vertices = np.ascontiguousarray(vertices, dtype=np.float64)

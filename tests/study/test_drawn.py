@@ -227,7 +227,8 @@ def test_stages_that_go_on_are_those_of_the_unbroken_run(broken):
     whole, before, after = Stages(), Stages(), Stages()
     for k, each in enumerate(FRAMES):
         whole.add(each)
-        (before if k < broken else after).add(each) if k < broken else None
+        if k < broken:
+            before.add(each)
     after.go_on(before.state())
     for each in FRAMES[broken:]:
         after.add(each)
