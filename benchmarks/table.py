@@ -201,7 +201,7 @@ def _igl_distance(igl, points, vertices, faces):
 def bench_deformation(table, name, scene, muscle):
     """One frame of the mesh muscle against pyPBD's distance constraints and libigl's ARAP iterations."""
     from rbfmuscle.models import build_model
-    from rbfmuscle.sim.loop.live import LiveSession
+    from rbfmuscle.sim.loop.driving.live import LiveSession
 
     alone = scene.copy()
     alone.muscles = [scene.muscle(muscle)]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import toy_scene
 
-from rbfmuscle.sim.loop.live import LiveSession, coordinate_limits
+from rbfmuscle.sim.loop.driving.live import LiveSession, coordinate_limits
 from rbfmuscle.study.show.viewer import LiveViewer, SavedViewer
 from rbfmuscle.validation import UsageError
 

@@ -12,40 +12,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
-from rbfmuscle.geometry.arrays import Array, Booleans, Floats, Integers
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.fields import Cut, Field
 from rbfmuscle.geometry.surfaces import mesh_volume, vertex_normals
-from rbfmuscle.implicit.extraction.band import BandGrid
+from rbfmuscle.implicit.extraction.carried_material import CarriedMaterial
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
-from rbfmuscle.implicit.extraction.obstacles import CHORD, ObstaclePoints, faces_within, points_near_cells
-from rbfmuscle.implicit.extraction.projection import CutBounds, Projector
+from rbfmuscle.implicit.extraction.obstacles import ObstaclePoints
 from rbfmuscle.implicit.extraction.surface import ExtractedSurface
+from rbfmuscle.implicit.extraction.untangling import gather, untangle
 from rbfmuscle.validation import check_finite
 
 # No vertex goes farther than this from where the material carries it, in mean edges; and where the field's slope
 # has sunk to these shares of its slope at rest, not at all, or as far as it likes within that.
 FARTHEST = 1.0
 UNSURE, SURE = 0.3, 0.7
-# What is within this many mean edges of the bones may come to lie on them.
-NEAR_CUT = 1.5
-# Rounds of smoothing for triangles that cross others, and how the smoothed region grows with them; as the way back to
-# the volume can make others cross, all of it is done up to so many times.
-UNTANGLE, GROWTH, AGAIN = 24, 4, 8
-# Rounds before them in which what crosses is taken back to where the material is, by this share of the way.
-RETURN, BACK = 12, 0.15
-# What the material takes so many mean edges deep into a bone, or a bone sent so
-# far away, is drawn as a skin over the place where it goes in: so many sweeps of smoothing first, and in each of some
-# rounds after, each followed by the way out of the bone.
-SUNK, STRAYED = 1.0, 1.5
-FILL_SWEEPS, GATHER, GATHER_SWEEPS = 150, 4, 12
-# Mean edges that a bone's vertex may lie within the surface; rounds of smoothing after which bones are looked at again.
-PUSHED, CLEAR = 0.01, 2
+# As the way back to the volume can make triangles cross others, all of it is done up to so many times; and rounds of
+# smoothing after which bones are looked at again.
+AGAIN, CLEAR = 8, 2
 # A level that moves vertices by less than this share of a mean edge is met, as what is left is of second order.
 SETTLED = 0.01
 # Rounds in which the volume is met and what that drove into a bone is brought out.
 MEET = 4
-# Where both sides of a muscle sink into a bone, the far one stays above it by this share of a mean edge.
-LAMELLA = 0.02
 
 
 @dataclass(frozen=True)
@@ -136,7 +123,7 @@ def carry_material(
     return fitting.finish(volume, obstacles, axes)
 
 
-class _Fitting:
+class _Fitting(CarriedMaterial):
     """A material mesh on its way to a level set."""
 
     def __init__(
@@ -147,16 +134,8 @@ class _Fitting:
         cut: Cut | None,
         level: float,
     ) -> None:
-        self.mesh, self.carried, self.level = mesh, np.ascontiguousarray(vertices, dtype=np.float64), level
-        self.field, self.cut = field, cut
-        self.edge = mesh.edge(self.carried)
-        self.sunk = np.zeros(len(vertices), dtype=np.bool_)
-        self.outside = np.ones(len(vertices), dtype=np.bool_)
-        self._start(cut)
-        self.left, self.pushed = (
-            np.zeros(len(vertices), dtype=np.bool_),
-            np.zeros(len(vertices), dtype=np.bool_),
-        )
+        super().__init__(mesh, vertices, field, cut, level)
+        self.left = np.zeros(len(vertices), dtype=np.bool_)
         self.evaluations = 0
         self.reach_of = None
         if mesh.slope is not None and field is not None:
@@ -165,29 +144,6 @@ class _Fitting:
             gradient = self.projector.known[1]
             share = np.sqrt(np.einsum("nd,nd->n", gradient, gradient)) / mesh.slope
             self.reach_of = FARTHEST * self.edge * np.clip((share - UNSURE) / (SURE - UNSURE), 0.0, 1.0)
-
-    def _start(self, cut: Cut | None) -> None:
-        """A projector of the vertices where the material takes them, that knows how far the bones are there."""
-        near, vertices = np.zeros(len(self.carried), dtype=np.bool_), self.carried.copy()
-        if cut is None:
-            self.projector = Projector(self.field, None, vertices, self.edge, near)
-            return
-        limit = np.full(len(vertices), NEAR_CUT * self.edge)
-        distance, outward = cut.value_and_gradient_below(self.carried, limit)
-        near, self.outside = distance < limit, distance >= 0.0
-        self.projector = Projector(self.field, cut if near.any() else None, vertices, self.edge, near)
-        if np.isfinite(cut.steepest):
-            self.projector.bounds = CutBounds(self.carried, np.minimum(distance, limit), cut.steepest)
-        if near.any():
-            self.projector.clearance = self._clearance(near, distance, outward)
-
-    def _clearance(self, near: Booleans, distance: Floats, outward: Floats) -> Floats:
-        """How far from the bones vertices that sink into them end: those that look away keep off the others."""
-        normals, clearance = vertex_normals(self.carried, self.mesh.faces), np.zeros(len(self.carried))
-        away = near & (np.einsum("nd,nd->n", normals, outward) > 0.0)
-        clearance[away] = LAMELLA * self.edge
-        self.sunk = near & (distance < -SUNK * self.edge)
-        return clearance
 
     def project(self) -> None:
         """Newton steps onto the level set, no farther from where the material is than the field is to be trusted."""
@@ -201,7 +157,7 @@ class _Fitting:
         _bound_loop(projector.vertices, self.carried, self.reach_of, bounded, self.left)
         rows = np.flatnonzero(self.left)
         if len(rows):
-            self._lift(rows)
+            self.lift(rows)
 
     def reach(self, volume: float) -> None:
         """Move the level until the mesh has the volume."""
@@ -238,7 +194,7 @@ class _Fitting:
         axes: Floats | None,
     ) -> FittedMesh:
         """Bone vertices pushed off, crossings smoothed, the volume met: the mesh."""
-        self.gather()
+        gather(self)
         self.push_off(obstacles, axes)
         smoothed, crossing = self.settle(volume, obstacles, axes)
         vertices, faces = self.projector.vertices, self.mesh.faces
@@ -258,7 +214,7 @@ class _Fitting:
         smoothed = 0
         for turn in range(AGAIN):
             self.fill(volume)
-            touched = self.untangle()
+            touched = untangle(self)
             if touched == 0:
                 return smoothed, 0
             smoothed = max(smoothed, touched)
@@ -286,124 +242,6 @@ class _Fitting:
             self.projector.shift(step)
             if turn == MEET or not self.projector.lift():
                 break
-
-    def gather(self) -> None:
-        """Close the surface over what is deep in a bone: a sheet that is folded over it would cross itself."""
-        projector = self.projector
-        away = projector.vertices - self.carried
-        strayed = np.einsum("nd,nd->n", away, away) > (STRAYED * self.edge) ** 2
-        lost = np.asarray(self.sunk | strayed, dtype=np.bool_)
-        if not lost.any():
-            return
-        rows = np.flatnonzero(self.mesh.around(lost, 1))
-        for turn in range(GATHER):
-            self.mesh.smooth(projector.vertices, rows, GATHER_SWEEPS if turn else FILL_SWEEPS)
-            if self.field is None:
-                self._lift(rows)
-                continue
-            part = projector.part(rows)
-            part.project(self.level)
-            projector.take(part, rows)
-
-    def _lift(self, rows: Integers) -> None:
-        """Bring vertices out of the bones, where they stay."""
-        part = self.projector.part(rows)
-        part.lift()
-        part.hold(slice(None))
-        self.projector.take(part, rows)
-
-    def push_off(self, obstacles: list[tuple[ObstaclePoints, Floats]] | None, axes: Floats | None) -> None:
-        """Move the corners of triangles that a bone's vertices came through."""
-        if not obstacles:
-            return
-        vertices, faces = self.projector.vertices, self.mesh.faces
-        # So large that no corner is farther than 1.3 cells from its triangle's middle.
-        spacing = max(self.edge, 0.52 * self.mesh.longest(vertices))
-        size = float(np.ptp(vertices, axis=0).max())
-        grid = BandGrid.around(vertices, resolution=max(int(size / spacing), 4), padding=2, axes=axes)
-        if self.projector.bounds is not None:
-            distance = self.projector.bounds.distance(vertices)
-            faces = faces[faces_within(vertices, faces, distance, 1.1 * CHORD * grid.spacing)]
-            if len(faces) == 0:
-                return
-        state = np.zeros(int(np.prod(grid.shape)), dtype=np.uint8)
-        cells = _touched_cells(grid, vertices, faces, state)
-        points = points_near_cells(obstacles, grid, state, cells)
-        if self.field is not None:
-            points = points[self.field(points) - self.level < CHORD * grid.spacing]
-        before = vertices.copy()
-        self.projector.push_off(faces, points, grid, PUSHED * self.edge)
-        self.pushed |= (self.projector.vertices != before).any(axis=1)
-
-    def untangle(self) -> int:
-        """Smooth what crosses itself; return how many vertices were moved for it."""
-        projector, faces = self.projector, self.mesh.faces
-        touched = np.zeros(len(self.carried), dtype=np.bool_)
-        among: Booleans | None = None
-        for turn in range(0 if self.field is None else -RETURN, UNTANGLE + 1):
-            # What was not moved does not begin to cross; where nothing crosses, a quick look is enough.
-            if among is None and not self.mesh.tree.crossing(projector.vertices, by_sheets=True).any():
-                break
-            bad = self.mesh.tree.crossing(projector.vertices, among)
-            if turn == UNTANGLE or not bad.any():
-                break
-            marked = np.zeros(len(self.carried), dtype=np.bool_)
-            marked[faces[bad].ravel()] = True
-            region = self.mesh.around(marked, 1 + max(turn, 0) // GROWTH)
-            among = np.asarray(region[faces].any(axis=1), dtype=np.bool_)
-            touched |= region
-            if turn < 0:
-                self._return(np.flatnonzero(region))
-            else:
-                self._smooth(np.flatnonzero(region), self.field is not None and turn < UNTANGLE // 2)
-        return int(touched.sum())
-
-    def _return(self, rows: Integers) -> None:
-        """Take vertices back towards where the material is, which smoothing would shorten; not those on bones."""
-        projector = self.projector
-        away = projector.vertices[rows] - self.carried[rows]
-        strayed = np.einsum("nd,nd->n", away, away) > (STRAYED * self.edge) ** 2
-        free = projector.on_field[rows] & ~strayed & ~self.pushed[rows]
-        projector.vertices[rows[free]] -= BACK * away[free]
-        self._lift(rows[free])
-
-    def _smooth(self, rows: Integers, onto_field: bool) -> None:
-        """Move vertices towards their neighbours, then back onto the surface, or out of the bones at least."""
-        projector = self.projector
-        before = projector.vertices[rows]
-        self.mesh.smooth(projector.vertices, rows, 3)
-        if not onto_field:
-            self._lift(rows)
-            return
-        part = projector.part(rows)
-        part.project(self.level)
-        gone = np.einsum("nd,nd->n", part.vertices - before, part.vertices - before) > self.edge**2
-        part.vertices[gone] = projector.vertices[rows[gone]]
-        projector.take(part, rows)
-
-
-def _touched_cells(grid: BandGrid, vertices: Floats, faces: Integers, state: Array) -> Integers:
-    """Mark the cells that hold vertices or middles of triangles, and those beside them; their flat numbers."""
-    corners = vertices[faces]
-    holders = grid.cells(np.concatenate([corners.reshape(-1, 3), corners.mean(axis=1)]))
-    cells = np.empty(len(state), dtype=np.int64)
-    return cells[: _touch_loop(np.unique(holders), grid.strides, state, cells)]
-
-
-@compiled(error_model="numpy")
-def _touch_loop(holders, strides, state, cells):
-    """Mark cells and their neighbours, each once; returns how many."""
-    count = 0
-    for cell in holders:
-        for i in range(-1, 2):
-            for j in range(-1, 2):
-                for k in range(-1, 2):
-                    near = cell + i * strides[0] + j * strides[1] + k * strides[2]
-                    if 0 <= near < len(state) and state[near] == 0:
-                        state[near] = 1
-                        cells[count] = near
-                        count += 1
-    return count
 
 
 @compiled(error_model="numpy")

@@ -2,12 +2,13 @@
 
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, wait
+from concurrent.futures import Future
 from contextlib import contextmanager
 
 from rbfmuscle.sim.contraction.course import Activations
 from rbfmuscle.sim.loop.carrying import Carrier
 from rbfmuscle.sim.loop.contact import BoneContacts
+from rbfmuscle.sim.loop.driving.ahead import run_ahead
 from rbfmuscle.sim.loop.frame import Event, FinishedDrawing, Frame, ModelSurface, MuscleModel
 from rbfmuscle.sim.loop.from_rest import Trail
 from rbfmuscle.sim.loop.overlap import settle_rest
@@ -26,7 +27,6 @@ __all__ = [
     "FrameLoop",
     "ModelSurface",
     "MuscleModel",
-    "run_ahead",
     "simulate_frames",
 ]
 
@@ -315,42 +315,6 @@ class FrameLoop:
         if self._sliding is not None:
             self.workers.each(self._sliding.show, drawings)
         return drawings
-
-
-def run_ahead(
-    loop: FrameLoop, path: Iterable[Mapping[str, float]], written: Collection[int] | None = None
-) -> Iterator[Frame]:
-    """Drive a loop so that each frame is solved while the one before is drawn: no thread waits for another muscle.
-
-    Models are then a frame ahead of what was yielded.
-
-    Parameters
-    ----------
-    loop : FrameLoop
-        One that ``can_run_ahead``.
-    path : iterable of dict
-        Coordinates of the frames.
-    written : collection of int, optional
-        Places in the path of the frames to yield; all where not given.
-    """
-    loop.workers.widen(2 * len(loop.steppers))
-    frame, drawings = None, []
-    for place, coordinates in enumerate(path):
-        with loop.clocked(), loop.workers.one_thread_each():
-            going = loop.start(coordinates)
-            drawn = [done.result() for done in loop.workers.start(TimedDrawing.draw, drawings)]
-            wait(going)
-        if frame is not None:
-            yield loop.finish(frame, drawn)
-        frame, drawings = None, [done.result() for done in going]
-        if written is None or place in written:
-            frame = loop.collect()
-        else:
-            drawings = []
-    if frame is not None:
-        with loop.clocked(), loop.workers.one_thread_each():
-            drawn = [done.result() for done in loop.workers.start(TimedDrawing.draw, drawings)]
-        yield loop.finish(frame, drawn)
 
 
 def simulate_frames(

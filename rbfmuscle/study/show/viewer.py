@@ -23,7 +23,7 @@ from rbfmuscle.study.show.render import coordinate_texts
 from rbfmuscle.validation import SolveError, UsageError
 
 if TYPE_CHECKING:
-    from rbfmuscle.sim.loop.live import LiveSession
+    from rbfmuscle.sim.loop.driving.live import LiveSession
     from rbfmuscle.study.files.saved import SavedRun
 
 
@@ -175,7 +175,7 @@ class LiveViewer(Viewer):
 
     Parameters
     ----------
-    session : rbfmuscle.sim.loop.live.LiveSession
+    session : rbfmuscle.sim.loop.driving.live.LiveSession
     build : callable
         ``build(model, quality)`` returns new models, one a muscle.
     models, qualities : list of str
