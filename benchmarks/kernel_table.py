@@ -25,6 +25,7 @@ from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import SPAN, spacing, surface_miss
 from rbfmuscle.study.experiment import kernel_study
 from rbfmuscle.study.experiment.kernel_choice import mark_unfit
+from rbfmuscle.study.experiment.kernel_judge import SurfaceJudge
 
 SCANNED, LIMIT = 40, 1.05
 KEYS = ("surface", "centres", "placement", "kernel")
@@ -176,7 +177,7 @@ def main():
     ]
     if options.shuffle is not None:
         random.Random(options.shuffle).shuffle(cases)
-    judges = functools.cache(lambda name: kernel_study.SurfaceJudge(*shapes[name], 64, 0))
+    judges = functools.cache(lambda name: SurfaceJudge(*shapes[name], 64, 0))
     samples = functools.cache(lambda name, count: sample_surface(*shapes[name], count, placement="greedy"))
     for name, count, placement, kernel in cases:
         if (name, count, placement, kernel) in known or time.monotonic() > until:

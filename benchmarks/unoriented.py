@@ -16,7 +16,7 @@ from kernel_table import surfaces
 from rbfmuscle.implicit.orientation import orient_points
 from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.reconstruction import reconstruct_surface
-from rbfmuscle.study.experiment.kernel_study import SurfaceJudge
+from rbfmuscle.study.experiment.kernel_judge import SurfaceJudge
 
 CHOSEN = (
     "hip/iliacus,hip/gluteus_maximus,hip/adductor_brevis,leg/sartorius,leg/popliteus,bumps,bent plate,torus"

@@ -13,7 +13,7 @@ import numpy as np
 
 from rbfmuscle.commands.scenes import load_scene
 from rbfmuscle.commands.view import _open_scene
-from rbfmuscle.study.show.window import Window
+from rbfmuscle.study.show.view.window import Window
 
 PICTURES = 24
 

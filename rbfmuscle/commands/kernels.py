@@ -85,7 +85,7 @@ def kernels(
     from rbfmuscle.implicit.selection import CRITERIA
     from rbfmuscle.study.experiment.kernel_study import study_kernels
     from rbfmuscle.study.files.writer import json_text
-    from rbfmuscle.study.show.kernel_page import write_study
+    from rbfmuscle.study.show.kernels.page import write_study
 
     if derivatives not in ("all", "normal") or criterion not in CRITERIA:
         raise UsageError(f"derivatives must be all or normal, criterion {', '.join(CRITERIA)}; "

@@ -120,7 +120,7 @@ def _measure(scene, output, grid, model, frames, reference, jobs, scheduler, par
     from rbfmuscle.models import configure_scene
     from rbfmuscle.sim.scene.settings import parse_settings
     from rbfmuscle.study.experiment.sweep import parse_grid, plan_sweep
-    from rbfmuscle.study.experiment.sweep_points import SweepRunner
+    from rbfmuscle.study.experiment.sweep_runner import SweepRunner
 
     axes = parse_grid(grid or [])
     loaded = configure_scene(load_scene(scene), model=model)

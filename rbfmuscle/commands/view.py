@@ -49,8 +49,8 @@ def view(
         Write the window to this PNG as soon as it stands at --at, and close it.
     """
     from rbfmuscle.study.files.saved import SavedRun
-    from rbfmuscle.study.show.viewer import COLOURINGS
-    from rbfmuscle.study.show.window import Window, require_display
+    from rbfmuscle.study.show.view.viewer import COLOURINGS
+    from rbfmuscle.study.show.view.window import Window, require_display
 
     stops = [_parse_stop(text) for text in at or []]
     if colour not in COLOURINGS:
@@ -96,7 +96,7 @@ def _begin_at(viewer, stops):
 
 
 def _open_saved(run):
-    from rbfmuscle.study.show.viewer import SavedViewer
+    from rbfmuscle.study.show.view.saved import SavedViewer
 
     return SavedViewer(run), None, f"rbfmuscle: {run.directory}"
 
@@ -105,7 +105,7 @@ def _open_scene(loaded, model):
     from rbfmuscle.models import build_models, configure_scene
     from rbfmuscle.sim.loop.driving.live import LiveSession
     from rbfmuscle.sim.scene.motion import shown_value
-    from rbfmuscle.study.show.viewer import LiveViewer
+    from rbfmuscle.study.show.view.live import LiveViewer
 
     scene = configure_scene(loaded, model=model)
     scene.validate()

@@ -182,7 +182,7 @@ class TestOutputs:
     def test_full_disk_for_kernels_names_the_folder(self, tmp_path, capsys, monkeypatch):
         import errno
 
-        from rbfmuscle.study.show import kernel_page
+        from rbfmuscle.study.show.kernels import page as kernel_page
 
         trimesh.creation.icosphere(subdivisions=2, radius=20).export(tmp_path / "ball.ply")
 
@@ -241,7 +241,7 @@ class TestKilledRuns:
         assert (killed / "last.png").read_bytes().startswith(b"\x89PNG")
 
     def test_it_is_scrubbed_in_the_viewer(self, killed):
-        from rbfmuscle.study.show.viewer import SavedViewer
+        from rbfmuscle.study.show.view.saved import SavedViewer
 
         viewer = SavedViewer(SavedRun(killed))
         viewer.scrub(5)

@@ -20,8 +20,8 @@ from rbfmuscle.compiled.progress import describe_stage
 from rbfmuscle.sim.scene.check import check_centre, check_extents, check_scene
 from rbfmuscle.study.measure.summary import require_limits
 from rbfmuscle.study.show.comparison_page import cell
-from rbfmuscle.study.show.kernel_page import COLUMNS
-from rbfmuscle.study.show.kernel_page import _row as kernel_row
+from rbfmuscle.study.show.kernels.page import COLUMNS
+from rbfmuscle.study.show.kernels.page import _row as kernel_row
 from rbfmuscle.study.show.model_paths import _panel
 from rbfmuscle.study.show.report import _cell as report_cell
 from rbfmuscle.study.show.report import _facts, _stages, _summary, _verdict

@@ -11,7 +11,7 @@ from rbfmuscle.sim.loop.driving.live import LiveSession
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.contraction import ContractionStudy, belly_measures, pennation, section_area
 from rbfmuscle.study.show.paint import check_colouring, painting
-from rbfmuscle.study.show.viewer import LiveViewer
+from rbfmuscle.study.show.view.live import LiveViewer
 from rbfmuscle.validation import UsageError
 
 

@@ -12,8 +12,8 @@ from command_line import call
 
 import rbfmuscle as rm
 from rbfmuscle.study.experiment.kernel_choice import recommend
-from rbfmuscle.study.experiment.kernel_study import SurfaceJudge
-from rbfmuscle.study.show.kernel_page import named, write_study
+from rbfmuscle.study.experiment.kernel_judge import SurfaceJudge
+from rbfmuscle.study.show.kernels.page import named, write_study
 from rbfmuscle.validation import MeshError, UsageError
 
 

@@ -17,7 +17,8 @@ import rbfmuscle.study.show.render as render
 from rbfmuscle.run import simulate, stream_run
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.summary import within
-from rbfmuscle.study.show.appearance import fitted_size
+from rbfmuscle.study.show import labels
+from rbfmuscle.study.show.appearance import fitted_size, neighbour_colours
 from rbfmuscle.study.show.page import folded_events
 from rbfmuscle.study.show.plots import motion_axis, plot_panels
 from rbfmuscle.study.show.report import write_report
@@ -200,7 +201,7 @@ def test_events_are_folded_by_kind():
 
 
 def test_neighbours_of_many_have_different_colours(crowd):
-    colours = render.neighbour_colours(SavedRun(crowd))
+    colours = neighbour_colours(SavedRun(crowd))
     names = sorted(name for name in colours if name.startswith("muscle"))
     # They lie 11 mm apart and are 10 mm wide: each touches the next, none the one after.
     assert all(colours[one] != colours[two] for one, two in pairwise(names))
@@ -228,8 +229,8 @@ def test_frames_of_different_heights_make_one_animation(tmp_path, suffix):
 def test_long_captions_take_more_lines():
     picture = np.full((50, 300, 3), 255, dtype=np.uint8)
     text = "frame 12, " + ", ".join(f"joint_{k}.coordinate {k}°" for k in range(4))
-    sheet = render.labelled(picture, text, ["front"], {"muscle": "#aa0000"})
-    short = render.labelled(picture, "frame 12", ["front"], {"muscle": "#aa0000"})
+    sheet = labels.labelled(picture, text, ["front"], {"muscle": "#aa0000"})
+    short = labels.labelled(picture, "frame 12", ["front"], {"muscle": "#aa0000"})
     assert sheet.size[0] == 300 and sheet.size[1] > short.size[1]
     # Nothing of the caption is cut off by the right edge.
     assert (np.asarray(sheet)[50:, -4:] == 255).all()

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from rbfmuscle.app import run_command as command
 from rbfmuscle.commands.sweep import run_point
 from rbfmuscle.study.experiment.sweep import SweepFolder, parse_grid, parse_task, plan_sweep, point_key
-from rbfmuscle.study.experiment.sweep_points import SweepRunner
+from rbfmuscle.study.experiment.sweep_runner import SweepRunner
 from rbfmuscle.study.experiment.sweep_table import (
     mark_front,
     merge_sweeps,
@@ -359,6 +359,6 @@ def test_dask_gives_the_same_table(finished, scheduler, tmp_path):
 
 def test_no_scheduler_is_said(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("rbfmuscle.study.experiment.sweep_points.CONNECT_WITHIN", 2)
+    monkeypatch.setattr("rbfmuscle.study.experiment.workers.CONNECT_WITHIN", 2)
     with pytest.raises(UsageError, match="no Dask scheduler"):
         run_sweep(tmp_path, scheduler="tcp://127.0.0.1:1")

@@ -12,7 +12,8 @@ import pytest
 import toy_scene
 
 from rbfmuscle.sim.loop.driving.live import LiveSession, coordinate_limits
-from rbfmuscle.study.show.viewer import LiveViewer, SavedViewer
+from rbfmuscle.study.show.view.live import LiveViewer
+from rbfmuscle.study.show.view.saved import SavedViewer
 from rbfmuscle.validation import UsageError
 
 HERE = Path(__file__).resolve().parent

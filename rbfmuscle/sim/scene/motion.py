@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -126,6 +126,14 @@ class Motion:
         names = sorted({name for frame in self.frames for name in frame})
         spans = {name: np.ptp([frame.get(name, 0.0) for frame in self.frames]) for name in names}
         return sorted((name for name in names if spans[name] > 0), key=lambda name: -spans[name])
+
+    def check_names(self, known: Collection[str]) -> None:
+        """Raise SceneError if a frame names a coordinate that is not among those known."""
+        for name in (name for frame in self.frames for name in frame):
+            if name not in known:
+                raise SceneError(
+                    f"[motion]: unknown coordinate {name!r}, {did_you_mean(name, sorted(known))}"
+                )
 
     def sliced(self, frames: slice) -> Motion:
         """Return the motion of the frames in a slice, as ``frames[A:B:S]`` does."""

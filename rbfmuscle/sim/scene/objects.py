@@ -5,10 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from rbfmuscle.sim.joints.joint import Joint
-from rbfmuscle.validation import SceneError, did_you_mean, shown
+import numpy as np
 
-__all__ = ["Bone", "Joint", "Muscle", "check_new_name", "find_named", "split_model"]
+from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.sim.joints.joint import Joint
+from rbfmuscle.validation import SceneError, check_points, did_you_mean, shown
+
+__all__ = [
+    "Bone",
+    "Joint",
+    "Muscle",
+    "as_vector",
+    "check_new_name",
+    "check_tree",
+    "find_named",
+    "split_model",
+]
 
 _NAME_CHARACTERS = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-")
 
@@ -71,3 +83,30 @@ def check_new_name(items: list[Any], name: str, what: str) -> None:
         )
     if any(item.name == name for item in items):
         raise SceneError(f"{what} {name!r} is given twice")
+
+
+def check_tree(joints: list[Joint], new: Joint) -> None:
+    """Raise SceneError if bones and joints would no longer form a tree with one joint more."""
+    place, child = f"joint {new.name!r}", new.child
+    if any(other.child == child for other in joints):
+        raise SceneError(f"{place}: bone {child!r} is already the child of another joint")
+    parents, ancestor = {other.child: other.parent for other in joints}, new.parent
+    while ancestor is not None:
+        if ancestor == child:
+            raise SceneError(f"{place}: {child!r} would hang on itself, joints must form a tree")
+        ancestor = parents.get(ancestor)
+
+
+def as_vector(values: Any, name: str, *, unit: bool = False) -> Floats:
+    """Three numbers as an array (3,), of length one where a unit vector is asked for, or raise SceneError."""
+    try:
+        vector = check_points([values], name=name)[0]
+    except (ValueError, TypeError) as error:
+        raise SceneError(f"{name} must be three numbers, got {shown(values)} ({error})") from None
+    if not unit:
+        return vector
+    largest = np.abs(vector).max()
+    if largest == 0:
+        raise SceneError(f"{name} must not be the zero vector")
+    vector = vector / largest  # the squares of very long or short ones leave the range of numbers
+    return vector / np.linalg.norm(vector)

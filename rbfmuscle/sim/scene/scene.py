@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Floats, Integers
@@ -20,9 +19,18 @@ from rbfmuscle.sim.scene.attachments import Attachment, resolve_attachments
 from rbfmuscle.sim.scene.joint_tables import CouplingTable, JointTable, make_coupling
 from rbfmuscle.sim.scene.meshes import ReadMesh, as_mesh
 from rbfmuscle.sim.scene.motion import Motion, coordinate_names
-from rbfmuscle.sim.scene.objects import Bone, Joint, Muscle, check_new_name, find_named, split_model
+from rbfmuscle.sim.scene.objects import (
+    Bone,
+    Joint,
+    Muscle,
+    as_vector,
+    check_new_name,
+    check_tree,
+    find_named,
+    split_model,
+)
 from rbfmuscle.sim.scene.options import ContactOptions, MotionOptions, OutputOptions
-from rbfmuscle.validation import SceneError, check_points, did_you_mean, shown
+from rbfmuscle.validation import SceneError
 
 if TYPE_CHECKING:
     import trimesh
@@ -195,28 +203,20 @@ class Scene:
         place = f"joint {name!r}"
         row = {"name": name, "parent": parent, "child": child, **keys}
         if centre is not None:
-            row["centre"] = _vector(centre, f"{place}: centre").tolist()
+            row["centre"] = as_vector(centre, f"{place}: centre").tolist()
         if axes:
             row["axes"] = {
-                k: _vector(axis, f"{place}: axis {k!r}", unit=True).tolist() for k, axis in axes.items()
+                k: as_vector(axis, f"{place}: axis {k!r}", unit=True).tolist() for k, axis in axes.items()
             }
         return self.place_joint(JointTable.build(row, place=f"{place}: ").joint())
 
     def place_joint(self, joint: Any) -> Any:
         """Add a `Joint` and return the scene; bones and joints form a tree."""
         check_new_name(self.joints, joint.name, "joint")
-        place, child = f"joint {joint.name!r}", joint.child
-        for bone in (joint.parent, child):
+        for bone in (joint.parent, joint.child):
             if bone not in self.links:
-                find_named(self.bones, bone, "bone", place=place)
-        if any(other.child == child for other in self.joints):
-            raise SceneError(f"{place}: bone {child!r} is already the child of another joint")
-        ancestor = joint.parent
-        parents = {other.child: other.parent for other in self.joints}
-        while ancestor is not None:
-            if ancestor == child:
-                raise SceneError(f"{place}: {child!r} would hang on itself, joints must form a tree")
-            ancestor = parents.get(ancestor)
+                find_named(self.bones, bone, "bone", place=f"joint {joint.name!r}")
+        check_tree(self.joints, joint)
         self.joints.append(joint)
         return self
 
@@ -303,13 +303,7 @@ class Scene:
         for what in ("bones", "muscles"):
             if not getattr(self, what):
                 raise SceneError(f"scene {self.name!r} has no {what}, add a [[{what[:-1]}]]")
-        known = set(coordinate_names(self.joints))
-        for frame in self.motion.frames:
-            for name in frame:
-                if name not in known:
-                    raise SceneError(
-                        f"[motion]: unknown coordinate {name!r}, {did_you_mean(name, sorted(known))}"
-                    )
+        self.motion.check_names(set(coordinate_names(self.joints)))
         for muscle in self.muscles:
             bones = sorted({attachment.bone for attachment in muscle.attachments})
             if not bones:
@@ -398,20 +392,6 @@ class Scene:
         muscles = ", ".join(f"{muscle.name} ({muscle.model})" for muscle in self.muscles) or "no muscles"
         counts = f"{len(self.bones)} bones, {muscles}, {len(self.motion)} frames"
         return f"<Scene {self.name!r}, {self.units}: {counts}>"
-
-
-def _vector(values, name, *, unit=False):
-    try:
-        vector = check_points([values], name=name)[0]
-    except (ValueError, TypeError) as error:
-        raise SceneError(f"{name} must be three numbers, got {shown(values)} ({error})") from None
-    if not unit:
-        return vector
-    largest = np.abs(vector).max()
-    if largest == 0:
-        raise SceneError(f"{name} must not be the zero vector")
-    vector = vector / largest  # the squares of very long or short ones leave the range of numbers
-    return vector / np.linalg.norm(vector)
 
 
 __all__ = ["Attachment", "Bone", "Joint", "Muscle", "Scene"]

@@ -13,12 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from rbfmuscle.study.cohort.jobs import CohortFolder, CohortJob
-from rbfmuscle.study.experiment.sweep_points import (
-    POINT_ERRORS,
-    available_cores,
-    connect_cluster,
-    threads_limited,
-)
+from rbfmuscle.study.experiment.sweep_points import POINT_ERRORS
+from rbfmuscle.study.experiment.workers import available_cores, connect_cluster, threads_limited
 
 DIED = "its process ended without a word (out of memory, or a crash)"
 

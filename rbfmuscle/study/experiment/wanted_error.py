@@ -21,7 +21,8 @@ from rbfmuscle.implicit.placement.density import GREEDY_LARGEST
 from rbfmuscle.implicit.placement.refinement import FITTED
 from rbfmuscle.implicit.placement.sampling import PLACEMENTS, sample_surface
 from rbfmuscle.study.experiment.kernel_choice import mark_unfit
-from rbfmuscle.study.experiment.kernel_study import KernelStudy, Request, SurfaceJudge, measure_row
+from rbfmuscle.study.experiment.kernel_judge import SurfaceJudge
+from rbfmuscle.study.experiment.kernel_study import KernelStudy, Request, measure_row
 from rbfmuscle.validation import UsageError, check_mesh
 
 # Kernels that take part by default, the quickest first.

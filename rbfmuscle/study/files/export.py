@@ -148,7 +148,7 @@ def _export_animation(saved, folder, name, frames, how):
     path = folder / f"{run.name}{SUFFIX_OF[name]}"
     if name == "html":
         from rbfmuscle.study.animation.page import write_animated_page
-        from rbfmuscle.study.show.render import coordinate_texts
+        from rbfmuscle.study.show.labels import coordinate_texts
 
         told_of = {
             entry["frame"]: ", ".join(coordinate_texts(saved.info, entry)) for entry in saved.info["frames"]

@@ -11,8 +11,10 @@ import numpy as np
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.show.appearance import muscle_colours
+from rbfmuscle.study.show.labels import caption, labelled
 from rbfmuscle.study.show.paint import CHIPS, scale_chips
-from rbfmuscle.study.show.render import Stage, caption, labelled, main, save_images
+from rbfmuscle.study.show.render import main, save_images
+from rbfmuscle.study.show.stage import Stage
 
 
 def _open(folder):

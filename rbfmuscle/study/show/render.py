@@ -14,30 +14,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from rbfmuscle.geometry.arrays import Integers
-from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.show.appearance import (
     BACKGROUND,
-    BONE_COLOUR,
     MUSCLE_COLOURS,
     USUAL_VIEWS,
     VIEWS,
-    aim_camera,
     fitted_size,
-    neighbour_colours,
 )
-from rbfmuscle.study.show.paint import PAINT_COLOURS, check_colouring, painting
+from rbfmuscle.study.show.labels import caption, labelled
+from rbfmuscle.study.show.paint import check_colouring, painting
+from rbfmuscle.study.show.stage import Stage, path_bounds
 from rbfmuscle.validation import MissingPartError, RBFMuscleError, UsageError
 
 ANIMATIONS = (".webp", ".gif")
-_STRIP = 30
-_PAINT = "paint"
-_BONE_TRIANGLES = 12_000
-# Coordinates that a caption names at most.
-MOST_SHOWN = 4
 _TIMEOUT = 1800
 # Code of a child that could draw and could not save.
 _REFUSED = 3
@@ -172,190 +162,17 @@ def draw_pictures(directory: str | Path, make_jobs: Callable[..., Any], **how: A
         return {path.stem: path.read_bytes() for path in sorted(Path(folder).glob("*.png"))}, missing
 
 
-class Stage:
-    """An off-screen window with several panels, each aimed at the muscles' whole path.
-
-    Parameters
-    ----------
-    rows : list of list of (SavedRun, str)
-        What each panel shows: a run, and the view of it. Runs of several panels are of one scene.
-    size : (width, height)
-        Of a panel [pixel].
-    paint : callable, optional
-        ``paint(saved, muscle, frame, vertices)`` gives values (n,) from 0 to 1 to colour a muscle by; plain
-        colours where not given.
-    """
-
-    def __init__(self, rows: list[Any], size: Any, paint: Callable[..., Any] | None = None) -> None:
-        import pyvista
-
-        self.paint = paint
-        self.panels = [
-            (i, j, saved, view) for i, row in enumerate(rows) for j, (saved, view) in enumerate(row)
-        ]
-        shape = (len(rows), len(rows[0]))
-        window = (size[0] * shape[1], size[1] * shape[0])
-        self.plotter = pyvista.Plotter(off_screen=True, shape=shape, border=False, window_size=window)
-        self.plotter.set_background(BACKGROUND)
-        first = rows[0][0][0]
-        self.first, self.colours = first, neighbour_colours(first)
-        self.bones = [(name, self._add_bone(first.bone(name))) for name in first.bones]
-        # Of each run's muscle: its mesh, shared by the panels, and its actors there.
-        self.skins: dict[Any, tuple[Any, list[Any]]] = {}
-        bounds = _path_bounds({id(saved): saved for row in rows for saved, _ in row}.values())
-        for i, j, _, view in self.panels:
-            self.plotter.subplot(i, j)
-            aim_camera(self.plotter.camera, VIEWS[view][0], bounds, size)
-            self.plotter.enable_anti_aliasing("ssaa")
-
-    def show(self, frame: int) -> Any:
-        """Put bones and muscles where they are in a frame, and return the picture (h, w, 3) uint8."""
-        for name, actors in self.bones:
-            for actor in actors:
-                actor.user_matrix = self.first.poses[frame][name]
-        for saved in {id(saved): saved for _, _, saved, _ in self.panels}.values():
-            for muscle in saved.muscles:
-                self._show_skin(saved, muscle, frame)
-        for renderer in self.plotter.renderers:
-            renderer.ResetCameraClippingRange()
-        self.plotter.render()  # a screenshot alone shows what was drawn last
-        return self.plotter.screenshot(return_img=True)
-
-    def close(self) -> None:
-        """Let the plotter go."""
-        self.plotter.close()
-
-    def _add_bone(self, mesh):
-        import pyvista
-
-        mesh = pyvista.make_tri_mesh(*mesh)
-        if mesh.n_cells > _BONE_TRIANGLES:  # software drawing pays for each of them in every frame
-            mesh = mesh.decimate(1.0 - _BONE_TRIANGLES / mesh.n_cells)
-        mesh = mesh.compute_normals(split_vertices=False, auto_orient_normals=False)
-        return [self._add(i, j, mesh, BONE_COLOUR) for i, j, _, _ in self.panels]
-
-    def _show_skin(self, saved, muscle, frame):
-        """A muscle in all panels of its run: moved where its faces are those of the frame before, else made anew."""
-        import pyvista
-
-        vertices, faces = saved.surface(muscle, frame)
-        mesh, actors = self.skins.get((id(saved), muscle), (None, []))
-        known = mesh is not None and np.array_equal(mesh.regular_faces, faces)
-        if known:
-            mesh.points = vertices
-        else:
-            mesh = pyvista.make_tri_mesh(vertices, faces)
-        # Set and not computed by the plotter, which would do it again for every panel.
-        mesh.point_data.active_normals = vertex_normals(vertices, np.asarray(faces)).astype(np.float32)
-        if self.paint is not None:
-            mesh.point_data[_PAINT] = self.paint(saved, muscle, frame, np.asarray(mesh.points))
-        if known:
-            return
-        for actor in actors:
-            self.plotter.remove_actor(actor, render=False)
-        panels = [(i, j) for i, j, shown, _ in self.panels if shown is saved]
-        actors = [self._add(i, j, mesh, self.colours[muscle]) for i, j in panels]
-        self.skins[id(saved), muscle] = mesh, actors
-
-    def _add(self, row, column, mesh, colour):
-        self.plotter.subplot(row, column)
-        painted = _PAINT in mesh.point_data
-        return self.plotter.add_mesh(
-            mesh,
-            color=None if painted else colour,
-            scalars=_PAINT if painted else None,
-            cmap=PAINT_COLOURS,
-            clim=(0.0, 1.0),
-            show_scalar_bar=False,
-            smooth_shading=True,
-            specular=0.25,
-            specular_power=18,
-            ambient=0.12,
-            render=False,
-            reset_camera=False,
-        )
-
-
-def _path_bounds(runs):
-    """Box around the muscles of all runs in the first, middle and last frame."""
-    boxes = np.array([saved.path_bounds for saved in runs])
-    return np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
-
-
 def chosen_frames(frames: list[int], most: int = 24) -> list[int]:
     """At most so many of the frames of a motion for an animation, evenly, the last one included."""
     stride = -(-len(frames) // most)
     return frames[(len(frames) - 1) % stride :: stride]
 
 
-def caption(saved: Any, frame: int) -> Any:
-    """Frame number and joint angles, as text."""
-    entry = next(entry for entry in saved.info["frames"] if entry["frame"] == frame)
-    clock = [f"{entry['time']:.4g} s"] if "time" in entry else []
-    return ", ".join([f"frame {frame}", *clock, *coordinate_texts(saved.info, entry)])
-
-
-def coordinate_texts(info: dict[str, Any], entry: dict[str, Any]) -> Any:
-    """A frame's coordinates as text, each with its unit; of many, those that the motion moves most.
-
-    Parameters
-    ----------
-    info : dict
-        What ``run.json`` holds.
-    entry : dict
-        Of its ``frames``.
-    """
-    values = entry["coordinates"]
-    if len(values) > MOST_SHOWN:
-        tracks = {n: [row["coordinates"].get(n, 0.0) for row in info["frames"]] for n in values}
-        spans = {n: max(track) - min(track) for n, track in tracks.items()}
-        values = {n: values[n] for n in sorted(values, key=lambda n: -spans[n])[:MOST_SHOWN]}
-    units = info["scene"].get("coordinate_units", {})
-    return [f"{name} {value:.4g}{units.get(name, '°')}" for name, value in values.items()]
-
-
-def labelled(image: Integers, text: str, titles: list[Any], chips: dict[str, Any]) -> Any:
-    """Image with a title above each column, and below a strip with a caption and what colours mean.
-
-    Parameters
-    ----------
-    image : (h, w, 3) ndarray of uint8
-    text : str
-    titles : list of str
-    chips : dict of str to colour
-    """
-    from PIL import Image, ImageDraw, ImageFont
-
-    font = ImageFont.load_default(13)
-    height, width = image.shape[:2]
-    pen = ImageDraw.Draw(Image.new("RGB", (1, 1)))
-    # Where each word begins: side by side, and in another line where there is no room.
-    x, y, places = 8, height + 7, []
-    parts = [text] if pen.textlength(text, font=font) <= width - 16 else text.split(", ")
-    for name in [*parts, *chips]:
-        wide = int(pen.textlength(name, font=font)) + (17 if len(places) >= len(parts) else 0)
-        if places and x + wide > width:
-            x, y = 8, y + _STRIP - 8
-        places.append((x, y))
-        x += wide + 20
-    sheet = Image.new("RGB", (width, y - 7 + _STRIP), BACKGROUND)
-    sheet.paste(Image.fromarray(image), (0, 0))
-    pen = ImageDraw.Draw(sheet)
-    for k, title in enumerate(titles):
-        pen.text((k * width // len(titles) + 8, 6), title, fill="#8a8a8a", font=font)
-    for place, part in zip(places, parts):
-        pen.text(place, part, fill="#333333", font=font)
-    for (x, y), (name, colour) in zip(places[len(parts) :], chips.items()):
-        pen.rectangle((x, y + 2, x + 12, y + 14), fill=colour)
-        pen.text((x + 17, y), name, fill="#333333", font=font)
-    return sheet
-
-
 def _draw_job(saved, job, seconds, stages):
     views, size, colour = tuple(job["views"]), tuple(job["size"]), job.get("colour", "muscle")
     paint, chips = painting(saved, colour, job["frames"])
     if job.get("fit"):
-        size = fitted_size(_path_bounds([saved]), views, size)
+        size = fitted_size(path_bounds([saved]), views, size)
     if (views, *size, colour) not in stages:
         stages[views, *size, colour] = Stage([[(saved, view) for view in views]], size, paint)
     stage = stages[views, *size, colour]

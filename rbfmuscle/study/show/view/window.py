@@ -13,7 +13,7 @@ import numpy as np
 
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.study.show.appearance import BACKGROUND, BONE_COLOUR, muscle_colours
-from rbfmuscle.study.show.viewer import COLOURINGS
+from rbfmuscle.study.show.view.viewer import COLOURINGS
 from rbfmuscle.validation import MissingPartError
 
 KEYS = "m model   k quality   c colour   space motion   h rest   i screenshot   x export   q close"

@@ -1,0 +1,1 @@
+"""The page of a kernel study: its table, its plots, its surfaces."""

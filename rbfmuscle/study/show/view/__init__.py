@@ -1,0 +1,1 @@
+"""The window: what it shows of a live scene or a saved run, and its switches."""
