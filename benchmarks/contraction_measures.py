@@ -29,6 +29,7 @@ from scipy.optimize import brentq
 
 from rbfmuscle.models import build_model
 from rbfmuscle.run import simulate
+from rbfmuscle.study.measure.centreline import MuscleAtRest
 from rbfmuscle.study.measure.contraction import ContractionStudy, belly_measures, pennation
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 
@@ -171,7 +172,7 @@ def panel(model):
         scene = panel_scene(stretch, model=model)
         run = simulate(scene)
         muscle = scene.muscles[0]
-        study = ContractionStudy(muscle, scene.joints, *_at_rest(scene, model))
+        study = ContractionStudy(MuscleAtRest(muscle, scene.joints, *_at_rest(scene, model)))
         angles = []
         for frame in (run.frames[0], run.frames[-1]):
             lines = study.lines(frame.carried[MUSCLE][0])

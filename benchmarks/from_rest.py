@@ -18,7 +18,7 @@ from rbfmuscle.sim.loop.simulate import simulate_frames
 from rbfmuscle.sim.scene.phantom import phantom_scene
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.sim.scene.settings import parse_setting
-from rbfmuscle.study.measure.centreline import Centreline
+from rbfmuscle.study.measure.centreline import Centreline, MuscleAtRest
 
 ASIDE, LEG = {"hip.adduction": -25.0}, {"hip.flexion": 60.0}
 WINDOW = 21  # frames of one degree
@@ -28,7 +28,7 @@ def leg(scene):
     """Lengths (frames,) of the scene's only muscle along the leg, sub-steps, and processor time [s]."""
     scene.set_motion(waypoints=[{}, ASIDE, {**ASIDE, **LEG}], step=1.0)
     (muscle,), (model,) = scene.muscles, build_models(scene)
-    line = Centreline(muscle, scene.joints, *model.carried_mesh())
+    line = Centreline(MuscleAtRest(muscle, scene.joints, *model.carried_mesh()))
     began, lengths, substeps = time.process_time(), [], 0
     for frame in simulate_frames(scene, [model], surfaces=False):
         lengths.append(line.length(frame.carried[muscle.name][0], frame.poses))

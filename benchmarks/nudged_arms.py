@@ -18,7 +18,7 @@ from rbfmuscle.sim.loop.simulate import FrameLoop
 from rbfmuscle.sim.plan.reach import build_fields, reached_bones
 from rbfmuscle.sim.scene.motion import bone_poses
 from rbfmuscle.sim.scene.phantom import phantom_scene
-from rbfmuscle.study.measure.centreline import Centreline
+from rbfmuscle.study.measure.centreline import Centreline, MuscleAtRest
 
 NAMES = ("hip.flexion", "hip.adduction", "hip.internal_rotation")
 POSES = ((40.0, 10.0, 0.0), (20.0, 6.0, 5.0), (50.0, -8.0, -10.0))
@@ -35,7 +35,7 @@ class Judge:
         self.models = build_models(self.scene)
         self.rest = [model.snapshot() for model in self.models]
         self.lines = {
-            m.name: Centreline(self.scene.muscle(m.name), self.scene.joints, *m.carried_mesh())
+            m.name: Centreline(MuscleAtRest(self.scene.muscle(m.name), self.scene.joints, *m.carried_mesh()))
             for m in self.models
         }
         self.fields = build_fields(self.scene, reached_bones(self.scene))

@@ -26,20 +26,7 @@ POINTS = {"vertices": 1, "faces": 6}
 def estimate_muscle(
     muscle: Muscle, scene: Scene, rates: Mapping[str, float], options: PBDOptions
 ) -> MuscleCost:
-    """What a mesh muscle takes.
-
-    Parameters
-    ----------
-    muscle : Muscle
-    scene : Scene
-    rates : dict of str to float
-        From `rbfmuscle.sim.plan.rates.measure_rates`.
-    options : PBDOptions
-
-    Returns
-    -------
-    MuscleCost
-    """
+    """What a mesh muscle with these options takes, as `rbfmuscle.models.estimate_model` says it."""
     count, call, visit = len(muscle.mesh.vertices), rates["call"], rates["visit"]
     method, rounds = METHODS[options.method], sweeps(options)
     search = CROSSING_VISITS * POINTS[options.contact] * count if scene.detect is not None else 0

@@ -141,24 +141,12 @@ class XPBDShape(Shape):
         self.edges.project(points, self.inverse_mass)
 
 
-class ARAPShape(Shape):
-    """The ARAP energy as PBD constraints: the paper's section 6.2, first option."""
+class RotatingShape(Shape):
+    """A shape whose neighbourhoods have rotations (`ARAP`), which it remembers from sweep to sweep."""
 
     def __init__(self, rest: Rest, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
         super().__init__(rest)
         self.arap = ARAP(rest.vertices, rest.topology, stiffer=stiffer)
-        self.constraint = ARAPConstraint(self.arap, compliance=options.arap_compliance)
-
-    def contract(self, fibres: MeshFibres, points: np.ndarray) -> None:
-        """Take rest vectors from the fibres."""
-        self.arap.rest = fibres.targets(points)
-        self.constraint.rest = np.ascontiguousarray(self.arap.rest[self.constraint.order])
-
-    def sweep(self, points: Floats, time: float) -> None:
-        """Rotations, then one small step of the constraints."""
-        self.arap.fit_rotations(points)
-        self.constraint.reset()
-        self.constraint.project(points, self.inverse_mass, time=time)
 
     def transform(self, motion: np.ndarray) -> None:
         """The rotations go along with a rigid motion (4, 4)."""
@@ -173,7 +161,26 @@ class ARAPShape(Shape):
         self.arap.quaternions[:] = state
 
 
-class GlobalARAPShape(Shape):
+class ARAPShape(RotatingShape):
+    """The ARAP energy as PBD constraints: the paper's section 6.2, first option."""
+
+    def __init__(self, rest: Rest, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
+        super().__init__(rest, options, stiffer)
+        self.constraint = ARAPConstraint(self.arap, compliance=options.arap_compliance)
+
+    def contract(self, fibres: MeshFibres, points: np.ndarray) -> None:
+        """Take rest vectors from the fibres."""
+        self.arap.rest = fibres.targets(points)
+        self.constraint.rest = np.ascontiguousarray(self.arap.rest[self.constraint.order])
+
+    def sweep(self, points: Floats, time: float) -> None:
+        """Rotations, then one small step of the constraints."""
+        self.arap.fit_rotations(points)
+        self.constraint.reset()
+        self.constraint.project(points, self.inverse_mass, time=time)
+
+
+class GlobalARAPShape(RotatingShape):
     """Local rotations and one prefactored global solve: the ARAP of the paper's second option.
 
     The global step makes E(x) + |x - z|^2 / (2 l^2) least in the surface's own measure, z where contact and
@@ -182,8 +189,7 @@ class GlobalARAPShape(Shape):
     """
 
     def __init__(self, rest: Rest, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
-        super().__init__(rest)
-        self.arap = ARAP(rest.vertices, rest.topology, stiffer=stiffer)
+        super().__init__(rest, options, stiffer)
         self.free = np.flatnonzero(rest.inverse_mass > 0.0)
         self.held = np.flatnonzero(rest.inverse_mass == 0.0)
         reach = options.arap_reach * float(np.linalg.norm(np.ptp(rest.vertices, axis=0)))
@@ -202,18 +208,6 @@ class GlobalARAPShape(Shape):
         right = self.arap.targets()[self.free] + self.mass * points[self.free]
         right -= self.coupling @ points[self.held]
         points[self.free] = self.factor.solve(right)
-
-    def transform(self, motion: np.ndarray) -> None:
-        """The rotations go along with a rigid motion (4, 4)."""
-        self.arap.quaternions[:] = turned_quaternions(self.arap.quaternions, motion[:3, :3])
-
-    def snapshot(self) -> np.ndarray:
-        """The rotations."""
-        return self.arap.quaternions.copy()
-
-    def restore(self, state: Any) -> None:
-        """Go back to the rotations of a snapshot."""
-        self.arap.quaternions[:] = state
 
     def _swelling(self, points: np.ndarray) -> np.ndarray:
         """L^-1 of the volume's gradient: its smooth (Sobolev) direction, 0 at held vertices."""

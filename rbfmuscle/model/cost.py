@@ -52,20 +52,7 @@ DENSE_BYTES, PAIR_BYTES = 27 * 40, 19
 def estimate_muscle(
     muscle: Muscle, scene: Scene, rates: Mapping[str, float], options: RBFOptions
 ) -> MuscleCost:
-    """What an RBF muscle takes.
-
-    Parameters
-    ----------
-    muscle : Muscle
-    scene : Scene
-    rates : dict of str to float
-        From `rbfmuscle.sim.plan.rates.measure_rates`.
-    options : RBFOptions
-
-    Returns
-    -------
-    MuscleCost
-    """
+    """What an RBF muscle with these options takes, as `rbfmuscle.models.estimate_model` says it."""
     chosen = choose_centres(muscle, scene, options, known_only=True)
     centres = chosen.centres
     points = centres + (dense_count(muscle, options) if options.inside else options.samples)

@@ -1,4 +1,4 @@
-"""Muscle paths of a model: points, conditions and moving points, and the lengths that they give without wrapping."""
+"""Muscle paths of a model: points, conditions and moving points."""
 
 from collections.abc import Callable
 
@@ -95,13 +95,3 @@ def _moved(name, function, resolved, facts):
     limits = facts[name].range
     value = resolved[name] if limits is None else min(max(resolved[name], limits[0]), limits[1])
     return function(value)
-
-
-def straight_length(model: OsimModel, path: ModelPath, values: dict[str, float] | None = None) -> float:
-    """Return the length of a path that wraps about nothing [metre]: straight between its points."""
-    transforms = model.transforms(values)
-    places = []
-    for point, place in active_points(model, path, values):
-        pose = transforms[point.body]
-        places.append(pose[:3, :3] @ place + pose[:3, 3])
-    return float(np.linalg.norm(np.diff(np.array(places), axis=0), axis=1).sum())

@@ -89,12 +89,12 @@ def test_pennate_panel_turns_its_fibres_as_its_volume_says(model):
     from peers.contraction_scenes import panel_pennation, panel_scene
 
     from rbfmuscle.models import build_model
+    from rbfmuscle.study.measure.centreline import MuscleAtRest
     from rbfmuscle.study.measure.contraction import ContractionStudy, pennation
 
     scene = panel_scene(0.8, model=model, spacing=6.0)
     run = rm.simulate(scene, settings={"output.surfaces": False})
-    study = ContractionStudy(
-        scene.muscles[0], scene.joints, *build_model(scene.muscles[0], scene).carried_mesh()
-    )
+    rest = build_model(scene.muscles[0], scene).carried_mesh()
+    study = ContractionStudy(MuscleAtRest(scene.muscles[0], scene.joints, *rest))
     lines = study.lines(carried(run, -1))
     assert pennation(lines, study.belly, np.eye(3)[0]) == pytest.approx(panel_pennation(0.8), abs=1.0)

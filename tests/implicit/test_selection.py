@@ -7,7 +7,7 @@ import pytest
 from peers.variable import FAMILIES, fit_variable, search_variable, variable_epsilon
 
 from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.fit.cross_validation import least_squares_residuals, leave_one_out
+from rbfmuscle.implicit.fit.cross_validation import LeastSquaresPath, leave_one_out
 from rbfmuscle.implicit.fit.fitting import Basis
 from rbfmuscle.implicit.fit.systems import collocation, frame, hermite_system
 from rbfmuscle.implicit.kernels.table import get_kernel
@@ -67,7 +67,7 @@ def test_least_squares_residuals_equal_the_literal_loop():
     kernel = get_kernel("gaussian")
     matrix, _ = collocation(points, centres, kernel, 1.5, -1, *frame(centres))
     for ridge in (0.0, 1e-3):
-        found = least_squares_residuals(matrix, values, smoothing=ridge)
+        found = LeastSquaresPath(matrix, values).residuals(ridge)
         for k in (0, 20, 59):
             rest = np.arange(60) != k
             normal = matrix[rest].T @ matrix[rest] + ridge * np.eye(15)

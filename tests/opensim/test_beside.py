@@ -6,12 +6,12 @@ import re
 import numpy as np
 import pytest
 import trimesh
+from straight_paths import straight_length
 
 import rbfmuscle as rm
 from rbfmuscle.opensim import beside
 from rbfmuscle.opensim.folder import write_scene
 from rbfmuscle.opensim.match import attach, match_meshes
-from rbfmuscle.opensim.paths import straight_length
 from rbfmuscle.opensim.read import read_osim
 from rbfmuscle.opensim.scene import import_osim
 from rbfmuscle.run import stream_run

@@ -5,10 +5,10 @@ import math
 
 import numpy as np
 import pytest
+from straight_paths import straight_length
 
 import rbfmuscle as rm
 from rbfmuscle.opensim.folder import write_scene
-from rbfmuscle.opensim.paths import straight_length
 from rbfmuscle.opensim.read import read_osim
 from rbfmuscle.opensim.scene import import_osim
 from rbfmuscle.sim.joints.joint import frame_at, rotation_about

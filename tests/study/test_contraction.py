@@ -9,6 +9,7 @@ import rbfmuscle as rm
 from rbfmuscle.models import build_model
 from rbfmuscle.sim.loop.driving.live import LiveSession
 from rbfmuscle.study.files.saved import SavedRun
+from rbfmuscle.study.measure.centreline import MuscleAtRest
 from rbfmuscle.study.measure.contraction import ContractionStudy, belly_measures, pennation, section_area
 from rbfmuscle.study.show.paint import check_colouring, painting
 from rbfmuscle.study.show.view.live import LiveViewer
@@ -48,7 +49,7 @@ def test_fibres_of_the_spindle_at_rest_and_shortened(given):
     if not given:
         muscle.fibres = None
     vertices, faces = np.asarray(muscle.mesh.vertices), np.asarray(muscle.mesh.faces)
-    study = ContractionStudy(muscle, scene.joints, vertices, faces)
+    study = ContractionStudy(MuscleAtRest(muscle, scene.joints, vertices, faces))
     poses = {bone.name: np.eye(4) for bone in scene.bones}
     rest = study.measure(vertices, poses)
     # Whole segments of 20 mm count, none that tendon reaches.

@@ -15,6 +15,7 @@ from rbfmuscle.geometry.mean_value import mean_value_weights
 from rbfmuscle.run import simulate, stream_run
 from rbfmuscle.study.files.export import export_run
 from rbfmuscle.study.files.saved import SavedRun
+from rbfmuscle.study.measure.centreline import MuscleAtRest
 from rbfmuscle.study.measure.fibre_field import FibreField, attachment_points
 from rbfmuscle.study.measure.fibre_lines import grow_fibres, resampled, spread
 from rbfmuscle.study.measure.fibre_study import FibreBundle, FibreStudy, line_lengths
@@ -169,9 +170,8 @@ class TestCarried:
     def bundle(self):
         scene = arm_scene()
         mesh = scene.muscles[0].mesh
-        return scene, FibreBundle(
-            scene.muscles[0], scene.joints, np.array(mesh.vertices), np.array(mesh.faces), count=20
-        )
+        carried = np.array(mesh.vertices), np.array(mesh.faces)
+        return scene, FibreBundle(MuscleAtRest(scene.muscles[0], scene.joints, *carried), count=20)
 
     def test_rest_gives_back_the_fibres(self, bundle):
         scene, made = bundle

@@ -12,7 +12,7 @@ from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
 from rbfmuscle.sim.joints.joint import Coordinate
 from rbfmuscle.sim.loop.simulate import Event, Frame, ModelSurface
 from rbfmuscle.sim.scene.motion import Motion
-from rbfmuscle.study.measure.centreline import Centreline, slice_operator, split_ends
+from rbfmuscle.study.measure.centreline import Centreline, MuscleAtRest, slice_operator, split_ends
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.measure.metrics import (
     MetricsRecorder,
@@ -234,7 +234,7 @@ def rod(length=100.0, radius=8.0, rings=60, around=24):
 def rod_muscle(mesh, length=100.0):
     ends = [("trunk", mesh.vertices[:, 0] == 0), ("limb", mesh.vertices[:, 0] == length)]
     attachments = [SimpleNamespace(bone=bone, vertices=np.flatnonzero(where)) for bone, where in ends]
-    return SimpleNamespace(name="rod", mesh=mesh, attachments=attachments)
+    return SimpleNamespace(name="rod", mesh=mesh, attachments=attachments, contraction=None)
 
 
 BEND = {"bend": Coordinate()}
@@ -245,7 +245,7 @@ class TestLength:
     def test_straight_cylinder(self):
         mesh = rod()
         assert mesh.volume > 0
-        line = Centreline(rod_muscle(mesh), JOINTS, *arrays(mesh))
+        line = Centreline(MuscleAtRest(rod_muscle(mesh), JOINTS, *arrays(mesh)))
         assert line.length(np.array(mesh.vertices), {"trunk": EYE, "limb": EYE}) == pytest.approx(
             100, abs=1e-6
         )
@@ -261,13 +261,13 @@ class TestLength:
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         held = vertices[vertices[:, 0] == 100, 1]
         assert held.mean() > 2  # where there are more
-        line = Centreline(rod_muscle(mesh), JOINTS, *arrays(mesh))
+        line = Centreline(MuscleAtRest(rod_muscle(mesh), JOINTS, *arrays(mesh)))
         last = line.points(vertices, {"trunk": EYE, "limb": EYE})[-1]
         assert last == pytest.approx([100, 0, 0], abs=0.6)  # the new ones on the rim have no side faces
 
     def test_stretch_is_followed(self):
         mesh = rod()
-        line = Centreline(rod_muscle(mesh), JOINTS, *arrays(mesh))
+        line = Centreline(MuscleAtRest(rod_muscle(mesh), JOINTS, *arrays(mesh)))
         pose = np.eye(4)
         pose[0, 3] = 30.0
         stretched = np.array(mesh.vertices) * [1.3, 0.9, 0.9]
@@ -275,7 +275,7 @@ class TestLength:
 
     def test_bent_cylinder_has_its_arc(self):
         mesh, radius = rod(), 60.0
-        line = Centreline(rod_muscle(mesh), JOINTS, *arrays(mesh))
+        line = Centreline(MuscleAtRest(rod_muscle(mesh), JOINTS, *arrays(mesh)))
         v = np.array(mesh.vertices)
         angle = v[:, 0] / radius
         bent = np.stack([(radius + v[:, 1]) * np.sin(angle), (radius + v[:, 1]) * np.cos(angle), v[:, 2]], 1)

@@ -18,7 +18,7 @@ from rbfmuscle.sim.plan.reach import build_fields, reached_bones
 from rbfmuscle.sim.scene.joint_tables import full_name
 from rbfmuscle.sim.scene.motion import Motion, bone_poses, inner_value
 from rbfmuscle.sim.scene.scene import Scene
-from rbfmuscle.study.measure.centreline import Centreline
+from rbfmuscle.study.measure.centreline import Centreline, MuscleAtRest
 from rbfmuscle.validation import SceneError, SolveError, UsageError
 
 # Every fifth sample is held out of the fit.
@@ -95,7 +95,8 @@ class Sampling:
             models = build_models(scene)
             rest = [model.snapshot() for model in models]
             lines = {
-                m.name: Centreline(scene.muscle(m.name), scene.joints, *m.carried_mesh()) for m in models
+                m.name: Centreline(MuscleAtRest(scene.muscle(m.name), scene.joints, *m.carried_mesh()))
+                for m in models
             }
             fields = build_fields(scene, reached_bones(scene))
             for index in waiting:

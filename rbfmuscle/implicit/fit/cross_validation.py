@@ -133,34 +133,16 @@ def _from_eigenvectors(basis: Basis, right: Floats, smoothing: float) -> Residua
     return _residuals(blocks, weights, count, sizes.max() / max(sizes.min(), 1e-300))
 
 
-def least_squares_residuals(
-    matrix: Floats, right: Floats, *, smoothing: float = 0.0, cutoff: float = 1e-14
-) -> Residuals:
-    """Leave-one-out residuals (y - Hy)_k / (1 - H_kk) and GCV of a ridge or truncated least-squares fit.
+class LeastSquaresPath:
+    """Residuals of a truncated least-squares fit for any Tikhonov term, by one singular value decomposition.
 
     Parameters
     ----------
     matrix : (n, m) ndarray
         Collocation matrix, n > m.
     right : (n,) ndarray
-    smoothing : float
-        Tikhonov term; see `fitting.solve_least_squares`.
     cutoff : float
-
-    Returns
-    -------
-    Residuals
-    """
-    return LeastSquaresPath(matrix, right, cutoff=cutoff).residuals(smoothing)
-
-
-class LeastSquaresPath:
-    """Residuals of a truncated least-squares fit for any Tikhonov term, by one singular value decomposition.
-
-    Parameters
-    ----------
-    matrix, right, cutoff
-        As in `least_squares_residuals`.
+        Share of the greatest singular value below which one is left out.
 
     Attributes
     ----------
@@ -181,7 +163,7 @@ class LeastSquaresPath:
         self.span = 1e-28 * self._squares[0], self._squares[0]
 
     def residuals(self, smoothing: float) -> Residuals:
-        """`Residuals` with a given smoothing."""
+        """Leave-one-out residuals (y - Hy)_k / (1 - H_kk) and GCV with a Tikhonov term (`solve_least_squares`)."""
         damp = self._squares / (self._squares + smoothing)
         residual = self._right - self._left @ (damp * self._along)
         rest = np.maximum(1 - (self._left * self._left) @ damp, np.finfo(float).eps)

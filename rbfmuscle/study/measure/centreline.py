@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sparse
@@ -17,6 +17,38 @@ from rbfmuscle.sim.joints.skeleton import all_coordinates
 _FINE, _SLICES = 120, 16
 
 
+class MuscleAtRest(NamedTuple):
+    """What measures that follow a muscle are bound to.
+
+    Attributes
+    ----------
+    muscle : Muscle
+        Input mesh and attachments.
+    joints : list of Joint
+        Bones that no joint separates count as one.
+    vertices, faces : (n, 3) and (m, 3) ndarray
+        The model's carried mesh at rest [scene unit].
+    moving : collection of str, optional
+        Names of the joints that move; all where not given.
+    """
+
+    muscle: Any
+    joints: list[Any]
+    vertices: Floats
+    faces: Integers
+    moving: Collection[str] | None = None
+
+    def grown_fibres(self, count: int, segments: int) -> Floats:
+        """Fibres (count, segments + 1, 3) of the input mesh from origin to insertion, as `grow_fibres` has them."""
+        from rbfmuscle.study.measure.fibre_lines import grow_fibres
+
+        groups = split_ends(self.muscle, self.joints, self.moving)
+        ends = [np.concatenate([np.asarray(a.vertices) for a in group]) for group in groups]
+        mesh = self.muscle.mesh
+        vertices = np.asarray(mesh.vertices, dtype=np.float64)
+        return grow_fibres(vertices, np.asarray(mesh.faces), ends, count=count, segments=segments)
+
+
 class Centreline:
     """The centreline of one muscle on a mesh of constant topology.
 
@@ -27,30 +59,15 @@ class Centreline:
 
     Parameters
     ----------
-    muscle : Muscle
-        Input mesh and attachments.
-    joints : list of Joint
-        Bones that no joint separates count as one.
-    vertices, faces : (n, 3) and (m, 3) ndarray
-        The carried mesh at rest [scene unit].
+    rest : MuscleAtRest
     slices : int
         Points of the line between its ends.
-    moving : collection of str, optional
-        Names of the joints that move; all where not given.
     """
 
-    def __init__(
-        self,
-        muscle: Any,
-        joints: list[Any],
-        vertices: Floats,
-        faces: Integers,
-        *,
-        slices: int = _SLICES,
-        moving: Collection[str] | None = None,
-    ) -> None:
-        self.ends = end_groups(muscle, joints, moving)
-        sides = _sides(muscle, self.ends, vertices)
+    def __init__(self, rest: MuscleAtRest, *, slices: int = _SLICES) -> None:
+        vertices, faces = rest.vertices, rest.faces
+        self.ends = end_groups(rest.muscle, rest.joints, rest.moving)
+        sides = _sides(rest.muscle, self.ends, vertices)
         field = harmonic_weights(vertices, faces, sides)[:, 1]
         levels = np.linspace(0.0, 1.0, _FINE + 2)[1:-1]
         fine = slice_operator(vertices, faces, field, levels)

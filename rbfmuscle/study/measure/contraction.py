@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -14,8 +13,8 @@ from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.mean_value import mean_value_weights
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.sim.contraction.resolve import resolve_contraction
-from rbfmuscle.study.measure.centreline import carried_middle, end_groups, split_ends
-from rbfmuscle.study.measure.fibre_lines import grow_fibres, resampled
+from rbfmuscle.study.measure.centreline import MuscleAtRest, carried_middle, end_groups
+from rbfmuscle.study.measure.fibre_lines import resampled
 from rbfmuscle.validation import SolveError
 
 # Fibres that are grown where the scene gives none, and the segments of each.
@@ -30,33 +29,19 @@ class ContractionStudy:
 
     Parameters
     ----------
-    muscle : Muscle
-        With keys of contraction. Its fibres are followed where the scene gives them, else streamlines of the
-        harmonic field (`grow_fibres`).
-    joints : list of Joint
-    vertices, faces : (n, 3) and (m, 3) ndarray
-        The model's carried mesh at rest [scene unit].
-    moving : collection of str, optional
-        Names of the joints that move, as for `split_ends`; all where not given.
+    rest : MuscleAtRest
+        Its muscle has keys of contraction. Fibres are followed where the scene gives them, else streamlines of
+        the harmonic field (`grow_fibres`).
     """
 
-    def __init__(
-        self,
-        muscle: Any,
-        joints: list[Any],
-        vertices: Floats,
-        faces: Integers,
-        *,
-        moving: Collection[str] | None = None,
-    ) -> None:
+    def __init__(self, rest: MuscleAtRest) -> None:
+        muscle, vertices, faces = rest.muscle, rest.vertices, rest.faces
         self.name = muscle.name
         mesh = np.asarray(muscle.mesh.vertices, dtype=np.float64)
         if muscle.fibres:
             lines = np.array([resampled(np.asarray(line, dtype=float), SEGMENTS) for line in muscle.fibres])
         else:
-            groups = split_ends(muscle, joints, moving)
-            ends = [np.concatenate([np.asarray(a.vertices) for a in group]) for group in groups]
-            lines = grow_fibres(mesh, np.asarray(muscle.mesh.faces), ends, count=COUNT, segments=SEGMENTS)
+            lines = rest.grown_fibres(COUNT, SEGMENTS)
         lines = _kept_inside(lines, vertices, faces)
         self.shape = lines.shape
         self.weights = mean_value_weights(lines.reshape(-1, 3), vertices, faces)
@@ -64,7 +49,7 @@ class ContractionStudy:
         # A segment is belly where neither end is tendon; a line of tendon alone counts for nothing.
         self.belly = ~(tendon[:, 1:] | tendon[:, :-1])
         self.rest_lengths = _segments(self.lines(vertices))
-        self.ends = end_groups(muscle, joints, moving)
+        self.ends = end_groups(muscle, rest.joints, rest.moving)
 
     def lines(self, vertices: NDArray[np.float64]) -> NDArray[np.float64]:
         """The fibres (n, k, 3) that a carried mesh with these vertices holds."""

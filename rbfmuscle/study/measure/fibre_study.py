@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.mean_value import mean_value_weights
-from rbfmuscle.study.measure.centreline import moving_joints, split_ends
-from rbfmuscle.study.measure.fibre_lines import grow_fibres
+from rbfmuscle.study.measure.centreline import MuscleAtRest, moving_joints, split_ends
 from rbfmuscle.validation import MeshError
 
 if TYPE_CHECKING:
     from rbfmuscle.sim.loop.frame import Frame
-    from rbfmuscle.sim.scene.objects import Joint, Muscle
     from rbfmuscle.sim.scene.scene import Scene
 
 
@@ -47,14 +44,8 @@ class FibreBundle:
 
     Parameters
     ----------
-    muscle : Muscle
-        Input mesh and attachments.
-    joints : list of Joint
-    vertices, faces : (n, 3) and (m, 3) ndarray
-        The carried mesh at rest [scene unit].
+    at_rest : MuscleAtRest
     count, segments : int
-    moving : collection of str, optional
-        Names of the joints that move, as for `split_ends`; all where not given.
 
     Raises
     ------
@@ -62,28 +53,17 @@ class FibreBundle:
         If origin and insertion are not joined by the inside of the muscle.
     """
 
-    def __init__(
-        self,
-        muscle: Muscle,
-        joints: list[Joint],
-        vertices: Floats,
-        faces: Integers,
-        *,
-        count: int = 100,
-        segments: int = 15,
-        moving: Collection[str] | None = None,
-    ) -> None:
-        mesh = np.asarray(muscle.mesh.vertices, dtype=np.float64)
-        groups = split_ends(muscle, joints, moving)
-        ends = [np.concatenate([np.asarray(a.vertices) for a in group]) for group in groups]
-        self.rest = grow_fibres(mesh, np.asarray(muscle.mesh.faces), ends, count=count, segments=segments)
+    def __init__(self, at_rest: MuscleAtRest, *, count: int = 100, segments: int = 15) -> None:
+        muscle, mesh = at_rest.muscle, np.asarray(at_rest.muscle.mesh.vertices, dtype=np.float64)
+        groups = split_ends(muscle, at_rest.joints, at_rest.moving)
+        self.rest = at_rest.grown_fibres(count, segments)
         self.rest_lengths = line_lengths(self.rest)
         self.holders = [_holders(mesh, group, self.rest[:, k]) for group, k in zip(groups, (0, -1))]
         inner = self.rest[:, 1:-1].reshape(-1, 3)
         # Half the memory, and an error of less than 1e-6 of the muscle's size: positions are taken about
         # a mean vertex.
         try:
-            self.weights = mean_value_weights(inner, vertices, faces).astype(np.float32)
+            self.weights = mean_value_weights(inner, at_rest.vertices, at_rest.faces).astype(np.float32)
         except ValueError as error:
             raise MeshError(f"muscle {muscle.name!r}: fibre {error}") from None
 
@@ -124,18 +104,11 @@ class FibreStudy:
 
     def __init__(self, scene: Scene, carried: dict[str, Any]) -> None:
         options: Any = scene.output.fibres
-        moving = moving_joints(scene)
-        self.bundles = {
-            muscle.name: FibreBundle(
-                muscle,
-                scene.joints,
-                *carried[muscle.name],
-                count=options.count,
-                segments=options.segments,
-                moving=moving,
-            )
-            for muscle in scene.muscles
-        }
+        moving, self.bundles = moving_joints(scene), {}
+        for muscle in scene.muscles:
+            vertices, faces = carried[muscle.name]
+            rest = MuscleAtRest(muscle, scene.joints, vertices, faces, moving)
+            self.bundles[muscle.name] = FibreBundle(rest, count=options.count, segments=options.segments)
 
     def at(self, frame: Frame) -> dict[str, FibreLines]:
         """Fibres in a frame: dict of muscle name to FibreLines."""

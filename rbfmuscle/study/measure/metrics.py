@@ -13,7 +13,7 @@ from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.sim.joints.skeleton import all_coordinates
 from rbfmuscle.sim.scene.motion import shown_value
-from rbfmuscle.study.measure.centreline import Centreline, moving_joints
+from rbfmuscle.study.measure.centreline import Centreline, MuscleAtRest, moving_joints
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.measure.penetration import BoneProbe, bone_depth, surface_depth
 from rbfmuscle.study.measure.topology import SurfaceForm
@@ -208,10 +208,9 @@ class _Tracker:
         self.edges = unique_edges(faces)
         self.rest_lengths = edge_lengths(vertices, self.edges)
         has_line = len(muscle.attachments) > 1
-        self.line = None
-        if has_line:
-            self.line = Centreline(muscle, scene.joints, vertices, faces, moving=moving_joints(scene))
-        self.contraction = _contraction(muscle, scene, vertices, faces)
+        rest = MuscleAtRest(muscle, scene.joints, vertices, faces, moving_joints(scene))
+        self.line = Centreline(rest) if has_line else None
+        self.contraction = _contraction(rest)
         self.length = math.nan
         self.rest_measured = False
         output = getattr(scene, "output", None)
@@ -300,12 +299,12 @@ class _Tracker:
         return float(np.sqrt(np.mean(change**2))), float(np.abs(change).max())
 
 
-def _contraction(muscle, scene, vertices, faces):
-    if getattr(muscle, "contraction", None) is None:
+def _contraction(rest):
+    if rest.muscle.contraction is None:
         return None
     from rbfmuscle.study.measure.contraction import ContractionStudy
 
-    return ContractionStudy(muscle, scene.joints, vertices, faces, moving=moving_joints(scene))
+    return ContractionStudy(rest)
 
 
 def unit_text(kind: str, units: str) -> str:

@@ -164,10 +164,13 @@ class LiveViewer(Viewer):
             return np.full(len(vertices), frame.activations[name])
         key = (self.model, self.quality, name)
         if key not in self._studies:
+            from rbfmuscle.study.measure.centreline import MuscleAtRest
             from rbfmuscle.study.measure.contraction import ContractionStudy
 
             scene = self.session.scene
-            self._studies[key] = ContractionStudy(scene.muscle(name), scene.joints, *self._rests[key])
+            self._studies[key] = ContractionStudy(
+                MuscleAtRest(scene.muscle(name), scene.joints, *self._rests[key])
+            )
         middles, stretch = self._studies[key].stretches(frame.carried[name][0])
         distance, index = cKDTree(middles).query(vertices, k=min(NEAREST_FIBRES, len(middles)))
         share = 1.0 / np.maximum(distance, 1e-9 * np.ptp(vertices)) ** 2
