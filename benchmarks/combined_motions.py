@@ -16,6 +16,7 @@ import numpy as np
 import rbfmuscle as rm
 from rbfmuscle.sim.scene.phantom import AXES, phantom_scene
 from rbfmuscle.sim.scene.settings import parse_settings
+from rbfmuscle.study.measure.mesh_distance import MeshDistance
 
 # Degrees from rest to the end of each coordinate, all together, or angles of stops on a way.
 RAMPS = {
@@ -31,6 +32,8 @@ WORST = (
     "volume_error",
 )  # fmt: skip
 FLICKER = 0.5
+# Material whose step changed by less than this since the frame before goes on as it went [mm]; the rest leaps.
+STEADY = 0.5
 BOUNDS = {"flexion": (-15, 80), "adduction": (-30, 12), "internal_rotation": (-25, 25)}
 
 
@@ -112,6 +115,20 @@ def write_scenes(source: Path, motions: dict, folder: Path) -> list[Path]:
     return written
 
 
+def steady_flicker(run: rm.Run, name: str) -> tuple[float, float]:
+    """Flicker, greatest [mm], of material that goes on as it went, and how far the rest leaps at most.
+
+    Each vertex of the carried mesh is asked for the change of its step; where a sheet slips from one place of rest to
+    another, surface and material part for another reason than a grid or a fold.
+    """
+    places = np.array([frame.carried[name][0] for frame in run.frames])
+    surfaces = [frame.surfaces[name] for frame in run.frames]
+    offsets = np.array([MeshDistance(s.vertices, s.faces).signed(p) for s, p in zip(surfaces, places)])
+    leap = np.linalg.norm(np.diff(places, 2, axis=0), axis=2)
+    change = np.abs(np.diff(offsets, axis=0))[1:]
+    return float(change[leap < STEADY].max(initial=0.0)), float(leap.max(initial=0.0))
+
+
 def measure(scene: rm.Scene, model: str | None) -> tuple[list[tuple], float]:
     """Run a scene; for each muscle its worst figures over the frames, and the processor time of a frame [s]."""
     started = time.process_time()
@@ -126,6 +143,7 @@ def measure(scene: rm.Scene, model: str | None) -> tuple[list[tuple], float]:
         euler = run.values(name, "euler")
         worst = {q: abs(run.values(name, q)).max(initial=0.0) for q in WORST if q in run.summary[name]}
         flicker = run.values(name, "flicker_max")
+        worst["steady"], worst["leap"] = steady_flicker(run, name)
         rows.append((name, int((euler != 2).sum()), len(euler), int((flicker > FLICKER).sum()), worst, count))
     return rows, spent
 
@@ -134,14 +152,16 @@ def show(title: str, frames: int, rows: list[tuple], spent: float) -> None:
     """Print the table of a motion."""
     print(f"\n{title}: {frames} frames, {spent:.2f} s of processor time each, measures included")
     print(
-        "| muscle | frames with handles | crossing | flicker max (frames over 0.5) | rms | unfitted | surface in bones "
+        "| muscle | frames with handles | crossing | flicker max (frames over 0.5) | of steady material "
+        "| leap | rms | unfitted | surface in bones "
         "| bones in muscle | volume | unresolved | grazed | held back |"
     )
-    print("|---" * 12 + "|")
+    print("|---" * 14 + "|")
     for name, handles, count, over, worst, events in rows:
         print(
             f"| {name} | {handles} of {count} | {worst['self_crossing']:.0f} | {worst['flicker_max']:.2f} ({over}) "
-            f"| {worst['flicker_rms']:.3f} | {worst.get('unfitted_fraction', 0.0):.3f} "
+            f"| {worst['steady']:.2f} | {worst['leap']:.1f} | {worst['flicker_rms']:.3f} "
+            f"| {worst.get('unfitted_fraction', 0.0):.3f} "
             f"| {worst['penetration_max']:.3f} | {worst['bone_penetration_max']:.3f} "
             f"| {worst['volume_error']:.0e} | {events['unresolved']} | {events['grazed']} | {events['held_back']} |",
             flush=True,
@@ -155,6 +175,7 @@ def main() -> None:
     parser.add_argument("--muscles", nargs="*")
     parser.add_argument("--model")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--first", action="store_true", help="the first motion alone")
     parser.add_argument("--own", action="store_true", help="the scene's own motion, whatever its joints")
     parser.add_argument("--seeds", nargs="*", type=int, help="random walks of these seeds, and nothing else")
     parser.add_argument(
@@ -175,6 +196,8 @@ def main() -> None:
             f"random walk of {WALK} stops, seed {seed}": {"waypoints": walk(WALK, seed), "step": FARTHEST}
             for seed in arguments.seeds
         }
+    if arguments.first:
+        motions = dict(list(motions.items())[:1])
     if arguments.write:
         arguments.write.mkdir(parents=True, exist_ok=True)
         source = phantom_files(arguments.write) if arguments.scene == "phantom" else Path(arguments.scene)

@@ -3,6 +3,7 @@
 Imports nothing but the standard library's lightest parts: it must stand before anything else is loaded.
 """
 
+import atexit
 import contextlib
 import os
 import signal
@@ -42,6 +43,8 @@ def install(*, as_json: bool = False, watch: bool = False) -> None:
         os.set_blocking(writer, False)
         signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
         threading.Thread(target=_listen, args=(reader,), daemon=True).start()
+        # The first of all that is registered is the last that is called.
+        atexit.register(_ignore)
 
 
 @contextlib.contextmanager
@@ -64,6 +67,12 @@ def check() -> None:
     """Raise KeyboardInterrupt if one was asked for and got lost."""
     if _State.asked:
         raise KeyboardInterrupt
+
+
+def _ignore():
+    """Everything is done and only Python's own end is left, in which signals would have no handler: the code stands."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _must_finish():
