@@ -1,23 +1,26 @@
-"""Runs that are killed at random moments and resumed, against one that was not: the same folder but for times.
+"""Runs and comparisons that are killed at random moments and resumed, against one that was not: the same but for times.
 
     python benchmarks/resume.py --kills 10 --seed 1
+    python benchmarks/resume.py --kills 10 --seed 1 --what compare
 
-Each run is a process of its own, ended by SIGKILL; then the same command goes on. Frames that were lost are those
-since the last checkpoint.
+Each is a process of its own, ended by SIGKILL; then the same command goes on. Frames of a run that were lost are those
+since the last checkpoint; a comparison keeps the models that it has measured.
 """
 
 import argparse
+import json
 import random
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from blend_model import files_in
-from run_folders import timeless
+from run_folders import timeless, without_times
 
 RUN = """
 import sys
@@ -26,18 +29,51 @@ from rbfmuscle.run import stream_run
 settings = {"output.report": False, "output.preview": False}
 stream_run(phantom_scene(end=60.0), sys.argv[1], settings=settings, pictures=False, resume=True)
 """
+COMPARE = """
+import sys
+from rbfmuscle import phantom_scene
+from rbfmuscle.compare import compare_models
+compare_models(phantom_scene(end=16.0), sys.argv[1], ["rbf", "pbd", "xpbd"], pictures=False, resume=True)
+"""
+# Rows of tables that a clock or the process's size wrote, and files that show them.
+COSTS, SHOWN = (",time_", ",memory,"), ("report.html", "measures.npz")
 
 
-def start(folder: Path) -> subprocess.Popen:
-    """Begin a run, or go on with one."""
-    return subprocess.Popen([sys.executable, "-c", RUN, str(folder)])
+def start(folder: Path, code: str) -> subprocess.Popen:
+    """Begin a run or a comparison, or go on with one."""
+    return subprocess.Popen([sys.executable, "-c", code, str(folder)])
 
 
-def frames_in(folder: Path) -> int:
-    """Whole frames that a killed run has left, as its readers find them."""
+def left_in(folder: Path, code: str) -> str:
+    """What a killed process has left, as its readers find it."""
     from rbfmuscle.study.files.saved import SavedRun
 
-    return len(SavedRun(folder).frames) if (folder / "run.json").exists() else 0
+    if code == COMPARE:
+        return f"{len(list(folder.glob('*/measures.npz')))} models measured"
+    frames = len(SavedRun(folder).frames) if (folder / "run.json").exists() else 0
+    return f"{frames} whole frames"
+
+
+def content(path: Path) -> Any:
+    """What a file holds, without what a clock wrote into it."""
+    if path.name == "comparison.json":
+        return _without(without_times(json.loads(path.read_text())), "memory")
+    if path.name == "comparison.csv":
+        return [line for line in path.read_text().splitlines() if not any(word in line for word in COSTS)]
+    return None if path.name in SHOWN else timeless(path)
+
+
+def _without(value: Any, key: str) -> Any:
+    """A tree of dicts and lists without a key."""
+    if isinstance(value, dict):
+        return {k: _without(item, key) for k, item in value.items() if k != key}
+    return [_without(item, key) for item in value] if isinstance(value, list) else value
+
+
+def same(one: Path, other: Path) -> bool:
+    """Whether two folders hold the same."""
+    names = files_in(one)
+    return files_in(other) == names and all(content(one / name) == content(other / name) for name in names)
 
 
 def main() -> int:
@@ -45,34 +81,30 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=10)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--what", choices=("run", "compare"), default="run")
     asked = parser.parse_args()
-    draw, same = random.Random(asked.seed), 0
+    code = RUN if asked.what == "run" else COMPARE
+    draw, alike = random.Random(asked.seed), 0
     with tempfile.TemporaryDirectory() as home:
         whole = Path(home) / "whole"
         begun = time.perf_counter()
-        if start(whole).wait():
+        if start(whole, code).wait():
             return 1
         length = time.perf_counter() - begun
-        print(f"unbroken: {frames_in(whole)} frames in {length:.1f} s")
+        print(f"unbroken: {left_in(whole, code)} in {length:.1f} s", flush=True)
         for number in range(asked.kills):
             folder = Path(home) / f"killed{number}"
-            process = start(folder)
+            process = start(folder, code)
             moment = draw.uniform(0.1, 1.0) * length
             time.sleep(moment)
             process.kill()
             process.wait()
-            there = frames_in(folder)
-            ended = start(folder).wait()
-            names = files_in(whole)
-            alike = files_in(folder) == names and all(
-                timeless(whole / name) == timeless(folder / name) for name in names
-            )
-            same += alike and ended == 0
-            print(
-                f"killed after {moment:5.1f} s with {there:2d} whole frames: {'the same' if alike else 'OTHER'}"
-            )
-    print(f"{same} of {asked.kills} the same")
-    return same != asked.kills
+            there, ended = left_in(folder, code), start(folder, code).wait()
+            good = ended == 0 and same(whole, folder)
+            alike += good
+            print(f"killed after {moment:5.1f} s with {there}: {'the same' if good else 'OTHER'}", flush=True)
+    print(f"{alike} of {asked.kills} the same")
+    return alike != asked.kills
 
 
 if __name__ == "__main__":
