@@ -118,7 +118,7 @@ def blended_motion(points: Floats, weights: Floats, motions: Floats) -> Floats:
     -------
     (n, 3) ndarray
     """
-    twists = np.array([_twist(motion) for motion in motions])
+    twists = _twists(motions)
     out = np.empty((len(points), 3))
     _exponential_loop(np.asarray(points, dtype=np.float64), weights @ twists, out)
     return out
@@ -146,15 +146,16 @@ def _exponential_loop(points, twists, out):
         out[n, 2] = z + w + first * pz + second * (a * py - b * px + sz) + third * (a * sy - b * sx)
 
 
-def _twist(motion: Floats) -> Floats:
-    """Logarithm of a rigid 4x4 motion as (omega, velocity)."""
-    rotation = Rotation.from_matrix(motion[:3, :3])
-    omega = rotation.as_rotvec()
-    angle = np.linalg.norm(omega)
-    cross = np.array([[0, -omega[2], omega[1]], [omega[2], 0, -omega[0]], [-omega[1], omega[0], 0]])
-    if angle < 1e-4:
-        third = 1 / 12 + angle**2 / 720
-    else:
-        third = 1 / angle**2 - (1 + np.cos(angle)) / (2 * angle * np.sin(angle))
-    inverse = np.eye(3) - 0.5 * cross + third * (cross @ cross)
-    return np.concatenate([omega, inverse @ motion[:3, 3]])
+def _twists(motions: Floats) -> Floats:
+    """Logarithms of rigid motions (b, 4, 4) as (omega, velocity), (b, 6)."""
+    omega = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()
+    angle = np.linalg.norm(omega, axis=1)
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    third = np.where(
+        small, 1 / 12 + angle**2 / 720, 1 / safe**2 - (1 + np.cos(safe)) / (2 * safe * np.sin(safe))
+    )
+    shift = motions[:, :3, 3]
+    once = np.cross(omega, shift)
+    velocity = shift - 0.5 * once + third[:, None] * np.cross(omega, once)
+    return np.concatenate([omega, velocity], axis=1)

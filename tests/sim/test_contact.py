@@ -6,7 +6,7 @@ from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, joint, muscle, sc
 
 from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.sim.loop.contact import BoneContacts
-from rbfmuscle.sim.loop.overlap import rest_overlap, settle_rest
+from rbfmuscle.sim.loop.overlap import settle_rest
 from rbfmuscle.sim.loop.simulate import simulate_frames
 from rbfmuscle.sim.loop.stepper import MuscleStepper
 from rbfmuscle.sim.scene.motion import rotation_about
@@ -191,7 +191,7 @@ def test_resolve_brings_everything_out_and_leaves_the_rest_alone():
 
 def test_free_points_alone_count_as_overlap():
     *_, model, stepper = _sunk("keep")
-    depth = rest_overlap(stepper.contacts, model.contact_points())[0]
+    depth = stepper.contacts.depths(model.contact_points())[0]
     assert depth.max() == pytest.approx(2.0, abs=1e-9)
     assert not depth[model.contact_bone >= 0].any()
 

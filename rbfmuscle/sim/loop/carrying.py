@@ -118,7 +118,7 @@ def relative_motion(
     old, new = (np.linalg.inv(poses[root]) @ poses[bone] for poses in (before, after))
     if np.array_equal(old, new):
         return 0.0
-    turn = turned_angle(new[:3, :3] @ old[:3, :3].T)
+    turn = float(turned_angle(new[:3, :3] @ old[:3, :3].T))
     way = corners @ (new - old)[:3, :3].T + (new - old)[:3, 3]
     return max(turn, float(np.sqrt((way**2).sum(axis=1)).max()) / (ARC * size))
 

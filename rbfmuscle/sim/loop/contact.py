@@ -74,37 +74,47 @@ class BoneContacts:
         self.names = list(names)
         self.fields = list(fields)
         self.reached = [b for b, field in enumerate(self.fields) if field is not None]
-        self._bounds = {b: np.array(self.fields[b].bounds, dtype=np.float64) for b in self.reached}
-        self._middles = {b: bounds.mean(axis=0) for b, bounds in self._bounds.items()}
+        self._row = {b: row for row, b in enumerate(self.reached)}
+        boxes = [self.fields[b].bounds for b in self.reached]
+        self.boxes = np.array(boxes, dtype=np.float64).reshape(-1, 2, 3)
         self.contact_bone = None if contact_bone is None else np.asarray(contact_bone, dtype=np.int64)
-        self.poses = {name: np.eye(4) for name in self.names}
+        self._take({name: np.eye(4) for name in self.names})
         self.margin = float(margin)
         self.allowed = {}
         self.neighbours, self.cuts = [], []
-        self._known = {}
+        self._known: tuple[Floats, ...] = (
+            np.zeros((len(self.reached), 0, 3)),
+            np.zeros((len(self.reached), 0)),
+        )
 
     def move(self, poses: dict[str, Floats]) -> None:
         """Take the bones' poses, a dict of bone name to (4, 4) rest-to-world transform."""
         missing = [self.names[b] for b in self.reached if self.names[b] not in poses]
         if missing:
             raise ValueError(f"poses lack the bone {missing[0]!r}")
-        self.poses = poses
+        self._take(poses)
 
     def snapshot(self) -> tuple[Any, ...]:
         """What `restore` needs: the poses, and what earlier queries left behind."""
-        known = {str(b): (anchor.copy(), bound.copy()) for b, (anchor, bound) in self._known.items()}
-        return dict(self.poses), known
+        return dict(self.poses), tuple(part.copy() for part in self._known)
 
     def restore(self, state: tuple[Any, ...]) -> None:
         """Go back to a snapshot."""
-        poses, known = state
-        self.poses = dict(poses)
-        self._known = {int(b): (anchor.copy(), bound.copy()) for b, (anchor, bound) in known.items()}
+        poses, (anchor, bound) = state
+        self._take(dict(poses))
+        self._known = anchor.copy(), bound.copy()
+
+    def stacked(self, poses: dict[str, Floats]) -> Floats:
+        """Poses (r, 4, 4) of the bones that the muscle can reach, in their order."""
+        return np.array([poses[self.names[b]] for b in self.reached]).reshape(-1, 4, 4)
+
+    def _take(self, poses: dict[str, Floats]) -> None:
+        self.poses, self._placed = poses, self.stacked(poses)
 
     def frozen(self) -> BoneContacts:
         """These obstacles as they stand, for questions from another thread while the bones move on."""
         other = copy.copy(self)
-        other.cuts, other._known = list(self.cuts), {}
+        other.cuts, other._known = list(self.cuts), tuple(part[:, :0] for part in self._known)
         return other
 
     def only(self, index: Any) -> BoneContacts:
@@ -145,8 +155,9 @@ class BoneContacts:
             neighbour it is half the difference of the two muscles' distances, so that both are cut alike.
         """
         points = check_points(points)
-        smallest = np.full(len(points), np.inf)
-        for b in self.reached:
+        near, beyond = self._within(points, reach)
+        smallest = np.full(len(points), beyond)
+        for b in near:
             pose = self.poses[self.names[b]]
             distance = self.fields[b].distance(points, pose=pose, reach=reach)
             np.minimum(smallest, distance, out=smallest)
@@ -163,8 +174,9 @@ class BoneContacts:
         a gradient.
         """
         points = check_points(points)
-        smallest, gradient = np.full(len(points), np.inf), np.zeros((len(points), 3))
-        answers = [self._query(points, b, limit) for b in self.reached]
+        near, beyond = self._within(points, limit)
+        smallest, gradient = np.full(len(points), beyond), np.zeros((len(points), 3))
+        answers = [self._query(points, b, limit) for b in near]
         answers += [neighbour.cut_with_gradient(points) for neighbour in self.cuts if neighbours]
         for distance, direction in answers:
             _closer_loop(distance, direction, smallest, gradient)
@@ -177,37 +189,38 @@ class BoneContacts:
     def depth(self, points: Floats) -> float:
         """How deep the deepest free contact point is in a bone, 0 where none is [scene unit]."""
         points = check_points(points)
-        free, reach = self.free(len(points)), np.zeros(len(points))
         deepest = 0.0
-        for b in self.reached:
-            near = self._near(points, free, b, reach)
-            if len(near):
-                distance, _ = self._query(points[near], b, 0.0)
-                self._remember(points, near, distance, b)
-                deepest = max(deepest, -float(distance.min()))
+        for b, near in self._near(points, np.zeros(len(points)), self.reached):
+            distance, _ = self._query(points[near], b, 0.0)
+            self._remember(points, near, distance, b)
+            deepest = max(deepest, -float(distance.min()))
         return deepest
+
+    def depths(self, points: Floats) -> dict[int, Floats]:
+        """How deep each free contact point is in each bone, by the bone's index, (n,) [scene unit]; 0 outside."""
+        points = check_points(points)
+        found = {b: np.zeros(len(points)) for b in self.reached}
+        for b, near in self._near(points, np.zeros(len(points)), self.reached):
+            distance, _ = self._query(points[near], b, 0.0)
+            self._remember(points, near, distance, b)
+            found[b][near] = np.maximum(-distance, 0.0)
+        return found
 
     def comes_near(self, points: Floats, bone_index: int, reach: float) -> bool:
         """Whether a bone is nearer than ``reach`` to any free contact point."""
-        free, limit = self.free(len(points)), np.full(len(points), reach)
-        near = self._near(points, free, bone_index, limit)
-        if len(near) == 0:
-            return False
-        distance, _ = self._query(points[near], bone_index, limit[near])
-        self._remember(points, near, distance, bone_index)
-        return bool(distance.min() < reach)
+        for b, near in self._near(points, np.full(len(points), reach), [bone_index]):
+            distance, _ = self._query(points[near], b, reach)
+            self._remember(points, near, distance, b)
+            return bool(distance.min() < reach)
+        return False
 
     def query(self, points: Floats, reach: ArrayLike) -> list[tuple[Integers, Floats, Floats]]:
         """Contacts of each bone: a list, one entry a bone, of ``(index, distance, direction)``."""
         points = check_points(points)
-        free = self.free(len(points))
         empty = (np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)))
         found = [empty] * len(self.names)
         reach = np.full(len(points), reach) if np.ndim(reach) == 0 else np.asarray(reach, dtype=np.float64)
-        for b in self.reached:
-            near = self._near(points, free, b, reach + self.margin)
-            if len(near) == 0:
-                continue
+        for b, near in self._near(points, reach + self.margin, self.reached):
             limit = reach[near]
             distance, direction = self._query(points[near], b, limit + self.margin)
             self._remember(points, near, distance, b)
@@ -240,14 +253,20 @@ class BoneContacts:
         source = np.concatenate([np.full(len(part[0]), part[3], dtype=np.int64) for part in parts])
         return HalfSpaces(index, gap, normal, source)
 
-    def known(self, count: int, bone_index: int) -> tuple[Floats, Floats]:
+    def known(self, count: int, bone_index: int) -> tuple[Floats, ...]:
         """Earlier places (count, 3) of the contact points in a bone's coordinates, and distances (count,) there.
 
         The distances are lower bounds, -infinity where nothing is known; they hold wherever the bone goes.
         """
-        if bone_index not in self._known or len(self._known[bone_index][1]) != count:
-            self._known[bone_index] = np.zeros((count, 3)), np.full(count, -np.inf)
-        return self._known[bone_index]
+        anchor, bound = self.all_known(count)
+        return anchor[self._row[bone_index]], bound[self._row[bone_index]]
+
+    def all_known(self, count: int) -> tuple[Floats, ...]:
+        """What `known` says of all bones that the muscle can reach: (r, count, 3) and (r, count)."""
+        if self._known[1].shape[1] != count:
+            rows = len(self.reached)
+            self._known = np.zeros((rows, count, 3)), np.full((rows, count), -np.inf)
+        return self._known
 
     def free(self, count: int) -> Booleans:
         """Mask (n,) of the contact points that are attached to no bone."""
@@ -262,22 +281,36 @@ class BoneContacts:
         distance, gradient = self.fields[b].distance_and_gradient(points, pose=pose, reach=reach)
         # On the medial surface the field has no direction; away from the bone's middle is as good as any.
         direction = np.empty_like(gradient)
-        _direction_loop(points, gradient, pose, self._middles[b], direction)
+        _direction_loop(points, gradient, pose, self.boxes[self._row[b]], direction)
         return distance, direction
 
-    def _near(self, points, free, b, reach):
-        """Contact points that may be nearer than their ``reach`` to bone b, by its box and by earlier answers."""
-        found, known = np.empty(len(points), dtype=np.int64), self.known(len(points), b)
-        count = _near_loop(points, free, self.poses[self.names[b]], self._bounds[b], reach, *known, found)
-        return found[:count]
+    def _within(self, points, limit):
+        """Bones whose box is within the greatest limit of the points' box, and how near the nearest other one is."""
+        apart = np.empty(len(self.reached))
+        _apart_loop(points, self._placed, self.boxes, apart)
+        far = apart > np.max(limit, initial=0.0)
+        return [b for b, left in zip(self.reached, far) if not left], apart[far].min(initial=np.inf)
+
+    def _near(self, points, reach, bones):
+        """Bones, each with the free contact points that may be nearer to it than their ``reach``: by boxes and by
+        earlier answers.
+        """
+        rows = np.array([self._row[b] for b in bones], dtype=np.int64)
+        found, counts = (
+            np.empty((len(rows), len(points)), dtype=np.int64),
+            np.zeros(len(rows), dtype=np.int64),
+        )
+        free, known = self.free(len(points)), self.all_known(len(points))
+        _near_loop(points, free, reach, rows, (self._placed, self.boxes), known, found, counts)
+        return [(b, near[:count]) for b, near, count in zip(bones, found, counts.tolist()) if count]
 
     def _remember(self, points, near, distance, b):
-        _remember_loop(points, self.poses[self.names[b]], near, distance, *self._known[b])
+        _remember_loop(points, self.poses[self.names[b]], near, distance, *self.known(len(points), b))
 
 
 @compiled(error_model="numpy")
-def _direction_loop(points, gradient, pose, middle, out):
-    """Unit gradients; away from the bone's middle where there is none."""
+def _direction_loop(points, gradient, pose, box, out):
+    """Unit gradients; away from the middle of the bone's box where there is none."""
     for i in range(len(points)):
         square = 0.0
         for a in range(3):
@@ -288,7 +321,7 @@ def _direction_loop(points, gradient, pose, middle, out):
             for a in range(3):
                 out[i, a] = points[i, a] - pose[a, 3] + 1e-12
                 for b in range(3):
-                    out[i, a] -= pose[a, b] * middle[b]
+                    out[i, a] -= 0.5 * pose[a, b] * (box[0, b] + box[1, b])
                 square += out[i, a] ** 2
         length = np.sqrt(square)
         for a in range(3):
@@ -332,11 +365,55 @@ def _lower_bound(points, i, pose, bounds, anchor, bound):
 
 
 @compiled(error_model="numpy")
-def _near_loop(points, free, pose, bounds, reach, anchor, bound, found):
-    """Fill ``found`` with the free points that may be nearer than ``reach``; return their number."""
-    count = 0
+def box_loop(points, chosen, box):
+    """Fill ``box`` (2, 3) with the least and greatest coordinates of the chosen points."""
+    box[0], box[1] = np.inf, -np.inf
     for i in range(len(points)):
-        if free[i] and _lower_bound(points, i, pose, bounds, anchor, bound) <= reach[i]:
-            found[count] = i
-            count += 1
-    return count
+        if chosen[i]:
+            for k in range(3):
+                box[0, k] = min(box[0, k], points[i, k])
+                box[1, k] = max(box[1, k], points[i, k])
+
+
+@compiled(error_model="numpy")
+def boxes_apart(box, pose, bounds):
+    """Distance at least between a box along the world's axes and one (2, 3) along a bone's, in a pose of the bone."""
+    square = 0.0
+    for k in range(3):
+        middle, half = pose[k, 3], 0.0
+        for j in range(3):
+            middle += 0.5 * pose[k, j] * (bounds[0, j] + bounds[1, j])
+            half += 0.5 * abs(pose[k, j]) * (bounds[1, j] - bounds[0, j])
+        beyond = max(box[0, k] - middle - half, middle - half - box[1, k], 0.0)
+        square += beyond * beyond
+    return np.sqrt(square)
+
+
+@compiled(error_model="numpy")
+def _apart_loop(points, poses, boxes, apart):
+    """How far each bone's box is from the points' box at least."""
+    box = np.empty((2, 3))
+    box_loop(points, np.ones(len(points), np.bool_), box)
+    for b in range(len(poses)):
+        apart[b] = boxes_apart(box, poses[b], boxes[b])
+
+
+@compiled(error_model="numpy")
+def _near_loop(points, free, reach, rows, bones, known, found, counts):
+    """Fill ``found`` (b, n) with the free points that may be nearer than ``reach`` to each bone, and their numbers."""
+    poses, boxes = bones
+    anchor, bound = known
+    box, farthest = np.empty((2, 3)), -np.inf
+    box_loop(points, free, box)
+    for i in range(len(points)):
+        if free[i]:
+            farthest = max(farthest, reach[i])
+    for n in range(len(rows)):
+        b, count = rows[n], 0
+        if boxes_apart(box, poses[b], boxes[b]) > farthest:
+            continue
+        for i in range(len(points)):
+            if free[i] and _lower_bound(points, i, poses[b], boxes[b], anchor[b], bound[b]) <= reach[i]:
+                found[n, count] = i
+                count += 1
+        counts[n] = count

@@ -7,11 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.validation import SceneError
 
 if TYPE_CHECKING:
-    from rbfmuscle.sim.loop.contact import BoneContacts
     from rbfmuscle.sim.loop.stepper import MuscleStepper
 
 
@@ -21,17 +19,6 @@ SETTLED = 0.01
 # Bones grow into a muscle by this much [mm] in one solve, so that contact never has to guess the way out.
 GROWTH = 1.0
 MOST_SOLVES = 60
-
-
-def rest_overlap(contacts: BoneContacts, points: Floats) -> dict[int, Floats]:
-    """Depths at rest: dict of bone index to (n,) depth of each free contact point inside that bone."""
-    free = contacts.free(len(points))
-    overlap = {}
-    for b in contacts.reached:
-        distance, _ = contacts.distance_and_direction(points, b)
-        depth = np.where(free, np.maximum(-distance, 0.0), 0.0)
-        overlap[b] = depth
-    return overlap
 
 
 def settle_rest(stepper: MuscleStepper) -> None:
@@ -48,7 +35,7 @@ def settle_rest(stepper: MuscleStepper) -> None:
     """
     contacts, scene = stepper.contacts, stepper.scene
     least = scene.length(DEPTH)
-    overlap = rest_overlap(contacts, stepper.model.contact_points())
+    overlap = contacts.depths(stepper.model.contact_points())
     overlap = {b: depth for b, depth in overlap.items() if depth.max(initial=0.0) > least}
     if not overlap:
         return

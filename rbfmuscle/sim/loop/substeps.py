@@ -197,7 +197,7 @@ class SubSteps:
     def _excess(self, old, new):
         """How far a step between poses (b, 4, 4) goes beyond what one sub-step may do: 1 is just allowed."""
         turns = new[:, :3, :3] @ old[:, :3, :3].transpose(0, 2, 1)
-        excess = max(turned_angle(turn) for turn in turns) / self.limit
+        excess = float(turned_angle(turns).max()) / self.limit
         # How the bones that carry the corners move, seen from every bone.
         change = (
             np.linalg.inv(new)[:, None] @ new[self._owner] - np.linalg.inv(old)[:, None] @ old[self._owner]

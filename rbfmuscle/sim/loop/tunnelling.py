@@ -17,6 +17,7 @@ import numpy as np
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.sim.loop.contact import box_loop, boxes_apart
 from rbfmuscle.sim.loop.sliding import Planes
 
 if TYPE_CHECKING:
@@ -145,15 +146,9 @@ def find_crossings(
         One for each bone that was crossed or flagged.
     """
     crossings = []
-    for b in contacts.reached:
+    for b, index in _candidates(contacts, start, end, before, after):
         name = contacts.names[b]
-        back = np.linalg.inv(before[name]), np.linalg.inv(after[name])
-        bounds = np.asarray(contacts.fields[b].bounds, dtype=np.float64)
-        index, first, second = _candidates(
-            start, end, *back, bounds, *contacts.known(len(end), b), contacts.free(len(end))
-        )
-        if len(index) == 0:
-            continue
+        first, second = _local(start[index], before[name]), _local(end[index], after[name])
         sweep = sweep_paths(
             contacts.fields[b], first, second, tolerance=tolerance, angle=math.radians(options.angle)
         )
@@ -311,47 +306,87 @@ def _directions(field, points):
     return gradient / np.maximum(np.linalg.norm(gradient, axis=1), 1e-12)[:, None]
 
 
-def _candidates(start, end, back_before, back_after, bounds, anchor, known, free):
-    """Free points whose paths may touch the bone, and those paths in bone coordinates."""
-    first, second = np.empty_like(start), np.empty_like(end)
-    index = np.empty(len(start), dtype=np.int64)
-    count = _candidates_loop(
-        (start, end), (back_before, back_after), bounds, (anchor, known), free, index, (first, second)
-    )
-    return index[:count], first[:count], second[:count]
+def _local(points, pose):
+    """Points in the coordinates of a bone in a rigid pose."""
+    return (points - pose[:3, 3]) @ pose[:3, :3]
+
+
+def _candidates(contacts, start, end, before, after):
+    """Bones, each with the free points whose paths may touch it."""
+    poses = contacts.stacked(before), contacts.stacked(after)
+    found = np.empty((len(contacts.reached), len(start)), dtype=np.int64)
+    counts = np.zeros(len(found), dtype=np.int64)
+    free, known = contacts.free(len(end)), contacts.all_known(len(end))
+    _candidates_loop((start, end), free, poses, contacts.boxes, known, found, counts)
+    return [(b, index[:count]) for b, index, count in zip(contacts.reached, found, counts.tolist()) if count]
 
 
 @compiled(error_model="numpy")
-def _candidates_loop(paths, back, bounds, answers, free, index, local):
+def _candidates_loop(paths, free, poses, boxes, known, found, counts):
     """Leave out paths that are shorter than what is known of their end's distance to the bone.
 
     That is the distance to the bone's box, and an earlier answer less the way since, (x + y)^2 <= 2 x^2 + 2 y^2.
     """
     start, end = paths
-    back_before, back_after = back
-    anchor, known = answers
-    first, second = local
-    count = 0
+    before, after = poses
+    anchor, answer = known
+    ends, starts, longest = np.empty((2, 3)), np.empty((2, 3)), 0.0
+    box_loop(start, free, starts)
+    box_loop(end, free, ends)
     for i in range(len(start)):
-        if not free[i]:
+        if free[i]:
+            way = 0.0
+            for k in range(3):
+                way += (end[i, k] - start[i, k]) ** 2
+            longest = max(longest, way)
+    longest = np.sqrt(longest)
+    for b in range(len(boxes)):
+        count = 0
+        if boxes_apart(ends, after[b], boxes[b]) > longest + _carried_way(starts, before[b], after[b]):
             continue
-        way, moved, outside = 0.0, 0.0, 0.0
+        for i in range(len(start)):
+            if free[i] and _may_touch(
+                start[i], end[i], before[b], after[b], boxes[b], anchor[b, i], answer[b, i]
+            ):
+                found[b, count] = i
+                count += 1
+        counts[b] = count
+
+
+@compiled(error_model="numpy")
+def _may_touch(start, end, before, after, bounds, anchor, known):
+    """Whether a path is long enough to reach a bone from where it ends."""
+    way, moved, outside = 0.0, 0.0, 0.0
+    for k in range(3):
+        a, b = 0.0, 0.0
+        for j in range(3):
+            a += before[j, k] * (start[j] - before[j, 3])
+            b += after[j, k] * (end[j] - after[j, 3])
+        way += (b - a) ** 2
+        moved += (b - anchor[k]) ** 2
+        beyond = max(bounds[0, k] - b, b - bounds[1, k], 0.0)
+        outside += beyond * beyond
+    if way < outside:
+        return False
+    if known <= 0.0:
+        return True
+    square = known * known
+    return not (2.0 * (way + moved) < square or np.sqrt(way) + np.sqrt(moved) < known)
+
+
+@compiled(error_model="numpy")
+def _carried_way(box, before, after):
+    """How far the farthest point of a box goes from one pose to another: one of its corners, as the way is convex."""
+    farthest = 0.0
+    for corner in range(8):
+        square = 0.0
         for k in range(3):
-            a, b = back_before[k, 3], back_after[k, 3]
+            there = after[k, 3]
             for j in range(3):
-                a += back_before[k, j] * start[i, j]
-                b += back_after[k, j] * end[i, j]
-            first[count, k], second[count, k] = a, b
-            way += (b - a) ** 2
-            moved += (b - anchor[i, k]) ** 2
-            beyond = max(bounds[0, k] - b, b - bounds[1, k], 0.0)
-            outside += beyond * beyond
-        if way < outside:
-            continue
-        if known[i] > 0.0:
-            square = known[i] * known[i]
-            if 2.0 * (way + moved) < square or np.sqrt(way) + np.sqrt(moved) < known[i]:
-                continue
-        index[count] = i
-        count += 1
-    return count
+                local = 0.0
+                for m in range(3):
+                    local += before[m, j] * (box[corner >> m & 1, m] - before[m, 3])
+                there += after[k, j] * local
+            square += (there - box[corner >> k & 1, k]) ** 2
+        farthest = max(farthest, square)
+    return np.sqrt(farthest)

@@ -227,12 +227,11 @@ def step_angle(scene: Scene, before: Any, after: Any, *, shifts: bool = True) ->
     return largest
 
 
-def turned_angle(rotation: Any) -> Any:
-    """Angle of a (3, 3) rotation [radian], accurate for small ones too."""
-    skew = np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
-    return math.atan2(float(np.linalg.norm(skew)), float(np.trace(rotation)) - 1.0)
+def turned_angle(rotations: Floats) -> Floats:
+    """Angles (...) of rotations (..., 3, 3) [radian], accurate for small ones too."""
+    skew = rotations - np.swapaxes(rotations, -1, -2)
+    length = np.sqrt(skew[..., 2, 1] ** 2 + skew[..., 0, 2] ** 2 + skew[..., 1, 0] ** 2)
+    return np.arctan2(length, np.trace(rotations, axis1=-2, axis2=-1) - 1.0)
 
 
 def shown_value(scene: Scene, name: str, value: Any) -> Any:
