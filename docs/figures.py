@@ -24,6 +24,8 @@ _VALUE = re.compile(r"<!-- value: ([\w]+)\.([\w]+) -->.*?<!-- end -->", re.S)
 # Name: what measures it. DATA stands for the folder of the real hip.
 COMMANDS = {
     "headline": ["benchmarks/headline.py", "DATA/hip/flexion.toml", "-o", "OUT"],
+    "rest_fits": ["benchmarks/rest_fits.py", "DATA/hip/flexion.toml", "-o", "OUT"],
+    "plan": ["benchmarks/plan_check.py", "-", "DATA/hip/flexion.toml", "--remake", "-o", "OUT"],
     "real_solids": ["benchmarks/real_solids.py", "compare", "gluteus_maximus", "rectus_femoris", "-o", "OUT"],
 }
 
@@ -87,7 +89,39 @@ def real_solids_table(facts):
     return lines
 
 
-TABLES = {"headline": headline_table, "real_solids": real_solids_table}
+def rest_fits_table(facts):
+    """How far fits of all derivatives and of normal ones miss the mesh."""
+    lines = ["| | all, 150 / 300 / 600 | normal only, 150 / 300 / 600 |", "|---|---|---|"]
+    for name, row in facts["rows"].items():
+        cells = [" / ".join(f"{value:.2f}" for value in row[kind]) for kind in ("all", "normal")]
+        lines.append(f"| {name.replace('_', ' ')} | {' | '.join(cells)} |")
+    return lines
+
+
+# What a row of a forecast holds: how a table calls it, and what of the unit it is in.
+PLANNED = {"build": ("build s", 1), "motion": ("muscles ms", 1e3), "metrics": ("metrics ms", 1e3),
+           "write": ("files ms", 1e3), "total": ("all s", 1), "peak": ("peak MB", 1e-6)}  # fmt: skip
+
+
+def plan_table(facts):
+    """What a plan foretold and what its run took, by part, with the factor of both."""
+    titles = [title for title, _ in PLANNED.values()]
+    lines = [f"| scene: model | {' | '.join(titles)} |", "|---" * (len(titles) + 1) + "|"]
+    for name, row in facts["rows"].items():
+        cells = [
+            f"{scale * row[part][0]:.3g} / {scale * row[part][1]:.3g} ({row[part][0] / row[part][1]:.2f})"
+            for part, (_, scale) in PLANNED.items()
+        ]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return lines
+
+
+TABLES = {
+    "headline": headline_table,
+    "plan": plan_table,
+    "real_solids": real_solids_table,
+    "rest_fits": rest_fits_table,
+}
 
 
 def span(rows, key):
@@ -117,7 +151,8 @@ def facts_of(name):
 def provenance(facts):
     """The line under a table: command, commit, machine, and what else has to be known."""
     note = f" {facts['note']}" if facts.get("note") else ""
-    return f"`{facts['command']}`, commit {facts['commit']}, {facts['machine']}.{note}"
+    date = f", {facts['date']}" if facts.get("date") else ""
+    return f"`{facts['command']}`, commit {facts['commit']}, {facts['machine']}{date}.{note}"
 
 
 def written(text):

@@ -55,8 +55,8 @@ def _fixed(field, points, factor):
 def _alone(field, j):
     """The field of one centre, without polynomial."""
     return RBFField(
-        field.centres[j : j + 1], field.origin, field.scale, field.kernel, field.epsilon,
-        field.weights[j : j + 1], np.zeros(0), np.zeros((0, 3), dtype=np.int64), 1.0,
+        field.centres[j : j + 1], (field.origin, field.scale), field.kernel, field.epsilon,
+        field.weights[j : j + 1], (np.zeros(0), np.zeros((0, 3), dtype=np.int64)), 1.0,
     )  # fmt: skip
 
 
@@ -73,8 +73,8 @@ def _through_weights(field, points, factor):
     weights = adjoint[: basis.size]
     weights = weights.reshape(4, -1).T.copy() if hermite else weights
     other = RBFField(
-        field.centres, field.origin, field.scale, kernel, field.epsilon, weights,
-        adjoint[basis.size :], field.powers, 1.0,
+        field.centres, (field.origin, field.scale), kernel, field.epsilon, weights,
+        (adjoint[basis.size :], field.powers), 1.0,
     )  # fmt: skip
     return -(_moved(field, other) + _moved(other, field))
 

@@ -80,9 +80,8 @@ def fit_variable(points, values, epsilon, *, kernel="gaussian", degree=None):
             NumericalWarning,
             stacklevel=2,
         )
-    return RBFField(
-        points, origin, scale, kernel, epsilon, solution[:count], solution[count:], powers, condition
-    )
+    polynomial = solution[count:], powers
+    return RBFField(points, (origin, scale), kernel, epsilon, solution[:count], polynomial, condition)
 
 
 def search_variable(

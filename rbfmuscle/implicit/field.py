@@ -66,25 +66,24 @@ class RBFField:
     def __init__(
         self,
         centres: Floats,
-        origin: Floats,
-        scale: float,
+        place: tuple[Floats, float],
         kernel: Kernel,
         epsilon: float,
         weights: Floats,
-        coefficients: Floats,
-        powers: Integers,
+        polynomial: tuple[Floats, Integers],
         condition: float,
         smoothing: float = 0.0,
     ) -> None:
-        self.centres, self.origin, self.scale = centres, origin, scale
+        self.centres, (self.origin, self.scale) = centres, place
         self.kernel, self.epsilon = kernel, epsilon
-        self.weights, self.coefficients, self.powers = weights, coefficients, powers
+        self.weights, (self.coefficients, self.powers) = weights, polynomial
         self.condition, self.smoothing = condition, smoothing
-        self._scaled = np.ascontiguousarray(((centres - origin) / scale).T)
+        self._scaled = np.ascontiguousarray(((centres - self.origin) / self.scale).T)
         self._rows = np.ascontiguousarray(weights.reshape(len(centres), -1).T)
-        shape = epsilon * scale if kernel.has_epsilon else 1.0
+        shape = epsilon * self.scale if kernel.has_epsilon else 1.0
         self._shape = np.ascontiguousarray(np.broadcast_to(shape, len(centres)), dtype=float)
-        self._polynomial = np.ascontiguousarray(coefficients, dtype=float), np.ascontiguousarray(powers)
+        coefficients = np.ascontiguousarray(self.coefficients, dtype=float)
+        self._polynomial = coefficients, np.ascontiguousarray(self.powers)
 
     @classmethod
     def fit(
@@ -136,8 +135,8 @@ class RBFField:
         basis = Basis((points - origin) / scale, kernel, shape, degree)
         smoothing = basis_smoothing(smoothing, basis, values)
         weights, coefficients, condition = solve(basis, values, smoothing=smoothing, truncate=truncate)
-        rest = basis.powers, condition, smoothing
-        return cls(points, origin, scale, kernel, epsilon, weights, coefficients, *rest)
+        polynomial = coefficients, basis.powers
+        return cls(points, (origin, scale), kernel, epsilon, weights, polynomial, condition, smoothing)
 
     @classmethod
     def fit_hermite(
@@ -188,8 +187,8 @@ class RBFField:
         basis, right, origin, scale = hermite_system(points, normals, kernel, epsilon, derivatives)
         smoothing = basis_smoothing(smoothing, basis, right)
         weights, coefficients, condition = solve(basis, right, smoothing=smoothing, truncate=truncate)
-        weights, rest = hermite_weights(basis, weights), (basis.powers, condition, smoothing)
-        fitted = cls(points, origin, scale, kernel, epsilon, weights, coefficients, *rest)
+        weights, polynomial = hermite_weights(basis, weights), (coefficients, basis.powers)
+        fitted = cls(points, (origin, scale), kernel, epsilon, weights, polynomial, condition, smoothing)
         if kernel.has_epsilon:
             _warn_if_narrow(fitted, points, normals)
         return fitted
@@ -288,8 +287,8 @@ class RBFField:
         if rank < matrix.shape[1]:
             _warn_if_truncated(kernel, rank, matrix.shape[1])
         weights, coefficients = solution[: len(centres)], solution[len(centres) :]
-        rest = powers, condition, smoothing
-        return cls(centres, origin, scale, kernel, epsilon, weights, coefficients, *rest)
+        polynomial = coefficients, powers
+        return cls(centres, (origin, scale), kernel, epsilon, weights, polynomial, condition, smoothing)
 
     def __call__(self, points: ArrayLike) -> Floats:
         """Field value at (n, 3) points: (n,), negative inside."""

@@ -72,8 +72,8 @@ def test_volume_derivative_against_central_differences(hermite, kernel, refit):
             return volume(make(centres))
         return volume(
             RBFField(
-                centres, field.origin, field.scale, field.kernel, field.epsilon, field.weights,
-                field.coefficients, field.powers, 1.0,
+                centres, (field.origin, field.scale), field.kernel, field.epsilon, field.weights,
+                (field.coefficients, field.powers), 1.0,
             )
         )  # fmt: skip
 
