@@ -14,7 +14,7 @@ out = folder("exporting")
 scene = rm.phantom_scene()
 run = rm.simulate(scene, frames="0:31:10")
 run.save(out / "run", pictures=False)
-draw(run, out / "exported.png")
+draw(out / "run", out / "exported.png")
 
 for path in sorted((out / "run").iterdir()):
     print(path.name)

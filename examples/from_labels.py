@@ -22,6 +22,7 @@ from pictures import folder
 
 import rbfmuscle as rm
 from rbfmuscle.cli import main
+from rbfmuscle.study.files.saved import SavedRun
 
 out = folder("from_labels")
 VOXEL = 1.5
@@ -76,13 +77,13 @@ meshes.mkdir(exist_ok=True)
 for part in parts:
     part.mesh.export(meshes / f"{part.name}.ply")
 command("new", meshes, "--units", "mm", "--force")
-found, true = (
-    rm.simulate(rm.Scene.load(file), settings={"output.moment_arms": True}, frames="0:9:4")
-    for file in (out / "hip_scene" / "scene.toml", meshes / "scene.toml")
+found = SavedRun(out / "run")
+true = rm.simulate(
+    rm.Scene.load(meshes / "scene.toml"), settings={"output.moment_arms": True}, frames="0:9:4"
 )
 worst = 0.0
 for muscle in true:
-    off = found.values(muscle.name, "moment_arm") - muscle.values("moment_arm")
+    off = found.series(muscle.name, "moment_arm")[1] - muscle.values("moment_arm")
     print(f"{muscle.name}: moment arms from the labels differ by {np.sqrt(np.mean(off**2)):.2f} mm RMS")
     worst = max(worst, np.sqrt(np.mean(off**2)))
 assert worst < 5.0

@@ -9,6 +9,8 @@ from pathlib import Path
 from rbfmuscle.study.show.render import render_run
 from rbfmuscle.validation import MissingPartError
 
+_SAVED = {}  # runs that were drawn already, and their folders
+
 
 def folder(name):
     """Folder of an example's files: the first argument of the script, else example_output/NAME."""
@@ -18,10 +20,12 @@ def folder(name):
 
 
 def draw(run, file, *, frame=None, views=("side", "back")):
-    """Picture of a run's frame; where there are no graphics a line says so."""
+    """Picture of a frame of a run, or of the folder of one; where there are no graphics a line says so."""
     file = Path(file)
-    saved = file.parent / f"run_{file.stem}"
-    run.save(saved, pictures=False)
+    if not isinstance(run, Path) and id(run) not in _SAVED:
+        _SAVED[id(run)] = run, file.parent / f"run_{file.stem}"
+        run.save(_SAVED[id(run)][1], pictures=False)
+    saved = run if isinstance(run, Path) else _SAVED[id(run)][1]
     try:
         render_run(saved, file, frame=frame, views=views)
     except MissingPartError as error:

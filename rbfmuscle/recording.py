@@ -17,7 +17,8 @@ from rbfmuscle.sim.scene.check import bone_collisions, bone_findings, check_init
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.study.files.runinfo import Clock, Stages, build_info, frame_facts
 from rbfmuscle.study.files.sinks import Sink
-from rbfmuscle.study.measure.metrics import MetricsRecorder, Row
+from rbfmuscle.study.measure.metrics import MetricsRecorder
+from rbfmuscle.study.measure.quantities import Row
 from rbfmuscle.study.measure.summary import LIMITS, Summary, default_limit
 from rbfmuscle.validation import RBFMuscleError, SceneWarning, SolveError
 

@@ -17,7 +17,7 @@ from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.study.files.resume import left_behind
 from rbfmuscle.study.files.sinks import MemorySink
 from rbfmuscle.study.files.writer import RunWriter
-from rbfmuscle.study.measure.metrics import Row
+from rbfmuscle.study.measure.quantities import Row
 from rbfmuscle.study.measure.summary import parse_limits, require_limits
 from rbfmuscle.validation import SolveError, UsageError
 

@@ -12,7 +12,7 @@ from rbfmuscle.run import simulate
 from rbfmuscle.sim.loop.carrying import Work
 from rbfmuscle.study.files.runinfo import Stages
 from rbfmuscle.study.files.saved import SavedRun
-from rbfmuscle.study.measure.metrics import ALL
+from rbfmuscle.study.measure.quantities import ALL
 from rbfmuscle.study.show.comparison_plots import plot_models
 from rbfmuscle.study.show.plots import plot_panels
 from rbfmuscle.study.show.sweep_page import draw_front

@@ -14,12 +14,7 @@ from rbfmuscle.sim.loop.simulate import Event, Frame, ModelSurface
 from rbfmuscle.sim.scene.motion import Motion
 from rbfmuscle.study.measure.centreline import Centreline, MuscleAtRest, slice_operator, split_ends
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
-from rbfmuscle.study.measure.metrics import (
-    MetricsRecorder,
-    edge_strain,
-    moment_arms,
-    surface_distance,
-)
+from rbfmuscle.study.measure.metrics import MetricsRecorder, edge_strain, moment_arms, surface_distance
 from rbfmuscle.study.measure.occupancy import OccupancyGrid
 from rbfmuscle.study.measure.penetration import (
     BoneProbe,

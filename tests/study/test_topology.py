@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from rbfmuscle.geometry.crossing import crossing_faces
-from rbfmuscle.study.measure.metrics import Row
+from rbfmuscle.study.measure.quantities import Row
 from rbfmuscle.study.measure.summary import Summary, exceeded
 from rbfmuscle.study.measure.topology import euler_characteristic, self_crossing
 

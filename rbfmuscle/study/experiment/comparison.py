@@ -14,7 +14,8 @@ from rbfmuscle.study.files.runinfo import machine, versions
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.files.writer import write_json
 from rbfmuscle.study.measure.comparison_measures import MaterialProbe, array_bytes, curvature_variation
-from rbfmuscle.study.measure.metrics import ALL, surface_distance, unit_text
+from rbfmuscle.study.measure.metrics import surface_distance
+from rbfmuscle.study.measure.quantities import ALL, unit_text
 
 if TYPE_CHECKING:
     from rbfmuscle.sim.loop.frame import Frame, MuscleModel

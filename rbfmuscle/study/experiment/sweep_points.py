@@ -14,7 +14,8 @@ import numpy as np
 
 from rbfmuscle.study.experiment.sweep import SweepFolder
 from rbfmuscle.study.experiment.workers import threads_limited
-from rbfmuscle.study.measure.metrics import ALL, surface_distance
+from rbfmuscle.study.measure.metrics import surface_distance
+from rbfmuscle.study.measure.quantities import ALL
 from rbfmuscle.validation import RBFMuscleError, UsageError
 
 if TYPE_CHECKING:

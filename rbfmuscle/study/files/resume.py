@@ -13,7 +13,7 @@ from rbfmuscle.study.files.checkpoint import NAME, read_checkpoint
 from rbfmuscle.study.files.meshfiles import SUFFIXES
 from rbfmuscle.study.files.runinfo import content_hash, versions
 from rbfmuscle.study.files.writer import plain
-from rbfmuscle.study.measure.metrics import Row
+from rbfmuscle.study.measure.quantities import Row
 from rbfmuscle.validation import SceneWarning, UsageError
 
 if TYPE_CHECKING:

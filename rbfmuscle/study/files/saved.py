@@ -13,7 +13,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.study.files.meshfiles import SUFFIXES, read_mesh
-from rbfmuscle.study.measure.metrics import Row
+from rbfmuscle.study.measure.quantities import Row
 from rbfmuscle.validation import MeshError, UsageError
 
 

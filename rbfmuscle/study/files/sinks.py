@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 from rbfmuscle.sim.loop.frame import Frame
-from rbfmuscle.study.measure.metrics import Row
+from rbfmuscle.study.measure.quantities import Row
 
 
 class Sink(Protocol):

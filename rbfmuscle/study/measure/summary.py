@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rbfmuscle.study.measure.metrics import ALL, QUANTITIES
+from rbfmuscle.study.measure.quantities import ALL, QUANTITIES
 from rbfmuscle.validation import LimitExceededError, UsageError, did_you_mean
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import Any
 
 from rbfmuscle.study.experiment.comparison import COST, FIRST, LAW, MEASURES, MESH, OWN, best_models
 from rbfmuscle.study.files.saved import SavedRun
-from rbfmuscle.study.measure.metrics import ALL
+from rbfmuscle.study.measure.quantities import ALL
 from rbfmuscle.study.show.appearance import line_colours
 from rbfmuscle.study.show.comparison_plots import plot_models
 from rbfmuscle.study.show.model_paths import beside_section

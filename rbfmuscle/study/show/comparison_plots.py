@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rbfmuscle.study.measure.metrics import ALL
+from rbfmuscle.study.measure.quantities import ALL
 from rbfmuscle.study.show.appearance import line_colours
 from rbfmuscle.study.show.plots import PLOT_STYLE, arm_unit, motion_axis, wrapped
 

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.study.files.saved import SavedRun
@@ -105,6 +104,8 @@ def near_segments(saved: SavedRun, muscle: str, frame: int, vertices: Floats) ->
     """Segments of fibres (n, k) near each of some points (n, 3) of a muscle, by their place, and their shares."""
     points = saved.fibres(muscle, frame)[0]
     middles = (0.5 * (points[:, 1:] + points[:, :-1])).reshape(-1, 3)
+    from scipy.spatial import cKDTree
+
     away, nearest = cKDTree(middles).query(vertices, k=[*range(1, min(NEAREST, len(middles)) + 1)])
     weight = 1.0 / np.maximum(away, 1e-9)
     return nearest, weight / weight.sum(axis=1, keepdims=True)

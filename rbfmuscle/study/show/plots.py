@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rbfmuscle.study.measure.metrics import ALL
+from rbfmuscle.study.measure.quantities import ALL
 from rbfmuscle.study.show.appearance import LINE_COLOURS, line_colours
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rbfmuscle.study.files.saved import SavedRun
-from rbfmuscle.study.measure.metrics import QUANTITIES
+from rbfmuscle.study.measure.quantities import QUANTITIES
 from rbfmuscle.study.measure.summary import LEAST, exceeded
 from rbfmuscle.study.show.appearance import USUAL_VIEWS, line_colours
 from rbfmuscle.study.show.model_paths import beside_section

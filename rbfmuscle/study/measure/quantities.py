@@ -1,0 +1,72 @@
+"""What is measured of a frame, in which unit, and a row of it; for those who read what others measured."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+# Quantity: kind of unit (volume and length follow the scene's unit), meaning; in the order of the tables.
+QUANTITIES = {
+    "volume": ("volume", "volume enclosed by the surface"),
+    "volume_error": ("1", "volume relative to the input mesh's, minus one"),
+    "penetration_max": ("length", "deepest surface vertex inside a bone, exact distance to the bone mesh"),
+    "penetration_fraction": ("1", "share of surface vertices inside a bone"),
+    "bone_penetration_max": ("length", "deepest bone vertex inside the muscle"),
+    "solver_penetration_max": ("length", "deepest point inside a bone before the bone is cut away"),
+    "components": ("1", "closed pieces of the surface"),
+    "euler": ("1", "Euler characteristic of the surface: 2 for a sphere, two less for each handle"),
+    "self_crossing": ("1", "triangles of the surface that cross others of it"),
+    "self_crossing_area": ("1", "their share of the surface's area"),
+    "unfitted_fraction": (
+        "1",
+        "share of the surface's vertices kept off the level set; 1 where none is shown",
+    ),
+    "flicker_rms": (
+        "length",
+        "change, since the frame before, of the way from the carried mesh to the surface",
+    ),
+    "flicker_max": ("length", "the same, greatest"),
+    "tunnelled": ("1", "points that passed through a bone and were not brought back"),
+    "rest_error_rms": ("length", "distance between extracted surface and input mesh at rest, both ways"),
+    "rest_error_max": ("length", "the same, greatest (Hausdorff)"),
+    "edge_strain_rms": ("1", "relative change of edge lengths of the carried mesh"),
+    "condition": ("1", "condition estimate of the fit"),
+    "length": ("length", "centreline from origin to insertion"),
+    "moment_arm": ("length", "minus the change of length with the coordinate's angle"),
+    "activation": ("1", "activation, 0 to 1; this and the next seven for muscles that contract"),
+    "fibre_length": ("length", "mean length of the fibres without their tendon"),
+    "fibre_stretch": ("1", "mean stretch of these against the scan"),
+    "fibre_stretch_5": ("1", "the stretch that 5 % of their segments stay below"),
+    "fibre_stretch_95": ("1", "the stretch that 5 % of their segments exceed"),
+    "pennation": ("deg", "mean angle of these to the line between the middles of origin and insertion"),
+    "belly_thickness": ("length", "least width of the greatest section across that line"),
+    "csa_max": ("area", "area of the greatest section across that line"),
+    "csa_place": ("1", "where it lies: 0 at the origin, 1 at the insertion"),
+    "fibre_length_mean": ("length", "mean length of the fibres"),
+    "fibre_length_std": ("length", "standard deviation of the fibres' lengths"),
+    "fibre_moment_arm_mean": ("length", "mean over the fibres of their moment arms"),
+    "fibre_moment_arm_std": ("length", "standard deviation of the fibres' moment arms"),
+    "time": ("s", "time of the frame in the motion file; muscle 'all'"),
+    "time_solve": ("s", "prediction, solution and contacts"),
+    "time_fit": ("s", "fit of the field"),
+    "time_extract": ("s", "extraction of the surface"),
+    "time_frame": ("s", "all of the frame; muscle 'all': wall time of all muscles together"),
+}
+ALL = "all"
+FIBRES = "fibres"
+
+
+class Row(NamedTuple):
+    """One line of ``metrics.csv``; the angle is in degrees, the value of a translation in scene units."""
+
+    frame: int
+    coordinate: str
+    angle: float
+    muscle: str
+    quantity: str
+    value: float
+    unit: str
+
+
+def unit_text(kind: str, units: str) -> str:
+    """Unit of a quantity as written in tables: ``length`` and ``volume`` take the scene's unit."""
+    return {"length": units, "area": f"{units}^2", "volume": f"{units}^3"}.get(kind, kind)
