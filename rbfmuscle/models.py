@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from rbfmuscle.sim.loop.frame import MuscleModel
 from rbfmuscle.sim.plan.forecast import MuscleCost
+from rbfmuscle.sim.plan.rates import scales
 from rbfmuscle.sim.scene.objects import Muscle
 from rbfmuscle.sim.scene.options import Table
 from rbfmuscle.sim.scene.scene import Scene
@@ -76,7 +77,8 @@ def estimate_model(muscle: Muscle, scene: Scene, rates: Mapping[str, float]) -> 
     """
     home = _HOME[check_model_name(muscle.model)]
     options = _read_options(muscle, home, muscle.options)
-    return _part(home, "cost", "estimate_muscle")(muscle, scene, rates, options)
+    cost = _part(home, "cost", "estimate_muscle")(muscle, scene, rates, options)
+    return cost.scaled(**scales()["models"][muscle.model])
 
 
 def build_models(scene: Scene) -> list[MuscleModel]:

@@ -39,7 +39,10 @@ def test_every_folder_with_modules_is_a_package():
 
 def test_typed_marker_and_table_of_loops_travel_with_the_packages():
     data = PROJECT["tool"]["setuptools"]["package-data"]
-    assert data == {"rbfmuscle": ["py.typed", "compiled/needs.json"], "pbd_baseline": ["py.typed"]}
+    assert data == {
+        "rbfmuscle": ["py.typed", "compiled/needs.json", "sim/plan/scales.json"],
+        "pbd_baseline": ["py.typed"],
+    }
 
 
 def run(*command, **options):

@@ -6,14 +6,15 @@ import sys
 import numpy as np
 import pytest
 from conftest import ROOT
+from plan_check import remade
 
 from rbfmuscle.model.cost import dense_count
-from rbfmuscle.models import build_model, estimate_model
+from rbfmuscle.models import MODEL_NAMES, build_model, estimate_model
 from rbfmuscle.sim.distance.sdf import BoneSDF
 from rbfmuscle.sim.loop.contact import BoneContacts
 from rbfmuscle.sim.plan.forecast import FieldCost, MuscleCost, estimate_field, forecast, side_by_side
 from rbfmuscle.sim.plan.plan import plan_scene
-from rbfmuscle.sim.plan.rates import _bumpy_sphere, measure_rates
+from rbfmuscle.sim.plan.rates import _bumpy_sphere, measure_rates, scales
 from rbfmuscle.sim.scene.phantom import phantom_scene
 
 RATES = {"call": 1e-6, "visit": 1e-9, "query": 1e-6}
@@ -159,3 +160,34 @@ def test_plan_loads_no_graphics_and_builds_nothing():
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=120, check=True
     )
     assert done.stdout.strip() == "[]", done.stderr
+
+
+def test_scales_name_every_model_and_where_they_come_from():
+    found = scales()
+    assert set(found["models"]) == set(MODEL_NAMES)
+    every = [found["metrics"], found["write"], *(v for row in found["models"].values() for v in row.values())]
+    # Beyond a factor of four the counts of work themselves describe another program.
+    assert all(0.25 < value < 4.0 for value in every)
+    assert all(isinstance(found[key], str) and found[key] for key in ("command", "commit", "machine", "date"))
+
+
+def test_scales_multiply_what_is_foretold(scene, monkeypatch):
+    before = estimate_model(scene.muscles[0], scene, RATES)
+    build, motion = scales()["models"]["rbf"].values()
+    twice = {"build": 2 * build, "motion": 3 * motion}
+    monkeypatch.setitem(scales()["models"], "rbf", twice)
+    after = estimate_model(scene.muscles[0], scene, RATES)
+    assert after.build == pytest.approx(2 * before.build)
+    assert (after.step, after.show) == pytest.approx((3 * before.step, 3 * before.show))
+    assert after.memory == before.memory
+
+
+def test_counts_made_anew_agree_with_what_was_measured():
+    """Runs that take twice what was foretold double the counts, those of other models stay."""
+    row = {"build": [1.0, 2.0], "motion": [0.1, 0.4], "metrics": [1.0, 1.0], "write": [1.0, 0.25]}
+    old = {"models": {"rbf": {"build": 1.5, "motion": 1.0}, "pbd": {"build": 1.2, "motion": 0.8}},
+           "metrics": 0.7, "write": 2.0}  # fmt: skip
+    new = remade({"one: rbf": row, "two: rbf": {**row, "motion": [0.1, 0.1]}}, old)
+    assert new["models"]["rbf"] == {"build": 3.0, "motion": 2.0}
+    assert new["models"]["pbd"] == old["models"]["pbd"]
+    assert (new["metrics"], new["write"]) == (0.7, 0.5)

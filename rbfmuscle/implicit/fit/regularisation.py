@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.fit.cross_validation import LeastSquaresPath, SmoothingPath
@@ -70,6 +69,8 @@ def search_smoothing(path: SmoothingPath | LeastSquaresPath, criterion: str = "g
     tried = [(exponent, objective(exponent)) for exponent in exponents]
     best = int(np.argmin([score for _, score in tried]))
     ends = exponents[max(best - 1, 0)], exponents[min(best + 1, len(exponents) - 1)]
+    from scipy.optimize import minimize_scalar  # a fifth of a second, which few fits ask for
+
     found = minimize_scalar(objective, bounds=ends, method="bounded", options={"xatol": 1e-3})
     scores = np.array(sorted([*tried, (float(found.x), float(found.fun))]))
     scores[:, 0] = 10.0 ** scores[:, 0]

@@ -1,13 +1,15 @@
 """Memory and time that a scene will take, from counts of its work and the measured speed of this machine.
 
 Counts of work (how many visits a surface vertex costs, say) are properties of the code, fitted to runs of the real
-and of the embedded hip; seconds come from `rbfmuscle.sim.plan.rates` alone, measured when the forecast is made.
+and of the embedded hip; what has changed since is one factor for each model and part (`scales`), which
+``benchmarks/plan_check.py --remake`` measures. Seconds come from `rbfmuscle.sim.plan.rates`, measured when the
+forecast is made.
 """
 
 from __future__ import annotations
 
 import heapq
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +18,7 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.sim.distance.build import CUT, OUTER, grid_shape
 from rbfmuscle.sim.distance.cells import BLOCK
 from rbfmuscle.sim.distance.sdf import BAND, CELL_SHARE, LEAST_CELLS, BoneSDF
+from rbfmuscle.sim.plan.rates import scales
 from rbfmuscle.sim.scene.motion import bone_poses
 
 if TYPE_CHECKING:
@@ -78,6 +81,10 @@ class MuscleCost:
     carried: int
     shown: int
     points: str = ""
+
+    def scaled(self, *, build: float, motion: float) -> MuscleCost:
+        """The same with other times to build it and to move it."""
+        return replace(self, build=build * self.build, step=motion * self.step, show=motion * self.show)
 
 
 @dataclass(frozen=True)
@@ -189,7 +196,7 @@ def _memory(scene, fields, costs, resident):
 def _time(scene, fields, costs, work, rates, threads):
     frames, output = max(len(scene.motion), 1), scene.output
     shows = bool(output.surfaces) or output.metrics
-    visit, query = rates["visit"], rates["query"]
+    visit, query, scale = rates["visit"], rates["query"], scales()
     bones = sum(len(bone.mesh.vertices) for bone in scene.bones)
     shown = sum(cost.shown for cost in costs)
     moving = _moving_vertices(scene)
@@ -210,10 +217,11 @@ def _time(scene, fields, costs, work, rates, threads):
     ]
     frame = {
         "muscles": side_by_side(each, threads),
-        "metrics": visit * BONE_VISITS * bones * len(costs) + query * SHOWN_QUERIES * shown
+        "metrics": scale["metrics"]
+        * (visit * BONE_VISITS * bones * len(costs) + query * SHOWN_QUERIES * shown)
         if output.metrics
         else 0.0,
-        "write": visit * WRITE_VISITS * (shown + moving) if output.surfaces else 0.0,
+        "write": scale["write"] * visit * WRITE_VISITS * (shown + moving) if output.surfaces else 0.0,
     }
     build["total"], frame["total"] = sum(build.values()), sum(frame.values())
     motion = frames * frame["total"]

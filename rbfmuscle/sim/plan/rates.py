@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,19 @@ def measure_rates() -> Any:
         stands for the loops over meshes. ``query``: an exact distance near a mesh.
     """
     return {"call": _call(), "visit": _visit(), "query": _query()}
+
+
+@cache
+def scales() -> dict[str, Any]:
+    """What the counts of work are multiplied by, as runs were last found to take: ``plan_check.py --remake`` writes it.
+
+    Returns
+    -------
+    dict
+        ``models``: of each model ``build`` and ``motion``; ``metrics`` and ``write`` of any; ``command``, ``commit``,
+        ``machine`` and ``date`` say where they come from.
+    """
+    return json.loads(Path(__file__).with_name("scales.json").read_text(encoding="utf-8"))
 
 
 def resident_memory() -> Any:
