@@ -57,16 +57,6 @@ class Node:
         inner = node.child("objects")
         return (inner or node).children if inner is not None else node.children
 
-    def walk(self, *, skip: tuple[str, ...] = ()) -> Iterator[Node]:
-        """The node and all below it in order; nodes of the tags in ``skip`` are left out with all they hold."""
-        waiting = [self]
-        while waiting:
-            node = waiting.pop()
-            if node.tag in skip:
-                continue
-            yield node
-            waiting.extend(reversed(node.children))
-
 
 class _Builder:
     def __init__(self, path: Path) -> None:
