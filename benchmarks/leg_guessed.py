@@ -4,8 +4,8 @@
     python benchmarks/leg_guessed.py labels --voxel 1.0
 
 `meshes`: right bones, hip, axes and middles of patches against ``data/leg/scene.json``; then the file goes through
-`check` and `run --frames 0:5`. With ``--plain`` files are named Segment_1 and on. `labels`: the 47 meshes as one volume
-of labels through `new`; each surface against its mesh, its volume against the label's, with time and memory.
+`check` and `run --frames 0:5`. With ``--plain`` muscles are named Segment_1 and on. `labels`: the 47 meshes as one
+volume of labels through `new`; each surface against its mesh, its volume against the label's, with time and memory.
 """
 
 import argparse
@@ -37,12 +37,13 @@ class Wanted(NamedTuple):
 
 def copied(data: Path, facts: dict, folder: Path, *, plain: bool) -> dict[str, str]:
     """Meshes of all bones and muscles in a folder; the true name of each file."""
-    parts = [("bones", name) for name in facts["bones"]] + [("muscles", name) for name in facts["muscles"]]
     names = {}
-    for number, (kind, name) in enumerate(parts, start=1):
-        stem = f"Segment_{number}" if plain else name
-        (folder / f"{stem}.ply").write_bytes((data / "leg" / kind / f"{name}.ply").read_bytes())
-        names[stem] = name
+    for kind in ("bones", "muscles"):
+        (folder / kind).mkdir()
+        for number, name in enumerate(facts[kind], start=1):
+            stem = f"Segment_{number}" if plain and kind == "muscles" else name
+            (folder / kind / f"{stem}.ply").write_bytes((data / "leg" / kind / f"{name}.ply").read_bytes())
+            names[stem] = name
     return names
 
 
@@ -156,7 +157,7 @@ def main() -> None:
     """Print the rows."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("what", choices=("meshes", "labels"))
-    parser.add_argument("--plain", action="store_true", help="files named Segment_1 and on")
+    parser.add_argument("--plain", action="store_true", help="muscles named Segment_1 and on")
     parser.add_argument("--voxel", type=float, default=1.0)
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     asked = parser.parse_args()
