@@ -24,7 +24,7 @@ def bar(nodes=150, regions=12, iterations=100, size=(40.0, 10.0, 8.0)):
     held = np.flatnonzero(owner >= 0)
     return Interior(
         lattice, frame, points, owner, held, count=len(points), free=np.flatnonzero(owner < 0),
-        regions=regions, iterations=iterations, contacts=24, memory=5,
+        regions=regions, iterations=iterations, contacts=24, memory=5, area=float(block.area) / len(points),
     )  # fmt: skip
 
 

@@ -46,7 +46,7 @@ def build_interior(muscle: Muscle, rest: Rest, options: RBFOptions) -> tuple[Int
     interior = Interior(
         lattice, frame, points, owner, held, count=centres, free=rest.free,
         regions=max(1, len(lattice.rest) // NODES_A_REGION), iterations=options.iterations,
-        contacts=options.contacts, memory=options.acceleration,
+        contacts=options.contacts, memory=options.acceleration, area=float(muscle.mesh.area) / len(points),
     )  # fmt: skip
     if options.fibre_ratio > 1.0 or muscle.contraction is not None:
         axis = points[held].mean(axis=0) - points.mean(axis=0)

@@ -186,7 +186,7 @@ def _answers_loop(index, columns, shares, inverse, answers):
 
 
 @compiled(error_model="numpy")
-def _pairs_loop(index, normal, rows, answers, columns, shares):
+def _pairs_loop(index, normal, rows, answers, columns, shares, yielding):
     """Motion at contact c for a unit force at contact d, the regions' volumes kept."""
     size = len(index)
     gram = np.empty((size, size))
@@ -202,7 +202,7 @@ def _pairs_loop(index, normal, rows, answers, columns, shares):
             gram[d, c] = value
     least = 1e-7 * np.abs(np.diag(gram)).max()
     for c in range(size):
-        gram[c, c] += least
+        gram[c, c] += least + yielding
     return gram
 
 
@@ -219,7 +219,7 @@ def mobility_loop(columns, shares, inverse, out):
 @compiled(error_model="numpy")
 def touch_loop(
     index, gap, normal, source, motion, inverse, columns, shares, response, table,
-    batch, rounds, sweeps, tolerance, push, taken,
+    batch, rounds, sweeps, tolerance, yielding, push, taken,
 ):  # fmt: skip
     """Contact: fill the nodes' ``push`` (N, 3), what it takes from the whitened pressures (M,), and the forces.
 
@@ -251,7 +251,7 @@ def touch_loop(
         _rows_loop(index[chosen], normal[chosen], response, columns, shares, rows)
         answers = np.empty((len(chosen), len(push)))
         _answers_loop(index[chosen], columns, shares, inverse, answers)
-        gram = _pairs_loop(index[chosen], normal[chosen], rows, answers, columns, shares)
+        gram = _pairs_loop(index[chosen], normal[chosen], rows, answers, columns, shares, yielding)
         strength = force[chosen]
         solve_contact_forces(gram, need[chosen], strength, sweeps, 0.1 * tolerance)
         force[chosen] = strength

@@ -118,9 +118,9 @@ class Response:
 
 
 def _pushing(solid: Any, contacts: Any) -> _Pushing:
-    points = solid.carry()
+    points = solid.carry_from(solid.y)
     index, source = np.nonzero(solid.forces > 0.0)
-    spaces = contacts.half_spaces(points, solid.reach)
+    spaces = solid.obstacles.rounded(contacts).half_spaces(points, solid.obstacles.reach)
     width = solid.forces.shape[1]
     known = {pair: k for k, pair in enumerate(zip(spaces.index.tolist(), (spaces.source % width).tolist()))}
     found = [

@@ -14,7 +14,7 @@ contacts in its metric. The pressures are kept, so that where the iteration stan
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -33,9 +33,9 @@ from rbfmuscle.model.inside.loops import (
     respond_loop,
     stress_loop,
     swell_loop,
-    touch_loop,
     turn_loop,
 )
+from rbfmuscle.model.inside.obstacles import Near, Obstacles
 from rbfmuscle.model.inside.response import Response
 
 # Times the iterations of a muscle without an inside: they end by the residual, mostly sooner.
@@ -44,23 +44,7 @@ HOLD = 25.0  # stiffness of the spring at a held point, in that of a cell
 GHOST = 1e-3  # of a cell's stiffness: what carries nodes that hold hardly any material
 MOST_TREND = 1.5  # of the last sub-step's correction that the next one starts with
 MOBILE = 0.02  # points that move by less than this share of the median for a unit force are attached
-CONTACT_TOLERANCE = 2e-5  # of the muscle's size
-REACH_MARGIN = 0.003
-NEAR = 0.03  # points nearer to an obstacle than this take part in a solve
 SETTLED = 2e-5
-CONTACT_ROUNDS, CONTACT_SWEEPS = 10, 400
-
-
-class _Near(NamedTuple):
-    """Contact points near an obstacle: their indices and embedding, forces on them, obstacles, nodes then."""
-
-    index: np.ndarray
-    columns: np.ndarray
-    shares: np.ndarray
-    forces: np.ndarray
-    contacts: Any
-    y: np.ndarray
-    reach: float
 
 
 class Interior:
@@ -82,6 +66,8 @@ class Interior:
     free : (f,) ndarray of int
         Centres that are free to move.
     regions, iterations, contacts, memory : int
+    area : float
+        Of the surface that a contact point stands for [scene unit squared].
     """
 
     def __init__(
@@ -98,6 +84,7 @@ class Interior:
         iterations: Any,
         contacts: Any,
         memory: int,
+        area: float,
     ) -> None:
         self.rest = frame.points(lattice.rest)
         self.points, self.owner, self.held = points, owner, held
@@ -119,8 +106,9 @@ class Interior:
         self.f, self.target = np.empty((2, count, 3, 3))
         self._number_regions(lattice.regions(regions))
         self._assemble(lattice)
-        self.reach = NEAR * self.scale
+        self.obstacles = Obstacles(self, area)
         self.y, self.pressure = self.rest.copy(), np.zeros(len(self.rest_volumes))
+        self.shown = self.y
         self.forces = np.zeros((len(points), 1))
         self.anchor, self.history = points[held], [0.0]
         self.trend, self.begun = None, None
@@ -200,11 +188,15 @@ class Interior:
 
     def carry(self, centres: Floats | None = None) -> Any:
         """Contact points now, (n, 3); they go with the nodes, whatever the centres are."""
-        if self._carried is None or self._carried[0] is not self.y:
-            out = np.empty_like(self.points)
-            carry_loop(self.y, self.columns, self.shares, out)
-            self._carried = self.y, out
+        if self._carried is None or self._carried[0] is not self.shown:
+            self._carried = self.shown, self.carry_from(self.shown)
         return self._carried[1].copy()
+
+    def carry_from(self, y: Floats) -> Floats:
+        """Contact points (n, 3) that nodes at y (N, 3) carry."""
+        out = np.empty_like(self.points)
+        carry_loop(y, self.columns, self.shares, out)
+        return out
 
     def follow(self, points: Floats) -> Floats:
         """Where the nodes carry points (n, 3) of the muscle at rest; asked for the same ones again and again."""
@@ -212,20 +204,20 @@ class Interior:
             found = self.lattice.embed((points - self.frame.origin) @ self.frame.axes.T / self.frame.size)
             self._followed = points, found.columns, found.shares
         out = np.empty_like(points)
-        carry_loop(self.y, *self._followed[1:], out)
+        carry_loop(self.shown, *self._followed[1:], out)
         return out
 
     def centres(self, before: Floats) -> Floats:
         """Centres (K, 3) where the nodes carry the free ones; the held ones stay as they are."""
         out, free = before.copy(), np.empty((len(self.free), 3))
-        carry_loop(self.y, self.columns[self.free], self.shares[self.free], free)
+        carry_loop(self.shown, self.columns[self.free], self.shares[self.free], free)
         out[self.free] = free
         return out
 
     def deformation(self) -> Any:
         """Deformation gradient (n, 3, 3) at the contact points that are centres."""
         at = slice(0, self.count)
-        return np.einsum("nka,nkb->nab", self.y[self.columns[at]], self.slopes_at[at])
+        return np.einsum("nka,nkb->nab", self.shown[self.columns[at]], self.slopes_at[at])
 
     def move(self, motions: Any, poses: Any) -> None:
         """Nodes take their share of the bones' motions (b, 4, 4); held points go with the poses (by bone)."""
@@ -240,6 +232,7 @@ class Interior:
             share = float(np.clip(share, -MOST_TREND, MOST_TREND))
             self.y = self.y + share * correction
             self.pressure = self.pressure + share * pressed
+        self.shown = self.y
 
     def _ends(self, poses: Any) -> Floats:
         """Held points (h, 3) where the bones' poses take them."""
@@ -263,11 +256,14 @@ class Interior:
         np.add.at(every, self.columns, self.shares)
         share = (hit / np.maximum(every, 1e-12))[:, None]
         self.y = self.y + share * (self.y @ transform[:3, :3].T + transform[:3, 3] - self.y)
+        self.shown = self.y
 
     def transform(self, motion: Floats, centres: Floats | None = None) -> None:
         """Go along with a rigid motion (4, 4)."""
         turn = motion[:3, :3].T
-        self.y, self.anchor = self.y @ turn + motion[:3, 3], self.anchor @ turn + motion[:3, 3]
+        self.y, self.shown, self.anchor = (
+            at @ turn + motion[:3, 3] for at in (self.y, self.shown, self.anchor)
+        )
         self.quaternion[:] = turned_quaternions(self.quaternion, motion[:3, :3])
         self.begun = None
         if self.trend is not None:
@@ -278,6 +274,7 @@ class Interior:
         """State that ``restore`` brings back."""
         return (
             self.y.copy(),
+            self.shown.copy(),
             self.quaternion.copy(),
             self.pressure.copy(),
             self.forces.copy(),
@@ -287,8 +284,10 @@ class Interior:
 
     def restore(self, state: Any) -> None:
         """Return to an earlier ``snapshot``."""
-        self.y, self.quaternion, self.pressure, self.forces, self.anchor = (part.copy() for part in state[:5])
-        self.trend, self.begun = state[5], None
+        self.y, self.shown, self.quaternion, self.pressure, self.forces, self.anchor = (
+            part.copy() for part in state[:6]
+        )
+        self.trend, self.begun = state[6], None
 
     def solve(self, centres: Any, contacts: Any) -> Any:
         """Return the settled centres, (K, 3)."""
@@ -308,7 +307,7 @@ class Interior:
             if step:
                 self.localise()
             if near is None or np.abs(self.y - near.y).max() > 0.4 * near.reach:
-                near = self._near(contacts, near)
+                near = self.obstacles.near(contacts, near)
             new, pressure = self._iterate(near)
             moved = float(np.sqrt(((new - self.y) ** 2).sum(axis=1).max()))
             self.history.append(moved)
@@ -320,28 +319,12 @@ class Interior:
                 break
         self.forces[:] = 0.0
         self.forces[near.index] = near.forces
+        self.shown = self.obstacles.lifted(near)
         if self.begun is not None:
             motion, start, pressure = self.begun
             if np.abs(motion).max() > SETTLED * self.scale:
                 self.trend = motion, self.y - start, self.pressure - pressure
             self.begun = None
-
-    def _near(self, contacts: Any, before: _Near | None) -> _Near:
-        """The contact points near an obstacle, with what pushed them until now."""
-        if before is not None:
-            self.forces[:] = 0.0
-            self.forces[before.index] = before.forces
-        sources = max(1, len(contacts.names) + len(contacts.neighbours))
-        if self.forces.shape[1] != sources:
-            self.forces = np.zeros((len(self.points), sources))
-        reach = self.reach
-        index = np.arange(len(self.points))
-        if not contacts.neighbours:
-            index = np.unique(contacts.half_spaces(self.carry(), reach).index)
-            contacts = contacts.only(index)
-        return _Near(
-            index, self.columns[index], self.shares[index], self.forces[index], contacts, self.y.copy(), reach
-        )
 
     def elastic(self, y: Floats) -> Floats:
         """Matrix of the elastic energy times places y, targets frozen, (N, 3)."""
@@ -384,7 +367,7 @@ class Interior:
         white = solve_triangular(self.factor, response.reshape(count, -1), lower=True, check_finite=False)
         self.response = np.ascontiguousarray(white.reshape(response.shape))
 
-    def _iterate(self, near: _Near) -> tuple[Floats, Floats]:
+    def _iterate(self, near: Near) -> tuple[Floats, Floats]:
         right = self.right
         press_loop(self.pressure, self.start, self.touched, self.gradient, right)
         free = self.inverse @ (right + self.pull)
@@ -393,19 +376,7 @@ class Interior:
         excess = self.volumes - self.rest_volumes + swollen
         change = -solve_triangular(self.factor, excess, lower=True, check_finite=False)
         step = free + np.tensordot(change, self.response, 1).T
-        here, there = np.empty((2, len(near.index), 3))
-        carry_loop(self.y, near.columns, near.shares, here)
-        carry_loop(step, near.columns, near.shares, there)
-        motion = there - here
-        spaces = near.contacts.half_spaces(
-            here, 1.5 * np.sqrt((motion**2).sum(axis=1)) + REACH_MARGIN * self.scale
-        )
-        push, taken = np.empty_like(self.y), np.empty_like(change)
-        touch_loop(
-            spaces.index, spaces.gap, spaces.normal, spaces.source % near.forces.shape[1], motion, self.inverse,
-            near.columns, near.shares, self.response, near.forces,
-            self.batch, CONTACT_ROUNDS, CONTACT_SWEEPS, CONTACT_TOLERANCE * self.scale, push, taken,
-        )  # fmt: skip
+        push, taken = self.obstacles.push(near, self.y, step)
         change -= taken
         pressure = self.pressure + solve_triangular(
             self.factor, change, lower=True, trans=1, check_finite=False
