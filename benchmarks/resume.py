@@ -33,7 +33,7 @@ COMPARE = """
 import sys
 from rbfmuscle import phantom_scene
 from rbfmuscle.compare import compare_models
-compare_models(phantom_scene(end=16.0), sys.argv[1], ["rbf", "pbd", "xpbd"], pictures=False, resume=True)
+compare_models(phantom_scene(end=8.0), sys.argv[1], ["rbf", "pbd", "xpbd"], pictures=False, resume=True)
 """
 # Rows of tables that a clock or the process's size wrote, and files that show them.
 COSTS, SHOWN = (",time_", ",memory,"), ("report.html", "measures.npz")
@@ -57,17 +57,20 @@ def left_in(folder: Path, code: str) -> str:
 def content(path: Path) -> Any:
     """What a file holds, without what a clock wrote into it."""
     if path.name == "comparison.json":
-        return _without(without_times(json.loads(path.read_text())), "memory")
+        return _without_costs(without_times(json.loads(path.read_text())))
     if path.name == "comparison.csv":
         return [line for line in path.read_text().splitlines() if not any(word in line for word in COSTS)]
     return None if path.name in SHOWN else timeless(path)
 
 
-def _without(value: Any, key: str) -> Any:
-    """A tree of dicts and lists without a key."""
+def _without_costs(value: Any) -> Any:
+    """A tree without memory, and without verdicts on times and memory."""
     if isinstance(value, dict):
-        return {k: _without(item, key) for k, item in value.items() if k != key}
-    return [_without(item, key) for item in value] if isinstance(value, list) else value
+        return {key: _without_costs(item) for key, item in value.items() if key != "memory"}
+    if not isinstance(value, list):
+        return value
+    judged = [item.get("quantity", "") if isinstance(item, dict) else "" for item in value]
+    return [_without_costs(v) for v, name in zip(value, judged) if not name.startswith(("time_", "memory"))]
 
 
 def same(one: Path, other: Path) -> bool:
