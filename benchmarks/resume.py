@@ -69,7 +69,7 @@ def _without_costs(value: Any) -> Any:
         return {key: _without_costs(item) for key, item in value.items() if key != "memory"}
     if not isinstance(value, list):
         return value
-    judged = [item.get("quantity", "") if isinstance(item, dict) else "" for item in value]
+    judged = [str(item.get("quantity", "") if isinstance(item, dict) else item) for item in value]
     return [_without_costs(v) for v, name in zip(value, judged) if not name.startswith(("time_", "memory"))]
 
 
