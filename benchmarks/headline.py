@@ -7,12 +7,10 @@ way there and back to rest. Lengths in the scene's unit.
 """
 
 import argparse
-import json
-import subprocess
 from pathlib import Path
 
 import numpy as np
-from table import machine
+from evidence import write_evidence
 
 import rbfmuscle as rm
 
@@ -65,26 +63,12 @@ def measure(path):
     return rows
 
 
-def commit():
-    """The commit that was measured, with a plus where files were changed since."""
-    run = {"cwd": ROOT, "capture_output": True, "text": True, "check": True}
-    number = subprocess.run(["git", "rev-parse", "--short", "HEAD"], **run).stdout.strip()
-    changed = subprocess.run(["git", "status", "--porcelain", "--untracked-files=no"], **run).stdout.strip()
-    return number + ("+" if changed else "")
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path, metavar="SCENE.toml")
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "evidence" / "headline.json")
     given = parser.parse_args()
-    found = {
-        "command": f"python benchmarks/headline.py {given.scene.name}",
-        "commit": commit(),
-        "machine": machine()["cpu"],
-        "rows": measure(given.scene),
-    }
-    given.output.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    write_evidence(given.output, ["benchmarks/headline.py", str(given.scene)], measure(given.scene))
 
 
 if __name__ == "__main__":

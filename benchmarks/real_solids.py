@@ -18,7 +18,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from headline import commit
+from evidence import commit
 from peers.finite_element import TetSolid, follow, nearest_bone
 from scipy.spatial import cKDTree
 from table import machine

@@ -7,18 +7,15 @@ scene's unit.
 """
 
 import argparse
-import json
-import subprocess
 from pathlib import Path
 
 import numpy as np
-from table import machine
+from evidence import write_evidence
 
 import rbfmuscle as rm
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.sampling import sample_surface
 
-ROOT = Path(__file__).resolve().parent.parent
 CENTRES = (150, 300, 600)
 DERIVATIVES = ("all", "normal")
 
@@ -43,15 +40,7 @@ def main():
     for name, row in rows.items():
         print(name, *(" / ".join(f"{value:.2f}" for value in row[kind]) for kind in DERIVATIVES))
     if given.output:
-        asked = ["git", "rev-parse", "--short", "HEAD"]
-        commit = subprocess.run(asked, capture_output=True, text=True, cwd=ROOT, check=True).stdout.strip()
-        facts = {
-            "command": f"python benchmarks/rest_fits.py {given.scene.name}",
-            "commit": commit,
-            "machine": machine()["cpu"],
-            "rows": rows,
-        }
-        given.output.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+        write_evidence(given.output, ["benchmarks/rest_fits.py", str(given.scene)], rows)
 
 
 if __name__ == "__main__":

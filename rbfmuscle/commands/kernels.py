@@ -82,18 +82,11 @@ def kernels(
     as_json
         Print JSON and nothing else.
     """
-    from rbfmuscle.implicit.selection import CRITERIA
     from rbfmuscle.study.experiment.kernel_study import study_kernels
     from rbfmuscle.study.files.writer import json_text
     from rbfmuscle.study.show.kernels.page import write_study
 
-    if derivatives not in ("all", "normal") or criterion not in CRITERIA:
-        raise UsageError(f"derivatives must be all or normal, criterion {', '.join(CRITERIA)}; "
-                         f"got {derivatives!r} and {criterion!r}")  # fmt: skip
-    names, counts = _split(names), _split(centres)
-    if not all(count.isdecimal() and int(count) >= 4 for count in counts or ()):
-        raise UsageError(f"--centres must be whole numbers of 4 and more, got {' '.join(counts)!r}")
-    counts = [int(count) for count in counts or (150, 300)]
+    names, counts = _split(names), _checked_counts(derivatives, criterion, centres)
     if extremes:
         return _extremes(names, output, as_json)
     if source is None:
@@ -126,6 +119,19 @@ def kernels(
     if missing is not None:
         raise missing
     return 0
+
+
+def _checked_counts(derivatives, criterion, centres):
+    """The numbers of centres; what the words of the command cannot mean is refused."""
+    from rbfmuscle.implicit.selection import CRITERIA
+
+    if derivatives not in ("all", "normal") or criterion not in CRITERIA:
+        raise UsageError(f"derivatives must be all or normal, criterion {', '.join(CRITERIA)}; "
+                         f"got {derivatives!r} and {criterion!r}")  # fmt: skip
+    counts = _split(centres) or ["150", "300"]
+    if not all(count.isdecimal() and int(count) >= 4 for count in counts):
+        raise UsageError(f"--centres must be whole numbers of 4 and more, got {' '.join(counts)!r}")
+    return [int(count) for count in counts]
 
 
 def _split(texts):

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 from conftest import ROOT
-from plan_check import remade
+from plan_check import corrected, corrections, remade
 
 from rbfmuscle.model.cost import dense_count
 from rbfmuscle.models import MODEL_NAMES, build_model, estimate_model
@@ -165,9 +165,10 @@ def test_plan_loads_no_graphics_and_builds_nothing():
 def test_scales_name_every_model_and_where_they_come_from():
     found = scales()
     assert set(found["models"]) == set(MODEL_NAMES)
-    every = [found["metrics"], found["write"], *(v for row in found["models"].values() for v in row.values())]
-    # Beyond a factor of four the counts of work themselves describe another program.
-    assert all(0.25 < value < 4.0 for value in every)
+    every = [found[part] for part in ("checks", "lines", "metrics", "write")]
+    every += [*(v for row in found["models"].values() for v in row.values())]
+    # Beyond a factor of twenty the counts of work themselves describe another program.
+    assert all(0.05 < value < 20.0 for value in every)
     assert all(isinstance(found[key], str) and found[key] for key in ("command", "commit", "machine", "date"))
 
 
@@ -182,12 +183,19 @@ def test_scales_multiply_what_is_foretold(scene, monkeypatch):
     assert after.memory == before.memory
 
 
-def test_counts_made_anew_agree_with_what_was_measured():
-    """Runs that take twice what was foretold double the counts, those of other models stay."""
-    row = {"build": [1.0, 2.0], "motion": [0.1, 0.4], "metrics": [1.0, 1.0], "write": [1.0, 0.25]}
+def test_scales_made_anew_agree_with_what_was_measured():
+    """Runs that take twice what was foretold double the scale, those of other models stay; sums go along."""
+    parts = {"checks": [2.0, 1.0], "lines": [1.0, 1.0], "metrics": [1.0, 1.0], "write": [1.0, 0.25]}
+    row = {"build": [1.0, 2.0], "motion": [0.1, 0.4], **parts, "total": [27.0, 20.0]}
+    rows = {"one: rbf": row, "two: rbf": {**row, "motion": [0.1, 0.1]}}
+    found = corrections(rows)
     old = {"models": {"rbf": {"build": 1.5, "motion": 1.0}, "pbd": {"build": 1.2, "motion": 0.8}},
-           "metrics": 0.7, "write": 2.0}  # fmt: skip
-    new = remade({"one: rbf": row, "two: rbf": {**row, "motion": [0.1, 0.1]}}, old)
+           "checks": 1.0, "lines": 3.0, "metrics": 0.7, "write": 2.0}  # fmt: skip
+    new = remade(old, found)
     assert new["models"]["rbf"] == {"build": 3.0, "motion": 2.0}
     assert new["models"]["pbd"] == old["models"]["pbd"]
-    assert (new["metrics"], new["write"]) == (0.7, 0.5)
+    assert [new[part] for part in parts] == [0.5, 3.0, 0.7, 0.5]
+    after = corrected("one: rbf", row, 10, found)
+    assert after["motion"] == pytest.approx([0.2, 0.4])
+    # One second more of building, one less of checks, and in ten frames a second more of motion, 7.5 less of files.
+    assert after["total"] == pytest.approx([27.0 + 1.0 - 1.0 + 1.0 - 7.5, 20.0])

@@ -206,8 +206,10 @@ def _time(scene, fields, costs, work, rates, threads):
             visit * READ_VISITS * field.memory if field.kept else query * CELL_QUERIES * field.cells / threads
             for field in fields
         ),
-        "checks": query * CHECK_QUERIES * bones if moving else 0.0,
-        "metrics": visit * LINE_VISITS * sum(cost.carried for cost in costs) if output.metrics else 0.0,
+        "checks": scale["checks"] * query * CHECK_QUERIES * bones if moving else 0.0,
+        "metrics": scale["lines"] * visit * LINE_VISITS * sum(cost.carried for cost in costs)
+        if output.metrics
+        else 0.0,
     }
     # A muscle is drawn where it was solved, and once for the first frame.
     each = [

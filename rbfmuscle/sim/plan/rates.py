@@ -45,7 +45,8 @@ def scales() -> dict[str, Any]:
     Returns
     -------
     dict
-        ``models``: of each model ``build`` and ``motion``; ``metrics`` and ``write`` of any; ``command``, ``commit``,
+        ``models``: of each model ``build`` and ``motion``; of any ``checks`` of the bones and ``lines`` that lengths
+        are taken along, before the motion, and ``metrics`` and ``write`` of a frame; ``command``, ``commit``,
         ``machine`` and ``date`` say where they come from.
     """
     return json.loads(Path(__file__).with_name("scales.json").read_text(encoding="utf-8"))

@@ -1,0 +1,35 @@
+"""Files of evidence: what the tables of the pages are made of, each with command, commit, machine and date."""
+
+import datetime
+import json
+import subprocess
+from pathlib import Path
+
+from table import machine
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def commit():
+    """The commit that was measured, with a plus where files were changed since."""
+    run = {"cwd": ROOT, "capture_output": True, "text": True, "check": True}
+    number = subprocess.run(["git", "rev-parse", "--short", "HEAD"], **run).stdout.strip()
+    changed = subprocess.run(["git", "status", "--porcelain", "--untracked-files=no"], **run).stdout.strip()
+    return number + ("+" if changed else "")
+
+
+def provenance(command):
+    """Where figures come from that are measured now; files in the command are named without their folders."""
+    words = (Path(word).name if word.endswith(".toml") else word for word in command)
+    return {
+        "command": f"python {' '.join(words)}",
+        "commit": commit(),
+        "machine": machine()["cpu"],
+        "date": datetime.date.today().isoformat(),
+    }
+
+
+def write_evidence(path, command, rows, **more):
+    """Write the rows of a table, and whatever else it needs, with where they come from."""
+    text = json.dumps({**provenance(command), **more, "rows": rows}, indent=1)
+    Path(path).write_text(text + "\n", encoding="utf-8")
