@@ -235,7 +235,11 @@ class FrameLoop:
         try:
             yield
         finally:
-            self._wall += time.perf_counter() - start
+            self.count(time.perf_counter() - start)
+
+    def count(self, seconds: float) -> None:
+        """Count a time to the frame that is finished next."""
+        self._wall += seconds
 
     def close(self) -> None:
         """End the threads."""
