@@ -32,7 +32,7 @@ class Near(NamedTuple):
     ``exact`` are the obstacles as they are, ``contacts`` rounded.
     """
 
-    index: np.ndarray
+    index: np.ndarray  # type: ignore[assignment]  # a tuple has a method of that name
     columns: np.ndarray
     shares: np.ndarray
     forces: np.ndarray

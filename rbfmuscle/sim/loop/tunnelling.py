@@ -17,7 +17,7 @@ import numpy as np
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.sim.loop.contact import box_loop, boxes_apart
+from rbfmuscle.sim.loop.near_bones import box_loop, boxes_apart
 from rbfmuscle.sim.loop.sliding import Planes
 
 if TYPE_CHECKING:

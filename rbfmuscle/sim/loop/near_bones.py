@@ -1,0 +1,120 @@
+"""Which points come near which bones, and which way out each shows: loops over points and boxes."""
+
+import numpy as np
+
+from rbfmuscle.compiled.loop import compiled
+
+# Share of a queried distance that later calls rely on: a field is exact near its bone, coarser far away.
+TRUSTED_SHARE = 0.8
+
+
+@compiled(error_model="numpy")
+def direction_loop(points, gradient, pose, box, out):
+    """Unit gradients; away from the middle of the bone's box where there is none."""
+    for i in range(len(points)):
+        square = 0.0
+        for a in range(3):
+            out[i, a] = gradient[i, a]
+            square += out[i, a] ** 2
+        if square < 1e-18:
+            square = 0.0
+            for a in range(3):
+                out[i, a] = points[i, a] - pose[a, 3] + 1e-12
+                for b in range(3):
+                    out[i, a] -= 0.5 * pose[a, b] * (box[0, b] + box[1, b])
+                square += out[i, a] ** 2
+        length = np.sqrt(square)
+        for a in range(3):
+            out[i, a] /= length
+
+
+@compiled(error_model="numpy")
+def closer_loop(distance, direction, smallest, gradient):
+    """Take over the distances that are smaller, with their directions."""
+    for i in range(len(distance)):
+        if distance[i] < smallest[i]:
+            smallest[i] = distance[i]
+            for a in range(3):
+                gradient[i, a] = direction[i, a]
+
+
+@compiled(error_model="numpy")
+def remember_loop(points, pose, near, distance, anchor, bound):
+    """Keep where points (in bone coordinates) were asked, and below what distance they need not be asked again."""
+    for n in range(len(near)):
+        i = near[n]
+        bound[i] = TRUSTED_SHARE * distance[n]
+        for k in range(3):
+            anchor[i, k] = 0.0
+            for j in range(3):
+                anchor[i, k] += pose[j, k] * (points[i, j] - pose[j, 3])
+
+
+@compiled(error_model="numpy")
+def _lower_bound(points, i, pose, bounds, anchor, bound):
+    """Distance that point i has at least: from the bone's box, or an earlier answer less the way since."""
+    moved, outside = 0.0, 0.0
+    for k in range(3):
+        local = 0.0
+        for j in range(3):
+            local += pose[j, k] * (points[i, j] - pose[j, 3])
+        moved += (local - anchor[i, k]) ** 2
+        beyond = max(bounds[0, k] - local, local - bounds[1, k], 0.0)
+        outside += beyond * beyond
+    known = bound[i] - np.sqrt(moved)
+    return max(np.sqrt(outside), known) if outside > 0.0 else known
+
+
+@compiled(error_model="numpy")
+def box_loop(points, chosen, box):
+    """Fill ``box`` (2, 3) with the least and greatest coordinates of the chosen points."""
+    box[0], box[1] = np.inf, -np.inf
+    for i in range(len(points)):
+        if chosen[i]:
+            for k in range(3):
+                box[0, k] = min(box[0, k], points[i, k])
+                box[1, k] = max(box[1, k], points[i, k])
+
+
+@compiled(error_model="numpy")
+def boxes_apart(box, pose, bounds):
+    """Distance at least between a box along the world's axes and one (2, 3) along a bone's, in a pose of the bone."""
+    square = 0.0
+    for k in range(3):
+        middle, half = pose[k, 3], 0.0
+        for j in range(3):
+            middle += 0.5 * pose[k, j] * (bounds[0, j] + bounds[1, j])
+            half += 0.5 * abs(pose[k, j]) * (bounds[1, j] - bounds[0, j])
+        beyond = max(box[0, k] - middle - half, middle - half - box[1, k], 0.0)
+        square += beyond * beyond
+    return np.sqrt(square)
+
+
+@compiled(error_model="numpy")
+def apart_loop(points, poses, boxes, apart):
+    """How far each bone's box is from the points' box at least."""
+    box = np.empty((2, 3))
+    box_loop(points, np.ones(len(points), np.bool_), box)
+    for b in range(len(poses)):
+        apart[b] = boxes_apart(box, poses[b], boxes[b])
+
+
+@compiled(error_model="numpy")
+def near_loop(points, free, reach, rows, bones, known, found, counts):
+    """Fill ``found`` (b, n) with the free points that may be nearer than ``reach`` to each bone, and their numbers."""
+    poses, boxes = bones
+    anchor, bound = known
+    box, farthest = np.empty((2, 3)), -np.inf
+    box_loop(points, free, box)
+    for i in range(len(points)):
+        if free[i]:
+            farthest = max(farthest, reach[i])
+    for n in range(len(rows)):
+        b, count = rows[n], 0
+        if boxes_apart(box, poses[b], boxes[b]) > farthest:
+            continue
+        for i in range(len(points)):
+            if free[i] and _lower_bound(points, i, poses[b], boxes[b], anchor[b], bound[b]) <= reach[i]:
+                found[n, count] = i
+                count += 1
+        counts[n] = count
