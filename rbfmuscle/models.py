@@ -2,7 +2,6 @@
 
 import importlib
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 from rbfmuscle.sim.loop.frame import MuscleModel
@@ -83,10 +82,15 @@ def estimate_model(muscle: Muscle, scene: Scene, rates: Mapping[str, float]) -> 
 
 def build_models(scene: Scene) -> list[MuscleModel]:
     """Return the models of all muscles of a scene, in their order, built side by side."""
-    import numba
+    from rbfmuscle.sim.loop.workers import Workers
 
-    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
-        return list(pool.map(lambda muscle: build_model(muscle, scene), scene.muscles))
+    workers = Workers(len(scene.muscles))
+    try:
+        # BLAS under threads of ours would spin for cores that they hold.
+        with workers.all_threads():
+            return workers.each(lambda muscle: build_model(muscle, scene), scene.muscles)
+    finally:
+        workers.close()
 
 
 def configure_scene(

@@ -20,11 +20,12 @@ def box_corners(bounds: Any) -> Floats:
     return np.array(np.meshgrid(*np.transpose(bounds))).reshape(3, -1).T
 
 
-def moved_box(bounds: Floats, pose: Floats) -> Floats:
-    """Box (2, 3) along the axes that holds a box after a pose (4, 4)."""
+def moved_box(bounds: Floats, poses: Floats) -> Floats:
+    """Boxes (..., 2, 3) along the axes that hold a box (2, 3) after poses (..., 4, 4)."""
     centre, half = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
-    middle, reach = pose[:3, :3] @ centre + pose[:3, 3], np.abs(pose[:3, :3]) @ half
-    return np.array([middle - reach, middle + reach])
+    middle = poses[..., :3, :3] @ centre + poses[..., :3, 3]
+    reach = np.abs(poses[..., :3, :3]) @ half
+    return np.stack([middle - reach, middle + reach], axis=-2)
 
 
 class RestFrame:

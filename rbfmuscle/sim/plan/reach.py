@@ -38,15 +38,18 @@ def swept_region(muscle: Muscle, bone_name: str, poses: list[dict[str, Floats]])
     poses : list of dict
         Poses of all bones, the rest pose among them.
     """
+    back = np.linalg.inv(np.array([pose[bone_name] for pose in poses]))
+    held = np.array([[pose[name] for pose in poses] for name in {a.bone for a in muscle.attachments}])
+    return _swept(muscle, back[None], held)[0]
+
+
+def _swept(muscle, back, held):
+    """Boxes (b, 2, 3) for the inverse poses (b, p, 4, 4) of bones, and the poses (h, p, 4, 4) of those that hold it."""
     bounds = np.asarray(muscle.mesh.bounds, dtype=np.float64)
-    boxes = []
-    for pose in poses:
-        back = np.linalg.inv(pose[bone_name])
-        boxes.extend(moved_box(bounds, back @ pose[name]) for name in {a.bone for a in muscle.attachments})
+    boxes = moved_box(bounds, back[:, None] @ held)
     pad = PADDING * float(np.linalg.norm(bounds[1] - bounds[0]))
-    return np.array(
-        [np.min([b[0] for b in boxes], axis=0) - pad, np.max([b[1] for b in boxes], axis=0) + pad]
-    )
+    low, high = boxes[..., 0, :].min(axis=(1, 2)) - pad, boxes[..., 1, :].max(axis=(1, 2)) + pad
+    return np.stack([low, high], axis=1)
 
 
 def sampled_poses(scene: Scene) -> list[dict[str, Floats]]:
@@ -65,13 +68,15 @@ def reached_bones(scene: Scene) -> dict[tuple[Any, ...], Floats]:
     """Region of each bone that each muscle can reach: dict of (muscle name, bone name) to (2, 3) box."""
     check_substeps(scene)
     poses = sampled_poses(scene)
+    there = {bone.name: np.array([pose[bone.name] for pose in poses]) for bone in scene.bones}
+    back = np.linalg.inv(np.array(list(there.values())))
+    boxes = np.array([bone.mesh.bounds for bone in scene.bones])
     regions = {}
     for muscle in scene.muscles:
-        for bone in scene.bones:
-            region = swept_region(muscle, bone.name, poses)
-            box = np.asarray(bone.mesh.bounds)
-            if np.all(region[0] <= box[1]) and np.all(region[1] >= box[0]):
-                regions[muscle.name, bone.name] = region
+        held = np.array([there[name] for name in {a.bone for a in muscle.attachments}])
+        swept = _swept(muscle, back, held)
+        met = np.all((swept[:, 0] <= boxes[:, 1]) & (swept[:, 1] >= boxes[:, 0]), axis=1)
+        regions.update({(muscle.name, scene.bones[b].name): swept[b] for b in np.flatnonzero(met)})
     return regions
 
 
