@@ -12,9 +12,13 @@ import time
 from pathlib import Path
 
 import numpy as np
+from peers.fibre_material import PassiveFibres
 from peers.finite_element import HexSolid, brick_grid, follow, nearest_bone
+from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.surfaces import mesh_volume
+from rbfmuscle.model.muscle import RBFMuscle
+from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.models import MODEL_NAMES
 from rbfmuscle.run import simulate
 from rbfmuscle.sim.distance.sdf import BoneSDF
@@ -30,6 +34,7 @@ STEP, SMALLEST_STEP = 1.0, 0.05  # degrees
 SPACING = 3.0  # of the phantom's surface mesh [mm]
 END = 0.5  # share of the largest section's area that the cube's end faces take
 CELLS = (40, 12, 8)
+FIBRE_NODES = 1200  # of the inside whose fibres a reinforced solid takes
 DATA = Path(__file__).resolve().parents[1] / "tests" / "data" / "fe_reference.npz"
 
 
@@ -90,13 +95,16 @@ def _share(away, axis):
 class Course:
     """The solid on its way through the motion."""
 
-    def __init__(self, cells):
+    def __init__(self, cells, ratio=1.0):
         self.scene = phantom_scene(end=max(ANGLES), step=STEP, spacing=SPACING)
         tube = MUSCLES[MUSCLE]
         self.cells = cells
         self.cube, bricks = brick_grid(cells)
         rest = solid_points(tube, self.cube)
-        self.solid = HexSolid(rest, bricks)
+        fibres = None
+        if ratio > 1.0:
+            fibres = PassiveFibres.of_ratio(model_fibres(rest[bricks].mean(axis=1)), ratio)
+        self.solid = HexSolid(rest, bricks, fibres=fibres)
         fields = {bone.name: BoneSDF.from_mesh(bone.mesh) for bone in self.scene.bones}
         self.fields = fields
         u = self._fraction()
@@ -150,6 +158,15 @@ class Course:
             yield goal, moved, depth, self.solid.volume(moved) / rest_volume - 1.0
 
 
+def model_fibres(points):
+    """Unit directions (n, 3) of the model's own fibres at points of the muscle at rest."""
+    scene = phantom_scene(end=0.0, spacing=SPACING)
+    scene.muscles = [scene.muscle(MUSCLE)]
+    options = RBFOptions(inside=FIBRE_NODES, fibre_ratio=2.0)
+    inside = RBFMuscle(scene.muscles[0], scene, options).interior
+    return inside.fibres.direction[cKDTree(inside.quad_points).query(points)[1]]
+
+
 def carried(course, displacement):
     """Places of the phantom's surface vertices that go along with the bricks."""
     from scipy.interpolate import RegularGridInterpolator
@@ -163,10 +180,10 @@ def carried(course, displacement):
     return vertices + RegularGridInterpolator(axes, grid)(cube_points(tube, vertices, u))
 
 
-def solve(path, cells):
+def solve(path, cells, ratio=1.0):
     """Run the reference and keep it."""
     start = time.perf_counter()
-    course = Course(cells)
+    course = Course(cells, ratio)
     print(f"{len(course.solid.rest)} nodes, {(course.owner >= 0).sum()} of them attached")
     angles, places, depths, volumes = [], [], [], []
     for angle, displacement, depth, volume in course.run():
@@ -177,8 +194,9 @@ def solve(path, cells):
         volumes.append(volume)
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(
-        path, angles=angles, vertices=np.array(places), depth=depths, volume_error=volumes, cells=cells
-    )
+        path, angles=angles, vertices=np.array(places), depth=depths, volume_error=volumes, cells=cells,
+        fibre_ratio=ratio,
+    )  # fmt: skip
     print(f"{path}: {path.stat().st_size} bytes, {time.perf_counter() - start:.0f} s")
 
 
@@ -236,9 +254,12 @@ def main():
     parser.add_argument("action", choices=("solve", "compare"))
     parser.add_argument("file", nargs="?", type=Path, default=DATA)
     parser.add_argument("--cells", nargs=3, type=int, default=CELLS)
+    parser.add_argument(
+        "--fibre-ratio", type=float, default=1.0, help="Young's modulus along fibres over across"
+    )
     given = parser.parse_args()
     if given.action == "solve":
-        solve(given.file, tuple(given.cells))
+        solve(given.file, tuple(given.cells), given.fibre_ratio)
     else:
         compare(given.file)
 

@@ -2,7 +2,8 @@
 
     python benchmarks/inside.py PART ... [--scene data/hip/flexion.toml]
 
-Parts: ``solid`` (the phantom's extensor to the finite-element reference, over nodes and over centres), ``centres``
+Parts: ``solid`` (the phantom's extensor to the finite-element reference, over nodes and over centres), ``fibres`` (to
+the one that is stiffer along its fibres), ``centres``
 (neighbouring numbers of centres), ``stretched``, ``bent``, ``wrapped`` (closed forms), ``ripple`` (moment arms of a
 scene's muscles by one degree) and ``time`` (processor time a frame, settings in turn). One pose over several ways is
 measured by `one_pose.py`.
@@ -26,6 +27,7 @@ from rbfmuscle.study.measure.metrics import surface_distance
 
 NODES, CENTRES = (150, 300, 600, 1200), (150, 300, 600, 1200)
 INSIDE = 300
+FIBRES = DATA.with_name("fe_reference_fibres.npz")
 ROUNDS = 3
 WINDOW = 21  # frames of one degree that the smooth curve of a moment arm is fitted to, a cubic
 
@@ -38,6 +40,18 @@ def solid():
     for name, settings in rows:
         settings = {"model.placement": "even", **settings} if "centres" in name else settings
         found = distances("rbf", DATA, settings=settings)
+        print(f"{name:28}" + "".join(f"{rms:7.2f} ({worst:4.1f})" for _, rms, worst, _ in found), flush=True)
+
+
+def fibres():
+    """Distance to the solid that is stiffer along its fibres: no inside, an isotropic one, one like it."""
+    with np.load(FIBRES) as kept:
+        kept = dict(kept)
+    ratio = float(kept["fibre_ratio"])
+    rows = [("without", {}), (f"{INSIDE} nodes, isotropic", {"model.inside": INSIDE})]
+    rows += [(f"{n} nodes, {ratio:g}", {"model.inside": n, "model.fibre_ratio": ratio}) for n in NODES[:3]]
+    for name, settings in rows:
+        found = distances("rbf", kept, settings=settings)
         print(f"{name:28}" + "".join(f"{rms:7.2f} ({worst:4.1f})" for _, rms, worst, _ in found), flush=True)
 
 
@@ -145,15 +159,15 @@ def times(path):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    names = ("solid", "centres", "stretched", "bent", "wrapped", "ripple", "time")
+    names = ("solid", "fibres", "centres", "stretched", "bent", "wrapped", "ripple", "time")
     parser.add_argument("parts", nargs="+", choices=names)
     parser.add_argument("--scene")
     given = parser.parse_args()
     for part in given.parts:
         if part in ("stretched", "bent", "wrapped"):
             closed_forms(part)
-        elif part == "solid":
-            solid()
+        elif part in ("solid", "fibres"):
+            {"solid": solid, "fibres": fibres}[part]()
         else:
             {"centres": centres, "ripple": ripple, "time": times}[part](given.scene)
 

@@ -62,6 +62,35 @@ class FibreMaterial:
         )
 
 
+@dataclass(frozen=True)
+class PassiveFibres:
+    """Fibres that make a solid stiffer along them, alike in tension and compression: W = stiffness (λ - 1)².
+
+    For small strains Young's modulus along them is 3 μ + 2 stiffness, in an incompressible ground of shear modulus μ.
+
+    Attributes
+    ----------
+    direction : (m, 3) ndarray
+        Unit directions at rest.
+    stiffness : float
+        [shear modulus of the solid].
+    """
+
+    direction: np.ndarray
+    stiffness: float
+
+    @classmethod
+    def of_ratio(cls, direction, ratio):
+        """Fibres along which Young's modulus is ``ratio`` times that across."""
+        return cls(direction, 1.5 * (ratio - 1.0))
+
+    def evaluate(self, stretch, activation):
+        """Energy and its first two derivatives by the stretch (m, q), each (m, q)."""
+        twice = 2.0 * self.stiffness
+        away = stretch - 1.0
+        return self.stiffness * away**2, twice * away, np.full_like(stretch, twice)
+
+
 def active_curve(x):
     """Integral from 0, value and slope of the active curve at x (stretch over the optimal one)."""
     low, high = (x >= 0.4) & (x < 0.6), (x > 1.4) & (x <= 1.6)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from peers.fibre_material import FibreMaterial, active_curve, free_stretch, passive_curve
+from peers.fibre_material import FibreMaterial, PassiveFibres, active_curve, free_stretch, passive_curve
 
 STEP = 1e-5
 
@@ -14,6 +14,16 @@ def test_curves_are_derivatives_of_each_other(curve):
     above, below, here = curve(x + STEP), curve(x - STEP), curve(x)
     assert (above[0] - below[0]) / (2 * STEP) == pytest.approx(here[1], abs=1e-8)
     assert (above[1] - below[1]) / (2 * STEP) == pytest.approx(here[2], abs=1e-7)
+
+
+def test_passive_fibres_make_the_modulus_along_them_so_many_times_that_across():
+    made = PassiveFibres.of_ratio(np.eye(3)[:1], 20.0)
+    x = np.array([[0.8, 1.0, 1.3]])
+    above, below, here = (made.evaluate(x + step, 0.0) for step in (STEP, -STEP, 0.0))
+    assert (above[0] - below[0]) / (2 * STEP) == pytest.approx(here[1], abs=1e-8)
+    assert (above[1] - below[1]) / (2 * STEP) == pytest.approx(here[2], abs=1e-7)
+    # An incompressible ground of shear modulus 1 pulls along by 3 a strain, neo-Hookean at rest.
+    assert (3.0 + here[2][0, 1]) / 3.0 == pytest.approx(20.0)
 
 
 def _bricks(direction, **options):

@@ -32,7 +32,7 @@ class Near(NamedTuple):
     ``exact`` are the obstacles as they are, ``contacts`` rounded.
     """
 
-    index: np.ndarray  # type: ignore[assignment]  # a tuple has a method of that name
+    which: np.ndarray
     columns: np.ndarray
     shares: np.ndarray
     forces: np.ndarray
@@ -74,7 +74,7 @@ class Obstacles:
         solid = self.solid
         if before is not None:
             solid.forces[:] = 0.0
-            solid.forces[before.index] = before.forces
+            solid.forces[before.which] = before.forces
         sources = max(1, len(contacts.names) + len(contacts.neighbours))
         if solid.forces.shape[1] != sources:
             solid.forces = np.zeros((len(solid.points), sources))
@@ -121,6 +121,6 @@ class Obstacles:
 
 
 def _carried(near: Near, y: Floats) -> Floats:
-    out = np.empty((len(near.index), 3))
+    out = np.empty((len(near.which), 3))
     carry_loop(y, near.columns, near.shares, out)
     return out

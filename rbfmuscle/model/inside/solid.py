@@ -318,7 +318,7 @@ class Interior:
             if last:
                 break
         self.forces[:] = 0.0
-        self.forces[near.index] = near.forces
+        self.forces[near.which] = near.forces
         self.shown = self.obstacles.lifted(near)
         if self.begun is not None:
             motion, start, pressure = self.begun
