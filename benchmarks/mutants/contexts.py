@@ -181,6 +181,9 @@ class _Alarm:
         if self.seconds:
             signal.setitimer(signal.ITIMER_PROF, 0.0)
             signal.signal(signal.SIGPROF, self.before)
+        if caught[0] is TooSlow:
+            # Its own traceback may end at an instruction without a line, which pytest cannot show.
+            raise pytest.fail.Exception("TooSlow", pytrace=False) from None
 
     @staticmethod
     def _ring(number, frame):
