@@ -9,7 +9,8 @@ K' the derivative of elastic and pressure forces, G the gradients of the regions
 So lengths have derivatives without any difference of settled shapes, which differ by where each happened to come to
 rest. Two things are taken as the smooth muscle would have them, not as its points have. Obstacles count as planes: a
 point that slides over a ridge hands its force on to the next one, and what touches the ridge stays. And a contact that
-hardly pushes gives way, C = τ/λ² (the derivative of λ · gap = τ), so that points may come and go without a step.
+hardly pushes gives way more than contacts do anyway, C = C₀ + τ/λ² (the derivative of λ · gap = τ), so that points may
+come and go without a step.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.model.inside.loops import carry_loop
 
-# A contact at the median force yields by this share of what the muscle itself does for that force.
-YIELD = 0.1
+# What a contact at the median force yields more than contacts do anyway, as a share of that.
+WEAK = 0.5
 
 
 class _Pushing(NamedTuple):
@@ -135,12 +136,9 @@ def _pushing(solid: Any, contacts: Any) -> _Pushing:
 
 def _yielding(solid: Any, found: _Pushing) -> Floats:
     """How far each contact gives way for a unit force."""
-    moved = np.array([
-        shares @ solid.inverse[np.ix_(columns, columns)] @ shares
-        for columns, shares in zip(found.columns, found.shares, strict=True)
-    ])  # fmt: skip
     usual = float(np.median(found.force))
-    return YIELD * float(np.median(moved)) * (usual / np.maximum(found.force, 1e-3 * usual)) ** 2
+    weak = usual / np.maximum(found.force, 1e-3 * usual)
+    return solid.obstacles.yielding * (1.0 + WEAK * weak**2)
 
 
 def _softening(solid: Any) -> Floats:
