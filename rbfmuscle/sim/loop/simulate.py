@@ -235,11 +235,7 @@ class FrameLoop:
         try:
             yield
         finally:
-            self.count(time.perf_counter() - start)
-
-    def count(self, seconds: float) -> None:
-        """Count a time to the frame that is finished next."""
-        self._wall += seconds
+            self._wall += time.perf_counter() - start
 
     def close(self) -> None:
         """End the threads."""
