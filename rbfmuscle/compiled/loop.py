@@ -21,7 +21,9 @@ def compiled(function: Callable | None = None, **options: Any) -> Callable:
     function : callable
         A function of arrays, numbers and NamedTuples of these.
     **options
-        As for ``numba.njit``, ``error_model="numpy"`` for instance; ``nogil`` is set.
+        As for ``numba.njit``, ``error_model="numpy"`` for instance; ``nogil`` is set. ``nogil=False`` suits a loop of
+        a few microseconds that is asked thousands of times a frame: with muscles on two threads each hand-over of
+        the interpreter may take longer than the loop.
 
     Returns
     -------

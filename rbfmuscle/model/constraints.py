@@ -93,7 +93,7 @@ def _local_loop(x, clusters, law, q, target, deformation):
                 r[a, b] = s * r[a, b] + (t - s) * along * fibre[i, b]
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", nogil=False)
 def _right_side_loop(arm, start, other, target, out):
     """b = Σ over edges (i, j) of w T_i (X_j - X_i), added at j and taken from i."""
     out[:] = 0.0

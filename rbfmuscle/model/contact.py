@@ -110,7 +110,7 @@ def _lacking_loop(contacts, need, share, push, hanging, lacking):
         lacking[c] = value
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", nogil=False)
 def _contact_loop(spaces, motion, volume, influence, hanging, table, effort, push):
     """Fill ``push`` and the forces in ``table``; returns the volume's share that the push takes back."""
     index, gap, normal, source = spaces

@@ -23,7 +23,7 @@ SETTLED = 1e-4  # of the muscle's size: an iteration that moves no centre farthe
 SETTLED_STILL = 2e-6  # the same where no bone moves, so that only activation leads anywhere
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", nogil=False)
 def _move_loop(first, second, columns, shares, moved, also):
     """Motions of each contact point for two motions of the centres: Σ_k share_k dx_k."""
     for s in range(len(columns)):
@@ -40,7 +40,7 @@ def _move_loop(first, second, columns, shares, moved, also):
         also[s, 0], also[s, 1], also[s, 2] = bx, by, bz
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", nogil=False)
 def _gather_loop(gradient, columns, shares, out):
     """Transpose of `_move_loop`: out_k = Σ_s share_sk gradient_s."""
     out[:] = 0.0

@@ -119,7 +119,7 @@ def _mark_blocks_loop(cells, strides, blocks):
                     blocks[a, b, c] = True
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", nogil=False)
 def _near_cells_loop(points, boxes, visited, index):
     turn, shift, shape, blocks = visited.turn, visited.shift, visited.shape, visited.blocks
     low, high = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)

@@ -8,7 +8,7 @@ from rbfmuscle.compiled.loop import compiled
 TRUSTED_SHARE = 0.8
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", nogil=False)
 def direction_loop(points, gradient, pose, box, out):
     """Unit gradients; away from the middle of the bone's box where there is none."""
     for i in range(len(points)):
@@ -28,7 +28,7 @@ def direction_loop(points, gradient, pose, box, out):
             out[i, a] /= length
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", nogil=False)
 def closer_loop(distance, direction, smallest, gradient):
     """Take over the distances that are smaller, with their directions."""
     for i in range(len(distance)):
@@ -38,7 +38,7 @@ def closer_loop(distance, direction, smallest, gradient):
                 gradient[i, a] = direction[i, a]
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", nogil=False)
 def remember_loop(points, pose, near, distance, anchor, bound):
     """Keep where points (in bone coordinates) were asked, and below what distance they need not be asked again."""
     for n in range(len(near)):
@@ -90,7 +90,7 @@ def boxes_apart(box, pose, bounds):
     return np.sqrt(square)
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", nogil=False)
 def apart_loop(points, poses, boxes, apart):
     """How far each bone's box is from the points' box at least."""
     box = np.empty((2, 3))
