@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rbfmuscle.geometry.threads import each
 from rbfmuscle.study.files.checkpoint import NAME, write_checkpoint
 from rbfmuscle.study.files.meshfiles import SUFFIXES, write_mesh
 from rbfmuscle.study.files.vtp import Collection
@@ -153,19 +154,13 @@ class RunWriter:
         write_json(self.directory / "run.json", info)
 
     def _write(self, frame, rows):
-        entries = []
-        for name, surface in frame.surfaces.items():
-            if self.format is None:
-                break
-            file = f"surfaces/{name}_{frame.index:04d}{SUFFIXES[self.format]}"
-            write_mesh(self.directory / file, surface.vertices, surface.faces)
-            entries.append((name, file))
+        surfaces = self._write_surfaces(frame) if self.format is not None else []
         bones = self._write_bones(frame) if self.format is not None else []
         if "bones" in self._collections:
             times = self.scene.motion.times
             step = frame.index if times is None else times[frame.index]
             self._collections["bones"].add(step, bones)
-            self._collections["surfaces"].add(step, entries)
+            self._collections["surfaces"].add(step, surfaces)
         (poses, poses_file), (events, events_file) = self._tables["poses.csv"], self._tables["events.csv"]
         poses.writerows(
             [frame.index, bone, *(repr(float(x)) for x in pose.ravel())] for bone, pose in frame.poses.items()
@@ -182,6 +177,19 @@ class RunWriter:
             metrics, file = self._tables["metrics.csv"]
             metrics.writerows(rows)
             file.flush()
+
+    def _write_surfaces(self, frame):
+        """Surfaces of a frame, side by side: most of the time goes into packing them."""
+        entries = [
+            (name, f"surfaces/{name}_{frame.index:04d}{SUFFIXES[self.format]}") for name in frame.surfaces
+        ]
+
+        def write(entry):
+            surface = frame.surfaces[entry[0]]
+            write_mesh(self.directory / entry[1], surface.vertices, surface.faces)
+
+        each(write, entries)
+        return entries
 
     def _write_bones(self, frame):
         """Bones of a frame; one that stands where it stood is not written again."""
