@@ -46,6 +46,17 @@ def test_shape_functions_reproduce_linear_maps():
     assert np.abs(lattice.second_differences() @ there).max() < 1e-9
 
 
+def elastic(solid, y):
+    """Matrix of the elastic energy times places y (N, 3), targets frozen."""
+    f = np.einsum("qka,qkb->qab", y[solid.quad_columns], solid.slopes)
+    fibre, stiff = solid.fibres.direction, solid.fibres.passive + solid.fibres.active
+    along = np.einsum("qab,qb->qa", f, fibre)
+    f = f + (stiff[:, None] * along)[:, :, None] * fibre[:, None, :]
+    out = np.zeros_like(y)
+    np.add.at(out, solid.quad_columns, np.einsum("q,qab,qkb->qka", solid.weights, f, solid.slopes))
+    return out
+
+
 def test_right_side_is_the_derivative_of_the_energy():
     solid = bar()
     solid.reinforce(np.tile([0.8, 0.6, 0.0], (len(solid.weights), 1)), 4.0)
@@ -59,7 +70,7 @@ def test_right_side_is_the_derivative_of_the_energy():
         found.append(solid.energy())
     solid.y = base
     solid.energy()
-    force = solid.elastic(base) - solid.right
+    force = elastic(solid, base) - solid.right
     # Differences of an energy some 1e5 times as great.
     assert (found[0] - found[1]) / (2 * h) == pytest.approx(np.vdot(force, way), rel=1e-4)
 

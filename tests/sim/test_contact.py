@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, joint, muscle, scene, sphere
 
-from rbfmuscle.geometry.rest_frame import moved_box
+from rbfmuscle.geometry.rest_frame import box_corners, moved_box
 from rbfmuscle.sim.loop.contact import BoneContacts
+from rbfmuscle.sim.loop.near_bones import boxes_apart
 from rbfmuscle.sim.loop.overlap import settle_rest
 from rbfmuscle.sim.loop.simulate import simulate_frames
 from rbfmuscle.sim.loop.stepper import MuscleStepper
@@ -112,6 +113,33 @@ def test_nearest_is_the_smallest_over_bones_and_infinite_without():
     assert np.array_equal(found[below], distance[below])
     assert np.array_equal(slope[below], gradient[below])
     assert np.all(found[~below] >= limit[~below])
+
+
+def test_boxes_are_apart_by_no_more_than_what_is_in_them():
+    rng = np.random.default_rng(3)
+    apart = []
+    for _ in range(200):
+        box_of_points, bounds = (
+            np.sort(rng.uniform(-3, 3, (2, 3)), axis=0) + rng.uniform(-8, 8, 3) for _ in range(2)
+        )
+        pose = rotation_about(rng.normal(size=3), rng.uniform(0, 3), rng.uniform(-2, 2, 3))
+        corners = box_corners(bounds) @ pose[:3, :3].T + pose[:3, 3]
+        # Of a corner the nearest place of the other box is the corner itself, kept within its sides.
+        least = np.linalg.norm(corners - np.clip(corners, *box_of_points), axis=1).min()
+        apart.append(boxes_apart(box_of_points, pose, bounds))
+        assert apart[-1] <= least + 1e-9
+    assert np.mean(np.array(apart) > 0.0) > 0.3
+    # Side by side along the axes they are as far apart as they look.
+    two = np.array([[0.0, 0, 0], [1, 1, 1]])
+    assert boxes_apart(two, np.eye(4), two + [3.0, 0, 5.0]) == pytest.approx(np.hypot(2.0, 4.0))
+
+
+def test_beyond_a_limit_a_lower_bound_of_the_distance_stands():
+    contacts, poses = _pair()
+    points = _points() + [0, 0, 40.0]
+    true = np.min([f.distance(points, poses[n]) for f, n in zip(contacts.fields, contacts.names)], axis=0)
+    for found in (contacts.nearest(points, 5.0), contacts.nearest_with_gradient(points, 5.0)[0]):
+        assert np.all(found > 5.0) and np.all(found <= true + 1e-9)
 
 
 def test_point_with_no_direction_still_gets_one():

@@ -125,6 +125,15 @@ def test_paths_are_relative_to_the_bone(angle):
     assert find_crossings(contacts, points, carried, *poses, options, tolerance=TOLERANCE) == []
 
 
+@pytest.mark.parametrize("angle", [0.0, 1.0])
+def test_bone_that_leaves_all_points_behind_has_passed_through_them(angle):
+    """Where they end no box of theirs is near it, and they did not move: it did."""
+    contacts, points, poses = _moving_plate(rotation_about([1, 2, 3], angle, np.array([4.0, 5, 6])))
+    points = points[:1]
+    (crossing,) = find_crossings(contacts, points, points, *poses, TunnellingOptions(), tolerance=TOLERANCE)
+    assert crossing.bone == 0 and crossing.index.tolist() == [0]
+
+
 def test_earlier_distances_spare_the_field_and_change_nothing():
     contacts, points, poses = _moving_plate(np.eye(4))
     contacts.half_spaces(points, 50.0)

@@ -11,9 +11,6 @@ from rbfmuscle.geometry.rotations import quaternion_matrix
 from rbfmuscle.model.constraints import _rotation_loop
 from rbfmuscle.model.contact import solve_contact_forces
 
-# Below this determinant a cell counts as folded: its pressure pushes as at this one.
-LEAST_VOLUME = 0.05
-
 
 class Fibres(NamedTuple):
     """Springs along the fibres at the quadrature points, stiffnesses over twice the shear modulus.

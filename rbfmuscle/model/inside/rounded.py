@@ -14,6 +14,7 @@ import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.bsplines import bspline_sum, bspline_weights
 
 SIDE = 4  # cells along a block
 WIDE = SIDE + 3  # nodes along it, those of the splines that reach into it too
@@ -87,25 +88,6 @@ def _spline_loop(local, cell, row, nodes, value, slope):
     first = np.empty(3, np.int64)
     for n in range(len(local)):
         for k in range(3):
-            t = local[n, k] - cell[n, k]
-            s = 1.0 - t
+            bspline_weights(local[n, k] - cell[n, k], weight[k], lean[k])
             first[k] = cell[n, k] - SIDE * (cell[n, k] // SIDE)
-            weight[k, 0], weight[k, 3] = s * s * s / 6.0, t * t * t / 6.0
-            weight[k, 1] = (4.0 - 6.0 * t * t + 3.0 * t * t * t) / 6.0
-            weight[k, 2] = (4.0 - 6.0 * s * s + 3.0 * s * s * s) / 6.0
-            lean[k, 0], lean[k, 3] = -0.5 * s * s, 0.5 * t * t
-            lean[k, 1] = 1.5 * t * t - 2.0 * t
-            lean[k, 2] = 2.0 * s - 1.5 * s * s
-        d, gx, gy, gz = 0.0, 0.0, 0.0, 0.0
-        for a in range(4):
-            for b in range(4):
-                line, along = 0.0, 0.0
-                for c in range(4):
-                    node = nodes[row[n], first[0] + a, first[1] + b, first[2] + c]
-                    line += weight[2, c] * node
-                    along += lean[2, c] * node
-                d += weight[0, a] * weight[1, b] * line
-                gx += lean[0, a] * weight[1, b] * line
-                gy += weight[0, a] * lean[1, b] * line
-                gz += weight[0, a] * weight[1, b] * along
-        value[n], slope[n, 0], slope[n, 1], slope[n, 2] = d, gx, gy, gz
+        value[n], slope[n, 0], slope[n, 1], slope[n, 2] = bspline_sum(nodes[row[n]], first, weight, lean)

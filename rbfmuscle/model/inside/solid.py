@@ -326,16 +326,6 @@ class Interior:
                 self.trend = motion, self.y - start, self.pressure - pressure
             self.begun = None
 
-    def elastic(self, y: Floats) -> Floats:
-        """Matrix of the elastic energy times places y, targets frozen, (N, 3)."""
-        f = np.einsum("qka,qkb->qab", y[self.quad_columns], self.slopes)
-        fibre, stiff = self.fibres.direction, self.fibres.passive + self.fibres.active
-        along = np.einsum("qab,qb->qa", f, fibre)
-        f = f + (stiff[:, None] * along)[:, :, None] * fibre[:, None, :]
-        out = np.zeros_like(y)
-        np.add.at(out, self.quad_columns, np.einsum("q,qab,qkb->qka", self.weights, f, self.slopes))
-        return out
-
     def energy(self) -> float:
         """Elastic energy over 2 μ at the present nodes."""
         self.localise()

@@ -6,18 +6,16 @@ It stands beside `BoneSDF` to be compared with it; nothing uses it by default.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import MeshLike
+from rbfmuscle.geometry.bsplines import bspline_sum, bspline_weights
 from rbfmuscle.sim.distance.detectors import PointDetector, grid_of, sample_nodes
 from rbfmuscle.validation import check_points
-
-if TYPE_CHECKING:
-    pass
 
 
 class SplineField(PointDetector):
@@ -72,30 +70,7 @@ def _spline_loop(points, origin, spacing, coefficients, distance, gradient):
             u = (points[n, k] - origin[k]) / spacing
             u = min(max(u, 1.0), coefficients.shape[k] - 2.000001)
             base[k] = int(u) - 1
-            _weights(u - int(u), spacing, weight[k], slope[k])
-        value, gx, gy, gz = 0.0, 0.0, 0.0, 0.0
-        for a in range(4):
-            for b in range(4):
-                line, lean = 0.0, 0.0
-                for c in range(4):
-                    node = coefficients[base[0] + a, base[1] + b, base[2] + c]
-                    line += weight[2, c] * node
-                    lean += slope[2, c] * node
-                value += weight[0, a] * weight[1, b] * line
-                gx += slope[0, a] * weight[1, b] * line
-                gy += weight[0, a] * slope[1, b] * line
-                gz += weight[0, a] * weight[1, b] * lean
+            bspline_weights(u - int(u), weight[k], slope[k])
+        value, gx, gy, gz = bspline_sum(coefficients, base, weight, slope)
         distance[n] = value
-        gradient[n, 0], gradient[n, 1], gradient[n, 2] = gx, gy, gz
-
-
-@compiled
-def _weights(t, spacing, weight, slope):
-    """Uniform cubic B-spline at t in [0, 1], and its derivative."""
-    s = 1.0 - t
-    weight[0], weight[3] = s * s * s / 6.0, t * t * t / 6.0
-    weight[1] = (4.0 - 6.0 * t * t + 3.0 * t * t * t) / 6.0
-    weight[2] = (4.0 - 6.0 * s * s + 3.0 * s * s * s) / 6.0
-    slope[0], slope[3] = -0.5 * s * s / spacing, 0.5 * t * t / spacing
-    slope[1] = (1.5 * t * t - 2.0 * t) / spacing
-    slope[2] = (2.0 * s - 1.5 * s * s) / spacing
+        gradient[n, 0], gradient[n, 1], gradient[n, 2] = gx / spacing, gy / spacing, gz / spacing

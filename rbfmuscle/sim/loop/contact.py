@@ -185,47 +185,33 @@ class BoneContacts:
 
     def depth(self, points: Floats) -> float:
         """How deep the deepest free contact point is in a bone, 0 where none is [scene unit]."""
-        points = check_points(points)
-        deepest = 0.0
-        for b, near in self._near(points, np.zeros(len(points)), self.reached):
-            distance, _ = self._query(points[near], b, 0.0)
-            self._remember(points, near, distance, b)
-            deepest = max(deepest, -float(distance.min()))
-        return deepest
+        return max([0.0, *(-float(distance.min()) for _, _, distance in self._inside(points))])
 
     def depths(self, points: Floats) -> dict[int, Floats]:
         """How deep each free contact point is in each bone, by the bone's index, (n,) [scene unit]; 0 outside."""
-        points = check_points(points)
         found = {b: np.zeros(len(points)) for b in self.reached}
-        for b, near in self._near(points, np.zeros(len(points)), self.reached):
-            distance, _ = self._query(points[near], b, 0.0)
-            self._remember(points, near, distance, b)
+        for b, near, distance in self._inside(points):
             found[b][near] = np.maximum(-distance, 0.0)
         return found
 
     def comes_near(self, points: Floats, bone_index: int, reach: float) -> bool:
         """Whether a bone is nearer than ``reach`` to any free contact point."""
-        for b, near in self._near(points, np.full(len(points), reach), [bone_index]):
-            distance, _ = self._query(points[near], b, reach)
-            self._remember(points, near, distance, b)
-            return bool(distance.min() < reach)
-        return False
+        asked = self._near(points, np.full(len(points), reach), [bone_index])
+        return any(self._ask(points, near, b, reach)[0].min() < reach for b, near in asked)
 
-    def query(self, points: Floats, reach: ArrayLike) -> list[tuple[Integers, Floats, Floats]]:
-        """Contacts of each bone: a list, one entry a bone, of ``(index, distance, direction)``."""
-        points = check_points(points)
-        empty = (np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)))
-        found = [empty] * len(self.names)
+    def _of_bones(self, points: Floats, reach: ArrayLike) -> list[tuple[Integers, Floats, Floats, int]]:
+        """Contacts of bones, ``(index, distance, direction, bone)`` of each that has any."""
+        found = []
         reach = np.full(len(points), reach) if np.ndim(reach) == 0 else np.asarray(reach, dtype=np.float64)
         for b, near in self._near(points, reach + self.margin, self.reached):
             limit = reach[near]
-            distance, direction = self._query(points[near], b, limit + self.margin)
-            self._remember(points, near, distance, b)
+            distance, direction = self._ask(points, near, b, limit + self.margin)
             distance = distance - self.margin
             if b in self.allowed and len(self.allowed[b]) == len(points):
                 distance = distance + self.allowed[b][near]
             keep = distance < limit
-            found[b] = (near[keep], distance[keep], direction[keep])
+            if keep.any():
+                found.append((near[keep], distance[keep], direction[keep], b))
         return found
 
     def half_spaces(self, points: ArrayLike, reach: ArrayLike) -> HalfSpaces:
@@ -239,7 +225,7 @@ class BoneContacts:
             For all, or for each point [scene unit].
         """
         points = check_points(points)
-        parts = [(*found, b) for b, found in enumerate(self.query(points, reach)) if len(found[0])]
+        parts = self._of_bones(points, reach)
         for k, neighbour in enumerate(self.neighbours):
             found = neighbour.contacts(points, np.max(reach))
             if len(found[0]):
@@ -250,16 +236,12 @@ class BoneContacts:
         source = np.concatenate([np.full(len(part[0]), part[3], dtype=np.int64) for part in parts])
         return HalfSpaces(index, gap, normal, source)
 
-    def known(self, count: int, bone_index: int) -> tuple[Floats, ...]:
-        """Earlier places (count, 3) of the contact points in a bone's coordinates, and distances (count,) there.
+    def known(self, count: int) -> tuple[Floats, ...]:
+        """Earlier places (r, count, 3) of the contact points in the coordinates of each bone that the muscle can reach,
+        and distances (r, count) there.
 
         The distances are lower bounds, -infinity where nothing is known; they hold wherever the bone goes.
         """
-        anchor, bound = self.all_known(count)
-        return anchor[self._row[bone_index]], bound[self._row[bone_index]]
-
-    def all_known(self, count: int) -> tuple[Floats, ...]:
-        """What `known` says of all bones that the muscle can reach: (r, count, 3) and (r, count)."""
         if self._known[1].shape[1] != count:
             rows = len(self.reached)
             self._known = np.zeros((rows, count, 3)), np.full((rows, count), -np.inf)
@@ -297,9 +279,19 @@ class BoneContacts:
             np.empty((len(rows), len(points)), dtype=np.int64),
             np.zeros(len(rows), dtype=np.int64),
         )
-        free, known = self.free(len(points)), self.all_known(len(points))
+        free, known = self.free(len(points)), self.known(len(points))
         near_loop(points, free, reach, rows, (self._placed, self.boxes), known, found, counts)
         return [(b, near[:count]) for b, near, count in zip(bones, found, counts.tolist()) if count]
 
-    def _remember(self, points, near, distance, b):
-        remember_loop(points, self.poses[self.names[b]], near, distance, *self.known(len(points), b))
+    def _inside(self, points):
+        """Bones that free contact points may be in, each with these points and their distances."""
+        points = check_points(points)
+        for b, near in self._near(points, np.zeros(len(points)), self.reached):
+            yield b, near, self._ask(points, near, b, 0.0)[0]
+
+    def _ask(self, points, near, b, reach):
+        """Distance to bone b and direction of some of the contact points; what is learnt is remembered."""
+        distance, direction = self._query(points[near], b, reach)
+        known = (part[self._row[b]] for part in self.known(len(points)))
+        remember_loop(points, self.poses[self.names[b]], near, distance, *known)
+        return distance, direction

@@ -316,7 +316,7 @@ def _candidates(contacts, start, end, before, after):
     poses = contacts.stacked(before), contacts.stacked(after)
     found = np.empty((len(contacts.reached), len(start)), dtype=np.int64)
     counts = np.zeros(len(found), dtype=np.int64)
-    free, known = contacts.free(len(end)), contacts.all_known(len(end))
+    free, known = contacts.free(len(end)), contacts.known(len(end))
     _candidates_loop((start, end), free, poses, contacts.boxes, known, found, counts)
     return [(b, index[:count]) for b, index, count in zip(contacts.reached, found, counts.tolist()) if count]
 
