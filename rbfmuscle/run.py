@@ -68,7 +68,8 @@ def simulate(
     if progress is True:
         with Progress(scene.name) as shown:
             return simulate(scene, model, settings=settings, frames=frames, progress=shown)
-    recording, memory = _record(scene, model, settings, frames), MemorySink()
+    scene = configure_scene(scene, settings, model=model, frames=frames)
+    recording, memory = Recording(scene, options=_asked(model, settings, frames)), MemorySink()
     run = Run(recording, memory)
     try:
         recording.feed(memory, progress=progress or None)
@@ -139,11 +140,6 @@ def stream_run(
         recording.go_on(kept.state, kept.rows)
     recording.feed(writer, progress=progress, watch=watch)
     return _finish(recording, writer, limits, pictures)
-
-
-def _record(scene, model, settings, frames):
-    options = _asked(model, settings, frames)
-    return Recording(configure_scene(scene, settings, model=model, frames=frames), options=options)
 
 
 def _asked(model, settings, frames):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.harmonic import (
@@ -42,6 +43,25 @@ def pose(seed, *, angle=None, shift=50.0):
 
 def moved(points, motion):
     return points @ motion[:3, :3].T + motion[:3, 3]
+
+
+def test_laplacian_knows_no_scale_and_takes_linear_functions_for_harmonic():
+    """Cotangents are of angles alone; in a plane what is linear has no curvature inside, whatever the triangles."""
+    rng = np.random.default_rng(5)
+    across, up = np.meshgrid(np.arange(7.0), np.arange(7.0), indexing="ij")
+    inside = (np.minimum(across, up) > 0) & (np.maximum(across, up) < 6)
+    flat = np.stack([across, up, 0 * up], axis=-1)
+    flat[inside, :2] += rng.uniform(-0.12, 0.12, (inside.sum(), 2))
+    points = flat.reshape(-1, 3)
+    faces = Delaunay(points[:, :2]).simplices
+    laplacian = cotangent_laplacian(points, faces)
+    flux = (laplacian @ points)[inside.ravel()]
+    assert np.abs(flux).max() < 0.02  # a right angle's weight of none is raised to a thousandth
+    np.testing.assert_allclose(
+        cotangent_laplacian(30.0 * points, faces).toarray(), laplacian.toarray(), atol=1e-12
+    )
+    third = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, np.sqrt(0.75), 0.0]])
+    assert cotangent_laplacian(third, np.array([[0, 1, 2]]))[0, 1] == pytest.approx(-0.5 / np.sqrt(3.0))
 
 
 class TestWeights:

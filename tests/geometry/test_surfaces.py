@@ -5,6 +5,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.geometry.surfaces import (
     barycentric_weights,
     edge_lengths,
@@ -76,3 +77,20 @@ def test_weights_give_the_point_back_inside_and_the_nearest_side_weighs_nothing_
     beyond = corners[0].mean(axis=0) + 3.0 * (corners[0, 1] + corners[0, 2] - 2.0 * corners[0, 0])
     found = barycentric_weights(beyond[None], corners)[0]
     assert found[0] == 0.0 and found.sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rest_frame_turns_with_its_points_whichever_of_them_comes_first(seed):
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(30, 3)) * [4.0, 2.0, 1.0]
+    # The first lies in the very middle, where it has no direction; the second on one line with the third.
+    points[0] = points[1:].mean(axis=0)
+    points[1] = 2.0 * points[2] - points[0]
+    points[0] = points[1:].mean(axis=0)
+    frame = RestFrame(points)
+    np.testing.assert_allclose(frame.axes @ frame.axes.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(frame.points(frame.local), points, atol=1e-7 * frame.size)
+    turn = Rotation.random(random_state=seed).as_matrix()
+    moved = RestFrame(1e3 * points @ turn.T + [5.0, -6.0, 7.0])
+    np.testing.assert_allclose(moved.local, frame.local, atol=2e-8)
+    assert moved.size == pytest.approx(1e3 * frame.size)

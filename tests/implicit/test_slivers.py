@@ -63,3 +63,12 @@ def test_what_cannot_be_mended_is_given_back_no_worse():
     spoil = np.random.default_rng(1)
     same, vertices = mend_slivers(mesh, points, lambda m, v: v + spoil.normal(size=v.shape))
     assert same is mesh and vertices is points
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_flips_alone_leave_fewer_bad_triangles_on_the_same_points(seed):
+    points, faces = planted(seed)
+    flipped = flip_edges(points, faces)
+    assert 0 < bad_triangles(points, flipped).sum() < bad_triangles(points, faces).sum()
+    found = trimesh.Trimesh(points, flipped, process=False)
+    assert found.is_watertight and found.euler_number == 2 and len(flipped) == len(faces)

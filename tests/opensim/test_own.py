@@ -2,6 +2,7 @@
 
 import copy
 import csv
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -46,6 +47,16 @@ def test_short_names_stand_for_long_ones(muscle, mesh):
 )
 def test_other_muscles_do_not_match(muscle, mesh):
     assert name_score(muscle, *split_name(mesh)) == 0.0
+
+
+def test_likeness_is_one_for_the_word_itself_and_less_the_shorter_the_piece_of_it():
+    assert likeness("gluteus", ("gluteus",)) == pytest.approx(1.0)
+    assert likeness("gluteusmaximus", ("gluteus", "maximus")) == pytest.approx(1.0)
+    pieces = [likeness("gluteus"[:count], ("gluteus",)) for count in range(1, 8)]
+    assert pieces == sorted(set(pieces)) and pieces[0] > 0.5, (
+        "a piece of a word is nearly as good as the word"
+    )
+    assert likeness("gluteus", ("gluteus", "maximus")) == 0.5
 
 
 def test_likeness_is_quick_for_long_nonsense():
@@ -179,3 +190,24 @@ def test_folder_without_bones_of_the_model_is_refused(osim_data, tmp_path):
     trimesh.creation.box().export(tmp_path / "skull.ply")
     with pytest.raises(UsageError, match="no mesh has the name of a body"):
         bring_to_bones(found, tmp_path)
+
+
+def test_joint_below_a_body_that_nobody_scanned_goes_all_the_way_to_the_childs_bone(tmp_path):
+    """Above a joint both bones were scanned or none: where the parent has no bone, there is nothing to meet midway."""
+    scene = rm.Scene("leg", units="mm").add_link("patella")
+    for name, middle in (("thigh", [0.0, 100.0, 0.0]), ("shank", [0.0, -100.0, 0.0])):
+        mesh = trimesh.creation.icosphere(subdivisions=2)
+        mesh.vertices = mesh.vertices * [10.0, 60.0, 20.0] + [8.0, 0.0, 0.0] * (mesh.vertices > 0.4)
+        scene.add_bone(name, trimesh.Trimesh(mesh.vertices + middle, mesh.faces, process=False))
+    scene.add_joint("upper", "thigh", "patella", (0, 10, 0), {"flexion": (0, 0, 1)})
+    scene.add_joint("lower", "patella", "shank", (0, -10, 0), {"flexion": (0, 0, 1)})
+    away = {"thigh": np.zeros(3), "shank": np.array([3.0, 7.0, -5.0])}
+    for bone in scene.bones:
+        mesh = trimesh.Trimesh(bone.mesh.vertices + away[bone.name], bone.mesh.faces, process=False)
+        mesh.export(tmp_path / f"{bone.name}.ply")
+    found = SimpleNamespace(scene=scene, names={}, places={}, notes=[])
+    rows = bring_to_bones(found, tmp_path)
+    upper, lower = found.scene.joints
+    np.testing.assert_allclose(upper.centre, [0.0, 10.0, 0.0], atol=1e-3)
+    np.testing.assert_allclose(lower.centre, [3.0, -3.0, -5.0], atol=1e-3)
+    assert [row["what"] for row in rows] == ["thigh", "shank", "joint upper"]

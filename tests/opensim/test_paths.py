@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from rbfmuscle.commands.opensim import sampling
 from rbfmuscle.commands.opensim.sampling import Sampling, parse_ranges, report_fits
 from rbfmuscle.opensim.fitted import FittedPath, exponents, fit_path, write_paths
 from rbfmuscle.sim.scene.phantom import phantom_scene
@@ -127,6 +128,18 @@ def test_sampling_goes_on_where_it_ended_and_is_fitted(scene, tmp_path):
     assert ElementTree.parse(tmp_path / "paths.xml").getroot().find(".//order").text in "123"
     with pytest.raises(UsageError, match="another scene or other ranges"):
         Sampling(scene, tmp_path, {**RANGES, "hip.flexion": (0.0, 0.5)}, samples=6, kind="sobol")
+
+
+def test_what_moves_a_muscle_is_asked_over_the_ranges_from_end_to_end(scene, tmp_path, monkeypatch):
+    asked, really = [], sampling.moving_coordinates
+    monkeypatch.setattr(
+        sampling, "moving_coordinates", lambda *given: asked.append(given[2]) or really(*given)
+    )
+    Sampling(scene, tmp_path, RANGES, samples=6, kind="sobol")
+    for name, (low, high) in RANGES.items():
+        values = [pose[name] for pose in asked if pose]
+        assert min(values) == pytest.approx(low) and max(values) == pytest.approx(high)
+        assert len(set(values)) >= 3, "what moves it between the ends only is found too"
 
 
 def test_ranges_are_checked(scene):

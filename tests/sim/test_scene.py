@@ -215,8 +215,10 @@ class TestMistakes:
             load(folder, (', { bone = "lower", vertices = "lower.txt" }', ""))
 
     def test_no_muscles_and_missing_file(self, folder):
-        with pytest.raises(SceneError, match="has no muscles"):
+        with pytest.raises(SceneError, match=r"has no muscles, add a \[\[muscle\]\]$"):
             load(folder, (TEXT[TEXT.index("[[muscle]]") : TEXT.index("[contact]")], ""))
+        with pytest.raises(SceneError, match=r"has no bones, add a \[\[bone\]\]$"):
+            Scene("bare").validate()
         with pytest.raises(SceneError, match="no such scene file"):
             Scene.load(folder / "none.toml")
         with pytest.raises(SceneError, match="is a folder"):

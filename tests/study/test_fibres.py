@@ -96,6 +96,12 @@ class TestGrowth:
         assert np.abs(radius - radius.mean(axis=1, keepdims=True)).max() < 1.5
         np.testing.assert_allclose(line_lengths(lines), radius.mean(axis=1) * np.pi / 2, rtol=0.02)
 
+    def test_fibres_grow_and_move_with_their_muscle(self):
+        vertices, faces, ends = ring()
+        lines = grow_fibres(vertices, faces, ends, count=8, segments=6)
+        larger = grow_fibres(50.0 * vertices + [700.0, -300.0, 20.0], faces, ends, count=8, segments=6)
+        np.testing.assert_allclose((larger - [700.0, -300.0, 20.0]) / 50.0, lines, atol=1e-6)
+
     def test_ends_may_be_given_in_either_order(self):
         vertices, faces, ends = ring()
         first, second = (grow_fibres(vertices, faces, e, count=10, segments=4) for e in (ends, ends[::-1]))

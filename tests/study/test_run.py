@@ -67,6 +67,13 @@ class TestSimulate:
         assert seen == [(1, 2), (2, 2)]
         assert len(run.frames) == 2
 
+    @pytest.mark.parametrize("report", [True, False])
+    @pytest.mark.parametrize("preview", [True, False])
+    def test_report_and_preview_are_asked_for_one_by_one(self, report, preview, tmp_path):
+        settings = {"output.report": report, "output.preview": preview}
+        stream_run(arm_scene(end=10), tmp_path, settings=settings, pictures=False)
+        assert (tmp_path / "report.html").exists() == report
+
     def test_units_change_nothing_but_units(self):
         big = simulate(arm_scene(units="mm"))
         rows = simulate(arm_scene(units="m")).metrics
