@@ -66,6 +66,13 @@ def test_the_table_is_not_far_behind_the_code():
 
 
 @with_jit
+def test_an_entry_says_which_loop_it_is():
+    for need in needs.loops_needed(["sdf"]):
+        module, function = need.name.split(":")
+        assert need.entry.startswith(f"{module.split('.')[-1]}.{function}-")
+
+
+@with_jit
 def test_a_task_needs_only_its_own():
     names = {need.name for need in needs.loops_needed(["sdf"])}
     assert names

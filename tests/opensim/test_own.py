@@ -10,6 +10,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 import rbfmuscle as rm
+from rbfmuscle.app import run_command
 from rbfmuscle.opensim.folder import write_scene
 from rbfmuscle.opensim.match import attach, likeness, match_meshes, name_score, split_name, write_table
 from rbfmuscle.opensim.register import bring_to_bones, fit_similarity
@@ -118,6 +119,21 @@ def test_own_muscles_get_first_attachments_marked_as_guesses(own, tmp_path):
         match_meshes(found, folder, tmp_path / "wrong.csv")
 
 
+@pytest.mark.parametrize("subdivisions", [3, 4])
+def test_an_end_takes_the_same_share_of_a_muscle_however_fine_it_is(own, subdivisions):
+    found, folder = own
+    found.model.paths[0].points[0].body = "thigh"
+    rod = trimesh.creation.icosphere(subdivisions=subdivisions)
+    rod.apply_scale([20, 260, 20])
+    rod.apply_translation([-40, -220, 0])
+    rod.export(folder / "hamstring_right.ply")
+    match = match_meshes(found, folder)[0]
+    attach(found, match)
+    assert len(match.ends) == 2
+    for _, vertices in match.ends:
+        assert 0.02 < len(set(vertices)) / len(rod.vertices) < 0.04
+
+
 @pytest.mark.parametrize("far", ["r", "l"])
 def test_of_paths_of_both_sides_those_beside_the_mesh_hold_it(own, far):
     """A mesh without a side in its name lies beside one of two legs: in this model the other is 300 mm off."""
@@ -211,3 +227,11 @@ def test_joint_below_a_body_that_nobody_scanned_goes_all_the_way_to_the_childs_b
     np.testing.assert_allclose(upper.centre, [0.0, 10.0, 0.0], atol=1e-3)
     np.testing.assert_allclose(lower.centre, [3.0, -3.0, -5.0], atol=1e-3)
     assert [row["what"] for row in rows] == ["thigh", "shank", "joint upper"]
+
+
+def test_import_takes_a_model_alone_and_refuses_matches_of_no_muscles(small, tmp_path, capsys):
+    assert run_command(["import", str(small), "-o", str(tmp_path / "out")]) == 0
+    assert (tmp_path / "out" / "scene.toml").is_file()
+    capsys.readouterr()
+    assert run_command(["import", str(small), "-o", str(tmp_path / "no"), "--matches", "m.csv"]) == 2
+    assert "--matches belongs to --muscles" in capsys.readouterr().err

@@ -130,6 +130,17 @@ def test_sampling_goes_on_where_it_ended_and_is_fitted(scene, tmp_path):
         Sampling(scene, tmp_path, {**RANGES, "hip.flexion": (0.0, 0.5)}, samples=6, kind="sobol")
 
 
+def test_a_pose_is_sampled_from_rest_whatever_was_sampled_before(scene, tmp_path):
+    found = []
+    for name, counts in (("at once", [4]), ("by halves", [2, 4])):
+        for count in counts:
+            run = Sampling(scene, tmp_path / name, RANGES, samples=count, kind="halton")
+            run.run()
+        found.append(run.table("abductor"))
+    for one, other in zip(*found):
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+
+
 def test_what_moves_a_muscle_is_asked_over_the_ranges_from_end_to_end(scene, tmp_path, monkeypatch):
     asked, really = [], sampling.moving_coordinates
     monkeypatch.setattr(

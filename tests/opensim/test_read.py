@@ -129,6 +129,24 @@ class TestSmall:
             model, path, {"knee_angle": -0.601}
         )
 
+    def test_coordinate_is_found_by_its_path_or_its_bare_name(self, small):
+        wanted = [point.condition for point in read_osim(small).paths[0].points]
+        assert wanted[1] == ("knee_angle", -0.6, 0.2)
+        old = "<socket_coordinate>/jointset/knee/knee_angle</socket_coordinate>"
+        text = small.read_text()
+        assert old in text
+        small.write_text(text.replace(old, "<coordinate>knee_angle</coordinate>"))
+        assert [point.condition for point in read_osim(small).paths[0].points] == wanted
+
+    def test_joint_that_closes_a_loop_is_left_out_and_named(self, small):
+        joint = """<PinJoint name="strut"><socket_parent_frame>/ground</socket_parent_frame>
+            <socket_child_frame>shank</socket_child_frame>
+            <coordinates><Coordinate name="strut_angle"><range>-1 1</range></Coordinate></coordinates></PinJoint>"""
+        assert not any("closes a loop" in note for note in read_osim(small).notes)
+        small.write_text(small.read_text().replace("<SliderJoint", joint + "<SliderJoint"))
+        (note,) = [note for note in read_osim(small).notes if "closes a loop" in note]
+        assert "joint 'strut' (ground to shank)" in note
+
     def test_what_is_not_taken_is_named(self, small):
         notes = "\n".join(import_osim(small).notes)
         for text in ("'rail' (PointOnLineConstraint)", "'wedge.obj' is hidden", "'nowhere.vtp' is not there"):

@@ -207,3 +207,9 @@ def test_even_weights_stretch_less_than_harmonic_ones(body):
     np.testing.assert_allclose(even.sum(axis=1), 1.0)
     assert even.min() >= 0.0
     assert (even[groups[0], 0] == 1.0).all()
+
+
+def test_one_bone_alone_carries_every_vertex_whole(body):
+    vertices, faces, _ = body
+    weights = even_weights(vertices, faces, [np.flatnonzero(vertices[:, 0] < -2.9)])
+    np.testing.assert_allclose(weights, np.ones((len(vertices), 1)), atol=1e-12)

@@ -59,6 +59,19 @@ def test_rbf_muscle_has_the_foretold_surface_and_matrix(scene):
     assert foretold.memory > hanging + model.solver.inverse.nbytes
 
 
+def test_what_a_surface_takes_while_it_is_made_grows_with_the_matrix_of_the_fit(scene):
+    from rbfmuscle.model.cost import estimate_muscle
+    from rbfmuscle.model.options import RBFOptions
+
+    working = [
+        estimate_muscle(scene.muscles[0], scene, RATES, RBFOptions(centres=count, resolution=48)).working
+        for count in (100, 200, 400)
+    ]
+    # Twice the centres are twice the unknowns, and a matrix and its factor four times as large.
+    assert (working[2] - working[1]) / (working[1] - working[0]) == pytest.approx(4.0, rel=0.05)
+    assert working[1] - working[0] == pytest.approx(2 * 8 * (800**2 - 400**2), rel=0.05)
+
+
 def test_more_centres_cells_and_iterations_take_more(scene):
     from rbfmuscle.model.cost import estimate_muscle
     from rbfmuscle.model.options import RBFOptions

@@ -101,3 +101,7 @@ def test_without_the_coarsest_kernel_the_median_bounds_the_error():
 def test_best_conditioned_of_those_alike_comes_first():
     tried = np.array([[1.0, 0.100, 1e12], [2.0, 0.1015, 1e6], [3.0, 0.103, 1e3], [4.0, 0.2, 1e1]])
     assert by_worth(tried).tolist() == [1, 0, 2, 3]
+
+
+def test_of_those_that_err_nowhere_the_best_conditioned_comes_first():
+    assert by_worth(np.array([[1.0, 0.0, 1e6], [2.0, 0.0, 1e3], [3.0, 0.1, 1e1]])).tolist() == [1, 0, 2]

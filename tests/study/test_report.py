@@ -198,6 +198,8 @@ def test_events_are_folded_by_kind():
     text = folded_events(events, 60)
     assert text.count("<details>") == 2 and "and 10 more" in text
     assert text.index("halved") < text.index("bones_overlap") and "one 70" in text
+    assert text.count("<td>") == (60 + 1) * 4 and text.count("<th>") == 2 * 4, "a cell for each heading"
+    assert "<td>59</td><td>one</td><td>bone</td><td>1</td></tr>" in text
 
 
 def test_neighbours_of_many_have_different_colours(crowd):

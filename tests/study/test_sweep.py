@@ -198,6 +198,29 @@ class TestRun:
         plan = merge_sweeps(parts, tmp_path / "merged")
         assert table_of(plan, tmp_path / "merged") == table_of(*finished)
 
+    def test_of_two_results_the_first_that_is_done_is_kept(self, finished, tmp_path):
+        plan, done = finished
+        key = plan.points[0].key
+        kinds = {
+            "a": ("failed", "first"),
+            "b": ("done", "second"),
+            "c": ("done", "third"),
+            "d": ("failed", "last"),
+        }
+        for name, (status, process) in kinds.items():
+            part = SweepFolder(tmp_path / name)
+            part.prepare(plan)
+            part.write({**SweepFolder(done).read(key), "status": status, "process": process})
+        for order, kept in (
+            ("abc", "second"),
+            ("cb", "third"),
+            ("ad", "first"),
+            ("db", "second"),
+            ("bd", "second"),
+        ):
+            merge_sweeps([tmp_path / name for name in order], tmp_path / order)
+            assert SweepFolder(tmp_path / order).read(key)["process"] == kept
+
     def test_processes_give_the_same_table(self, finished, tmp_path):
         plan, count = run_sweep(tmp_path, jobs=2)
         assert count == POINTS
@@ -205,6 +228,15 @@ class TestRun:
         results = [SweepFolder(tmp_path).read(point.key) for point in plan.points]
         assert len({result["process"] for result in results}) == 2
         assert os.getpid() not in {result["process"] for result in results}
+
+    def test_failed_points_alone_are_tried_again_where_that_is_asked_for(self, tmp_path):
+        texts = ["model.centres=40,-3"]
+        _, count = run_sweep(tmp_path, texts=texts)
+        plan = plan_of(rbf_scene(), texts)
+        failed = [p.key for p in plan.points if SweepFolder(tmp_path).read(p.key)["status"] == "failed"]
+        assert 0 < len(failed) < count
+        runner = SweepRunner(run_point, rbf_scene(), plan, tmp_path, frames=FRAMES, jobs=1)
+        assert runner.run() == 0 and runner.run(retry=True) == len(failed)
 
     def test_a_failed_point_leaves_the_others(self, tmp_path):
         plan, _ = run_sweep(tmp_path, texts=["model.centres=40,-3", "model.resolution=16,24"])

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import toy_scene
 
+from rbfmuscle.commands.view import _begin_at
 from rbfmuscle.sim.loop.driving.live import LiveSession, coordinate_limits
 from rbfmuscle.study.show.view.live import LiveViewer
 from rbfmuscle.study.show.view.saved import SavedViewer
@@ -36,6 +37,34 @@ def go(viewer):
     while viewer.pending:
         view, count = viewer.advance(), count + 1
     return view, count
+
+
+def test_view_begins_where_it_is_told_live_or_saved():
+    class Told:
+        """Takes down what it is told."""
+
+        coordinates = ("hip.flexion", "knee.flexion")
+
+        def __init__(self, live):
+            self.live, self.at = live, []
+
+        def set(self, name, value):
+            self.at.append((name, value))
+
+        def place_of(self, value):
+            return 0.1 * value
+
+        def scrub(self, place):
+            self.at.append(place)
+
+    live, saved = Told(True), Told(False)
+    _begin_at(live, [("knee.flexion", 20.0), ("hip.flexion", 5.0)])
+    _begin_at(saved, [("frame", 3.0)])
+    assert live.at == [("knee.flexion", 20.0), ("hip.flexion", 5.0)] and saved.at == [pytest.approx(0.3)]
+    with pytest.raises(UsageError, match="unknown coordinate 'frame'"):
+        _begin_at(live, [("frame", 3.0)])
+    with pytest.raises(UsageError, match=r"unknown coordinate 'knee\.flexion'"):
+        _begin_at(saved, [("knee.flexion", 3.0)])
 
 
 def test_limits_hold_the_motion_and_30_degrees():
