@@ -7,7 +7,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.model.clusters import bind_samples, build_clusters, opposite_points
-from rbfmuscle.model.constraints import ShapeConstraint, VolumeConstraint
+from rbfmuscle.model.constraints import ShapeConstraint, VolumeConstraint, _rotation_loop
 from rbfmuscle.model.contact import solve_contact_forces
 
 
@@ -147,3 +147,17 @@ def test_clusters_without_centres_across_are_the_rings_alone(ellipsoid):
     # Two rings about a vertex of five or six neighbours.
     assert np.diff(start).min() >= 15 and np.diff(start).max() <= 18
     assert (weight == 1.0).all()
+
+
+def test_turning_towards_a_deformation_ends_at_its_polar_rotation():
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        stretch = rng.normal(size=(3, 3))
+        deformation = Rotation.from_rotvec(0.5 * rng.normal(size=3)).as_matrix()
+        deformation = deformation @ (np.eye(3) + 0.15 * (stretch + stretch.T))
+        u, _, vt = np.linalg.svd(deformation)
+        wanted = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        quaternion = np.array([1.0, 0.0, 0.0, 0.0])
+        _rotation_loop(deformation, quaternion)
+        found = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix()
+        np.testing.assert_allclose(found, wanted, atol=2e-3)

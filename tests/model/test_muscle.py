@@ -1,6 +1,7 @@
 """The RBF muscle against laws, on the embedded phantom and, where present, on the real hip."""
 
 import warnings
+from types import SimpleNamespace
 
 import igl
 import numpy as np
@@ -176,6 +177,22 @@ def test_fitted_centres_need_a_hermite_fit_to_all_derivatives(hip):
                 RBFMuscle(hip.muscles[0], hip, RBFOptions(placement="fitted", **options))
 
 
+@pytest.mark.parametrize(
+    ("count", "place", "asked", "wanted"),
+    [
+        (200, "even", "auto", "all"),
+        (201, "even", "auto", "normal"),
+        (201, "fitted", "auto", "all"),
+        (20, "even", "normal", "normal"),
+        (900, "even", "all", "all"),
+    ],
+)
+def test_all_derivatives_are_fitted_where_few_or_fitted_centres_can_bear_it(count, place, asked, wanted):
+    centres = SimpleNamespace(points=np.zeros((count, 3)))
+    options = RBFOptions(placement=place, derivatives=asked)
+    assert placement._choose_fit("m", (None, None), options, centres, None).derivatives == wanted
+
+
 def unshowable(surface):
     scene = phantom_scene().with_options(
         {"model.kernel": "gaussian", "model.epsilon": 1.0, "model.centres": 100, "model.surface": surface}
@@ -292,3 +309,16 @@ def test_centres_are_as_many_as_allowed_at_most_where_no_fit_is_to_be_had(monkey
     monkeypatch.setattr(placement, "_rest_miss", lambda *given: np.inf)
     count, error = placement._search_centres(muscle, frame, RBFOptions(placement="even"), 150, 0.5)
     assert asked == [150, 600] and (count, error) == (150, np.inf)
+
+
+@pytest.mark.parametrize("wanted", [0.8, 0.5, 0.3])
+def test_an_error_that_falls_as_foretold_is_met_by_the_second_trial(monkeypatch, wanted):
+    scene = phantom_scene()
+    muscle = scene.muscle("abductor")
+    frame, asked = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)), []
+    monkeypatch.setattr(
+        placement, "place_points", lambda *given: (asked.append(given[-1]) or given[-1], None, None)
+    )
+    monkeypatch.setattr(placement, "_rest_miss", lambda _, count, fit: (150 / count) ** placement.FALL)
+    count, error = placement._search_centres(muscle, frame, RBFOptions(placement="even"), 150, wanted)
+    assert asked == [150, count] and error <= placement.AIM * wanted < (150 / (count - 21)) ** placement.FALL

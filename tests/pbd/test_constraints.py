@@ -129,12 +129,14 @@ def test_collapsed_and_folded_elements_stay_finite(body):
         assert np.isfinite(points).all()
 
 
-def test_edge_beyond_its_limit_is_hard_whatever_its_stiffness():
+@pytest.mark.parametrize(("stretch", "wanted"), [(3.0, 2.2), (0.2, 0.6), (1.5, 1.5)])
+@pytest.mark.parametrize("inverse_mass", [(1.0, 1.0), (0.0, 0.5), (3.0, 1.0)])
+def test_edge_beyond_its_limits_is_hard_whatever_its_stiffness(stretch, wanted, inverse_mass):
     vertices = np.array([[0.0, 0, 0], [1.0, 0, 0]])
     edge = np.array([[0, 1]])
-    points = vertices * 3.0
-    EdgeConstraint(vertices, edge, stiffness=0.0, limits=(0.6, 2.2)).project(points, np.ones(2))
-    assert np.linalg.norm(points[1] - points[0]) == pytest.approx(2.2)
+    points = vertices * stretch
+    EdgeConstraint(vertices, edge, stiffness=0.0, limits=(0.6, 2.2)).project(points, np.array(inverse_mass))
+    assert np.linalg.norm(points[1] - points[0]) == pytest.approx(wanted)
 
 
 def test_volume_is_that_of_the_ellipsoid_far_from_the_origin():

@@ -40,6 +40,18 @@ def test_rest_is_a_minimum_before_any_rotation_was_fitted(rest):
     np.testing.assert_allclose(arap.quaternions[:, 0], 1.0, atol=1e-12)
 
 
+def test_rotations_of_a_turned_shape_are_its_turn_and_leave_no_energy(rest):
+    vertices, topology = rest
+    arap, turn = ARAP(vertices, topology), Rotation.from_rotvec([0.3, -0.4, 0.2])
+    turned = turn.apply(vertices) + [5.0, 6.0, 7.0]
+    assert arap.energy(turned) > 1.0
+    arap.fit_rotations(turned)
+    wanted = turn.as_quat()[[3, 0, 1, 2]]
+    np.testing.assert_allclose(arap.quaternions, np.tile(wanted, (len(vertices), 1)), atol=1e-9)
+    assert arap.energy(turned) < 1e-15
+    np.testing.assert_allclose(arap.gradient(turned), 0.0, atol=1e-8)
+
+
 def test_energy_grows_with_the_square_of_a_stretch(rest):
     """Rotations stay where they are when a shape grows evenly, so E is quadratic in the growth."""
     vertices, topology = rest
