@@ -63,19 +63,18 @@ def run(count: int, seed: int, minutes: float, rooms: list[str], loops: bool | N
     tree = WORK / f"tree{os.getpid()}"
     copy_tree(tree)
     sound = Sound(tree)
-    known = {row["key"] for row in results()}
     for fault in kept_sample(count, seed, rooms, loops):
         if time.monotonic() > end:
             print("time is over; the same command goes on from here")
             break
         row = describe(fault, seed, tree)
-        known |= {r["key"] for r in results()}  # another share may run beside this one
-        if row is None or row["key"] in known:
+        if row is None or not claimed(row["key"]):
             continue
-        row |= judge(fault, tree, reach, sound)
-        known.add(row["key"])
+        named = row["key"] in equivalent()
+        row |= {"outcome": "equivalent", "by": "", "tests": 0} if named else judge(fault, tree, reach, sound)
         with (WORK / "results.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
+        (WORK / "doing" / row["key"]).unlink()
         print(f"{row['outcome']:9} {fault.path}:{fault.line} {row['after'].strip()[:90]}", flush=True)
     shutil.rmtree(tree, ignore_errors=True)
 
@@ -92,6 +91,24 @@ def kept_sample(count: int, seed: int, rooms: list[str], loops: bool | None) -> 
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(found), encoding="utf-8")
     return [Fault(**row) for row in json.loads(path.read_text(encoding="utf-8"))]
+
+
+def claimed(key: str) -> bool:
+    """Take a fault, unless it has a result or another share, running beside this one, is at it."""
+    path = WORK / "doing" / key
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.exists() and not Path("/proc", path.read_text(encoding="utf-8")).exists():
+        path.unlink()  # of a share that was broken off
+    mine = WORK / "doing" / f".{os.getpid()}"
+    mine.write_text(str(os.getpid()), encoding="utf-8")
+    try:
+        os.link(mine, path)
+    except FileExistsError:
+        return False
+    if any(row["key"] == key for row in results()):
+        path.unlink()
+        return False
+    return True
 
 
 def describe(fault, seed: int, tree: Path) -> dict | None:
@@ -116,16 +133,16 @@ def key_of(*facts: str) -> str:
 
 
 def judge(fault, tree: Path, reach: dict, sound: Sound) -> dict:
-    """Try the fault on the tests that reach it: without compiler first, which is quicker to start."""
+    """Try the fault on the tests that reach it: without compiler in a loop, or where none with it does."""
     from mutants.runner import run_tests
 
     path = tree / fault.path
     source = path.read_text(encoding="utf-8")
     outcome, first, tried = "unreached", "", 0
-    for kind in ("plain",) if fault.loop else ("plain", "compiled"):
+    for kind in ("plain",) if fault.loop else ("compiled", "plain"):
         tests = sound.kept(reach[kind].tests(fault.path, fault.line, outside=not fault.function), kind)
         while tests:
-            seconds = 20.0 + 5.0 * sum(reach[kind].seconds[t] for t in tests)
+            seconds = 30.0 + 2.0 * sum(reach[kind].seconds[t] for t in tests)
             try:
                 path.write_text(fault.planted(source), encoding="utf-8")
                 outcome, first = run_tests(tree, tests, compiler=kind == "compiled", seconds=seconds)
@@ -135,7 +152,7 @@ def judge(fault, tree: Path, reach: dict, sound: Sound) -> dict:
             if outcome != "noticed" or sound.passes(first or tests[0], kind):
                 break
             outcome, tests = "unreached", sound.kept(tests, kind)
-        if outcome in ("noticed", "slow"):
+        if outcome != "unreached":
             break
     return {"outcome": outcome, "by": first, "tests": tried}
 

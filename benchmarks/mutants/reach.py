@@ -11,7 +11,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 # A fault is tried on tests of so many seconds together at most, and so many of them.
-BUDGET, MOST = 8.0, 250
+BUDGET, MOST = 8.0, 60
+# Where fewer reach a line, others of its module are tried too.
+FEW = 15
 
 
 @dataclass
@@ -33,12 +35,12 @@ class Reach:
                 lines = found.lines.setdefault(name, {})
                 now = _lines_now(name, folder / "sources" / kept["digest"])
                 for line, tests in kept["lines"].items():
-                    if int(line) in now:
-                        lines.setdefault(str(now[int(line)]), set()).update(tests)
+                    for place in now.get(int(line), ()):
+                        lines.setdefault(str(place), set()).update(tests)
         return found
 
     def tests(self, path: str, line: int, *, outside: bool) -> list[str]:
-        """Tests that run a line, quick ones first, within the budget.
+        """Tests that run a line, those most apt to tell first, within the budget, those of a file together.
 
         Parameters
         ----------
@@ -48,21 +50,24 @@ class Reach:
             The line lies in no function: it runs when the module is imported, so any test of the module may tell.
         """
         lines = self.lines.get(path, {})
-        if outside:
-            contexts = {test for tests in lines.values() for test in tests}
-        else:
-            contexts = lines.get(str(line), ())
+        wanted = [] if outside else self._in_turn(self._expanded(lines.get(str(line), ())), lines)
+        if len(wanted) < FEW:
+            # A default or a table runs when its module is imported, under the name of no test or of a chance one.
+            every = {test for tests in lines.values() for test in tests}
+            others = self._in_turn(self._expanded(every) - set(wanted), lines)
+            wanted = [t for pair in itertools.zip_longest(wanted, others) for t in pair if t is not None]
         chosen, spent = [], 0.0
-        tests = self._expanded(contexts)
-        wanted = self._by_share(tests, lines) if outside else self._in_turn(tests)
         for test in wanted:
             if len(chosen) < MOST and spent + self.seconds[test] <= BUDGET * (2.0 if outside else 1.0):
                 chosen.append(test)
                 spent += self.seconds[test]
-        return chosen or wanted[:1]
+        return self._by_file(chosen or wanted[:1])
 
-    def _by_share(self, tests, lines):
-        """First those of whose lines the most lie in this module: a table's constants are told by who asks for them."""
+    def _in_turn(self, tests, lines):
+        """By the chance to tell, which is the share of this module among the lines that a test runs, for the time.
+
+        One of each test function comes before the second of any: their parameters say much alike.
+        """
         if not self.total:
             for kept in self.lines.values():
                 for found in kept.values():
@@ -72,15 +77,25 @@ class Reach:
         for found in lines.values():
             for test in found:
                 here[test] = here.get(test, 0) + 1
-        return sorted(tests, key=lambda t: (-here.get(t, 0) / self.total.get(t, 1), self.seconds[t]))
 
-    def _in_turn(self, tests):
-        """Quick ones first, one of each test function before the second of any: their parameters say much alike."""
+        def worth(test):
+            share = here.get(test, here.get(test.split("::")[0], 0)) / self.total.get(test, 1)
+            # Squared: a test of this very module, though slow, before many that only pass through it.
+            return -(min(share, 1.0) ** 2) / (self.seconds[test] + 0.3)
+
         functions: dict[str, list[str]] = {}
-        for test in sorted(tests, key=lambda t: self.seconds[t]):
+        for test in sorted(tests, key=lambda t: (worth(t), t)):
             functions.setdefault(test.split("[")[0], []).append(test)
         rounds = itertools.zip_longest(*functions.values())
         return [test for row in rounds for test in row if test is not None]
+
+    @staticmethod
+    def _by_file(tests):
+        """Files in turn: what a module's fixtures set up would be set up again whenever pytest came back to it."""
+        files: dict[str, list[str]] = {}
+        for test in tests:
+            files.setdefault(test.split("::")[0], []).append(test)
+        return [test for kept in files.values() for test in kept]
 
     def _expanded(self, contexts):
         """Tests of these contexts; what a fixture ran belongs to every test of its file."""
@@ -91,11 +106,17 @@ class Reach:
 
 @cache
 def _lines_now(name, recorded):
-    """Numbers of lines in the text that was recorded, with those of the same lines in the present one."""
+    """Of each line that was recorded, those that take its tests now: itself, and what is new behind it."""
     path = ROOT / name
     new = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     old = recorded.read_text(encoding="utf-8").splitlines() if recorded.exists() else new
     if old == new:
-        return {k: k for k in range(1, len(old) + 1)}
+        return {k: [k] for k in range(1, len(old) + 1)}
     matcher = difflib.SequenceMatcher(None, old, new, autojunk=False)
-    return {a + k + 1: b + k + 1 for a, b, size in matcher.get_matching_blocks() for k in range(size)}
+    found = {a + k + 1: [b + k + 1] for a, b, size in matcher.get_matching_blocks() for k in range(size)}
+    owner = {now[0]: then for then, now in found.items()}
+    for line in range(2, len(new) + 1):
+        if line not in owner and line - 1 in owner:
+            owner[line] = owner[line - 1]
+            found[owner[line]].append(line)
+    return found

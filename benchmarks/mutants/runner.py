@@ -19,6 +19,8 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
+# Seconds of the processor after which a fault has been tried enough.
+SPENT = 20.0
 # No plugin of pytest (hypothesis): one that is loaded before pytest is a warning, and warnings are errors here.
 HEAVY = (
     "numpy", "scipy.linalg", "scipy.sparse.linalg", "scipy.spatial.transform", "scipy.optimize", "scipy.interpolate",
@@ -36,16 +38,24 @@ def copy_tree(target: Path) -> None:
 
 
 def preload() -> None:
-    """Load what no fault can touch, once."""
+    """Load what no fault can touch, once; threads of BLAS that spin would take the time of what is tried."""
+    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
     for name in HEAVY:
         importlib.import_module(name)
 
 
 class Failures:
-    """A pytest plugin that writes down the first test that failed."""
+    """A pytest plugin that writes down the first test that failed, and ends the run when its time is spent."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, seconds: float) -> None:
         self.path = path
+        self.end = time.process_time() + seconds
+
+    def pytest_runtest_logfinish(self, nodeid):
+        if time.process_time() > self.end:
+            # Fixtures and imports take what no recording foresees; the tests most apt to tell have run by now.
+            os._exit(0 if not self.path.exists() else 1)
 
     def pytest_runtest_logreport(self, report):
         if report.failed and not self.path.exists():
@@ -64,7 +74,7 @@ def run_tests(tree: Path, tests: list[str], *, compiler: bool, seconds: float) -
     child = os.fork()
     if child == 0:
         resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(seconds), math.ceil(seconds) + 1))
-        _be_child(tree, tests, compiler, Failures(told))
+        _be_child(tree, tests, compiler, Failures(told, SPENT))
     end = time.monotonic() + 10.0 * seconds
     while time.monotonic() < end:
         done, status = os.waitpid(child, os.WNOHANG)
