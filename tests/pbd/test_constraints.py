@@ -90,6 +90,22 @@ def numerical_gradient(value, points, members, step):
     return gradient
 
 
+def test_a_sweep_over_a_mesh_is_one_edge_after_another(rng):
+    """Colours and blocks are for speed: what they hold is done in their order, each on what the last one left."""
+    vertices, faces = ellipsoid(1)
+    topology = Topology.from_mesh(vertices, faces)
+    given, mass = vertices + 0.1 * rng.normal(size=vertices.shape), rng.uniform(0.5, 2.0, len(vertices))
+    for family, extra in ((EdgeConstraint, ()), (BendingConstraint, (topology.wings,))):
+        whole = family(vertices, topology.edges, *extra, stiffness=0.7)
+        swept, stepped = given.copy(), given.copy()
+        whole.project(swept, mass)
+        for number in whole.order:
+            parts = [part[[number]] for part in (topology.edges, *extra)]
+            family(vertices, *parts, stiffness=0.7).project(stepped, mass)
+        np.testing.assert_allclose(swept, stepped, atol=1e-12)
+        assert np.abs(swept - given).max() > 1e-2
+
+
 @pytest.mark.parametrize("number", [0, 100, 500])
 @pytest.mark.parametrize("family", ["edge", "bending"])
 def test_projection_follows_the_gradient(body, rng, family, number):

@@ -64,7 +64,9 @@ def test_what_a_surface_takes_while_it_is_made_grows_with_the_matrix_of_the_fit(
     from rbfmuscle.model.options import RBFOptions
 
     working = [
-        estimate_muscle(scene.muscles[0], scene, RATES, RBFOptions(centres=count, resolution=48)).working
+        estimate_muscle(
+            scene.muscles[0], scene, RATES, RBFOptions(centres=count, resolution=48, derivatives="all")
+        ).working
         for count in (100, 200, 400)
     ]
     # Twice the centres are twice the unknowns, and a matrix and its factor four times as large.
