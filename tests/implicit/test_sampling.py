@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from rbfmuscle.geometry.surfaces import unique_edges
 from rbfmuscle.implicit.field import RBFField
+from rbfmuscle.implicit.placement.clustering import _equalise_loop
 from rbfmuscle.implicit.placement.control_mesh import contract_clusters
 from rbfmuscle.implicit.placement.off_surface import off_surface_points
 from rbfmuscle.implicit.placement.sampling import sample_surface
@@ -213,3 +215,32 @@ def test_off_surface_points_refuse_bad_numbers():
         off_surface_points(np.eye(3), np.eye(3), distance=-1.0)
     with pytest.raises(ValueError, match="safety"):
         off_surface_points(np.eye(3), np.eye(3), safety=2.0)
+
+
+def test_cells_are_equalised_until_no_vertex_would_rather_be_in_a_neighbouring_one():
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    vertices, weight = (
+        np.array(mesh.vertices) * [2.0, 1.0, 1.0],
+        np.random.default_rng(2).uniform(0.5, 2.0, 162),
+    )
+    edges = unique_edges(np.array(mesh.faces))
+    seeds = vertices[np.random.default_rng(1).choice(162, 8, replace=False)]
+    labels = np.linalg.norm(vertices[:, None] - seeds, axis=2).argmin(axis=1)
+
+    def inertia(cells):
+        total = 0.0
+        for k in range(8):
+            own, mass = vertices[cells == k], weight[cells == k]
+            total += (mass[:, None] * (own - np.average(own, axis=0, weights=mass)) ** 2).sum()
+        return total
+
+    before = inertia(labels)
+    _equalise_loop(vertices, weight, edges, labels, 8, 200)
+    after = inertia(labels)
+    assert after < 0.9 * before and set(labels) == set(range(8))
+    for i, j in edges:
+        for v, k in ((i, labels[j]), (j, labels[i])):
+            if labels[v] != k and (labels == labels[v]).sum() > 1:
+                other = labels.copy()
+                other[v] = k
+                assert inertia(other) > after * (1.0 - 1e-9)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from pbd_baseline.arap import ARAP, ARAPConstraint, _turn_towards
 from pbd_baseline.constraints import _cubic_step
 from pbd_baseline.contact import ContactConstraint, _keep_deepest
+from pbd_baseline.fibres import edge_stiffness
 from pbd_baseline.motion import carry
 from pbd_baseline.muscle import _contact_carriers
 from pbd_baseline.topology import Topology
@@ -231,3 +232,15 @@ def test_newton_steps_find_the_rotation_of_a_stretched_ring_in_five(flat):
         assert steps[-1] < 1e-18
         found = np.array(quaternion_matrix(q))
         np.testing.assert_allclose(found, turn.as_matrix(), atol=1e-9)
+
+
+def test_edges_along_the_fibres_are_soft_and_those_across_as_stiff_as_any(rest):
+    vertices, topology = rest
+    edges, along = topology.edges, np.tile([1.0, 0.0, 0.0], (len(vertices), 1))
+    assert (edge_stiffness(vertices, edges, along, 0.0) == 1.0).all()
+    steps = vertices[edges[:, 1]] - vertices[edges[:, 0]]
+    cosine = np.abs(steps[:, 0]) / np.linalg.norm(steps, axis=1)
+    found = [edge_stiffness(vertices, edges, sign * along, 0.5) for sign in (1.0, -1.0)]
+    np.testing.assert_array_equal(*found)
+    np.testing.assert_allclose(found[0], np.sqrt(1.0 - cosine), atol=1e-7)
+    assert found[0].min() < 0.3 and found[0].max() > 0.9

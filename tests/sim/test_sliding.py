@@ -43,6 +43,8 @@ def test_surface_distance_agrees_with_the_sphere():
     index, distance, normal, nearest = surface.query(points, np.ones(500, dtype=bool), 3.0)
     # The triangles lie up to 0.06 below the sphere.
     assert np.allclose(distance, exact[index], atol=0.08)
+    squared = igl.point_mesh_squared_distance(points[index], surface.vertices, surface.faces)[0]
+    np.testing.assert_allclose(np.abs(distance), np.sqrt(squared), atol=1e-9)
     assert set(np.flatnonzero(exact < 2.9)) <= set(index)
     assert (
         np.einsum("ij,ij->i", normal, points[index] / np.linalg.norm(points[index], axis=1)[:, None]).min()

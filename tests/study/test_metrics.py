@@ -74,6 +74,17 @@ class TestOccupancy:
         candidates = OccupancyGrid(*arrays(blob), cells=64).candidates(points)
         assert outside[candidates].sum() < 0.2 * outside.sum()
 
+    @pytest.mark.parametrize("axis", [0, 1, 2])
+    def test_nothing_beyond_the_grid_is_a_candidate_however_near(self, blob, axis):
+        grid = OccupancyGrid(*arrays(blob), cells=16)
+        ends = grid.origin, grid.origin + np.array(grid.state.shape) * grid.spacing
+        middle = 0.5 * (ends[0] + ends[1])
+        points = np.tile(middle, (6, 1))
+        for k, beyond in enumerate((1e-9, 0.3, 5.0)):
+            points[k, axis] = ends[0][axis] - beyond * grid.spacing
+            points[3 + k, axis] = ends[1][axis] + beyond * grid.spacing
+        assert len(grid.candidates(points)) == 0 and len(grid.candidates(middle[None])) == 1
+
     def test_large_triangles_mark_only_cells_that_they_meet(self):
         grid = OccupancyGrid(*arrays(trimesh.creation.box((1, 1, 1))), cells=16)
         far = np.array([[0.7, 0.7, 0.7], [0.0, 0.0, 0.66]])
@@ -194,6 +205,17 @@ class TestMeshMeasures:
         assert found[0]["self_crossing"] == 0 < found[1]["self_crossing"]
         assert found[2] == found[1]
         assert found[3]["self_crossing"] == 0
+
+    @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+    def test_strain_knows_no_unit(self, scale):
+        vertices, faces = arrays(trimesh.creation.icosphere(subdivisions=1))
+        edges = unique_edges(faces)
+        rest, moved = scale * vertices, scale * vertices * [1.1, 0.9, 1.0]
+        found = edge_strain(moved, edges, edge_lengths(rest, edges))
+        assert found == pytest.approx(
+            edge_strain(moved / scale, edges, edge_lengths(vertices, edges)), rel=1e-12
+        )
+        assert 0.01 < found < 0.1
 
     def test_strain_of_a_stretch(self):
         vertices, faces = arrays(trimesh.creation.icosphere(subdivisions=2))
