@@ -3,6 +3,7 @@
 import gc
 import io
 import os
+import runpy
 import stat
 import time
 import types as pytypes
@@ -40,6 +41,11 @@ def places(tmp_path, monkeypatch):
 def age(path, days):
     then = time.time() - days * DAY
     os.utime(path, (then, then))
+
+
+def test_nothing_is_compiled_before_the_first_loop():
+    fresh = runpy.run_path(watch.__file__)
+    assert fresh["compiled_so_far"]() == {"loops": 0, "seconds": 0.0}
 
 
 class TestEntries:

@@ -8,10 +8,12 @@ from scipy.spatial.transform import Rotation
 
 from pbd_baseline.contraction import _stretch_loop
 from pbd_baseline.shapes import _scale_loop
+from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.fields import LevelField
 from rbfmuscle.geometry.mean_value import mean_value_weights
 from rbfmuscle.geometry.rest_frame import BoneFrame
+from rbfmuscle.geometry.triangles import nearest_weights
 from rbfmuscle.implicit.placement.off_surface import _touching_ball_loop
 from rbfmuscle.study.measure.mesh_distance import _winding_loop
 
@@ -192,3 +194,29 @@ def test_local_units_are_the_same_wherever_a_bone_is_and_however_large(scale):
     np.testing.assert_allclose(sides, scale * np.array([1.0, 2.0, 5.0]), rtol=1e-5)
     np.testing.assert_allclose(frame.axes @ frame.axes.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(frame.axes) == pytest.approx(1.0)
+
+
+def test_nearest_point_of_a_triangle_is_a_mean_of_its_corners_in_every_region():
+    rng = np.random.default_rng(3)
+    seen = set()
+    for a, b, c, p in rng.normal(size=(400, 4, 3)) * np.array([1.0, 1.0, 1.0, 2.0])[:, None]:
+        weights = np.full(3, np.nan)
+        nearest_weights(p, a, b, c, weights)
+        assert weights.min() >= 0.0 and weights.sum() == pytest.approx(1.0)
+        squared = igl.point_mesh_squared_distance(p[None], np.array([a, b, c]), np.array([[0, 1, 2]]))[0]
+        assert ((weights @ [a, b, c] - p) ** 2).sum() == pytest.approx(float(np.ravel(squared)[0]), rel=1e-9)
+        seen.add(tuple(weights > 0.0))
+    assert len(seen) == 7, "three corners, three edges, the inside"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_crossings_by_sheets_turn_with_the_surface_and_are_among_all(seed):
+    """Two balls that reach into each other, as one surface: whichever way the axes lie, the same triangles cross."""
+    one, two = trimesh.creation.icosphere(2), trimesh.creation.icosphere(2, radius=0.8)
+    vertices = np.vstack([one.vertices, two.vertices + [0.9, 0.2, 0.1]])
+    faces = np.vstack([one.faces, two.faces + len(one.vertices)])
+    found = FaceTree(vertices, faces).crossing(vertices, by_sheets=True)
+    every = FaceTree(vertices, faces).crossing(vertices)
+    assert 10 < found.sum() <= every.sum() and not (found & ~every).any()
+    turned = Rotation.random(random_state=seed).apply(vertices)
+    np.testing.assert_array_equal(FaceTree(turned, faces).crossing(turned, by_sheets=True), found)

@@ -7,7 +7,7 @@ import trimesh
 from rbfmuscle.geometry.crossing import FaceTree, crossing_faces
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction.material import _Fitting, carry_material, fit_material
-from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
+from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh, _edges_loop
 from rbfmuscle.implicit.extraction.obstacles import ObstaclePoints
 from rbfmuscle.implicit.extraction.projection import Projector
 
@@ -270,3 +270,11 @@ def test_what_is_known_of_the_cut_changes_nothing(shift):
     ]
     np.testing.assert_allclose(found[0].vertices, found[1].vertices, rtol=0, atol=1e-12)
     assert np.abs(cut(found[0].vertices)).min() < 1e-3
+
+
+def test_edges_of_a_mesh_have_their_mean_and_greatest_length_whichever_corner_is_first():
+    vertices = np.array(BALL.vertices) * [3.0, 1.0, 0.5]
+    lengths = np.linalg.norm(np.diff(vertices[BALL.edges_unique], axis=1)[:, 0], axis=1)
+    for first in range(3):
+        mean, greatest = _edges_loop(vertices, np.roll(BALL.faces, first, axis=1).astype(np.int64))
+        assert mean == pytest.approx(lengths.mean()) and greatest == pytest.approx(lengths.max())

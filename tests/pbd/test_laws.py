@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from pbd_baseline.arap import ARAP, ARAPConstraint, _turn_towards
 from pbd_baseline.constraints import _cubic_step
-from pbd_baseline.contact import ContactConstraint, _keep_deepest
+from pbd_baseline.contact import ContactConstraint, _keep_deepest, _push_loop
 from pbd_baseline.fibres import edge_stiffness
 from pbd_baseline.motion import carry
 from pbd_baseline.muscle import _contact_carriers
@@ -244,3 +244,16 @@ def test_edges_along_the_fibres_are_soft_and_those_across_as_stiff_as_any(rest):
     np.testing.assert_array_equal(*found)
     np.testing.assert_allclose(found[0], np.sqrt(1.0 - cosine), atol=1e-7)
     assert found[0].min() < 0.3 and found[0].max() > 0.9
+
+
+def test_a_push_moves_each_point_by_its_depth_whatever_carries_it():
+    rng = np.random.default_rng(4)
+    points = rng.normal(size=(9, 3))
+    columns = np.arange(9).reshape(3, 3)
+    shares = np.array([[1.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.2, 0.3, 0.5]])
+    normal = rng.normal(size=(3, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    depth, moved = np.array([0.4, 0.7, -0.2]), points.copy()
+    _push_loop(moved, columns, shares, np.arange(3), normal, depth)
+    went = np.einsum("pk,pka->pa", shares, (moved - points)[columns])
+    np.testing.assert_allclose(went, np.maximum(depth, 0.0)[:, None] * normal, atol=1e-14)

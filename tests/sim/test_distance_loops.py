@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from rbfmuscle.sim.distance.query import _mixed_side
 from rbfmuscle.sim.distance.sdf import BoneSDF
 from rbfmuscle.sim.distance.serendipity import SerendipityField
 from rbfmuscle.sim.distance.spline import SplineField
@@ -139,3 +140,17 @@ def test_spline_meets_its_nodes_and_its_gradient_is_that_of_its_values():
         slope = (field.distance(points + way) - field.distance(points - way)) / (2 * step)
         np.testing.assert_allclose(gradient[:, k], slope, atol=1e-8)
     assert np.ptp(field.distance(points + [1e-9, 0, 0]) - distance) < 1e-7
+
+
+def test_a_mixed_cell_interpolates_what_its_corners_say_and_ends_at_its_sides():
+    low, size = np.array([2.0, -1.0, 4.0]), 0.5
+    corner = np.array([[k >> 2 & 1, k >> 1 & 1, k & 1] for k in range(8)], dtype=float)
+
+    def asked(place):
+        return 1.0 + 2.0 * place[0] - 3.0 * place[1] + place[2] + 5.0 * place[0] * place[1] * place[2]
+
+    row = np.array([[*(asked(c) for c in corner), *low, 1.0 / size]])
+    lists = np.zeros(2, dtype=np.int32)  # no triangle, then the number of the corners' row
+    for place in np.random.default_rng(0).uniform(-1.0, 2.0, (50, 3)):
+        found = _mixed_side(*(low + size * place), 0, lists, row)
+        assert found == pytest.approx(asked(np.clip(place, 0.0, 1.0)))
