@@ -88,14 +88,15 @@ def energy_matrix(points: Floats, kernel: str = KERNEL) -> Floats:
     if factor is None:
         raise_if_singular(basis)
         raise np.linalg.LinAlgError("the points all but coincide; thin them out")
-    inverse, failed = linalg.lapack.dpotri(factor.lower, lower=1, overwrite_c=1)
+    n = len(points)
+    # with the values first, the last block of the inverse is that of the last block of the factor alone
+    block, failed = linalg.lapack.dpotri(np.asfortranarray(factor.lower[n:, n:]), lower=1, overwrite_c=1)
     if failed:
         raise np.linalg.LinAlgError("the points all but coincide; thin them out")
-    n = len(points)
-    block = np.tril(inverse[n:, n:])  # above the diagonal stands whatever was in memory
-    directions = factor.directions[n:]
-    block -= directions @ directions.T / factor.gamma
-    return np.tril(block)
+    directions, gamma = np.asfortranarray(factor.directions[n:]), factor.gamma
+    del factor
+    block = linalg.blas.dsyrk(-1.0 / gamma, directions, beta=1.0, c=block, lower=1, overwrite_c=1)
+    return np.tril(block)  # above the diagonal stands whatever was in memory
 
 
 def _least_energy(points: Floats, start: Floats | None) -> Floats:

@@ -96,7 +96,19 @@ def test_files_hold_the_table(study, tmp_path):
     page = (tmp_path / "kernels.html").read_text()
     assert "An ellipsoid" in page and "http" not in page.replace("http-equiv", "")
     assert (tmp_path / "kernels.csv").read_text().count("\n") == len(study.rows) + 1
-    assert (tmp_path / "fronts.png").stat().st_size > 5000
+    for name in ("error_time", "error_size", "map_error", "map_condition"):
+        assert (tmp_path / f"{name}.png").stat().st_size > 5000
+
+
+def test_plots_fit_a_telephone(study, tmp_path):
+    """No picture of a plot is so wide that its letters cannot be read on a page of 400 pixels."""
+    import matplotlib.image
+
+    write_study(study, tmp_path, pictures=False)
+    plots = sorted(tmp_path.glob("*.png"))
+    assert len(plots) == 4 and all(matplotlib.image.imread(plot).shape[1] <= 650 for plot in plots)
+    page = (tmp_path / "kernels.html").read_text()
+    assert page.count('<div class="plots">') == 2 and "min(100%,460px)" in page
 
 
 def test_slender_muscles_are_looked_at_with_finer_cells(ellipsoid):

@@ -6,12 +6,13 @@ import base64
 import csv
 import html
 import io
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rbfmuscle.study.experiment.kernel_choice import named
 from rbfmuscle.study.files.writer import json_text
-from rbfmuscle.study.show.kernels.plots import draw_fronts, draw_maps
+from rbfmuscle.study.show.kernels.plots import draw_map, draw_sizes, draw_times
 from rbfmuscle.study.show.kernels.surfaces import draw_surfaces
 from rbfmuscle.study.show.page import STYLE
 from rbfmuscle.validation import MissingPartError
@@ -47,9 +48,9 @@ SIGNED = (
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">
 <title>{title}</title><style>{style} tr.front td:first-child{{font-weight:650}} td.text{{text-align:left}}
-.plots{{grid-template-columns:1fr}} pre{{overflow-x:auto}}
+.plots{{grid-template-columns:repeat(auto-fit,minmax(min(100%,460px),1fr))}} pre{{overflow-x:auto}}
 td{{white-space:nowrap}} td.text{{min-width:19em;white-space:normal}}
-@media(max-width:760px){{figure{{overflow-x:auto}}figure img{{width:860px;max-width:none}}}}</style>
+@media(max-width:760px){{figure.big{{overflow-x:auto}}figure.big img{{width:860px;max-width:none}}}}</style>
 </head><body><main><h1>{title}</h1>
 <p class="sub">Each kernel with as many centres, its shape parameter chosen by the error at other points of the mesh</p>
 <p>Recommended: <b>{best}</b>: {reason}.{others} Distances{units} are measured both ways between the mesh and the
@@ -58,8 +59,8 @@ best one's are a tie, in which time decides;
 normals by the field's gradient; the mesh in the last but one column was decimated to as many stored numbers. Kernels in
 bold are on the front of error against time. A volume error is that of the level zero; a muscle's level is moved until
 its volume is right.</p>
-<h2>What each costs</h2><div class="plots"><figure><img alt="error against time and size" src="{fronts}"></figure>
-</div>{pictures}{moved}{maps}
+<h2>What each costs</h2>{fronts}
+{pictures}{moved}{maps}
 <h2>All of them</h2><div class="wide"><table><tr>{head}</tr>{body}</table></div>{unfit}
 <h2>To paste</h2><pre>{toml}</pre>
 </main></body></html>
@@ -100,8 +101,15 @@ def write_study(
         writer.writerows(study.rows)
     facts = {"title": title, "units": study.units, "rows": study.rows, "scan": study.scan}
     (directory / "kernels.json").write_text(json_text(facts), encoding="utf-8")
-    fronts = _save(directory / "fronts.png", draw_fronts, study)
-    maps = _save(directory / "map.png", draw_maps, study) if study.scan else None
+    fronts = {
+        "error against time": _save(directory / "error_time.png", draw_times, study),
+        "error against stored numbers": _save(directory / "error_size.png", draw_sizes, study),
+    }
+    maps = {}
+    if study.scan:
+        for key in ("error", "condition"):
+            name = f"{key} over the shape parameter"
+            maps[name] = _save(directory / f"map_{key}.png", partial(draw_map, key=key), study)
     missing, drawn = None, None
     if pictures:
         try:
@@ -110,8 +118,8 @@ def write_study(
             missing = error
     page = PAGE.format(
         title=html.escape(title), style=STYLE, **_advice(study),
-        units=f" in {study.units}" if study.units else "", fronts=_inline(fronts),
-        maps=_figure("Error and condition over the shape parameter", maps),
+        units=f" in {study.units}" if study.units else "", fronts=_beside(fronts),
+        maps=f"<h2>Error and condition over the shape parameter</h2>{_beside(maps)}" if maps else "",
         pictures=_figure("Where it errs", drawn, SIGNED) + _worst(study), moved=_motion(moved or [], study.units),
         head="".join(f"<th>{html.escape(name)}</th>" for name in COLUMNS.values()),
         body="".join(_row(row) for row in study.rows if not row["unfit"]),
@@ -159,11 +167,17 @@ def _inline(data):
     return f"data:image/png;base64,{base64.b64encode(data).decode()}"
 
 
+def _beside(plots):
+    """Plots beside each other where the page is wide enough, below each other where not."""
+    each = (f'<figure><img alt="{name}" src="{_inline(data)}"></figure>' for name, data in plots.items())
+    return f'<div class="plots">{"".join(each)}</div>'
+
+
 def _figure(title, data, words=""):
     if data is None:
         return ""
     note = f'<p class="note">{words}</p>' if words else ""
-    return f'<h2>{title}</h2>{note}<figure><img alt="{title}" src="{_inline(data)}"></figure>'
+    return f'<h2>{title}</h2>{note}<figure class="big"><img alt="{title}" src="{_inline(data)}"></figure>'
 
 
 def _length(value, unit):
