@@ -29,9 +29,11 @@ from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import SPAN, spacing, surface_miss
 from rbfmuscle.study.experiment import kernel_study
 from rbfmuscle.study.experiment.kernel_choice import mark_unfit
-from rbfmuscle.study.experiment.kernel_judge import SurfaceJudge
+from rbfmuscle.study.experiment.kernel_judge import BOX, SurfaceJudge
 from rbfmuscle.study.experiment.workers import threads_limited
 
+# The judge has the cells of the command: with 64 the chords of a rod err by twice what the field does, inwards, so that
+# a field which bulges seems better.
 SCANNED, LIMIT = 40, 1.05
 KEYS = ("surface", "centres", "placement", "kernel")
 HIP = ("gluteus_maximus", "gluteus_medius", "iliacus", "adductor_brevis")
@@ -87,14 +89,19 @@ def brute_force(judge, sample, kernel, derivatives):
 def both_ways(judge, sample, fitted):
     """Error as `fill_row` measures it, infinite where the field is unfit."""
     try:
-        found = extract_surface(
-            fitted, points=sample.points, resolution=judge.resolution, search="box", keep="largest"
-        )
+        whole = extract_surface(fitted, points=sample.points, resolution=BOX, search="box", keep="largest")
+        if (
+            whole.components + whole.spurious > judge.sheets
+        ):  # long ones fall into pieces between coarse nodes
+            whole = extract_surface(
+                fitted, points=sample.points, resolution=judge.resolution, search="box", keep="largest"
+            )
+        found = extract_surface(fitted, points=sample.points, resolution=judge.resolution)
     except ValueError:
         return np.inf
     rms, *_ = judge.apart(found.vertices, found.faces)
-    row = {"kernel": fitted.kernel.name, "centres": 0, "rms": rms, "components": found.components,
-           "spurious": found.spurious, "note": "", "volume_error": found.volume / judge.volume - 1.0,
+    row = {"kernel": fitted.kernel.name, "centres": 0, "rms": rms, "components": whole.components,
+           "spurious": whole.spurious, "note": "", "volume_error": found.volume / judge.volume - 1.0,
            "condition": fitted.condition}  # fmt: skip
     mark_unfit([row], sheets=judge.sheets)
     return np.inf if row["unfit"] else rms
@@ -187,7 +194,7 @@ def main():
         map(int, options.centres.split(",")), options.placements.split(","), options.kernels.split(",")
     )
     cases = in_rounds(list(groups), list(shapes), options.shuffle)
-    judges = functools.cache(lambda name: SurfaceJudge(*shapes[name], 64, 0))
+    judges = functools.cache(lambda name: SurfaceJudge(*shapes[name], 0, 0))
     samples = functools.cache(lambda name, count: sample_surface(*shapes[name], count, placement="greedy"))
     for count, placement, kernel, name in cases:
         if (name, count, placement, kernel) in known or time.monotonic() > until:
