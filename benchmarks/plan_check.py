@@ -79,7 +79,7 @@ def built(path, model, settings):
     """What a run does before its first frame, part by part."""
     from rbfmuscle.models import build_models
     from rbfmuscle.recording import _bones_driven_together, check_initial
-    from rbfmuscle.study.measure.metrics import MetricsRecorder
+    from rbfmuscle.study.measure.metrics import MuscleMeasures
 
     scene, clock = load(path, model, settings), [time.perf_counter()]
 
@@ -88,7 +88,7 @@ def built(path, model, settings):
         return found
 
     models = tick(build_models(scene))
-    tick(MetricsRecorder(scene, {made.name: made.carried_mesh() for made in models}))
+    tick(MuscleMeasures(scene, {made.name: made.carried_mesh() for made in models}))
     tick((check_initial(scene), _bones_driven_together(scene)))
     return dict(zip(("build", "lines", "checks"), np.diff(clock).tolist(), strict=True))
 

@@ -1,7 +1,7 @@
 """Model name -> model, loaded on demand: the only file that names both models."""
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 from rbfmuscle.sim.loop.frame import MuscleModel
@@ -80,15 +80,16 @@ def estimate_model(muscle: Muscle, scene: Scene, rates: Mapping[str, float]) -> 
     return cost.scaled(**scales()["models"][muscle.model])
 
 
-def build_models(scene: Scene) -> list[MuscleModel]:
-    """Return the models of all muscles of a scene, in their order, built side by side."""
+def build_models(scene: Scene, names: Collection[str] | None = None) -> list[MuscleModel]:
+    """Return the models of a scene's muscles, all or those named, in the scene's order, built side by side."""
     from rbfmuscle.sim.loop.workers import Workers
 
-    workers = Workers(len(scene.muscles))
+    muscles = [muscle for muscle in scene.muscles if names is None or muscle.name in names]
+    workers = Workers(len(muscles))
     try:
         # BLAS under threads of ours would spin for cores that they hold.
         with workers.all_threads():
-            return workers.each(lambda muscle: build_model(muscle, scene), scene.muscles)
+            return workers.each(lambda muscle: build_model(muscle, scene), muscles)
     finally:
         workers.close()
 

@@ -5,20 +5,20 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 
 from rbfmuscle.compiled.warm import compile_ahead
 from rbfmuscle.compiled.watch import compiled_so_far, tell_stage
-from rbfmuscle.models import build_models
+from rbfmuscle.sharing.crew import Crew, helpers_for
+from rbfmuscle.sharing.share import Share
 from rbfmuscle.sim.loop.frame import Event, Frame
-from rbfmuscle.sim.loop.simulate import simulate_frames
 from rbfmuscle.sim.scene.check import bone_collisions, bone_findings, check_initial
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.study.files.runinfo import Clock, Stages, build_info, frame_facts
 from rbfmuscle.study.files.sinks import Sink
-from rbfmuscle.study.measure.metrics import MetricsRecorder
 from rbfmuscle.study.measure.quantities import Row
+from rbfmuscle.study.measure.recorder import MetricsRecorder
 from rbfmuscle.study.measure.summary import LIMITS, Summary, default_limit
 from rbfmuscle.validation import RBFMuscleError, SceneWarning, SolveError
 
@@ -34,9 +34,18 @@ class Recording:
         What the caller asked for, for ``run.json``.
     resumable : bool
         Give the sink what `go_on` needs, frame by frame.
+    models_here : bool
+        Build the models in this process, for who wants to watch them, however many they are.
     """
 
-    def __init__(self, scene: Scene, *, options: dict | None = None, resumable: bool = False) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        options: dict | None = None,
+        resumable: bool = False,
+        models_here: bool = True,
+    ) -> None:
         self.started, self._start = datetime.now(UTC), time.perf_counter()
         self.scene = scene.validate()
         self.options = options or {}
@@ -45,16 +54,28 @@ class Recording:
         self.status, self.message = "running", ""
         self.summary, self.stages = Summary(), Stages()
         self.written: list[dict] = []
-        self.resumable, self._behind = resumable, None
+        self.resumable, self._behind, self._measures = resumable, None, None
+        self._place = {muscle.name: k for k, muscle in enumerate(scene.muscles)}
         with self.timed("compile"):
             compile_ahead({muscle.model for muscle in scene.muscles})
         with self.timed("build"), tell_stage("building"):
+            self.recorder = MetricsRecorder(scene) if scene.output.metrics else None
+            self.share, self._driven = self._build(0 if models_here else helpers_for(scene))
+
+    def _build(self, helpers):
+        """All muscles, here or in helpers' hands, and the events of bones; a scene that is refused ends the helpers."""
+        if helpers < 2:
             check_initial(self.scene)
-            self.models = build_models(scene)
-            carried = {m.name: m.carried_mesh() for m in self.models}
-            self.recorder = MetricsRecorder(scene, carried) if scene.output.metrics else None
-            self.fibres = _fibre_study(scene, carried) if scene.output.fibres else None
-            self._driven = _bones_driven_together(scene)
+            return Share(self.scene, resumable=self.resumable), _bones_driven_together(self.scene)
+        crew = Crew(self.scene, helpers, resumable=self.resumable)
+        try:
+            check_initial(self.scene)
+            driven = _bones_driven_together(self.scene)
+            crew.built()
+        except BaseException:
+            crew.close()
+            raise
+        return crew, driven
 
     @contextmanager
     def timed(self, part: str) -> Iterator[None]:
@@ -73,6 +94,7 @@ class Recording:
             self.times[part] = self.times.get(part, 0.0) + seconds
         self.stages.go_on(state["stages"])
         self.summary.add(rows)
+        self._measures = state["measures"]
         if self.recorder is not None:
             self.recorder.go_on(state["recorder"])
 
@@ -81,8 +103,9 @@ class Recording:
         return {
             "loop": frame.state,
             "written": self.written,
-            "times": {**self.times, "wall": time.perf_counter() - self._start},
+            "times": {**self._spent(), "wall": time.perf_counter() - self._start},
             "stages": self.stages.state(),
+            "measures": self._measures,
             "recorder": None if self.recorder is None else self.recorder.state(),
         }
 
@@ -98,10 +121,10 @@ class Recording:
         try:
             sink.write_info(self.info("running"))
             if watch is not None:
-                watch(self.models, None)
+                watch(self.share.models, None)
             for frame, rows in self.frames():
                 if watch is not None:
-                    watch(self.models, frame)
+                    watch(self.share.models, frame)
                 with self.timed("write"):
                     sink.write(frame, rows)
                     self.written.append(frame_facts(self.scene, frame))
@@ -114,6 +137,7 @@ class Recording:
             self.status, self.message = "failed", str(error)
             raise
         finally:
+            self.close()
             rows = self.recorder.finish() if self.recorder is not None else []
             self.summary.add(rows)
             # What ended the run says more than a disk that then refuses the rest.
@@ -121,41 +145,39 @@ class Recording:
                 sink.close(rows)
                 sink.write_info(self.info())
 
+    def close(self) -> None:
+        """End what helps; nothing more can be solved."""
+        self.share.close()
+
     def frames(self) -> Iterator[tuple[Frame, list[Row]]]:
         """The frames as they are solved, each with the rows of metrics that became complete with it."""
-        wanted = bool(self.scene.output.surfaces) or self.recorder is not None
-        frames = simulate_frames(
-            self.scene, self.models, surfaces=wanted, resumable=self.resumable, start=self._behind
-        )
-        while True:
-            with (
-                self.timed("simulate"),
-                nullcontext() if self.written else tell_stage("solving the first frame"),
-            ):
-                frame = next(frames, None)
-            if frame is None:
-                return
+        for frame, measured, measures in self.share.frames(self._behind, self._measures):
+            # By muscle, whoever solved it.
+            frame.events.sort(key=lambda event: self._place[event.muscle])
             frame.events.extend(self._driven.get(frame.index, []))
             self.stages.add(frame)
-            if self.fibres is not None:
-                with self.timed("fibres"):
-                    frame.fibres = self.fibres.at(frame)
-            rows = []
+            self._measures, rows = measures, []
             if self.recorder is not None:
-                with self.timed("metrics"):
-                    rows = self.recorder.add(frame)
-                    self.summary.add(rows)
+                rows = self.recorder.add(frame, measured)
+                self.summary.add(rows)
             yield frame, rows
+
+    def _spent(self):
+        """Wall time of all parts so far [s]."""
+        times = dict(self.times)
+        for part, seconds in self.share.times.items():
+            times[part] = times.get(part, 0.0) + seconds
+        return times
 
     def info(self, status: str | None = None) -> dict:
         """What ``run.json`` holds by now."""
         self.times["wall"] = time.perf_counter() - self._start
-        found = compiled_so_far()
-        compiled = {name: found[name] - self._compiled[name] for name in found}
+        found, there = compiled_so_far(), self.share.compiled
+        compiled = {name: found[name] - self._compiled[name] + there[name] for name in found}
         return build_info(
             self.scene,
             ending=(status or self.status, self.message),
-            clock=Clock(self.started, dict(self.times), self.stages, compiled),
+            clock=Clock(self.started, self._spent(), self.stages, compiled),
             frames=self.written,
             summary=self.summary.table(),
             limits={name: default_limit(name, self.scene) for name in LIMITS},
@@ -167,16 +189,10 @@ def _bones_driven_together(scene):
     """Events by frame, for some frames of the motion, and a warning for each pair of bones."""
     collisions = bone_collisions(scene)
     for finding in bone_findings(collisions, scene.units):
-        warnings.warn(f"{finding.place}: {finding.message}", SceneWarning, stacklevel=4)
+        warnings.warn(f"{finding.place}: {finding.message}", SceneWarning, stacklevel=5)
     for note in scene.motion.notes:
-        warnings.warn(f"motion: {note}", SceneWarning, stacklevel=4)
+        warnings.warn(f"motion: {note}", SceneWarning, stacklevel=5)
     events = {}
     for frame, first, second, _ in collisions:
         events.setdefault(frame, []).append(Event(frame, "", f"{first} and {second}", 1, "bones_overlap"))
     return events
-
-
-def _fibre_study(scene, carried):
-    from rbfmuscle.study.measure.fibre_study import FibreStudy
-
-    return FibreStudy(scene, carried)

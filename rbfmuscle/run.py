@@ -4,6 +4,7 @@ Both are one run, a generator of frames, and differ in the sink that takes them.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -69,7 +70,8 @@ def simulate(
         with Progress(scene.name) as shown:
             return simulate(scene, model, settings=settings, frames=frames, progress=shown)
     scene = configure_scene(scene, settings, model=model, frames=frames)
-    recording, memory = Recording(scene, options=_asked(model, settings, frames)), MemorySink()
+    options = _asked(model, settings, frames)
+    recording, memory = Recording(scene, options=options, models_here=False), MemorySink()
     run = Run(recording, memory)
     try:
         recording.feed(memory, progress=progress or None)
@@ -134,11 +136,14 @@ def stream_run(
     if kept is not None and kept.state is None:
         require_limits(kept.info["muscles"], limits)
         return kept.info
-    recording = Recording(scene, options=_asked(model, settings, frames), resumable=True)
-    writer = RunWriter(directory, scene, kept and kept.state["files"])
-    if kept is not None:
-        recording.go_on(kept.state, kept.rows)
-    recording.feed(writer, progress=progress, watch=watch)
+    recording = Recording(
+        scene, options=_asked(model, settings, frames), resumable=True, models_here=watch is not None
+    )
+    with closing(recording):
+        writer = RunWriter(directory, scene, kept and kept.state["files"])
+        if kept is not None:
+            recording.go_on(kept.state, kept.rows)
+        recording.feed(writer, progress=progress, watch=watch)
     return _finish(recording, writer, limits, pictures)
 
 

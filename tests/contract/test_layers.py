@@ -28,7 +28,8 @@ ALLOWED = {
     ),
     "rbfmuscle.model": (*LEAVES, "rbfmuscle.implicit", "rbfmuscle.sim", "rbfmuscle.model"),
     "pbd_baseline": (*LEAVES, "rbfmuscle.sim", "pbd_baseline"),
-    "rbfmuscle.recording": (*ABOVE, "rbfmuscle.models"),
+    "rbfmuscle.sharing": (*ABOVE, "rbfmuscle.models", "rbfmuscle.sharing"),
+    "rbfmuscle.recording": (*ABOVE, "rbfmuscle.sharing"),
     "rbfmuscle.run": (*ABOVE, "rbfmuscle.models", "rbfmuscle.recording"),
     "rbfmuscle.compare": (*ABOVE, "rbfmuscle.models", "rbfmuscle.run"),
     "rbfmuscle.commands": (

@@ -62,7 +62,7 @@ def test_without_surfaces_and_metrics_nothing_is_extracted_or_measured(monkeypat
         raise AssertionError("called")
 
     monkeypatch.setattr(BlendMuscle, "drawing", refuse)
-    monkeypatch.setattr("rbfmuscle.recording.MetricsRecorder", refuse)
+    monkeypatch.setattr("rbfmuscle.sharing.share.MuscleMeasures", refuse)
     run = simulate(arm_scene(surfaces=False, metrics=False))
     assert len(run.frames) == 3 and run.metrics == []
 
@@ -84,7 +84,7 @@ def test_run_without_pictures_loads_no_vtk(tmp_path):
         "import rbfmuscle.models as models, rbfmuscle.run as r\n"
         "models.build_model = BlendMuscle\n"
         "run = r.simulate(arm_scene())\n"
-        "assert type(run._recording.models[0]) is BlendMuscle\n"
+        "assert type(run._recording.share.models[0]) is BlendMuscle\n"
         f"run.save({str(tmp_path)!r}, pictures=False)\n"
         "print([m for m in sys.modules if m.split('.')[0] in ('vtk', 'vtkmodules', 'pyvista', 'matplotlib')])"
     )

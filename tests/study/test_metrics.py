@@ -14,7 +14,7 @@ from rbfmuscle.sim.loop.simulate import Event, Frame, ModelSurface
 from rbfmuscle.sim.scene.motion import Motion
 from rbfmuscle.study.measure.centreline import Centreline, MuscleAtRest, slice_operator, split_ends
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
-from rbfmuscle.study.measure.metrics import MetricsRecorder, edge_strain, moment_arms, surface_distance
+from rbfmuscle.study.measure.metrics import MuscleMeasures, edge_strain, surface_distance
 from rbfmuscle.study.measure.occupancy import OccupancyGrid
 from rbfmuscle.study.measure.penetration import (
     BoneProbe,
@@ -22,6 +22,7 @@ from rbfmuscle.study.measure.penetration import (
     bones_about,
     surface_depth,
 )
+from rbfmuscle.study.measure.recorder import MetricsRecorder, moment_arms
 from rbfmuscle.study.measure.topology import SurfaceForm, count_components
 
 EYE = np.eye(4)
@@ -386,8 +387,12 @@ class TestRecorder:
         return Frame(index, {"joint.bend": angle}, poses, {"rod": surface}, carried, events, times, 3.0)
 
     def rows(self, scene):
-        recorder = MetricsRecorder(scene, {"rod": arrays(scene.muscles[0].mesh)})
-        return [row for k in range(3) for row in recorder.add(self.frame(scene, k))] + recorder.finish()
+        measures, recorder = (
+            MuscleMeasures(scene, {"rod": arrays(scene.muscles[0].mesh)}),
+            MetricsRecorder(scene),
+        )
+        frames = [self.frame(scene, k) for k in range(3)]
+        return [row for f in frames for row in recorder.add(f, measures.measure(f))] + recorder.finish()
 
     def test_values_units_and_order(self, scene):
         rows = self.rows(scene)
@@ -411,7 +416,7 @@ class TestRecorder:
         assert [(r.frame, r.value) for r in rows] == [(0, 0.0), (0, 0.0)]
 
     def test_rigid_motion_changes_nothing(self, scene):
-        recorder = MetricsRecorder(scene, {"rod": arrays(scene.muscles[0].mesh)})
+        measures = MuscleMeasures(scene, {"rod": arrays(scene.muscles[0].mesh)})
         move = turned(1.1, (1, -2, 0.5), (3, 1, 4))
         move[:3, 3] += [1000, -2000, 500]
         frame = self.frame(scene, 0)
@@ -420,8 +425,6 @@ class TestRecorder:
         vertices = trimesh.transform_points(frame.surfaces["rod"].vertices, move)
         moved.surfaces = {"rod": ModelSurface(vertices, frame.surfaces["rod"].faces, {})}
         moved.carried = {"rod": (vertices, frame.carried["rod"][1])}
-        tracker = recorder.trackers["rod"]
-        before = tracker.measure(frame, recorder.probes, False)
-        after = tracker.measure(moved, recorder.probes, False)
+        before, after = (measures.measure(each)["rod"].values for each in (frame, moved))
         for name in ("volume", "penetration_max", "penetration_fraction", "length", "components"):
             assert after[name] == pytest.approx(before[name], rel=1e-8)

@@ -370,12 +370,19 @@ def simulate_frames(
 
 
 def _obstacles(scene, models, fields):
-    """One BoneContacts for each model, with fields of the bones that it can reach."""
+    """One BoneContacts for each model, with fields of the bones that it can reach.
+
+    A field is built for all muscles of the scene that can reach its bone, also for those that are not here: so it is
+    the same wherever a muscle is simulated.
+    """
     regions = reached_bones(scene) if fields is None else None
-    built = build_fields(scene, regions) if fields is None else fields
+    here = {model.name for model in models}
+    if regions is not None:
+        met = {bone for muscle, bone in regions if muscle in here}
+        fields = build_fields(scene, {pair: box for pair, box in regions.items() if pair[1] in met})
     names, margin = [bone.name for bone in scene.bones], scene.contact.margin
     for model in models:
-        reached = [built.get(n) if regions is None or (model.name, n) in regions else None for n in names]
+        reached = [fields.get(n) if regions is None or (model.name, n) in regions else None for n in names]
         yield BoneContacts(names, reached, contact_bone=model.contact_bone, margin=margin)
 
 

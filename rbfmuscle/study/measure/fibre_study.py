@@ -92,20 +92,22 @@ class FibreBundle:
 
 
 class FibreStudy:
-    """Fibres of every muscle of a scene, frame by frame.
+    """Fibres of a scene's muscles, frame by frame.
 
     Parameters
     ----------
     scene : Scene
         Its ``output.fibres`` says how many.
     carried : dict of str to (vertices, faces)
-        Each model's carried mesh at rest, before the motion.
+        Carried meshes at rest, before the motion, of the models that are studied here.
     """
 
     def __init__(self, scene: Scene, carried: dict[str, Any]) -> None:
         options: Any = scene.output.fibres
         moving, self.bundles = moving_joints(scene), {}
         for muscle in scene.muscles:
+            if muscle.name not in carried:
+                continue
             vertices, faces = carried[muscle.name]
             rest = MuscleAtRest(muscle, scene.joints, vertices, faces, moving)
             self.bundles[muscle.name] = FibreBundle(rest, count=options.count, segments=options.segments)

@@ -1,0 +1,1 @@
+"""The muscles of a run, dealt out to processes where they are many."""

@@ -1,0 +1,221 @@
+"""A run's muscles on several processes: a share of them in each, put together frame by frame.
+
+Two threads of one interpreter hand its lock to and fro and get 1.2 to 1.4 times of one thread done (docs/speed.md); two
+processes get nearly twice as much done. They are started by command, not forked or spawned by Python's own means, so
+that a script needs no guard of its main part and no thread is cut in two.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import pickle
+import queue
+import subprocess
+import sys
+import threading
+import warnings
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numba
+
+from rbfmuscle.sharing.share import Solved
+from rbfmuscle.sim.loop.frame import Frame
+from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.validation import SolveError
+
+# A process more takes about two seconds to begin and 0.2 GB: fewer muscles, or fewer muscles times frames, are
+# quicker in one.
+LEAST_MUSCLES, LEAST_WORK = 5, 400
+MOST_HELPERS = 4
+# Frames that a helper may be ahead of what is written: memory is bounded, and nobody waits for the disk.
+AHEAD = 2
+
+
+def helpers_for(scene: Scene) -> int:
+    """How many processes a run is worth; fewer than two: none but one's own.
+
+    Muscles that slide on each other see each other at every sub-step, and stay together.
+    """
+    count = len(scene.muscles)
+    if scene.sliding is not None or count * len(scene.motion.frames) < LEAST_WORK:
+        return 0
+    return min(numba.get_num_threads(), count // LEAST_MUSCLES, MOST_HELPERS)
+
+
+class Crew:
+    """Stands in for a `Share` of all muscles: same frames, to the last digit.
+
+    Parameters
+    ----------
+    scene : Scene
+    helpers : int
+        At least two.
+    resumable : bool
+        As for `Share`.
+
+    Attributes
+    ----------
+    times : dict of str to float
+        Wall time spent so far [s], of the helper that spent most: ``simulate``, ``metrics``, ``fibres``.
+    compiled : dict of str to float
+        Loops that helpers compiled, and the processor time they took.
+    """
+
+    def __init__(self, scene: Scene, helpers: int, *, resumable: bool = False) -> None:
+        self.scene = scene
+        threads = max(1, numba.get_num_threads() // helpers)
+        self._told: set[str] = set()
+        self._helpers = [
+            _Helper((scene, names, resumable), threads)
+            for names in _dealt([m.name for m in scene.muscles], helpers)
+        ]
+
+    @property
+    def times(self) -> dict[str, float]:
+        """See the class."""
+        every = [helper.clock.get("times", {}) for helper in self._helpers]
+        return {part: max(times.get(part, 0.0) for times in every) for part in {p for t in every for p in t}}
+
+    @property
+    def compiled(self) -> dict[str, float]:
+        """See the class."""
+        every = [helper.clock.get("compiled", {}) for helper in self._helpers]
+        return {name: sum(found.get(name, 0.0) for found in every) for name in ("loops", "seconds")}
+
+    def built(self) -> None:
+        """Wait until all muscles are built, or raise what went wrong."""
+        for helper in self._helpers:
+            self._next(helper)
+
+    def frames(
+        self, start: Mapping[str, Any] | None = None, measures: Mapping[str, Any] | None = None
+    ) -> Iterator[Solved]:
+        """As of a `Share`."""
+        for helper in self._helpers:
+            helper.begin(start, measures)
+        while True:
+            parts = [self._next(helper) for helper in self._helpers]
+            if any(part is None for part in parts):
+                return
+            yield _joined(parts, [muscle.name for muscle in self.scene.muscles])
+
+    def close(self) -> None:
+        """End the helpers, whatever they are at."""
+        for helper in self._helpers:
+            helper.close()
+
+    def _next(self, helper):
+        """What a helper has to give; what it has to say on the way is said here."""
+        while True:
+            kind, what = helper.inbox.get()
+            if kind == "done":
+                return what
+            if kind == "failed":
+                raise what
+            if kind == "gone":
+                raise SolveError(
+                    f"a helper process was ended{what}; memory may have run out: with NUMBA_NUM_THREADS=1 set, one "
+                    "process does it all"
+                )
+            if str(what) in self._told:
+                continue
+            self._told.add(str(what))
+            if kind == "warned":
+                warnings.warn(what, stacklevel=3)
+            else:
+                logging.getLogger(what[0]).log(*what[1:])
+
+
+class _Helper:
+    """One process, seen from here: its messages are taken by a thread, so that it need not wait for ours."""
+
+    def __init__(self, job: Any, threads: int) -> None:
+        # Nothing that lies in the present folder shall take the place of a module.
+        command = [sys.executable, "-P", "-m", "rbfmuscle.sharing.helper"]
+        places = [str(Path(__file__).resolve().parents[2]), *(p for p in sys.path if p)]
+        counts = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+        environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(places),
+            **dict.fromkeys(counts, str(threads)),
+        }
+        # A group of its own: an interrupt is for this process, which ends the helper.
+        self.process = subprocess.Popen(
+            command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, process_group=0
+        )
+        self.inbox: queue.Queue[tuple[str, Any]] = queue.Queue(AHEAD)
+        self.clock: dict[str, Any] = {}
+        self._closed = False
+        self._thread = threading.Thread(target=self._listen, args=(job,), daemon=True)
+        self._thread.start()
+
+    def begin(self, start: Any, measures: Any) -> None:
+        """Let it go through the motion."""
+        with contextlib.suppress(OSError):  # it is gone: the inbox says so
+            self._send((start, measures))
+
+    def close(self) -> None:
+        """End it."""
+        self._closed = True
+        self.process.kill()
+        self.process.wait()
+        self._thread.join()
+        for pipe in (self.process.stdin, self.process.stdout):
+            with contextlib.suppress(OSError):
+                pipe.close()
+
+    def _send(self, what):
+        pickle.dump(what, self.process.stdin, protocol=pickle.HIGHEST_PROTOCOL)
+        self.process.stdin.flush()
+
+    def _listen(self, job):
+        try:
+            self._send(job)
+            while True:
+                kind, what, self.clock = pickle.load(self.process.stdout)
+                self._put(kind, what)
+        except (OSError, EOFError, pickle.UnpicklingError):
+            code = self.process.wait()
+            self._put("gone", f" by signal {-code}" if code < 0 else f" (exit code {code})")
+
+    def _put(self, kind, what):
+        while not self._closed:
+            with contextlib.suppress(queue.Full):
+                self.inbox.put((kind, what), timeout=0.1)
+                return
+
+
+def _dealt(names, hands):
+    """Muscles in turn: neighbours in a scene's list are often alike in size."""
+    return [names[k::hands] for k in range(hands)]
+
+
+def _joined(parts, order):
+    """One frame of several, with all muscles in the scene's order."""
+
+    def joined(dicts):
+        found = {name: value for each in dicts for name, value in each.items()}
+        return {name: found.pop(name) for name in order if name in found} | found
+
+    first, frames = parts[0].frame, [part.frame for part in parts]
+    frame = Frame(
+        first.index,
+        first.coordinates,
+        first.poses,
+        joined(f.surfaces for f in frames),
+        joined(f.carried for f in frames),
+        [event for f in frames for event in f.events],
+        joined(f.times for f in frames),
+        max(f.wall for f in frames),
+        activations=first.activations,
+        **{part: joined(getattr(f, part) for f in frames) for part in ("fibres", "nudged", "work")},
+    )
+    if first.state:
+        for key, value in first.state.items():
+            same = key in ("index", "here", "activations")
+            frame.state[key] = value if same else joined(f.state[key] for f in frames)
+    return Solved(frame, joined(p.measured for p in parts), joined(p.measures for p in parts))

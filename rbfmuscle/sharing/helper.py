@@ -1,0 +1,88 @@
+"""The life of a process that takes a share of a run's muscles: ``python -m rbfmuscle.sharing.helper``, by `Crew` alone.
+
+It is given a scene and the names of its muscles on standard input, and gives pairs of a kind and what it is about on
+standard output, each with its clock. It ends with the process that started it.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import pickle
+import queue
+import sys
+import threading
+import traceback
+import warnings
+from typing import Any
+
+from rbfmuscle.validation import RBFMuscleError
+
+
+class _Outbox:
+    """Standard output, for messages alone: what else is printed goes to standard error."""
+
+    def __init__(self) -> None:
+        self.file = os.fdopen(os.dup(1), "wb")
+        os.dup2(2, 1)
+        self.clock: Any = dict
+        self._lock = threading.Lock()
+
+    def put(self, kind: str, what: Any) -> None:
+        """Give a message, whole."""
+        text = pickle.dumps((kind, what, self.clock()), protocol=pickle.HIGHEST_PROTOCOL)
+        with self._lock:
+            self.file.write(text)
+            self.file.flush()
+
+
+class _Forward(logging.Handler):
+    """What the library logs is said where the run was asked for."""
+
+    def __init__(self, outbox: _Outbox) -> None:
+        super().__init__()
+        self.outbox = outbox
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send one record."""
+        self.outbox.put("logged", (record.name, record.levelno, record.getMessage()))
+
+
+def main() -> None:
+    """Build, wait for the word, go through the motion."""
+    outbox, inbox = _Outbox(), sys.stdin.buffer
+    scene, names, resumable = pickle.load(inbox)
+    warnings.simplefilter("always")
+    warnings.showwarning = lambda message, *_: outbox.put("warned", message)
+    logging.getLogger("rbfmuscle").addHandler(_Forward(outbox))
+    try:
+        _work(outbox, inbox, scene, names, resumable)
+    except RBFMuscleError as error:
+        outbox.put("failed", error)
+    except Exception:  # noqa: BLE001 - whatever it is, it is told where the run was asked for
+        outbox.put("failed", RuntimeError(traceback.format_exc()))
+
+
+def _work(outbox, inbox, scene, names, resumable):
+    from rbfmuscle.compiled.watch import compiled_so_far
+    from rbfmuscle.sharing.share import Share
+
+    share = Share(scene, names, resumable=resumable)
+    outbox.clock = lambda: {"times": dict(share.times), "compiled": compiled_so_far()}
+    outbox.put("done", None)
+    words: queue.Queue[Any] = queue.Queue()
+    threading.Thread(target=_listen, args=(inbox, words), daemon=True).start()
+    for solved in share.frames(*words.get()):
+        outbox.put("done", solved)
+    outbox.put("done", None)
+
+
+def _listen(inbox, words):
+    """Pass the word on; when there is nobody left to give another, end at once."""
+    words.put(pickle.load(inbox))
+    inbox.read()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,132 @@
+"""Muscles of a scene that one process builds, brings through the motion and measures."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+from rbfmuscle.compiled.watch import tell_stage
+from rbfmuscle.models import build_models
+from rbfmuscle.sim.loop.frame import Frame
+from rbfmuscle.sim.loop.simulate import simulate_frames
+from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.study.measure.metrics import Measured, MuscleMeasures
+
+
+class Solved(NamedTuple):
+    """A frame of some muscles, or of all.
+
+    Attributes
+    ----------
+    frame : Frame
+    measured : dict of str to Measured
+        By muscle; empty where metrics are not asked for.
+    measures : dict
+        What a `Share` that goes on behind this frame needs beside the frame's own state; empty where that is.
+    """
+
+    frame: Frame
+    measured: dict[str, Measured]
+    measures: dict[str, Any]
+
+
+class Share:
+    """Some muscles of a scene, or all.
+
+    Parameters
+    ----------
+    scene : Scene
+        Whole: what does not belong to a muscle is the same in every share.
+    names : collection of str, optional
+        Of the muscles; all where not given.
+    resumable : bool
+        Give each frame the state that a share needs to go on behind it.
+
+    Attributes
+    ----------
+    models : list of MuscleModel
+    times : dict of str to float
+        Wall time spent so far [s]: ``simulate``, ``metrics``, ``fibres``.
+    compiled : dict of str to float
+        What other processes compiled for it: nothing.
+
+    Raises
+    ------
+    SceneError, MeshError
+        If a muscle cannot be built.
+    """
+
+    def __init__(
+        self, scene: Scene, names: Collection[str] | None = None, *, resumable: bool = False
+    ) -> None:
+        self.scene, self.resumable = scene, resumable
+        self.times: dict[str, float] = {}
+        self.compiled = {"loops": 0.0, "seconds": 0.0}
+        self.models = build_models(scene, names)
+        carried = {model.name: model.carried_mesh() for model in self.models}
+        self._measures = MuscleMeasures(scene, carried) if scene.output.metrics else None
+        self._fibres = _fibre_study(scene, carried) if scene.output.fibres else None
+
+    def frames(
+        self, start: Mapping[str, Any] | None = None, measures: Mapping[str, Any] | None = None
+    ) -> Iterator[Solved]:
+        """The frames as they are solved and measured.
+
+        Parameters
+        ----------
+        start : mapping, optional
+            The state of the frame to go on behind.
+        measures : mapping, optional
+            What came with it in its `Solved`.
+
+        Raises
+        ------
+        SolveError
+            If a muscle cannot be solved, naming muscle, frame and coordinates.
+        """
+        if measures and self._measures is not None:
+            self._measures.go_on(measures)
+        wanted = bool(self.scene.output.surfaces) or self._measures is not None
+        frames = simulate_frames(
+            self.scene, self.models, surfaces=wanted, resumable=self.resumable, start=start
+        )
+        first = start is None
+        while True:
+            with self._timed("simulate"):
+                frame = _first(frames) if first else next(frames, None)
+            first = False
+            if frame is None:
+                return
+            if self._fibres is not None:
+                with self._timed("fibres"):
+                    frame.fibres = self._fibres.at(frame)
+            measured: dict[str, Measured] = {}
+            if self._measures is not None:
+                with self._timed("metrics"):
+                    measured = self._measures.measure(frame)
+            keep = self.resumable and self._measures is not None
+            yield Solved(frame, measured, self._measures.state() if keep else {})
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    @contextmanager
+    def _timed(self, part):
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.times[part] = self.times.get(part, 0.0) + time.perf_counter() - start
+
+
+def _first(frames):
+    with tell_stage("solving the first frame"):
+        return next(frames, None)
+
+
+def _fibre_study(scene, carried):
+    from rbfmuscle.study.measure.fibre_study import FibreStudy
+
+    return FibreStudy(scene, carried)
