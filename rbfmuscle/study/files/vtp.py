@@ -100,13 +100,15 @@ def _array(values, name, ascii, *, components=1):
         rows = values.reshape(-1, 3) if values.size % 3 == 0 else values.reshape(-1, 1)
         text = "\n".join(" ".join(map(repr, row)) for row in rows.tolist())
     else:
-        text = _compressed(values.astype(values.dtype.newbyteorder("<"), copy=False).tobytes())
+        # Digits of positions are as good as random: zlib would take forty times as long to save 7 %.
+        level = 0 if values.dtype.kind == "f" else 1
+        text = _compressed(values.astype(values.dtype.newbyteorder("<"), copy=False).tobytes(), level)
     return f"{head}{text}\n</DataArray>\n"
 
 
-def _compressed(data):
+def _compressed(data, level):
     """VTK's inline form: a header of block sizes, then the zlib blocks, each part in base64."""
-    blocks = [zlib.compress(data[start : start + _BLOCK], 1) for start in range(0, len(data), _BLOCK)]
+    blocks = [zlib.compress(data[start : start + _BLOCK], level) for start in range(0, len(data), _BLOCK)]
     last = len(data) % _BLOCK
     header = np.array([len(blocks), _BLOCK, last, *map(len, blocks)], dtype="<u4")
     return (base64.b64encode(header.tobytes()) + base64.b64encode(b"".join(blocks))).decode("ascii")
