@@ -7,7 +7,7 @@ import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components
 
 from rbfmuscle.geometry.arrays import Integers
-from rbfmuscle.geometry.crossing import crossing_faces
+from rbfmuscle.geometry.crossing import FaceTree, crossing_faces
 
 if TYPE_CHECKING:
     from rbfmuscle.sim.loop.frame import ModelSurface
@@ -42,7 +42,7 @@ def euler_characteristic(faces: np.ndarray) -> int:
     return len(np.unique(faces)) - len(edges) + len(faces)
 
 
-def self_crossing(vertices: np.ndarray, faces: np.ndarray) -> Crossings:
+def self_crossing(vertices: np.ndarray, faces: np.ndarray, tree: FaceTree | None = None) -> Crossings:
     """Triangles that cross others of the same surface, as `rbfmuscle.geometry.crossing.crossing_faces` sees them.
 
     Parameters
@@ -50,9 +50,11 @@ def self_crossing(vertices: np.ndarray, faces: np.ndarray) -> Crossings:
     vertices : (n, 3) ndarray
         [scene unit]
     faces : (m, 3) ndarray of int
+    tree : FaceTree, optional
+        Of these faces, from whatever moment, where it is at hand.
     """
-    marked = crossing_faces(vertices, faces)
-    a, b, c = np.moveaxis(np.asarray(vertices)[faces], 1, 0)
+    marked = crossing_faces(vertices, faces) if tree is None else tree.crossing(vertices)
+    a, b, c = (np.asarray(vertices)[faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     share = area[marked].sum() / max(area.sum(), np.finfo(float).tiny)
     return Crossings(int(marked.sum()), float(share))
@@ -75,6 +77,7 @@ class SurfaceForm:
     def __init__(self) -> None:
         self._drawn: ModelSurface | None = None
         self._faces: np.ndarray | None = None
+        self._tree: FaceTree | None = None
         self._pieces: dict[str, float] = {}
         self._crossings: dict[str, float] = {}
 
@@ -82,13 +85,14 @@ class SurfaceForm:
         """``components``, ``euler``, ``self_crossing`` and ``self_crossing_area``."""
         faces = np.asarray(surface.faces)
         if self._faces is None or not (self._faces is faces or np.array_equal(self._faces, faces)):
+            self._tree = FaceTree(surface.vertices, faces)
             self._pieces = {
                 "components": count_components(len(surface.vertices), faces),
                 "euler": euler_characteristic(faces),
             }
         drawn = surface.origin[0] if surface.origin is not None else surface
         if self._drawn is not drawn:
-            found = self_crossing(surface.vertices, faces)
+            found = self_crossing(surface.vertices, faces, self._tree)
             self._crossings = {"self_crossing": found.count, "self_crossing_area": found.area}
         self._faces, self._drawn = faces, drawn
         return {**self._pieces, **self._crossings}
