@@ -5,10 +5,16 @@
 Processor time of frames with surfaces, one thread, each number of muscles in turn within every round, so that whatever
 else the machine does meets all of them alike; muscles are taken in an order in which every beginning has the area of
 the whole on average. The exponent is the slope of log time over log number. With ``--hip`` the four muscles of
-``data/hip`` are measured in the same rounds. ``--threads`` measures wall time of all muscles on one and on two threads.
+``data/hip`` are measured in the same rounds. ``--threads`` measures wall time of all muscles on one and on two threads
+of one process, ``--processes`` of a run (frames solved, drawn and measured) in one process with one thread and in one
+process a core, each in turn in an interpreter of its own.
 """
 
 import argparse
+import json
+import os
+import subprocess
+import sys
 import time
 
 import numba
@@ -74,8 +80,12 @@ def main():
     parser.add_argument("--counts", default="1,4,10,20,38")
     parser.add_argument("--hip", action="store_true")
     parser.add_argument("--threads", action="store_true")
+    parser.add_argument("--processes", action="store_true")
     arguments = parser.parse_args()
     folder = leg_folder().parent
+    if arguments.processes:
+        _processes(folder / "leg" / "squat.toml", arguments)
+        return
     scene, models, fields = loaded(folder / "leg" / "squat.toml", arguments.model)
     order = evenly_mixed(scene)
     tracks = {
@@ -100,6 +110,59 @@ def main():
     print(f"exponent {slope:.3f}")
     if arguments.hip:
         print(f"squat beside the hip's four muscles: {medians[counts[-1]] / medians['hip']:.2f} times")
+
+
+def run_frames(path, frames):
+    """Wall and processor time of a run's frames behind the first, all processes together [s]."""
+    from rbfmuscle.recording import Recording
+    from rbfmuscle.run import configure_scene
+
+    class Clock:
+        """A sink that keeps the moments at which frames came."""
+
+        def __init__(self):
+            self.moments = []
+
+        def write(self, frame, rows=()):
+            self.moments.append(time.perf_counter())
+
+        def keep(self, state):
+            pass
+
+        def close(self, rows=()):
+            pass
+
+        def write_info(self, info):
+            pass
+
+    clock = Clock()
+    Recording(
+        configure_scene(Scene.load(path), frames=f"0:{frames}"), resumable=True, models_here=False
+    ).feed(clock)
+    spent = os.times()
+    return clock.moments[-1] - clock.moments[0], sum(spent[:4])
+
+
+def _processes(path, arguments):
+    code = (
+        f"import json, leg_scale; print(json.dumps(leg_scale.run_frames({str(path)!r}, {arguments.frames})))"
+    )
+    cores, found = str(len(os.sched_getaffinity(0))), {}
+    for _ in range(arguments.rounds):
+        for threads in ("1", cores):
+            child = subprocess.run(
+                [sys.executable, "-W", "ignore", "-c", code],
+                env={**os.environ, "NUMBA_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": "1"},
+                cwd=os.path.dirname(os.path.abspath(__file__)), capture_output=True, text=True, check=True,
+            )  # fmt: skip
+            found.setdefault(threads, []).append(json.loads(child.stdout))
+            wall, processor = found[threads][-1]
+            print(
+                f"{threads} process(es): {wall:.1f} s for the frames behind the first, processor {processor:.1f} in all"
+            )
+    one, all_cores = (np.median(found[threads], axis=0) for threads in ("1", cores))
+    wall, processor = all_cores / one
+    print(f"{cores} against 1: {wall:.2f} of the wall time, {processor:.2f} of the processor time")
 
 
 def _with_names(parts):

@@ -82,9 +82,8 @@ def flip_edges(vertices: Floats, faces: Integers) -> Integers:
     if not bad:
         return faces
     normals, count = vertex_normals(vertices, faces), len(vertices)
-    beside = {
-        int(a) * count + int(b): f for f, row in enumerate(faces) for a, b in zip(row, np.roll(row, -1))
-    }
+    sides = faces.astype(np.int64) * count + np.roll(faces, -1, axis=1)
+    beside = {side: f for f, row in enumerate(sides.tolist()) for side in row}
     changed = faces.copy()
     done: set[int] = set()
     for f in bad:

@@ -1,0 +1,220 @@
+"""Muscles dealt out to processes: what comes together is what one process finds, whatever ends the run."""
+
+import logging
+import os
+import pickle
+import queue
+import signal
+import subprocess
+import sys
+import warnings
+from types import SimpleNamespace
+
+import numba
+import numpy as np
+import pytest
+import trimesh
+from blend_model import files_in
+from run_folders import timeless
+
+from rbfmuscle import recording
+from rbfmuscle.run import simulate, stream_run
+from rbfmuscle.sharing import crew as sharing
+from rbfmuscle.sharing.crew import Crew, helpers_for
+from rbfmuscle.sharing.share import Share
+from rbfmuscle.sim.scene.motion import Motion
+from rbfmuscle.sim.scene.phantom import phantom_scene
+from rbfmuscle.study.files import writer as writing
+from rbfmuscle.study.files.saved import SavedRun
+from rbfmuscle.validation import SceneWarning, SolveError
+
+
+@pytest.fixture
+def two_helpers(monkeypatch):
+    monkeypatch.setattr(recording, "helpers_for", lambda scene: 2)
+
+
+@pytest.fixture
+def crews(monkeypatch):
+    """The crews that a test starts."""
+    made = []
+
+    class Watched(Crew):
+        def __init__(self, *given, **options):
+            super().__init__(*given, **options)
+            made.append(self)
+
+    monkeypatch.setattr(recording, "Crew", Watched)
+    return made
+
+
+def small_scene(mixed=0, **settings):
+    """The phantom's four muscles through four frames; fields for the first so many, meshes for the others."""
+    scene = phantom_scene(spacing=6.0)
+    scene.motion = Motion([{"hip.flexion": np.radians(angle)} for angle in (0.0, 6.0, 12.0, 9.0)])
+    for muscle in scene.muscles[mixed:]:
+        muscle.model = "pbd"
+    for muscle in scene.muscles[:mixed]:
+        muscle.options.update(centres=80, samples=300, resolution=16)
+    return scene.with_options({"output.report": False, "output.preview": False, **settings})
+
+
+def assert_same_folders(one, other):
+    assert files_in(one) == files_in(other)
+    for name in files_in(one):
+        assert timeless(one / name) == timeless(other / name), name
+
+
+def ended(crew):
+    return all(helper.process.poll() is not None for helper in crew._helpers)
+
+
+def test_folder_is_that_of_one_process_to_the_last_byte(tmp_path, two_helpers, crews, monkeypatch):
+    fibres = {"count": 4, "segments": 3}
+    scene = small_scene(1, **{"output.moment_arms": True, "output.fibres": fibres})
+    stream_run(scene, tmp_path / "several", pictures=False)
+    assert len(crews) == 1 and ended(crews[0])
+    monkeypatch.setattr(recording, "helpers_for", lambda scene: 0)
+    stream_run(scene, tmp_path / "one", pictures=False)
+    assert len(crews) == 1
+    assert_same_folders(tmp_path / "several", tmp_path / "one")
+    assert SavedRun(tmp_path / "several").muscles == [muscle.name for muscle in scene.muscles]
+
+
+def test_run_begun_by_several_is_ended_by_one_and_the_other_way_round(tmp_path, monkeypatch):
+    monkeypatch.setattr(writing, "KEEPING_SHARE", np.inf)
+    scene = small_scene()
+
+    def until(frames):
+        def stop(done, total):
+            if done == frames:
+                raise KeyboardInterrupt
+
+        return stop
+
+    stream_run(scene, tmp_path / "whole", pictures=False)
+    for first, then in ((2, 0), (0, 2)):
+        folder = tmp_path / str(first)
+        monkeypatch.setattr(recording, "helpers_for", lambda scene, first=first: first)
+        with pytest.raises(KeyboardInterrupt):
+            stream_run(scene, folder, pictures=False, progress=until(2))
+        assert SavedRun(folder).frames == [0, 1]
+        monkeypatch.setattr(recording, "helpers_for", lambda scene, then=then: then)
+        stream_run(scene, folder, pictures=False, resume=True)
+        assert_same_folders(tmp_path / "whole", folder)
+
+
+def test_frames_in_memory_have_all_muscles_in_the_scenes_order(two_helpers, crews):
+    scene = small_scene()
+    run = simulate(scene)
+    names = [muscle.name for muscle in scene.muscles]
+    assert len(crews) == 1 and len(run.frames) == 4
+    for frame in run.frames:
+        for found in (frame.surfaces, frame.carried, frame.times, frame.work):
+            assert list(found) == names
+    assert [r.muscle for r in run.metrics if r.frame == 1 and r.quantity == "length"] == names
+    alone = Share(scene, names[1:2])
+    for frame, solved in zip(run.frames, alone.frames()):
+        surface = solved.frame.surfaces[names[1]]
+        np.testing.assert_array_equal(surface.vertices, frame.surfaces[names[1]].vertices)
+
+
+def test_what_cannot_be_built_is_told_as_by_one_process(two_helpers, crews):
+    scene = small_scene(**{"output.fibres": {"count": 4, "segments": 3}})
+    muscle = scene.muscles[0]
+    apart = trimesh.util.concatenate([muscle.mesh, muscle.mesh.copy().apply_translation([400, 0, 0])])
+    muscle.mesh, half = apart, len(muscle.mesh.vertices)
+    muscle.attachments[1].vertices = muscle.attachments[1].vertices + half
+    with pytest.raises(SolveError, match="no way leads"):
+        simulate(scene)
+    assert ended(crews[0])
+
+
+def test_helper_that_is_killed_ends_the_run_with_the_frames_so_far(tmp_path, two_helpers, crews):
+    def kill(done, total):
+        if done == 1:
+            os.kill(crews[0]._helpers[1].process.pid, signal.SIGKILL)
+            crews[0]._helpers[1].process.wait()
+
+    with pytest.raises(
+        SolveError, match=r"helper process was ended by signal 9; memory.*NUMBA_NUM_THREADS=1"
+    ):
+        stream_run(small_scene(), tmp_path, pictures=False, progress=kill)
+    saved = SavedRun(tmp_path)
+    assert saved.info["status"] == "failed" and saved.frames and ended(crews[0])
+    assert {row.muscle for row in saved.metrics if row.frame == 0} >= set(saved.muscles)
+
+
+def test_folder_that_cannot_be_written_leaves_no_helper(tmp_path, two_helpers, crews):
+    (tmp_path / "taken").write_text("a file")
+    with pytest.raises(ValueError, match="cannot write"):
+        stream_run(small_scene(), tmp_path / "taken", pictures=False)
+    assert ended(crews[0])
+
+
+def test_helper_ends_with_the_process_that_started_it():
+    """Nobody is left to say a word: its standard input is closed."""
+    scene = small_scene()
+    helper = subprocess.Popen(
+        [sys.executable, "-m", "rbfmuscle.sharing.helper"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    pickle.dump((scene, [scene.muscles[0].name], False), helper.stdin)
+    pickle.dump((None, None), helper.stdin)
+    helper.stdin.close()
+    helper.stdout.read()
+    assert helper.wait(timeout=120) == 0
+    helper.stdout.close()
+
+
+class TestHelpersFor:
+    @pytest.fixture(autouse=True)
+    def four_cores(self, monkeypatch):
+        monkeypatch.setattr(numba, "get_num_threads", lambda: 4)
+
+    def scene(self, muscles, frames, sliding=None):
+        return SimpleNamespace(
+            muscles=range(muscles), motion=SimpleNamespace(frames=range(frames)), sliding=sliding
+        )
+
+    def test_one_process_where_another_costs_more_than_it_brings(self):
+        assert helpers_for(self.scene(4, 1000)) < 2
+        assert helpers_for(self.scene(38, 5)) < 2
+        assert helpers_for(phantom_scene()) < 2
+
+    def test_no_more_than_cores_or_muscles_feed(self, monkeypatch):
+        assert helpers_for(self.scene(38, 37)) == 4
+        assert helpers_for(self.scene(12, 100)) == 2
+        monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
+        assert helpers_for(self.scene(38, 37)) == 2
+        monkeypatch.setattr(numba, "get_num_threads", lambda: 1)
+        assert helpers_for(self.scene(38, 37)) < 2
+
+    def test_muscles_that_slide_stay_together(self):
+        assert helpers_for(self.scene(38, 37, sliding=object())) < 2
+
+
+def test_what_helpers_say_is_said_once(caplog):
+    def helper(*messages):
+        inbox = queue.Queue()
+        for message in messages:
+            inbox.put(message)
+        return SimpleNamespace(inbox=inbox)
+
+    crew = Crew.__new__(Crew)
+    crew._told = set()
+    warning, line = SceneWarning("bones meet"), ("rbfmuscle.bones", logging.WARNING, "bone: is open")
+    one = helper(("warned", warning), ("logged", line), ("done", 1))
+    other = helper(("logged", line), ("warned", SceneWarning("bones meet")), ("done", 2))
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        assert [crew._next(one), crew._next(other)] == [1, 2]
+    assert [str(w.message) for w in heard] == ["bones meet"]
+    assert [record.getMessage() for record in caplog.records] == ["bone: is open"]
+
+
+def test_muscles_are_dealt_whole():
+    names = [f"muscle_{k}" for k in range(11)]
+    for hands in (2, 3, 4):
+        dealt = sharing._dealt(names, hands)
+        assert sorted(name for share in dealt for name in share) == sorted(names)
+        assert max(map(len, dealt)) - min(map(len, dealt)) <= 1
