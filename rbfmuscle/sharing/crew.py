@@ -166,7 +166,8 @@ class _Helper:
         self._thread.join()
         for pipe in (self.process.stdin, self.process.stdout):
             with contextlib.suppress(OSError):
-                pipe.close()
+                if pipe is not None:
+                    pipe.close()
 
     def _send(self, what):
         pickle.dump(what, self.process.stdin, protocol=pickle.HIGHEST_PROTOCOL)

@@ -14,6 +14,7 @@ import sys
 import threading
 import traceback
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 from rbfmuscle.validation import RBFMuscleError
@@ -25,7 +26,7 @@ class _Outbox:
     def __init__(self) -> None:
         self.file = os.fdopen(os.dup(1), "wb")
         os.dup2(2, 1)
-        self.clock: Any = dict
+        self.clock: Callable[[], dict[str, Any]] = dict
         self._lock = threading.Lock()
 
     def put(self, kind: str, what: Any) -> None:
@@ -70,7 +71,7 @@ def _work(outbox, inbox, scene, names, resumable):
     share = Share(scene, names, resumable=resumable)
     outbox.clock = lambda: {"times": dict(share.times), "compiled": compiled_so_far()}
     outbox.put("done", None)
-    words: queue.Queue[Any] = queue.Queue()
+    words = queue.Queue()
     threading.Thread(target=_listen, args=(inbox, words), daemon=True).start()
     for solved in share.frames(*words.get()):
         outbox.put("done", solved)

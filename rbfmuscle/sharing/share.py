@@ -103,11 +103,12 @@ class Share:
                 with self._timed("fibres"):
                     frame.fibres = self._fibres.at(frame)
             measured: dict[str, Measured] = {}
+            known: dict[str, Any] = {}
             if self._measures is not None:
                 with self._timed("metrics"):
                     measured = self._measures.measure(frame)
-            keep = self.resumable and self._measures is not None
-            yield Solved(frame, measured, self._measures.state() if keep else {})
+                    known = self._measures.state() if self.resumable else {}
+            yield Solved(frame, measured, known)
 
     def close(self) -> None:
         """Nothing is held."""
