@@ -32,7 +32,7 @@ from rbfmuscle.validation import SolveError
 LEAST_MUSCLES, LEAST_WORK = 5, 400
 MOST_HELPERS = 4
 # Frames that a helper may be ahead of what is written: memory is bounded, and nobody waits for the disk.
-AHEAD = 2
+AHEAD = 1
 
 
 def helpers_for(scene: Scene) -> int:
