@@ -6,9 +6,10 @@
 ``pairs`` runs ``data/leg/squat.toml`` with ``[sliding]`` through its whole motion and measures the shown surfaces of
 the chosen frames by exact distances, which the solver does not use: how deep a vertex of one muscle lies in another,
 and for vertices nearer than the threshold at rest how much farther they are now (RMS by pair). Both are listed by pair,
-the worst first. ``--without`` measures the same run without sliding. ``cost`` compares processor time of a frame with
-surfaces, one thread, with and without sliding in turn; ``order`` solves with the file's order of muscles and with its
-reverse, and compares the surfaces.
+the worst first. What two bones hold on both sides is counted apart: where a vertex and what it meets of the other
+muscle both belong to attachments, the bones decide how far they come apart or into each other. ``--without`` measures
+the same run without sliding. ``cost`` compares processor time of a frame with surfaces, one thread, with and without
+sliding in turn; ``order`` solves with the file's order of muscles and with its reverse, and compares the surfaces.
 """
 
 import argparse
@@ -18,6 +19,7 @@ import time
 import numba
 import numpy as np
 from leg_joints import leg_folder
+from scipy.spatial import cKDTree
 
 from rbfmuscle.models import build_models
 from rbfmuscle.sim.loop.simulate import FrameLoop
@@ -67,37 +69,71 @@ def chosen(text, count):
 
 
 class Touching:
-    """Vertices of the surfaces at rest that touch another muscle, by ordered pair of names."""
+    """Vertices of the surfaces at rest that touch another muscle, by ordered pair of names.
 
-    def __init__(self, surfaces):
-        self.found = {}
+    Parameters
+    ----------
+    surfaces : dict of str to (vertices, faces)
+        At rest.
+    held : dict of str to (n,) ndarray of bool
+        Vertices that attachments hold.
+    """
+
+    def __init__(self, surfaces, held):
+        self.held, self.found = held, {}
         for one, other in itertools.permutations(surfaces, 2):
             near = _near(surfaces[one], surfaces[other], THRESHOLD)
             if len(near):
                 distance = MeshDistance(*surfaces[other]).signed(surfaces[one][0][near])
                 touch = distance < THRESHOLD
                 if touch.any():
-                    self.found[one, other] = near[touch], np.maximum(distance[touch], 0.0)
+                    both = self.both(one, other, surfaces, near[touch])
+                    self.found[one, other] = near[touch], np.maximum(distance[touch], 0.0), both
+
+    def both(self, one, other, surfaces, index):
+        """Which vertices of one muscle are held, as is what lies nearest to them of the other."""
+        nearest = cKDTree(surfaces[other][0]).query(surfaces[one][0][index])[1]
+        return self.held[one][index] & self.held[other][nearest]
 
     def opened(self, surfaces):
-        """RMS of how much farther these are, by pair of sorted names."""
-        squares = {}
-        for (one, other), (index, rest) in self.found.items():
+        """RMS of how much farther these are, by pair of sorted names, and the same of those held on both sides."""
+        free, held = {}, {}
+        for (one, other), (index, rest, both) in self.found.items():
             now = MeshDistance(*surfaces[other]).signed(surfaces[one][0][index])
+            square = np.maximum(now - rest, 0.0) ** 2
             pair = tuple(sorted((one, other)))
-            squares.setdefault(pair, []).append(np.maximum(now - rest, 0.0) ** 2)
-        return {pair: float(np.sqrt(np.concatenate(all_).mean())) for pair, all_ in squares.items()}
+            free.setdefault(pair, []).append(square[~both])
+            held.setdefault(pair, []).append(square[both])
+        return tuple(_rms_by_pair(squares) for squares in (free, held))
+
+    def overlaps(self, surfaces):
+        """Deepest vertex of one in the other, by pair of sorted names, and the deepest held on both sides."""
+        free, held = {}, {}
+        for one, other in itertools.permutations(surfaces, 2):
+            near = _near(surfaces[one], surfaces[other], 0.0)
+            if len(near):
+                depth = MeshDistance(*surfaces[other]).depth(surfaces[one][0][near])
+                near, depth = near[depth > 0.0], depth[depth > 0.0]
+                both = self.both(one, other, surfaces, near)
+                pair = tuple(sorted((one, other)))
+                for found, deep in ((free, depth[~both]), (held, depth[both])):
+                    found[pair] = max(float(deep.max(initial=0.0)), found.get(pair, 0.0))
+        return free, held
 
 
-def overlaps(surfaces):
-    """Deepest vertex of one in the other, by pair of sorted names; those that meet."""
+def _rms_by_pair(squares):
+    joined = {pair: np.concatenate(parts) for pair, parts in squares.items()}
+    return {pair: float(np.sqrt(part.mean())) if len(part) else 0.0 for pair, part in joined.items()}
+
+
+def held_vertices(scene, surfaces):
+    """Vertices (n,) of each surface at rest whose nearest vertex of the input mesh belongs to an attachment."""
     found = {}
-    for one, other in itertools.permutations(surfaces, 2):
-        near = _near(surfaces[one], surfaces[other], 0.0)
-        if len(near):
-            depth = float(MeshDistance(*surfaces[other]).depth(surfaces[one][0][near]).max(initial=0.0))
-            pair = tuple(sorted((one, other)))
-            found[pair] = max(depth, found.get(pair, 0.0))
+    for muscle in scene.muscles:
+        patch = np.zeros(len(muscle.mesh.vertices), dtype=bool)
+        for attachment in muscle.attachments:
+            patch[np.asarray(attachment.vertices)] = True
+        found[muscle.name] = patch[cKDTree(muscle.mesh.vertices).query(surfaces[muscle.name][0])[1]]
     return found
 
 
@@ -120,22 +156,29 @@ def pairs(bench, arguments):
                 continue
             frame = loop.advance(coordinates)
             surfaces = _surfaces(frame)
-            touching = touching or Touching(surfaces)
-            deep, opened = overlaps(surfaces), touching.opened(surfaces)
-            for place, found in ((0, deep), (2, opened)):
-                for pair, value in found.items():
-                    row = worst.setdefault(pair, [0.0, 0, 0.0, 0])
-                    if value > row[place]:
-                        row[place : place + 2] = value, k
-            _tell_frame(k, frame, deep, opened)
+            touching = touching or Touching(surfaces, held_vertices(bench.scenes[True], surfaces))
+            # Overlap, gap; the same of what is held on both sides.
+            found = [
+                one for pair in zip(touching.overlaps(surfaces), touching.opened(surfaces)) for one in pair
+            ]
+            for place, values in enumerate(found):
+                for pair, value in values.items():
+                    row = worst.setdefault(pair, [(0.0, 0)] * 4)
+                    row[place] = max(row[place], (value, k))
+            _tell_frame(k, frame, found[:2])
     print(f"{len(touching.found) // 2} pairs touch at rest, {len(worst)} pairs meet")
-    print(f"{'pair':60} overlap at  opened at")
-    for pair, (deep, at, wide, there) in sorted(
-        worst.items(), key=lambda row: -max(row[1][0] / 0.3, row[1][2])
+    for name, places in (("muscle against muscle", (0, 1)), ("held by bones on both sides", (2, 3))):
+        _tell_pairs(name, {pair: [row[k] for k in places] for pair, row in worst.items()})
+
+
+def _tell_pairs(name, worst):
+    print(f"{name:60} overlap at  opened at")
+    for pair, ((deep, at), (wide, there)) in sorted(
+        worst.items(), key=lambda row: -max(row[1][0][0] / 0.3, row[1][1][0])
     ):
-        if deep > 0.01 or wide > 0.1:
+        if deep > 0.1 or wide > 0.3:
             print(f"{' and '.join(pair):60} {deep:7.3f} {at:2d} {wide:7.3f} {there:2d}")
-    deep, wide = (np.array([row[k] for row in worst.values()]) for k in (0, 2))
+    deep, wide = (np.array([row[k][0] for row in worst.values()]) for k in range(2))
     print(f"overlap: {(deep > 0.3).sum()} of {len(deep)} pairs beyond 0.3 mm, worst {deep.max():.3f}")
     print(
         f"opened: {(wide > 1.0).sum()} of {len(wide)} pairs beyond 1 mm RMS, worst {wide.max():.3f}",
@@ -143,13 +186,14 @@ def pairs(bench, arguments):
     )
 
 
-def _tell_frame(k, frame, deep, opened):
+def _tell_frame(k, frame, values):
     lost = sum(event.count for event in frame.events if event.action in ("unresolved", "reported"))
     print(f"frame {k:2d}: unresolved {lost}", end="")
-    for found, name in ((deep, "overlap"), (opened, "opened")):
+    for found, name in zip(values, ("overlap", "opened")):
         listed = sorted(found, key=found.get)[:-4:-1]
         print(f"; {name} " + ", ".join(f"{found[p]:.2f} ({' + '.join(p)})" for p in listed), end="")
-    print(flush=True)
+    told = sorted({(e.muscle, e.action) for e in frame.events if e.action != "angle_flag"})
+    print(f"; events {', '.join(' '.join(one) for one in told)}" if told else "", flush=True)
 
 
 def cost(bench, arguments):

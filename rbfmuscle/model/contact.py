@@ -61,7 +61,7 @@ def _deepest(lacking, is_chosen, tolerance, most):
 
 
 @compiled(error_model="numpy")
-def _gram_loop(index, normal, row, stiffness, influence, columns, shares):
+def _gram_loop(index, normal, give, row, stiffness, influence, columns, shares):
     """(n_c · n_d) w_cᵀ A⁻¹ w_d - row_c row_d / stiffness: motion at c for a unit force at d, volume kept."""
     size = len(index)
     gram = np.empty((size, size))
@@ -71,6 +71,8 @@ def _gram_loop(index, normal, row, stiffness, influence, columns, shares):
             for k in range(columns.shape[1]):
                 value += shares[index[c], k] * influence[index[d], columns[index[c], k]]
             value *= normal[c, 0] * normal[d, 0] + normal[c, 1] * normal[d, 1] + normal[c, 2] * normal[d, 2]
+            if c == d:
+                value *= 1.0 + give[c]
             value -= row[c] * row[d] / stiffness
             gram[c, d] = value
             gram[d, c] = value
@@ -113,7 +115,7 @@ def _lacking_loop(contacts, need, share, push, hanging, lacking):
 @compiled(error_model="numpy", nogil=False)
 def _contact_loop(spaces, motion, volume, influence, hanging, table, effort, push):
     """Fill ``push`` and the forces in ``table``; returns the volume's share that the push takes back."""
-    index, gap, normal, source = spaces
+    index, gap, normal, source, give = spaces
     response, stiffness = volume
     columns, shares = hanging
     batch, rounds, sweeps, tolerance = effort
@@ -139,7 +141,9 @@ def _contact_loop(spaces, motion, volume, influence, hanging, table, effort, pus
         for c in added:
             is_chosen[c] = True
         chosen = np.concatenate((chosen, added))
-        gram = _gram_loop(index[chosen], normal[chosen], row[chosen], stiffness, influence, columns, shares)
+        gram = _gram_loop(
+            index[chosen], normal[chosen], give[chosen], row[chosen], stiffness, influence, columns, shares
+        )
         strength = force[chosen]
         solve_contact_forces(gram, need[chosen], strength, sweeps, 0.1 * tolerance)
         for k in range(len(chosen)):
@@ -213,7 +217,8 @@ class ContactConstraint:
         if self.forces.shape[1] != sources:
             self.forces = np.zeros((len(self.influence), sources))
         push = np.empty((self.influence.shape[1], 3))
-        contacts = spaces.index, spaces.gap, spaces.normal, spaces.source % sources
+        give = np.zeros(len(spaces)) if spaces.give is None else spaces.give
+        contacts = spaces.index, spaces.gap, spaces.normal, spaces.source % sources, give
         effort = self.batch, ROUNDS, SWEEPS, self.tolerance
         lost = _contact_loop(
             contacts, motion, (response, stiffness), self.influence, (self.columns, self.shares),

@@ -120,6 +120,34 @@ def test_contact_that_nothing_violates_moves_nothing(system):
     assert not motion.any() and not table.any()
 
 
+def test_a_contact_that_gives_way_moves_its_point_by_less(system):
+    """By 1 / (1 + give) of its gap, as the force alone would move the point by the rest."""
+    s = system.spaces
+    for give in (0.0, 0.5, 3.0):
+        one = HalfSpaces(s.index[:1], np.array([-0.4]), s.normal[:1], s.source[:1], np.array([give]))
+        system.motion[:] = 0.0
+        # A muscle without a volume to keep.
+        push, _ = system.constraint().correction(one, 2, system.motion, np.zeros((POINTS, 3)), 1.0)
+        assert system.gaps(push, one)[0] == pytest.approx(-0.4 * give / (1.0 + give), abs=1e-8)
+
+
+def test_contacts_that_no_place_allows_push_no_harder_than_they_give_way(system):
+    """One point between two half-spaces that overlap: rigid, their forces grow without end."""
+    system.motion[:] = 0.0
+    normal = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    point, gap, source = np.zeros(2, dtype=np.int64), np.full(2, -0.5), np.arange(2)
+    reaction = (system.weights @ system.inverse @ system.weights.T)[0, 0]
+    forces = []
+    for give in (0.0, 0.1):
+        between = HalfSpaces(point, gap, normal, source, np.full(2, give))
+        constraint = system.constraint()
+        push, _ = constraint.correction(between, 2, system.motion, np.zeros((POINTS, 3)), 1.0)
+        forces.append(constraint.forces.max())
+    assert np.abs(push).max() < 1e-6
+    assert forces[1] == pytest.approx(0.5 / (0.1 * reaction), rel=1e-5)
+    assert forces[0] > 5.0 * forces[1]
+
+
 def test_the_deepest_of_many_join_first(system):
     """With one round's batch for all that is violated, and with one at a time, nothing is left over."""
     deep = HalfSpaces(

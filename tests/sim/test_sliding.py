@@ -6,9 +6,9 @@ import pytest
 import trimesh
 from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, joint, muscle, scene, sphere
 
-from rbfmuscle.sim.loop.carried_surface import CarriedSurface
+from rbfmuscle.sim.loop.carried_surface import CarriedSurface, inner_radii
 from rbfmuscle.sim.loop.simulate import FrameLoop, simulate_frames
-from rbfmuscle.sim.loop.sliding import sliding_pairs
+from rbfmuscle.sim.loop.sliding import MOST, sliding_pairs
 from rbfmuscle.sim.loop.substeps import SubSteps
 from rbfmuscle.sim.scene.motion import rotation_about
 from rbfmuscle.sim.scene.options import SlidingOptions
@@ -71,6 +71,48 @@ def test_surface_far_away_or_empty_answers_nothing():
         assert len(surface.query(points, np.ones(len(points), dtype=bool), 3.0)[0]) == 0
 
 
+def test_side_and_distance_around_a_sharp_rim_are_those_of_the_mesh():
+    """Beside the rim of a lens the normals of its two sides disagree."""
+    lens = trimesh.creation.icosphere(subdivisions=3, radius=10.0)
+    lens.apply_scale((1.0, 1.0, 0.25))
+    surface = CarriedSurface(_Mesh(lens), reach=4.0)
+    rng = np.random.default_rng(3)
+    angle, away = rng.uniform(0, 2 * np.pi, 600), rng.uniform(9.0, 13.0, 600)
+    points = np.column_stack([away * np.cos(angle), away * np.sin(angle), rng.uniform(-3, 3, 600)])
+    index, distance, normal, _ = surface.query(points, np.ones(600, dtype=bool), 4.0)
+    exact, _, foot, _ = igl.signed_distance(points[index], lens.vertices, lens.faces)
+    assert len(index) > 500 and (exact < 0.0).any()
+    assert np.array_equal(distance < 0.0, exact < 0.0)
+    # The nearest point is looked for around the nearest vertex, which on long triangles may be another's.
+    assert np.allclose(distance, exact, atol=0.2)
+    way = (points[index] - foot) * np.sign(exact)[:, None]
+    far = exact > 1.0
+    assert (np.einsum("ij,ij->i", normal[far], way[far]) > 0.0).all()
+
+
+def test_a_folded_triangle_makes_no_point_outside_deep():
+    model = _ball()
+    surface = CarriedSurface(model, reach=6.0)
+    corner = int(model.vertices[:, 0].argmax())
+    model.vertices = model.vertices.copy()
+    # A vertex that was driven out through the rim it belongs to: its triangles are turned inside out.
+    model.vertices[corner] = (10.0, 3.0 * surface.edge, 0.0)
+    surface.refresh()
+    points = np.array([12.0, 0, 0]) + np.random.default_rng(2).normal(scale=2.0, size=(300, 3))
+    points = points[np.linalg.norm(points, axis=1) > 10.6]
+    _, distance, _, _ = surface.query(points, np.ones(len(points), dtype=bool), 6.0)
+    assert distance.min() > -0.5 * surface.edge
+
+
+def test_balls_inside_a_surface_are_as_great_as_it_is_thick():
+    ball = _ball(10.0).vertices
+    assert np.allclose(inner_radii(ball, ball / 10.0, 50.0), 10.0, rtol=1e-9)
+    assert np.allclose(inner_radii(ball, ball / 10.0, 4.0), 4.0)
+    # Two sheets 3 apart, each vertex above another.
+    grid = np.stack(np.meshgrid(*[np.arange(-8.0, 9.0)] * 2, [-1.5, 1.5]), axis=-1).reshape(-1, 3)
+    assert np.allclose(inner_radii(grid, np.sign(grid) * (0, 0, 1), 50.0), 1.5)
+
+
 def _neighbours(angles, gap=1.0, *, sliding, order=(0, 1), belly=4.0):
     """Two long muscles side by side; one end of the upper hangs on an arm that turns it into the lower."""
     fields = {"trunk": sphere(1.0, (0, 0, -60)), "arm": box((1, 1, 1), (60, 0, -40))}
@@ -118,6 +160,20 @@ def test_pressed_muscles_do_not_overlap():
     frames, parts = _run(PRESS, SlidingOptions())
     assert _overlap(parts) < 0.1
     assert "time_sliding" in frames[-1].times["upper"]
+
+
+def test_planes_ask_for_little_in_one_sub_step_however_deep_the_overlap():
+    made, fields = _neighbours(PRESS, gap=-3.0, sliding=SlidingOptions())
+    parts = {m.name: ToyMuscle(m, made, sweeps=4, reach=2.0) for m in made.muscles}
+    with FrameLoop(made, parts, fields=fields) as loop:
+        assert _overlap(parts) > 2.5
+        for links in loop._sliding.links.values():
+            for link in links:
+                link.update()
+                assert link.push.gap.min() == -MOST
+        for coordinates in made.motion.frames[::-1]:
+            loop.advance(coordinates)
+    assert _overlap(parts) < 0.1
 
 
 def test_each_muscle_takes_its_own_sub_steps_and_all_meet_at_the_frame():
@@ -180,7 +236,8 @@ def test_what_is_pulled_away_hard_is_let_go():
     frames, parts = _run(lift, SlidingOptions(release=0.01, strip=0.1))
     _, alone = _run(lift, None)
     _, held = _run(lift, SlidingOptions(release=50.0, strip=0.1))
-    assert frames[-1].surfaces["upper"].quantities["sliding_gap_max"] < 2.2
+    # Linked points were nearer than 2.11 where they were predicted; settling moves them by some tenths.
+    assert frames[-1].surfaces["upper"].quantities["sliding_gap_max"] < 2.7
     away = [np.sqrt(np.square(one["upper"].x - alone["upper"].x).sum(axis=1).mean()) for one in (parts, held)]
     # Those near the hinge, which move little, stay linked.
     assert away[0] < 0.7 * away[1]

@@ -16,6 +16,14 @@ if TYPE_CHECKING:
     from rbfmuscle.sim.loop.frame import MuscleModel
 
 
+# A muscle may come to be so many times as thick as at rest.
+DEEPER = 1.5
+# Least cosine between a surface's normal and the way to a point for which the normal counts as its direction.
+RIM = 0.7
+# Mean edges below which a point counts as deep only where the mesh winds around it.
+FOLDED = 0.3
+
+
 class Cells(NamedTuple):
     """Vertices sorted by the cells of a grid: its box, edge and shape; those of cell c are
     members[first[c] : first[c + 1]].
@@ -43,7 +51,8 @@ class CarriedSurface:
 
     The nearest vertex is found through a uniform grid of cells as wide as the reach; the nearest point of the
     surface lies in one of the triangles around it, up to the square of an edge over the radius of curvature.
-    Signs and directions come from vertex normals, interpolated, so that they vary smoothly.
+    Directions come from vertex normals, interpolated, so that they vary smoothly, or where these are at odds with it,
+    as around a rim, from the way to the point; the side from the triangles that meet where the nearest point lies.
 
     Parameters
     ----------
@@ -57,6 +66,8 @@ class CarriedSurface:
     vertices : (n, 3) ndarray
     fixed : (n,) ndarray of bool
         Vertices that a bone holds.
+    deepest : (n,) ndarray
+        How deep a point whose nearest vertex is this one may be.
     box, reach_box : (2, 3) ndarray
         About the surface, and about the model's contact points.
     field : Field or None
@@ -74,6 +85,9 @@ class CarriedSurface:
         sides = vertices[self.faces] - vertices[np.roll(self.faces, 1, axis=1)]
         self.edge = float(np.linalg.norm(sides, axis=2).mean())
         self.cell = float(reach) + self.edge
+        self.deepest = (
+            DEEPER * inner_radii(vertices, vertex_normals(vertices, self.faces), float(reach)) + self.edge
+        )
         nearest = cKDTree(model.contact_points()).query(vertices)[1]
         self.fixed = np.asarray(model.contact_bone)[nearest] >= 0
         self.refresh()
@@ -126,8 +140,46 @@ class CarriedSurface:
         distance, normal = np.empty(count), np.empty((count, 3))
         skin = Skin(self.vertices, self.normals, self.faces, self.start, self.ring)
         _distance_loop(points, index, nearest, skin, distance, normal)
-        near = distance < reach
+        # Beyond a sharp rim the normals of its two sides disagree: no point is deeper than the muscle is thick.
+        near = (distance < reach) & (distance >= -self.deepest[nearest])
+        # A triangle that is folded over at a rim may take a point far outside for one that is deep.
+        deep = np.flatnonzero(near & (distance < -FOLDED * self.edge))
+        if len(deep):
+            near[deep] = _winding_loop(points[index[deep]], self.vertices, self.faces) > 0.5
         return index[near], distance[near], normal[near], nearest[near]
+
+
+def inner_radii(vertices: Floats, normals: Floats, most: float) -> Floats:
+    """Radius of the greatest ball inside a surface that touches it at each vertex.
+
+    Parameters
+    ----------
+    vertices, normals : (n, 3) ndarray
+        Normals unit, outward.
+    most : float
+        What greater ones are given as.
+
+    Returns
+    -------
+    (n,) ndarray
+    """
+    radii = np.full(len(vertices), float(most))
+    _radii_loop(np.ascontiguousarray(vertices, dtype=np.float64), normals, radii)
+    return radii
+
+
+@compiled
+def _radii_loop(vertices, normals, radii):
+    """A ball of radius r at v - r n holds u where |u - v|² < 2 r n . (v - u)."""
+    for v in range(len(vertices)):
+        for u in range(len(vertices)):
+            square, along = 0.0, 0.0
+            for k in range(3):
+                way = vertices[v, k] - vertices[u, k]
+                square += way * way
+                along += way * normals[v, k]
+            if square < 2.0 * radii[v] * along:
+                radii[v] = square / (2.0 * along)
 
 
 @compiled
@@ -182,10 +234,35 @@ def _nearest_loop(points, which, vertices, cells, bound, index, nearest):
     return count
 
 
+@compiled(error_model="numpy")
+def _winding_loop(points, vertices, faces):
+    """Generalised winding number of a mesh at each point, by the solid angles of its triangles (van Oosterom 1983)."""
+    found, arm, size = np.zeros(len(points)), np.empty((3, 3)), np.empty(3)
+    for p in range(len(points)):
+        for f in range(len(faces)):
+            for c in range(3):
+                for k in range(3):
+                    arm[c, k] = vertices[faces[f, c], k] - points[p, k]
+                size[c] = np.sqrt(arm[c, 0] ** 2 + arm[c, 1] ** 2 + arm[c, 2] ** 2)
+            volume = (
+                arm[0, 0] * (arm[1, 1] * arm[2, 2] - arm[1, 2] * arm[2, 1])
+                + arm[0, 1] * (arm[1, 2] * arm[2, 0] - arm[1, 0] * arm[2, 2])
+                + arm[0, 2] * (arm[1, 0] * arm[2, 1] - arm[1, 1] * arm[2, 0])
+            )
+            below = size[0] * size[1] * size[2]
+            for c in range(3):
+                d = (c + 1) % 3
+                dot = arm[c, 0] * arm[d, 0] + arm[c, 1] * arm[d, 1] + arm[c, 2] * arm[d, 2]
+                below += dot * size[(c + 2) % 3]
+            found[p] += np.arctan2(volume, below)
+        found[p] /= 2.0 * np.pi
+    return found
+
+
 @compiled
 def _distance_loop(points, index, nearest, skin, distance, normal):
     vertices, normals, faces, start, ring = skin
-    weights, best = np.empty(3), np.empty(3)
+    weights, best, at, way, true = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for q in range(len(index)):
         p = index[q]
         least, face = np.inf, -1
@@ -195,22 +272,45 @@ def _distance_loop(points, index, nearest, skin, distance, normal):
             nearest_weights(points[p], a, b, c, weights)
             squared = 0.0
             for k in range(3):
-                at = 0.0
+                here = points[p, k]
                 for corner in range(3):
-                    at += weights[corner] * vertices[faces[f, corner], k]
-                squared += (points[p, k] - at) ** 2
+                    here -= weights[corner] * vertices[faces[f, corner], k]
+                squared += here * here
+                at[k] = here
+            # The triangles that meet where the nearest point lies decide the side together.
+            same = squared <= least * (1.0 + 1e-9) and squared >= least * (1.0 - 1e-9)
+            if squared < least or same:
+                if not same:
+                    true[:] = 0.0
+                _add_unit_normal(a, b, c, true)
             if squared < least:
                 least, face = squared, f
-                best[:] = weights
-        size, side = 0.0, 0.0
+                best[:], way[:] = weights, at
+        size, side, agree = 0.0, 0.0, 0.0
         for k in range(3):
-            n, at = 0.0, 0.0
+            n = 0.0
             for corner in range(3):
                 n += best[corner] * normals[faces[face, corner], k]
-                at += best[corner] * vertices[faces[face, corner], k]
             normal[q, k] = n
             size += n * n
-            side += n * (points[p, k] - at)
+            side += true[k] * way[k]
+            agree += n * way[k]
+        length, size = np.sqrt(least), max(np.sqrt(size), 1e-300)
+        sign = 1.0 if side >= 0.0 else -1.0
+        # Around a rim the surface's normals vary so fast that the way from it is the better direction.
+        along = sign * agree < RIM * size * length
         for k in range(3):
-            normal[q, k] /= max(np.sqrt(size), 1e-300)
-        distance[q] = np.sqrt(least) if side >= 0.0 else -np.sqrt(least)
+            normal[q, k] = sign * way[k] / length if along else normal[q, k] / size
+        distance[q] = sign * length
+
+
+@compiled
+def _add_unit_normal(a, b, c, total):
+    """Add the unit normal of a triangle."""
+    ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    size = max(np.sqrt(x * x + y * y + z * z), 1e-300)
+    total[0] += x / size
+    total[1] += y / size
+    total[2] += z / size

@@ -32,12 +32,16 @@ class HalfSpaces:
         Unit direction of growing distance, world axes.
     source : (c,) ndarray of int
         Index of the bone, or ``-1 - k`` for virtual edges of family k.
+    give : (c,) ndarray or None
+        How far a contact gives way to the force on it, as a share of how far that force alone would move its point;
+        None where all are rigid.
     """
 
     index: np.ndarray
     gap: np.ndarray
     normal: np.ndarray
     source: np.ndarray
+    give: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.index)
@@ -225,16 +229,17 @@ class BoneContacts:
             For all, or for each point [scene unit].
         """
         points = check_points(points)
-        parts = self._of_bones(points, reach)
+        parts = [(*found, 0.0) for found in self._of_bones(points, reach)]
         for k, neighbour in enumerate(self.neighbours):
             found = neighbour.contacts(points, np.max(reach))
             if len(found[0]):
-                parts.append((*found, -1 - k))
+                parts.append((*found, -1 - k, neighbour.give))
         if not parts:
             return HalfSpaces(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64))
         index, gap, normal = (np.concatenate([part[k] for part in parts]) for k in range(3))
         source = np.concatenate([np.full(len(part[0]), part[3], dtype=np.int64) for part in parts])
-        return HalfSpaces(index, gap, normal, source)
+        give = np.concatenate([np.full(len(part[0]), part[4]) for part in parts]) if self.neighbours else None
+        return HalfSpaces(index, gap, normal, source, give)
 
     def known(self, count: int) -> tuple[Floats, ...]:
         """Earlier places (r, count, 3) of the contact points in the coordinates of each bone that the muscle can reach,

@@ -32,6 +32,11 @@ THRESHOLD, STRIP, RELEASE = 2.0, 1.0, 2.0
 SEARCH = 5.0
 # Distance [mm] between the surfaces as solved below which they are cut, and how deep an overlap may be.
 CUT_FROM, CUT_DEPTH = 4.0, 6.0
+# Neighbours on all sides, and bones, may leave no place that all of them allow: rigid planes would push without end.
+# So planes give way, by this share of how far their force alone would move the point; nearness more than keeping out.
+PUSH_GIVES, PULL_GIVES = 0.1, 3.0
+# How far a plane pushes out of a neighbour at most in one sub-step [mm].
+MOST = 0.5
 
 
 # The answer for muscles that are nowhere near each other.
@@ -66,9 +71,12 @@ class Planes:
     ----------
     index, gap, normal
         As in :class:`~rbfmuscle.sim.loop.contact.HalfSpaces`, at the points ``anchor`` (c, 3).
+    give : float
+        The same of all of them.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, give: float = 0.0) -> None:
+        self.give = give
         self.set(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
 
     def set(self, index: Any, gap: Any, normal: Any, anchor: Any) -> None:
@@ -96,7 +104,7 @@ class Link:
 
     def __init__(self, stepper: Any, own: Any, other: Any, limits: Any) -> None:
         self.stepper, self.own, self.other, self.limits = stepper, own, other, limits
-        self.push, self.pull = Planes(), Planes()
+        self.push, self.pull = Planes(PUSH_GIVES), Planes(PULL_GIVES)
         self.free = stepper.contacts.free(len(stepper.model.contact_points()))
         #: Which points are linked, and how far each may be from the neighbour.
         self.linked = np.zeros(len(self.free), dtype=bool)
@@ -122,7 +130,7 @@ class Link:
         if limits.join:
             self.linked[index[distance < limits.threshold]] = True
         share = np.where(self.other.fixed[nearest], 1.0, 0.5)
-        self.push.set(index, share * distance, normal, points[index])
+        self.push.set(index, np.maximum(share * distance, -limits.most), normal, points[index])
         held = self.linked[index]
         slack = share[held] * (self.hold[index[held]] - distance[held])
         self.pull.set(index[held], slack, -normal[held], points[index[held]])
@@ -233,6 +241,7 @@ class SlidingLimits:
         self.release = length(options.release, RELEASE)
         self.search = max(scene.length(SEARCH), self.hold + self.release)
         self.cut_from, self.cut_depth = scene.length(CUT_FROM), scene.length(CUT_DEPTH)
+        self.most = scene.length(MOST)
         self.join, self.cut = options.join, options.cut
 
 
