@@ -9,7 +9,7 @@ zeros and unit normals, refitted in motion like any other, and takes no more num
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,7 +36,7 @@ FITTED = "fitted"
 # What moving a centre counts beside a miss of the same size at a sample, each on average over its kind; turning a
 # normal by one counts as moving by the spacing. Half of it lets thin rims swell, more of it gives accuracy away.
 STIFFNESS = 0.1
-ROUNDS = 2
+ROUNDS = 3
 SAMPLES = 4000
 _CHUNK = 1000
 
@@ -91,7 +91,7 @@ def fit_centres(
     kernel, epsilon
         As in `RBFField.fit_hermite`.
     rounds : int
-        Moving centres changes the basis, so that the least-squares problem is solved again.
+        The least-squares problem is that of the given centres; what their moves leave is met by further rounds of it.
 
     Returns
     -------
@@ -111,39 +111,53 @@ def fit_centres(
         )
     reach = spacing(points).mean()
 
-    def missed(where: Floats, direction: Floats) -> float:
+    def fitted(where: Floats, direction: Floats) -> tuple[Floats, float]:
         field = RBFField.fit_hermite(where, direction, kernel=kernel, epsilon=epsilon)
-        return surface_miss(field, samples, reach)
+        return field(samples), surface_miss(field, samples, reach)
 
-    best, least = (points, normals), missed(points, normals)
+    value, least = fitted(points, normals)
+    best, problem = (points, normals), _problem(points, normals, samples, kernel, epsilon, reach)
     for _ in range(rounds):
-        points, normals = _step(points, normals, samples, kernel, epsilon, reach)
-        now = missed(points, normals)
+        points, normals = _step(points, normals, value, problem)
+        value, now = fitted(points, normals)
         if now < least:
             best, least = (points, normals), now
     return best
 
 
-def _step(
+class _Problem(NamedTuple):
+    """Linear least squares for values and gradients at the centres; they change too little for another matrix."""
+
+    cardinal: np.ndarray  # (4K, n), values at the samples for unit values and gradients: of order one
+    factor: Any  # of its normal matrix
+    scale: float
+
+
+def _problem(
     points: Floats, normals: Floats, samples: Floats, kernel: Kernel, epsilon: float, reach: float
-) -> tuple[Floats, Floats]:
-    """One linear least-squares problem for the values and gradients at the centres, and what follows for these."""
+) -> _Problem:
+    """The problem of some centres."""
     count = len(points)
-    basis, right, origin, scale = hermite_system(points, normals, kernel, epsilon, "all")
+    basis, _, origin, scale = hermite_system(points, normals, kernel, epsilon, "all")
     scaled, shape = (samples - origin) / scale, epsilon * scale if kernel.has_epsilon else 1.0
     factor = linalg.lu_factor(basis.full_matrix(), overwrite_a=True, check_finite=False)
-    normal_matrix, normal_right = np.zeros((basis.size, basis.size)), np.zeros(basis.size)
+    cardinal = np.empty((basis.size, len(scaled)), order="F")
     for low in range(0, len(scaled), _CHUNK):
         rows = _rows(basis, kernel, shape, scaled[low : low + _CHUNK])
-        # Values at the samples for unit values and gradients at the centres: of order one, whatever the condition.
-        cardinal = linalg.lu_solve(factor, rows.T, trans=1, check_finite=False)[: basis.size]
-        normal_matrix += cardinal @ cardinal.T
-        normal_right -= cardinal @ (cardinal.T @ right)
+        found = linalg.lu_solve(factor, rows.T, trans=1, check_finite=False)
+        cardinal[:, low : low + _CHUNK] = found[: basis.size]
+    matrix = cardinal @ cardinal.T
     weight = np.full(basis.size, STIFFNESS)
     weight[count:] *= reach / scale  # derivatives are by scaled coordinates
-    normal_matrix[np.diag_indices(basis.size)] += weight**2 * len(samples) / count
-    change = linalg.solve(normal_matrix, normal_right, assume_a="pos", check_finite=False)
-    gradients = normals + change[count:].reshape(3, count).T / scale
+    matrix[np.diag_indices(basis.size)] += weight**2 * len(samples) / count
+    return _Problem(cardinal, linalg.cho_factor(matrix, overwrite_a=True, check_finite=False), scale)
+
+
+def _step(points: Floats, normals: Floats, value: Floats, problem: _Problem) -> tuple[Floats, Floats]:
+    """Centres and normals after the change that undoes most of the values (n,) at the samples."""
+    count = len(points)
+    change = linalg.cho_solve(problem.factor, problem.cardinal @ -value, check_finite=False)
+    gradients = normals + change[count:].reshape(3, count).T / problem.scale
     size = np.linalg.norm(gradients, axis=1)
     turned = gradients / size[:, None]
     return points - (change[:count] / size)[:, None] * turned, turned
