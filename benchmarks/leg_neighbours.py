@@ -7,7 +7,7 @@
 the chosen frames by exact distances, which the solver does not use: how deep a vertex of one muscle lies in another,
 and for vertices nearer than the threshold at rest how much farther they are now (RMS by pair). Both are listed by pair,
 the worst first. What two bones hold on both sides is counted apart: where a vertex and what it meets of the other
-muscle both belong to attachments, the bones decide how far they come apart or into each other. ``--without`` measures
+muscle both go along with bones, these decide how far they come apart or into each other. ``--without`` measures
 the same run without sliding. ``cost`` compares processor time of a frame with surfaces, one thread, with and without
 sliding in turn; ``order`` solves with the file's order of muscles and with its reverse, and compares the surfaces.
 """
@@ -76,7 +76,7 @@ class Touching:
     surfaces : dict of str to (vertices, faces)
         At rest.
     held : dict of str to (n,) ndarray of bool
-        Vertices that attachments hold.
+        Vertices that bones hold.
     """
 
     def __init__(self, surfaces, held):
@@ -126,15 +126,15 @@ def _rms_by_pair(squares):
     return {pair: float(np.sqrt(part.mean())) if len(part) else 0.0 for pair, part in joined.items()}
 
 
-def held_vertices(scene, surfaces):
-    """Vertices (n,) of each surface at rest whose nearest vertex of the input mesh belongs to an attachment."""
-    found = {}
-    for muscle in scene.muscles:
-        patch = np.zeros(len(muscle.mesh.vertices), dtype=bool)
-        for attachment in muscle.attachments:
-            patch[np.asarray(attachment.vertices)] = True
-        found[muscle.name] = patch[cKDTree(muscle.mesh.vertices).query(surfaces[muscle.name][0])[1]]
-    return found
+def held_vertices(models, surfaces):
+    """Vertices (n,) of each surface at rest that go along with a bone, as the model's nearest contact point does."""
+    return {
+        model.name: np.asarray(model.contact_bone)[
+            cKDTree(model.contact_points()).query(surfaces[model.name][0])[1]
+        ]
+        >= 0
+        for model in models
+    }
 
 
 def _near(one, other, reach):
@@ -156,7 +156,7 @@ def pairs(bench, arguments):
                 continue
             frame = loop.advance(coordinates)
             surfaces = _surfaces(frame)
-            touching = touching or Touching(surfaces, held_vertices(bench.scenes[True], surfaces))
+            touching = touching or Touching(surfaces, held_vertices(bench.models, surfaces))
             # Overlap, gap; the same of what is held on both sides.
             found = [
                 one for pair in zip(touching.overlaps(surfaces), touching.opened(surfaces)) for one in pair

@@ -10,6 +10,7 @@ from rbfmuscle.implicit.extraction.material import _Fitting, carry_material, fit
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh, _edges_loop
 from rbfmuscle.implicit.extraction.obstacles import ObstaclePoints
 from rbfmuscle.implicit.extraction.projection import Projector
+from rbfmuscle.implicit.extraction.untangling import creased_faces
 
 BALL = trimesh.creation.icosphere(3)
 VOLUME = 4.0 / 3.0 * np.pi
@@ -221,6 +222,25 @@ def test_a_look_by_sheets_sees_a_bump_that_goes_through_the_other_side(tilt):
     near = np.exp(-(((points[:, :2]) ** 2).sum(axis=1)) / 0.05) * (points[:, 2] > 0)
     tree = FaceTree(points, np.asarray(BALL.faces))
     assert tree.crossing(points + 0.8 * near[:, None] * away, by_sheets=True).any()
+
+
+@pytest.mark.parametrize("seed", [9, 15, 26])
+def test_one_vertex_dragged_over_its_neighbours_is_seen_at_its_crease(seed):
+    """A fold within a sheet, which a look by sheets misses."""
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    points, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
+    edge, rng = ball.edges_unique_length.mean(), np.random.default_rng(seed)
+    vertex = rng.integers(len(points))
+    way = np.cross(points[vertex], rng.normal(size=3))
+    moved = points.copy()
+    moved[vertex] += edge * rng.uniform(0.8, 1.4) * way / np.linalg.norm(way)
+    moved[vertex] += 0.1 * edge * rng.normal() * points[vertex]
+    tree = FaceTree(points, faces)
+    expected = crossing_faces(moved, faces)
+    assert expected.any() and not tree.crossing(moved, by_sheets=True).any()
+    creased = creased_faces(moved, faces)
+    assert creased.sum() < 40 and not creased_faces(points, faces).any()
+    np.testing.assert_array_equal(tree.crossing(moved, creased), expected)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05, 0.1, 0.3])

@@ -2,7 +2,9 @@
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Booleans, Integers
+from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.implicit.extraction.carried_material import CarriedMaterial
 
 # Rounds of smoothing for triangles that cross others, and how the smoothed region grows with them.
@@ -13,6 +15,8 @@ RETURN, BACK = 12, 0.15
 # in: so many sweeps of smoothing first, and in each of some rounds after, each followed by the way out of the bone.
 STRAYED = 1.5
 FILL_SWEEPS, GATHER, GATHER_SWEEPS = 150, 4, 12
+# Cosine between a triangle's normal and that at a corner below which the surface has a crease there.
+CREASED = 0.7
 
 
 def gather(material: CarriedMaterial) -> None:
@@ -40,9 +44,10 @@ def untangle(material: CarriedMaterial) -> int:
     touched = np.zeros(len(material.carried), dtype=np.bool_)
     among: Booleans | None = None
     for turn in range(0 if material.field is None else -RETURN, UNTANGLE + 1):
-        # What was not moved does not begin to cross; where nothing crosses, a quick look is enough.
+        # What was not moved does not begin to cross; where nothing crosses, a quick look is enough, and one at creases:
+        # what crosses within a sheet is folded there.
         if among is None and not material.mesh.tree.crossing(projector.vertices, by_sheets=True).any():
-            break
+            among = creased_faces(projector.vertices, faces)
         bad = material.mesh.tree.crossing(projector.vertices, among)
         if turn == UNTANGLE or not bad.any():
             break
@@ -56,6 +61,37 @@ def untangle(material: CarriedMaterial) -> int:
         else:
             _smooth(material, np.flatnonzero(region), material.field is not None and turn < UNTANGLE // 2)
     return int(touched.sum())
+
+
+def creased_faces(vertices: Floats, faces: Integers) -> Booleans:
+    """Mask (m,) of the triangles at vertices around which the surface is no smooth sheet.
+
+    Parameters
+    ----------
+    vertices : (n, 3) ndarray
+    faces : (m, 3) ndarray of int
+        Closed, outward.
+    """
+    sharp, found = np.zeros(len(vertices), dtype=np.bool_), np.zeros(len(faces), dtype=np.bool_)
+    _creased_loop(vertices, faces, vertex_normals(vertices, faces), sharp, found)
+    return found
+
+
+@compiled(error_model="numpy")
+def _creased_loop(vertices, faces, normals, sharp, found):
+    """A vertex is sharp where a triangle looks away from its normal by more than the angle of CREASED."""
+    for f in range(len(faces)):
+        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+        ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+        vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+        x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        least = CREASED * np.sqrt(x * x + y * y + z * z)
+        for k in range(3):
+            n = normals[faces[f, k]]
+            if n[0] * x + n[1] * y + n[2] * z <= least:
+                sharp[faces[f, k]] = True
+    for f in range(len(faces)):
+        found[f] = sharp[faces[f, 0]] or sharp[faces[f, 1]] or sharp[faces[f, 2]]
 
 
 def _return(material: CarriedMaterial, rows: Integers) -> None:

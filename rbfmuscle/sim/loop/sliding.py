@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
 
 # Defaults [mm]: nearer than THRESHOLD at rest is linked; STRIP beyond its gap there is free; RELEASE beyond lets go.
-THRESHOLD, STRIP, RELEASE = 2.0, 1.0, 2.0
+THRESHOLD, STRIP, RELEASE = 2.0, 1.0, 5.0
 # Neighbours are looked for within this distance [mm] of the predicted points.
 SEARCH = 5.0
 # Distance [mm] between the surfaces as solved below which they are cut, and how deep an overlap may be.
 CUT_FROM, CUT_DEPTH = 4.0, 6.0
 # Neighbours on all sides, and bones, may leave no place that all of them allow: rigid planes would push without end.
 # So planes give way, by this share of how far their force alone would move the point; nearness more than keeping out.
-PUSH_GIVES, PULL_GIVES = 0.1, 3.0
+PUSH_GIVES, PULL_GIVES = 0.1, 1.0
 # How far a plane pushes out of a neighbour at most in one sub-step [mm].
 MOST = 0.5
 
