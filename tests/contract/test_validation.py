@@ -5,7 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pbd_baseline.options import PBDOptions
 from rbfmuscle import validation
+from rbfmuscle.model.options import RBFOptions
+from rbfmuscle.sim.scene.options import Table
 from rbfmuscle.validation import (
     MeshError,
     NotFiniteError,
@@ -136,3 +139,16 @@ def test_only_regular_files_are_files(tmp_path):
         and not is_file("a\0b")
         and not is_file("/dev/null")
     )
+
+
+def test_every_default_of_an_option_is_a_value_that_may_be_given():
+    """pydantic takes defaults on trust."""
+    kinds, tried = [Table, PBDOptions, RBFOptions], 0
+    for kind in kinds:
+        kinds += [new for new in kind.__subclasses__() if new not in kinds]
+        if not any(field.is_required() for field in kind.model_fields.values()):
+            made = kind()
+            given = {name: value for name, value in made.model_dump().items() if value is not None}
+            assert kind.model_validate(given) == made
+            tried += 1
+    assert tried >= 8

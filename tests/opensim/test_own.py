@@ -13,7 +13,7 @@ import rbfmuscle as rm
 from rbfmuscle.app import run_command
 from rbfmuscle.opensim.folder import write_scene
 from rbfmuscle.opensim.match import attach, likeness, match_meshes, name_score, split_name, write_table
-from rbfmuscle.opensim.register import bring_to_bones, fit_similarity
+from rbfmuscle.opensim.register import bring_to_bones, fit_similarity, register
 from rbfmuscle.opensim.scene import import_osim
 from rbfmuscle.sim.joints.skeleton import all_coordinates
 from rbfmuscle.sim.scene.motion import bone_poses
@@ -206,6 +206,22 @@ def test_folder_without_bones_of_the_model_is_refused(osim_data, tmp_path):
     trimesh.creation.box().export(tmp_path / "skull.ply")
     with pytest.raises(UsageError, match="no mesh has the name of a body"):
         bring_to_bones(found, tmp_path)
+
+
+@pytest.mark.parametrize("angles", [(0, 0, 0), (170, 20, 0), (10, 100, -90), (0, 0, 180)])
+def test_a_bone_is_registered_however_it_lies_in_the_scan(angles):
+    model = trimesh.creation.icosphere(subdivisions=3)
+    place = model.vertices * [10.0, 60.0, 22.0]
+    place[:, 0] += 9.0 * np.exp(
+        -(((place[:, 1] - 40.0) / 15.0) ** 2)
+    )  # a head, so that no half turn is like another
+    place[:, 2] += 6.0 * (place[:, 1] < -30.0) * (place[:, 0] > 0.0)
+    model = trimesh.Trimesh(place, model.faces, process=False)
+    turn = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+    scan = trimesh.Trimesh(1.3 * place @ turn.T + [100.0, -50.0, 20.0], model.faces, process=False)
+    fit = register(model, scan)
+    np.testing.assert_allclose(fit.turn, turn, atol=1e-6)
+    assert fit.scale == pytest.approx(1.3, rel=1e-6) and fit.rms < 1e-6
 
 
 def test_joint_below_a_body_that_nobody_scanned_goes_all_the_way_to_the_childs_bone(tmp_path):

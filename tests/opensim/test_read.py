@@ -214,3 +214,15 @@ def test_ground_may_be_the_child(small):
     imported = import_osim(small)
     pose = bone_poses(imported.scene, {"hip.hip_angle": 0.3})["shank"] @ imported.places["shank"]
     assert pose == pytest.approx(forth["shank"], abs=1e-14)
+
+
+def test_a_body_keeps_the_meshes_that_can_be_read_beside_one_that_cannot(small):
+    both = '<Mesh name="bad"><mesh_file>bad.obj</mesh_file></Mesh><Mesh name="n">'
+    small.write_text(small.read_text().replace('<Mesh name="n">', both))
+    torn = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 99\n"
+    (small.parent / "bad.obj").write_text(torn)
+    found = import_osim(small)
+    assert [bone.name for bone in found.scene.bones] == ["thigh", "shank"]
+    assert sum("body 'thigh': mesh 'bad.obj' is not taken" in note for note in found.notes) == 1
+    (small.parent / "wedge.obj").write_text(torn)
+    assert not import_osim(small).scene.bones
