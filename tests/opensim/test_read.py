@@ -9,9 +9,10 @@ from straight_paths import straight_length
 
 import rbfmuscle as rm
 from rbfmuscle.opensim.folder import write_scene
+from rbfmuscle.opensim.model import motion_kinds
 from rbfmuscle.opensim.read import read_osim
 from rbfmuscle.opensim.scene import import_osim
-from rbfmuscle.sim.joints.joint import frame_at, rotation_about
+from rbfmuscle.sim.joints.joint import TransformAxis, frame_at, rotation_about
 from rbfmuscle.sim.joints.skeleton import all_coordinates
 from rbfmuscle.sim.scene.motion import bone_poses
 from rbfmuscle.validation import SceneError
@@ -226,3 +227,14 @@ def test_a_body_keeps_the_meshes_that_can_be_read_beside_one_that_cannot(small):
     assert sum("body 'thigh': mesh 'bad.obj' is not taken" in note for note in found.notes) == 1
     (small.parent / "wedge.obj").write_text(torn)
     assert not import_osim(small).scene.bones
+
+
+@pytest.mark.parametrize("slot", ["rotation", "translation"])
+@pytest.mark.parametrize("place", [1, 2, 3])
+def test_a_coordinate_is_what_it_drives_alone_with_a_slope_of_one_on_any_axis(slot, place):
+    key = f"{slot}{place}"
+    axes = {key: TransformAxis((0.0, 0.0, 1.0), ("q",))}
+    assert motion_kinds("custom", ["q", "p"], axes, {key: -1.0}) == [slot, "coupled"]
+    assert motion_kinds("custom", ["q", "p"], axes, {key: 0.5}) == ["coupled", "coupled"]
+    shared = {key: TransformAxis((0.0, 0.0, 1.0), ("q", "p"))}
+    assert motion_kinds("custom", ["q", "p"], shared, {key: 1.0}) == ["coupled", "coupled"]

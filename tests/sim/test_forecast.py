@@ -214,3 +214,11 @@ def test_scales_made_anew_agree_with_what_was_measured():
     assert after["motion"] == pytest.approx([0.2, 0.4])
     # One second more of building, one less of checks, and in ten frames a second more of motion, 7.5 less of files.
     assert after["total"] == pytest.approx([27.0 + 1.0 - 1.0 + 1.0 - 7.5, 20.0])
+
+
+def test_a_mesh_model_that_keeps_a_factor_takes_more_memory_than_one_that_does_not(scene):
+    memory = {
+        method: estimate_model(scene.with_options(model=method).muscles[0], scene, RATES).memory
+        for method in ("pbd", "xpbd", "arap-pbd", "arap-volume")
+    }
+    assert 0 < memory["pbd"] == memory["xpbd"] < memory["arap-volume"]

@@ -86,6 +86,14 @@ class TestOccupancy:
             points[3 + k, axis] = ends[1][axis] + beyond * grid.spacing
         assert len(grid.candidates(points)) == 0 and len(grid.candidates(middle[None])) == 1
 
+    @pytest.mark.parametrize("scale", [2.0**-10, 2.0**10])
+    def test_candidates_are_the_same_in_any_unit(self, blob, scale):
+        vertices, faces = arrays(blob)
+        points = np.random.default_rng(6).uniform(*(1.2 * blob.bounds), size=(2000, 3))
+        found = OccupancyGrid(vertices, faces, cells=24).candidates(points)
+        same = OccupancyGrid(scale * vertices, faces, cells=24).candidates(scale * points)
+        np.testing.assert_array_equal(same, found)
+
     def test_large_triangles_mark_only_cells_that_they_meet(self):
         grid = OccupancyGrid(*arrays(trimesh.creation.box((1, 1, 1))), cells=16)
         far = np.array([[0.7, 0.7, 0.7], [0.0, 0.0, 0.66]])
