@@ -1,12 +1,18 @@
 """``--set``: every key that the schemas document, from the command line into the run."""
 
+import importlib
+import inspect
 import json
+import pkgutil
+import typing
 
 import pytest
 from blend_model import arm_files
 from command_line import call
+from cyclopts import Parameter
 
 from pbd_baseline.options import PBDOptions
+from rbfmuscle import commands
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.models import MODEL_NAMES
 from rbfmuscle.sim.scene import options
@@ -186,3 +192,25 @@ def test_the_name_of_a_model_decides_its_method(scene_file, tmp_path, capsys):
     )
     assert code == 2 and "method follows from the model's name" in err
     assert all(name in err for name in MODEL_NAMES)
+
+
+def test_a_flag_that_cannot_be_taken_back_is_off_until_it_is_given():
+    """``--json`` has no ``--no-json``: were it on by default, nobody could turn it off."""
+    found = []
+    for module in pkgutil.walk_packages(commands.__path__, commands.__name__ + "."):
+        for name, function in vars(importlib.import_module(module.name)).items():
+            if not inspect.isfunction(function) or function.__module__ != module.name or name[0] == "_":
+                continue
+            try:
+                hints = typing.get_type_hints(function, include_extras=True)
+            except NameError:  # no command, whose types have to be known where it is called
+                continue
+            for key, parameter in inspect.signature(function).parameters.items():
+                extras = [e for e in getattr(hints.get(key), "__metadata__", ()) if isinstance(e, Parameter)]
+                if any(extra.negative in ("", ("",), ()) for extra in extras) and parameter.default in (
+                    True,
+                    False,
+                ):
+                    found.append((name, key))
+                    assert parameter.default is False, (name, key)
+    assert len(found) >= 8, found

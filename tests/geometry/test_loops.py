@@ -199,7 +199,7 @@ def test_local_units_are_the_same_wherever_a_bone_is_and_however_large(scale):
 def test_nearest_point_of_a_triangle_is_a_mean_of_its_corners_in_every_region():
     rng = np.random.default_rng(3)
     seen = set()
-    for a, b, c, p in rng.normal(size=(400, 4, 3)) * np.array([1.0, 1.0, 1.0, 2.0])[:, None]:
+    for a, b, c, p in rng.normal(size=(4000, 4, 3)) * np.array([1.0, 1.0, 1.0, 2.0])[:, None]:
         weights = np.full(3, np.nan)
         nearest_weights(p, a, b, c, weights)
         assert weights.min() >= 0.0 and weights.sum() == pytest.approx(1.0)

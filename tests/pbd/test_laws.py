@@ -53,6 +53,31 @@ def test_rotations_of_a_turned_shape_are_its_turn_and_leave_no_energy(rest):
     np.testing.assert_allclose(arap.gradient(turned), 0.0, atol=1e-8)
 
 
+def test_edges_in_turn_bring_a_shape_back_and_leave_what_is_held(rest):
+    vertices, topology = rest
+    arap = ARAP(vertices, topology)
+    held = vertices[:, 0] < -1.5
+    mass = np.where(held, 0.0, 1.0)
+    points = vertices + np.where(
+        held[:, None], 0.0, 0.2 * np.random.default_rng(6).normal(size=vertices.shape)
+    )
+    before, given = arap.energy(points), points.copy()
+    constraint = ARAPConstraint(arap, compliance=0.0)
+    single = given.copy()
+    constraint.project(points, mass)
+    for c in range(len(constraint.edges)):
+        i, j = constraint.edges[c]
+        if mass[i] + mass[j] > 0.0:
+            error = single[i] - single[j] - constraint.rest[c]
+            single[i] -= mass[i] / (mass[i] + mass[j]) * error
+            single[j] += mass[j] / (mass[i] + mass[j]) * error
+    np.testing.assert_allclose(points, single, atol=1e-12)
+    for _ in range(100):
+        constraint.project(points, mass)
+    np.testing.assert_array_equal(points[held], vertices[held])
+    assert arap.energy(points) < 1e-3 * before
+
+
 def test_energy_grows_with_the_square_of_a_stretch(rest):
     """Rotations stay where they are when a shape grows evenly, so E is quadratic in the growth."""
     vertices, topology = rest

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from rbfmuscle.geometry.exact_distance import STACK, ExactDistance, record_square
+from rbfmuscle.sim.distance import build, lists, query
 from rbfmuscle.sim.distance.query import _mixed_side
 from rbfmuscle.sim.distance.sdf import BoneSDF
 from rbfmuscle.sim.distance.serendipity import SerendipityField
@@ -154,3 +156,59 @@ def test_a_mixed_cell_interpolates_what_its_corners_say_and_ends_at_its_sides():
     for place in np.random.default_rng(0).uniform(-1.0, 2.0, (50, 3)):
         found = _mixed_side(*(low + size * place), 0, lists, row)
         assert found == pytest.approx(asked(np.clip(place, 0.0, 1.0)))
+
+
+def test_walks_from_beside_the_nearest_triangle_lead_to_it():
+    """On a convex body every way downhill ends at the nearest triangle, whichever neighbour it begins at."""
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    vertices, faces = np.array(ball.vertices) * [2.0, 1.0, 0.7], np.array(ball.faces)
+    exact = ExactDistance(vertices, faces)
+    builder = build._Builder(exact, np.zeros(3), 1.0, None, None)
+    records, across = exact.records, builder.across
+    for point in 1.5 * np.random.default_rng(5).normal(size=(60, 3)) + [0.0, 0.0, 2.5]:
+        squares = np.array([record_square(records, n, *point) for n in range(len(faces))])
+        nearest = int(squares.argmin())
+        for start in across[nearest]:
+            for walk in (query._walk, lists._walk):
+                end = walk(int(start), squares[start], *point, records, across)
+                assert squares[end] == pytest.approx(squares[nearest], rel=1e-5)
+
+
+def test_a_cells_list_holds_what_is_nearest_to_the_points_within_it():
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    exact = ExactDistance(np.array(ball.vertices) * [2.0, 1.0, 0.7], np.array(ball.faces))
+    across = build._Builder(exact, np.zeros(3), 1.0, None, None).across
+    origin, edge, grown, far = np.array([-2.5, -1.5, 0.45]), 0.5, 0, []
+    for low in np.ndindex(10, 6, 2):
+        middle = origin + edge * (np.array(low) + 0.5)
+        squares = [record_square(exact.records, n, *middle) for n in range(len(ball.faces))]
+        listed = np.full(lists.MOST, -1, dtype=np.int64)
+        listed[0] = int(np.argmin(squares))
+        mesh = (exact.tree, across, origin, np.zeros(len(ball.faces), dtype=np.bool_))
+        stack = np.empty(STACK, dtype=np.int64), np.empty(STACK)
+        count = lists._probe(listed, 1, False, np.array(low), edge, mesh, stack)
+        grown += count > 1
+        for probe in lists.PROBES:
+            at = origin + edge * (np.array(low) + 0.5 + probe)
+            least = min(record_square(exact.records, n, *at) for n in range(len(ball.faces)))
+            here = min(record_square(exact.records, n, *at) for n in listed[:count])
+            far.append(here / least - 1.0)
+    # A walk ends where no neighbour is nearer, a hair before the goal at most.
+    assert grown > 20 and max(far) < 0.02 and np.mean(np.array(far) < 1e-6) > 0.95
+
+
+def test_small_cells_that_no_triangle_of_their_block_comes_near_are_left_out():
+    plate = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 2.0, 0.5], [3.0, 2.0, 0.5]])
+    exact = ExactDistance(plate, np.array([[0, 1, 2], [1, 3, 2]]))
+    origin, edge, band, side = np.array([0.4, -0.7, -1.1]), 1.2, 0.1, 4
+    blocks = np.array(list(np.ndindex(2, 3, 2)))
+    active = np.ones((len(blocks), side**3), dtype=np.bool_)
+    held, offsets = np.array([2, 0, 1], dtype=np.int32), np.zeros(len(blocks), dtype=np.int64)
+    build._near_loop(blocks, offsets, held, exact.records, (origin, edge, band, side), active)
+    small = edge / side
+    cells = np.array(list(np.ndindex(side, side, side)))
+    middle = origin + edge * blocks[:, None] + small * (cells + 0.5)
+    away = np.sqrt(igl.point_mesh_squared_distance(middle.reshape(-1, 3), plate, exact.faces)[0])
+    wanted = away.reshape(active.shape) < band + 0.5 * np.sqrt(3.0) * small
+    np.testing.assert_array_equal(active, wanted)
+    assert 0.05 < wanted.mean() < 0.95

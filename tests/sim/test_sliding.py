@@ -33,6 +33,21 @@ def _ball(radius=10.0):
     return _Mesh(trimesh.creation.icosphere(subdivisions=3, radius=radius))
 
 
+def test_distances_of_a_long_flat_surface_are_exact_wherever_they_are_asked():
+    """Three extents, so that no axis of the cells can stand for another."""
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    mesh.vertices = mesh.vertices * [24.0, 9.0, 4.0]
+    surface = CarriedSurface(_Mesh(mesh), reach=1.5)
+    rng = np.random.default_rng(7)
+    points = mesh.vertices + rng.normal(scale=0.3, size=mesh.vertices.shape)
+    index, distance, _, _ = surface.query(points, np.ones(len(points), dtype=bool), 1.5)
+    assert index.tolist() == list(range(len(points)))
+    squared = igl.point_mesh_squared_distance(points, surface.vertices, surface.faces)[0]
+    assert (
+        np.mean(np.abs(np.abs(distance) - np.sqrt(squared)) < 1e-9) > 0.95
+    )  # the rest is nearer to another ring
+
+
 def test_surface_distance_agrees_with_the_sphere():
     surface = CarriedSurface(_ball(), reach=3.0)
     points = np.random.default_rng(0).normal(size=(500, 3))

@@ -153,3 +153,23 @@ def test_a_kernel_that_does_not_reach_its_neighbours_says_so():
     points = sphere(200)
     with pytest.warns(NumericalWarning, match="does not reach from centre to centre.*lower epsilon"):
         RBFField.fit_hermite(points, points, kernel="wendland_c2", epsilon=10.0)
+
+
+@pytest.mark.parametrize("steep", [0.5, 1.0, 5.0])
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+def test_a_field_is_judged_by_the_way_to_its_surface_whatever_its_slope(steep, size):
+    judge = extremes._ellipsoid(10, size=size)[2]
+
+    class Off:
+        """A field whose surface lies 1 % of the shortest half axis below an ellipsoid, or that falls outwards."""
+
+        def __init__(self, sign):
+            self.sign = sign
+
+        def value_and_gradient(self, points):
+            normals = points / size / np.array([3.0, 2.0, 1.0]) ** 2
+            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+            return np.full(len(points), steep * 0.01 * size), self.sign * steep * normals
+
+    assert judge(Off(1.0)) == pytest.approx(0.01)
+    assert judge(Off(-1.0)) == pytest.approx(1.0)

@@ -86,6 +86,16 @@ class TestOccupancy:
             points[3 + k, axis] = ends[1][axis] + beyond * grid.spacing
         assert len(grid.candidates(points)) == 0 and len(grid.candidates(middle[None])) == 1
 
+    @pytest.mark.parametrize("scale", [2.0**-10, 1.0, 2.0**10])
+    def test_slanted_triangles_mark_only_cells_that_they_meet(self, scale):
+        corners = scale * np.vstack([np.eye(3), -np.eye(3)])
+        octahedron = trimesh.convex.convex_hull(corners)
+        grid = OccupancyGrid(*arrays(octahedron), cells=32)
+        points = scale * np.random.default_rng(9).uniform(-1.0, 1.0, (3000, 3))
+        above = np.abs(points).sum(axis=1) - scale
+        found = np.isin(np.arange(3000), grid.candidates(points))
+        assert found[above < 0.0].all() and not found[above > 4.0 * grid.spacing].any()
+
     @pytest.mark.parametrize("scale", [2.0**-10, 2.0**10])
     def test_candidates_are_the_same_in_any_unit(self, blob, scale):
         vertices, faces = arrays(blob)
