@@ -231,3 +231,13 @@ def test_one_bone_alone_carries_every_vertex_whole(body):
     vertices, faces, _ = body
     weights = even_weights(vertices, faces, [np.flatnonzero(vertices[:, 0] < -2.9)])
     np.testing.assert_allclose(weights, np.ones((len(vertices), 1)), atol=1e-12)
+
+
+def test_a_volume_that_nothing_can_change_is_left_as_it_is():
+    vertices, faces = ellipsoid(1)
+    constraint, points = VolumeConstraint(vertices, faces), 1.1 * vertices
+    constraint.project(points, np.zeros(len(points)))
+    np.testing.assert_array_equal(points, 1.1 * vertices)
+    for _ in range(5):
+        constraint.project(points, np.ones(len(points)))
+    assert constraint.volume(points) == pytest.approx(constraint.rest, rel=1e-9)
