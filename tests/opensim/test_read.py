@@ -148,6 +148,15 @@ class TestSmall:
         (note,) = [note for note in read_osim(small).notes if "closes a loop" in note]
         assert "joint 'strut' (ground to shank)" in note
 
+    def test_axis_that_follows_no_coordinate_of_its_joint_is_refused(self, small):
+        old = '<TransformAxis name="translation1"><coordinates>knee_angle<'
+        assert old in small.read_text()
+        small.write_text(small.read_text().replace(old, old.replace("knee_angle", "hip_angle")))
+        with pytest.raises(
+            SceneError, match=r"joint 'knee' .*: an axis follows 'hip_angle', which is no coordinate"
+        ):
+            read_osim(small)
+
     def test_what_is_not_taken_is_named(self, small):
         notes = "\n".join(import_osim(small).notes)
         for text in ("'rail' (PointOnLineConstraint)", "'wedge.obj' is hidden", "'nowhere.vtp' is not there"):

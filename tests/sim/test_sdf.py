@@ -213,6 +213,14 @@ def test_region_is_fine_inside_and_right_outside():
     assert np.mean((part.distance(points) * exact < 0.0) & (np.abs(exact) > 0.5)) < 0.01
 
 
+def test_a_region_without_a_face_has_nothing_to_be_wrong_in():
+    mesh = trimesh.creation.icosphere(subdivisions=1, radius=10.0)
+    field = BoneSDF.from_mesh(mesh, region=[[30.0, -2.0, -2.0], [34.0, 2.0, 2.0]], cache=False)
+    points = np.array([[31.0, 0.0, 0.5], [33.0, 1.0, -1.0], [0.0, 12.0, 0.0]])
+    exact = field.exact.signed_distance(points)
+    assert np.abs(field.distance(points) - exact).max() < 0.3 * 16 * field.spacing
+
+
 def test_smaller_tolerance_gives_smaller_errors():
     mesh = trimesh.creation.icosphere(3, 20.0)
     mesh.vertices *= np.random.default_rng(0).uniform(0.9, 1.1, (len(mesh.vertices), 1))
