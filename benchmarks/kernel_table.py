@@ -32,9 +32,9 @@ from rbfmuscle.study.experiment.kernel_choice import mark_unfit
 from rbfmuscle.study.experiment.kernel_judge import SurfaceJudge
 from rbfmuscle.study.experiment.workers import threads_limited
 
-# Cells: what is measured has no chords in it.
+# Cells of the brute force: what is measured has no chords in it.
 CELLS = 64
-SCANNED, LIMIT = 40, 1.05
+SCANNED, LIMIT, LOOKS = 40, 1.05, 12
 KEYS = ("surface", "centres", "placement", "kernel")
 HIP = ("gluteus_maximus", "gluteus_medius", "iliacus", "adductor_brevis")
 LEG = ("sartorius", "semimembranosus", "tibialis_anterior", "popliteus")
@@ -67,20 +67,25 @@ def surfaces(data):
         yield name, np.asarray(mesh[0], float), np.asarray(mesh[1])
 
 
-def brute_force(judge, sample, kernel, derivatives):
-    """Least error both ways of the scan's fits that are fit, and its epsilon times the spacing."""
+def brute_force(judge, sample, kernel, derivatives, own):
+    """Least error both ways of the scan's fits that are fit, and its epsilon times the spacing.
+
+    Half of the square of the error both ways is that of the judge's points: fits that miss by so much more there than
+    the choice errs, ``own``, cannot be better. Where the choice is unfit, the best dozen by that are looked at.
+    """
     h, scan = spacing(sample.points).mean(), []
     for epsilon in np.geomspace(*SPAN, SCANNED) / h:
         try:
             fitted = RBFField.fit_surface(
                 sample.points, sample.normals, kernel=kernel, epsilon=epsilon, derivatives=derivatives
             )
-            scan.append((surface_miss(fitted, judge.held_out, h), epsilon, fitted))
+            scan.append((surface_miss(fitted, judge.points[::4], h), epsilon, fitted))
         except np.linalg.LinAlgError:
             continue
-    best = (np.inf, np.nan)
-    for missed, epsilon, fitted in sorted(scan, key=lambda trial: trial[0]):
-        if missed > np.sqrt(2.0) * best[0]:  # half of the square of the error both ways is this one's
+    best = (own, np.nan)
+    scan.sort(key=lambda trial: trial[0])
+    for missed, epsilon, fitted in scan if np.isfinite(own) else scan[:LOOKS]:
+        if missed > np.sqrt(2.0) * best[0]:
             break
         best = min(best, (both_ways(judge, sample, fitted), epsilon * h))
     return best
@@ -92,14 +97,14 @@ def both_ways(judge, sample, fitted):
     The zero set's vertices lie on it to rounding: their distances to the mesh are exact. The judge's points know their
     distance to the zero set to first order, at most the spacing of the centres.
     """
-    grid = {"points": sample.points, "resolution": judge.resolution}
+    grid = {"points": sample.points, "resolution": CELLS}
     try:
         extract_surface(fitted, **grid)  # what is open takes a hundred times as long to find in the whole box
         found = extract_surface(fitted, **grid, search="box", keep="all")
     except ValueError:
         return np.inf
     back = judge.distance.unsigned(found.vertices)
-    there = surface_miss(fitted, judge.points, spacing(sample.points).mean())
+    there = surface_miss(fitted, judge.points[::4], spacing(sample.points).mean())
     rms = float(np.sqrt(0.5 * (there**2 + (back**2).mean())))
     # long muscles fall into pieces between coarse nodes, sheets of a field's own stand off the mesh
     pieces = found.spurious == 0 and back.max() < 2.0 * found.spacing
@@ -121,13 +126,15 @@ def case(judge, sample, kernel, placement):
         # the centres that the choice was made for
         sample = fit_sample(sample, judge.vertices, judge.faces, kernel=kernel, epsilon=row["placed"] or 1.0)
     if row["unfit"] or not kernel.has_epsilon:
-        row["own"] = row["rms"]
+        row["own"] = np.inf if row["unfit"] else row["rms"]
     else:
         chosen = RBFField.fit_surface(
             sample.points, sample.normals, kernel=kernel, epsilon=row["epsilon"], derivatives="all"
         )
         row["own"] = both_ways(judge, sample, chosen)
-    best = brute_force(judge, sample, kernel, "all") if kernel.has_epsilon else (row["rms"] or np.inf, np.nan)
+    best = (row["own"], np.nan)
+    if kernel.has_epsilon:
+        best = brute_force(judge, sample, kernel, "all", row["own"])
     return row, best, seconds
 
 
@@ -205,7 +212,7 @@ def main():
         map(int, options.centres.split(",")), options.placements.split(","), options.kernels.split(",")
     )
     cases = in_rounds(list(groups), list(shapes), options.shuffle)
-    judges = functools.cache(lambda name: SurfaceJudge(*shapes[name], CELLS, 0))
+    judges = functools.cache(lambda name: SurfaceJudge(*shapes[name], 0, 0))
     samples = functools.cache(lambda name, count: sample_surface(*shapes[name], count, placement="greedy"))
     for count, placement, kernel, name in cases:
         if (name, count, placement, kernel) in known or time.monotonic() > until:
