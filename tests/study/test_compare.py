@@ -10,6 +10,7 @@ import pytest
 import trimesh
 from blend_model import BlendMuscle, arm_scene
 
+from rbfmuscle import compare
 from rbfmuscle.compare import compare_models
 from rbfmuscle.sim.scene.phantom import phantom_scene
 from rbfmuscle.study.experiment.comparison import MEASURES, best_models, verdict
@@ -216,3 +217,15 @@ class TestFailure:
         assert table["models"] == ["pbd", "arap-pbd"] and "planted" in table["failed"]["xpbd"]
         assert "xpbd did not finish" in (tmp_path / "report.html").read_text(encoding="utf-8")
         assert not math.isnan(table["results"]["pbd"]["all"]["volume_error"])
+
+
+def test_the_way_back_is_the_way_there_from_the_last_pose(monkeypatch):
+    scene, asked = arm_scene(end=60, step=5), []
+    monkeypatch.setattr(
+        compare, "_surfaces", lambda scene, at: (0.0, asked.append((scene.motion.frames, at)) or "ab")
+    )
+    found = compare._there_and_back(scene)
+    ((path, (turn, end)),) = asked
+    assert path == path[::-1] and path[0] == scene.motion.frames[0] == path[end] and end == len(path) - 1
+    assert path[turn] == scene.motion.frames[-1] and turn > 1
+    assert found == {"build": 0.0, "turn": "a", "end": "b"}
