@@ -137,6 +137,7 @@ def test_pictures_are_coloured_by_activation_or_stretch(saved):
 def test_colours_of_what_a_run_has_not_are_refused(saved):
     with pytest.raises(UsageError, match="known: muscle, activation, stretch"):
         check_colouring(saved, "force")
+    saved = SavedRun(saved.directory)  # what is taken from it here, the others need
     saved.info["scene"]["output"]["fibres"] = False
     with pytest.raises(UsageError, match=r"output\.fibres"):
         check_colouring(saved, "stretch")
