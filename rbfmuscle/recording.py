@@ -8,11 +8,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 
+import numba
+
 from rbfmuscle.compiled.warm import compile_ahead
 from rbfmuscle.compiled.watch import compiled_so_far, tell_stage
-from rbfmuscle.sharing.crew import Crew, helpers_for
+from rbfmuscle.sharing.crew import Crew
 from rbfmuscle.sharing.share import Share
 from rbfmuscle.sim.loop.frame import Event, Frame
+from rbfmuscle.sim.plan.processes import helpers_for
 from rbfmuscle.sim.scene.check import bone_collisions, bone_findings, check_initial
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.study.files.runinfo import Clock, Stages, build_info, frame_facts
@@ -60,7 +63,9 @@ class Recording:
             compile_ahead({muscle.model for muscle in scene.muscles})
         with self.timed("build"), tell_stage("building"):
             self.recorder = MetricsRecorder(scene) if scene.output.metrics else None
-            self.share, self._driven = self._build(0 if models_here else helpers_for(scene))
+            self.share, self._driven = self._build(
+                0 if models_here else helpers_for(scene, numba.get_num_threads())
+            )
 
     def _build(self, helpers):
         """All muscles, here or in helpers' hands, and the events of bones; a scene that is refused ends the helpers."""

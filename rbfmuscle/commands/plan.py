@@ -83,10 +83,20 @@ def _forecast_lines(memory, time):
     return [
         f"expected memory: {_megabytes(memory['total'])} of the scene (fields {_megabytes(memory['fields'])}, "
         f"muscles {_megabytes(memory['muscles'])}, metrics {_megabytes(memory['metrics'])}), "
-        f"peak of the process {_megabytes(memory['peak'])}",
+        f"peak of the process {_megabytes(memory['peak'])}{_together(memory)}",
         f"expected time: {time['total']:.3g} s without report and pictures; build {time['build']['total']:.2g} s "
         f"({build}), a frame {1e3 * time['frame']['total']:.3g} ms ({frame})",
     ]
+
+
+def _together(memory):
+    """What several processes take; they are quicker, and a setting keeps the run in one."""
+    if memory["helpers"] < 2:
+        return ""
+    size = _megabytes(memory["together"])
+    return (
+        f"; in {memory['helpers']} processes, as it will be run, {size} (NUMBA_NUM_THREADS=1 keeps it in one)"
+    )
 
 
 def _megabytes(size):

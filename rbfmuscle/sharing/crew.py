@@ -27,23 +27,8 @@ from rbfmuscle.sim.loop.frame import Frame
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.validation import SolveError
 
-# A process more takes about two seconds to begin and 0.2 GB: fewer muscles, or fewer muscles times frames, are
-# quicker in one.
-LEAST_MUSCLES, LEAST_WORK = 5, 400
-MOST_HELPERS = 4
 # Frames that a helper may be ahead of what is written: memory is bounded, and nobody waits for the disk.
 AHEAD = 1
-
-
-def helpers_for(scene: Scene) -> int:
-    """How many processes a run is worth; fewer than two: none but one's own.
-
-    Muscles that slide on each other see each other at every sub-step, and stay together.
-    """
-    count = len(scene.muscles)
-    if scene.sliding is not None or count * len(scene.motion.frames) < LEAST_WORK:
-        return 0
-    return min(numba.get_num_threads(), count // LEAST_MUSCLES, MOST_HELPERS)
 
 
 class Crew:

@@ -10,7 +10,6 @@ import sys
 import warnings
 from types import SimpleNamespace
 
-import numba
 import numpy as np
 import pytest
 import trimesh
@@ -20,8 +19,10 @@ from run_folders import timeless
 from rbfmuscle import recording
 from rbfmuscle.run import simulate, stream_run
 from rbfmuscle.sharing import crew as sharing
-from rbfmuscle.sharing.crew import Crew, helpers_for
+from rbfmuscle.sharing.crew import Crew
 from rbfmuscle.sharing.share import Share
+from rbfmuscle.sim.plan.forecast import _memory
+from rbfmuscle.sim.plan.processes import HELPER_MEMORY, helpers_for
 from rbfmuscle.sim.scene.motion import Motion
 from rbfmuscle.sim.scene.phantom import phantom_scene
 from rbfmuscle.study.files import writer as writing
@@ -31,7 +32,7 @@ from rbfmuscle.validation import SceneWarning, SolveError
 
 @pytest.fixture
 def two_helpers(monkeypatch):
-    monkeypatch.setattr(recording, "helpers_for", lambda scene: 2)
+    monkeypatch.setattr(recording, "helpers_for", lambda *given: 2)
 
 
 @pytest.fixture
@@ -74,7 +75,7 @@ def test_folder_is_that_of_one_process_to_the_last_byte(tmp_path, two_helpers, c
     scene = small_scene(1, **{"output.moment_arms": True, "output.fibres": fibres})
     stream_run(scene, tmp_path / "several", pictures=False)
     assert len(crews) == 1 and ended(crews[0])
-    monkeypatch.setattr(recording, "helpers_for", lambda scene: 0)
+    monkeypatch.setattr(recording, "helpers_for", lambda *given: 0)
     stream_run(scene, tmp_path / "one", pictures=False)
     assert len(crews) == 1
     assert_same_folders(tmp_path / "several", tmp_path / "one")
@@ -95,11 +96,11 @@ def test_run_begun_by_several_is_ended_by_one_and_the_other_way_round(tmp_path, 
     stream_run(scene, tmp_path / "whole", pictures=False)
     for first, then in ((2, 0), (0, 2)):
         folder = tmp_path / str(first)
-        monkeypatch.setattr(recording, "helpers_for", lambda scene, first=first: first)
+        monkeypatch.setattr(recording, "helpers_for", lambda *given, first=first: first)
         with pytest.raises(KeyboardInterrupt):
             stream_run(scene, folder, pictures=False, progress=until(2))
         assert SavedRun(folder).frames == [0, 1]
-        monkeypatch.setattr(recording, "helpers_for", lambda scene, then=then: then)
+        monkeypatch.setattr(recording, "helpers_for", lambda *given, then=then: then)
         stream_run(scene, folder, pictures=False, resume=True)
         assert_same_folders(tmp_path / "whole", folder)
 
@@ -167,30 +168,32 @@ def test_helper_ends_with_the_process_that_started_it():
 
 
 class TestHelpersFor:
-    @pytest.fixture(autouse=True)
-    def four_cores(self, monkeypatch):
-        monkeypatch.setattr(numba, "get_num_threads", lambda: 4)
-
     def scene(self, muscles, frames, sliding=None):
         return SimpleNamespace(
             muscles=range(muscles), motion=SimpleNamespace(frames=range(frames)), sliding=sliding
         )
 
     def test_one_process_where_another_costs_more_than_it_brings(self):
-        assert helpers_for(self.scene(4, 1000)) < 2
-        assert helpers_for(self.scene(38, 5)) < 2
-        assert helpers_for(phantom_scene()) < 2
+        assert helpers_for(self.scene(4, 1000), 4) < 2
+        assert helpers_for(self.scene(38, 5), 4) < 2
+        assert helpers_for(phantom_scene(), 4) < 2
 
-    def test_no_more_than_cores_or_muscles_feed(self, monkeypatch):
-        assert helpers_for(self.scene(38, 37)) == 4
-        assert helpers_for(self.scene(12, 100)) == 2
-        monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
-        assert helpers_for(self.scene(38, 37)) == 2
-        monkeypatch.setattr(numba, "get_num_threads", lambda: 1)
-        assert helpers_for(self.scene(38, 37)) < 2
+    def test_no_more_than_cores_or_muscles_feed(self):
+        assert helpers_for(self.scene(38, 37), 4) == 4
+        assert helpers_for(self.scene(12, 100), 4) == 2
+        assert helpers_for(self.scene(38, 37), 2) == 2
+        assert helpers_for(self.scene(38, 37), 1) < 2
 
     def test_muscles_that_slide_stay_together(self):
-        assert helpers_for(self.scene(38, 37, sliding=object())) < 2
+        assert helpers_for(self.scene(38, 37, sliding=object()), 4) < 2
+
+    def test_forecast_adds_what_each_process_takes(self):
+        output = SimpleNamespace(metrics=False, report=False)
+        scene = SimpleNamespace(bones=[], output=output, **vars(self.scene(38, 37)))
+        memory = [_memory(scene, [], [], 1e8, threads) for threads in (1, 2, 4)]
+        assert [found["helpers"] for found in memory] == [1, 2, 4]
+        more = np.diff([found["together"] - found["peak"] for found in memory])
+        assert list(more) == [2 * HELPER_MEMORY, 2 * HELPER_MEMORY]
 
 
 def test_what_helpers_say_is_said_once(caplog):

@@ -18,6 +18,7 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.sim.distance.build import CUT, OUTER, grid_shape
 from rbfmuscle.sim.distance.cells import BLOCK
 from rbfmuscle.sim.distance.sdf import BAND, CELL_SHARE, LEAST_CELLS, BoneSDF
+from rbfmuscle.sim.plan.processes import HELPER_MEMORY, helpers_for
 from rbfmuscle.sim.plan.rates import scales
 from rbfmuscle.sim.scene.motion import bone_poses
 
@@ -174,12 +175,12 @@ def forecast(
     Returns
     -------
     memory, time : dict
-        Bytes and seconds.
+        Bytes and seconds; ``peak`` of the memory in one process, ``together`` in that many ``helpers``.
     """
-    return _memory(scene, fields, costs, resident), _time(scene, fields, costs, work, rates, threads)
+    return _memory(scene, fields, costs, resident, threads), _time(scene, fields, costs, work, rates, threads)
 
 
-def _memory(scene, fields, costs, resident):
+def _memory(scene, fields, costs, resident, threads):
     triangles = sum(len(bone.mesh.faces) for bone in scene.bones)
     parts = {
         "fields": sum(field.memory for field in fields),
@@ -190,7 +191,10 @@ def _memory(scene, fields, costs, resident):
     program = resident + (REPORT_LIBRARIES if scene.output.report else 0.0)
     working = sum(cost.working for cost in costs)
     working += sum((READ_SPARE if field.kept else BUILD_SPARE) * field.memory for field in fields)
-    return {**parts, "program": program, "peak": parts["total"] + working + program}
+    peak = parts["total"] + working + program
+    helpers = max(helpers_for(scene, threads), 1)
+    together = peak + (helpers * HELPER_MEMORY if helpers > 1 else 0.0)
+    return {**parts, "program": program, "peak": peak, "helpers": helpers, "together": together}
 
 
 def _time(scene, fields, costs, work, rates, threads):
