@@ -6,8 +6,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable
-from pathlib import Path
 
+from rbfmuscle.compiled.child import child_call
 from rbfmuscle.compiled.needs import UNFIT, is_settled, loops_missing, task_names
 from rbfmuscle.compiled.progress import Progress
 from rbfmuscle.compiled.store import PATIENCE, EntryLock, write_entry
@@ -131,10 +131,7 @@ def _typing_errors():
 def _start_helpers(tasks, missing, jobs):
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     count = min((jobs or cores) - 1, int(sum(need.cost for need in missing) / _WORTH))
-    # Nothing that lies in the present folder shall take the place of a module.
-    command = [sys.executable, "-P", "-m", "rbfmuscle.compiled.warm", *tasks]
-    places = [str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(place for place in places if place)}
+    command, environment = child_call("rbfmuscle.compiled.warm", *tasks)
     quiet = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
     helpers = []
     for _ in range(count):

@@ -9,19 +9,17 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import pickle
 import queue
 import subprocess
-import sys
 import threading
 import warnings
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import numba
 
+from rbfmuscle.compiled.child import child_call
 from rbfmuscle.sharing.share import Solved
 from rbfmuscle.sim.loop.frame import Frame
 from rbfmuscle.sim.scene.scene import Scene
@@ -119,15 +117,9 @@ class _Helper:
     """One process, seen from here: its messages are taken by a thread, so that it need not wait for ours."""
 
     def __init__(self, job: Any, threads: int) -> None:
-        # Nothing that lies in the present folder shall take the place of a module.
-        command = [sys.executable, "-P", "-m", "rbfmuscle.sharing.helper"]
-        places = [str(Path(__file__).resolve().parents[2]), *(p for p in sys.path if p)]
+        command, environment = child_call("rbfmuscle.sharing.helper")
         counts = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-        environment = {
-            **os.environ,
-            "PYTHONPATH": os.pathsep.join(places),
-            **dict.fromkeys(counts, str(threads)),
-        }
+        environment |= dict.fromkeys(counts, str(threads))
         # A group of its own: an interrupt is for this process, which ends the helper.
         self.process = subprocess.Popen(
             command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, process_group=0

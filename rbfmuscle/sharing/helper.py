@@ -19,6 +19,8 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
+from rbfmuscle.compiled.watch import compiled_so_far
+from rbfmuscle.sharing.share import Share
 from rbfmuscle.validation import RBFMuscleError
 
 
@@ -32,11 +34,14 @@ class _Outbox:
         self._lock = threading.Lock()
 
     def put(self, kind: str, what: Any) -> None:
-        """Give a message, whole."""
+        """Give a message, whole; where nobody takes it any more, end at once."""
         text = pickle.dumps((kind, what, self.clock()), protocol=pickle.HIGHEST_PROTOCOL)
-        with self._lock:
-            self.file.write(text)
-            self.file.flush()
+        try:
+            with self._lock:
+                self.file.write(text)
+                self.file.flush()
+        except BrokenPipeError:
+            os._exit(0)
 
 
 class _Forward(logging.Handler):
@@ -53,29 +58,26 @@ class _Forward(logging.Handler):
 
 def main() -> None:
     """Build, wait for the word, go through the motion."""
-    outbox, inbox = _Outbox(), sys.stdin.buffer
-    scene, names, resumable = pickle.load(inbox)
+    outbox, words = _Outbox(), queue.Queue[Any]()
+    threading.Thread(target=_listen, args=(sys.stdin.buffer, words), daemon=True).start()
+    scene, names, resumable = words.get()
     warnings.simplefilter("always")
     warnings.showwarning = lambda message, *_: outbox.put("warned", message)
     logging.getLogger("rbfmuscle").addHandler(_Forward(outbox))
     try:
-        _work(outbox, inbox, scene, names, resumable)
+        _work(outbox, words, Share(scene, names, resumable=resumable))
     except RBFMuscleError as error:
         outbox.put("failed", error)
     except Exception:  # noqa: BLE001 - whatever it is, it is told where the run was asked for
         outbox.put("failed", RuntimeError(traceback.format_exc()))
+    # Not by Python's own end, which would wait for the thread that listens.
+    os._exit(0)
 
 
-def _work(outbox, inbox, scene, names, resumable):
-    from rbfmuscle.compiled.watch import compiled_so_far
-    from rbfmuscle.sharing.share import Share
-
-    share = Share(scene, names, resumable=resumable)
+def _work(outbox, words, share):
     return_freed_memory()
     outbox.clock = lambda: {"times": dict(share.times), "compiled": compiled_so_far()}
     outbox.put("done", None)
-    words = queue.Queue()
-    threading.Thread(target=_listen, args=(inbox, words), daemon=True).start()
     for place, solved in enumerate(share.frames(*words.get())):
         outbox.put("done", solved)
         if place == 0:
@@ -90,9 +92,10 @@ def return_freed_memory() -> None:
 
 
 def _listen(inbox, words):
-    """Pass the word on; when there is nobody left to give another, end at once."""
-    words.put(pickle.load(inbox))
-    inbox.read()
+    """Pass on the job and the word to begin; when there is nobody left to give another, end at once."""
+    with contextlib.suppress(EOFError, pickle.UnpicklingError):
+        while True:
+            words.put(pickle.load(inbox))
     os._exit(0)
 
 
