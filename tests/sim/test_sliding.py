@@ -191,6 +191,24 @@ def test_planes_ask_for_little_in_one_sub_step_however_deep_the_overlap():
     assert _overlap(parts) < 0.1
 
 
+def test_both_are_cut_where_only_one_sees_that_they_meet():
+    """Held points take no contact: where one muscle's lie in the other, this one alone sees it."""
+    made, fields = _neighbours(PRESS, sliding=SlidingOptions())
+    parts = {m.name: ToyMuscle(m, made, sweeps=4, reach=2.0) for m in made.muscles}
+    with FrameLoop(made, parts, fields=fields) as loop:
+        for coordinates in made.motion.frames:
+            loop.advance(coordinates)
+        (one,), (other,) = (loop._sliding.links[name] for name in ("lower", "upper"))
+        assert one.back is other and other.back is one
+        low, high = one.meeting()
+        assert np.all(low <= one.zone[0]) and np.all(high >= other.zone[1])
+        one.zone = None
+        point = 0.5 * (other.zone[0] + other.zone[1])[None]
+        assert np.isfinite(one.cut(point)).all() and len(one.points())
+        other.zone = None
+        assert one.meeting() is None and np.isinf(one.cut(point)).all() and not len(one.points())
+
+
 def test_each_muscle_takes_its_own_sub_steps_and_all_meet_at_the_frame():
     path = [{"hinge.press": np.radians(angle)} for angle in (0, 5)]
     made, fields = _neighbours([{"press": 5}], sliding=SlidingOptions())

@@ -110,7 +110,9 @@ class Link:
         self.linked = np.zeros(len(self.free), dtype=bool)
         self.hold = np.full(len(self.free), limits.hold)
         self.before: Any = None
-        self.zone = None
+        #: Box in which the points of this muscle come near the neighbour, and the link that looks the other way.
+        self.zone: Any = None
+        self.back: Link | None = None
         index, distance, _, _ = self._near()
         self.linked[index[distance < limits.threshold]] = True
         near = distance < limits.threshold
@@ -158,6 +160,15 @@ class Link:
         opened = np.maximum(apart[self.touching] - np.maximum(self.gap, 0.0), 0.0)
         return Met(max(0.0, -float(distance.min(initial=0.0))), len(opened), float((opened**2).sum()))
 
+    def meeting(self) -> Any:
+        """Box in which the two meet, as either sees it, or None: what is held takes no contact, but is met."""
+        zones = [
+            zone for zone in (self.zone, None if self.back is None else self.back.zone) if zone is not None
+        ]
+        if not zones:
+            return None
+        return np.min([low for low, _ in zones], axis=0), np.max([high for _, high in zones], axis=0)
+
     def cut(self, points: Floats) -> Any:
         """Half the difference of both muscles' distances near where they meet, infinity elsewhere."""
         return self.cut_with_gradient(points)[0]
@@ -165,9 +176,9 @@ class Link:
     def cut_with_gradient(self, points: Floats) -> Any:
         """Cut (n,) and its gradient (n, 3): the surface midway between two overlapping muscles."""
         value, gradient = np.full(len(points), np.inf), np.zeros((len(points), 3))
-        if self.zone is None or not self.limits.cut:
+        zone, depth = self.meeting(), self.limits.cut_depth
+        if zone is None or not self.limits.cut:
             return value, gradient
-        zone, depth = self.zone, self.limits.cut_depth
         inside = np.all((points > zone[0]) & (points < zone[1]), axis=1)
         if self.own.field is not None and self.other.field is not None:
             # What is shown is the zero set of the fields: where these are equal both are cut alike.
@@ -188,9 +199,10 @@ class Link:
 
     def points(self) -> Floats:
         """Points (k, 3) of the neighbour where the two meet, which the faces of a surface have to leave outside."""
-        if self.zone is None or not self.limits.cut:
+        zone = self.meeting()
+        if zone is None or not self.limits.cut:
             return np.zeros((0, 3))
-        found, (low, high) = self.other.vertices, self.zone
+        found, (low, high) = self.other.vertices, zone
         return found[np.all((found > low) & (found < high), axis=1)]
 
     def _near(self):
@@ -280,6 +292,9 @@ class Sliding:
                     self.links[stepper.name].append(link)
                     stepper.contacts.neighbours += [link.push, link.pull]
                     stepper.contacts.cuts.append(link)
+                    link.back = next((b for b in self.links[other.name] if b.other is link.own), None)
+                    if link.back is not None:
+                        link.back.back = link
             if options.bones:
                 held = [BoneLink(stepper, b, limits) for b in stepper.contacts.reached]
                 self.bone_links[stepper.name] = held

@@ -10,7 +10,7 @@ import numpy as np
 
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
-from rbfmuscle.study.show.appearance import muscle_colours
+from rbfmuscle.study.show.appearance import neighbour_colours
 from rbfmuscle.study.show.labels import caption, labelled
 from rbfmuscle.study.show.paint import CHIPS, scale_chips
 from rbfmuscle.study.show.render import main, save_images
@@ -34,7 +34,7 @@ def _draw_job(folder, job, seconds, stages):
         paint = _distance_paint(SavedRun(folder / job["reference"]), limit) if limit else None
         rows = [[(saved, view) for saved in runs.values()] for view in job["views"]]
         stages[key] = Stage(rows, job["size"], paint)
-    chips = _scale(limit, first.units) if limit else muscle_colours(first.muscles)
+    chips = _scale(limit, first.units) if limit else neighbour_colours(first)
     images = [
         labelled(stages[key].show(frame), caption(first, frame), list(runs), chips) for frame in job["frames"]
     ]
