@@ -344,7 +344,9 @@ def test_cut_is_midway_between_overlapping_muscles():
     inside = upper.x[igl.signed_distance(upper.x, lower.x, lower.faces)[0] < 0]
     assert len(inside) > 10
     assert np.isin(inside.view("f8,f8,f8"), np.ascontiguousarray(met).view("f8,f8,f8")).all()
-    assert len(met) < len(upper.x)
+    low, high = steppers[0].contacts.cuts[0].meeting()
+    assert np.all((met > low) & (met < high))
+    assert high[2] < upper.x[:, 2].max() + 6.5
     steppers[0].contacts.cuts[0].limits.cut = False
     assert steppers[0].contacts.neighbour_points().shape == (0, 3)
 
