@@ -40,6 +40,8 @@ ALIKE = 1.05
 RIDGE_SHARE = 1e-12
 # Zero sets that are looked at, and cells of the box in which sheets are looked for that do not belong to the surface.
 LOOKS, BOX = 12, 40
+# Cells of another look where slender muscles fall into pieces between the nodes of that box.
+FINER = 160
 # Where sheets are found, so much flatter kernels are looked at next.
 FLATTER = 1.15
 OPEN = "the level set is open at every epsilon that was looked at; take more centres or another kernel"
@@ -164,10 +166,15 @@ def _look_at_zero_sets(
     """The best of the tried epsilons by the distance both ways; the choice, named broken, where none is closed."""
     found, spare = None, replace(choice, broken=OPEN)
     tried = choice.tried[choice.tried[:, 2] <= limits.condition]
-    looks, narrow = 0, np.inf
-    for number in by_worth(tried):
+    looks, narrow, again = 0, np.inf, False
+    queue, passed = list(by_worth(tried)), list[int]()
+    while queue or (passed and found is None and not again):
+        if not queue:  # none is flat enough; long muscles may be whole only with narrower kernels
+            queue, looks, narrow, again = passed, 0, np.inf, True
+        number = queue.pop(0)
         epsilon, missed, condition = (float(x) for x in tried[number])
-        if epsilon > narrow:
+        if epsilon > narrow and not again:
+            passed.append(number)
             continue  # one little flatter has sheets of its own where the kernels end
         looks += 1
         least = np.inf if found is None else found.objective
@@ -182,7 +189,7 @@ def _look_at_zero_sets(
             continue
         now = replace(choice, epsilon=epsilon, objective=both, condition=condition)
         # In the whole box of the points, open ones included.
-        sheets = extract_surface(field, points=points, resolution=BOX, search="box").components
+        sheets = _sheets(field, points, distance)
         if sheets > 1:
             if condition < DOUBTFUL:
                 narrow = epsilon / FLATTER
@@ -212,3 +219,13 @@ def _back(field: RBFField, points: Floats, distance: Callable[..., Any]) -> floa
     except ValueError:
         return np.inf
     return float(np.sqrt((np.asarray(distance(found.vertices)) ** 2).mean()))
+
+
+def _sheets(field: RBFField, points: Floats, distance: Callable[..., Any]) -> int:
+    """Sheets of the zero set in the whole box of the points."""
+    found = extract_surface(field, points=points, resolution=BOX, search="box", keep="all")
+    if found.components > 1 and not found.spurious:
+        away = np.abs(np.asarray(distance(found.vertices)))
+        if away.max() < found.spacing:  # none stands off the surface: pieces of it
+            found = extract_surface(field, points=points, resolution=FINER, search="box", keep="all")
+    return found.components

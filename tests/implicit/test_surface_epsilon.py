@@ -9,8 +9,9 @@ import trimesh
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.sampling import sample_surface
-from rbfmuscle.implicit.selection import SPAN, spacing, surface_miss
-from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
+from rbfmuscle.implicit.selection import SPAN, EpsilonChoice, spacing, surface_miss
+from rbfmuscle.implicit.shape_search import Limits
+from rbfmuscle.implicit.surface_epsilon import _look_at_zero_sets, _sheets, choose_surface_epsilon
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.validation import NumericalWarning, UsageError
 
@@ -85,3 +86,56 @@ def test_without_other_points_the_centres_choose(plate):
     assert alone.epsilon > 0
     with pytest.raises(UsageError, match="held_out points"):
         choose_surface_epsilon(centres.points, centres.normals, kernel="matern_52", criterion="held_out")
+
+
+class Shape:
+    """A field made of a function of points that is negative inside."""
+
+    condition = 1.0
+
+    def __init__(self, function):
+        self.function = function
+
+    def __call__(self, points):
+        return self.function(points)
+
+    def value_and_gradient(self, points):
+        step = 1e-5 * np.eye(3)
+        slopes = [(self(points + d) - self(points - d)) / 2e-5 for d in step]
+        return self(points), np.stack(slopes, axis=1)
+
+
+def ball(points, centre=0.0, radius=10.0):
+    return np.linalg.norm(points - np.array([centre, 0.0, 0.0]), axis=1) - radius
+
+
+def test_a_slender_bent_tube_is_one_sheet_though_the_coarse_box_cuts_it():
+    """The cells of the box are 5 wide, the tube 4; a ball beside it is a sheet of its own at any grid."""
+
+    def tube(points):
+        x, y, z = points.T
+        across = np.hypot(y - 10.0 * np.sin(x / 20.0), z)
+        return np.hypot(across, np.maximum(np.abs(x) - 95.0, 0.0)) - 2.0
+
+    x = np.linspace(-95.0, 95.0, 400)
+    points = np.c_[x, 10.0 * np.sin(x / 20.0), 2.0 + 0.0 * x]
+    field, alone = Shape(tube), dict(points=points, resolution=40, search="box", keep="all")
+    assert extract_surface(field, **alone).components > 1
+    assert _sheets(field, points, field) == 1
+    both = Shape(lambda at: np.minimum(tube(at), ball(at - [0.0, 10.0, 0.0], 70.0, 3.0)))
+    assert _sheets(both, np.vstack([points, [[0.0, 14.0, 0.0]]]), field) > 1
+
+
+def test_narrower_kernels_are_looked_at_where_all_flat_ones_have_sheets_of_their_own():
+    epsilons = np.geomspace(0.1, 10.0, 9)
+    tried = np.c_[epsilons, 0.1 * (1.0 + 0.05 * np.arange(9)), 1e6 / epsilons]
+    points = 10.0 * trimesh.creation.icosphere(subdivisions=2).vertices
+
+    def fit(epsilon):
+        two = Shape(lambda at: np.minimum(ball(at), ball(at, 12.6, 2.0)))
+        return two if epsilon < 1.5 else Shape(ball)
+
+    around = np.vstack([points, [[15.0, 0.0, 0.0]]])
+    choice = EpsilonChoice(0.1, 0.1, 1e7, tried)
+    found = _look_at_zero_sets(choice, Limits(), fit, around, ball)
+    assert not found.broken and 1.5 < found.epsilon < 2.0
