@@ -12,12 +12,13 @@ from scipy.spatial.transform import Rotation
 from pbd_baseline.arap import ARAP, ARAPConstraint, _turn_towards
 from pbd_baseline.constraints import _cubic_step
 from pbd_baseline.contact import ContactConstraint, _keep_deepest, _push_loop
-from pbd_baseline.fibres import edge_stiffness
+from pbd_baseline.fibres import edge_stiffness, swelling_room
 from pbd_baseline.motion import carry
 from pbd_baseline.muscle import _contact_carriers
 from pbd_baseline.topology import Topology
 from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.geometry.rotations import quaternion_matrix
+from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.sim.loop.contact import HalfSpaces
 from rbfmuscle.sim.scene.motion import rotation_about
 
@@ -282,3 +283,13 @@ def test_a_push_moves_each_point_by_its_depth_whatever_carries_it():
     _push_loop(moved, columns, shares, np.arange(3), normal, depth)
     went = np.einsum("pk,pka->pa", shares, (moved - points)[columns])
     np.testing.assert_allclose(went, np.maximum(depth, 0.0)[:, None] * normal, atol=1e-14)
+
+
+def test_room_to_swell_grows_with_the_muscle_and_is_none_where_it_is_held(rest):
+    vertices, topology = rest
+    normals = vertex_normals(vertices, topology.faces)
+    held = vertices[:, 0] < -2.5
+    room = swelling_room(vertices, topology.faces, normals, held, 0.04)
+    larger = swelling_room(50.0 * vertices + [3.0, -4.0, 5.0], topology.faces, normals, held, 0.04)
+    np.testing.assert_allclose(larger, 50.0 * room, rtol=1e-6, atol=1e-9)
+    assert (room[held] == 0.0).all() and room[~held].max() > 0.5
