@@ -14,8 +14,8 @@ from rbfmuscle.geometry.fields import LevelField
 from rbfmuscle.geometry.mean_value import mean_value_weights
 from rbfmuscle.geometry.rest_frame import BoneFrame
 from rbfmuscle.geometry.triangles import nearest_weights
+from rbfmuscle.geometry.winding import winding_number
 from rbfmuscle.implicit.placement.off_surface import _touching_ball_loop
-from rbfmuscle.study.measure.mesh_distance import _winding_loop
 
 
 def solid():
@@ -167,12 +167,12 @@ def test_a_field_less_a_level_is_zero_where_the_field_has_the_level():
 def test_winding_numbers_are_one_inside_none_outside_and_halves_add_up():
     vertices, faces = solid()
     inside, outside = np.array([5.2, 0.1, 1.1]), np.array([8.0, 0.3, 1.0])
-    assert _winding_loop(inside, vertices, faces) == pytest.approx(1.0)
-    assert _winding_loop(outside, vertices, faces) == pytest.approx(0.0, abs=1e-12)
+    assert winding_number(inside, vertices, faces) == pytest.approx(1.0)
+    assert winding_number(outside, vertices, faces) == pytest.approx(0.0, abs=1e-12)
     half = faces[: len(faces) // 2], faces[len(faces) // 2 :]
-    parts = [_winding_loop(inside, vertices, np.ascontiguousarray(part)) for part in half]
+    parts = [winding_number(inside, vertices, np.ascontiguousarray(part)) for part in half]
     assert sum(parts) == pytest.approx(1.0) and 0.1 < parts[0] < 0.9
-    assert _winding_loop(inside, vertices, np.ascontiguousarray(faces[:, ::-1])) == pytest.approx(-1.0)
+    assert winding_number(inside, vertices, np.ascontiguousarray(faces[:, ::-1])) == pytest.approx(-1.0)
 
 
 @pytest.mark.parametrize("scale", [1.0, 40.0])

@@ -11,6 +11,7 @@ from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.geometry.triangles import nearest_weights
+from rbfmuscle.geometry.winding import wound_around
 
 if TYPE_CHECKING:
     from rbfmuscle.sim.loop.frame import MuscleModel
@@ -145,7 +146,9 @@ class CarriedSurface:
         # A triangle that is folded over at a rim may take a point far outside for one that is deep.
         deep = np.flatnonzero(near & (distance < -FOLDED * self.edge))
         if len(deep):
-            near[deep] = _winding_loop(points[index[deep]], self.vertices, self.faces) > 0.5
+            inside = np.empty(len(deep), dtype=np.bool_)
+            wound_around(points[index[deep]], self.vertices, self.faces, inside)
+            near[deep] = inside
         return index[near], distance[near], normal[near], nearest[near]
 
 
@@ -232,31 +235,6 @@ def _nearest_loop(points, which, vertices, cells, bound, index, nearest):
             index[count], nearest[count] = p, best
             count += 1
     return count
-
-
-@compiled(error_model="numpy")
-def _winding_loop(points, vertices, faces):
-    """Generalised winding number of a mesh at each point, by the solid angles of its triangles (van Oosterom 1983)."""
-    found, arm, size = np.zeros(len(points)), np.empty((3, 3)), np.empty(3)
-    for p in range(len(points)):
-        for f in range(len(faces)):
-            for c in range(3):
-                for k in range(3):
-                    arm[c, k] = vertices[faces[f, c], k] - points[p, k]
-                size[c] = np.sqrt(arm[c, 0] ** 2 + arm[c, 1] ** 2 + arm[c, 2] ** 2)
-            volume = (
-                arm[0, 0] * (arm[1, 1] * arm[2, 2] - arm[1, 2] * arm[2, 1])
-                + arm[0, 1] * (arm[1, 2] * arm[2, 0] - arm[1, 0] * arm[2, 2])
-                + arm[0, 2] * (arm[1, 0] * arm[2, 1] - arm[1, 1] * arm[2, 0])
-            )
-            below = size[0] * size[1] * size[2]
-            for c in range(3):
-                d = (c + 1) % 3
-                dot = arm[c, 0] * arm[d, 0] + arm[c, 1] * arm[d, 1] + arm[c, 2] * arm[d, 2]
-                below += dot * size[(c + 2) % 3]
-            found[p] += np.arctan2(volume, below)
-        found[p] /= 2.0 * np.pi
-    return found
 
 
 @compiled

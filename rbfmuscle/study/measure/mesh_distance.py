@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.winding import winding_number
 from rbfmuscle.validation import check_mesh, check_points
 
 
@@ -75,7 +75,7 @@ class MeshDistance:
         # At a face the normal points along the way; elsewhere it may be nearly square to it.
         unsure = np.abs(np.einsum("ij,ij->i", points - closest, normal)) < 0.1 * np.abs(out)
         for n in np.flatnonzero(unsure):
-            inside = _winding_loop(points[n], self.vertices, self.faces) > 0.5
+            inside = winding_number(points[n], self.vertices, self.faces) > 0.5
             out[n] = -abs(out[n]) if inside else abs(out[n])
         return out
 
@@ -98,26 +98,7 @@ class MeshDistance:
         depth = np.maximum(-self.signed(points), 0.0)
         while depth.any():
             deepest = int(depth.argmax())
-            if _winding_loop(points[deepest], self.vertices, self.faces) > 0.5:
+            if winding_number(points[deepest], self.vertices, self.faces) > 0.5:
                 break
             depth[deepest] = 0.0
         return depth
-
-
-@compiled
-def _winding_loop(point, vertices, faces):
-    """Winding number of a mesh about one point, by solid angles of triangles (van Oosterom 1983)."""
-    total = 0.0
-    for f in range(len(faces)):
-        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
-        ax, ay, az = a[0] - point[0], a[1] - point[1], a[2] - point[2]
-        bx, by, bz = b[0] - point[0], b[1] - point[1], b[2] - point[2]
-        cx, cy, cz = c[0] - point[0], c[1] - point[1], c[2] - point[2]
-        p = np.sqrt(ax * ax + ay * ay + az * az)
-        q = np.sqrt(bx * bx + by * by + bz * bz)
-        r = np.sqrt(cx * cx + cy * cy + cz * cz)
-        triple = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
-        below = p * q * r + (ax * bx + ay * by + az * bz) * r
-        below += (bx * cx + by * cy + bz * cz) * p + (cx * ax + cy * ay + cz * az) * q
-        total += np.arctan2(triple, below)
-    return total / (2.0 * np.pi)
