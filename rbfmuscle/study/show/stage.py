@@ -51,7 +51,7 @@ class Stage:
         for i, j, _, view in self.panels:
             self.plotter.subplot(i, j)
             aim_camera(self.plotter.camera, VIEWS[view][0], bounds, size)
-            self.plotter.enable_anti_aliasing("ssaa")
+            self.plotter.enable_anti_aliasing("fxaa")
 
     def show(self, frame: int) -> Any:
         """Put bones and muscles where they are in a frame, and return the picture (h, w, 3) uint8."""
