@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from datetime import UTC, datetime
 
 import numba
@@ -13,7 +13,7 @@ import numba
 from rbfmuscle.compiled.warm import compile_ahead
 from rbfmuscle.compiled.watch import compiled_so_far, tell_stage
 from rbfmuscle.sharing.crew import Crew
-from rbfmuscle.sharing.share import Share
+from rbfmuscle.sharing.share import Share, timed
 from rbfmuscle.sim.loop.frame import Event, Frame
 from rbfmuscle.sim.plan.processes import helpers_for
 from rbfmuscle.sim.scene.check import bone_collisions, bone_findings, check_initial
@@ -82,14 +82,9 @@ class Recording:
             raise
         return crew, driven
 
-    @contextmanager
-    def timed(self, part: str) -> Iterator[None]:
-        """Add the time spent inside to one entry of ``times`` [s]."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.times[part] = self.times.get(part, 0.0) + time.perf_counter() - start
+    def timed(self, part: str) -> AbstractContextManager[None]:
+        """Context whose time is added to one entry of ``times`` [s]."""
+        return timed(self.times, part)
 
     def go_on(self, state: dict, rows: list[Row]) -> None:
         """Go on behind a frame: what a sink was given to keep with it, and the rows that were complete by then."""

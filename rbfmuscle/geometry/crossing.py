@@ -4,6 +4,7 @@ import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.triangles import triangle_normal
 
 # Triangles in a leaf of the tree, and bits of their places along each axis by which they are sorted.
 LEAF, BITS = 4, 10
@@ -133,7 +134,7 @@ def _cones_loop(vertices, faces, order, leaves, out):
     """Unit normals, and a cone around those of each node: its axis, and how far another may be from it."""
     units, cone = out
     for m in range(len(order)):
-        x, y, z = _normal(vertices, faces, order[m])
+        x, y, z = triangle_normal(vertices, faces, order[m])
         length = max(np.sqrt(x * x + y * y + z * z), 1e-300)
         units[m, 0], units[m, 1], units[m, 2] = x / length, y / length, z / length
         for a in range(3):
@@ -192,12 +193,12 @@ def _plain_loop(vertices, faces, normals, turns, plain):
     the ring goes round once, none covers another, so no two of them cross.
     """
     for f in range(len(faces)):
-        normal = _normal(vertices, faces, f)
+        normal = triangle_normal(vertices, faces, f)
         for k in range(3):
             for a in range(3):
                 normals[faces[f, k], a] += normal[a]
     for f in range(len(faces)):
-        x, y, z = _normal(vertices, faces, f)
+        x, y, z = triangle_normal(vertices, faces, f)
         for k in range(3):
             v, p, q = faces[f, k], faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
             u = normals[v]
@@ -217,23 +218,6 @@ def _plain_loop(vertices, faces, normals, turns, plain):
             turns[v] += below and above
     for v in range(len(plain)):
         plain[v] &= turns[v] == 1
-
-
-@compiled
-def _normal(vertices, faces, f):
-    """Normal of a triangle, twice its area long."""
-    a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-    ux, uy, uz = (
-        vertices[b, 0] - vertices[a, 0],
-        vertices[b, 1] - vertices[a, 1],
-        vertices[b, 2] - vertices[a, 2],
-    )
-    vx, vy, vz = (
-        vertices[c, 0] - vertices[a, 0],
-        vertices[c, 1] - vertices[a, 1],
-        vertices[c, 2] - vertices[a, 2],
-    )
-    return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
 
 
 @compiled

@@ -201,6 +201,23 @@ def _dot(a, b, p, q):
 
 
 @compiled
+def triangle_normal(vertices, faces, f):
+    """Normal of a triangle, twice its area long."""
+    a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+    ux, uy, uz = (
+        vertices[b, 0] - vertices[a, 0],
+        vertices[b, 1] - vertices[a, 1],
+        vertices[b, 2] - vertices[a, 2],
+    )
+    vx, vy, vz = (
+        vertices[c, 0] - vertices[a, 0],
+        vertices[c, 1] - vertices[a, 1],
+        vertices[c, 2] - vertices[a, 2],
+    )
+    return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+
+
+@compiled
 def nearest_weights(p, a, b, c, weights):
     """Barycentric weights of the point of a triangle nearest to p (Ericson 2005, section 5.1.5)."""
     d1, d2 = _dot(a, b, p, a), _dot(a, c, p, a)

@@ -15,6 +15,7 @@ import subprocess
 import threading
 import warnings
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numba
@@ -22,7 +23,6 @@ import numba
 from rbfmuscle.compiled.child import child_call
 from rbfmuscle.compiled.watch import tell_stage
 from rbfmuscle.sharing.share import Solved
-from rbfmuscle.sim.loop.frame import Frame
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.validation import SolveError
 
@@ -184,20 +184,16 @@ def _joined(parts, order):
         return {name: found.pop(name) for name in order if name in found} | found
 
     first, frames = parts[0].frame, [part.frame for part in parts]
-    frame = Frame(
-        first.index,
-        first.coordinates,
-        first.poses,
-        joined(f.surfaces for f in frames),
-        joined(f.carried for f in frames),
-        [event for f in frames for event in f.events],
-        joined(f.times for f in frames),
-        max(f.wall for f in frames),
-        activations=first.activations,
-        **{part: joined(getattr(f, part) for f in frames) for part in ("fibres", "nudged", "work")},
+    by_muscle = ("surfaces", "carried", "times", "fibres", "nudged", "work")
+    state = {
+        key: value if key in ("index", "here", "activations") else joined(f.state[key] for f in frames)
+        for key, value in first.state.items()
+    }
+    frame = replace(
+        first,
+        events=[event for f in frames for event in f.events],
+        wall=max(f.wall for f in frames),
+        state=state,
+        **{part: joined(getattr(f, part) for f in frames) for part in by_muscle},
     )
-    if first.state:
-        for key, value in first.state.items():
-            same = key in ("index", "here", "activations")
-            frame.state[key] = value if same else joined(f.state[key] for f in frames)
     return Solved(frame, joined(p.measured for p in parts), joined(p.measures for p in parts))

@@ -7,7 +7,6 @@ standard output, each with its clock. It ends with the process that started it.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import logging
 import os
 import pickle
@@ -66,7 +65,7 @@ def main() -> None:
     logging.getLogger("rbfmuscle").addHandler(_Forward(outbox))
     try:
         _work(outbox, words, Share(scene, names, resumable=resumable))
-    except RBFMuscleError as error:
+    except (RBFMuscleError, MemoryError, OSError) as error:  # what the command line tells in one line
         outbox.put("failed", error)
     except Exception:  # noqa: BLE001 - whatever it is, it is told where the run was asked for
         outbox.put("failed", RuntimeError(traceback.format_exc()))
@@ -75,20 +74,11 @@ def main() -> None:
 
 
 def _work(outbox, words, share):
-    return_freed_memory()
     outbox.clock = lambda: {"times": dict(share.times), "compiled": compiled_so_far()}
     outbox.put("done", None)
-    for place, solved in enumerate(share.frames(*words.get())):
+    for solved in share.frames(*words.get()):
         outbox.put("done", solved)
-        if place == 0:
-            return_freed_memory()
     outbox.put("done", None)
-
-
-def return_freed_memory() -> None:
-    """Give back what building and the first frame took and freed, a fifth of all, where the C library can (glibc)."""
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _listen(inbox, words):

@@ -94,18 +94,18 @@ class Share:
         )
         first = start is None
         while True:
-            with self._timed("simulate"):
+            with timed(self.times, "simulate"):
                 frame = _first(frames) if first else next(frames, None)
             first = False
             if frame is None:
                 return
             if self._fibres is not None:
-                with self._timed("fibres"):
+                with timed(self.times, "fibres"):
                     frame.fibres = self._fibres.at(frame)
             measured: dict[str, Measured] = {}
             known: dict[str, Any] = {}
             if self._measures is not None:
-                with self._timed("metrics"):
+                with timed(self.times, "metrics"):
                     measured = self._measures.measure(frame)
                     known = self._measures.state() if self.resumable else {}
             yield Solved(frame, measured, known)
@@ -113,13 +113,15 @@ class Share:
     def close(self) -> None:
         """Nothing is held."""
 
-    @contextmanager
-    def _timed(self, part):
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.times[part] = self.times.get(part, 0.0) + time.perf_counter() - start
+
+@contextmanager
+def timed(times: dict[str, float], part: str) -> Iterator[None]:
+    """Add the time spent inside to one entry of ``times`` [s]."""
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        times[part] = times.get(part, 0.0) + time.perf_counter() - start
 
 
 def _first(frames):

@@ -13,9 +13,9 @@ from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.fields import LevelField
 from rbfmuscle.geometry.mean_value import mean_value_weights
 from rbfmuscle.geometry.rest_frame import BoneFrame
+from rbfmuscle.geometry.touching_balls import touching_balls
 from rbfmuscle.geometry.triangles import nearest_weights
 from rbfmuscle.geometry.winding import winding_number
-from rbfmuscle.implicit.placement.off_surface import _touching_ball_loop
 
 
 def solid():
@@ -77,15 +77,20 @@ def test_touching_balls_are_those_of_the_definition_and_of_the_sphere():
     points, normals = rng.normal(size=(2, 9, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     steps, nearest = np.empty((2, 9)), np.empty(9)
-    _touching_ball_loop(points, normals, steps, nearest)
+    touching_balls(points, normals, steps, nearest)
     expected = literal_balls(points, normals)
     np.testing.assert_allclose(steps, expected[0])
     np.testing.assert_allclose(nearest, expected[1])
     sphere = np.array(trimesh.creation.icosphere(subdivisions=1).vertices)
     steps, nearest = np.empty((2, len(sphere))), np.empty(len(sphere))
-    _touching_ball_loop(3.0 * sphere, sphere, steps, nearest)
+    touching_balls(3.0 * sphere, sphere, steps, nearest)
     assert np.isinf(steps[0]).all()  # nothing lies beyond a tangent plane
     np.testing.assert_allclose(steps[1], 3.0)  # the ball inside is the sphere
+    # Two sheets 3 apart, each vertex above another.
+    grid = np.stack(np.meshgrid(*[np.arange(-8.0, 9.0)] * 2, [-1.5, 1.5]), axis=-1).reshape(-1, 3)
+    steps, nearest = np.empty((2, len(grid))), np.empty(len(grid))
+    touching_balls(grid, np.sign(grid) * (0.0, 0.0, 1.0), steps, nearest)
+    np.testing.assert_allclose(steps[1], 1.5)
 
 
 def test_fibre_stretch_of_an_affine_stretch_is_its_own():

@@ -154,17 +154,50 @@ def test_folder_that_cannot_be_written_leaves_no_helper(tmp_path, two_helpers, c
 
 
 def test_helper_ends_with_the_process_that_started_it():
-    """Nobody is left to say a word: its standard input is closed."""
+    """It waits for the word to begin, and nobody is left to say it: its standard input is closed."""
     scene = small_scene()
     helper = subprocess.Popen(
         [sys.executable, "-m", "rbfmuscle.sharing.helper"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
     pickle.dump((scene, [scene.muscles[0].name], False), helper.stdin)
-    pickle.dump((None, None), helper.stdin)
     helper.stdin.close()
-    helper.stdout.read()
-    assert helper.wait(timeout=120) == 0
-    helper.stdout.close()
+    try:
+        assert helper.wait(timeout=120) == 0
+    finally:
+        helper.kill()
+        helper.stdout.close()
+
+
+@pytest.mark.parametrize(
+    ("raised", "told"),
+    [
+        ("MemoryError('asked for 7 GB')", MemoryError("asked for 7 GB")),
+        ("OSError(28, 'No space left', 'cache')", OSError(28, "No space left", "cache")),
+        ("SolveError('frame 3')", SolveError("frame 3")),
+        ("ZeroDivisionError('a bug')", RuntimeError),
+    ],
+)
+def test_what_goes_wrong_in_a_helper_is_told_as_what_it_is(raised, told):
+    code = (
+        "from rbfmuscle.sharing import helper\n"
+        "from rbfmuscle.validation import SolveError\n"
+        f"def share(*given, **options): raise {raised}\n"
+        "helper.Share = share\n"
+        "helper.main()"
+    )
+    job = pickle.dumps((None, [], False))
+    # Its standard input stays open: it has to end by itself.
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        process.stdin.write(job)
+        process.stdin.flush()
+        kind, what, _ = pickle.load(process.stdout)
+    assert kind == "failed"
+    if isinstance(told, Exception):
+        assert type(what) is type(told) and what.args == told.args and str(what) == str(told)
+    else:
+        assert type(what) is told and "ZeroDivisionError: a bug" in str(what)
 
 
 class TestHelpersFor:

@@ -5,6 +5,7 @@ import numpy as np
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
+from rbfmuscle.geometry.triangles import triangle_normal
 from rbfmuscle.implicit.extraction.carried_material import CarriedMaterial
 
 # Rounds of smoothing for triangles that cross others, and how the smoothed region grows with them.
@@ -81,15 +82,12 @@ def creased_faces(vertices: Floats, faces: Integers) -> Booleans:
 def _creased_loop(vertices, faces, normals, sharp, found):
     """A vertex is sharp where a triangle looks away from its normal by more than the angle of CREASED."""
     for f in range(len(faces)):
-        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
-        ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-        vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-        x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        x, y, z = triangle_normal(vertices, faces, f)
         least = CREASED * np.sqrt(x * x + y * y + z * z)
         for k in range(3):
-            n = normals[faces[f, k]]
-            if n[0] * x + n[1] * y + n[2] * z <= least:
-                sharp[faces[f, k]] = True
+            v = faces[f, k]
+            if normals[v, 0] * x + normals[v, 1] * y + normals[v, 2] * z <= least:
+                sharp[v] = True
     for f in range(len(faces)):
         found[f] = sharp[faces[f, 0]] or sharp[faces[f, 1]] or sharp[faces[f, 2]]
 

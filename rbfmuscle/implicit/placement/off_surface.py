@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.touching_balls import touching_balls
 from rbfmuscle.validation import check_points, check_positive, check_vectors
 
 
@@ -50,29 +50,8 @@ def off_surface_points(
         raise ValueError(f"safety must be above 0 and at most 1, got {safety}")
     steps = np.empty((2, len(points)))
     nearest = np.empty(len(points))
-    _touching_ball_loop(points, normals, steps, nearest)
+    touching_balls(points, normals, steps, nearest)
     distance = 0.5 * np.median(nearest) if distance is None else check_positive(distance, name="distance")
     outside, inside = np.minimum(safety * steps, distance)
     where = np.vstack([points, points + outside[:, None] * normals, points - inside[:, None] * normals])
     return where, np.concatenate([np.zeros(len(points)), outside, -inside])
-
-
-@compiled
-def _touching_ball_loop(points, normals, steps, nearest):
-    """Radii of the empty balls that touch each point from outside (row 0) and inside (row 1)."""
-    for i in range(len(points)):
-        steps[:, i] = np.inf
-        least = np.inf
-        for j in range(len(points)):
-            square, along = 0.0, 0.0
-            for c in range(3):
-                d = points[j, c] - points[i, c]
-                square += d * d
-                along += d * normals[i, c]
-            if j == i:
-                continue
-            least = min(least, square)
-            side = 0 if along > 0 else 1
-            if along != 0.0:
-                steps[side, i] = min(steps[side, i], square / (2 * abs(along)))
-        nearest[i] = np.sqrt(least)

@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.geometry.surfaces import vertex_normals
-from rbfmuscle.geometry.triangles import nearest_weights
+from rbfmuscle.geometry.touching_balls import touching_balls
+from rbfmuscle.geometry.triangles import nearest_weights, triangle_normal
 from rbfmuscle.geometry.winding import wound_around
 
 if TYPE_CHECKING:
@@ -86,9 +87,9 @@ class CarriedSurface:
         sides = vertices[self.faces] - vertices[np.roll(self.faces, 1, axis=1)]
         self.edge = float(np.linalg.norm(sides, axis=2).mean())
         self.cell = float(reach) + self.edge
-        self.deepest = (
-            DEEPER * inner_radii(vertices, vertex_normals(vertices, self.faces), float(reach)) + self.edge
-        )
+        rest, balls = np.ascontiguousarray(vertices, dtype=np.float64), np.empty((2, len(vertices)))
+        touching_balls(rest, vertex_normals(rest, self.faces), balls, np.empty(len(rest)))
+        self.deepest = DEEPER * np.minimum(balls[1], float(reach)) + self.edge
         nearest = cKDTree(model.contact_points()).query(vertices)[1]
         self.fixed = np.asarray(model.contact_bone)[nearest] >= 0
         self.refresh()
@@ -150,39 +151,6 @@ class CarriedSurface:
             wound_around(points[index[deep]], self.vertices, self.faces, inside)
             near[deep] = inside
         return index[near], distance[near], normal[near], nearest[near]
-
-
-def inner_radii(vertices: Floats, normals: Floats, most: float) -> Floats:
-    """Radius of the greatest ball inside a surface that touches it at each vertex.
-
-    Parameters
-    ----------
-    vertices, normals : (n, 3) ndarray
-        Normals unit, outward.
-    most : float
-        What greater ones are given as.
-
-    Returns
-    -------
-    (n,) ndarray
-    """
-    radii = np.full(len(vertices), float(most))
-    _radii_loop(np.ascontiguousarray(vertices, dtype=np.float64), normals, radii)
-    return radii
-
-
-@compiled
-def _radii_loop(vertices, normals, radii):
-    """A ball of radius r at v - r n holds u where |u - v|² < 2 r n . (v - u)."""
-    for v in range(len(vertices)):
-        for u in range(len(vertices)):
-            square, along = 0.0, 0.0
-            for k in range(3):
-                way = vertices[v, k] - vertices[u, k]
-                square += way * way
-                along += way * normals[v, k]
-            if square < 2.0 * radii[v] * along:
-                radii[v] = square / (2.0 * along)
 
 
 @compiled
@@ -260,7 +228,7 @@ def _distance_loop(points, index, nearest, skin, distance, normal):
             if squared < least or same:
                 if not same:
                     true[:] = 0.0
-                _add_unit_normal(a, b, c, true)
+                _add_unit_normal(vertices, faces, f, true)
             if squared < least:
                 least, face = squared, f
                 best[:], way[:] = weights, at
@@ -283,11 +251,9 @@ def _distance_loop(points, index, nearest, skin, distance, normal):
 
 
 @compiled
-def _add_unit_normal(a, b, c, total):
+def _add_unit_normal(vertices, faces, f, total):
     """Add the unit normal of a triangle."""
-    ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-    x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    x, y, z = triangle_normal(vertices, faces, f)
     size = max(np.sqrt(x * x + y * y + z * z), 1e-300)
     total[0] += x / size
     total[1] += y / size
