@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from rbfmuscle.implicit.extraction.sheets import BOXES, count_sheets
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels.table import KERNELS
@@ -87,31 +88,33 @@ def brute_force(judge, sample, kernel, derivatives, own):
     for missed, epsilon, fitted in scan if np.isfinite(own) else scan[:LOOKS]:
         if missed > np.sqrt(2.0) * best[0]:
             break
-        best = min(best, (both_ways(judge, sample, fitted), epsilon * h))
+        best = min(best, (both_ways(judge, sample, fitted, best[0]), epsilon * h))
     return best
 
 
-def both_ways(judge, sample, fitted):
-    """Error both ways of a field [length], infinite where it is unfit; no chords of a grid are in it.
+def both_ways(judge, sample, fitted, least=np.inf):
+    """Error both ways of a field [length], infinite where it is unfit or not below ``least``; without chords of a grid.
 
     The zero set's vertices lie on it to rounding: their distances to the mesh are exact. The judge's points know their
     distance to the zero set to first order, at most the spacing of the centres.
     """
-    grid = {"points": sample.points, "resolution": CELLS}
+    sheets = functools.partial(count_sheets, fitted, sample.points, judge.distance.unsigned)
+    if not sheets(
+        boxes=BOXES[:1]
+    ).sound():  # what is open takes a hundred times as long to follow through a band
+        return np.inf
     try:
-        extract_surface(fitted, **grid)  # what is open takes a hundred times as long to find in the whole box
-        found = extract_surface(fitted, **grid, search="box", keep="all")
+        found = extract_surface(fitted, points=sample.points, resolution=max(CELLS, judge.resolution // 2))
     except ValueError:
         return np.inf
     back = judge.distance.unsigned(found.vertices)
     there = surface_miss(fitted, judge.points[::4], spacing(sample.points).mean())
     rms = float(np.sqrt(0.5 * (there**2 + (back**2).mean())))
-    # long muscles fall into pieces between coarse nodes, sheets of a field's own stand off the mesh
-    pieces = found.spurious == 0 and back.max() < 2.0 * found.spacing
-    row = {"kernel": fitted.kernel.name, "centres": 0, "rms": rms, "components": found.components,
-           "spurious": found.spurious, "note": "", "volume_error": found.volume / judge.volume - 1.0,
-           "condition": fitted.condition}  # fmt: skip
-    mark_unfit([row], sheets=found.components if pieces else judge.sheets)
+    if rms >= least or not sheets(boxes=BOXES[1:]).sound():
+        return np.inf
+    row = {"kernel": fitted.kernel.name, "centres": 0, "rms": rms, "components": found.components, "note": "",
+           "volume_error": found.volume / judge.volume - 1.0, "condition": fitted.condition}  # fmt: skip
+    mark_unfit([row], sheets=judge.sheets)
     return np.inf if row["unfit"] else rms
 
 

@@ -47,6 +47,8 @@ class Limits:
         None beyond it is chosen.
     scan : int
         Fits of the first scan.
+    doubt : float
+        An error at a condition beyond `DOUBTFUL`, whose fits take fifteen times as long, must be so much smaller.
     """
 
     fits: int = 80
@@ -54,6 +56,7 @@ class Limits:
     slow: int = 4
     condition: float = math.inf
     scan: int = 25
+    doubt: float = 1.05
 
     def start(self) -> None:
         """Begin to count."""
@@ -171,12 +174,26 @@ def _beyond(
 ) -> list[Trial]:
     """Beyond the sound fits: all scanned with a ridge, for the time of a sound fit, the best also without."""
     first = flattest / STEP if tried else flattest
-    count = max(int(math.log(first / span[0]) / math.log(STEP**2)), 2)
+    count = max(int(math.log(first / span[0]) / math.log(STEP**2)) + 1, 2)
     with_ridge = [attempt(float(e), RIDGE) for e in np.geomspace(first, span[0], count)]
     least = min((t[1] for t in tried), default=math.inf)
-    found: list[Trial] = []
-    for epsilon, worth, _ in sorted(with_ridge, key=lambda t: t[1])[: limits.slow]:
-        if worth < least and math.isfinite(worth):
-            found.append(attempt(epsilon, TRUNCATED))
-            found += [attempt(epsilon * STEP, TRUNCATED)] if len(found) == 1 else []
+    queue = [t[0] for t in sorted(with_ridge, key=lambda t: t[1]) if t[1] < least][: limits.slow]
+    # with a ridge the valley is not quite the same one: down it from there, then what else is promising
+    found = _descend(attempt, queue[0], limits.slow) if queue else []
+    found += [attempt(epsilon, TRUNCATED) for epsilon in queue[1 : 1 + limits.slow - len(found)]]
     return [t for t in found if math.isfinite(t[1])]
+
+
+def _descend(attempt: Attempt, first: float, most: int) -> list[Trial]:
+    """Steps from the first as long as the error falls, flatter ones first."""
+    found = [attempt(first, TRUNCATED)]
+    for step in (1.0 / STEP, STEP):
+        at = found[0]
+        while len(found) < most:
+            found.append(attempt(at[0] * step, TRUNCATED))
+            if found[-1][1] >= at[1]:
+                break
+            at = found[-1]
+        if at is not found[0]:
+            break
+    return found

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,10 +10,9 @@ from numpy.typing import ArrayLike
 from scipy.linalg import blas
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit.condition import largest_eigenvalue
-from rbfmuscle.implicit.fit.fitting import DOUBTFUL, Basis
+from rbfmuscle.implicit.fit.fitting import Basis
 from rbfmuscle.implicit.fit.systems import frame, hermite_system
 from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
 from rbfmuscle.implicit.placement.off_surface import off_surface_points
@@ -28,23 +25,14 @@ from rbfmuscle.implicit.selection import (
     surface_miss,
 )
 from rbfmuscle.implicit.shape_search import RIDGE, TRUNCATED, Limits, search_shape
-from rbfmuscle.validation import NumericalWarning, check_points
+from rbfmuscle.implicit.zero_sets import look_at_zero_sets
+from rbfmuscle.validation import check_points
 
 # Evaluations of the scan and of the refinement. Flat Gaussians close their surface in spans of a factor of 1.3 only.
 COARSE, REFINE = 25, 6
-# Cells along the longest side when the zero set is looked at.
-RESOLUTION = 48
-# A zero set this much further from the mesh than the mesh from it has sheets that the mesh has not.
-ALIKE = 1.05
-# Ridge, as a share of the largest eigenvalue: errors are those of the truncated solution to a few per cent.
-RIDGE_SHARE = 1e-12
-# Zero sets that are looked at, and cells of the box in which sheets are looked for that do not belong to the surface.
-LOOKS, BOX = 12, 40
-# Cells of another look where slender muscles fall into pieces between the nodes of that box.
-FINER = 160
-# Where sheets are found, so much flatter kernels are looked at next.
-FLATTER = 1.15
-OPEN = "the level set is open at every epsilon that was looked at; take more centres or another kernel"
+# Ridge, as a share of the largest eigenvalue: near the least that Cholesky can take, so that what it smooths is what
+# the truncated solution does.
+RIDGE_SHARE = 3e-13
 
 
 def choose_surface_epsilon(
@@ -110,23 +98,33 @@ def choose_surface_epsilon(
     limits, unit = limits or Limits(), 1.0 / spacing(data["points"]).mean()
     others, reach = check_points(held_out, name="held_out"), spacing(points).mean()
 
+    fields: dict[float, RBFField] = {}  # those without a ridge, which the looks ask for again
+
     def fit(epsilon: float, how: str = TRUNCATED) -> RBFField:
+        if how != RIDGE and epsilon in fields:
+            return fields[epsilon]
         ridge = _ridge(data, kernel, epsilon) if how == RIDGE else 0.0
-        return RBFField.fit_surface(
+        found = RBFField.fit_surface(
             points, normals, kernel=kernel, epsilon=epsilon, derivatives=derivatives, smoothing=ridge,
             truncate=how == TRUNCATED,
         )  # fmt: skip
+        if how != RIDGE:
+            fields[epsilon] = found
+        return found
+
+    def miss(field: RBFField) -> float:
+        return surface_miss(field, others, reach)
 
     def error(epsilon: float, how: str) -> tuple[float, float]:
         field = fit(epsilon, how)
-        return surface_miss(field, others, reach), field.condition
+        return miss(field), field.condition
 
     each = {"all": 4, "normal": 2}[derivatives] if kernel.hermite else 3
     tried = search_shape(
         error, (span[0] * unit, span[1] * unit), refine=REFINE, size=each * len(points), limits=limits
     )
     choice = _best_within(tried, kernel, limits)
-    return choice if distance is None else _look_at_zero_sets(choice, limits, fit, points, distance)
+    return choice if distance is None else look_at_zero_sets(choice, limits, fit, miss, points, distance)
 
 
 def _ridge(data: dict[str, Any], kernel: Kernel, epsilon: float) -> float:
@@ -152,80 +150,5 @@ def _best_within(tried: Floats, kernel: Kernel, limits: Limits) -> EpsilonChoice
             f"no epsilon of kernel '{kernel.name}' has a condition of at most {limits.condition:g}, the least is "
             f"{tried[:, 2].min():.1e}; raise the bound or take another kernel"
         )
-    best = allowed[by_worth(allowed)[0]]
+    best = allowed[by_worth(allowed, limits.doubt)[0]]
     return EpsilonChoice(float(best[0]), float(best[1]), float(best[2]), tried, limits.why())
-
-
-def _look_at_zero_sets(
-    choice: EpsilonChoice,
-    limits: Limits,
-    fit: Callable[..., Any],
-    points: Floats,
-    distance: Callable[..., Any],
-) -> EpsilonChoice:
-    """The best of the tried epsilons by the distance both ways; the choice, named broken, where none is closed."""
-    found, spare = None, replace(choice, broken=OPEN)
-    tried = choice.tried[choice.tried[:, 2] <= limits.condition]
-    looks, narrow, again = 0, np.inf, False
-    queue, passed = list(by_worth(tried)), list[int]()
-    while queue or (passed and found is None and not again):
-        if not queue:  # none is flat enough; long muscles may be whole only with narrower kernels
-            queue, looks, narrow, again = passed, 0, np.inf, True
-        number = queue.pop(0)
-        epsilon, missed, condition = (float(x) for x in tried[number])
-        if epsilon > narrow and not again:
-            passed.append(number)
-            continue  # one little flatter has sheets of its own where the kernels end
-        looks += 1
-        least = np.inf if found is None else found.objective
-        # The distance both ways is at least this, and twice the error has never been the better surface.
-        if looks > LOOKS or missed > 2.0 * least or missed / np.sqrt(2.0) > least or not np.isfinite(missed):
-            break
-        field = _fitted(fit, epsilon)
-        if field is None:
-            continue
-        both = float(np.sqrt(0.5 * (missed**2 + _back(field, points, distance) ** 2)))
-        if both >= least:
-            continue
-        now = replace(choice, epsilon=epsilon, objective=both, condition=condition)
-        # In the whole box of the points, open ones included.
-        sheets = _sheets(field, points, distance)
-        if sheets > 1:
-            if condition < DOUBTFUL:
-                narrow = epsilon / FLATTER
-            if spare.broken == OPEN or both < spare.objective:
-                spare = replace(now, broken=f"{sheets} sheets at every epsilon that was looked at")
-            continue
-        found = now
-        if both < ALIKE * missed:
-            break
-    return found or spare
-
-
-def _fitted(fit: Callable[..., RBFField], epsilon: float) -> RBFField | None:
-    """The field of an epsilon, None where it fails."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NumericalWarning)
-        try:
-            return fit(epsilon)
-        except np.linalg.LinAlgError:
-            return None
-
-
-def _back(field: RBFField, points: Floats, distance: Callable[..., Any]) -> float:
-    """Root mean square distance of the zero set's vertices from the surface, infinite where it is open."""
-    try:
-        found = extract_surface(field, points=points, resolution=RESOLUTION)
-    except ValueError:
-        return np.inf
-    return float(np.sqrt((np.asarray(distance(found.vertices)) ** 2).mean()))
-
-
-def _sheets(field: RBFField, points: Floats, distance: Callable[..., Any]) -> int:
-    """Sheets of the zero set in the whole box of the points."""
-    found = extract_surface(field, points=points, resolution=BOX, search="box", keep="all")
-    if found.components > 1 and not found.spurious:
-        away = np.abs(np.asarray(distance(found.vertices)))
-        if away.max() < found.spacing:  # none stands off the surface: pieces of it
-            found = extract_surface(field, points=points, resolution=FINER, search="box", keep="all")
-    return found.components

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import trimesh
 
+from rbfmuscle.implicit.extraction.sheets import count_sheets
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import SPAN, EpsilonChoice, spacing, surface_miss
 from rbfmuscle.implicit.shape_search import Limits
-from rbfmuscle.implicit.surface_epsilon import _look_at_zero_sets, _sheets, choose_surface_epsilon
+from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
+from rbfmuscle.implicit.zero_sets import OPEN, look_at_zero_sets
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.validation import NumericalWarning, UsageError
 
@@ -121,21 +123,70 @@ def test_a_slender_bent_tube_is_one_sheet_though_the_coarse_box_cuts_it():
     points = np.c_[x, 10.0 * np.sin(x / 20.0), 2.0 + 0.0 * x]
     field, alone = Shape(tube), dict(points=points, resolution=40, search="box", keep="all")
     assert extract_surface(field, **alone).components > 1
-    assert _sheets(field, points, field) == 1
+    assert count_sheets(field, points, field).sound()
     both = Shape(lambda at: np.minimum(tube(at), ball(at - [0.0, 10.0, 0.0], 70.0, 3.0)))
-    assert _sheets(both, np.vstack([points, [[0.0, 14.0, 0.0]]]), field) > 1
+    assert count_sheets(both, np.vstack([points, [[0.0, 14.0, 0.0]]]), field).number > 1
 
 
-def test_narrower_kernels_are_looked_at_where_all_flat_ones_have_sheets_of_their_own():
+def test_sheets_beyond_the_box_of_a_band_and_open_ones_are_seen():
+    """Whatever the cells, the box is the same: a ball 12 off, of radius 1.5, touches none of the surface's cells."""
+    points = np.vstack([10.0 * trimesh.creation.icosphere(subdivisions=2).vertices, [[30.0, 0.0, 0.0]]])
+    two = Shape(lambda at: np.minimum(ball(at), ball(at, 22.0, 1.5)))
+    assert count_sheets(Shape(ball), points, ball).sound()
+    assert count_sheets(two, points, ball) == (2, False, 40)
+    assert count_sheets(two, points, ball, wanted=2).sound(2)
+    halved = Shape(lambda at: np.minimum(ball(at), at[:, 0] - 11.0))
+    assert count_sheets(halved, points, ball).is_open
+    assert count_sheets(Shape(lambda at: 1.0 + 0.0 * at[:, 0]), points, ball).number == 0
+
+
+@pytest.fixture
+def looked():
+    """``looked(tried, fit, limits)``: the choice after its zero sets were looked at, round a ball."""
+    points = np.vstack([10.0 * trimesh.creation.icosphere(subdivisions=2).vertices, [[15.0, 0.0, 0.0]]])
+
+    def ask(tried, fit, limits=None):
+        limits = limits or Limits()
+        limits.start()
+        choice = EpsilonChoice(float(tried[0, 0]), 0.1, 1e7, tried)
+        miss = lambda field: field.missed  # noqa: E731
+        return look_at_zero_sets(choice, limits, fit, miss, points, ball)
+
+    return ask
+
+
+def shape(function, missed=0.1):
+    made = Shape(function)
+    made.missed = missed
+    return made
+
+
+def two_balls(at):
+    return np.minimum(ball(at), ball(at, 12.6, 2.0))
+
+
+def test_narrower_kernels_are_looked_at_where_all_flat_ones_have_sheets_of_their_own(looked):
     epsilons = np.geomspace(0.1, 10.0, 9)
     tried = np.c_[epsilons, 0.1 * (1.0 + 0.05 * np.arange(9)), 1e6 / epsilons]
-    points = 10.0 * trimesh.creation.icosphere(subdivisions=2).vertices
+    found = looked(tried, lambda epsilon: shape(two_balls if epsilon < 1.5 else ball))
+    assert not found.broken and 1.5 < found.epsilon < 1.6  # halved four times from 1.78
 
-    def fit(epsilon):
-        two = Shape(lambda at: np.minimum(ball(at), ball(at, 12.6, 2.0)))
-        return two if epsilon < 1.5 else Shape(ball)
 
-    around = np.vstack([points, [[15.0, 0.0, 0.0]]])
-    choice = EpsilonChoice(0.1, 0.1, 1e7, tried)
-    found = _look_at_zero_sets(choice, Limits(), fit, around, ball)
-    assert not found.broken and 1.5 < found.epsilon < 2.0
+def test_many_alike_that_broke_do_not_use_up_the_looks(looked):
+    """Forty of the least error within a factor of 1.5, which all broke, and one that did not."""
+    epsilons = np.r_[np.geomspace(1.0, 1.5, 40), 3.0]
+    tried = np.c_[epsilons, np.r_[np.full(40, 0.1), 0.2], np.full(41, 1e6)]
+    found = looked(tried, lambda epsilon: shape(two_balls if epsilon < 2.5 else ball, 0.2 * epsilon / 3.0))
+    assert not found.broken and 2.5 < found.epsilon <= 2.6
+
+
+def test_what_is_open_in_the_box_broke_and_is_no_error(looked):
+    tried = np.c_[[1.0, 2.0, 3.0], [0.1, 0.11, 0.12], [1e6, 1e6, 1e6]]
+
+    def everywhere(at):
+        return at[:, 0] - 11.0
+
+    found = looked(tried, lambda epsilon: shape(everywhere))
+    assert found.broken == OPEN
+    one = looked(tried, lambda epsilon: shape(everywhere if epsilon < 2.5 else ball))
+    assert not one.broken and one.epsilon > 2.4

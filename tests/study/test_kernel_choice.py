@@ -83,7 +83,7 @@ def test_rows_that_broke_are_never_recommended():
     ]
     mark_unfit(rows)
     why = {r["kernel"]: r["unfit"] for r in rows}
-    assert why["gaussian"].startswith("19 sheets") and "volume" in why["matern_12"]
+    assert why["gaussian"].startswith("9 sheets") and "volume" in why["matern_12"]
     assert "beyond that of linear, 0.4" in why["buhmann"]
     assert why["linear"] == why["cubic"] == ""
     assert recommend(rows).row["kernel"] == "cubic"

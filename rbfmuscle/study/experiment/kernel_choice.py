@@ -91,9 +91,8 @@ def mark_unfit(rows: list[dict[str, Any]], *, sheets: int = 1, condition: float 
 def _why_unfit(row, sheets):
     if row["rms"] is None:
         return row["note"] or "no closed surface"
-    found = row["components"] + row["spurious"]
-    if found > sheets:
-        return f"{found} sheets where the mesh has {sheets}"
+    if row["components"] > sheets:
+        return f"{row['components']} sheets where the mesh has {sheets}"
     if abs(row["volume_error"]) > VOLUME_BOUND:
         return f"{100 * row['volume_error']:+.3g} % of volume, beyond {100 * VOLUME_BOUND:g}"
     return ""

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
+from rbfmuscle.implicit.extraction.sheets import count_sheets
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit.fitting import DOUBTFUL
@@ -24,7 +25,7 @@ from rbfmuscle.implicit.selection import spacing
 from rbfmuscle.implicit.shape_search import Limits
 from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
 from rbfmuscle.study.experiment.kernel_choice import Recommendation, mark_unfit, recommend
-from rbfmuscle.study.experiment.kernel_judge import BOX, SurfaceJudge
+from rbfmuscle.study.experiment.kernel_judge import SurfaceJudge
 from rbfmuscle.study.experiment.sweep_table import pareto_front
 from rbfmuscle.validation import NumericalWarning, UsageError, check_mesh
 
@@ -201,7 +202,7 @@ def _choose(row, judge, sample, kernel, ask, *, last):
     """Choose epsilon for these centres and write it into the row; the choice, for the map."""
     start = time.perf_counter()
     # What is only to place centres needs none of the slow fits.
-    limits = Limits(seconds=max(SECONDS - row["search_time"], 0.5), condition=ask.condition)
+    limits = Limits(seconds=max(SECONDS - row["search_time"], 0.5), condition=ask.condition, doubt=1.0)
     if not last:
         limits.slow, limits.scan = 0, 13
     choice = choose_surface_epsilon(
@@ -240,7 +241,7 @@ def measure_row(
     confirm : SurfaceJudge, optional
         Measures the row in place of the judge, which then only chooses.
     """
-    count, placement = len(sample.points), ask.placement
+    count, placement, looked = len(sample.points), ask.placement, False
     if placement == FITTED and not (kernel.hermite and ask.derivatives == "all"):
         placement = "greedy"
     row = {
@@ -267,7 +268,8 @@ def measure_row(
                 _note_trials(scan, row, choice)
                 if choice.broken:
                     raise ValueError(choice.broken)
-            surface = fill_row(row, confirm or judge, sample, kernel, ask.derivatives)
+                looked = ask.criterion == "held_out" and judge.sheets == 1
+            surface = fill_row(row, confirm or judge, sample, kernel, ask.derivatives, looked=looked)
         except (ValueError, np.linalg.LinAlgError) as error:
             row["note"], surface = " ".join(str(error).split()), None
     if said and surface is not None:
@@ -283,7 +285,13 @@ def _note_trials(scan, row, choice):
 
 
 def fill_row(
-    row: dict[str, Any], judge: SurfaceJudge, sample: SurfaceSample, kernel: Kernel, derivatives: str
+    row: dict[str, Any],
+    judge: SurfaceJudge,
+    sample: SurfaceSample,
+    kernel: Kernel,
+    derivatives: str,
+    *,
+    looked: bool = False,
 ) -> tuple[Floats, Integers, Floats]:
     """Fit with the row's epsilon and write what is measured into the row; the surface and its signed distances.
 
@@ -294,6 +302,8 @@ def fill_row(
     sample : SurfaceSample
     kernel : Kernel
     derivatives : str
+    looked : bool
+        Whether the search has looked for sheets and found as many as there should be.
     """
     epsilon = row["epsilon"] or 1.0
     spent = []
@@ -311,22 +321,21 @@ def fill_row(
     cosine = np.einsum("ij,ij->i", gradient, judge.normals[::5])
     cosine /= np.maximum(np.linalg.norm(gradient, axis=1), np.finfo(float).tiny)
     row["normal_error"] = float(np.degrees(np.sqrt((np.arccos(np.clip(cosine, -1.0, 1.0)) ** 2).mean())))
-    # long muscles fall into pieces between the nodes of a coarse box
-    for cells in (min(BOX, judge.resolution), judge.resolution):
-        whole = extract_surface(fitted, points=sample.points, resolution=cells, search="box", keep="largest")
-        if whole.components + whole.spurious <= judge.sheets:
-            break
-    row["components"], row["spurious"] = whole.components, whole.spurious
-    found = whole
-    if judge.resolution > BOX:
-        found = extract_surface(fitted, points=sample.points, resolution=judge.resolution)
+    sheets = judge.sheets
+    if not looked:
+        seen = count_sheets(fitted, sample.points, judge.distance.unsigned, wanted=sheets)
+        if seen.is_open and seen.number <= sheets:
+            raise ValueError("the level set is open: it leaves the box of the muscle; take more centres")
+        sheets = seen.number
+    row["components"], row["spurious"] = sheets, max(sheets - judge.sheets, 0)
+    found = extract_surface(fitted, points=sample.points, resolution=judge.resolution)
     row["volume_error"] = found.volume / judge.volume - 1.0
     row["rms"], row["hausdorff"], error, (row["low"], row["high"]) = judge.apart(found.vertices, found.faces)
     row["worst"] = judge.worst(found, sample.points)
     # a field of slope one by the mesh's own normals: outside is where the nearest triangle looks
     error = np.copysign(error, judge.distance.signed(found.vertices))
-    if found.spurious:
-        row["note"] = f"{found.spurious} spurious sheets; {row['note']}".rstrip("; ")
+    if row["spurious"]:
+        row["note"] = f"{row['spurious']} spurious sheets; {row['note']}".rstrip("; ")
     return found.vertices, found.faces, error
 
 

@@ -1,0 +1,91 @@
+"""Sheets of a zero set in the whole box around a surface, those of its own included that a band never meets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.fields import Field
+from rbfmuscle.implicit.extraction.band import Band, BandGrid
+from rbfmuscle.implicit.extraction.surface import _label_sheets_loop
+
+# Cells along the longest side of the boxes that are looked at, and of another look where slender muscles fall into
+# pieces between the nodes of these. A sheet between the nodes of one is found by the other, or is smaller than both.
+BOXES, FINER = (40, 64), 160
+# Of the longest side: what the box holds on every side of the points, whatever its cells.
+MARGIN = 0.075
+
+
+class Sheets(NamedTuple):
+    """What a box holds.
+
+    Attributes
+    ----------
+    number : int
+        Of sheets, 0 where the field has one sign.
+    is_open : bool
+        Whether one leaves the box.
+    cells : int
+        Along the longest side of the box that showed it.
+    """
+
+    number: int
+    is_open: bool
+    cells: int
+
+    def sound(self, wanted: int = 1) -> bool:
+        """Whether there are as many as wanted, and all are closed."""
+        return self.number == wanted and not self.is_open
+
+
+def count_sheets(
+    field: Field,
+    points: Floats,
+    distance: Callable[..., Any],
+    *,
+    boxes: tuple[int, ...] = BOXES,
+    wanted: int = 1,
+) -> Sheets:
+    """Sheets of the zero set in boxes around the points, of the first box that has not as many as wanted.
+
+    Parameters
+    ----------
+    field : Field
+        Negative inside.
+    points : (n, 3) ndarray
+        Points of the surface, which give the box [length].
+    distance : callable
+        ``(n, 3) -> (n,)``, distance to the surface, signed or not. Sheets none of which stands off the surface by a
+        cell may be pieces of a muscle that is thinner than that: finer cells then decide.
+    boxes : tuple of int
+        Cells along the longest side.
+    wanted : int
+        Sheets of the surface.
+
+    Returns
+    -------
+    Sheets
+    """
+    for cells in boxes:
+        found, vertices, spacing = _look(field, points, cells)
+        if found.number > wanted and np.abs(np.asarray(distance(vertices))).max() < spacing:
+            found = _look(field, points, FINER)[0]
+        if not found.sound(wanted):
+            break
+    return found
+
+
+def _look(field: Field, points: Floats, cells: int) -> tuple[Sheets, Floats, float]:
+    """Sheets of one box, the vertices of their cells' crossings, and the edge of a cell."""
+    grid = BandGrid.around(points, resolution=cells, padding=round(MARGIN * cells))
+    band = Band(grid, field)
+    band.visit_all()
+    band.grow(0.0)
+    if not band.crosses(0.0):
+        return Sheets(0, False, cells), np.zeros((0, 3)), grid.spacing
+    coordinates, faces, on_border, _ = band.march(0.0)
+    number = int(_label_sheets_loop(faces, len(coordinates))[1])
+    return Sheets(number, bool(on_border.any()), cells), grid.positions(coordinates), grid.spacing
