@@ -36,8 +36,10 @@ class FaceTree:
             for axis in range(3):
                 code |= (cell[:, axis] >> bit & 1) << (3 * bit + axis)
         self.order = np.argsort(code, kind="stable")
+        self._corners = self.faces[self.order]
         self.leaves = 1 << max(int(np.ceil(len(self.faces) / LEAF)) - 1, 0).bit_length()
         self.closed = _is_closed(self.faces)
+        self._room = 16 * self.leaves
 
     def crossing(
         self, vertices: Floats, among: Booleans | None = None, *, by_sheets: bool = False
@@ -54,23 +56,34 @@ class FaceTree:
             sheet has another side, which is seen. It takes a third of the time, and may miss single triangles.
         """
         vertices = np.ascontiguousarray(vertices, dtype=np.float64)
-        box, node = np.empty((len(self.faces), 6)), np.empty((2 * self.leaves, 6))
-        _boxes_loop(vertices, self.faces, self.order, box, self.leaves, node)
-        marked = np.zeros(len(self.faces), dtype=np.bool_)
-        among = np.ones(len(self.faces), dtype=np.bool_) if among is None else among
-        cone, units = np.zeros((2 * self.leaves, 4)), np.zeros((len(self.faces), 3))
-        if by_sheets and self.closed:
-            _cones_loop(vertices, self.faces, self.order, self.leaves, (units, cone))
+        faces, count = self._corners, len(self._corners)
+        box, node = np.empty((self.leaves, 6, LEAF)), np.empty((2 * self.leaves, 6))
+        _boxes_loop(vertices, faces, box, self.leaves, node)
+        sheets = by_sheets and self.closed
+        cone, units = np.zeros((2 * self.leaves, 4)), np.zeros((count, 3))
+        if sheets:
+            _cones_loop(vertices, faces, self.leaves, (units, cone))
+        asked = np.ones(count, dtype=np.bool_) if among is None else among[self.order]
         wanted = np.zeros(2 * self.leaves, dtype=np.bool_)
-        _wanted_loop(among, self.order, self.leaves, wanted)
+        _wanted_loop(asked, self.leaves, wanted)
         plain = np.full(len(vertices), self.closed and not by_sheets, dtype=np.bool_)
         if plain.any():
-            _plain_loop(
-                vertices, self.faces, np.zeros_like(vertices), np.zeros(len(vertices), np.int64), plain
-            )
-        tree = (box, node, units, cone, wanted)
-        _cross_loop(vertices, self.faces, self.order, tree, among, plain, marked)
+            _plain_loop(vertices, faces, np.zeros_like(vertices), np.zeros(len(vertices), np.int64), plain)
+        pairs = self._pairs((node, cone, wanted), sheets)
+        found = np.zeros(count, dtype=np.bool_)
+        _cross_loop(vertices, faces, (pairs, box, units), (asked, plain, sheets), found)
+        marked = np.zeros(count, dtype=np.bool_)
+        marked[self.order] = found
         return marked
+
+    def _pairs(self, tree: tuple[Floats, Floats, Booleans], sheets: bool) -> Integers:
+        """Pairs (k, 2) of leaves whose boxes touch."""
+        while True:
+            pairs = np.empty((self._room, 2), dtype=np.int64)
+            count = _pairs_loop(tree, sheets, pairs)
+            if count <= self._room:
+                return pairs[:count]
+            self._room = 2 * count
 
 
 def _is_closed(faces: Integers) -> bool:
@@ -105,15 +118,18 @@ def crossing_faces(vertices: Floats, faces: Integers) -> Booleans:
 
 
 @compiled
-def _boxes_loop(vertices, faces, order, box, leaves, node):
-    """Boxes of the triangles in their order, and of the tree's nodes: node k holds those of 2k and 2k + 1."""
+def _boxes_loop(vertices, faces, box, leaves, node):
+    """Boxes of the triangles, leaf by leaf, and of the tree's nodes: node k holds those of 2k and 2k + 1."""
+    box[:, :3], box[:, 3:] = np.inf, -np.inf
     node[:, :3], node[:, 3:] = np.inf, -np.inf
-    for m in range(len(order)):
-        f, k = order[m], leaves + m // LEAF
+    for f in range(len(faces)):
+        leaf, place = f // LEAF, f % LEAF
+        k = leaves + leaf
         for a in range(3):
             x, y, z = vertices[faces[f, 0], a], vertices[faces[f, 1], a], vertices[faces[f, 2], a]
-            box[m, a], box[m, 3 + a] = min(x, y, z), max(x, y, z)
-            node[k, a], node[k, 3 + a] = min(node[k, a], box[m, a]), max(node[k, 3 + a], box[m, 3 + a])
+            low, high = min(x, y, z), max(x, y, z)
+            box[leaf, a, place], box[leaf, 3 + a, place] = low, high
+            node[k, a], node[k, 3 + a] = min(node[k, a], low), max(node[k, 3 + a], high)
     for k in range(leaves - 1, 0, -1):
         for a in range(3):
             node[k, a] = min(node[2 * k, a], node[2 * k + 1, a])
@@ -121,20 +137,20 @@ def _boxes_loop(vertices, faces, order, box, leaves, node):
 
 
 @compiled
-def _wanted_loop(among, order, leaves, wanted):
+def _wanted_loop(asked, leaves, wanted):
     """Mark the nodes that hold triangles among which crossings are sought."""
-    for m in range(len(order)):
-        wanted[leaves + m // LEAF] |= among[order[m]]
+    for f in range(len(asked)):
+        wanted[leaves + f // LEAF] |= asked[f]
     for k in range(leaves - 1, 0, -1):
         wanted[k] = wanted[2 * k] or wanted[2 * k + 1]
 
 
 @compiled
-def _cones_loop(vertices, faces, order, leaves, out):
+def _cones_loop(vertices, faces, leaves, out):
     """Unit normals, and a cone around those of each node: its axis, and how far another may be from it."""
     units, cone = out
-    for m in range(len(order)):
-        x, y, z = triangle_normal(vertices, faces, order[m])
+    for m in range(len(faces)):
+        x, y, z = triangle_normal(vertices, faces, m)
         length = max(np.sqrt(x * x + y * y + z * z), 1e-300)
         units[m, 0], units[m, 1], units[m, 2] = x / length, y / length, z / length
         for a in range(3):
@@ -143,7 +159,7 @@ def _cones_loop(vertices, faces, order, leaves, out):
         _normalise(cone, k)
         first = LEAF * (k - leaves)
         least = 1.0
-        for m in range(first, min(first + LEAF, len(order))):
+        for m in range(first, min(first + LEAF, len(faces))):
             along = units[m, 0] * cone[k, 0] + units[m, 1] * cone[k, 1] + units[m, 2] * cone[k, 2]
             least = min(least, along)
         cone[k, 3] = np.arccos(max(least, -1.0))
@@ -179,9 +195,10 @@ def _one_sheet(cone, i, j):
 @compiled
 def _apart(one, i, other, j):
     """Whether two boxes do not touch."""
+    # All six are compared: which of them tells cannot be foreseen, and a wrong guess costs more than the rest.
     return (
-        one[i, 0] > other[j, 3] or other[j, 0] > one[i, 3] or one[i, 1] > other[j, 4]
-        or other[j, 1] > one[i, 4] or one[i, 2] > other[j, 5] or other[j, 2] > one[i, 5]
+        (one[i, 0] > other[j, 3]) | (other[j, 0] > one[i, 3]) | (one[i, 1] > other[j, 4])
+        | (other[j, 1] > one[i, 4]) | (one[i, 2] > other[j, 5]) | (other[j, 2] > one[i, 5])
     )  # fmt: skip
 
 
@@ -221,57 +238,78 @@ def _plain_loop(vertices, faces, normals, turns, plain):
 
 
 @compiled
-def _cross_loop(vertices, faces, order, tree, among, plain, marked):
-    """All pairs of leaves whose boxes touch, from the root down."""
-    box, node, units, cone, wanted = tree
+def _pairs_loop(tree, sheets, pairs):
+    """Pairs of leaves whose boxes touch, from the root down; how many there are, also beyond the room for them."""
+    node, cone, wanted = tree
     leaves = len(node) // 2
     waiting = np.empty((WAITING, 2), dtype=np.int64)
     waiting[0, 0], waiting[0, 1] = 1, 1
-    count = 1
+    count, met = 1, 0
     while count > 0:
         count -= 1
         i, j = waiting[count, 0], waiting[count, 1]
         if i >= leaves:
-            _leaf_loop(vertices, faces, order, (box, units), (i - leaves, j - leaves), among, plain, marked)
+            if met < len(pairs):
+                pairs[met, 0], pairs[met, 1] = i - leaves, j - leaves
+            met += 1
             continue
         # Nodes of a pair are of one level.
         for p in range(2 * i, 2 * i + 2):
             for q in range(2 * j, 2 * j + 2):
                 if p > q or _apart(node, p, node, q) or not (wanted[p] or wanted[q]):
                     continue
-                if not _one_sheet(cone, p, q):
+                if not (sheets and _one_sheet(cone, p, q)):
                     waiting[count, 0], waiting[count, 1] = p, q
                     count += 1
+    return met
 
 
 @compiled
-def _leaf_loop(vertices, faces, order, tree, pair, among, plain, marked):
-    box, units = tree
-    first, second = LEAF * pair[0], LEAF * pair[1]
-    for m in range(first, min(first + LEAF, len(order))):
-        for n in range(max(second, m + 1), min(second + LEAF, len(order))):
-            along = units[m, 0] * units[n, 0] + units[m, 1] * units[n, 1] + units[m, 2] * units[n, 2]
-            if along > ALONG or _apart(box, m, box, n):
+def _cross_loop(vertices, faces, leaves, asked, found):
+    """The triangles of pairs of leaves: which of them touch by their boxes, then which of these cross."""
+    pairs, box, units = leaves
+    among, plain, sheets = asked
+    for k in range(len(pairs)):
+        i, j = pairs[k, 0], pairs[k, 1]
+        for m in range(LEAF):
+            touching = 0
+            for n in range(LEAF):
+                near = (
+                    (box[i, 0, m] <= box[j, 3, n]) & (box[j, 0, n] <= box[i, 3, m])
+                    & (box[i, 1, m] <= box[j, 4, n]) & (box[j, 1, n] <= box[i, 4, m])
+                    & (box[i, 2, m] <= box[j, 5, n]) & (box[j, 2, n] <= box[i, 5, m])
+                )  # fmt: skip
+                touching |= np.int64(near) << n
+            if touching == 0:
                 continue
-            f, g = order[m], order[n]
-            if (marked[f] and marked[g]) or not (among[f] or among[g]):
-                continue
-            count, corner = _shared(faces, f, g)
-            if count > 1 or (count == 1 and plain[corner]):
-                continue
-            if _cross(vertices, faces, f, g):
-                marked[f], marked[g] = True, True
+            f = LEAF * i + m
+            for n in range(LEAF):
+                g = LEAF * j + n
+                if g <= f or not (touching >> n) & 1:
+                    continue
+                if (found[f] and found[g]) or not (among[f] or among[g]):
+                    continue
+                if sheets and _along(units, f, g) > ALONG:
+                    continue
+                if _meet(faces, f, g, plain) and _cross(vertices, faces, f, g):
+                    found[f], found[g] = True, True
 
 
 @compiled
-def _shared(faces, f, g):
-    """Number of corners that two triangles have in common, and one of them."""
-    count, corner = 0, 0
+def _along(units, f, g):
+    return units[f, 0] * units[g, 0] + units[f, 1] * units[g, 1] + units[f, 2] * units[g, 2]
+
+
+@compiled
+def _meet(faces, f, g, plain):
+    """Whether two triangles can cross: not if they share an edge, or a corner around which none covers another."""
+    count, ringed = 0, False
     for a in range(3):
-        for b in range(3):
-            if faces[f, a] == faces[g, b]:
-                count, corner = count + 1, faces[f, a]
-    return count, corner
+        v = faces[f, a]
+        if (v == faces[g, 0]) | (v == faces[g, 1]) | (v == faces[g, 2]):
+            count += 1
+            ringed |= plain[v]
+    return count == 0 or (count == 1 and not ringed)
 
 
 @compiled

@@ -55,6 +55,9 @@ class ExactDistance:
     faces : (m, 3) array_like of int
         At least one, outward; vertices are shared by index. The sign is exact where the mesh is closed and
         consistently oriented, and that of the nearest face elsewhere.
+    like : ExactDistance, optional
+        Of the same faces with their vertices elsewhere, as in a frame before: its order of the triangles is taken
+        over, which halves the time.
 
     Notes
     -----
@@ -68,18 +71,21 @@ class ExactDistance:
     [-0.02, 3.0]
     """
 
-    def __init__(self, vertices: ArrayLike, faces: ArrayLike) -> None:
+    def __init__(self, vertices: ArrayLike, faces: ArrayLike, *, like: ExactDistance | None = None) -> None:
         vertices = np.ascontiguousarray(vertices, dtype=np.float64)
         faces = np.ascontiguousarray(faces, dtype=np.int64)
         self.vertices, self.faces = vertices, faces
-        self.order = np.arange(len(faces))
-        depth = max(0, int(np.ceil(np.log2(len(faces) / LEAF))))
-        self.starts = np.zeros((1 << depth) + 1, dtype=np.int64)
-        _order_loop(vertices[faces].mean(axis=1), self.order, depth, self.starts)
-        start, around = vertex_faces(faces, len(vertices))
-        self.across = opposite_faces(faces, start, around)
+        if like is None:
+            self.order = np.arange(len(faces))
+            depth = max(0, int(np.ceil(np.log2(len(faces) / LEAF))))
+            self.starts = np.zeros((1 << depth) + 1, dtype=np.int64)
+            _order_loop(vertices[faces].mean(axis=1), self.order, depth, self.starts)
+            start, around = vertex_faces(faces, len(vertices))
+            self.across = opposite_faces(faces, start, around)
+        else:
+            self.order, self.starts, self.across = like.order, like.starts, like.across
         self.records = np.empty((len(faces), WIDTH))
-        self.boxes = np.empty((2 << depth, 6))
+        self.boxes = np.empty((2 * len(self.starts) - 2, 6))
         self.edge_normals = np.empty((len(faces), 3, 3))
         self.vertex_normals = np.empty((len(vertices), 3))
         fill_records(vertices, faces, self.order, self.records)

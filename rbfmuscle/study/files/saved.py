@@ -112,12 +112,16 @@ class SavedRun:
 
     def series(self, muscle: str, quantity: str, coordinate: str | None = None) -> tuple[Integers, Floats]:
         """Frames and values of a quantity of a muscle, of moment arms those of a coordinate, as two arrays."""
-        found = [
-            (r.frame, r.value)
-            for r in self.metrics
-            if r.muscle == muscle and r.quantity == quantity and coordinate in (None, r.coordinate)
-        ]
-        return np.array([f for f, _ in found]), np.array([v for _, v in found], dtype=float)
+        found = [r for r in self._rows.get((muscle, quantity), []) if coordinate in (None, r.coordinate)]
+        return np.array([r.frame for r in found]), np.array([r.value for r in found], dtype=float)
+
+    @cached_property
+    def _rows(self) -> dict[tuple[str, str], list[Row]]:
+        """Rows of ``metrics.csv`` by muscle and quantity: of dozens of muscles there are tens of thousands."""
+        found: dict[tuple[str, str], list[Row]] = {}
+        for row in self.metrics:
+            found.setdefault((row.muscle, row.quantity), []).append(row)
+        return found
 
     def arm_coordinates(self, muscle: str | None = None) -> list[str]:
         """The coordinates that a muscle, or any, has moment arms about, in their order in ``metrics.csv``."""

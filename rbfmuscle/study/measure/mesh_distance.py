@@ -23,6 +23,8 @@ class MeshDistance:
     faces : (m, 3) array_like of int
     closed : bool
         False for a mesh with holes.
+    like : MeshDistance, optional
+        Of a moment before: where the faces are the same, its tree is adapted.
 
     Notes
     -----
@@ -32,10 +34,13 @@ class MeshDistance:
     winding number decides (Jacobson et al. 2013; Barill et al. 2018): inside where it exceeds one half.
     """
 
-    def __init__(self, vertices: ArrayLike, faces: ArrayLike, *, closed: bool = True) -> None:
+    def __init__(
+        self, vertices: ArrayLike, faces: ArrayLike, *, closed: bool = True, like: MeshDistance | None = None
+    ) -> None:
         self.closed = closed
         self.vertices, self.faces = check_mesh(vertices, faces)
-        self._exact = ExactDistance(self.vertices, self.faces)
+        same = like is not None and np.array_equal(like.faces, self.faces)
+        self._exact = ExactDistance(self.vertices, self.faces, like=like._exact if same else None)
 
     def unsigned(self, points: ArrayLike) -> Floats:
         """Distance to the surface.

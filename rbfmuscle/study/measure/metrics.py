@@ -102,6 +102,7 @@ class _Tracker:
         self.scene = scene
         self.offset = None
         self.form = SurfaceForm()
+        self.distance: MeshDistance | None = None
 
     def state(self) -> tuple[Any, ...]:
         return self.rest_measured, self.offset
@@ -155,7 +156,7 @@ class _Tracker:
     def _of_surface(self, surface, frame, probes, first_rest):
         vertices, faces = surface.vertices, np.asarray(surface.faces)
         volume = mesh_volume(vertices, faces)
-        distance = MeshDistance(vertices, faces)
+        self.distance = distance = MeshDistance(vertices, faces, like=self.distance)
         depth = surface_depth(vertices, probes, frame.poses)
         found = {
             "volume": volume,

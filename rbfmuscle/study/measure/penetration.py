@@ -137,11 +137,21 @@ def bone_depth(
     near = []
     for probe in bones_about(low, high, probes, poses):
         pose = poses[probe.name]
-        moved = probe.vertices @ pose[:3, :3].T + pose[:3, 3]
-        near.append(moved[np.all((moved > low) & (moved < high), axis=1)])
+        local = bone_coordinates(vertices, pose)
+        within = _rows_within_box_of(local, probe.vertices)
+        near.append(probe.vertices[within] @ pose[:3, :3].T + pose[:3, 3])
     points = np.concatenate(near) if near else np.zeros((0, 3))
     if len(points) == 0:
         return 0.0
     points = points[OccupancyGrid(vertices, faces).candidates(points)]
     distance = MeshDistance(vertices, faces) if distance is None else distance
     return float(distance.depth(points).max(initial=0.0))
+
+
+def _rows_within_box_of(points: Floats, others: Floats) -> Integers:
+    """Rows of the others inside the box of points; axis by axis, as a bone has many and few are near one muscle."""
+    rows = np.arange(len(others))
+    for axis in range(3):
+        ends, values = points[:, axis], others[rows, axis]
+        rows = rows[(values > ends.min()) & (values < ends.max())]
+    return rows

@@ -54,6 +54,8 @@ def self_crossing(vertices: np.ndarray, faces: np.ndarray, tree: FaceTree | None
         Of these faces, from whatever moment, where it is at hand.
     """
     marked = crossing_faces(vertices, faces) if tree is None else tree.crossing(vertices)
+    if not marked.any():
+        return Crossings(0, 0.0)
     a, b, c = (np.asarray(vertices)[faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     share = area[marked].sum() / max(area.sum(), np.finfo(float).tiny)
