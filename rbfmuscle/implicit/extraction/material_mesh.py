@@ -29,9 +29,9 @@ class MaterialMesh:
         self.tree = FaceTree(vertices, faces)
         self.faces = np.ascontiguousarray(faces, dtype=np.int64)
         ends = np.concatenate([self.faces[:, :2], self.faces[:, 1:], self.faces[:, ::2]])
-        pairs = np.unique(np.concatenate([ends, ends[:, ::-1]]), axis=0)
-        self.other = np.ascontiguousarray(pairs[:, 1])
-        self.start = np.searchsorted(pairs[:, 0], np.arange(len(vertices) + 1))
+        pairs = np.unique(np.concatenate([ends @ (len(vertices), 1), ends @ (1, len(vertices))]))
+        self.other = pairs % len(vertices)
+        self.start = np.searchsorted(pairs, len(vertices) * np.arange(len(vertices) + 1))
 
     def edge(self, vertices: Floats) -> float:
         """Mean length of an edge [scene unit]."""
