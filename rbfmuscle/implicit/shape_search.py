@@ -24,6 +24,8 @@ STEP = 1.2
 SOUND, RIDGE, TRUNCATED = "sound", "ridge", "truncated"
 # Fits that find the flattest sound one, and the narrowest that is as good as the best.
 EDGE = 4
+# What counts the seconds of a search.
+CLOCK = time.monotonic
 # Unknowns beyond which an eigen-decomposition takes seconds: there it is the last resort.
 LARGE = 1500
 
@@ -60,12 +62,15 @@ class Limits:
 
     def start(self) -> None:
         """Begin to count."""
-        self.spent, self.begun, self.scanning = 0, time.monotonic(), True
+        self.spent, self.begun, self.scanning = 0, CLOCK(), True
 
     def left(self) -> bool:
         """Whether another fit may be made."""
-        in_time = self.scanning or time.monotonic() - self.begun < self.seconds
-        return self.spent < self.fits and in_time
+        return self.spent < self.fits and (self.scanning or self.in_time())
+
+    def in_time(self) -> bool:
+        """Whether its seconds are not over."""
+        return CLOCK() - self.begun < self.seconds
 
     def why(self) -> str:
         """What ran out, or empty."""
@@ -110,7 +115,7 @@ def search_shape(
                 return epsilon, math.inf, math.inf
             finally:
                 if limits.spent == 1:
-                    limits.begun = time.monotonic()
+                    limits.begun = CLOCK()
         return epsilon, score if math.isfinite(score) else math.inf, condition
 
     sound, ratio = _scan_sound(attempt, span, limits.scan)

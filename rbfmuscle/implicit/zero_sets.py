@@ -8,7 +8,6 @@ distance in epsilon, and where one that did not is found, the way back to the be
 from __future__ import annotations
 
 import math
-import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -71,8 +70,7 @@ class _Looks:
 
     def left(self) -> bool:
         """Whether another may be looked at."""
-        late = time.monotonic() - self.limits.begun > self.limits.seconds
-        return self.count < (LEAST_LOOKS if late else LOOKS)
+        return self.count < (LOOKS if self.limits.in_time() else LEAST_LOOKS)
 
     def near_broken(self, epsilon: float, factor: float) -> bool:
         """Whether one that broke lies within a factor."""
