@@ -48,8 +48,8 @@ class Stage:
         first = rows[0][0][0]
         self.first, self.colours = first, neighbour_colours(first)
         self.bones = [(name, self._add_bone(first.bone(name))) for name in first.bones]
-        # Of each run's muscle: its mesh, shared by the panels, and its actors there.
-        self.skins: dict[Any, tuple[Any, list[Any]]] = {}
+        # Of each run's muscle: its mesh, and its actor in all panels.
+        self.skins: dict[Any, tuple[Any, Any]] = {}
         bounds = path_bounds({id(saved): saved for row in rows for saved, _ in row}.values())
         for i, j, _, view in self.panels:
             self.plotter.subplot(i, j)
@@ -58,9 +58,8 @@ class Stage:
 
     def show(self, frame: int) -> Any:
         """Put bones and muscles where they are in a frame, and return the picture (h, w, 3) uint8."""
-        for name, actors in self.bones:
-            for actor in actors:
-                actor.user_matrix = self.first.poses[frame][name]
+        for name, actor in self.bones:
+            actor.user_matrix = self.first.poses[frame][name]
         for saved in {id(saved): saved for _, _, saved, _ in self.panels}.values():
             for muscle in saved.muscles:
                 self._show_skin(saved, muscle, frame)
@@ -80,14 +79,14 @@ class Stage:
         if mesh.n_cells > _BONE_TRIANGLES:  # software drawing pays for each of them in every frame
             mesh = mesh.decimate(1.0 - _BONE_TRIANGLES / mesh.n_cells)
         mesh = mesh.compute_normals(split_vertices=False, auto_orient_normals=False)
-        return [self._add(i, j, mesh, BONE_COLOUR) for i, j, _, _ in self.panels]
+        return self._add(self.panels, mesh, BONE_COLOUR)
 
     def _show_skin(self, saved, muscle, frame):
         """A muscle in all panels of its run: moved where its faces are those of the frame before, else made anew."""
         import pyvista
 
         vertices, faces = saved.surface(muscle, frame)
-        mesh, actors = self.skins.get((id(saved), muscle), (None, []))
+        mesh, actor = self.skins.get((id(saved), muscle), (None, None))
         known = mesh is not None and np.array_equal(mesh.regular_faces, faces)
         if known:
             mesh.points = vertices
@@ -99,16 +98,16 @@ class Stage:
             mesh.point_data[_PAINT] = self.paint(saved, muscle, frame, np.asarray(mesh.points))
         if known:
             return
-        for actor in actors:
+        panels = [panel for panel in self.panels if panel[2] is saved]
+        if actor is not None:
             self.plotter.remove_actor(actor, render=False)
-        panels = [(i, j) for i, j, shown, _ in self.panels if shown is saved]
-        actors = [self._add(i, j, mesh, self.colours[muscle]) for i, j in panels]
-        self.skins[id(saved), muscle] = mesh, actors
+        self.skins[id(saved), muscle] = mesh, self._add(panels, mesh, self.colours[muscle])
 
-    def _add(self, row, column, mesh, colour):
-        self.plotter.subplot(row, column)
+    def _add(self, panels, mesh, colour):
+        """One actor in all of some panels, so that the mesh goes to the graphics once."""
+        self.plotter.subplot(*panels[0][:2])
         painted = _PAINT in mesh.point_data
-        return self.plotter.add_mesh(
+        actor = self.plotter.add_mesh(
             mesh,
             color=None if painted else colour,
             scalars=_PAINT if painted else None,
@@ -122,6 +121,10 @@ class Stage:
             render=False,
             reset_camera=False,
         )
+        for i, j, _, _ in panels[1:]:
+            self.plotter.subplot(i, j)
+            self.plotter.renderer.AddActor(actor)
+        return actor
 
 
 def path_bounds(runs: Iterable[SavedRun]) -> Floats:
