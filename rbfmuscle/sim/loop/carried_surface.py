@@ -92,20 +92,29 @@ class CarriedSurface:
         self.deepest = DEEPER * np.minimum(balls[1], float(reach)) + self.edge
         nearest = cKDTree(model.contact_points()).query(vertices)[1]
         self.fixed = np.asarray(model.contact_bone)[nearest] >= 0
+        self.lead: tuple[Floats, Floats] | None = None
         self.refresh()
 
-    def refresh(self) -> None:
-        """Take over where the model is now."""
+    def refresh(self, share: float = 0.0) -> None:
+        """Take over where the model is now, moved on by a share of the way that its last settling took."""
+        self.points = self.model.contact_points()
         self.vertices = np.ascontiguousarray(self.model.carried_mesh()[0], dtype=np.float64)
+        self._predicted = self.points, self.vertices
+        if share and self.lead is not None:
+            self.points, self.vertices = (part + share * lead for part, lead in zip(self._predicted, self.lead))
         self.normals = vertex_normals(self.vertices, self.faces)
         self.box = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
-        points = self.model.contact_points()
         #: Box about all that the model meets others with.
-        self.reach_box = np.array([points.min(axis=0), points.max(axis=0)])
+        self.reach_box = np.array([self.points.min(axis=0), self.points.max(axis=0)])
         shape = (np.ceil((self.box[1] - self.box[0]) / self.cell).astype(np.int64) + 1).clip(1)
         first = np.zeros(int(np.prod(shape)) + 1, dtype=np.int64)
         self.cells = Cells(self.box, self.cell, shape, first, np.empty(len(self.vertices), dtype=np.int64))
         _fill_loop(self.vertices, self.cells)
+
+    def settled(self) -> None:
+        """Note how far the model went from where it was taken over to where it is now."""
+        now = self.model.contact_points(), self.model.carried_mesh()[0]
+        self.lead = tuple(part - before for part, before in zip(now, self._predicted))
 
     def apart(self, other: CarriedSurface, reach: float) -> bool:
         """Whether no point of the other muscle can be nearer than ``reach`` to this surface, by their boxes."""

@@ -124,7 +124,7 @@ class Link:
     def update(self) -> None:
         """Planes from both muscles' predicted states."""
         limits = self.limits
-        points = self.stepper.model.contact_points()
+        points = self.own.points
         index, distance, normal, nearest = self._near()
         far = np.ones(len(points), dtype=bool)
         far[index] = distance > self.hold[index] + limits.release
@@ -208,7 +208,7 @@ class Link:
     def _near(self):
         if self.other.apart(self.own, self.limits.search):
             return _FAR
-        return self.other.query(self.stepper.model.contact_points(), self.free, self.limits.search)
+        return self.other.query(self.own.points, self.free, self.limits.search)
 
     def _slip(self, points, index, normal, nearest):
         if self.before is None or len(index) == 0:
@@ -319,11 +319,17 @@ class Sliding:
             if any(m.touching or m.overlap for m in found)
         }
 
-    def refresh(self, stepper: Any) -> None:
-        """Take over a muscle's surface as it is now."""
+    def refresh(self, stepper: Any, lead: float = 0.0) -> None:
+        """Take over a muscle's surface as it is now, moved on by a share of what its last settling changed."""
         if stepper.name in self.surfaces:
             with stepper.timed("sliding"):
-                self.surfaces[stepper.name].refresh()
+                self.surfaces[stepper.name].refresh(lead)
+
+    def settled(self, stepper: Any) -> None:
+        """Note what settling changed."""
+        if stepper.name in self.surfaces:
+            with stepper.timed("sliding"):
+                self.surfaces[stepper.name].settled()
 
     def show(self, drawing: Any) -> None:
         """Take over the field that a muscle will be shown by, where it has one; its drawing comes afterwards."""

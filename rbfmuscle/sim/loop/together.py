@@ -17,8 +17,8 @@ class Together:
     """Brings muscles that see each other's surfaces through the sub-steps of a frame.
 
     The scene's fastest muscle cuts the frame. Another one takes as many of these sub-steps at a time as leave it no
-    longer steps than its own bones ask for, and is seen by its neighbours where it came to last; at the frame's end
-    all of them meet. What a muscle does depends on the places of the stops alone, never on an order of muscles.
+    longer steps than its own bones ask for; in between its neighbours see it where its bones have taken it. At the
+    frame's end all of them meet. What a muscle does depends on the places of the stops alone, never on an order of muscles.
 
     Parameters
     ----------
@@ -30,6 +30,7 @@ class Together:
 
     def __init__(self, steppers: list[MuscleStepper], sliding: Sliding, cuts: Mapping[str, SubSteps]) -> None:
         self.steppers, self.sliding, self.cuts = steppers, sliding, dict(cuts)
+        self.ways: dict[str, dict[str, float]] = {}
 
     def go(
         self,
@@ -52,8 +53,13 @@ class Together:
             for stepper in due if len(activations) else ():
                 stepper.excite(activations[stop - 1])
             workers.each(self._begin_to(stops, stop, here), due)
+            if due:
+                workers.each(self._carry_to(stops, stop, here), [s for s in self.steppers if s not in due])
             workers.each(self.sliding.update, due)
             workers.each(MuscleStepper.finish, due)
+            workers.each(self.sliding.settled, due)
+            for stepper in due:
+                self.ways[stepper.name] = _way(stops[here[stepper.name]], stops[stop])
             here.update((stepper.name, stop) for stepper in due)
 
     def _stride(self, name: str, stops: list[dict]) -> int:
@@ -69,7 +75,35 @@ class Together:
         """First half of a sub-step of one muscle, from where it is."""
 
         def begin(stepper: MuscleStepper) -> None:
-            stepper.begin(stops[here[stepper.name]], stops[stop])
-            self.sliding.refresh(stepper)
+            before, after = stops[here[stepper.name]], stops[stop]
+            stepper.begin(before, after)
+            self.sliding.refresh(stepper, self._share(stepper.name, before, after))
 
         return begin
+
+    def _carry_to(
+        self, stops: list[dict], stop: int, here: Mapping[str, int]
+    ) -> Callable[[MuscleStepper], None]:
+        """Show a muscle's neighbours where its bones take it meanwhile: left where it was, it would be run into."""
+
+        def carry(stepper: MuscleStepper) -> None:
+            state = stepper.model.snapshot()
+            before, after = stops[here[stepper.name]], stops[stop]
+            with stepper.timed("predict"):
+                stepper.model.predict(stepper.poses(before), stepper.poses(after))
+            self.sliding.refresh(stepper, self._share(stepper.name, before, after))
+            stepper.model.restore(state)
+
+        return carry
+
+    def _share(self, name: str, before: Mapping[str, float], after: Mapping[str, float]) -> float:
+        """How much of what its last settling changed a muscle's next one will change: as it goes on, or back."""
+        last, way = self.ways.get(name, {}), _way(before, after)
+        square = sum(value**2 for value in last.values())
+        along = sum(value * last.get(key, 0.0) for key, value in way.items())
+        return min(max(along / square, -1.0), 1.0) if square > 0.0 else 0.0
+
+
+def _way(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str, float]:
+    """How coordinates change."""
+    return {key: value - before.get(key, 0.0) for key, value in after.items()}
