@@ -7,8 +7,9 @@ import trimesh
 from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, joint, muscle, scene, sphere
 
 from rbfmuscle.sim.loop.carried_surface import DEEPER, CarriedSurface
+from rbfmuscle.sim.loop.neighbours.links import MOST
 from rbfmuscle.sim.loop.simulate import FrameLoop, simulate_frames
-from rbfmuscle.sim.loop.sliding import MOST, sliding_pairs
+from rbfmuscle.sim.loop.sliding import sliding_pairs
 from rbfmuscle.sim.loop.substeps import SubSteps
 from rbfmuscle.sim.scene.motion import rotation_about
 from rbfmuscle.sim.scene.options import SlidingOptions

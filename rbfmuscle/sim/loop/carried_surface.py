@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.geometry.touching_balls import touching_balls
 from rbfmuscle.geometry.triangles import nearest_weights, triangle_normal
 from rbfmuscle.geometry.winding import wound_around
+from rbfmuscle.sim.loop.neighbours.lead import Lead
 
 if TYPE_CHECKING:
     from rbfmuscle.sim.loop.frame import MuscleModel
@@ -65,6 +67,8 @@ class CarriedSurface:
 
     Attributes
     ----------
+    points : (c, 3) ndarray
+        The model's contact points.
     vertices : (n, 3) ndarray
     fixed : (n,) ndarray of bool
         Vertices that a bone holds.
@@ -92,16 +96,15 @@ class CarriedSurface:
         self.deepest = DEEPER * np.minimum(balls[1], float(reach)) + self.edge
         nearest = cKDTree(model.contact_points()).query(vertices)[1]
         self.fixed = np.asarray(model.contact_bone)[nearest] >= 0
-        self.lead: tuple[Floats, Floats] | None = None
+        #: Where it will settle.
+        self.lead = Lead()
         self.refresh()
 
-    def refresh(self, share: float = 0.0) -> None:
-        """Take over where the model is now, moved on by a share of the way that its last settling took."""
-        self.points = self.model.contact_points()
-        self.vertices = np.ascontiguousarray(self.model.carried_mesh()[0], dtype=np.float64)
-        self._predicted = self.points, self.vertices
-        if share and self.lead is not None:
-            self.points, self.vertices = (part + share * lead for part, lead in zip(self._predicted, self.lead))
+    def refresh(self, way: Mapping[str, float] | None = None) -> None:
+        """Take over where the model is now, or where a step of coordinates, as predicted, will settle it."""
+        self._predicted = [np.array(self.model.contact_points()), np.array(self.model.carried_mesh()[0])]
+        self.points, self.vertices = self._predicted if way is None else self.lead.ahead(self._predicted, way)
+        self.vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
         self.normals = vertex_normals(self.vertices, self.faces)
         self.box = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
         #: Box about all that the model meets others with.
@@ -111,10 +114,9 @@ class CarriedSurface:
         self.cells = Cells(self.box, self.cell, shape, first, np.empty(len(self.vertices), dtype=np.int64))
         _fill_loop(self.vertices, self.cells)
 
-    def settled(self) -> None:
-        """Note how far the model went from where it was taken over to where it is now."""
-        now = self.model.contact_points(), self.model.carried_mesh()[0]
-        self.lead = tuple(part - before for part, before in zip(now, self._predicted))
+    def settled(self, way: Mapping[str, float]) -> None:
+        """Note how far settling moved the model from where it was taken over, after a step of coordinates."""
+        self.lead.learn(way, self._predicted, [self.model.contact_points(), self.model.carried_mesh()[0]])
 
     def apart(self, other: CarriedSurface, reach: float) -> bool:
         """Whether no point of the other muscle can be nearer than ``reach`` to this surface, by their boxes."""

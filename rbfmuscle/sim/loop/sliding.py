@@ -3,258 +3,28 @@
 After Cervenka et al. 2023, section 5.4.1: a point nearer to its neighbour than a threshold at rest stays near
 the neighbour's surface; within a strip it is free, so that it slides; beyond a release distance it is let go.
 
-All muscles predict first; then each sees its neighbours' predicted surfaces, and what it may do is written as
-planes through its own predicted points. Each of two muscles may use half of the gap between them, or gives
-way by half of the overlap, so both stay on their own side of one surface whatever the other does: the answer
-does not depend on the order in which muscles are solved, nor on how many run at a time.
+All muscles predict first; then each sees its neighbours' surfaces where they will be, and what it may do is written as
+planes through its own points. Each of two muscles may use half of the gap between them, or gives way by half of the
+overlap, so both stay on their own side of one surface whatever the other does: the answer does not depend on the order
+in which muscles are solved, nor on how many run at a time.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.sim.loop.carried_surface import CarriedSurface
+from rbfmuscle.sim.loop.neighbours.links import BoneLink, Link, Met, SlidingLimits
 from rbfmuscle.sim.plan.reach import sampled_poses, swept_region
 from rbfmuscle.validation import SceneError
 
 if TYPE_CHECKING:
     from rbfmuscle.sim.scene.scene import Scene
-
-
-# Defaults [mm]: nearer than THRESHOLD at rest is linked; STRIP beyond its gap there is free; RELEASE beyond lets go.
-THRESHOLD, STRIP, RELEASE = 2.0, 1.0, 5.0
-# Neighbours are looked for within this distance [mm] of the predicted points.
-SEARCH = 5.0
-# Distance [mm] between the surfaces as solved below which they are cut, and how deep an overlap may be.
-CUT_FROM, CUT_DEPTH = 4.0, 6.0
-# Neighbours on all sides, and bones, may leave no place that all of them allow: rigid planes would push without end.
-# So planes give way, by this share of how far their force alone would move the point; nearness more than keeping out.
-PUSH_GIVES, PULL_GIVES = 0.1, 1.0
-# How far a plane pushes out of a neighbour at most in one sub-step [mm].
-MOST = 0.5
-
-
-# The answer for muscles that are nowhere near each other.
-_FAR = (np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, dtype=np.int64))
-
-
-class Met(NamedTuple):
-    """How a muscle lies to a neighbour.
-
-    Attributes
-    ----------
-    overlap : float
-        Its deepest point in the neighbour, 0 where none is.
-    touching : int
-        Points that touch the neighbour at rest.
-    opened : float
-        Sum of the squares of how much farther these are now.
-    """
-
-    overlap: float
-    touching: int
-    opened: float
-
-
-_NOTHING = Met(0.0, 0, 0.0)
-
-
-class Planes:
-    """Half-spaces of one kind against one obstacle, fixed through a sub-step.
-
-    Attributes
-    ----------
-    index, gap, normal
-        As in :class:`~rbfmuscle.sim.loop.contact.HalfSpaces`, at the points ``anchor`` (c, 3).
-    give : float
-        The same of all of them.
-    """
-
-    def __init__(self, give: float = 0.0) -> None:
-        self.give = give
-        self.set(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
-
-    def set(self, index: Any, gap: Any, normal: Any, anchor: Any) -> None:
-        """Replace the planes."""
-        self.index, self.gap, self.normal, self.anchor = index, gap, normal, anchor
-
-    def contacts(self, points: Floats, reach: Any) -> Any:
-        """``(index, gap, normal)`` of the planes nearer than ``reach`` to the model's contact points now."""
-        gap = self.gap + np.einsum("ij,ij->i", self.normal, points[self.index] - self.anchor)
-        near = gap < reach
-        return self.index[near], gap[near], self.normal[near]
-
-
-class Link:
-    """How one muscle sees one neighbour: which points are linked, and the planes they get.
-
-    Parameters
-    ----------
-    stepper : MuscleStepper
-        The muscle that is held.
-    own, other : CarriedSurface
-        Its own surface and the neighbour's.
-    limits : SlidingLimits
-    """
-
-    def __init__(self, stepper: Any, own: Any, other: Any, limits: Any) -> None:
-        self.stepper, self.own, self.other, self.limits = stepper, own, other, limits
-        self.push, self.pull = Planes(PUSH_GIVES), Planes(PULL_GIVES)
-        self.free = stepper.contacts.free(len(stepper.model.contact_points()))
-        #: Which points are linked, and how far each may be from the neighbour.
-        self.linked = np.zeros(len(self.free), dtype=bool)
-        self.hold = np.full(len(self.free), limits.hold)
-        self.before: Any = None
-        #: Box in which the points of this muscle come near the neighbour, and the link that looks the other way.
-        self.zone: Any = None
-        self.back: Link | None = None
-        index, distance, _, _ = self._near()
-        self.linked[index[distance < limits.threshold]] = True
-        near = distance < limits.threshold
-        self.hold[index[near]] = np.maximum(distance[near], 0.0) + limits.strip
-        #: Points that touch the neighbour at rest, and how far they are from it there.
-        self.touching, self.gap = index[near], distance[near]
-        self.found = _NOTHING
-
-    def update(self) -> None:
-        """Planes from both muscles' predicted states."""
-        limits = self.limits
-        points = self.own.points
-        index, distance, normal, nearest = self._near()
-        far = np.ones(len(points), dtype=bool)
-        far[index] = distance > self.hold[index] + limits.release
-        self.linked &= ~far
-        if limits.join:
-            self.linked[index[distance < limits.threshold]] = True
-        share = np.where(self.other.fixed[nearest], 1.0, 0.5)
-        self.push.set(index, np.maximum(share * distance, -limits.most), normal, points[index])
-        held = self.linked[index]
-        slack = share[held] * (self.hold[index[held]] - distance[held])
-        self.pull.set(index[held], slack, -normal[held], points[index[held]])
-
-    def measure(self) -> Any:
-        """Overlap, widest gap of linked points, and their slip over the neighbour since the last call."""
-        points = self.stepper.model.contact_points()
-        index, distance, normal, nearest = self._near()
-        held = self.linked[index]
-        self.found = self._met(index, distance)
-        close = distance < self.limits.cut_from
-        self.zone = _box(points[index[close]], self.limits.cut_depth) if close.any() else None
-        found = {
-            "sliding_overlap_max": max(0.0, -float(distance.min(initial=0.0))),
-            "sliding_gap_max": float(distance[held].max(initial=0.0)),
-            "sliding_speed": self._slip(points, index[held], normal[held], nearest[held]),
-        }
-        self.before = points.copy(), self.other.vertices.copy()
-        return found
-
-    def _met(self, index: Any, distance: Any) -> Met:
-        """How deep the muscle is in the neighbour, and how far what touched it at rest has come away."""
-        apart = np.full(len(self.free), self.limits.search)
-        apart[index] = distance
-        opened = np.maximum(apart[self.touching] - np.maximum(self.gap, 0.0), 0.0)
-        return Met(max(0.0, -float(distance.min(initial=0.0))), len(opened), float((opened**2).sum()))
-
-    def meeting(self) -> Any:
-        """Box in which the two meet, as either sees it, or None: what is held takes no contact, but is met."""
-        zones = [
-            zone for zone in (self.zone, None if self.back is None else self.back.zone) if zone is not None
-        ]
-        if not zones:
-            return None
-        return np.min([low for low, _ in zones], axis=0), np.max([high for _, high in zones], axis=0)
-
-    def cut(self, points: Floats) -> Any:
-        """Half the difference of both muscles' distances near where they meet, infinity elsewhere."""
-        return self.cut_with_gradient(points)[0]
-
-    def cut_with_gradient(self, points: Floats) -> Any:
-        """Cut (n,) and its gradient (n, 3): the surface midway between two overlapping muscles."""
-        value, gradient = np.full(len(points), np.inf), np.zeros((len(points), 3))
-        zone, depth = self.meeting(), self.limits.cut_depth
-        if zone is None or not self.limits.cut:
-            return value, gradient
-        inside = np.all((points > zone[0]) & (points < zone[1]), axis=1)
-        if self.own.field is not None and self.other.field is not None:
-            # What is shown is the zero set of the fields: where these are equal both are cut alike.
-            (ours, own), (theirs, normal) = (
-                self.own.field.value_and_gradient(points[inside]),
-                self.other.field.value_and_gradient(points[inside]),
-            )
-            value[inside], gradient[inside] = 0.5 * (theirs - ours), 0.5 * (normal - own)
-            return value, gradient
-        near, theirs, normal, _ = self.other.query(points, inside, depth)
-        inside[:] = False
-        inside[near] = True
-        both, ours, own, _ = self.own.query(points, inside, depth)
-        match = np.searchsorted(near, both)
-        value[both] = 0.5 * (theirs[match] - ours)
-        gradient[both] = 0.5 * (normal[match] - own)
-        return value, gradient
-
-    def points(self) -> Floats:
-        """Points (k, 3) of the neighbour where the two meet, which the faces of a surface have to leave outside."""
-        zone = self.meeting()
-        if zone is None or not self.limits.cut:
-            return np.zeros((0, 3))
-        found, (low, high) = self.other.vertices, zone
-        return found[np.all((found > low) & (found < high), axis=1)]
-
-    def _near(self):
-        if self.other.apart(self.own, self.limits.search):
-            return _FAR
-        return self.other.query(self.own.points, self.free, self.limits.search)
-
-    def _slip(self, points, index, normal, nearest):
-        if self.before is None or len(index) == 0:
-            return 0.0
-        own = points[index] - self.before[0][index]
-        way = own - (self.other.vertices[nearest] - self.before[1][nearest])
-        way -= np.einsum("ij,ij->i", way, normal)[:, None] * normal
-        return float(np.linalg.norm(way, axis=1).mean())
-
-
-class BoneLink:
-    """Points near a bone at rest, held near it in the same way; the bone's own contact keeps them out."""
-
-    def __init__(self, stepper: Any, bone_index: Any, limits: Any) -> None:
-        self.stepper, self.bone, self.limits = stepper, bone_index, limits
-        points = stepper.model.contact_points()
-        distance, _ = stepper.contacts.distance_and_direction(points, bone_index)
-        self.linked = stepper.contacts.free(len(points)) & (distance < limits.threshold)
-        self.pull = Planes()
-
-    def update(self) -> None:
-        """Planes from the predicted state."""
-        limits, points = self.limits, self.stepper.model.contact_points()
-        index = np.flatnonzero(self.linked)
-        distance, normal = self.stepper.contacts.distance_and_direction(points[index], self.bone)
-        held = distance <= limits.hold + limits.release
-        self.linked[index[~held]] = False
-        index, distance, normal = index[held], distance[held], normal[held]
-        self.pull.set(index, limits.hold - distance, -normal, points[index])
-
-
-class SlidingLimits:
-    """The distances of ``[sliding]`` in the scene's unit, with their defaults."""
-
-    def __init__(self, options: Any, scene: Scene) -> None:
-        def length(value, default):
-            return scene.length(default) if value is None else float(value)
-
-        self.threshold = length(options.threshold, THRESHOLD)
-        self.strip = length(options.strip, STRIP)
-        self.hold = self.threshold + self.strip
-        self.release = length(options.release, RELEASE)
-        self.search = max(scene.length(SEARCH), self.hold + self.release)
-        self.cut_from, self.cut_depth = scene.length(CUT_FROM), scene.length(CUT_DEPTH)
-        self.most = scene.length(MOST)
-        self.join, self.cut = options.join, options.cut
 
 
 class Sliding:
@@ -319,17 +89,17 @@ class Sliding:
             if any(m.touching or m.overlap for m in found)
         }
 
-    def refresh(self, stepper: Any, lead: float = 0.0) -> None:
-        """Take over a muscle's surface as it is now, moved on by a share of what its last settling changed."""
+    def refresh(self, stepper: Any, way: Mapping[str, float] | None = None) -> None:
+        """Take over a muscle's surface as it is now, or where a step of coordinates, as predicted, will settle it."""
         if stepper.name in self.surfaces:
             with stepper.timed("sliding"):
-                self.surfaces[stepper.name].refresh(lead)
+                self.surfaces[stepper.name].refresh(way)
 
-    def settled(self, stepper: Any) -> None:
-        """Note what settling changed."""
+    def settled(self, stepper: Any, way: Mapping[str, float]) -> None:
+        """Learn from where a step of coordinates settled a muscle."""
         if stepper.name in self.surfaces:
             with stepper.timed("sliding"):
-                self.surfaces[stepper.name].settled()
+                self.surfaces[stepper.name].settled(way)
 
     def show(self, drawing: Any) -> None:
         """Take over the field that a muscle will be shown by, where it has one; its drawing comes afterwards."""
@@ -345,21 +115,25 @@ class Sliding:
                 link.update()
 
     def snapshot(self) -> dict[str, Any]:
-        """What `restore` needs: by muscle, what is linked and where its links were measured last."""
+        """What `restore` needs: by muscle, what is linked and where its links were measured last, and its lead."""
         return {
-            name: [(link.linked.copy(), link.before) for link in links]
-            + [(link.linked.copy(), None) for link in self.bone_links[name]]
+            name: (
+                [(link.linked.copy(), link.before) for link in links],
+                [link.linked.copy() for link in self.bone_links[name]],
+                self.surfaces[name].lead.snapshot() if name in self.surfaces else None,
+            )
             for name, links in self.links.items()
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go back to a snapshot."""
-        for name, found in state.items():
-            links = self.links[name]
-            for link, (linked, before) in zip([*links, *self.bone_links[name]], found):
-                link.linked = linked.copy()
-                if link in links:
-                    link.before = before
+        for name, (links, bones, lead) in state.items():
+            for link, (linked, before) in zip(self.links[name], links):
+                link.linked, link.before = linked.copy(), before
+            for held, linked in zip(self.bone_links[name], bones):
+                held.linked = linked.copy()
+            if lead is not None:
+                self.surfaces[name].lead.restore(lead)
 
     def measure(self, stepper: Any) -> Any:
         """Worst of what a muscle's links say: a dict of quantities, empty without neighbours."""
@@ -396,7 +170,3 @@ def sliding_pairs(scene: Scene, names: list[str], reach: float) -> set[frozenset
 
 def _rms(squares, count):
     return math.sqrt(squares / count) if count else 0.0
-
-
-def _box(points, pad):
-    return points.min(axis=0) - pad, points.max(axis=0) + pad

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from rbfmuscle.sim.loop.neighbours.lead import way_between
 from rbfmuscle.sim.loop.stepper import MuscleStepper
 
 if TYPE_CHECKING:
@@ -18,7 +19,8 @@ class Together:
 
     The scene's fastest muscle cuts the frame. Another one takes as many of these sub-steps at a time as leave it no
     longer steps than its own bones ask for; in between its neighbours see it where its bones have taken it. At the
-    frame's end all of them meet. What a muscle does depends on the places of the stops alone, never on an order of muscles.
+    frame's end all of them meet. What a muscle does depends on the places of the stops alone, never on an order of
+    muscles.
 
     Parameters
     ----------
@@ -30,7 +32,6 @@ class Together:
 
     def __init__(self, steppers: list[MuscleStepper], sliding: Sliding, cuts: Mapping[str, SubSteps]) -> None:
         self.steppers, self.sliding, self.cuts = steppers, sliding, dict(cuts)
-        self.ways: dict[str, dict[str, float]] = {}
 
     def go(
         self,
@@ -57,9 +58,7 @@ class Together:
                 workers.each(self._carry_to(stops, stop, here), [s for s in self.steppers if s not in due])
             workers.each(self.sliding.update, due)
             workers.each(MuscleStepper.finish, due)
-            workers.each(self.sliding.settled, due)
-            for stepper in due:
-                self.ways[stepper.name] = _way(stops[here[stepper.name]], stops[stop])
+            workers.each(self._settled(stops, stop, here), due)
             here.update((stepper.name, stop) for stepper in due)
 
     def _stride(self, name: str, stops: list[dict]) -> int:
@@ -77,33 +76,31 @@ class Together:
         def begin(stepper: MuscleStepper) -> None:
             before, after = stops[here[stepper.name]], stops[stop]
             stepper.begin(before, after)
-            self.sliding.refresh(stepper, self._share(stepper.name, before, after))
+            self.sliding.refresh(stepper, way_between(before, after))
 
         return begin
+
+    def _settled(
+        self, stops: list[dict], stop: int, here: Mapping[str, int]
+    ) -> Callable[[MuscleStepper], None]:
+        """What a muscle's neighbours learn from where it settled."""
+
+        def settled(stepper: MuscleStepper) -> None:
+            self.sliding.settled(stepper, way_between(stops[here[stepper.name]], stops[stop]))
+
+        return settled
 
     def _carry_to(
         self, stops: list[dict], stop: int, here: Mapping[str, int]
     ) -> Callable[[MuscleStepper], None]:
-        """Show a muscle's neighbours where its bones take it meanwhile: left where it was, it would be run into."""
+        """Show a muscle where its bones take it meanwhile; left where it was, its neighbours would run into it."""
 
         def carry(stepper: MuscleStepper) -> None:
-            state = stepper.model.snapshot()
             before, after = stops[here[stepper.name]], stops[stop]
+            state = stepper.model.snapshot()
             with stepper.timed("predict"):
                 stepper.model.predict(stepper.poses(before), stepper.poses(after))
-            self.sliding.refresh(stepper, self._share(stepper.name, before, after))
+            self.sliding.refresh(stepper, way_between(before, after))
             stepper.model.restore(state)
 
         return carry
-
-    def _share(self, name: str, before: Mapping[str, float], after: Mapping[str, float]) -> float:
-        """How much of what its last settling changed a muscle's next one will change: as it goes on, or back."""
-        last, way = self.ways.get(name, {}), _way(before, after)
-        square = sum(value**2 for value in last.values())
-        along = sum(value * last.get(key, 0.0) for key, value in way.items())
-        return min(max(along / square, -1.0), 1.0) if square > 0.0 else 0.0
-
-
-def _way(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str, float]:
-    """How coordinates change."""
-    return {key: value - before.get(key, 0.0) for key, value in after.items()}

@@ -18,7 +18,7 @@ from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.sim.loop.near_bones import box_loop, boxes_apart
-from rbfmuscle.sim.loop.sliding import Planes
+from rbfmuscle.sim.loop.neighbours.links import Planes
 
 if TYPE_CHECKING:
     from rbfmuscle.sim.distance.sdf import BoneSDF
