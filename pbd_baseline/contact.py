@@ -35,6 +35,7 @@ class ContactConstraint:
         self.nearest_only = response == "nearest"
         self.index, self.gap = np.zeros(0, dtype=np.int64), np.zeros(0)
         self.normal = self.anchor = np.zeros((0, 3))
+        self.source = np.zeros(0, dtype=np.int64)
 
     def __len__(self) -> int:
         return len(self.index)
@@ -50,7 +51,7 @@ class ContactConstraint:
         placed = self.place(points)
         found = contacts.half_spaces(placed, self.reach if reach is None else reach)
         self.index, self.gap = np.ascontiguousarray(found.index), np.ascontiguousarray(found.gap)
-        self.normal = np.ascontiguousarray(found.normal)
+        self.normal, self.source = np.ascontiguousarray(found.normal), found.source
         self.anchor = placed[self.index]
         return max(0.0, -float(self.gap.min(initial=0.0)))
 
@@ -77,10 +78,10 @@ class ContactConstraint:
         if len(self.index) == 0 or step == 0.0:
             return False
         planes = self.index, self.gap, self.normal, self.anchor
-        return _clear_loop(points, self.columns, self.shares, planes, direction, step)
+        return clear_loop(points, self.columns, self.shares, planes, direction, step)
 
     def _depths(self, points, depth):
-        return _depth_loop(
+        return depth_loop(
             points, self.columns, self.shares, self.index, self.gap, self.normal, self.anchor, depth
         )
 
@@ -113,7 +114,8 @@ def _along(vectors, columns, shares, p, anchor, normal):
 
 
 @compiled
-def _depth_loop(points, columns, shares, index, gap, normal, anchor, depth):
+def depth_loop(points, columns, shares, index, gap, normal, anchor, depth):
+    """How deep each point is in its half-space, filled in; the greatest is returned."""
     worst = 0.0
     for c in range(len(index)):
         depth[c] = max(0.0, -gap[c] - _along(points, columns, shares, index[c], anchor[c], normal[c]))
@@ -139,7 +141,17 @@ def _push_loop(points, columns, shares, index, normal, depth):
 
 
 @compiled
-def _clear_loop(points, columns, shares, planes, direction, step):
+def push_in_turn(points, columns, shares, normal, anchor):
+    """Push points out one after another, each from where the last push left it: several may move the same vertices."""
+    for c in range(len(columns)):
+        depth = -_along(points, columns, shares, c, anchor[c], normal[c])
+        if depth > 0.0:
+            _move(points, columns, shares, c, normal[c], depth)
+
+
+@compiled
+def clear_loop(points, columns, shares, planes, direction, step):
+    """Take out of a direction what leads into half-spaces within twice a step along it; whether anything did."""
     index, gap, normal, anchor = planes
     cleared = False
     nothing = np.zeros(3)

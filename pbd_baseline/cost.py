@@ -11,6 +11,8 @@ from rbfmuscle.sim.scene.scene import Scene
 
 # Of the contacts and the volume after the last sweep: calls, and visits for a vertex.
 FINISH_CALLS, FINISH_VISITS = 1000, 870
+# Of a muscle kept sound besides: calls, and visits for a vertex.
+SOUND_CALLS, SOUND_VISITS = 3000, 9000
 # A sub-step besides: calls, and visits for a contact point in the search for tunnelling.
 PREDICT_CALLS, CROSSING_VISITS = 1100, 200
 # To build: visits for a vertex, and for its weights between the bones where these are not on disk.
@@ -31,11 +33,12 @@ def estimate_muscle(
     method, rounds = METHODS[options.method], sweeps(options)
     search = CROSSING_VISITS * POINTS[options.contact] * count if scene.detect is not None else 0
     weights = 0 if weights_are_cached(muscle, options.swelling_reach) else WEIGHT_VISITS
+    sound = (SOUND_CALLS, SOUND_VISITS) if options.sound else (0, 0)
     factor = FACTOR_BYTES if method.factored else 0
     return MuscleCost(
         build=visit * count * (VERTEX_VISITS + weights),
-        step=call * (PREDICT_CALLS + FINISH_CALLS + rounds * method.calls)
-        + visit * (count * (FINISH_VISITS + rounds * method.visits) + search),
+        step=call * (PREDICT_CALLS + FINISH_CALLS + sound[0] + rounds * method.calls)
+        + visit * (count * (FINISH_VISITS + sound[1] + rounds * method.visits) + search),
         show=visit * SHOW_VISITS * count,
         memory=count * (VERTEX_BYTES + factor),
         working=WORKING_BYTES * count,

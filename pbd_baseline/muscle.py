@@ -12,6 +12,9 @@ from pbd_baseline.motion import carry
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.rest import Rest
 from pbd_baseline.shapes import METHODS, sweeps
+from pbd_baseline.sound.contact import SoundContact
+from pbd_baseline.sound.ridges import Ridges
+from pbd_baseline.sound.untangling import Untangling
 from rbfmuscle.sim.loop.contact import BoneContacts
 from rbfmuscle.sim.loop.frame import FinishedDrawing, ModelSurface
 from rbfmuscle.sim.scene.objects import Muscle
@@ -23,6 +26,10 @@ FINISHING_REACH = 2.0
 # Rounds of contact and volume after the last sweep, and the depth [mm] that ends them.
 FINISHING_ROUNDS = 4
 DEPTH = 0.05
+# Solves that bring what is held out of bones at rest, at most.
+SETTLING_ROUNDS = 8
+# Of a muscle kept sound: what faces away from a bone keeps this share of an edge from it.
+SKIN = 0.2
 # Motion that makes the time of one XPBD step [radian].
 STEP_ANGLE = math.radians(2.0)
 
@@ -55,15 +62,12 @@ class PBDMuscle:
         kind: Any = METHODS[self.options.method].shape
         self.shape = kind(self.rest, self.options, stiffer)
         self.sweeps = sweeps(self.options)
-        columns, shares = _contact_carriers(self.rest, faces_too=self.options.contact == "faces")
-        self.contact = ContactConstraint(
-            columns, shares, reach=scene.length(REACH), response=self.options.response
-        )
+        numbers = _bone_numbers(self.rest, scene)
+        self.contact = _contact(self.rest, scene, self.options, numbers)
+        self.sound = self.contact if isinstance(self.contact, SoundContact) else None
+        self.untangling = Untangling(self.rest) if self.options.sound else None
         self.finishing_reach, self.depth = scene.length(FINISHING_REACH), scene.length(DEPTH)
-        names = [bone.name for bone in scene.bones]
-        numbers = np.array([names.index(bone) for bone in self.rest.bones])
-        of_vertex = np.where(self.rest.holder < 0, -1, numbers[self.rest.holder])
-        self.contact_bone = of_vertex[columns].max(axis=1)
+        self.contact_bone = numbers[self.contact.columns].max(axis=1)
         self.points = self.rest.vertices.copy()
         self.before = self.points.copy()
         self.time = 1.0
@@ -89,6 +93,8 @@ class PBDMuscle:
 
     def solve(self, contacts: BoneContacts) -> None:
         """Sweep the shape, contacts inside the iteration and last, the volume on what is not in contact."""
+        if self.sound is not None:
+            self.sound.free_held(contacts, self.points)
         self.contact.find(contacts, self.points)
         for _ in range(self.sweeps):
             if self.fibres is not None:
@@ -98,6 +104,8 @@ class PBDMuscle:
             if self.shape.volume_in_sweeps:
                 self.shape.restore_volume(self.points, self.contact)
         self._finish(contacts)
+        if self.untangling is not None:
+            self.untangling.untangle(self.points, lambda: self._settle(contacts))
 
     def respond(self, contacts: BoneContacts, before: Mapping, after: Mapping) -> None:
         """None: a mesh muscle has no linearised equilibrium, and is nudged."""
@@ -105,6 +113,15 @@ class PBDMuscle:
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next `solve` settles under."""
         self.fibres.law.activate(activation)
+
+    def settle(self, contacts: BoneContacts) -> None:
+        """Bring held vertices and faces out of the bones at rest, where the muscle is kept sound."""
+        if self.sound is None:
+            return
+        for _ in range(SETTLING_ROUNDS):
+            if self.sound.overlap(contacts, self.points) <= self.depth:
+                return
+            self.solve(contacts)
 
     def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
         """Move the vertices marked in a bool mask (n,) by a (4, 4) transform; held ones stay."""
@@ -165,6 +182,44 @@ class PBDMuscle:
                 self.penetration = self.contact.depth(self.points)
                 return
             self.penetration = self.contact.find(contacts, self.points, reach=self.finishing_reach)
+
+    def _settle(self, contacts):
+        """A round of contact and volume, two of contact where the first had far to go."""
+        for _ in range(2):
+            far = self.contact.find(contacts, self.points, reach=self.finishing_reach) > self.depth
+            self.contact.project(self.points)
+            if not far:
+                break
+        self.shape.restore_volume(self.points, self.contact)
+        self.penetration = self.contact.depth(self.points)
+
+
+def _bone_numbers(rest, scene):
+    """Number in the scene of the bone that holds each vertex, -1 where it is free."""
+    names = [bone.name for bone in scene.bones]
+    numbers = np.array([names.index(bone) for bone in rest.bones])
+    return np.where(rest.holder < 0, -1, numbers[rest.holder])
+
+
+def _contact(rest, scene, options, numbers):
+    """The contact that the options ask for."""
+    columns, shares = _contact_carriers(rest, faces_too=options.contact == "faces")
+    usual = {"reach": scene.length(REACH), "response": options.response}
+    if not options.sound:
+        return ContactConstraint(columns, shares, **usual)
+    faces, edge = rest.topology.faces, rest.edge()
+    ridges = Ridges(faces, [bone.mesh for bone in scene.bones], cell=edge, deepest=edge)
+    held = np.flatnonzero(numbers >= 0)
+    return SoundContact(
+        columns,
+        shares,
+        faces=faces,
+        held=held,
+        holder=numbers[held],
+        skin=SKIN * edge,
+        ridges=ridges,
+        **usual,
+    )
 
 
 def _contact_carriers(rest, *, faces_too):

@@ -19,7 +19,9 @@ class PBDOptions(Table):
     than ``limits`` times their rest length are hard in any case. ``prediction``: vertices are carried along
     by the bones (see ``pbd_baseline.weights``), or keep their velocity times ``damping`` as the authors' do,
     or stay (none). ``response`` to several bones: the sum of the ways out, or the longest alone. ``contact``: bones are
-    met by the vertices alone, or by the middles of edges and faces too, for ridges that come between vertices.
+    met by the vertices alone, or by the middles of edges and faces too, for ridges between vertices. ``sound``
+    keeps the surface one that could be a muscle's: held ends, too, give way to bones, faces to the vertices of bones,
+    the sides of what is pressed on a bone stay apart, and what crosses itself is smoothed; several times the time.
     """
 
     method: Literal["pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved"] = "pbd"
@@ -39,4 +41,5 @@ class PBDOptions(Table):
     arap_reach: Positive = 0.03
     swelling_reach: Positive = 0.04
     response: Literal["sum", "nearest"] = "sum"
+    sound: bool = False
     contact: Literal["vertices", "faces"] = "vertices"

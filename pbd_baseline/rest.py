@@ -88,6 +88,11 @@ class Rest:
             order, vertices, topology, bones, weights, holder, inverse_mass, fibres, room, volume
         )  # fmt: skip
 
+    def edge(self) -> float:
+        """Median length of the edges [scene unit]."""
+        one, two = self.vertices[self.topology.edges[:, 0]], self.vertices[self.topology.edges[:, 1]]
+        return float(np.median(np.linalg.norm(one - two, axis=1)))
+
     def relative_lengths(self) -> Floats:
         """Length of each edge in units of the median one.
 

@@ -54,6 +54,9 @@ class BlendMuscle:
     def restore(self, state):
         self.x = state.copy()
 
+    def settle(self, contacts):
+        pass
+
     def continue_drawing(self, quantities):
         pass
 

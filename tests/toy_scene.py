@@ -159,6 +159,9 @@ class ToyMuscle:
     def restore(self, state):
         self.x, self.target = state[0].copy(), state[1].copy()
 
+    def settle(self, contacts):
+        pass
+
     def continue_drawing(self, quantities):
         pass
 

@@ -4,6 +4,7 @@ import numpy as np
 
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.geometry.triangles import triangle_normal
 
 # Triangles in a leaf of the tree, and bits of their places along each axis by which they are sorted.
@@ -14,6 +15,8 @@ WAITING = 512
 # that two of them are less than twice that apart (ALONG is its cosine): well below the right angle by which what goes
 # through a sheet looks away from it on one of its sides.
 ONE_SHEET, ALONG = 0.5, np.cos(2 * 0.5)
+# Cosine between a triangle's normal and that at a corner below which the surface has a crease there.
+CREASED = 0.7
 
 
 class FaceTree:
@@ -115,6 +118,34 @@ def crossing_faces(vertices: Floats, faces: Integers) -> Booleans:
         return np.zeros(0, dtype=bool)
     vertices = np.asarray(vertices, dtype=np.float64)
     return FaceTree(vertices, faces).crossing(vertices)
+
+
+def creased_faces(vertices: Floats, faces: Integers) -> Booleans:
+    """Mask (m,) of the triangles at vertices around which the surface is no smooth sheet.
+
+    Parameters
+    ----------
+    vertices : (n, 3) ndarray
+    faces : (m, 3) ndarray of int
+        Closed, outward.
+    """
+    sharp, found = np.zeros(len(vertices), dtype=np.bool_), np.zeros(len(faces), dtype=np.bool_)
+    _creased_loop(vertices, faces, vertex_normals(vertices, faces), sharp, found)
+    return found
+
+
+@compiled(error_model="numpy")
+def _creased_loop(vertices, faces, normals, sharp, found):
+    """A vertex is sharp where a triangle looks away from its normal by more than the angle of CREASED."""
+    for f in range(len(faces)):
+        x, y, z = triangle_normal(vertices, faces, f)
+        least = CREASED * np.sqrt(x * x + y * y + z * z)
+        for k in range(3):
+            v = faces[f, k]
+            if normals[v, 0] * x + normals[v, 1] * y + normals[v, 2] * z <= least:
+                sharp[v] = True
+    for f in range(len(faces)):
+        found[f] = sharp[faces[f, 0]] or sharp[faces[f, 1]] or sharp[faces[f, 2]]
 
 
 @compiled

@@ -115,6 +115,9 @@ class RBFMuscle:
         """Take an activation, 0 to 1, that the next `solve` settles under."""
         self.law.activate(activation)
 
+    def settle(self, contacts: BoneContacts) -> None:
+        """Nothing: the surface is cut along the bones."""
+
     def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
         """Move the centres that carry contact points marked in a bool mask by a (4, 4) transform; held ones stay."""
         if self.interior:

@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.geometry.crossing import FaceTree, crossing_faces
+from rbfmuscle.geometry.crossing import FaceTree, creased_faces, crossing_faces
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction.material import _Fitting, carry_material, fit_material
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh, _edges_loop
 from rbfmuscle.implicit.extraction.obstacles import ObstaclePoints
 from rbfmuscle.implicit.extraction.projection import Projector
-from rbfmuscle.implicit.extraction.untangling import creased_faces
 
 BALL = trimesh.creation.icosphere(3)
 VOLUME = 4.0 / 3.0 * np.pi

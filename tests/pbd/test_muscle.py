@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from spindle_scene import CENTRE, build_scene
 
 from pbd_baseline.arap import ARAP
 from pbd_baseline.muscle import PBDMuscle
@@ -11,33 +12,9 @@ from pbd_baseline.topology import Topology
 from rbfmuscle.sim.distance.sdf import BoneSDF
 from rbfmuscle.sim.loop.contact import BoneContacts
 from rbfmuscle.sim.scene.motion import rotation_about
-from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.validation import SceneError
 
 METHODS = ["pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved"]
-CENTRE = np.array([0.0, -22.0, 0.0])
-
-
-def build_scene(transform=None, scale=1.0):
-    """A spindle of 90 mm before a ball of 10 mm that its two bones turn about."""
-    transform = np.eye(4) if transform is None else transform
-    muscle = trimesh.creation.icosphere(subdivisions=4)
-    muscle.apply_transform(np.diag([12.0, 9.0, 45.0, 1.0]))
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=10.0)
-    ball.apply_translation(CENTRE)
-    ends = [trimesh.creation.icosphere(subdivisions=2, radius=8.0) for _ in range(2)]
-    ends[0].apply_translation([0, 0, 50])
-    ends[1].apply_translation([0, 0, -50])
-    held = [np.flatnonzero(side * muscle.vertices[:, 2] > 38.0) for side in (1, -1)]
-    for mesh in (muscle, ball, *ends):
-        mesh.apply_transform(transform)
-        mesh.apply_scale(scale)
-    scene = Scene("spindle", units="mm" if scale == 1.0 else "m")
-    for name, mesh in zip(("upper", "lower", "ball"), (*ends, ball)):
-        scene.add_bone(name, mesh)
-    attach = [{"bone": name, "vertices": v.tolist()} for name, v in zip(("upper", "lower"), held)]
-    scene.add_muscle("spindle", muscle, attach=attach)
-    return scene
 
 
 class Rig:

@@ -2,10 +2,8 @@
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.surfaces import vertex_normals
-from rbfmuscle.geometry.triangles import triangle_normal
+from rbfmuscle.geometry.arrays import Booleans, Integers
+from rbfmuscle.geometry.crossing import creased_faces
 from rbfmuscle.implicit.extraction.carried_material import CarriedMaterial
 
 # Rounds of smoothing for triangles that cross others, and how the smoothed region grows with them.
@@ -16,8 +14,6 @@ RETURN, BACK = 12, 0.15
 # in: so many sweeps of smoothing first, and in each of some rounds after, each followed by the way out of the bone.
 STRAYED = 1.5
 FILL_SWEEPS, GATHER, GATHER_SWEEPS = 150, 4, 12
-# Cosine between a triangle's normal and that at a corner below which the surface has a crease there.
-CREASED = 0.7
 
 
 def gather(material: CarriedMaterial) -> None:
@@ -62,34 +58,6 @@ def untangle(material: CarriedMaterial) -> int:
         else:
             _smooth(material, np.flatnonzero(region), material.field is not None and turn < UNTANGLE // 2)
     return int(touched.sum())
-
-
-def creased_faces(vertices: Floats, faces: Integers) -> Booleans:
-    """Mask (m,) of the triangles at vertices around which the surface is no smooth sheet.
-
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-    faces : (m, 3) ndarray of int
-        Closed, outward.
-    """
-    sharp, found = np.zeros(len(vertices), dtype=np.bool_), np.zeros(len(faces), dtype=np.bool_)
-    _creased_loop(vertices, faces, vertex_normals(vertices, faces), sharp, found)
-    return found
-
-
-@compiled(error_model="numpy")
-def _creased_loop(vertices, faces, normals, sharp, found):
-    """A vertex is sharp where a triangle looks away from its normal by more than the angle of CREASED."""
-    for f in range(len(faces)):
-        x, y, z = triangle_normal(vertices, faces, f)
-        least = CREASED * np.sqrt(x * x + y * y + z * z)
-        for k in range(3):
-            v = faces[f, k]
-            if normals[v, 0] * x + normals[v, 1] * y + normals[v, 2] * z <= least:
-                sharp[v] = True
-    for f in range(len(faces)):
-        found[f] = sharp[faces[f, 0]] or sharp[faces[f, 1]] or sharp[faces[f, 2]]
 
 
 def _return(material: CarriedMaterial, rows: Integers) -> None:

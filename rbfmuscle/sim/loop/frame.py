@@ -171,6 +171,9 @@ class MuscleModel(Protocol):
     def solve(self, contacts: BoneContacts) -> None:
         """Settle under the model's own constraints and these contacts."""
 
+    def settle(self, contacts: BoneContacts) -> None:
+        """At rest, where a scene resolves overlap: bring out of the bones what no contact point stands for."""
+
     def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
         """Move the contact points marked in a bool mask (n,) by a (4, 4) transform."""
 

@@ -38,6 +38,7 @@ def settle_rest(stepper: MuscleStepper) -> None:
     overlap = contacts.depths(stepper.model.contact_points())
     overlap = {b: depth for b, depth in overlap.items() if depth.max(initial=0.0) > least}
     if not overlap:
+        _settle_rest_of(stepper)
         return
     if scene.contact.initial == "error":
         b = max(overlap, key=lambda key: overlap[key].max())
@@ -52,6 +53,13 @@ def settle_rest(stepper: MuscleStepper) -> None:
         stepper.report(contacts.names[b], (depth > least).sum(), action)
     if scene.contact.initial == "resolve":
         _resolve(stepper, overlap)
+    _settle_rest_of(stepper)
+
+
+def _settle_rest_of(stepper):
+    """Let the model bring out of bones what no contact point stands for, where that is to be resolved."""
+    if stepper.scene.contact.initial == "resolve":
+        stepper.model.settle(stepper.contacts)
 
 
 def _resolve(stepper, overlap):
