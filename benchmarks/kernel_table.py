@@ -133,8 +133,9 @@ def case(judge, sample, kernel, placement):
         row["own"] = np.inf if row["unfit"] else row["rms"]
     else:
         chosen = RBFField.fit_surface(
-            sample.points, sample.normals, kernel=kernel, epsilon=row["epsilon"], derivatives="all"
-        )
+            sample.points, sample.normals, kernel=kernel, epsilon=row["epsilon"], derivatives="all",
+            condition=row["bound"] or np.inf,
+        )  # fmt: skip
         row["own"] = both_ways(judge, sample, chosen)
     best = (row["own"], np.nan)
     if kernel.has_epsilon:
@@ -157,7 +158,8 @@ def measured(judge, sample, kernel, placement):
     row, best, seconds = case(judge, sample, kernel, placement)
     scan = float(best[0]) if np.isfinite(best[0]) else None
     ratio = None if row["unfit"] or scan is None else float(row["own"] / best[0])
-    return {"ratio": ratio, "scan": scan, "condition": row["condition"], "fits": row["fits"], "seconds": seconds,
+    return {"ratio": ratio, "scan": scan, "condition": row["condition"], "bound": row["bound"],
+            "fits": row["fits"], "seconds": seconds,
             "unfit": row["unfit"], "rms": row["rms"], "shape": row["shape"], "best": float(best[1])}  # fmt: skip
 
 

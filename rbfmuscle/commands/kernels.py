@@ -59,7 +59,7 @@ def kernels(
     criterion
         How epsilon is chosen: held_out, loo, gcv or condition.
     condition
-        None beyond it is chosen, as 1e10.
+        No epsilon beyond it is chosen, as 1e10, and fits to normals keep it by a ridge.
     resolution
         Cells along the longest side; 128, more for slender muscles, by default.
     best
@@ -185,6 +185,8 @@ def _run_best(scene, name, study, best, frames):
         }
         if row["epsilon"]:
             settings["model.epsilon"] = row["epsilon"]
+        if row["bound"]:
+            settings["model.condition"] = row["bound"]
         if row["fit"] != "values":
             settings["model.derivatives"] = row["fit"]
         facts = {"kernel": row["kernel"], "centres": row["centres"], "error": ""}

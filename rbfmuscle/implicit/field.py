@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.implicit.evaluation import evaluate
 from rbfmuscle.implicit.fit import assembly
+from rbfmuscle.implicit.fit.bounded import solve_bounded
 from rbfmuscle.implicit.fit.cross_validation import LeastSquaresPath
 from rbfmuscle.implicit.fit.fitting import Basis, solve, solve_least_squares
 from rbfmuscle.implicit.fit.regularisation import basis_smoothing, resolve_smoothing
@@ -149,6 +150,7 @@ class RBFField:
         smoothing: float | str = 0.0,
         derivatives: str = "all",
         truncate: bool = True,
+        condition: float = np.inf,
     ) -> RBFField:
         """Fit f = 0 and grad f = normal at every point (Hermite RBF, Macedo 2011).
 
@@ -163,6 +165,8 @@ class RBFField:
         derivatives : {"all", "normal"}
             "normal" asks only for the derivative along the normal: 2K unknowns in place of 4K, a quarter
             of the time for nearly the same surface (see ``docs/field.md``).
+        condition : float
+            Bound: a ridge keeps it, in units of the spacing (see `bounded`), in place of ``smoothing``.
 
         Returns
         -------
@@ -186,7 +190,10 @@ class RBFField:
             raise UsageError(f"derivatives must be 'all' or 'normal', got {derivatives!r}")
         basis, right, origin, scale = hermite_system(points, normals, kernel, epsilon, derivatives)
         smoothing = basis_smoothing(smoothing, basis, right)
-        weights, coefficients, condition = solve(basis, right, smoothing=smoothing, truncate=truncate)
+        if np.isfinite(condition):
+            weights, coefficients, condition = solve_bounded(basis, right, condition)
+        else:
+            weights, coefficients, condition = solve(basis, right, smoothing=smoothing, truncate=truncate)
         weights, polynomial = hermite_weights(basis, weights), (coefficients, basis.powers)
         fitted = cls(points, (origin, scale), kernel, epsilon, weights, polynomial, condition, smoothing)
         if kernel.has_epsilon:
@@ -204,6 +211,7 @@ class RBFField:
         smoothing: float = 0.0,
         derivatives: str = "all",
         truncate: bool = True,
+        condition: float = np.inf,
     ) -> RBFField:
         """Fit a surface through points with normals, whatever the kernel.
 
@@ -214,8 +222,8 @@ class RBFField:
         ----------
         points : (K, 3) array_like
         normals : (K, 3) array_like
-        kernel, epsilon, smoothing, derivatives, truncate
-            As in `fit_hermite`.
+        kernel, epsilon, smoothing, derivatives, truncate, condition
+            As in `fit_hermite`; fits to values have no bound.
 
         Returns
         -------
@@ -225,7 +233,7 @@ class RBFField:
         if kernel.hermite:
             return cls.fit_hermite(
                 points, normals, kernel=kernel, epsilon=epsilon, smoothing=smoothing, derivatives=derivatives,
-                truncate=truncate,
+                truncate=truncate, condition=condition,
             )  # fmt: skip
         fitted = cls.fit(
             *off_surface_points(points, normals), kernel=kernel, epsilon=epsilon, smoothing=smoothing,

@@ -24,7 +24,7 @@ class RBFOptions(Table):
     ``centres``, where none are given, follow from the muscle's area, and are more where the surface at rest would
     err by more than ``rest_error`` (RMS; 0 for 0.5 mm, or a tenth of the muscle's thickness where that is less), and
     ``epsilon`` (a kernel's shape parameter) from the error at rest, with a ``condition`` of at most so much, 0 for
-    any. ``samples`` of the surface meet the bones;
+    any; a ridge keeps it in every fit to normals. ``samples`` of the surface meet the bones;
     ``contacts`` of them join in one round. ``iterations`` a solve, ``acceleration`` of them remembered (Anderson). The
     fibre stretch is free from ``stretch_low`` to ``stretch_high`` but for the share ``stretch_hold`` that pulls it
     back to one; ``across`` links a centre go through the thickness, each counting ``across_weight``. ``surface`` is

@@ -56,17 +56,21 @@ class FieldFit:
         Its shape parameter [1 / scene unit].
     derivatives : {"all", "normal"}
         What the fit meets at a centre.
+    condition : float
+        Bound of its condition, which a ridge keeps.
     """
 
     kernel: Kernel
     epsilon: float
     derivatives: str
+    condition: float = np.inf
 
     def fit(self, centres: np.ndarray, normals: np.ndarray) -> RBFField:
         """The field through centres (K, 3) with unit normals (K, 3)."""
         return RBFField.fit_surface(
-            centres, normals, kernel=self.kernel, epsilon=self.epsilon, derivatives=self.derivatives
-        )
+            centres, normals, kernel=self.kernel, epsilon=self.epsilon, derivatives=self.derivatives,
+            condition=self.condition,
+        )  # fmt: skip
 
 
 def default_centres(area: float, scene: Scene) -> int:
@@ -204,7 +208,7 @@ def place_points(
         centres = _fit_centres(muscle.name, surface, options, centres, fit)
         # what was best for the greedy centres need not be so for these
         fit = _choose_fit(muscle.name, surface, options, centres, samples)
-    if fit.kernel.has_epsilon and not options.epsilon:
+    if options.condition or (fit.kernel.has_epsilon and not options.epsilon):
         _refuse_broken(muscle.name, surface, fit, centres)
     return centres, samples, fit
 
@@ -235,7 +239,7 @@ def _choose_fit(name: str, mesh: tuple[Any, Any], options: Any, centres: Surface
             ).epsilon / frame.size  # fmt: skip
         except np.linalg.LinAlgError as error:
             raise SceneError(f"muscle {name!r}: {error}") from None
-    return FieldFit(kernel, epsilon, derivatives)
+    return FieldFit(kernel, epsilon, derivatives, options.condition or np.inf)
 
 
 def _refuse_broken(name: str, mesh: tuple[Any, Any], fit: Any, centres: SurfaceSample) -> None:
@@ -244,7 +248,8 @@ def _refuse_broken(name: str, mesh: tuple[Any, Any], fit: Any, centres: SurfaceS
     local = replace(fit, epsilon=fit.epsilon * frame.size)
     shape = f" and epsilon {fit.epsilon:.3g}" if fit.kernel.has_epsilon else ""
     said = f"muscle {name!r}: kernel {fit.kernel.name!r} with {len(centres.points)} centres{shape}"
-    remedy = "take kernel 'cubic', more centres, or another epsilon (rbfmuscle kernels ranks them)"
+    bound = ", a greater condition" if np.isfinite(fit.condition) else ""
+    remedy = f"take kernel 'cubic', more centres{bound}, or another epsilon (rbfmuscle kernels ranks them)"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NumericalWarning)
         try:

@@ -268,10 +268,13 @@ def test_a_chosen_epsilon_never_gives_a_broken_field():
     scene.muscles = [scene.muscle("adductor_posterior")]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        with pytest.raises(SceneError, match=r"'gaussian' with 60 centres.*take kernel 'cubic'"):
+        with pytest.raises(
+            SceneError, match=r"'gaussian' with 60 centres.*take kernel 'cubic'.*greater condition"
+        ):
             build_model(scene.muscles[0], scene, "rbf")
-        scene.muscles[0].options |= {"kernel": "quintic", "condition": 1.5}
-        build_model(scene.muscles[0], scene, "rbf")  # without a shape parameter there is nothing to bound
+        scene.muscles[0].options |= {"kernel": "quintic", "condition": 1e6}
+        model = build_model(scene.muscles[0], scene, "rbf")
+        assert model.rest.fit.condition == 1e6  # without a shape parameter a ridge keeps the bound
         scene.muscles[0].options |= {"kernel": "matern_52", "condition": 1.5}
         with pytest.raises(
             SceneError, match=r"no epsilon of kernel 'matern_52' has a condition of at most 1.5"

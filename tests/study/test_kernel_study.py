@@ -77,6 +77,17 @@ def test_lines_to_paste_give_the_row(study):
     assert 'placement = "greedy"' in study.toml(row)  # not C2: no Hermite fit to be fitted
 
 
+def test_a_ridge_keeps_a_bound_of_the_condition_and_is_pasted(ellipsoid, study):
+    asked = {"kernels": ["quintic", "linear"], "centres": [80], "resolution": 32}
+    row = rm.study_kernels(ellipsoid, condition=1e6, **asked).rows[0]
+    plain = next(r for r in study.rows if (r["kernel"], r["centres"]) == ("quintic", 80))
+    assert not plain["bound"] and plain["condition"] > 1e6
+    assert not row["unfit"] and row["bound"] == 1e6 and row["condition"] <= 1e6
+    assert row["rms"] < 1.02 * plain["rms"] and row["solved"] == "Cholesky with a ridge"
+    assert tomllib.loads(study.toml(row))["muscle"]["model"]["condition"] == 1e6
+    assert "condition" not in tomllib.loads(study.toml(plain))["muscle"]["model"]
+
+
 def test_fitted_centres_halve_the_error_of_greedy_ones(ellipsoid, study):
     """Bumps that 80 centres cannot follow are met on average."""
     vertices, faces = np.array(ellipsoid.vertices), np.asarray(ellipsoid.faces)

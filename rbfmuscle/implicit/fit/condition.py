@@ -11,23 +11,31 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats
 
 
-def largest_eigenvalue(size: int, multiply: Callable[..., Any]) -> float:
-    """Largest eigenvalue of a symmetric matrix by two steps of power iteration, a lower bound.
+def largest_eigenvalue(
+    size: int, multiply: Callable[..., Any], *, steps: int = 2, start: Floats | None = None
+) -> float:
+    """Largest eigenvalue of a symmetric matrix by a few steps of power iteration, a lower bound.
 
     Parameters
     ----------
     size : int
     multiply : callable
         Vector (size,) -> matrix times vector.
+    steps : int
+    start : (size,) ndarray, optional
+        First vector; all but constant by default.
 
     Returns
     -------
     float
     """
-    vector = np.full(size, 1.0)
-    vector[1::2] -= 1e-3
+    if start is None:
+        vector = np.full(size, 1.0)
+        vector[1::2] -= 1e-3
+    else:
+        vector = start.copy()
     norm = 0.0
-    for _ in range(2):
+    for _ in range(steps):
         vector /= math.sqrt(vector @ vector)
         vector = multiply(vector)
         norm = math.sqrt(vector @ vector)

@@ -221,14 +221,24 @@ def factorise(basis: Basis, smoothing: float = 0.0) -> Factor | None:
     Factor or None
         None where the matrix is not definite in floating-point numbers, or the polynomials are dependent.
     """
-    matrix, size, q = basis.matrix(), basis.size, len(basis.powers)
+    matrix = basis.matrix()
     if smoothing:
-        matrix.ravel(order="K")[:: size + 1] += smoothing
+        matrix.ravel(order="K")[:: basis.size + 1] += smoothing
+    return factorise_matrix(matrix, basis.polynomials)
+
+
+def factorise_matrix(matrix: Floats, polynomials: Floats, *, condition: float = math.inf) -> Factor | None:
+    """Factor of a matrix A (lower triangle valid, Fortran order; overwritten) with polynomials (q, size).
+
+    With a bound of the ``condition`` the largest eigenvalue on the weights that annihilate polynomials, over that
+    bound, is added to the diagonal, and ``norm`` is theirs.
+    """
+    q, size = polynomials.shape
     norm = largest_eigenvalue(size, lambda vector: blas.dsymv(1.0, matrix, vector, lower=1))
     gamma = 0.0
     directions, triangle, products = np.empty((size, 0)), np.empty((0, 0)), np.empty((size, 0))
     if q:
-        directions, triangle = linalg.qr(basis.polynomials.T, mode="economic", check_finite=False)
+        directions, triangle = linalg.qr(polynomials.T, mode="economic", check_finite=False)
         if size < q or np.abs(np.diagonal(triangle)).min() < _DEPENDENT * math.sqrt(size):
             return None
         directions = np.asfortranarray(directions)
@@ -240,6 +250,12 @@ def factorise(basis: Basis, smoothing: float = 0.0) -> Factor | None:
         gamma = gamma if gamma > 0 else norm or 1.0
         half = blas.dgemm(-0.5, directions, inner + gamma * np.eye(q), beta=1.0, c=products)
         subtract_products(matrix, directions, half)
+    if math.isfinite(condition):  # a constant vector is all but a polynomial, which M has no share of
+        start = probe(np.ones(size))
+        norm = largest_eigenvalue(
+            size, lambda vector: blas.dsymv(1.0, matrix, vector, lower=1), steps=6, start=start
+        )
+        matrix.ravel(order="K")[:: size + 1] += norm / condition
     if factor_cholesky(matrix):
         return None
     return Factor(matrix, gamma, directions, triangle, products, norm)

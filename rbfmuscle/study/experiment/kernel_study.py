@@ -22,10 +22,10 @@ from rbfmuscle.implicit.fit.fitting import DOUBTFUL
 from rbfmuscle.implicit.kernels.table import KERNELS, Kernel, get_kernel
 from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
 from rbfmuscle.implicit.placement.sampling import PLACEMENTS, SurfaceSample, sample_surface
-from rbfmuscle.implicit.selection import spacing
+from rbfmuscle.implicit.selection import WITHIN, spacing, surface_miss
 from rbfmuscle.implicit.shape_search import Limits
 from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
-from rbfmuscle.study.experiment.kernel_choice import Recommendation, mark_unfit, recommend
+from rbfmuscle.study.experiment.kernel_choice import SOUND, Recommendation, mark_unfit, recommend
 from rbfmuscle.study.experiment.kernel_judge import SurfaceJudge
 from rbfmuscle.study.experiment.sweep_table import pareto_front
 from rbfmuscle.validation import NumericalWarning, UsageError, check_mesh
@@ -73,6 +73,8 @@ class KernelStudy:
         ]
         if row["epsilon"]:
             lines.append(f"epsilon = {row['epsilon']:.6g}")
+        if row["bound"]:
+            lines.append(f"condition = {row['bound']:g}")
         if row["fit"] != "values":
             lines.append(f'derivatives = "{row["fit"]}"')
         lines.append(f'placement = "{row["placement"]}"')
@@ -112,7 +114,7 @@ def study_kernels(
     criterion : {"held_out", "loo", "gcv", "condition"}
         How epsilon is chosen: by the error at other points of the mesh, or from the centres alone.
     condition : float
-        None beyond it is chosen; a kernel without a shape parameter that exceeds it is unfit.
+        No epsilon beyond it is chosen, and a ridge keeps it in fits to normals; others beyond it are unfit.
     seed : int
     units : str
         Name of the mesh's unit, for the page.
@@ -184,10 +186,11 @@ def _mark_fronts(rows):
             good[index][name] = True
 
 
-def _fit(sample, kernel, epsilon, derivatives):
+def _fit(sample, kernel, row, derivatives):
     return RBFField.fit_surface(
-        sample.points, sample.normals, kernel=kernel, epsilon=epsilon, derivatives=derivatives
-    )
+        sample.points, sample.normals, kernel=kernel, epsilon=row["epsilon"] or 1.0, derivatives=derivatives,
+        condition=row["bound"] or np.inf,
+    )  # fmt: skip
 
 
 class Request(NamedTuple):
@@ -249,7 +252,7 @@ def measure_row(
         "kernel": kernel.name, "centres": count, "placement": placement, "epsilon": 0.0, "placed": 0.0, "shape": None,
         "fit": ask.derivatives if kernel.hermite else "values", "rms": None, "low": None, "high": None,
         "hausdorff": None, "worst": [], "normal_error": None, "volume_error": None,
-        "components": None, "spurious": None, "condition": None, "solved": None,
+        "components": None, "spurious": None, "condition": None, "bound": 0.0, "solved": None,
         "fit_time": None, "evaluation_time": None, "fits": 0, "search_time": 0.0,
         "numbers": _stored(kernel, ask.derivatives, count),
         "note": "" if kernel.hermite else "values on and off the surface, the kernel is not C2",
@@ -270,12 +273,38 @@ def measure_row(
                 if choice.broken:
                     raise ValueError(choice.broken)
                 looked = ask.criterion == "held_out" and judge.sheets == 1
+            looked |= _bound(row, judge, sample, kernel, ask)
             surface = fill_row(row, confirm or judge, sample, kernel, ask.derivatives, looked=looked)
         except (ValueError, np.linalg.LinAlgError) as error:
             row["note"], surface = " ".join(str(error).split()), None
     if said and surface is not None:
         row["note"] = "; ".join([*([row["note"]] if row["note"] else []), str(said[-1].message)])
     return row, surface
+
+
+def _bound(row, judge, sample, kernel, ask):
+    """Bound the condition by a ridge where that costs no more than 2 % of the error, or where it is asked for.
+
+    Whether it is bounded; its sheets are then looked at and as many as they should be.
+    """
+    if not kernel.hermite:
+        return False
+    plain, bound = _fit(sample, kernel, row, ask.derivatives), min(SOUND, ask.condition)
+    if plain.condition <= bound:
+        return False
+    with_ridge, reach = (
+        _fit(sample, kernel, row | {"bound": bound}, ask.derivatives),
+        spacing(sample.points).mean(),
+    )
+    missed = [surface_miss(field, judge.held_out, reach) for field in (plain, with_ridge)]
+    if missed[1] > WITHIN * missed[0] and plain.condition <= ask.condition:
+        return False
+    if not count_sheets(with_ridge, sample.points, judge.distance.unsigned, wanted=judge.sheets).sound(
+        judge.sheets
+    ):
+        return False
+    row["bound"] = bound
+    return True
 
 
 def _note_trials(scan, row, choice):
@@ -306,18 +335,18 @@ def fill_row(
     looked : bool
         Whether the search has looked for sheets and found as many as there should be.
     """
-    epsilon = row["epsilon"] or 1.0
     spent = []
     for _ in range(REPEATS):
         start = time.perf_counter()
-        fitted = _fit(sample, kernel, epsilon, derivatives)
+        fitted = _fit(sample, kernel, row, derivatives)
         middle = time.perf_counter()
         fitted(judge.points[:TIMED])
         spent.append((middle - start, time.perf_counter() - middle))
     # The least, as the first may compile.
     row["fit_time"], row["evaluation_time"] = (float(t) for t in np.min(spent, axis=0))
     row["condition"] = float(fitted.condition)
-    row["solved"] = "eigenvectors" if fitted.condition >= DOUBTFUL else "Cholesky"
+    ridge = "Cholesky with a ridge" if row["bound"] else "Cholesky"
+    row["solved"] = "eigenvectors" if fitted.condition >= DOUBTFUL else ridge
     gradient = fitted.gradient(judge.points[::5])
     cosine = np.einsum("ij,ij->i", gradient, judge.normals[::5])
     cosine /= np.maximum(np.linalg.norm(gradient, axis=1), np.finfo(float).tiny)

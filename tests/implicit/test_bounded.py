@@ -1,0 +1,82 @@
+"""Fits of a bounded condition: the ridge is what it is said to be, the bound holds, and little is lost."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy import linalg
+
+from rbfmuscle.implicit.field import RBFField
+from rbfmuscle.implicit.fit.bounded import solve_bounded
+from rbfmuscle.implicit.fit.systems import hermite_system
+from rbfmuscle.implicit.kernels.table import KERNELS
+from rbfmuscle.implicit.placement.sampling import sample_surface
+from rbfmuscle.implicit.selection import spacing, surface_miss
+
+
+@pytest.fixture(scope="module")
+def plate():
+    """80 points and normals of a thin ellipsoid, and other points of it."""
+    mesh = trimesh.creation.icosphere(subdivisions=3).apply_scale([30.0, 18.0, 4.0])
+    sample = sample_surface(mesh.vertices, mesh.faces, 80, placement="adaptive")
+    return (
+        sample.points,
+        sample.normals,
+        sample_surface(mesh.vertices, mesh.faces, 600, placement="even").points,
+    )
+
+
+def literal(basis):
+    """The matrix whole, and the units of its unknowns: values 1, derivatives about the spacing."""
+    lower = np.tril(basis.matrix())
+    count = len(basis.points)
+    unit = np.r_[np.ones(count), np.full(basis.size - count, 1.0 / np.sqrt(count))]
+    return lower + np.tril(lower, -1).T, unit
+
+
+@pytest.mark.parametrize("derivatives", ["all", "normal"])
+@pytest.mark.parametrize(("kernel", "bound"), [("quintic", 1e6), ("cubic", 1e3), ("matern_52", 1e4)])
+def test_what_is_left_of_the_conditions_is_one_ridge_in_units_of_the_spacing(
+    plate, kernel, bound, derivatives
+):
+    points, normals, _ = plate
+    basis, right, *_ = hermite_system(points, normals, KERNELS[kernel], 0.1, derivatives)
+    weights, coefficients, condition = solve_bounded(basis, right, bound)
+    matrix, unit = literal(basis)
+    left = right - matrix @ weights - basis.polynomials.T @ coefficients
+    ridge = (unit**2 * left) @ weights / (weights @ weights)
+    assert np.abs(unit**2 * left - ridge * weights).max() < 1e-5 * ridge * np.abs(weights).max()
+    assert (np.abs(basis.polynomials @ weights) < 1e-9 * np.abs(weights).max()).all()
+    null = np.linalg.qr((basis.polynomials * unit).T, mode="complete")[0][:, len(basis.powers) :]
+    values = linalg.eigvalsh(null.T @ (unit[:, None] * matrix * unit) @ null)
+    assert 0.7 * values[-1] / bound < ridge < 1.01 * values[-1] / bound  # six steps of power iteration
+    assert condition <= bound
+    assert condition < 1.5 * (values[-1] + ridge) / (values[0] + ridge)
+
+
+def test_a_bound_that_is_not_reached_changes_next_to_nothing(plate):
+    points, normals, others = plate
+    plain = RBFField.fit_hermite(points, normals, kernel="cubic")
+    bounded = RBFField.fit_hermite(points, normals, kernel="cubic", condition=1e12)
+    assert bounded.condition < plain.condition  # values and slopes in comparable units
+    assert np.abs(plain(others) - bounded(others)).max() < 1e-6 * spacing(points).mean()
+
+
+def test_a_bound_costs_septic_little_of_its_error(plate):
+    points, normals, others = plate
+    reach = spacing(points).mean()
+    plain = RBFField.fit_hermite(points, normals, kernel="septic")
+    bounded = RBFField.fit_hermite(points, normals, kernel="septic", condition=1e10)
+    assert bounded.condition <= 1e10 < plain.condition
+    assert surface_miss(bounded, others, reach) < 1.02 * surface_miss(plain, others, reach)
+
+
+def test_bounds_beyond_floating_point_are_refused(plate):
+    points, normals, _ = plate
+    with pytest.raises(np.linalg.LinAlgError, match=r"condition of 1e\+30; lower the bound"):
+        RBFField.fit_hermite(points, normals, kernel="gaussian", epsilon=1e-3, condition=1e30)
+
+
+def test_polynomials_that_are_not_determined_are_refused_with_a_bound_too(plate):
+    flat = plate[0] * [1.0, 0.0, 0.0]
+    with pytest.raises(np.linalg.LinAlgError, match="singular fit"):
+        RBFField.fit_hermite(flat, np.tile([1.0, 0.0, 0.0], (len(flat), 1)), kernel="quintic", condition=1e8)
