@@ -32,6 +32,10 @@ REACH = 3.0
 # A tenth of the edges this much longer than at rest is the cause of what cannot be fitted.
 STRETCHED = 1.6
 
+# Where the material is no sound surface, what it does beside a rigid motion is smoothed so often, until it is one;
+# how deep in a bone a vertex of a sound one may be, in mean edges, and how much volume may be lacking.
+CALM, SUNKEN, LOST = (30, 120, 500, 2000, 10_000), 0.01, 1e-10
+
 
 class Moment(NamedTuple):
     """Where a muscle's points are at one moment.
@@ -124,6 +128,8 @@ class SurfaceDrawer:
             except (ValueError, np.linalg.LinAlgError):
                 continue
             self.level = result.level
+            if result.crossing:
+                result = self._sounder(result, mesh, carried, volume, where)
             break
         else:
             result = self._carry(mesh, carried, volume, where)
@@ -149,14 +155,37 @@ class SurfaceDrawer:
             "axes": self._axes(contacts),
         }
 
-    def _carry(self, mesh: MaterialMesh, carried: Floats, volume: float, where: dict[str, Any]) -> FittedMesh:
+    def _sounder(
+        self, fitted: FittedMesh, mesh: MaterialMesh, carried: Floats, volume: float, where: dict[str, Any]
+    ) -> FittedMesh:
+        """What was fitted and crosses itself, or the surface without a fit where that has fewer faults."""
         try:
-            return carry_material(mesh, carried, volume=volume, **where)
-        except ValueError as error:
-            raise SolveError(
-                f"muscle {self.name!r}: no surface outside the bones holds its volume of {volume:.6g} ({error}); "
-                "check where its attachments lie and what the motion drives into it"
-            ) from error
+            other = self._carry(mesh, carried, volume, where)
+        except SolveError:
+            return fitted
+        return min(fitted, other, key=lambda result: _faults(result, where["cut"], volume))
+
+    def _carry(self, mesh: MaterialMesh, carried: Floats, volume: float, where: dict[str, Any]) -> FittedMesh:
+        """The mesh where the material is; where no sound surface comes of that, where the material is on the whole."""
+        found: list[tuple[float, FittedMesh]] = []
+        reason: ValueError | None = None
+        for sweeps in (0, *CALM):
+            start = carried if sweeps == 0 else self.shown.calmed(carried, sweeps)
+            try:
+                result = carry_material(mesh, start, volume=volume, **where)
+            except ValueError as error:
+                reason = error
+                continue
+            faults = _faults(result, where["cut"], volume)
+            if faults == 0.0:
+                return result
+            found.append((faults, result))
+        if found:
+            return min(found, key=lambda pair: pair[0])[1]
+        raise SolveError(
+            f"muscle {self.name!r}: no surface outside the bones holds its volume of {volume:.6g} ({reason}); "
+            "check where its attachments lie and what the motion drives into it"
+        ) from reason
 
     def _march(self, fit: Callable[[], RBFField], now: Moment, contacts: BoneContacts) -> ExtractedSurface:
         axes, resolution = self._axes(contacts), self.options.resolution or MARCHING_CELLS
@@ -203,6 +232,13 @@ class SurfaceDrawer:
         if found:
             return found, "held_end"
         return "", "stretched" if self.shown.stretch(now.carried) > STRETCHED else "sheets"
+
+
+def _faults(result: FittedMesh, cut: Any, volume: float) -> float:
+    """Triangles that cross others, mean edges of depth in a bone, thousandths of volume lost; 0 where it is sound."""
+    deep = 0.0 if cut is None else -float(cut(result.vertices).min()) / result.spacing
+    lost = abs(result.volume / volume - 1.0)
+    return result.crossing + (deep if deep > SUNKEN else 0.0) + (1e3 * lost if lost > LOST else 0.0)
 
 
 class RBFDrawing:

@@ -94,6 +94,24 @@ class ShownMesh:
         """Where the material takes the vertices (n, 3) for centres (K, 3) and the solver's present targets."""
         return carry_points(centres, solver.shape, self.rest, self.columns, self.shares)
 
+    def calmed(self, vertices: np.ndarray, sweeps: int) -> np.ndarray:
+        """The shape at rest, moved as the material on the whole and deformed as it is where that is smooth.
+
+        Parameters
+        ----------
+        vertices : (n, 3) ndarray
+            Where the material is.
+        sweeps : int
+            Of smoothing of what the material does beside the rigid motion.
+        """
+        middle, there = self.rest.mean(axis=0), vertices.mean(axis=0)
+        u, _, vt = np.linalg.svd((self.rest - middle).T @ (vertices - there))
+        turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+        moved = (self.rest - middle) @ turn + there
+        beside = vertices - moved
+        self.mesh.smooth(beside, np.arange(len(moved)), sweeps)
+        return moved + beside
+
     def stretch(self, vertices: np.ndarray) -> float:
         """Length of edges relative to rest that a tenth of them exceeds."""
         return float(np.percentile(self._lengths(vertices) / self._sides, 90.0))
