@@ -7,8 +7,11 @@
 the chosen frames by exact distances, which the solver does not use: how deep a vertex of one muscle lies in another,
 and for vertices nearer than the threshold at rest how much farther they are now (RMS by pair). Both are listed by pair,
 the worst first. What two bones hold on both sides is counted apart: where a vertex and what it meets of the other
-muscle both go along with bones, these decide how far they come apart or into each other. ``--without`` measures
-the same run without sliding. ``cost`` compares processor time of a frame with surfaces, one thread, with and without
+muscle both go along with bones, these decide how far they come apart or into each other. Told beside the gap, RMS
+over the same vertices: of those that the neighbour still faces, without what slid past its rim (the way to the
+neighbour is more than 60 degrees off the vertex's own normal); and what of all is left beyond the gap that bones force
+even where both muscles are straight and stretched by a fifth (`tethers.least_gap`). ``--without`` measures the same
+run without sliding. ``cost`` compares processor time of a frame with surfaces, one thread, with and without
 sliding in turn; ``order`` solves with the file's order of muscles and with its reverse, and compares the surfaces.
 """
 
@@ -20,7 +23,10 @@ import numba
 import numpy as np
 from leg_joints import leg_folder
 from scipy.spatial import cKDTree
+from tethers import Tethered, least_gap
 
+from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.models import build_models
 from rbfmuscle.sim.loop.simulate import FrameLoop
 from rbfmuscle.sim.plan.reach import build_fields, reached_bones
@@ -28,6 +34,9 @@ from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 
 THRESHOLD = 2.0  # mm: nearer at rest is touching, as `[sliding]` has it
+FACING = 0.5  # cosine between a vertex's normal and the way to its neighbour, from which on it faces that
+STRETCH = 0.2  # of ways between held ends, in the gap that bones force
+TOLD = 12  # pairs listed of these
 FIRST = 2  # frames gone to before the cost is measured
 
 
@@ -75,12 +84,13 @@ class Touching:
     ----------
     surfaces : dict of str to (vertices, faces)
         At rest.
-    held : dict of str to (n,) ndarray of bool
-        Vertices that bones hold.
+    holder : dict of str to (n,) ndarray of str
+        Bones that hold vertices, empty where none does.
     """
 
-    def __init__(self, surfaces, held):
-        self.held, self.found = held, {}
+    def __init__(self, surfaces, holder):
+        self.held, self.found = {name: bones != "" for name, bones in holder.items()}, {}
+        self.tethered = {name: Tethered(*surfaces[name], holder[name]) for name in surfaces}
         for one, other in itertools.permutations(surfaces, 2):
             near = _near(surfaces[one], surfaces[other], THRESHOLD)
             if len(near):
@@ -95,16 +105,23 @@ class Touching:
         nearest = cKDTree(surfaces[other][0]).query(surfaces[one][0][index])[1]
         return self.held[one][index] & self.held[other][nearest]
 
-    def opened(self, surfaces):
-        """RMS of how much farther these are, by pair of sorted names, and the same of those held on both sides."""
-        free, held = {}, {}
+    def opened(self, surfaces, poses):
+        """RMS of how much farther these are, by pair of sorted names, and the same of those held on both sides; of the
+        first those that the neighbour faces, and all of them beyond what bones force.
+        """
+        found = {}, {}, {}, {}
         for (one, other), (index, rest, both) in self.found.items():
             now = MeshDistance(*surfaces[other]).signed(surfaces[one][0][index])
-            square = np.maximum(now - rest, 0.0) ** 2
-            pair = tuple(sorted((one, other)))
-            free.setdefault(pair, []).append(square[~both])
-            held.setdefault(pair, []).append(square[both])
-        return tuple(_rms_by_pair(squares) for squares in (free, held))
+            gap, forced = now - rest, np.zeros(len(index))
+            facing = _facing(surfaces[one], surfaces[other], index)
+            if (gap > 1.0).any():
+                forced = least_gap(self.tethered[one], self.tethered[other], index, poses, STRETCH)
+            beyond = now - np.maximum(rest, forced)
+            kinds = (gap, ~both), (gap, both), (gap, ~both & facing), (beyond, ~both)
+            for parts, (values, which) in zip(found, kinds):
+                square = np.maximum(values[which], 0.0) ** 2
+                parts.setdefault(tuple(sorted((one, other))), []).append(square)
+        return tuple(_rms_by_pair(squares) for squares in found)
 
     def overlaps(self, surfaces):
         """Deepest vertex of one in the other, by pair of sorted names, and the deepest held on both sides."""
@@ -126,13 +143,24 @@ def _rms_by_pair(squares):
     return {pair: float(np.sqrt(part.mean())) if len(part) else 0.0 for pair, part in joined.items()}
 
 
-def held_vertices(models, surfaces):
-    """Vertices (n,) of each surface at rest that go along with a bone, as the model's nearest contact point does."""
+def _facing(one, other, index):
+    """Which vertices of one surface have the other before them, no farther off than 60 degrees, or touch it."""
+    points = one[0][index]
+    distance, closest, _, _ = ExactDistance(*other).nearest(points)
+    normals = vertex_normals(np.ascontiguousarray(one[0]), np.ascontiguousarray(one[1], dtype=np.int64))[
+        index
+    ]
+    along = np.einsum("ij,ij->i", normals, closest - points)
+    return along >= FACING * np.abs(distance) * np.linalg.norm(normals, axis=1) - 0.5
+
+
+def holders(scene, models, surfaces):
+    """Bones that the vertices (n,) of each surface at rest go along with, as the model's nearest contact point does."""
+    names = np.array([*(bone.name for bone in scene.bones), ""])
     return {
-        model.name: np.asarray(model.contact_bone)[
-            cKDTree(model.contact_points()).query(surfaces[model.name][0])[1]
+        model.name: names[
+            np.asarray(model.contact_bone)[cKDTree(model.contact_points()).query(surfaces[model.name][0])[1]]
         ]
-        >= 0
         for model in models
     }
 
@@ -156,19 +184,26 @@ def pairs(bench, arguments):
                 continue
             frame = loop.advance(coordinates)
             surfaces = _surfaces(frame)
-            touching = touching or Touching(surfaces, held_vertices(bench.models, surfaces))
-            # Overlap, gap; the same of what is held on both sides.
-            found = [
-                one for pair in zip(touching.overlaps(surfaces), touching.opened(surfaces)) for one in pair
-            ]
+            touching = touching or Touching(surfaces, holders(bench.scenes[True], bench.models, surfaces))
+            opened = touching.opened(surfaces, frame.poses)
+            # Overlap, gap; the same of what is held on both sides; the gap of what is faced, and beyond bones' share.
+            found = [one for pair in zip(touching.overlaps(surfaces), opened) for one in pair]
+            found += opened[2:]
             for place, values in enumerate(found):
                 for pair, value in values.items():
-                    row = worst.setdefault(pair, [(0.0, 0)] * 4)
+                    row = worst.setdefault(pair, [(0.0, 0)] * 6)
                     row[place] = max(row[place], (value, k))
             _tell_frame(k, frame, found[:2])
     print(f"{len(touching.found) // 2} pairs touch at rest, {len(worst)} pairs meet")
     for name, places in (("muscle against muscle", (0, 1)), ("held by bones on both sides", (2, 3))):
         _tell_pairs(name, {pair: [row[k] for k in places] for pair, row in worst.items()})
+    for place, name in ((4, "faced by the neighbour"), (5, "beyond what bones force")):
+        wide = np.array([row[place][0] for row in worst.values()])
+        print(
+            f"opened, {name}: {(wide > 1.0).sum()} of {len(wide)} pairs beyond 1 mm RMS, worst {wide.max():.3f}"
+        )
+        for pair, row in sorted(worst.items(), key=lambda item: -item[1][place][0])[:TOLD]:
+            print(f"    {' and '.join(pair):60} {row[place][0]:7.3f} {row[place][1]:2d}", flush=True)
 
 
 def _tell_pairs(name, worst):

@@ -255,9 +255,10 @@ def test_linked_points_keep_near_their_neighbour():
     lift = [{"lift": a} for a in (0, 2, 4, 6)]
     frames, _ = _run(lift, SlidingOptions(release=50.0))
     apart, _ = _run(lift, SlidingOptions(threshold=1e-3))
-    assert frames[0].surfaces["upper"].quantities["sliding_gap_max"] < 2.0
-    # Free to 1 mm beyond the gap at rest; curved surfaces and one linearisation a sub-step leave some tenths.
-    assert frames[-1].surfaces["upper"].quantities["sliding_gap_max"] < 3.5
+    # Linked are points nearer than 2 mm and half an edge of 2.4.
+    assert 2.0 < frames[0].surfaces["upper"].quantities["sliding_gap_max"] < 3.2
+    # Free to 0.5 mm beyond the gap at rest; curved surfaces and one linearisation a sub-step leave some tenths.
+    assert frames[-1].surfaces["upper"].quantities["sliding_gap_max"] < 4.2
     assert frames[-1].neighbours["lower", "upper"][1] < 1.0
     assert apart[-1].surfaces["upper"].quantities["sliding_gap_max"] == 0.0
     held, loose = (f[-1].surfaces["upper"].vertices[:, 2].mean() for f in (frames, apart))
@@ -269,8 +270,8 @@ def test_what_is_pulled_away_hard_is_let_go():
     frames, parts = _run(lift, SlidingOptions(release=0.01, strip=0.1))
     _, alone = _run(lift, None)
     _, held = _run(lift, SlidingOptions(release=50.0, strip=0.1))
-    # Linked points were nearer than 2.11 where they were predicted; settling moves them by some tenths.
-    assert frames[-1].surfaces["upper"].quantities["sliding_gap_max"] < 2.7
+    # Linked points were nearer than 3.31 where they were expected; settling moves them by some tenths.
+    assert frames[-1].surfaces["upper"].quantities["sliding_gap_max"] < 3.6
     away = [np.sqrt(np.square(one["upper"].x - alone["upper"].x).sum(axis=1).mean()) for one in (parts, held)]
     # Those near the hinge, which move little, stay linked.
     assert away[0] < 0.7 * away[1]

@@ -13,7 +13,9 @@ if TYPE_CHECKING:
 
 
 # Defaults [mm]: nearer than THRESHOLD at rest is linked; STRIP beyond its gap there is free; RELEASE beyond lets go.
-THRESHOLD, STRIP, RELEASE = 2.0, 1.0, 5.0
+THRESHOLD, STRIP, RELEASE = 2.0, 0.5, 5.0
+# At rest points this share of a mean edge farther are linked too: a patch where two muscles touch may lie between them.
+BETWEEN = 0.5
 # Neighbours are looked for within this distance [mm] of the predicted points.
 SEARCH = 5.0
 # Distance [mm] between the surfaces as solved below which they are cut, and how deep an overlap may be.
@@ -100,9 +102,10 @@ class Link:
         self.zone: Any = None
         self.back: Link | None = None
         index, distance, _, _ = self._near()
-        self.linked[index[distance < limits.threshold]] = True
-        near = distance < limits.threshold
+        near = distance < limits.threshold + BETWEEN * own.edge
+        self.linked[index[near]] = True
         self.hold[index[near]] = np.maximum(distance[near], 0.0) + limits.strip
+        near = distance < limits.threshold
         #: Points that touch the neighbour at rest, and how far they are from it there.
         self.touching, self.gap = index[near], distance[near]
         self.found = _NOTHING
