@@ -188,7 +188,8 @@ def test_planes_ask_for_little_in_one_sub_step_however_deep_the_overlap():
                 assert link.push.gap.min() == -MOST
         for coordinates in made.motion.frames[::-1]:
             loop.advance(coordinates)
-    assert _overlap(parts) < 0.1
+    # What keeps them near asks for half a millimetre at the same time.
+    assert _overlap(parts) < 0.2
 
 
 def test_both_are_cut_where_only_one_sees_that_they_meet():

@@ -48,8 +48,8 @@ class Sliding:
         limits = SlidingLimits(options, scene)
         self.links = {stepper.name: [] for stepper in steppers}
         self.bone_links = {stepper.name: [] for stepper in steppers}
-        pairs = sliding_pairs(scene, [stepper.name for stepper in steppers], limits.search)
-        reach = max(limits.search, limits.cut_depth)
+        pairs = sliding_pairs(scene, [stepper.name for stepper in steppers], limits.reach)
+        reach = max(limits.reach, limits.cut_depth)
         self.surfaces = {
             stepper.name: CarriedSurface(stepper.model, reach)
             for stepper in steppers

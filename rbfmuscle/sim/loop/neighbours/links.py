@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 THRESHOLD, STRIP, RELEASE = 2.0, 0.5, 5.0
 # At rest points this share of a mean edge farther are linked too: a patch where two muscles touch may lie between them.
 BETWEEN = 0.5
-# Neighbours are looked for within this distance [mm] of the predicted points.
-SEARCH = 5.0
+# Neighbours are looked for within this distance [mm] of points that are not linked.
+SEARCH = 3.0
 # Distance [mm] between the surfaces as solved below which they are cut, and how deep an overlap may be.
-CUT_FROM, CUT_DEPTH = 4.0, 6.0
+CUT_FROM, CUT_DEPTH = 3.0, 6.0
 # Neighbours on all sides, and bones, may leave no place that all of them allow: rigid planes would push without end.
 # So planes give way, by this share of how far their force alone would move the point; nearness more than keeping out.
 PUSH_GIVES, PULL_GIVES = 0.1, 1.0
@@ -95,14 +95,16 @@ class Link:
         self.push, self.pull = Planes(PUSH_GIVES), Planes(PULL_GIVES)
         self.free = stepper.contacts.free(len(stepper.model.contact_points()))
         #: Which points are linked, and how far each may be from the neighbour.
-        self.linked = np.zeros(len(self.free), dtype=bool)
+        self.linked = self.free.copy()
+        self.touching = np.zeros(0, dtype=np.int64)
         self.hold = np.full(len(self.free), limits.hold)
         self.before: Any = None
         #: Box in which the points of this muscle come near the neighbour, and the link that looks the other way.
         self.zone: Any = None
         self.back: Link | None = None
         index, distance, _, _ = self._near()
-        near = distance < limits.threshold + BETWEEN * own.edge
+        self.linked[:] = False
+        near = distance < limits.threshold + min(BETWEEN * own.edge, limits.threshold)
         self.linked[index[near]] = True
         self.hold[index[near]] = np.maximum(distance[near], 0.0) + limits.strip
         near = distance < limits.threshold
@@ -144,7 +146,7 @@ class Link:
 
     def _met(self, index: Any, distance: Any) -> Met:
         """How deep the muscle is in the neighbour, and how far what touched it at rest has come away."""
-        apart = np.full(len(self.free), self.limits.search)
+        apart = np.full(len(self.free), self.limits.reach)
         apart[index] = distance
         opened = np.maximum(apart[self.touching] - np.maximum(self.gap, 0.0), 0.0)
         return Met(max(0.0, -float(distance.min(initial=0.0))), len(opened), float((opened**2).sum()))
@@ -195,9 +197,17 @@ class Link:
         return found[np.all((found > low) & (found < high), axis=1)]
 
     def _near(self):
-        if self.other.apart(self.own, self.limits.search):
+        """Points near the neighbour: what is or was linked as far as it can be held, the others close by."""
+        limits = self.limits
+        if self.other.apart(self.own, limits.reach):
             return _FAR
-        return self.other.query(self.own.points, self.free, self.limits.search)
+        far = self.linked.copy()
+        far[self.touching] = True
+        found = [
+            self.other.query(self.own.points, self.free & which, reach)
+            for which, reach in ((far, limits.reach), (~far, limits.search))
+        ]
+        return tuple(np.concatenate(parts) for parts in zip(*found))
 
     def _slip(self, points, index, normal, nearest):
         if self.before is None or len(index) == 0:
@@ -240,7 +250,8 @@ class SlidingLimits:
         self.strip = length(options.strip, STRIP)
         self.hold = self.threshold + self.strip
         self.release = length(options.release, RELEASE)
-        self.search = max(scene.length(SEARCH), self.hold + self.release)
+        self.search = max(scene.length(SEARCH), self.threshold)
+        self.reach = max(self.search, self.hold + self.release)
         self.cut_from, self.cut_depth = scene.length(CUT_FROM), scene.length(CUT_DEPTH)
         self.most = scene.length(MOST)
         self.join, self.cut = options.join, options.cut
