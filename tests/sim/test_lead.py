@@ -1,5 +1,6 @@
 """Where muscles that slide see each other: where their bones take them, and where settling will bring them."""
 
+import igl
 import numpy as np
 import pytest
 from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, joint, muscle, scene, sphere
@@ -96,3 +97,33 @@ def test_what_settling_does_is_expected_again_as_far_as_the_motion_goes_on(way, 
 
 def test_a_way_is_how_coordinates_change():
     assert way_between({"a": 1.0}, {"a": 3.0, "b": 2.0}) == {"a": 2.0, "b": 2.0}
+
+
+def _spike_into_a_belly(sliding):
+    """How deep a thin muscle that an arm holds has come into a coarse belly below it."""
+    fields = {"trunk": sphere(1.0, (0, 0, -60)), "arm": box((1, 1, 1), (60, 0, 40))}
+    belly, spike = (
+        ellipsoid((30, 9, 9), subdivisions=2),
+        ellipsoid((1.5, 1.5, 15), (3, 0, 25), subdivisions=3),
+    )
+    muscles = [
+        muscle("belly", belly, [attach(belly, "trunk", lambda v: np.abs(v[:, 0]) > 24)]),
+        muscle("spike", spike, [attach(spike, "arm", lambda v: np.abs(v[:, 2] - 25) > 3)]),
+    ]
+    made = scene(
+        [bone(name, field) for name, field in fields.items()],
+        [joint("hinge", "trunk", "arm", (-30, 0, 0), press=(0, 1, 0))],
+        muscles,
+        [{"hinge.press": np.radians(angle)} for angle in range(0, 9, 2)],
+        sliding=sliding,
+    )
+    parts = {one.name: ToyMuscle(one, made, sweeps=4, reach=2.0) for one in muscles}
+    with FrameLoop(made, parts, fields=fields) as loop:
+        for coordinates in made.motion.frames:
+            loop.advance(coordinates)
+    return -igl.signed_distance(parts["spike"].x, parts["belly"].x, parts["belly"].faces)[0].min()
+
+
+def test_a_coarse_muscle_gives_way_to_a_thin_end_that_a_bone_drives_into_it():
+    assert _spike_into_a_belly(None) > 3.0
+    assert _spike_into_a_belly(SlidingOptions()) < 0.6

@@ -72,6 +72,8 @@ class CarriedSurface:
     vertices : (n, 3) ndarray
     fixed : (n,) ndarray of bool
         Vertices that a bone holds.
+    contact : (n,) ndarray of int
+        Contact point that a vertex is, or is nearest to.
     deepest : (n,) ndarray
         How deep a point whose nearest vertex is this one may be.
     box, reach_box : (2, 3) ndarray
@@ -94,8 +96,8 @@ class CarriedSurface:
         rest, balls = np.ascontiguousarray(vertices, dtype=np.float64), np.empty((2, len(vertices)))
         touching_balls(rest, vertex_normals(rest, self.faces), balls, np.empty(len(rest)))
         self.deepest = DEEPER * np.minimum(balls[1], float(reach)) + self.edge
-        nearest = cKDTree(model.contact_points()).query(vertices)[1]
-        self.fixed = np.asarray(model.contact_bone)[nearest] >= 0
+        self.contact = cKDTree(model.contact_points()).query(vertices)[1]
+        self.fixed = np.asarray(model.contact_bone)[self.contact] >= 0
         #: Where it will settle.
         self.lead = Lead()
         self.refresh()

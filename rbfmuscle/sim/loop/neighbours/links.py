@@ -123,10 +123,35 @@ class Link:
         if limits.join:
             self.linked[index[distance < limits.threshold]] = True
         share = np.where(self.other.fixed[nearest], 1.0, 0.5)
-        self.push.set(index, np.maximum(share * distance, -limits.most), normal, points[index])
+        self._push_out((index, np.maximum(share * distance, -limits.most), normal))
         held = self.linked[index]
         slack = share[held] * (self.hold[index[held]] - distance[held])
         self.pull.set(index[held], slack, -normal[held], points[index[held]])
+
+    def _push_out(self, own: tuple[Any, Any, Any]) -> None:
+        """Planes that keep out: those of the muscle's own points, and those that fixed points of the neighbour want."""
+        at, gap, normal = self._given_way()
+        index = np.concatenate([own[0], at])
+        self.push.set(
+            index, np.concatenate([own[1], gap]), np.concatenate([own[2], normal]), self.own.points[index]
+        )
+
+    def _given_way(self) -> Any:
+        """Planes (index, gap, normal) by which the muscle gives way to fixed points of the neighbour that came into it.
+
+        These take no contact, and the muscle's own points may lie too far apart to meet a thin end.
+        """
+        if self.own.apart(self.other, self.limits.search):
+            return _FAR[:3]
+        _, distance, normal, nearest = self.own.query(
+            self.other.vertices, self.other.fixed, self.limits.search
+        )
+        at = self.own.contact[nearest]
+        deep = np.flatnonzero((distance < 0.0) & self.free[at])
+        # The deepest of each point alone.
+        deep = deep[np.lexsort((distance[deep], at[deep]))]
+        deep = deep[np.unique(at[deep], return_index=True)[1]]
+        return at[deep], np.maximum(distance[deep], -self.limits.most), -normal[deep]
 
     def measure(self) -> Any:
         """Overlap, widest gap of linked points, and their slip over the neighbour since the last call."""
