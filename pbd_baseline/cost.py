@@ -12,7 +12,7 @@ from rbfmuscle.sim.scene.scene import Scene
 # Of the contacts and the volume after the last sweep: calls, and visits for a vertex.
 FINISH_CALLS, FINISH_VISITS = 1000, 870
 # Of a muscle kept sound besides: calls, and visits for a vertex.
-SOUND_CALLS, SOUND_VISITS = 3000, 9000
+SOUND_CALLS, SOUND_VISITS = 3000, 5000
 # A sub-step besides: calls, and visits for a contact point in the search for tunnelling.
 PREDICT_CALLS, CROSSING_VISITS = 1100, 200
 # To build: visits for a vertex, and for its weights between the bones where these are not on disk.

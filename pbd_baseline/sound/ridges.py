@@ -87,7 +87,7 @@ class Ridges:
             How far [scene unit].
         """
         parts = [
-            self._of_bone(contacts, b, points, np.flatnonzero(near[b][self.faces].any(axis=1)))
+            self._of_bone(contacts, b, points, np.flatnonzero(faces_of(near[b], self.faces)))
             for b in contacts.reached
             if b in near
         ]
@@ -113,6 +113,11 @@ class Ridges:
             np.ascontiguousarray(values[:, 3:6]),
             np.ascontiguousarray(values[:, 6]),
         )
+
+
+def faces_of(marked: Booleans, faces: Integers) -> Booleans:
+    """Faces (m,) that have a corner among the vertices marked (n,)."""
+    return marked[faces[:, 0]] | marked[faces[:, 1]] | marked[faces[:, 2]]
 
 
 NOTHING = (np.zeros((0, 3), np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))

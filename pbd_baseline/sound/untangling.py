@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pbd_baseline.rest import Rest
+from pbd_baseline.sound.ridges import faces_of
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.geometry.crossing import FaceTree, creased_faces
@@ -53,7 +54,7 @@ class Untangling:
             marked = np.zeros(len(points), dtype=np.bool_)
             marked[faces[bad].ravel()] = True
             region = self.around(marked, 1 + turn // GROWTH)
-            among = np.asarray(region[faces].any(axis=1), dtype=np.bool_)
+            among = faces_of(region, faces)
             self._smooth(points, np.flatnonzero(region), SWELL * self.edge * turn / ROUNDS)
             settle()
         return int(self.tree.crossing(points).sum())
