@@ -11,6 +11,7 @@ from pbd_baseline.sound.ridges import faces_of
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.geometry.crossing import FaceTree, creased_faces
+from rbfmuscle.sim.loop.tunnelling import rigid_fit
 
 # Rounds of smoothing, how many of them until the smoothed region grows by a ring, and sweeps in each.
 ROUNDS, GROWTH, SWEEPS = 48, 4, 4
@@ -18,6 +19,9 @@ ROUNDS, GROWTH, SWEEPS = 48, 4, 4
 SHARE = 0.5
 # What was smoothed swells by what it lost, at most by this share of an edge, and in the last round by this besides.
 MOST, SWELL = 0.5, 0.6
+
+# Where that leaves crossings, what the muscle does beside a rigid motion is smoothed so often, until none is left.
+CALM = (30, 120, 500, 2000)
 
 
 class Untangling:
@@ -32,7 +36,8 @@ class Untangling:
     """
 
     def __init__(self, rest: Rest) -> None:
-        self.topology, self.volume, self.edge = rest.topology, rest.volume, rest.edge()
+        self.rest, self.topology, self.volume = rest.vertices, rest.topology, rest.volume
+        self.edge = rest.edge()
         self.tree = FaceTree(rest.vertices, rest.topology.faces)
 
     def untangle(self, points: Floats, settle: Callable[[], object]) -> int:
@@ -44,6 +49,28 @@ class Untangling:
         settle : callable
             Brings contact and volume back after each round.
         """
+        left = self._untangle(points, settle)
+        if left == 0:
+            return 0
+        tangled = points.copy()
+        for sweeps in CALM:
+            points[:] = self.calmed(tangled, sweeps)
+            settle()
+            left = self._untangle(points, settle)
+            if left == 0:
+                break
+        return left
+
+    def calmed(self, points: Floats, sweeps: int) -> Floats:
+        """The shape at rest, moved as the muscle on the whole, and deformed as it is where that is smooth, (n, 3)."""
+        motion = rigid_fit(self.rest, points)
+        moved = self.rest @ motion[:3, :3].T + motion[:3, 3]
+        beside, rows = points - moved, np.arange(len(points))
+        for _ in range(sweeps):
+            smooth_loop(beside, rows, self.topology.ring_start, self.topology.ring, SHARE)
+        return moved + beside
+
+    def _untangle(self, points, settle):
         faces, among = self.topology.faces, None
         for turn in range(ROUNDS):
             bad = self._crossing(points, among)

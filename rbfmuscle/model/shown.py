@@ -16,6 +16,7 @@ from rbfmuscle.model.elasticity import ElasticSolver, carry_points
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.model.placement import cached_sample
 from rbfmuscle.model.rest import Rest
+from rbfmuscle.sim.loop.tunnelling import rigid_fit
 from rbfmuscle.sim.scene.objects import Muscle
 
 # Edges of the shown mesh for each thickness of a muscle, and bounds on its vertices: by themselves, and asked for.
@@ -104,10 +105,8 @@ class ShownMesh:
         sweeps : int
             Of smoothing of what the material does beside the rigid motion.
         """
-        middle, there = self.rest.mean(axis=0), vertices.mean(axis=0)
-        u, _, vt = np.linalg.svd((self.rest - middle).T @ (vertices - there))
-        turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-        moved = (self.rest - middle) @ turn + there
+        motion = rigid_fit(self.rest, vertices)
+        moved = self.rest @ motion[:3, :3].T + motion[:3, 3]
         beside = vertices - moved
         self.mesh.smooth(beside, np.arange(len(moved)), sweeps)
         return moved + beside
