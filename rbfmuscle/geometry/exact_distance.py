@@ -45,6 +45,14 @@ class Tree(NamedTuple):
     order: NDArray[np.int64]
 
 
+class Layout(NamedTuple):
+    """What stays where vertices move: order of the triangles, starts of the leaves, faces across the edges."""
+
+    order: NDArray[np.int64]
+    starts: NDArray[np.int64]
+    across: NDArray[np.int64]
+
+
 class ExactDistance:
     """Signed distance, nearest point and nearest face of a closed triangle mesh.
 
@@ -55,9 +63,12 @@ class ExactDistance:
     faces : (m, 3) array_like of int
         At least one, outward; vertices are shared by index. The sign is exact where the mesh is closed and
         consistently oriented, and that of the nearest face elsewhere.
-    like : ExactDistance, optional
-        Of the same faces with their vertices elsewhere, as in a frame before: its order of the triangles is taken
-        over, which halves the time.
+    layout : Layout, optional
+        Of the same faces with their vertices elsewhere, as in a frame before: halves the time.
+
+    Attributes
+    ----------
+    layout : Layout
 
     Notes
     -----
@@ -71,19 +82,12 @@ class ExactDistance:
     [-0.02, 3.0]
     """
 
-    def __init__(self, vertices: ArrayLike, faces: ArrayLike, *, like: ExactDistance | None = None) -> None:
+    def __init__(self, vertices: ArrayLike, faces: ArrayLike, *, layout: Layout | None = None) -> None:
         vertices = np.ascontiguousarray(vertices, dtype=np.float64)
         faces = np.ascontiguousarray(faces, dtype=np.int64)
         self.vertices, self.faces = vertices, faces
-        if like is None:
-            self.order = np.arange(len(faces))
-            depth = max(0, int(np.ceil(np.log2(len(faces) / LEAF))))
-            self.starts = np.zeros((1 << depth) + 1, dtype=np.int64)
-            _order_loop(vertices[faces].mean(axis=1), self.order, depth, self.starts)
-            start, around = vertex_faces(faces, len(vertices))
-            self.across = opposite_faces(faces, start, around)
-        else:
-            self.order, self.starts, self.across = like.order, like.starts, like.across
+        self.layout = _layout(vertices, faces) if layout is None else layout
+        self.order, self.starts, self.across = self.layout.order, self.layout.starts, self.layout.across
         self.records = np.empty((len(faces), WIDTH))
         self.boxes = np.empty((2 * len(self.starts) - 2, 6))
         self.edge_normals = np.empty((len(faces), 3, 3))
@@ -138,6 +142,15 @@ class ExactDistance:
 
         in_chunks(count, work)
         return distance, closest, face, normal
+
+
+def _layout(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Layout:
+    order = np.arange(len(faces))
+    depth = max(0, int(np.ceil(np.log2(len(faces) / LEAF))))
+    starts = np.zeros((1 << depth) + 1, dtype=np.int64)
+    _order_loop(vertices[faces].mean(axis=1), order, depth, starts)
+    start, around = vertex_faces(faces, len(vertices))
+    return Layout(order, starts, opposite_faces(faces, start, around))
 
 
 @compiled

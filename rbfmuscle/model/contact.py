@@ -61,15 +61,31 @@ def _deepest(lacking, is_chosen, tolerance, most):
 
 
 @compiled(error_model="numpy")
-def _gram_loop(index, normal, give, row, stiffness, influence, columns, shares):
+def _influence_loop(index, inverse, slot, columns, shares, rows):
+    """W A⁻¹ for some contact points: term by term, so that a row is the same whoever else is asked for."""
+    rows[:] = 0.0
+    for c in range(len(index)):
+        for k in range(columns.shape[1]):
+            free = slot[columns[index[c], k]]
+            share = shares[index[c], k]
+            if free < 0 or share == 0.0:
+                continue
+            for j in range(rows.shape[1]):
+                if slot[j] >= 0:
+                    rows[c, j] += share * inverse[free, slot[j]]
+
+
+@compiled(error_model="numpy")
+def _gram_loop(contacts, give, row, stiffness, influence, columns, shares):
     """(n_c · n_d) w_cᵀ A⁻¹ w_d - row_c row_d / stiffness: motion at c for a unit force at d, volume kept."""
+    index, place, normal = contacts
     size = len(index)
     gram = np.empty((size, size))
     for c in range(size):
         for d in range(c + 1):
             value = 0.0
             for k in range(columns.shape[1]):
-                value += shares[index[c], k] * influence[index[d], columns[index[c], k]]
+                value += shares[index[c], k] * influence[place[d], columns[index[c], k]]
             value *= normal[c, 0] * normal[d, 0] + normal[c, 1] * normal[d, 1] + normal[c, 2] * normal[d, 2]
             if c == d:
                 value *= 1.0 + give[c]
@@ -86,15 +102,15 @@ def _gram_loop(index, normal, give, row, stiffness, influence, columns, shares):
 
 
 @compiled(error_model="numpy")
-def _push_loop(index, normal, strength, influence, push):
+def _push_loop(place, normal, strength, influence, push):
     """push = A⁻¹ Wᵀ of the forces: motion of all centres."""
     push[:] = 0.0
-    for c in range(len(index)):
+    for c in range(len(place)):
         if strength[c] == 0.0:
             continue
         for k in range(len(push)):
             for a in range(3):
-                push[k, a] += influence[index[c], k] * strength[c] * normal[c, a]
+                push[k, a] += influence[place[c], k] * strength[c] * normal[c, a]
 
 
 @compiled(error_model="numpy")
@@ -115,7 +131,7 @@ def _lacking_loop(contacts, need, share, push, hanging, lacking):
 @compiled(error_model="numpy", nogil=False)
 def _contact_loop(spaces, motion, volume, influence, hanging, table, effort, push):
     """Fill ``push`` and the forces in ``table``; returns the volume's share that the push takes back."""
-    index, gap, normal, source, give = spaces
+    index, place, gap, normal, source, give = spaces
     response, stiffness = volume
     columns, shares = hanging
     batch, rounds, sweeps, tolerance = effort
@@ -141,14 +157,13 @@ def _contact_loop(spaces, motion, volume, influence, hanging, table, effort, pus
         for c in added:
             is_chosen[c] = True
         chosen = np.concatenate((chosen, added))
-        gram = _gram_loop(
-            index[chosen], normal[chosen], give[chosen], row[chosen], stiffness, influence, columns, shares
-        )
+        contacts = index[chosen], place[chosen], normal[chosen]
+        gram = _gram_loop(contacts, give[chosen], row[chosen], stiffness, influence, columns, shares)
         strength = force[chosen]
         solve_contact_forces(gram, need[chosen], strength, sweeps, 0.1 * tolerance)
         for k in range(len(chosen)):
             force[chosen[k]] = strength[k]
-        _push_loop(index[chosen], normal[chosen], strength, influence, push)
+        _push_loop(place[chosen], normal[chosen], strength, influence, push)
         lost = 0.0
         for c in chosen:
             lost += row[c] * force[c]
@@ -171,8 +186,12 @@ class ContactConstraint:
     ----------
     columns, shares : (n, k) ndarray
         Sparse rows of W: how the contact points hang on the centres.
-    influence : (n, K) ndarray
-        W A⁻¹: motion of the centres for a unit force at each contact point.
+    inverse : (F, F) ndarray
+        A⁻¹ of the centres that are free.
+    free : (F,) ndarray of int
+        These, among the K centres.
+    count : int
+        K.
     batch : int
         Contacts that join the working set in one round.
     tolerance : float
@@ -184,13 +203,29 @@ class ContactConstraint:
         columns: np.ndarray,
         shares: np.ndarray,
         *,
-        influence: np.ndarray,
+        inverse: np.ndarray,
+        free: np.ndarray,
+        count: int,
         batch: int,
         tolerance: float,
     ) -> None:
-        self.influence, self.columns, self.shares = influence, columns, shares
+        self.inverse, self.columns, self.shares = inverse, columns, shares
+        self._slot = np.full(count, -1)
+        self._slot[free] = np.arange(len(free))
+        # W A⁻¹, motion of the centres for a unit force at a point, of the points that ever came near an obstacle.
+        self._influence, self._place = np.empty((0, count)), np.full(len(columns), -1)
         self.batch, self.tolerance = batch, tolerance
-        self.forces = np.zeros((len(influence), 1))
+        self.forces = np.zeros((len(columns), 1))
+
+    def _places(self, index: np.ndarray) -> np.ndarray:
+        """Row of ``_influence`` of each contact point; of a few hundredths of them it is ever asked for."""
+        new = np.unique(index[self._place[index] < 0])
+        if len(new):
+            rows = np.empty((len(new), len(self._slot)))
+            _influence_loop(new, self.inverse, self._slot, self.columns, self.shares, rows)
+            self._place[new] = len(self._influence) + np.arange(len(new))
+            self._influence = np.concatenate([self._influence, rows])
+        return self._place[index]
 
     def correction(
         self,
@@ -215,13 +250,14 @@ class ContactConstraint:
             Volume that a unit pressure adds.
         """
         if self.forces.shape[1] != sources:
-            self.forces = np.zeros((len(self.influence), sources))
-        push = np.empty((self.influence.shape[1], 3))
+            self.forces = np.zeros((len(self.columns), sources))
+        push = np.empty((len(self._slot), 3))
         give = np.zeros(len(spaces)) if spaces.give is None else spaces.give
-        contacts = spaces.index, spaces.gap, spaces.normal, spaces.source % sources, give
+        place = self._places(spaces.index)
+        contacts = spaces.index, place, spaces.gap, spaces.normal, spaces.source % sources, give
         effort = self.batch, ROUNDS, SWEEPS, self.tolerance
         lost = _contact_loop(
-            contacts, motion, (response, stiffness), self.influence, (self.columns, self.shares),
+            contacts, motion, (response, stiffness), self._influence, (self.columns, self.shares),
             self.forces, effort, push,
         )  # fmt: skip
         return push, lost

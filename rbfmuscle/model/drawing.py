@@ -82,7 +82,8 @@ class SurfaceDrawer:
 
     def __init__(self, muscle: Muscle, scene: Scene, rest: Rest, options: RBFOptions) -> None:
         self.name, self.rest, self.options = muscle.name, rest, options
-        self.bone_points = [ObstaclePoints(bone.mesh.vertices) for bone in scene.bones]
+        self._bones = [bone.mesh for bone in scene.bones]
+        self._bone_points: dict[int, ObstaclePoints] = {}
         self.level = 0.0
         self.shown = ShownMesh(muscle, rest, options) if options.surface == "material" else None
 
@@ -213,10 +214,16 @@ class SurfaceDrawer:
         self, contacts: BoneContacts, *, neighbours: bool = True
     ) -> list[tuple[ObstaclePoints, np.ndarray]]:
         """Points that faces have to leave outside: those of bones, and of sliding neighbours where they meet."""
-        found = [(self.bone_points[b], contacts.poses[contacts.names[b]]) for b in contacts.reached]
+        found = [(self._points_of(b), contacts.poses[contacts.names[b]]) for b in contacts.reached]
         points = contacts.neighbour_points() if neighbours else np.zeros((0, 3))
         # A neighbour thinner than the surface's edges would stick through its faces: their corners alone are cut.
         return [*found, (ObstaclePoints(points), np.eye(4))] if len(points) else found
+
+    def _points_of(self, bone: int) -> ObstaclePoints:
+        """A bone's vertices, sorted when the muscle first comes near: of a skeleton's bones it meets few."""
+        if bone not in self._bone_points:
+            self._bone_points[bone] = ObstaclePoints(self._bones[bone].vertices)
+        return self._bone_points[bone]
 
     def _cause(self, now: Moment, contacts: BoneContacts) -> tuple[str, str]:
         """Bone and cause of a surface that cannot be fitted: a held end in a bone, stretch, or sheets that met."""

@@ -117,12 +117,8 @@ class ElasticSolver:
         self.inverse = np.linalg.inv(laplacian[np.ix_(self.free, self.free)])
         self.inverse = 0.5 * (self.inverse + self.inverse.T)
         self.coupling = laplacian[np.ix_(self.free, self.held)]
-        dense = np.zeros((self.centres, len(self.points)))
-        np.add.at(dense, (self.columns, np.arange(len(self.points))[:, None]), self.shares)
-        influence = np.zeros((self.centres, len(self.points)))
-        influence[self.free] = self.inverse @ dense[self.free]
         self.contact = ContactConstraint(
-            self.columns, self.shares, influence=np.ascontiguousarray(influence.T),
+            self.columns, self.shares, inverse=self.inverse, free=self.free, count=self.centres,
             batch=options.contacts, tolerance=CONTACT_TOLERANCE * self.scale,
         )  # fmt: skip
 
@@ -133,14 +129,17 @@ class ElasticSolver:
     def snapshot(self) -> tuple[np.ndarray, ...]:
         """State that ``restore`` brings back."""
         shape = self.shape
-        parts = shape.quaternion, shape.target, shape.deformation, self.contact.forces
-        return tuple(part.copy() for part in parts)
+        forces = self.contact.forces
+        pushing = np.flatnonzero(forces)
+        parts = shape.quaternion.copy(), shape.target.copy(), shape.deformation.copy()
+        return *parts, np.array(forces.shape), pushing, forces.ravel()[pushing]
 
     def restore(self, state: tuple[np.ndarray, ...]) -> None:
         """Return to an earlier ``snapshot``, to the last digit: a run that resumes goes on from one."""
         shape = self.shape
-        shape.quaternion[:], shape.target[:], shape.deformation[:], forces = state
-        self.contact.forces = forces.copy()
+        shape.quaternion[:], shape.target[:], shape.deformation[:], size, pushing, strength = state
+        self.contact.forces = np.zeros(size)
+        self.contact.forces.ravel()[pushing] = strength
 
     def transform(self, motion: np.ndarray, x: np.ndarray) -> None:
         """Go along with a rigid motion (4, 4) that brought the centres to x (K, 3)."""

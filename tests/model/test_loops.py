@@ -50,8 +50,10 @@ class System:
         self.spaces = HalfSpaces(index, rng.uniform(-0.4, 0.3, len(index)), normal, source)
 
     def constraint(self, batch=4):
-        influence = np.ascontiguousarray(self.weights @ self.inverse)
-        return ContactConstraint(self.columns, self.shares, influence=influence, batch=batch, tolerance=1e-9)
+        return ContactConstraint(
+            self.columns, self.shares, inverse=self.inverse, free=np.arange(CENTRES), count=CENTRES,
+            batch=batch, tolerance=1e-9,
+        )  # fmt: skip
 
     def solve(self, constraint, spaces=None):
         """Motion of the centres by contact, what the volume takes back included, and the forces."""

@@ -57,8 +57,8 @@ class ModelSurface:
         """What `from_state` makes the surface that was drawn of, and its motion since."""
         drawn, motion = self.origin or (self, np.eye(4))
         return {
-            "vertices": np.array(drawn.vertices),
-            "faces": np.array(drawn.faces),
+            "vertices": np.asarray(drawn.vertices),
+            "faces": np.asarray(drawn.faces),
             "quantities": {name: float(value) for name, value in drawn.quantities.items()},
             "notes": [list(note) for note in drawn.notes],
             "motion": motion,

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.exact_distance import ExactDistance, Layout
 from rbfmuscle.geometry.winding import winding_number
 from rbfmuscle.validation import check_mesh, check_points
 
@@ -23,8 +23,12 @@ class MeshDistance:
     faces : (m, 3) array_like of int
     closed : bool
         False for a mesh with holes.
-    like : MeshDistance, optional
-        Of a moment before: where the faces are the same, its tree is adapted.
+    layout : Layout, optional
+        Of the same faces at another moment, as `ExactDistance` takes it.
+
+    Attributes
+    ----------
+    layout : Layout
 
     Notes
     -----
@@ -35,12 +39,12 @@ class MeshDistance:
     """
 
     def __init__(
-        self, vertices: ArrayLike, faces: ArrayLike, *, closed: bool = True, like: MeshDistance | None = None
+        self, vertices: ArrayLike, faces: ArrayLike, *, closed: bool = True, layout: Layout | None = None
     ) -> None:
         self.closed = closed
         self.vertices, self.faces = check_mesh(vertices, faces)
-        same = like is not None and np.array_equal(like.faces, self.faces)
-        self._exact = ExactDistance(self.vertices, self.faces, like=like._exact if same else None)
+        self._exact = ExactDistance(self.vertices, self.faces, layout=layout)
+        self.layout = self._exact.layout
 
     def unsigned(self, points: ArrayLike) -> Floats:
         """Distance to the surface.

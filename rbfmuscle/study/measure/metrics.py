@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.exact_distance import Layout
 from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.sim.joints.skeleton import all_coordinates
@@ -102,7 +103,8 @@ class _Tracker:
         self.scene = scene
         self.offset = None
         self.form = SurfaceForm()
-        self.distance: MeshDistance | None = None
+        # Of the last surface: its faces, and what its distance can be had quicker with while they stay.
+        self.layout: tuple[Integers, Layout] | None = None
 
     def state(self) -> tuple[Any, ...]:
         return self.rest_measured, self.offset
@@ -156,7 +158,9 @@ class _Tracker:
     def _of_surface(self, surface, frame, probes, first_rest):
         vertices, faces = surface.vertices, np.asarray(surface.faces)
         volume = mesh_volume(vertices, faces)
-        self.distance = distance = MeshDistance(vertices, faces, like=self.distance)
+        known = self.layout is not None and np.array_equal(self.layout[0], faces)
+        distance = MeshDistance(vertices, faces, layout=self.layout[1] if known else None)
+        self.layout = faces, distance.layout
         depth = surface_depth(vertices, probes, frame.poses)
         found = {
             "volume": volume,
