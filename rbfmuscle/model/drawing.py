@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -31,6 +32,8 @@ MARCHING_CELLS = 48
 REACH = 3.0
 # A tenth of the edges this much longer than at rest is the cause of what cannot be fitted.
 STRETCHED = 1.6
+# Bones' vertices, sorted, by the bone's distance field.
+_BONE_POINTS: WeakKeyDictionary[Any, ObstaclePoints] = WeakKeyDictionary()
 
 # Where the material is no sound surface, what it does beside a rigid motion is smoothed so often, until it is one;
 # how deep in a bone a vertex of a sound one may be, in mean edges, and how much volume may be lacking.
@@ -83,7 +86,6 @@ class SurfaceDrawer:
     def __init__(self, muscle: Muscle, scene: Scene, rest: Rest, options: RBFOptions) -> None:
         self.name, self.rest, self.options = muscle.name, rest, options
         self._bones = [bone.mesh for bone in scene.bones]
-        self._bone_points: dict[int, ObstaclePoints] = {}
         self.level = 0.0
         self.shown = ShownMesh(muscle, rest, options) if options.surface == "material" else None
 
@@ -214,16 +216,17 @@ class SurfaceDrawer:
         self, contacts: BoneContacts, *, neighbours: bool = True
     ) -> list[tuple[ObstaclePoints, np.ndarray]]:
         """Points that faces have to leave outside: those of bones, and of sliding neighbours where they meet."""
-        found = [(self._points_of(b), contacts.poses[contacts.names[b]]) for b in contacts.reached]
+        found = [(self._points_of(contacts, b), contacts.poses[contacts.names[b]]) for b in contacts.reached]
         points = contacts.neighbour_points() if neighbours else np.zeros((0, 3))
         # A neighbour thinner than the surface's edges would stick through its faces: their corners alone are cut.
         return [*found, (ObstaclePoints(points), np.eye(4))] if len(points) else found
 
-    def _points_of(self, bone: int) -> ObstaclePoints:
-        """A bone's vertices, sorted when the muscle first comes near: of a skeleton's bones it meets few."""
-        if bone not in self._bone_points:
-            self._bone_points[bone] = ObstaclePoints(self._bones[bone].vertices)
-        return self._bone_points[bone]
+    def _points_of(self, contacts: BoneContacts, bone: int) -> ObstaclePoints:
+        """A bone's vertices, sorted once for all muscles that share its field."""
+        field = contacts.fields[bone]
+        if field not in _BONE_POINTS:
+            _BONE_POINTS[field] = ObstaclePoints(self._bones[bone].vertices)
+        return _BONE_POINTS[field]
 
     def _cause(self, now: Moment, contacts: BoneContacts) -> tuple[str, str]:
         """Bone and cause of a surface that cannot be fitted: a held end in a bone, stretch, or sheets that met."""
