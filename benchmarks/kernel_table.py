@@ -34,8 +34,6 @@ from rbfmuscle.study.experiment.kernel_choice import mark_unfit
 from rbfmuscle.study.experiment.kernel_judge import SurfaceJudge
 from rbfmuscle.study.experiment.workers import threads_limited
 
-# Cells of the brute force: what is measured has no chords in it.
-CELLS = 64
 SCANNED, LIMIT, LOOKS = 40, 1.05, 12
 KEYS = ("surface", "centres", "placement", "kernel")
 HIP = ("gluteus_maximus", "gluteus_medius", "iliacus", "adductor_brevis")
@@ -105,11 +103,11 @@ def both_ways(judge, sample, fitted, least=np.inf):
     ).sound():  # what is open takes a hundred times as long to follow through a band
         return np.inf
     try:
-        found = extract_surface(fitted, points=sample.points, resolution=max(CELLS, judge.resolution // 2))
+        found = extract_surface(fitted, points=sample.points, resolution=judge.resolution)
     except ValueError:
         return np.inf
     back = judge.distance.unsigned(found.vertices)
-    there = surface_miss(fitted, judge.points[::4], spacing(sample.points).mean())
+    there = surface_miss(fitted, judge.points, spacing(sample.points).mean())
     rms = float(np.sqrt(0.5 * (there**2 + (back**2).mean())))
     if rms >= least or not sheets(boxes=BOXES[1:]).sound():
         return np.inf
