@@ -157,7 +157,7 @@ def measured(judge, sample, kernel, placement):
     scan = float(best[0]) if np.isfinite(best[0]) else None
     ratio = None if row["unfit"] or scan is None else float(row["own"] / best[0])
     return {"ratio": ratio, "scan": scan, "condition": row["condition"], "bound": row["bound"],
-            "fits": row["fits"], "seconds": seconds,
+            "fits": row["fits"], "seconds": seconds, "search": row["search_time"],
             "unfit": row["unfit"], "rms": row["rms"], "shape": row["shape"], "best": float(best[1])}  # fmt: skip
 
 
