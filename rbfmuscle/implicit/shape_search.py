@@ -51,6 +51,8 @@ class Limits:
         Fits of the first scan.
     doubt : float
         An error at a condition beyond `DOUBTFUL`, whose fits take fifteen times as long, must be so much smaller.
+    bound : float
+        A ridge keeps the condition of every fit to normals below it, so that flat kernels can be looked at too.
     """
 
     fits: int = 80
@@ -59,6 +61,7 @@ class Limits:
     condition: float = math.inf
     scan: int = 25
     doubt: float = 1.05
+    bound: float = math.inf
 
     def start(self) -> None:
         """Begin to count."""

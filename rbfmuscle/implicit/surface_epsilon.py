@@ -106,7 +106,7 @@ def choose_surface_epsilon(
         ridge = _ridge(data, kernel, epsilon) if how == RIDGE else 0.0
         found = RBFField.fit_surface(
             points, normals, kernel=kernel, epsilon=epsilon, derivatives=derivatives, smoothing=ridge,
-            truncate=how == TRUNCATED,
+            truncate=how == TRUNCATED, condition=limits.bound,
         )  # fmt: skip
         if how != RIDGE:
             fields[epsilon] = found

@@ -82,6 +82,17 @@ def test_miss_is_the_distance_to_first_order_and_a_flat_field_misses(plate):
     assert surface_miss(narrow, held_out, h) > 0.5 * h
 
 
+def test_with_a_ridge_the_whole_range_is_looked_at(plate):
+    _, _, _, centres, held_out = plate
+    data = {"kernel": "inverse_quadratic", "held_out": held_out}
+    limits = Limits(bound=1e8, slow=0, scan=9)
+    bounded = choose_surface_epsilon(centres.points, centres.normals, limits=limits, **data)
+    h = spacing(centres.points).mean()
+    assert (bounded.tried[:, 2] <= 1e8).all() and bounded.tried[0, 0] * h < 1.01 * SPAN[0]
+    plain = choose_surface_epsilon(centres.points, centres.normals, limits=Limits(slow=0, scan=9), **data)
+    assert plain.tried[0, 0] * h > 2.0 * SPAN[0]  # what is not sound ends the scan
+
+
 def test_without_other_points_the_centres_choose(plate):
     centres = plate[3]
     alone = choose_surface_epsilon(centres.points, centres.normals, kernel="matern_52")

@@ -209,13 +209,22 @@ def _choose(row, judge, sample, kernel, ask, *, last):
     limits = Limits(seconds=max(SECONDS - row["search_time"], 0.5), condition=ask.condition, doubt=1.0)
     if not last:
         limits.slow, limits.scan = 0, 13
-    choice = choose_surface_epsilon(
-        sample.points, sample.normals, kernel=kernel, criterion=ask.criterion, derivatives=ask.derivatives,
-        held_out=judge.held_out, distance=judge.distance.unsigned if last else None, limits=limits,
-    )  # fmt: skip
+    asked = {
+        "kernel": kernel, "criterion": ask.criterion, "derivatives": ask.derivatives, "held_out": judge.held_out,
+        "distance": judge.distance.unsigned if last else None,
+    }  # fmt: skip
+    choice = choose_surface_epsilon(sample.points, sample.normals, limits=limits, **asked)
+    spent = limits.spent if ask.criterion == "held_out" else len(choice.tried)
+    if choice.broken and kernel.hermite:  # flat kernels with a ridge have fewer sheets of their own
+        left = SECONDS - row["search_time"] - (shape_search.CLOCK() - start)
+        limits = Limits(seconds=max(left, 0.5), slow=0, scan=13, bound=min(SOUND, ask.condition))
+        bounded = choose_surface_epsilon(sample.points, sample.normals, limits=limits, **asked)
+        spent += limits.spent
+        if not bounded.broken:
+            choice, row["bound"] = bounded, limits.bound
     row["epsilon"] = choice.epsilon
     row["shape"] = float(choice.epsilon * spacing(sample.points).mean())
-    row["fits"] += limits.spent if ask.criterion == "held_out" else len(choice.tried)
+    row["fits"] += spent
     row["search_time"] += shape_search.CLOCK() - start
     if choice.stopped:
         row["note"] = f"{row['note']}; search stopped after {choice.stopped}".lstrip("; ")
@@ -287,7 +296,7 @@ def _bound(row, judge, sample, kernel, ask):
 
     Whether it is bounded; its sheets are then looked at and as many as they should be.
     """
-    if not kernel.hermite:
+    if not kernel.hermite or row["bound"]:
         return False
     plain, bound = _fit(sample, kernel, row, ask.derivatives), min(SOUND, ask.condition)
     if plain.condition <= bound:
@@ -357,8 +366,9 @@ def fill_row(
         if seen.is_open and seen.number <= sheets:
             raise ValueError("the level set is open: it leaves the box of the muscle; take more centres")
         sheets = seen.number
-    row["components"], row["spurious"] = sheets, max(sheets - judge.sheets, 0)
     found = extract_surface(fitted, points=sample.points, resolution=judge.resolution)
+    sheets = max(sheets, found.components)  # those that only finer cells show
+    row["components"], row["spurious"] = sheets, max(sheets - judge.sheets, 0)
     row["volume_error"] = found.volume / judge.volume - 1.0
     row["rms"], row["hausdorff"], error, (row["low"], row["high"]) = judge.apart(found.vertices, found.faces)
     row["worst"] = judge.worst(found, sample.points)
