@@ -53,6 +53,15 @@ def test_what_is_left_of_the_conditions_is_one_ridge_in_units_of_the_spacing(
     assert condition < 1.5 * (values[-1] + ridge) / (values[0] + ridge)
 
 
+def test_what_the_unused_triangle_holds_is_no_matter(plate, monkeypatch):
+    basis, right, *_ = hermite_system(*plate[:2], KERNELS["quintic"], 1.0, "all")
+    clean, found = basis.matrix(), solve_bounded(basis, right, 1e8)[0]
+    monkeypatch.setattr(
+        basis, "matrix", lambda: np.asfortranarray(np.tril(clean) + np.triu(np.full_like(clean, np.inf), 1))
+    )
+    assert np.array_equal(solve_bounded(basis, right, 1e8)[0], found)
+
+
 def test_a_bound_that_is_not_reached_changes_next_to_nothing(plate):
     points, normals, others = plate
     plain = RBFField.fit_hermite(points, normals, kernel="cubic")

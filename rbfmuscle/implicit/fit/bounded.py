@@ -40,8 +40,9 @@ def solve_bounded(basis: Basis, right: Floats, condition: float) -> tuple[Floats
     """
     count, unit = len(basis.points), _unit(basis)
     matrix = basis.matrix()
-    matrix[count:, :count] *= unit
-    matrix[count:, count:] *= unit**2
+    with np.errstate(all="ignore"):  # the upper triangle, which is never read, holds anything
+        matrix[count:, :count] *= unit
+        matrix[count:, count:] *= unit**2
     scale = np.ones(basis.size)
     scale[count:] = unit
     factor = factorise_matrix(matrix, np.ascontiguousarray(basis.polynomials * scale), condition=condition)
