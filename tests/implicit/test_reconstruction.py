@@ -82,8 +82,11 @@ def test_wrong_files_are_answered_in_one_line(tmp_path, spindle, capsys):
     with pytest.raises(MeshError, match="no such file"):
         read_points(tmp_path / "nothing.xyz")
     (tmp_path / "a.xyz").write_text("1 2 3\n4 five 6\n")
-    with pytest.raises(MeshError, match="not readable as points"):
+    with pytest.raises(MeshError, match=r"not readable as points .line 2: .*'five'"):
         read_points(tmp_path / "a.xyz")
+    (tmp_path / "c.xyz").write_text("# three\n1 2 3\n\n4 5\n")
+    with pytest.raises(MeshError, match="line 4 has 2 numbers, those before it 3"):
+        read_points(tmp_path / "c.xyz")
     (tmp_path / "b.xyz").write_text("1 2 3\n4 nan 6\n")
     with pytest.raises(MeshError, match="point 1 is not finite"):
         read_points(tmp_path / "b.xyz")

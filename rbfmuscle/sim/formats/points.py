@@ -57,8 +57,17 @@ def read_points(path: str | Path) -> tuple[Floats, Floats | None]:
 
 def _read_text(path: Path) -> Floats:
     text = path.read_text(encoding="utf-8", errors="replace").replace(",", " ")
-    rows = [line.split("#", 1)[0].split() for line in text.splitlines()]
-    return np.array([[float(word) for word in row] for row in rows if row], dtype=np.float64)
+    rows, width = [], 0
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split("#", 1)[0].split()
+        width = width or len(words)
+        if words and len(words) != width:
+            raise ValueError(f"line {number} has {len(words)} numbers, those before it {width}")
+        try:
+            rows += [[float(word) for word in words]] if words else []
+        except ValueError as error:
+            raise ValueError(f"line {number}: {error}") from None
+    return np.array(rows, dtype=np.float64)
 
 
 def _read_array(path: Path) -> Floats:

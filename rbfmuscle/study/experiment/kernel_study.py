@@ -367,7 +367,11 @@ def fill_row(
             raise ValueError("the level set is open: it leaves the box of the muscle; take more centres")
         sheets = seen.number
     found = extract_surface(fitted, points=sample.points, resolution=judge.resolution)
-    sheets = max(sheets, found.components)  # those that only finer cells show
+    if found.components > sheets:  # only these cells show them: of its own, or pieces of a thin rim
+        seen = count_sheets(
+            fitted, sample.points, judge.distance.unsigned, boxes=(judge.resolution,), wanted=judge.sheets
+        )
+        sheets = max(sheets, seen.number)
     row["components"], row["spurious"] = sheets, max(sheets - judge.sheets, 0)
     row["volume_error"] = found.volume / judge.volume - 1.0
     row["rms"], row["hausdorff"], error, (row["low"], row["high"]) = judge.apart(found.vertices, found.faces)
