@@ -15,7 +15,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.implicit import shape_search
-from rbfmuscle.implicit.extraction.sheets import count_sheets
+from rbfmuscle.implicit.extraction.sheets import FINER, count_sheets
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit.fitting import DOUBTFUL
@@ -367,9 +367,9 @@ def fill_row(
             raise ValueError("the level set is open: it leaves the box of the muscle; take more centres")
         sheets = seen.number
     found = extract_surface(fitted, points=sample.points, resolution=judge.resolution)
-    if found.components > sheets:  # only these cells show them: of its own, or pieces of a thin rim
+    if found.components > sheets:  # these cells alone show them: sheets of its own, or pieces of a thin rim
         seen = count_sheets(
-            fitted, sample.points, judge.distance.unsigned, boxes=(judge.resolution,), wanted=judge.sheets
+            fitted, sample.points, judge.distance.unsigned, boxes=(FINER,), wanted=judge.sheets
         )
         sheets = max(sheets, seen.number)
     row["components"], row["spurious"] = sheets, max(sheets - judge.sheets, 0)
