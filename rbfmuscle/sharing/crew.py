@@ -88,6 +88,7 @@ class Crew:
             parts = [self._next(helper) for helper in self._helpers]
         while not any(part is None for part in parts):
             yield _joined(parts, [muscle.name for muscle in self.scene.muscles])
+            parts.clear()  # a frame that is written need not be here any more
             parts = [self._next(helper) for helper in self._helpers]
 
     def close(self) -> None:
@@ -98,7 +99,7 @@ class Crew:
     def _next(self, helper):
         """What a helper has to give; what it has to say on the way is said here."""
         while True:
-            kind, what = helper.inbox.get()
+            kind, what = helper.take()
             if kind == "done":
                 return what
             if kind == "failed":
@@ -128,7 +129,9 @@ class _Helper:
         self.process = subprocess.Popen(
             command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, process_group=0
         )
-        self.inbox: queue.Queue[tuple[str, Any]] = queue.Queue(AHEAD)
+        self._inbox: queue.Queue[tuple[str, Any]] = queue.Queue()
+        # Taken before a message is read, so that no more of them than this wait here, each as large as a frame.
+        self._room = threading.Semaphore(AHEAD)
         self.clock: dict[str, Any] = {}
         self._closed = False
         self._thread = threading.Thread(target=self._listen, args=(job,), daemon=True)
@@ -139,9 +142,16 @@ class _Helper:
         with contextlib.suppress(OSError):  # it is gone: the inbox says so
             self._send((start, measures))
 
+    def take(self) -> tuple[str, Any]:
+        """Its next message: a kind, and what it is about."""
+        found = self._inbox.get()
+        self._room.release()
+        return found
+
     def close(self) -> None:
         """End it."""
         self._closed = True
+        self._room.release()
         self.process.kill()
         self.process.wait()
         self._thread.join()
@@ -157,18 +167,15 @@ class _Helper:
     def _listen(self, job):
         try:
             self._send(job)
-            while True:
+            while self._room.acquire():
+                if self._closed:
+                    return
                 kind, what, self.clock = pickle.load(self.process.stdout)
-                self._put(kind, what)
+                self._inbox.put((kind, what))
+                del what
         except (OSError, EOFError, pickle.UnpicklingError):
             code = self.process.wait()
-            self._put("gone", f" by signal {-code}" if code < 0 else f" (exit code {code})")
-
-    def _put(self, kind, what):
-        while not self._closed:
-            with contextlib.suppress(queue.Full):
-                self.inbox.put((kind, what), timeout=0.1)
-                return
+            self._inbox.put(("gone", f" by signal {-code}" if code < 0 else f" (exit code {code})"))
 
 
 def _dealt(names, hands):

@@ -34,10 +34,10 @@ class _Outbox:
 
     def put(self, kind: str, what: Any) -> None:
         """Give a message, whole; where nobody takes it any more, end at once."""
-        text = pickle.dumps((kind, what, self.clock()), protocol=pickle.HIGHEST_PROTOCOL)
         try:
             with self._lock:
-                self.file.write(text)
+                # Straight into the pipe: a frame's arrays are not held twice.
+                pickle.dump((kind, what, self.clock()), self.file, protocol=pickle.HIGHEST_PROTOCOL)
                 self.file.flush()
         except BrokenPipeError:
             os._exit(0)
