@@ -58,7 +58,8 @@ class SoundContact(ContactConstraint):
         super().find(contacts, points, reach=reach)
         outward = vertex_normals(points, self.faces)[self.columns[self.index, 0]]
         away = np.einsum("cd,cd->c", outward, self.normal)
-        self.gap = self.gap - self.skin * np.maximum(0.0, away)
+        # Bones alone: planes of sliding neighbours that keep near would pull through them.
+        self.gap = self.gap - np.where(self.source >= 0, self.skin * np.maximum(0.0, away), 0.0)
         self._take_held(self._held_in(contacts, points), points)
         self._before = self.ridges.find(contacts, points, self._near(len(points)))
         columns, shares, normal, depth = self._before

@@ -84,9 +84,9 @@ class FaceTree:
         while True:
             pairs = np.empty((self._room, 2), dtype=np.int64)
             count = _pairs_loop(tree, sheets, pairs)
-            if count <= self._room:
+            if count <= len(pairs):
                 return pairs[:count]
-            self._room = 2 * count
+            self._room = max(self._room, 2 * count)
 
 
 def _is_closed(faces: Integers) -> bool:

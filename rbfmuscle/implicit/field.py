@@ -166,7 +166,7 @@ class RBFField:
             "normal" asks only for the derivative along the normal: 2K unknowns in place of 4K, a quarter
             of the time for nearly the same surface (see ``docs/field.md``).
         condition : float
-            Bound: a ridge keeps it, in units of the spacing (see `bounded`), in place of ``smoothing``.
+            Bound, at least 1 [1]: a ridge keeps it, in units of the spacing (see `bounded`); without ``smoothing``.
 
         Returns
         -------
@@ -175,7 +175,7 @@ class RBFField:
         Raises
         ------
         UsageError
-            For a kernel that is not smooth enough, or a normal of length zero.
+            For a kernel that is not smooth enough, a normal of length zero, or a condition below 1 or beside smoothing.
         numpy.linalg.LinAlgError
             If the system is singular.
         """
@@ -188,6 +188,10 @@ class RBFField:
             )
         if derivatives not in ("all", "normal"):
             raise UsageError(f"derivatives must be 'all' or 'normal', got {derivatives!r}")
+        if not condition >= 1.0:
+            raise UsageError(f"condition must be at least 1, got {condition}")
+        if np.isfinite(condition) and smoothing != 0.0:
+            raise UsageError("a bound of the condition sets the ridge by itself; leave smoothing out")
         basis, right, origin, scale = hermite_system(points, normals, kernel, epsilon, derivatives)
         smoothing = basis_smoothing(smoothing, basis, right)
         if np.isfinite(condition):

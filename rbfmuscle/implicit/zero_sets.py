@@ -96,9 +96,10 @@ class _Looks:
         both = math.inf
         if found.sound():
             both = math.sqrt(0.5 * (missed**2 + _back(fitted, self.points, self.distance) ** 2))
-            if self.best is not None and both >= self.best[0]:
-                return math.isfinite(both)
-            found = count_sheets(fitted, self.points, self.distance, boxes=BOXES[1:])
+            if math.isfinite(both):
+                if self.best is not None and both >= self.best[0]:
+                    return True
+                found = count_sheets(fitted, self.points, self.distance, boxes=BOXES[1:])
         if not found.sound() or not math.isfinite(both):
             self.broken.append((trial, found))
             return False

@@ -248,7 +248,8 @@ def _faults(result: FittedMesh, cut: Any, volume: float) -> float:
     """Triangles that cross others, mean edges of depth in a bone, thousandths of volume lost; 0 where it is sound."""
     deep = 0.0 if cut is None else -float(cut(result.vertices).min()) / result.spacing
     lost = abs(result.volume / volume - 1.0)
-    return result.crossing + (deep if deep > SUNKEN else 0.0) + (1e3 * lost if lost > LOST else 0.0)
+    # Asked the other way round: NaN is no sound surface.
+    return result.crossing + (0.0 if deep <= SUNKEN else deep) + (0.0 if lost <= LOST else 1e3 * lost)
 
 
 class RBFDrawing:

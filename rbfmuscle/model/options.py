@@ -10,6 +10,12 @@ from rbfmuscle.sim.scene.options import NotNegative, Share, Table
 from rbfmuscle.validation import UsageError
 
 
+def _known_bound(condition: float) -> float:
+    if 0.0 < condition < 1.0:
+        raise ValueError("condition must be at least 1, or 0 for no bound")
+    return condition
+
+
 def _known_kernel(name: str) -> str:
     try:
         get_kernel(name)
@@ -44,7 +50,7 @@ class RBFOptions(Table):
     resolution: Annotated[int, Field(ge=0, le=1000)] = 0
     kernel: Annotated[str, AfterValidator(_known_kernel)] = "cubic"
     epsilon: NotNegative = 0.0
-    condition: NotNegative = 0.0
+    condition: Annotated[NotNegative, AfterValidator(_known_bound)] = 0.0
     stretch_low: Annotated[float, Field(ge=0.01, le=1.0)] = 0.5
     stretch_high: Annotated[float, Field(ge=1.0, le=100.0)] = 2.0
     stretch_hold: Share = 0.3

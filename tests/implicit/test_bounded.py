@@ -11,6 +11,7 @@ from rbfmuscle.implicit.fit.systems import hermite_system
 from rbfmuscle.implicit.kernels.table import KERNELS
 from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import spacing, surface_miss
+from rbfmuscle.validation import UsageError
 
 
 @pytest.fixture(scope="module")
@@ -89,3 +90,14 @@ def test_polynomials_that_are_not_determined_are_refused_with_a_bound_too(plate)
     flat = plate[0] * [1.0, 0.0, 0.0]
     with pytest.raises(np.linalg.LinAlgError, match="singular fit"):
         RBFField.fit_hermite(flat, np.tile([1.0, 0.0, 0.0], (len(flat), 1)), kernel="quintic", condition=1e8)
+
+
+@pytest.mark.parametrize("condition", [0.0, 0.5, -1e10, np.nan])
+def test_a_bound_that_is_none_is_refused(plate, condition):
+    with pytest.raises(UsageError, match="condition must be at least 1"):
+        RBFField.fit_hermite(plate[0], plate[1], condition=condition)
+
+
+def test_a_bound_and_a_smoothing_exclude_each_other(plate):
+    with pytest.raises(UsageError, match="leave smoothing out"):
+        RBFField.fit_hermite(plate[0], plate[1], condition=1e10, smoothing=1e-3)

@@ -1,9 +1,9 @@
-"""Fits whose condition is bounded: unknowns in units of the spacing, and the least ridge that keeps the bound.
+"""Fits whose condition is bounded: unknowns in units of the spacing, and a ridge that keeps the bound.
 
 Values and derivatives are unknowns of different units. Cholesky's digits do not depend on the choice (van der Sluis
 1969), an estimate of the condition does: with derivatives in units of the centres' spacing, and on the weights that
-annihilate polynomials alone, `quintic` with 300 centres has 2e9 where unit-ball coordinates say 4e11. What is still
-beyond the bound gets a ridge of the largest eigenvalue over the bound, in the same units.
+annihilate polynomials alone, `quintic` with 300 centres has 2e9 where unit-ball coordinates say 4e11. Every such fit
+gets a ridge of the largest eigenvalue over the bound, in the same units: one part in so many where it was not needed.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -218,10 +219,11 @@ def _choose(row, judge, sample, kernel, ask, *, last):
     if choice.broken and kernel.hermite:  # flat kernels with a ridge have fewer sheets of their own
         left = SECONDS - row["search_time"] - (shape_search.CLOCK() - start)
         limits = Limits(seconds=max(left, 0.5), slow=0, scan=13, bound=min(SOUND, ask.condition))
-        bounded = choose_surface_epsilon(sample.points, sample.normals, limits=limits, **asked)
+        with suppress(np.linalg.LinAlgError):  # then what broke without a bound is the reason that is told
+            bounded = choose_surface_epsilon(sample.points, sample.normals, limits=limits, **asked)
+            if not bounded.broken:
+                choice, row["bound"] = bounded, limits.bound
         spent += limits.spent
-        if not bounded.broken:
-            choice, row["bound"] = bounded, limits.bound
     row["epsilon"] = choice.epsilon
     row["shape"] = float(choice.epsilon * spacing(sample.points).mean())
     row["fits"] += spent
@@ -301,10 +303,11 @@ def _bound(row, judge, sample, kernel, ask):
     plain, bound = _fit(sample, kernel, row, ask.derivatives), min(SOUND, ask.condition)
     if plain.condition <= bound:
         return False
-    with_ridge, reach = (
-        _fit(sample, kernel, row | {"bound": bound}, ask.derivatives),
-        spacing(sample.points).mean(),
-    )
+    reach = spacing(sample.points).mean()
+    try:
+        with_ridge = _fit(sample, kernel, row | {"bound": bound}, ask.derivatives)
+    except np.linalg.LinAlgError:
+        return False  # the row has its fit without
     missed = [surface_miss(field, judge.held_out, reach) for field in (plain, with_ridge)]
     if missed[1] > WITHIN * missed[0] and plain.condition <= ask.condition:
         return False

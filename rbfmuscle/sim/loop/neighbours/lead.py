@@ -24,7 +24,8 @@ class Lead:
     Attributes
     ----------
     way : dict of str to float
-        How the coordinates changed in that step [radian].
+        How the coordinates changed in that step [radian, translations in scene unit]. Where both kinds move the larger
+        numbers decide the share: a translation in millimetres, as a rule.
     parts : list of (n, 3) ndarray
         How far points were moved by settling, for each array of them; empty before the first step.
     """

@@ -113,7 +113,7 @@ class Link:
         self.found = _NOTHING
 
     def update(self) -> None:
-        """Planes from both muscles' predicted states."""
+        """Planes from where both muscles will settle, as far as their leads tell."""
         limits = self.limits
         points = self.own.points
         index, distance, normal, nearest = self._near()
@@ -128,12 +128,12 @@ class Link:
         slack = share[held] * (self.hold[index[held]] - distance[held])
         self.pull.set(index[held], slack, -normal[held], points[index[held]])
 
-    def _push_out(self, own: tuple[Any, Any, Any]) -> None:
+    def _push_out(self, met: tuple[Any, Any, Any]) -> None:
         """Planes that keep out: those of the muscle's own points, and those that fixed points of the neighbour want."""
         at, gap, normal = self._given_way()
-        index = np.concatenate([own[0], at])
+        index = np.concatenate([met[0], at])
         self.push.set(
-            index, np.concatenate([own[1], gap]), np.concatenate([own[2], normal]), self.own.points[index]
+            index, np.concatenate([met[1], gap]), np.concatenate([met[2], normal]), self.own.points[index]
         )
 
     def _given_way(self) -> Any:
