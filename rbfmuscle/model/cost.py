@@ -41,6 +41,8 @@ FIT_CALLS, EXTRACT_CALLS, ENTRY_PAIRS, BONE_VISITS, SURFACE_VISITS, SURFACE_PAIR
     1200,
     3.5,
 )
+# Contact points that ever come near a bone, of all: the leg's squat.
+NEAR_SHARE = 0.025
 # Contact points hang on so many centres: an index and a share of eight bytes each.
 HANGING_BYTES = 6 * 16
 # With an inside: calls of a sub-step, visits for a node; bytes of a contact point, and of a pair of nodes (the matrix,
@@ -73,17 +75,17 @@ def estimate_muscle(
     search = CROSSING_VISITS * points if scene.detect is not None else 0
     iteration = ITERATION_CALLS * call + visit * (SOLVE_VISITS * centres + CONTACT_VISITS * points)
     solve = options.iterations * iteration
-    held = 8.0 * centres * points + 16.0 * centres**2 + HANGING_BYTES * points
+    held = NEAR_SHARE * 8.0 * centres * points + 16.0 * centres**2 + HANGING_BYTES * points
     if options.inside:
         solve = INSIDE_CALLS * call + visit * NODE_VISITS * options.inside
-        held += DENSE_BYTES * points + PAIR_BYTES * options.inside**2 - 8.0 * centres * points
+        held += DENSE_BYTES * points + PAIR_BYTES * options.inside**2 - NEAR_SHARE * 8.0 * centres * points
     fit = FIT_CALLS * call + flop * unknowns**3 / 3.0 + pair * ENTRY_PAIRS * unknowns**2
     surface = visit * (BONE_VISITS * bones + SURFACE_VISITS * shown) + pair * SURFACE_PAIRS * shown * centres
     return MuscleCost(
         build=visit * (sampling + placing),
         step=PREDICT_CALLS * call + solve + visit * search,
         show=fit + EXTRACT_CALLS * call + surface,
-        memory=held + 24.0 * bones,
+        memory=held + 24.0 * bones / max(len(scene.muscles), 1),  # which they share
         working=16.0 * unknowns**2 + NODE_BYTES * nodes + VERTEX_BYTES * shown,
         carried=options.samples,
         shown=int(shown),
