@@ -1,5 +1,7 @@
 """A mesh muscle that is kept sound: bones' vertices before its faces, ends out of bones, nothing through itself."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import trimesh
@@ -7,9 +9,11 @@ from spindle_scene import build_scene
 
 from pbd_baseline.muscle import PBDMuscle
 from pbd_baseline.options import PBDOptions
-from pbd_baseline.sound.ridges import Ridges
+from pbd_baseline.sound.contact import SoundContact
+from pbd_baseline.sound.ridges import NOTHING, Ridges
 from pbd_baseline.sound.untangling import Untangling
 from rbfmuscle.geometry.crossing import crossing_faces
+from rbfmuscle.sim.loop.contact import HalfSpaces
 from rbfmuscle.sim.loop.simulate import FrameLoop, simulate_frames
 from rbfmuscle.sim.scene.motion import rotation_about
 from rbfmuscle.study.measure.penetration import BoneProbe, bone_depth, surface_depth
@@ -162,3 +166,24 @@ def test_an_end_that_is_driven_into_a_bone_gives_way(method):
 def test_without_the_key_nothing_of_it_is_built():
     model = PBDMuscle((scene := build_scene()).muscles[0], scene)
     assert model.sound is None and model.untangling is None
+
+
+def test_a_skin_is_kept_from_bones_and_not_from_the_planes_of_neighbours():
+    """A plane that keeps a point near looks like a bone behind it: pushed off, the point would go through it."""
+    ball = trimesh.creation.icosphere(2, 1.0)
+    vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
+    count = len(vertices)
+    found = HalfSpaces(np.array([4, 9]), np.array([0.3, 0.3]), vertices[[4, 9]], np.array([0, -1]))
+    nothing = HalfSpaces(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64))
+    contacts = SimpleNamespace(
+        half_spaces=lambda points, reach: found if len(points) == count else nothing, margin=0.0
+    )
+    contact = SoundContact(
+        np.arange(count)[:, None], np.ones((count, 1)), reach=1.0, faces=faces,
+        held=np.zeros(0, np.int64), holder=np.zeros(0, np.int64), skin=0.1,
+        ridges=SimpleNamespace(find=lambda *_: NOTHING),
+    )  # fmt: skip
+    contact._held_in = lambda *_: nothing
+    contact._near = lambda _: np.zeros(0, np.int64)
+    contact.find(contacts, vertices)
+    assert contact.gap == pytest.approx([0.2, 0.3], abs=1e-6)
