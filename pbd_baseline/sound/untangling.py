@@ -11,7 +11,7 @@ from pbd_baseline.sound.ridges import faces_of
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.geometry.crossing import FaceTree, creased_faces
-from rbfmuscle.sim.loop.tunnelling import rigid_fit
+from rbfmuscle.geometry.rigid import calmed
 
 # Rounds of smoothing, how many of them until the smoothed region grows by a ring, and sweeps in each.
 ROUNDS, GROWTH, SWEEPS = 48, 4, 4
@@ -63,12 +63,13 @@ class Untangling:
 
     def calmed(self, points: Floats, sweeps: int) -> Floats:
         """The shape at rest, moved as the muscle on the whole, and deformed as it is where that is smooth, (n, 3)."""
-        motion = rigid_fit(self.rest, points)
-        moved = self.rest @ motion[:3, :3].T + motion[:3, 3]
-        beside, rows = points - moved, np.arange(len(points))
-        for _ in range(sweeps):
-            smooth_loop(beside, rows, self.topology.ring_start, self.topology.ring, SHARE)
-        return moved + beside
+        rows = np.arange(len(points))
+
+        def smooth(beside: Floats) -> None:
+            for _ in range(sweeps):
+                smooth_loop(beside, rows, self.topology.ring_start, self.topology.ring, SHARE)
+
+        return calmed(self.rest, points, smooth)
 
     def _untangle(self, points, settle):
         faces, among = self.topology.faces, None

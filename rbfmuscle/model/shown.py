@@ -8,6 +8,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.geometry.rigid import calmed
 from rbfmuscle.implicit.extraction.material import fit_material
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
 from rbfmuscle.implicit.extraction.slivers import mend_slivers
@@ -16,7 +17,6 @@ from rbfmuscle.model.elasticity import ElasticSolver, carry_points
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.model.placement import cached_sample
 from rbfmuscle.model.rest import Rest
-from rbfmuscle.sim.loop.tunnelling import rigid_fit
 from rbfmuscle.sim.scene.objects import Muscle
 
 # Edges of the shown mesh for each thickness of a muscle, and bounds on its vertices: by themselves, and asked for.
@@ -105,11 +105,8 @@ class ShownMesh:
         sweeps : int
             Of smoothing of what the material does beside the rigid motion.
         """
-        motion = rigid_fit(self.rest, vertices)
-        moved = self.rest @ motion[:3, :3].T + motion[:3, 3]
-        beside = vertices - moved
-        self.mesh.smooth(beside, np.arange(len(moved)), sweeps)
-        return moved + beside
+        rows = np.arange(len(vertices))
+        return calmed(self.rest, vertices, lambda beside: self.mesh.smooth(beside, rows, sweeps))
 
     def stretch(self, vertices: np.ndarray) -> float:
         """Length of edges relative to rest that a tenth of them exceeds."""

@@ -41,6 +41,9 @@ class _Outbox:
                 self.file.flush()
         except BrokenPipeError:
             os._exit(0)
+        except Exception:  # noqa: BLE001 - whatever it is, the message is cut, and none can follow it: the end tells
+            traceback.print_exc()
+            os._exit(1)
 
 
 class _Forward(logging.Handler):

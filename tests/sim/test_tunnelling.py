@@ -5,9 +5,10 @@ import pytest
 import trimesh
 from toy_scene import ToyMuscle, attach, bone, box, cylinder, ellipsoid, joint, muscle, scene, sphere
 
+from rbfmuscle.geometry.rigid import rigid_fit
 from rbfmuscle.sim.loop.contact import BoneContacts
 from rbfmuscle.sim.loop.stepper import MuscleStepper
-from rbfmuscle.sim.loop.tunnelling import Crossing, find_crossings, only_grazed, rigid_fit, sweep_paths
+from rbfmuscle.sim.loop.tunnelling import Crossing, find_crossings, only_grazed, sweep_paths
 from rbfmuscle.sim.scene.motion import bone_poses, rotation_about
 from rbfmuscle.sim.scene.options import TunnellingOptions
 

@@ -17,6 +17,7 @@ import numpy as np
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.rigid import rigid_fit
 from rbfmuscle.sim.loop.near_bones import box_loop, boxes_apart
 from rbfmuscle.sim.loop.neighbours.links import Planes
 
@@ -228,18 +229,6 @@ def only_grazed(
         if exact.signed_distance(places).min() < -(1.0 - 0.5 * GRAZE_STRIDE) * tolerance:
             return False
     return True
-
-
-def rigid_fit(points: Floats, targets: Any) -> Any:
-    """Rigid (4, 4) transform that takes points nearest to targets by least squares (Kabsch 1976)."""
-    middle, aim = points.mean(axis=0), targets.mean(axis=0)
-    u, _, vt = np.linalg.svd((points - middle).T @ (targets - aim))
-    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
-    transform = np.eye(4)
-    if len(points) > 2:
-        transform[:3, :3] = vt.T @ mirror @ u.T
-    transform[:3, 3] = aim - transform[:3, :3] @ middle
-    return transform
 
 
 def _halve(field, start, end, distance, last, tolerance):
