@@ -17,6 +17,7 @@ import struct
 import tempfile
 import zipfile
 from pathlib import Path
+from threading import Lock
 from typing import IO, Any
 
 import numpy as np
@@ -33,6 +34,7 @@ SUFFIX = ".sdf.npz"
 ALIGNED, _PADDING = 64, 0xD935
 # What an archive says before the name of an entry [bytes]; the lengths of name and extra field come last.
 _HEADER = 30
+_READING = Lock()
 # What reading a damaged, foreign or half-removed archive may raise.
 _DAMAGE = (OSError, ValueError, KeyError, EOFError, IndexError, NotImplementedError, zipfile.BadZipFile)
 
@@ -88,7 +90,9 @@ def load_arrays(key: str) -> dict[str, Array] | None:
     if not path.exists():
         return None
     try:
-        arrays = _mapped(path)
+        # One thread at a time: Python 3.11 counts the depth of what it parses, as NumPy's headers, for all together.
+        with _READING:
+            arrays = _mapped(path)
         if str(arrays.pop("key")) != key:
             raise ValueError("the entry belongs to another mesh")
     except _DAMAGE as error:

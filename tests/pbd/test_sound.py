@@ -179,7 +179,7 @@ def test_a_skin_is_kept_from_bones_and_not_from_the_planes_of_neighbours():
         half_spaces=lambda points, reach: found if len(points) == count else nothing, margin=0.0
     )
     contact = SoundContact(
-        np.arange(count)[:, None], np.ones((count, 1)), reach=1.0, faces=faces,
+        np.arange(count)[:, None].repeat(3, axis=1), np.tile([1.0, 0.0, 0.0], (count, 1)), reach=1.0, faces=faces,
         held=np.zeros(0, np.int64), holder=np.zeros(0, np.int64), skin=0.1,
         ridges=SimpleNamespace(find=lambda *_: NOTHING),
     )  # fmt: skip
