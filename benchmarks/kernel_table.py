@@ -26,7 +26,7 @@ from rbfmuscle.implicit.extraction.sheets import BOXES, count_sheets
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels.table import KERNELS
-from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
+from rbfmuscle.implicit.placement.refinement import fit_sample
 from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import SPAN, spacing, surface_miss
 from rbfmuscle.study.experiment import kernel_study
@@ -35,6 +35,11 @@ from rbfmuscle.study.experiment.kernel_judge import SurfaceJudge
 from rbfmuscle.study.experiment.workers import threads_limited
 
 SCANNED, LIMIT, LOOKS = 40, 1.05, 12
+# Beyond so many unknowns an eigen-decomposition takes seconds: of the scan's unsound fits so many, the best with a
+# ridge, are then solved by one. What the ridge keeps of a condition.
+LARGE, UNSOUND, RIDGED = 1000, 3, 3e12
+# Cells of a first look at a distance, which is within some per cent of that with all cells.
+FIRST, ABOUT = 64, 1.05
 KEYS = ("surface", "centres", "placement", "kernel")
 HIP = ("gluteus_maximus", "gluteus_medius", "iliacus", "adductor_brevis")
 LEG = ("sartorius", "semimembranosus", "tibialis_anterior", "popliteus")
@@ -73,15 +78,25 @@ def brute_force(judge, sample, kernel, derivatives, own):
     Half of the square of the error both ways is that of the judge's points: fits that miss by so much more there than
     the choice errs, ``own``, cannot be better. Where the choice is unfit, the best dozen by that are looked at.
     """
-    h, scan = spacing(sample.points).mean(), []
-    for epsilon in np.geomspace(*SPAN, SCANNED) / h:
+    h = spacing(sample.points).mean()
+    fit = functools.partial(
+        RBFField.fit_surface, sample.points, sample.normals, kernel=kernel, derivatives=derivatives
+    )
+
+    def tried(epsilon, **how):
+        """Error at the judge's points, epsilon, field; infinite where there is no fit."""
         try:
-            fitted = RBFField.fit_surface(
-                sample.points, sample.normals, kernel=kernel, epsilon=epsilon, derivatives=derivatives
-            )
-            scan.append((surface_miss(fitted, judge.points[::4], h), epsilon, fitted))
+            fitted = fit(epsilon=epsilon, **how)
         except np.linalg.LinAlgError:
-            continue
+            return np.inf, epsilon, None
+        return surface_miss(fitted, judge.points[::4], h), epsilon, fitted
+
+    scan = [tried(epsilon, truncate=False) for epsilon in np.geomspace(*SPAN, SCANNED) / h]
+    unsound = [epsilon for missed, epsilon, _ in scan if not np.isfinite(missed)]
+    if kernel.hermite and 4 * len(sample.points) > LARGE:
+        unsound.sort(key=lambda epsilon: tried(epsilon, condition=RIDGED)[0])
+        unsound = unsound[:UNSOUND]
+    scan = [trial for trial in scan if np.isfinite(trial[0])] + [tried(epsilon) for epsilon in unsound]
     best = (own, np.nan)
     scan.sort(key=lambda trial: trial[0])
     for missed, epsilon, fitted in scan if np.isfinite(own) else scan[:LOOKS]:
@@ -102,13 +117,16 @@ def both_ways(judge, sample, fitted, least=np.inf):
         boxes=BOXES[:1]
     ).sound():  # what is open takes a hundred times as long to follow through a band
         return np.inf
-    try:
-        found = extract_surface(fitted, points=sample.points, resolution=judge.resolution)
-    except ValueError:
-        return np.inf
-    back = judge.distance.unsigned(found.vertices)
-    there = surface_miss(fitted, judge.points, spacing(sample.points).mean())
-    rms = float(np.sqrt(0.5 * (there**2 + (back**2).mean())))
+    there, rms = surface_miss(fitted, judge.points, spacing(sample.points).mean()), np.inf
+    for cells in (FIRST, judge.resolution):
+        try:
+            found = extract_surface(fitted, points=sample.points, resolution=cells)
+        except ValueError:
+            return np.inf
+        back = judge.distance.unsigned(found.vertices)
+        rms = float(np.sqrt(0.5 * (there**2 + (back**2).mean())))
+        if rms >= ABOUT * least:
+            return np.inf
     if rms >= least or not sheets(boxes=BOXES[1:]).sound():
         return np.inf
     row = {"kernel": fitted.kernel.name, "centres": 0, "rms": rms, "components": found.components, "note": "",
@@ -121,12 +139,17 @@ def case(judge, sample, kernel, placement):
     """One case: the choice, and the best of the scan with the same centres."""
     ask = kernel_study.Request("all", "held_out", placement, np.inf)
     start = time.process_time()
+    placed = [sample]
+
+    def place(*arguments, **settings):
+        """The centres that the choice is made for, which are those of the scan."""
+        placed.append(fit_sample(*arguments, **settings))
+        return placed[-1]
+
+    kernel_study.fit_sample = place
     row, _ = kernel_study.measure_row(judge, sample, kernel, ask, [])
-    seconds = time.process_time() - start
+    seconds, sample = time.process_time() - start, placed[-1]
     mark_unfit([row], sheets=judge.sheets)
-    if placement == FITTED and kernel.hermite:
-        # the centres that the choice was made for
-        sample = fit_sample(sample, judge.vertices, judge.faces, kernel=kernel, epsilon=row["placed"] or 1.0)
     if row["unfit"] or not kernel.has_epsilon:
         row["own"] = np.inf if row["unfit"] else row["rms"]
     else:

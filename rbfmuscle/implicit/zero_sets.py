@@ -19,7 +19,7 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.extraction.sheets import BOXES, Sheets, count_sheets
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.selection import WITHIN, EpsilonChoice, by_worth, spacing
+from rbfmuscle.implicit.selection import WITHIN, EpsilonChoice, believed, by_worth, spacing
 from rbfmuscle.implicit.shape_search import Limits
 from rbfmuscle.validation import NumericalWarning
 
@@ -32,8 +32,12 @@ ALIKE = 1.05
 LOOKS, LEAST_LOOKS = 16, 6
 # Next to one that broke, epsilons within this factor of it are passed over, at first and where all others broke too.
 APART = (1.15, 1.04)
+# An error of this share of the spacing is that of a field that is flat between its centres: whatever its sheets are,
+# it knows no surface there.
+FLAT = 0.5
 # Halvings of the way from one that did not break to a better one that did.
 HALVINGS = 4
+UNKNOWN = "the field is flat between the centres at every epsilon; take more centres or another kernel"
 OPEN = "the level set is open at every epsilon that was looked at; take more centres or another kernel"
 
 Trial = tuple[float, float, float]
@@ -64,9 +68,13 @@ class _Looks:
     points: Floats
     distance: Callable[..., Any]
     limits: Limits
+    reach: float = field(init=False)
     best: tuple[float, Trial] | None = None
     broken: list[tuple[Trial, Sheets]] = field(default_factory=list)
     count: int = 0
+
+    def __post_init__(self) -> None:
+        self.reach = spacing(self.points).mean()
 
     def left(self) -> bool:
         """Whether another may be looked at."""
@@ -77,8 +85,10 @@ class _Looks:
         return any(max(epsilon / t[0], t[0] / epsilon) < factor for t, _ in self.broken)
 
     def hopeless(self, missed: float) -> bool:
-        """Whether the distance both ways, which is at least this, cannot be less than the best."""
-        return not np.isfinite(missed) or (self.best is not None and missed >= math.sqrt(2.0) * self.best[0])
+        """Whether the field knows no surface, or its distance both ways cannot be less than the best."""
+        return not missed < FLAT * self.reach or (
+            self.best is not None and missed >= math.sqrt(2.0) * self.best[0]
+        )
 
     def look(self, trial: Trial) -> bool:
         """Whether this one is sound; the best is kept."""
@@ -143,6 +153,7 @@ def look_at_zero_sets(
     if looks.best is None:
         return replace(choice, broken=_why(looks))
     _halve(looks, looks.best[1])
+    _doubt_relaxed(looks, trials)
     both, (epsilon, _, condition) = looks.best
     return replace(choice, epsilon=epsilon, objective=both, condition=condition)
 
@@ -175,6 +186,18 @@ def _halve(looks: _Looks, best: Trial) -> None:
                 broken = math.sqrt(sound * broken)
 
 
+def _doubt_relaxed(looks: _Looks, trials: list[Trial]) -> None:
+    """Take the least error instead of a better condition where both ways the latter costs more than it may."""
+    kept = looks.best
+    assert kept is not None
+    least = trials[int(np.argmin(believed(np.array(trials), looks.limits.doubt)))]
+    if least[1] >= kept[1][1] or looks.near_broken(least[0], APART[-1]) or not looks.left():
+        return
+    looks.look(least)
+    if looks.best is not None and WITHIN * looks.best[0] >= kept[0]:
+        looks.best = kept
+
+
 def _trial(looks: _Looks, epsilon: float) -> Trial | None:
     """Another epsilon's error and condition, None where its fit fails."""
     with warnings.catch_warnings():
@@ -188,7 +211,9 @@ def _trial(looks: _Looks, epsilon: float) -> Trial | None:
 
 
 def _why(looks: _Looks) -> str:
-    """Why none is sound: open where all are, else the sheets of the best."""
+    """Why none is sound: flat or open where all are, else the sheets of the best."""
+    if not looks.broken:
+        return UNKNOWN
     sheets = [found.number for _, found in looks.broken if found.number > 1]
     return f"{sheets[0]} sheets at every epsilon that was looked at" if sheets else OPEN
 
