@@ -28,6 +28,8 @@ from rbfmuscle.validation import NumericalWarning
 CELLS, RANGE = 3.0, (48, 160)
 # A zero set this much further from the mesh than the mesh from it has sheets that the mesh has not.
 ALIKE = 1.05
+# One that much further is no better company than one that broke.
+STRAYED = 1.5
 # Zero sets that are looked at; so many of them whatever the time.
 LOOKS, LEAST_LOOKS = 16, 6
 # Next to one that broke, epsilons within this factor of it are passed over, at first and where all others broke too.
@@ -107,6 +109,8 @@ class _Looks:
         if found.sound():
             both = math.sqrt(0.5 * (missed**2 + _back(fitted, self.points, self.distance) ** 2))
             if math.isfinite(both):
+                if both > STRAYED * missed:
+                    self.broken.append((trial, found))
                 if self.best is not None and both >= self.best[0]:
                     return True
                 found = count_sheets(fitted, self.points, self.distance, boxes=BOXES[1:])
@@ -115,6 +119,11 @@ class _Looks:
             return False
         self.best = both, trial
         return True
+
+    def improves(self, trial: Trial) -> bool:
+        """Look at this one: whether it is the best now."""
+        before = self.best
+        return self.look(trial) and self.best is not before
 
 
 def look_at_zero_sets(
@@ -180,7 +189,7 @@ def _halve(looks: _Looks, best: Trial) -> None:
             if not looks.left():
                 return
             trial = _trial(looks, math.sqrt(sound * broken))
-            if trial is not None and trial[2] <= looks.limits.condition and looks.look(trial):
+            if trial is not None and trial[2] <= looks.limits.condition and looks.improves(trial):
                 sound = trial[0]
             else:
                 broken = math.sqrt(sound * broken)
