@@ -26,12 +26,11 @@ from rbfmuscle.implicit.extraction.sheets import BOXES, count_sheets
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels.table import KERNELS
-from rbfmuscle.implicit.placement.refinement import fit_sample
 from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import SPAN, spacing, surface_miss
-from rbfmuscle.study.experiment import kernel_study
 from rbfmuscle.study.experiment.kernel_choice import mark_unfit
 from rbfmuscle.study.experiment.kernel_judge import SurfaceJudge
+from rbfmuscle.study.experiment.kernel_row import Request, measure_row
 from rbfmuscle.study.experiment.workers import threads_limited
 
 SCANNED, LIMIT, LOOKS = 40, 1.05, 12
@@ -137,18 +136,10 @@ def both_ways(judge, sample, fitted, least=np.inf):
 
 def case(judge, sample, kernel, placement):
     """One case: the choice, and the best of the scan with the same centres."""
-    ask = kernel_study.Request("all", "held_out", placement, np.inf)
+    ask = Request("all", "held_out", placement, np.inf)
     start = time.process_time()
-    placed = [sample]
-
-    def place(*arguments, **settings):
-        """The centres that the choice is made for, which are those of the scan."""
-        placed.append(fit_sample(*arguments, **settings))
-        return placed[-1]
-
-    kernel_study.fit_sample = place
-    row, _ = kernel_study.measure_row(judge, sample, kernel, ask, [])
-    seconds, sample = time.process_time() - start, placed[-1]
+    found = measure_row(judge, sample, kernel, ask)
+    row, sample, seconds = found.row, found.sample, time.process_time() - start
     mark_unfit([row], sheets=judge.sheets)
     if row["unfit"] or not kernel.has_epsilon:
         row["own"] = np.inf if row["unfit"] else row["rms"]
@@ -225,7 +216,6 @@ def main():
     parser.add_argument("--minutes", type=float, default=np.inf, help="begin no case after so many")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    kernel_study.REPEATS, kernel_study.TIMED = 1, 256  # times are not asked for
     shape_search.CLOCK = time.process_time  # a search is bounded as on cores of its own
     logged = []
     if options.log and options.log.exists():

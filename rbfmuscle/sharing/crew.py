@@ -11,7 +11,6 @@ import contextlib
 import logging
 import pickle
 import queue
-import subprocess
 import threading
 import warnings
 from collections.abc import Iterator, Mapping
@@ -20,7 +19,7 @@ from typing import Any
 
 import numba
 
-from rbfmuscle.compiled.child import child_call
+from rbfmuscle.compiled.child import start_child
 from rbfmuscle.compiled.watch import tell_stage
 from rbfmuscle.sharing.share import Solved
 from rbfmuscle.sim.scene.scene import Scene
@@ -122,13 +121,7 @@ class _Helper:
     """One process, seen from here: its messages are taken by a thread, so that it need not wait for ours."""
 
     def __init__(self, job: Any, threads: int) -> None:
-        command, environment = child_call("rbfmuscle.sharing.helper")
-        counts = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-        environment |= dict.fromkeys(counts, str(threads))
-        # A group of its own: an interrupt is for this process, which ends the helper.
-        self.process = subprocess.Popen(
-            command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, process_group=0
-        )
+        self.process = start_child("rbfmuscle.sharing.helper", threads)
         self._inbox: queue.Queue[tuple[str, Any]] = queue.Queue()
         # Taken before a message is read, so that no more of them than this wait here, each as large as a frame.
         self._room = threading.Semaphore(AHEAD)

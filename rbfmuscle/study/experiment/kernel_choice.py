@@ -23,8 +23,8 @@ VOLUME_BOUND = 0.1
 COARSEST, TIMES_MEDIAN = "linear", 3.0
 # Rows beyond this condition are taken only where none of the tie is below it.
 SOUND = 1e10
-# Quicker by less than this share is no reason to prefer a row.
-QUICKER = 0.1
+# Quicker by less than this share is no reason to prefer a row; times of one are apart by a few per cent.
+QUICKER = 0.15
 
 
 class Bootstrap:
@@ -99,7 +99,7 @@ def _why_unfit(row, sheets):
 
 
 def cost(row: dict[str, Any]) -> float:
-    """What a frame pays for a row's field [s]: a fit and the values at a band of 20,000 points."""
+    """What a frame pays for a row's field: a fit and the values at 20,000 points [s of processor time]."""
     return float(row["fit_time"] + row["evaluation_time"])
 
 
@@ -138,7 +138,8 @@ def recommend(rows: list[dict[str, Any]]) -> Recommendation | None:
     if not good:
         return None
     best = good[0]
-    tie = sorted((row for row in good if row["low"] <= best["high"]), key=_preference(good))
+    tie = [row for row in good if row["low"] <= best["high"]]
+    tie.sort(key=_preference(tie))
     row = tie[0]
     quick = min((r for r in good if r["rms"] <= 2.0 * best["rms"]), key=cost)
     return Recommendation(
@@ -150,9 +151,9 @@ def recommend(rows: list[dict[str, Any]]) -> Recommendation | None:
     )
 
 
-def _preference(good):
-    """Order within a tie: sound conditions first, time in steps of a tenth, no parameter to choose, the condition."""
-    least = min(cost(row) for row in good)
+def _preference(tie):
+    """Order within a tie: sound conditions first, time in steps, no parameter to choose, the condition."""
+    least = min(cost(row) for row in tie)
 
     def key(row):
         steps = int(np.log(cost(row) / least) / np.log1p(QUICKER))
@@ -171,11 +172,13 @@ def _reason(row, best, tie):
     if len(tie) == 1:
         return f"{place}, no other is as accurate"
     others = f"one of {len(tie)} that cannot be told apart from the best, {best['rms']:.3g}"
-    slow = max(tie, key=cost)
+    slow, quick = max(tie, key=cost), min(tie, key=cost)
     parts = [f"{place}, {others}"]
     if cost(slow) > 1.5 * cost(row):
         parts.append(f"and up to {cost(slow) / cost(row):.1f} times as quick as they are")
-    if row["condition"] <= SOUND < min(tie, key=cost)["condition"]:
+    elif quick is not row and cost(row) <= (1.0 + QUICKER) * cost(quick):
+        parts.append("as quick as the quickest of them to a few per cent")
+    if row["condition"] <= SOUND < quick["condition"]:
         parts.append(f"of a condition of at most {SOUND:.0e}".replace("e+", "e"))
     if not row["epsilon"]:
         parts.append("without a shape parameter to choose")

@@ -22,7 +22,8 @@ from rbfmuscle.implicit.placement.refinement import FITTED
 from rbfmuscle.implicit.placement.sampling import PLACEMENTS, sample_surface
 from rbfmuscle.study.experiment.kernel_choice import mark_unfit
 from rbfmuscle.study.experiment.kernel_judge import SurfaceJudge
-from rbfmuscle.study.experiment.kernel_study import KernelStudy, Request, measure_row
+from rbfmuscle.study.experiment.kernel_row import Request, measure_row, time_row
+from rbfmuscle.study.experiment.kernel_study import KernelStudy
 from rbfmuscle.validation import UsageError, check_mesh
 
 # Kernels that take part by default, the quickest first.
@@ -169,7 +170,7 @@ class Search:
         if key not in self.rows:
             if count not in self.samples:
                 self.samples[count] = sample_surface(*self.surface, count, placement=self.base)
-            row, _ = measure_row(self.judge, self.samples[count], kernel, self.ask, [])
+            row = measure_row(self.judge, self.samples[count], kernel, self.ask).row
             mark_unfit([row], sheets=self.judge.sheets)
             self.rows[key] = row
             self.tried.append({"kernel": kernel.name, "centres": count, "error": self._error(row)})
@@ -239,9 +240,11 @@ class Search:
         other = SurfaceJudge(*self.surface, self.cells, CONFIRMING)
         while self.best is not None:
             kernel, count = self.best
-            row, _ = measure_row(self.judge, self.samples[count], kernel, self.ask, [], confirm=other)
+            found = measure_row(self.judge, self.samples[count], kernel, self.ask, confirm=other)
+            row = found.row
             mark_unfit([row], sheets=self.judge.sheets)
             if self._error(row) <= self.error:
+                time_row(row, found.sample, self.ask.derivatives, self.judge.points)
                 return WantedError(True, row, self._error(row), self.error, self.greatest, self.tried)
             self.best, more = None, math.ceil(count * (1.0 + STEP))
             while more <= self.most and self.measure(kernel, more) > self.error:

@@ -24,7 +24,7 @@ def draw_times(study: KernelStudy, figure: Figure) -> None:
     best = _draw_rows(axes, good, cost, "front_time")
     _plain_ticks(axes.xaxis, axes.yaxis)
     _name_beside(axes, best)
-    axes.set_xlabel("fit and 20,000 values [ms]")
+    axes.set_xlabel("fit and 20,000 values [ms of one thread]")
     if good:
         axes.legend(fontsize=9, loc="upper right")
 
