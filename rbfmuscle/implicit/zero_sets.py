@@ -30,6 +30,8 @@ CELLS, RANGE = 3.0, (48, 160)
 ALIKE = 1.05
 # One that much further is no better company than one that broke.
 STRAYED = 1.5
+# A better condition may cost that much both ways, where it costs no more than 2 % to first order.
+RELAXED = 1.04
 # Zero sets that are looked at; so many of them whatever the time.
 LOOKS, LEAST_LOOKS = 16, 6
 # Next to one that broke, epsilons within this factor of it are passed over, at first and where all others broke too.
@@ -196,15 +198,26 @@ def _halve(looks: _Looks, best: Trial) -> None:
 
 
 def _doubt_relaxed(looks: _Looks, trials: list[Trial]) -> None:
-    """Take the least error instead of a better condition where both ways the latter costs more than it may."""
+    """Where a better condition costs more both ways than to first order, as much of it as 2 % of the least allow."""
     kept = looks.best
     assert kept is not None
     least = trials[int(np.argmin(believed(np.array(trials), looks.limits.doubt)))]
     if least[1] >= kept[1][1] or looks.near_broken(least[0], APART[-1]) or not looks.left():
         return
-    looks.look(least)
-    if looks.best is not None and WITHIN * looks.best[0] >= kept[0]:
+    if not looks.improves(least) or looks.best is None or RELAXED * looks.best[0] >= kept[0]:
         looks.best = kept
+        return
+    limit, good, bad = WITHIN * looks.best[0], looks.best, kept[1][0]
+    for _ in range(HALVINGS):
+        trial = _trial(looks, math.sqrt(good[1][0] * bad)) if looks.left() else None
+        if trial is None:
+            break
+        looks.best = None  # whether it is the least of all is not asked
+        if looks.look(trial) and looks.best is not None and looks.best[0] <= limit:
+            good = looks.best
+        else:
+            bad = trial[0]
+    looks.best = good
 
 
 def _trial(looks: _Looks, epsilon: float) -> Trial | None:

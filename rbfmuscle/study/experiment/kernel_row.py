@@ -252,7 +252,12 @@ def _fill_row(
         if seen.is_open and seen.number <= sheets:
             raise ValueError("the level set is open: it leaves the box of the muscle; take more centres")
         sheets = seen.number
-    found = extract_surface(fitted, points=sample.points, resolution=judge.resolution)
+    try:
+        found = extract_surface(fitted, points=sample.points, resolution=judge.resolution)
+    except ValueError as error:
+        if sheets > judge.sheets:
+            raise ValueError(f"{sheets} sheets where the mesh has {judge.sheets}") from error
+        raise
     if found.components > sheets:  # these cells alone show them: sheets of its own, or pieces of a thin rim
         seen = count_sheets(
             fitted, sample.points, judge.distance.unsigned, boxes=(FINER,), wanted=judge.sheets
