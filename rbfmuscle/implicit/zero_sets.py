@@ -208,7 +208,7 @@ def _doubt_relaxed(looks: _Looks, trials: list[Trial]) -> None:
         looks.best = kept
         return
     limit, good, bad = WITHIN * looks.best[0], looks.best, kept[1][0]
-    for _ in range(HALVINGS):
+    for _ in range(HALVINGS // 2):
         trial = _trial(looks, math.sqrt(good[1][0] * bad)) if looks.left() else None
         if trial is None:
             break
