@@ -64,8 +64,16 @@ def test_no_parameter_then_the_condition_decide_between_equally_quick_rows():
     assert [r["kernel"] for r in recommend(rows).tie] == ["cubic", "matern_52", "quintic"]
 
 
+def test_times_a_few_per_cent_apart_are_alike():
+    rows = [row("matern_52", 0.14, 2.0, epsilon=0.2, condition=1e5), row("quintic", 0.14, 2.2, condition=1e8)]
+    found = recommend(rows)
+    assert found.row["kernel"] == "quintic" and "as quick as the quickest" in found.reason
+    rows[1]["fit_time"] = 2.4e-3
+    assert recommend(rows).row["kernel"] == "matern_52"
+
+
 def test_a_row_that_is_really_better_is_no_tie():
-    found = recommend([row("quintic", 0.10, 20.0), row("cubic", 0.15, 2.0)])
+    found = recommend([row("quintic", 0.10, 20.0), row("cubic", 0.14, 2.0), row("linear", 0.19, 1.0)])
     assert (
         found.row["kernel"] == "quintic"
         and found.quickest["kernel"] == "cubic"

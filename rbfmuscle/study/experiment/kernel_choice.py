@@ -25,6 +25,8 @@ COARSEST, TIMES_MEDIAN = "linear", 3.0
 SOUND = 1e10
 # Quicker by less than this share is no reason to prefer a row; times of one are apart by a few per cent.
 QUICKER = 0.15
+# What a row for speed may err, in units of the least error.
+COARSER = 1.5
 
 
 class Bootstrap:
@@ -116,7 +118,7 @@ class Recommendation:
     tie : list of dict
         Rows whose intervals reach the best one's, the cheapest first.
     quickest, most_accurate : dict or None
-        Where another row is quicker at up to twice the error, or nominally more accurate.
+        Where another row is quicker at up to half more error, or nominally more accurate.
     """
 
     row: dict[str, Any]
@@ -141,7 +143,7 @@ def recommend(rows: list[dict[str, Any]]) -> Recommendation | None:
     tie = [row for row in good if row["low"] <= best["high"]]
     tie.sort(key=_preference(tie))
     row = tie[0]
-    quick = min((r for r in good if r["rms"] <= 2.0 * best["rms"]), key=cost)
+    quick = min((r for r in good if r["rms"] <= COARSER * best["rms"]), key=cost)
     return Recommendation(
         row,
         _reason(row, best, tie),

@@ -55,7 +55,7 @@ td{{white-space:nowrap}} td.text{{min-width:19em;white-space:normal}}
 <p class="sub">Each kernel with as many centres, its shape parameter chosen by the error at other points of the mesh</p>
 <p>Recommended: <b>{best}</b>: {reason}.{others} Distances{units} are measured both ways between the mesh and the
 extracted surface, with the interval that holds nine of ten other sets of points; rows whose intervals reach the
-best one's are a tie, in which time decides, that of one thread's processor;
+best one's are a tie, in which processor time decides;
 normals by the field's gradient; the mesh in the last but one column was decimated to as many stored numbers. Kernels in
 bold are on the front of error against time. A volume error is that of the level zero; a muscle's level is moved until
 its volume is right.</p>
