@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.partition import PartitionField
 from rbfmuscle.implicit.placement.off_surface import off_surface_points
+from rbfmuscle.study.measure.mesh_distance import MeshDistance
 
 MAJOR, MINOR, BUMP, WAVES = 60.0, 20.0, 2.0, 9
 # Of the spacing that as many points have on a torus.
@@ -67,6 +68,7 @@ def main():
     parser.add_argument("--resolution", type=int, default=256)
     parser.add_argument("--dense", type=int, default=0)
     parser.add_argument("--scipy", type=int, default=0)
+    parser.add_argument("--poisson", action="store_true", help="needs pymeshlab")
     options = parser.parse_args()
     PartitionField.fit_hermite(*torus(200, 5)).surface(resolution=16)  # compiles
     unseen, _ = torus(20_000, 1)
@@ -81,10 +83,39 @@ def main():
           f"{len(mesh.vertices)} vertices, Euler {mesh.euler_number}, closed {mesh.is_watertight}, "
           f"memory {memory():.2f} GB",
           flush=True)  # fmt: skip
+    if options.poisson:
+        apart = distance_of(mesh.vertices, mesh.faces, unseen)
+        print(f"  unseen points from that surface, its chords included: {apart}", flush=True)
+        compare_poisson(points, normals, unseen)
     if options.scipy:
         compare_scipy(points, normals, unseen[: options.scipy])
     if options.dense:
         compare_dense(options.dense, unseen)
+
+
+def distance_of(vertices, faces, points):
+    """Root mean square and greatest distance of points from a surface."""
+    surface = np.ascontiguousarray(vertices, float), np.ascontiguousarray(faces, np.int64)
+    distance = MeshDistance(*surface, closed=False).unsigned(points)
+    return float(np.sqrt((distance**2).mean())), float(distance.max())
+
+
+def compare_poisson(points, normals, unseen):
+    """Screened Poisson surfaces (Kazhdan and Hoppe 2013) as MeshLab makes them, 2^8 and 2^9 cells."""
+    import pymeshlab
+
+    meshes = pymeshlab.MeshSet()
+    meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=points, v_normals_matrix=normals))
+    for depth in (8, 9):
+        meshes.set_current_mesh(0)
+        _, cpu, _ = timed(
+            lambda d=depth: meshes.generate_surface_reconstruction_screened_poisson(depth=d, threads=1)
+        )
+        made = meshes.current_mesh()
+        apart = distance_of(made.vertex_matrix(), made.face_matrix(), unseen)
+        print(
+            f"screened Poisson, depth {depth}: {cpu:.1f} s, {made.vertex_number()} vertices, unseen points {apart}"
+        )
 
 
 def compare_scipy(points, normals, unseen):

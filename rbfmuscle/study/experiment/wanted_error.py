@@ -1,7 +1,7 @@
 """The fewest centres that meet a surface to a wanted error, with the kernel and the setting.
 
 The error falls with the number of centres, by a power, but for some per cent of chance: a bisection of the power law
-brackets the number, and numbers a little below are tried until two fail and the law promises no more. Kernels take
+brackets the number, and numbers a little below are tried until sixteen fail and the law promises no more. Kernels take
 part while they may need fewer centres than the best so far. The row is confirmed at points that chose nothing.
 """
 
@@ -29,9 +29,11 @@ from rbfmuscle.validation import UsageError, check_mesh
 # Kernels that take part by default, the quickest first.
 CANDIDATES = ("cubic", "quintic", "skala_cervenka", "matern_52")
 FEWEST = 20
-# Numbers of centres closer than this share are alike; of those below the first that serves, so many may fail. On long,
-# thin muscles a field in two pieces may stand between numbers that serve.
-STEP, FAILURES = 0.04, 2
+# Numbers of centres closer than this share are alike to the law.
+STEP = 0.04
+# A field in two pieces may stand between numbers that serve, more so on long, thin muscles: below the last that serves
+# numbers are tried in steps of this share, until so many fail and the law promises no more.
+DOWN, FAILURES = 0.01, 16
 # Power of the number of centres by which the error falls, before two numbers tell.
 POWER = 1.4
 # What a cell's chord may take of the wanted error, and the cells that follow.
@@ -204,7 +206,7 @@ class Search:
         failed = 0
         while high > FEWEST:
             promised = high * (self._error(self.rows[kernel.name, high]) / self.error) ** (1.0 / POWER)
-            lower = max(int((1.0 - STEP) ** (failed + 1) * high), FEWEST)
+            lower = max(min(int((1.0 - DOWN) ** (failed + 1) * high), high - failed - 1), FEWEST)
             if failed >= FAILURES and lower < promised:
                 return
             if self.measure(kernel, lower) <= self.error:
