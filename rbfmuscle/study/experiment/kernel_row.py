@@ -246,6 +246,20 @@ def _fill_row(
     cosine = np.einsum("ij,ij->i", gradient, judge.normals[::5])
     cosine /= np.maximum(np.linalg.norm(gradient, axis=1), np.finfo(float).tiny)
     row["normal_error"] = float(np.degrees(np.sqrt((np.arccos(np.clip(cosine, -1.0, 1.0)) ** 2).mean())))
+    found, sheets = _surface_and_sheets(fitted, judge, sample, looked)
+    row["components"], row["spurious"] = sheets, max(sheets - judge.sheets, 0)
+    row["volume_error"] = found.volume / judge.volume - 1.0
+    row["rms"], row["hausdorff"], error, (row["low"], row["high"]) = judge.apart(found.vertices, found.faces)
+    row["worst"] = judge.worst(found, sample.points)
+    # a field of slope one by the mesh's own normals: outside is where the nearest triangle looks
+    error = np.copysign(error, judge.distance.signed(found.vertices))
+    if row["spurious"]:
+        row["note"] = f"{row['spurious']} spurious sheets; {row['note']}".rstrip("; ")
+    return found.vertices, found.faces, error
+
+
+def _surface_and_sheets(fitted, judge, sample, looked):
+    """The extracted surface, and how many sheets the field has."""
     sheets = judge.sheets
     if not looked:
         seen = count_sheets(fitted, sample.points, judge.distance.unsigned, wanted=sheets)
@@ -263,15 +277,7 @@ def _fill_row(
             fitted, sample.points, judge.distance.unsigned, boxes=(FINER,), wanted=judge.sheets
         )
         sheets = max(sheets, seen.number)
-    row["components"], row["spurious"] = sheets, max(sheets - judge.sheets, 0)
-    row["volume_error"] = found.volume / judge.volume - 1.0
-    row["rms"], row["hausdorff"], error, (row["low"], row["high"]) = judge.apart(found.vertices, found.faces)
-    row["worst"] = judge.worst(found, sample.points)
-    # a field of slope one by the mesh's own normals: outside is where the nearest triangle looks
-    error = np.copysign(error, judge.distance.signed(found.vertices))
-    if row["spurious"]:
-        row["note"] = f"{row['spurious']} spurious sheets; {row['note']}".rstrip("; ")
-    return found.vertices, found.faces, error
+    return found, sheets
 
 
 def _stored(kernel, derivatives, count):
