@@ -17,6 +17,8 @@ from rbfmuscle.implicit.extraction.surface import _label_sheets_loop
 BOXES, FINER = (40, 64), 160
 # Of the longest side: what the box holds on every side of the points, whatever its cells.
 MARGIN = 0.075
+# Finer cells on every side of what coarser ones crossed: as far as a straight line in one of these is off.
+AROUND = 2
 
 
 class Sheets(NamedTuple):
@@ -72,17 +74,27 @@ def count_sheets(
     for cells in boxes:
         found, vertices, spacing = _look(field, points, cells)
         if found.number > wanted and np.abs(np.asarray(distance(vertices))).max() < spacing:
-            found = _look(field, points, FINER)[0]
+            found = _look(field, points, FINER, near=vertices)[0]
         if not found.sound(wanted):
             break
     return found
 
 
-def _look(field: Field, points: Floats, cells: int) -> tuple[Sheets, Floats, float]:
-    """Sheets of one box, the vertices of their cells' crossings, and the edge of a cell."""
+def _look(
+    field: Field, points: Floats, cells: int, *, near: Floats | None = None
+) -> tuple[Sheets, Floats, float]:
+    """Sheets of one box, the vertices of their cells' crossings, and the edge of a cell.
+
+    Of those near some points alone where these are given, which takes a fifth of the time with many cells.
+    """
     grid = BandGrid.around(points, resolution=cells, padding=round(MARGIN * cells))
     band = Band(grid, field)
-    band.visit_all()
+    if near is None:
+        band.visit_all()
+    else:
+        band.seed(np.vstack([points, near]))
+        for _ in range(AROUND):
+            band.widen()
     band.grow(0.0)
     if not band.crosses(0.0):
         return Sheets(0, False, cells), np.zeros((0, 3)), grid.spacing
