@@ -110,7 +110,16 @@ def commands(home: Path) -> dict[str, Command]:
             kept_models,
         ),
         "kernels": Command(
-            lambda out: ["kernels", mesh, "-o", str(out), "--kernels", "cubic,quintic", "--centres", "150"],
+            lambda out: [
+                "kernels",
+                mesh,
+                "-o",
+                str(out),
+                "--kernels",
+                "cubic,quintic,linear",
+                "--centres",
+                "150,200",
+            ],
             kept_study,
         ),
         "new": Command(

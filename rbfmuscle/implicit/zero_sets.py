@@ -61,10 +61,14 @@ class _Looks:
         Centres.
     distance : callable
     limits : Limits
+    reach : float
+        Mean distance of the centres to the nearest other.
     best : tuple or None
         Distance both ways and trial of the best that is sound.
     broken : list
-        Trials that broke, with their number of sheets.
+        Trials that broke, with their number of sheets, and those that are sound but stray far from the surface.
+    count : int
+        How many were looked at.
     """
 
     field_of: Callable[[float], RBFField]
@@ -208,12 +212,15 @@ def _doubt_relaxed(looks: _Looks, trials: list[Trial]) -> None:
         looks.best = kept
         return
     limit, good, bad = WITHIN * looks.best[0], looks.best, kept[1][0]
+    if kept[1][2] >= good[1][2]:
+        return
     for _ in range(HALVINGS // 2):
         trial = _trial(looks, math.sqrt(good[1][0] * bad)) if looks.left() else None
         if trial is None:
             break
         looks.best = None  # whether it is the least of all is not asked
-        if looks.look(trial) and looks.best is not None and looks.best[0] <= limit:
+        allowed = trial[2] <= looks.limits.condition
+        if allowed and looks.look(trial) and looks.best is not None and looks.best[0] <= limit:
             good = looks.best
         else:
             bad = trial[0]

@@ -1,8 +1,7 @@
 """A run's muscles on several processes: a share of them in each, put together frame by frame.
 
 Two threads of one interpreter hand its lock to and fro and get 1.2 to 1.35 times as much done as one, two processes 1.7
-times (docs/speed.md). They are started by command, not forked or spawned by Python's own means, so
-that a script needs no guard of its main part and no thread is cut in two.
+times (docs/speed.md).
 """
 
 from __future__ import annotations
@@ -19,11 +18,10 @@ from typing import Any
 
 import numba
 
-from rbfmuscle.compiled.child import start_child
+from rbfmuscle.compiled.child import gone, how_it_ended, send, start_child
 from rbfmuscle.compiled.watch import tell_stage
 from rbfmuscle.sharing.share import Solved
 from rbfmuscle.sim.scene.scene import Scene
-from rbfmuscle.validation import SolveError
 
 # Frames that a helper may be ahead of what is written: memory is bounded, and nobody waits for the disk.
 AHEAD = 1
@@ -104,10 +102,7 @@ class Crew:
             if kind == "failed":
                 raise what
             if kind == "gone":
-                raise SolveError(
-                    f"a helper process was ended{what}; memory may have run out: with NUMBA_NUM_THREADS=1 set, one "
-                    "process does it all"
-                )
+                raise gone(what)
             if str(what) in self._told:
                 continue
             self._told.add(str(what))
@@ -154,8 +149,7 @@ class _Helper:
                     pipe.close()
 
     def _send(self, what):
-        pickle.dump(what, self.process.stdin, protocol=pickle.HIGHEST_PROTOCOL)
-        self.process.stdin.flush()
+        send(self.process.stdin, what)
 
     def _listen(self, job):
         try:
@@ -167,8 +161,7 @@ class _Helper:
                 self._inbox.put((kind, what))
                 del what
         except (OSError, EOFError, pickle.UnpicklingError):
-            code = self.process.wait()
-            self._inbox.put(("gone", f" by signal {-code}" if code < 0 else f" (exit code {code})"))
+            self._inbox.put(("gone", how_it_ended(self.process)))
 
 
 def _dealt(names, hands):

@@ -201,3 +201,40 @@ def test_what_is_open_in_the_box_broke_and_is_no_error(looked):
     assert found.broken == OPEN
     one = looked(tried, lambda epsilon: shape(everywhere if epsilon < 2.5 else ball))
     assert not one.broken and one.epsilon > 2.4
+
+
+def test_a_better_condition_that_costs_too_much_both_ways_is_given_back_but_for_a_part(looked):
+    """To first order all are alike; both ways the error grows with epsilon, as of balls that are larger and larger."""
+    epsilons = np.array([0.1, 0.2, 0.4, 0.8])
+    tried = np.c_[epsilons, 0.1 * np.array([1.0, 1.005, 1.01, 1.015]), 1e6 / epsilons]
+
+    def grown(epsilon):
+        made = shape(lambda at: ball(at, 0.0, 10.05 + 0.06 * ((epsilon - 0.1) / 0.7) ** 2), 0.1)
+        made.condition = 1e6 / epsilon
+        return made
+
+    found = looked(tried, grown)
+    least = looked(tried[:1], grown)
+    assert 0.2 < found.epsilon < 0.4  # not the best-conditioned, 0.8, and not the least error alone
+    assert found.objective <= 1.02 * least.objective and found.condition < 1e7
+    alike = looked(tried, lambda epsilon: shape(ball))
+    assert alike.epsilon == 0.8  # where it costs nothing, the best-conditioned
+
+
+def test_a_sheet_far_from_its_surface_keeps_looks_away(looked):
+    """Closed and one, but 0.6 away where the points say 0.1: the next look is not beside it."""
+    asked = []
+
+    def fit(epsilon):
+        asked.append(epsilon)
+        return shape(ball if epsilon > 1.5 else lambda at: ball(at, 0.0, 10.6), 0.1)
+
+    epsilons = np.r_[np.geomspace(1.0, 1.1, 6), 2.0]
+    found = looked(np.c_[epsilons, np.linspace(0.1, 0.12, 7), np.full(7, 1e6)], fit)
+    assert found.epsilon > 1.5 and len([e for e in asked if e < 1.14]) == 1
+
+
+def test_a_field_flat_between_its_centres_is_never_looked_at(looked):
+    tried = np.array([[1.0, 4.0, 1e3], [2.0, 5.0, 1e3]])  # the centres are 5 apart
+    found = looked(tried, lambda epsilon: pytest.fail("looked at"))
+    assert found.broken.startswith("the field is flat between the centres")

@@ -256,13 +256,13 @@ def test_muscles_are_dealt_whole():
 def test_a_message_that_is_cut_is_the_last_one():
     """What follows it would be read as its rest: the process ends, and its end tells."""
     said = """
-from rbfmuscle.sharing.helper import _Outbox
-box = _Outbox()
+from rbfmuscle.compiled.child import Outbox
+box = Outbox()
 try:
-    box.put("done", ["first", lambda: 0])
+    box.put(("done", ["first", lambda: 0]))
 except Exception:
     pass
-box.put("failed", "next")
+box.put(("failed", "next"))
 """
     done = subprocess.run([sys.executable, "-c", said], capture_output=True, check=False)
     assert done.returncode == 1 and b"pickle" in done.stderr and b"next" not in done.stdout

@@ -1,4 +1,4 @@
-"""Calls that are spread over processes."""
+"""Calls that are made in several processes."""
 
 import operator
 import os
@@ -9,53 +9,72 @@ import pytest
 import trimesh
 
 import rbfmuscle as rm
-from rbfmuscle.study.experiment import kernel_study, workers
+from rbfmuscle.compiled import child
+from rbfmuscle.study.experiment import kernel_study
 from rbfmuscle.validation import SolveError
 
 
 @pytest.fixture
 def children(monkeypatch):
     """The processes that a test starts."""
-    started, start = [], workers.start_child
+    started, start = [], child.start_child
 
     def noted(*arguments):
         started.append(start(*arguments))
         return started[-1]
 
-    monkeypatch.setattr(workers, "start_child", noted)
+    monkeypatch.setattr(child, "start_child", noted)
     return started
 
 
 def test_results_come_in_the_order_of_the_calls(children):
-    calls = [(2, power) for power in range(9)]
-    assert list(workers.side_by_side(pow, calls, 2)) == [2**power for power in range(9)]
-    assert len(children) == 2 and all(child.poll() is not None for child in children)
+    calls = [(range(10**7),), *((range(number),) for number in range(9))]  # the first is the slowest
+    assert list(child.calls_apart(sum, calls, 2)) == [sum(*call) for call in calls]
+    assert [one.poll() for one in children] == [0, 0]
 
 
 def test_what_a_call_raises_is_raised_and_nothing_is_left(children):
-    results = workers.side_by_side(operator.truediv, [(1, 2), (1, 0), (1, 4)], 2)
+    results = child.calls_apart(operator.truediv, [(1, 2), (1, 0), (1, 4)], 2)
     assert next(results) == 0.5
-    with pytest.raises(ZeroDivisionError):
+    with pytest.raises(ZeroDivisionError) as raised:
         next(results)
-    assert all(child.poll() is not None for child in children)
+    assert "child.py" in "".join(raised.value.__notes__)  # where it was raised
+    assert all(one.poll() is not None for one in children)
 
 
 def test_an_ended_process_is_told_with_its_remedy(children):
-    with pytest.raises(SolveError, match="NUMBA_NUM_THREADS=1"):
-        list(workers.side_by_side(os._exit, [(3,)], 1))
+    with pytest.raises(SolveError, match=r"exit code 3.*NUMBA_NUM_THREADS=1"):
+        list(child.calls_apart(os._exit, [(3,), (3,)], 1))
+
+
+class Broken:
+    """What can be pickled and not unpickled."""
+
+    def __reduce__(self):
+        return int, ("no number",)
+
+
+def test_a_call_that_cannot_be_understood_is_told_and_not_waited_for(children, capfd):
+    with pytest.raises(SolveError, match="exit code 1"):
+        list(child.calls_apart(len, [(Broken(),)], 1))
+    assert "no number" in capfd.readouterr().err
 
 
 def test_calls_that_nobody_waits_for_any_more_are_ended(children):
-    results = workers.side_by_side(time.sleep, [(0.0,), (3600.0,), (3600.0,)], 2)
+    results = child.calls_apart(time.sleep, [(0.0,), (600.0,), (600.0,)], 2)
     assert next(results) is None
+    begun = time.monotonic()
     results.close()
-    assert [child.poll() is not None for child in children] == [True, True]
+    assert time.monotonic() - begun < 500.0  # nobody slept on
+    assert [one.poll() is not None for one in children] == [True, True]
 
 
 def test_a_study_in_several_processes_is_that_of_one(children, monkeypatch):
     ball = trimesh.creation.icosphere(3, 10.0).apply_scale([2.0, 1.0, 1.0])
     asked = {"kernels": ["cubic", "quintic", "gaussian"], "centres": [30, 50], "resolution": 24}
+    threads = kernel_study.processes_for(1000)
     assert kernel_study.processes_for(kernel_study.MANY - 1) == 1
+    assert kernel_study.processes_for(kernel_study.MANY) == min(threads, kernel_study.MANY)
     monkeypatch.setattr(kernel_study, "processes_for", lambda rows: 2)
     several = rm.study_kernels(ball, **asked)
     assert len(children) == 2

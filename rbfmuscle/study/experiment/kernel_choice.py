@@ -179,7 +179,7 @@ def _reason(row, best, tie):
     if cost(slow) > 1.5 * cost(row):
         parts.append(f"and up to {cost(slow) / cost(row):.1f} times as quick as they are")
     elif quick is not row and cost(row) <= (1.0 + QUICKER) * cost(quick):
-        parts.append("as quick as the quickest of them to a few per cent")
+        parts.append(f"as quick as the quickest of them to {100 * QUICKER:.0f} %")
     if row["condition"] <= SOUND < quick["condition"]:
         parts.append(f"of a condition of at most {SOUND:.0e}".replace("e+", "e"))
     if not row["epsilon"]:

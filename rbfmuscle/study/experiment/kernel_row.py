@@ -28,8 +28,8 @@ from rbfmuscle.validation import NumericalWarning
 
 # Seconds of both searches of one kernel together, the second for the fitted centres.
 SECONDS = 4.5
-# Points of one timed evaluation, and how often fit and evaluation are timed.
-TIMED, REPEATS = 20_000, 3
+# Points of one timed evaluation, and the processor time after which enough of them, or of fits, are made [s].
+TIMED, MEASURED = 20_000, 0.05
 
 
 class Request(NamedTuple):
@@ -204,17 +204,26 @@ def time_row(row: dict[str, Any], sample: SurfaceSample, derivatives: str, point
     points : (n, 3) ndarray
         Of the mesh [length].
     """
-    kernel, spent = get_kernel(row["kernel"]), []
+    kernel = get_kernel(row["kernel"])
     with warnings.catch_warnings(), threads_limited(1):
         warnings.simplefilter("ignore", NumericalWarning)  # it stands in the row's note
-        for _ in range(REPEATS):
-            start = time.process_time()
+        try:
             fitted = _fit(sample, kernel, row, derivatives)
-            middle = time.process_time()
-            fitted(points[:TIMED])
-            spent.append((middle - start, time.process_time() - middle))
-    # The least, as the first may compile.
-    row["fit_time"], row["evaluation_time"] = (float(t) for t in np.min(spent, axis=0))
+        except np.linalg.LinAlgError as error:  # at the edge: it could be solved when it was measured
+            row["unfit"] = " ".join(str(error).split())
+            return
+        row["fit_time"] = _spent(lambda: _fit(sample, kernel, row, derivatives))
+        fitted(points[:TIMED])
+        row["evaluation_time"] = _spent(lambda: fitted(points[:TIMED]))
+
+
+def _spent(work):
+    """Processor time of some work, done as often as a coarse clock needs [s]."""
+    start, runs = time.process_time(), 0
+    while runs == 0 or time.process_time() - start < MEASURED:
+        work()
+        runs += 1
+    return (time.process_time() - start) / runs
 
 
 def _fill_row(
@@ -249,12 +258,13 @@ def _fill_row(
     found, sheets = _surface_and_sheets(fitted, judge, sample, looked)
     row["components"], row["spurious"] = sheets, max(sheets - judge.sheets, 0)
     row["volume_error"] = found.volume / judge.volume - 1.0
-    row["rms"], row["hausdorff"], error, (row["low"], row["high"]) = judge.apart(found.vertices, found.faces)
+    rms, greatest, error, interval = judge.apart(found.vertices, found.faces)
     row["worst"] = judge.worst(found, sample.points)
     # a field of slope one by the mesh's own normals: outside is where the nearest triangle looks
     error = np.copysign(error, judge.distance.signed(found.vertices))
     if row["spurious"]:
         row["note"] = f"{row['spurious']} spurious sheets; {row['note']}".rstrip("; ")
+    row["rms"], row["hausdorff"], (row["low"], row["high"]) = rms, greatest, interval  # last: it is whole
     return found.vertices, found.faces, error
 
 

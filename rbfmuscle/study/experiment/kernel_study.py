@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import functools
 import pickle
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from rbfmuscle.compiled.child import calls_apart
 from rbfmuscle.geometry.arrays import MeshLike
+from rbfmuscle.implicit import shape_search
 from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
 from rbfmuscle.implicit.placement.refinement import FITTED
 from rbfmuscle.implicit.placement.sampling import PLACEMENTS, SurfaceSample, sample_surface
@@ -21,7 +24,6 @@ from rbfmuscle.study.experiment.kernel_choice import Recommendation, mark_unfit,
 from rbfmuscle.study.experiment.kernel_judge import SurfaceJudge
 from rbfmuscle.study.experiment.kernel_row import Measured, Request, measure_row, time_row
 from rbfmuscle.study.experiment.sweep_table import pareto_front
-from rbfmuscle.study.experiment.workers import side_by_side
 from rbfmuscle.validation import UsageError, check_mesh
 
 CENTRES = (150, 300)
@@ -89,6 +91,8 @@ def study_kernels(
 ) -> KernelStudy:
     """Fit a surface with many kernels and numbers of centres, and measure each fit.
 
+    Six rows and more are measured in as many processes as there are threads.
+
     Parameters
     ----------
     mesh : trimesh.Trimesh or pair of (n, 3) vertices and (m, 3) faces
@@ -123,6 +127,8 @@ def study_kernels(
         On an unknown kernel or placement, or a number of centres below 8.
     MeshError
         On an unusable mesh.
+    SolveError
+        If a process was ended.
 
     Examples
     --------
@@ -140,23 +146,23 @@ def study_kernels(
         raise UsageError(f"centres must be numbers of at least 8, got {list(centres)}")
     if not condition >= 1.0:
         raise UsageError(f"condition must be a bound of at least 1, got {condition:g}")
-    surface = pickle.dumps((vertices, faces, resolution, seed))
-    judge, study, found = _judge(surface), KernelStudy([], units=units), []
+    surface = (vertices, faces, resolution, seed)
+    judge, study, found = SurfaceJudge(*surface), KernelStudy([], units=units), []
     ask = Request(derivatives, criterion, placement, float(condition))
     base = "greedy" if placement == FITTED else placement
     calls = []
     for count in centres:
         sample = sample_surface(vertices, faces, int(count), seed=seed, placement=base)
-        calls += [(surface, sample, kernel.name, ask) for kernel in kernels]
-    for one in _measured(calls):
+        calls += [(sample, kernel.name, ask) for kernel in kernels]
+    for one in _measured(judge, surface, calls):
         study.scan += one.tried
         found.append(one)
         if progress is not None:
             progress(len(found), len(calls))
-    for one in found:  # when nothing else runs
-        if one.surface is not None:
-            time_row(one.row, one.sample, derivatives, judge.points)
     mark_unfit([one.row for one in found], sheets=judge.sheets, condition=condition)
+    for one in found:  # when nothing else runs
+        if not one.row["unfit"]:
+            time_row(one.row, one.sample, derivatives, judge.points)
     found.sort(key=lambda one: (bool(one.row["unfit"]), one.row["rms"] is None, one.row["rms"] or 0.0))
     study.rows, study.surfaces = [one.row for one in found], [one.surface for one in found]
     for row in study.rows:
@@ -169,29 +175,32 @@ def study_kernels(
     return study
 
 
-@functools.lru_cache(maxsize=1)
-def _judge(surface: bytes) -> SurfaceJudge:
-    """The judge of a pickled surface; each process makes its own."""
-    return SurfaceJudge(*pickle.loads(surface))
-
-
-def _row_of(surface: bytes, sample: SurfaceSample, kernel: str, ask: Request) -> Measured:
-    return measure_row(_judge(surface), sample, get_kernel(kernel), ask)
-
-
 def processes_for(rows: int) -> int:
     """Processes that share so many rows: one for each thread, where they are worth their start."""
     import numba
 
-    return numba.get_num_threads() if rows >= MANY else 1
+    return min(numba.get_num_threads(), rows) if rows >= MANY else 1
 
 
-def _measured(calls: Sequence[tuple[Any, ...]]) -> Iterator[Measured]:
-    """What the rows found, in their order."""
+def _measured(judge: SurfaceJudge, surface: tuple[Any, ...], calls: Sequence[Any]) -> Iterator[Measured]:
+    """What the rows of calls (sample, kernel's name, ask) found, in their order."""
     jobs = processes_for(len(calls))
-    if jobs > 1:
-        return side_by_side(_row_of, calls, jobs)
-    return (_row_of(*call) for call in calls)
+    if jobs == 1:
+        return (measure_row(judge, sample, get_kernel(name), ask) for sample, name, ask in calls)
+    pickled = pickle.dumps(surface)
+    return calls_apart(_row_apart, [(pickled, *call) for call in calls], jobs)
+
+
+def _row_apart(surface: bytes, sample: SurfaceSample, kernel: str, ask: Request) -> Measured:
+    """One row, in a process of its own: its searches are bounded by its processor time, however busy the machine."""
+    shape_search.CLOCK = time.process_time
+    return measure_row(_judge(surface), sample, get_kernel(kernel), ask)
+
+
+@functools.lru_cache(maxsize=1)
+def _judge(surface: bytes) -> SurfaceJudge:
+    """The judge of a pickled surface, made once in a process."""
+    return SurfaceJudge(*pickle.loads(surface))
 
 
 def _mark_fronts(rows):

@@ -19,7 +19,7 @@ from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
 from rbfmuscle.implicit.placement.density import GREEDY_LARGEST
 from rbfmuscle.implicit.placement.refinement import FITTED
-from rbfmuscle.implicit.placement.sampling import PLACEMENTS, sample_surface
+from rbfmuscle.implicit.placement.sampling import PLACEMENTS, SurfaceSample, sample_surface
 from rbfmuscle.study.experiment.kernel_choice import mark_unfit
 from rbfmuscle.study.experiment.kernel_judge import SurfaceJudge
 from rbfmuscle.study.experiment.kernel_row import Request, measure_row, time_row
@@ -163,6 +163,7 @@ class Search:
         self.judge = SurfaceJudge(vertices, faces, self.cells, CHOOSING)
         self.samples: dict[int, Any] = {}
         self.rows: dict[tuple[str, int], dict[str, Any]] = {}
+        self.placed: dict[tuple[str, int], SurfaceSample] = {}
         self.tried: list[dict[str, Any]] = []
         self.best: tuple[Kernel, int] | None = None
 
@@ -172,9 +173,10 @@ class Search:
         if key not in self.rows:
             if count not in self.samples:
                 self.samples[count] = sample_surface(*self.surface, count, placement=self.base)
-            row = measure_row(self.judge, self.samples[count], kernel, self.ask).row
+            found = measure_row(self.judge, self.samples[count], kernel, self.ask)
+            row = found.row
             mark_unfit([row], sheets=self.judge.sheets)
-            self.rows[key] = row
+            self.rows[key], self.placed[key] = row, found.sample
             self.tried.append({"kernel": kernel.name, "centres": count, "error": self._error(row)})
             if self.progress is not None:
                 self.progress(len(self.tried), max(len(self.tried) + 1, 8))
@@ -251,7 +253,10 @@ class Search:
             self.best, more = None, math.ceil(count * (1.0 + STEP))
             while more <= self.most and self.measure(kernel, more) > self.error:
                 more = math.ceil(more * (1.0 + STEP))
-        row = min(self.rows.values(), key=self._error)
+        key = min(self.rows, key=lambda key: self._error(self.rows[key]))
+        row = self.rows[key]
+        if not row["unfit"]:
+            time_row(row, self.placed[key], self.ask.derivatives, self.judge.points)
         return WantedError(False, row, self._error(row), self.error, self.greatest, self.tried)
 
 

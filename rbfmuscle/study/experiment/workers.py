@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import pickle
-import queue
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from typing import Any
 
-from rbfmuscle.compiled.child import start_child
-from rbfmuscle.validation import MissingPartError, SolveError, UsageError
+from rbfmuscle.validation import MissingPartError, UsageError
 
 CONNECT_WITHIN = 20  # seconds for a scheduler and its first two workers
 
@@ -40,62 +35,6 @@ class threads_limited:
 
         self.limits.restore_original_limits()
         numba.set_num_threads(self.before)
-
-
-def side_by_side(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], jobs: int) -> Iterator[Any]:
-    """What a function returns, in the order of the calls, from so many processes of one thread each.
-
-    They are ended with the iteration, however it ends, so that an interrupt leaves nothing behind.
-
-    Parameters
-    ----------
-    function : callable
-        Of a module, which a process can import.
-    calls : sequence of tuple
-        Positional arguments.
-    jobs : int
-
-    Raises
-    ------
-    SolveError
-        Where a process was ended; what the function raises is raised.
-    """
-    children: list[Any] = [start_child("rbfmuscle.study.experiment.worker", 1) for _ in range(jobs)]
-    idle: queue.Queue[Any] = queue.Queue()
-    for child in children:
-        idle.put(child)
-
-    def ask(call: tuple[Any, ...]) -> Any:
-        child = idle.get()
-        try:
-            pickle.dump((function, call), child.stdin, protocol=pickle.HIGHEST_PROTOCOL)
-            child.stdin.flush()
-            found, failed = pickle.load(child.stdout)
-        except (OSError, EOFError, pickle.UnpicklingError):
-            raise SolveError(
-                "a helper process was ended; memory may have run out: with NUMBA_NUM_THREADS=1 set, one process "
-                "does it all"
-            ) from None
-        finally:
-            idle.put(child)
-        if failed is not None:
-            raise failed
-        return found
-
-    with ThreadPoolExecutor(jobs) as pool:
-        waiting = [pool.submit(ask, call) for call in calls]
-        try:
-            for one in waiting:
-                yield one.result()
-        finally:
-            for one in waiting:
-                one.cancel()
-            for child in children:
-                child.kill()
-                child.wait()
-                for pipe in (child.stdin, child.stdout):
-                    with contextlib.suppress(OSError):
-                        pipe.close()
 
 
 def connect_cluster(scheduler: str, least: int) -> Any:
