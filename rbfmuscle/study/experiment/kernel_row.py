@@ -82,13 +82,15 @@ def _choose(row, judge, sample, kernel, ask, *, last):
     }  # fmt: skip
     choice = choose_surface_epsilon(sample.points, sample.normals, limits=limits, **asked)
     spent = limits.spent if ask.criterion == "held_out" else len(choice.tried)
-    if choice.broken and kernel.hermite:  # flat kernels with a ridge have fewer sheets of their own
+    bound = min(SOUND, ask.condition)
+    # flat kernels with a ridge have fewer sheets of their own, and may err as little as without
+    if last and kernel.hermite and (choice.broken or choice.condition > bound):
         left = SECONDS - row["search_time"] - (shape_search.CLOCK() - start)
-        limits = Limits(seconds=max(left, 0.5), slow=0, scan=13, bound=min(SOUND, ask.condition))
+        limits = Limits(seconds=max(left, 0.5), slow=0, scan=13, bound=bound)
         with suppress(np.linalg.LinAlgError):  # then what broke without a bound is the reason that is told
             bounded = choose_surface_epsilon(sample.points, sample.normals, limits=limits, **asked)
-            if not bounded.broken:
-                choice, row["bound"] = bounded, limits.bound
+            if not bounded.broken and (choice.broken or bounded.objective <= WITHIN * choice.objective):
+                choice, row["bound"] = bounded, bound
         spent += limits.spent
     row["epsilon"] = choice.epsilon
     row["shape"] = float(choice.epsilon * spacing(sample.points).mean())
