@@ -89,7 +89,7 @@ def test_a_ridge_keeps_a_bound_of_the_condition_and_is_pasted(ellipsoid, study):
 
 
 def test_an_epsilon_beyond_sound_conditions_is_sought_again_with_a_bound():
-    """Without, this one has 6e13 at 0.123 mm; a ridge at the same epsilon costs more than 2 %, at another it does not."""
+    """Without, this one has 6e13 at 0.123 mm; a ridge at that epsilon costs more than 2 %, at another it does not."""
     mesh = rm.phantom_scene().muscle("extensor").mesh
     asked = {"kernels": ["wendland_c6"], "centres": [200], "placement": "greedy", "resolution": 64}
     row = rm.study_kernels(mesh, **asked).rows[0]
