@@ -131,8 +131,8 @@ def test_plots_fit_a_telephone(study, tmp_path):
 
 
 def test_slender_muscles_are_looked_at_with_finer_cells(ellipsoid):
-    """With 128 cells along it a rod of 40 times its width is three cells thick."""
-    rod = trimesh.creation.capsule(400.0, 5.0, count=[24, 24])
+    """With 128 cells along it a spindle of 40 times its width is three cells thick."""
+    rod = trimesh.creation.icosphere(subdivisions=4).apply_scale([200.0, 5.0, 5.0])
     assert SurfaceJudge(np.array(rod.vertices), np.asarray(rod.faces), 0, 0).resolution == 320
     assert SurfaceJudge(ellipsoid.vertices, ellipsoid.faces, 0, 0).resolution == 128
 
