@@ -11,6 +11,8 @@ import trimesh
 from command_line import call
 
 import rbfmuscle as rm
+from rbfmuscle.compiled import child
+from rbfmuscle.study.experiment import kernel_study
 from rbfmuscle.study.experiment.kernel_choice import recommend
 from rbfmuscle.study.experiment.kernel_judge import SurfaceJudge
 from rbfmuscle.study.show.kernels.page import named, write_study
@@ -86,6 +88,29 @@ def test_a_ridge_keeps_a_bound_of_the_condition_and_is_pasted(ellipsoid, study):
     assert row["rms"] < 1.02 * plain["rms"] and row["solved"] == "Cholesky with a ridge"
     assert tomllib.loads(study.toml(row))["muscle"]["model"]["condition"] == 1e6
     assert "condition" not in tomllib.loads(study.toml(plain))["muscle"]["model"]
+
+
+def test_a_study_in_several_processes_is_that_of_one(monkeypatch):
+    started, start = [], child.start_child
+    monkeypatch.setattr(child, "start_child", lambda *given: started.append(given) or start(*given))
+    ball = trimesh.creation.icosphere(3, 10.0).apply_scale([2.0, 1.0, 1.0])
+    asked = {"kernels": ["cubic", "quintic", "gaussian"], "centres": [30, 50], "resolution": 24}
+    threads = kernel_study.processes_for(1000)
+    assert kernel_study.processes_for(kernel_study.MANY - 1) == 1
+    assert kernel_study.processes_for(kernel_study.MANY) == min(threads, kernel_study.MANY)
+    monkeypatch.setattr(kernel_study, "processes_for", lambda rows: 2)
+    several = rm.study_kernels(ball, **asked)
+    assert len(started) == 2
+    monkeypatch.setattr(kernel_study, "processes_for", lambda rows: 1)
+    one = rm.study_kernels(ball, **asked)
+    assert len(started) == 2
+    order = {(row["kernel"], row["centres"]): row for row in one.rows}
+    for row in several.rows:
+        same = order[row["kernel"], row["centres"]]
+        assert row["unfit"] == same["unfit"] and row["epsilon"] == pytest.approx(same["epsilon"], rel=1e-9)
+        if not row["unfit"]:
+            np.testing.assert_allclose(row["rms"], same["rms"], rtol=1e-6)
+            assert row["fit_time"] > 0.0 and row["evaluation_time"] > 0.0
 
 
 def test_an_epsilon_beyond_sound_conditions_is_sought_again_with_a_bound():

@@ -1,16 +1,12 @@
-"""Calls that are made in several processes."""
+"""Processes of ours beside this one: calls that are made in several."""
 
 import operator
 import os
 import time
 
-import numpy as np
 import pytest
-import trimesh
 
-import rbfmuscle as rm
 from rbfmuscle.compiled import child
-from rbfmuscle.study.experiment import kernel_study
 from rbfmuscle.validation import SolveError
 
 
@@ -67,24 +63,3 @@ def test_calls_that_nobody_waits_for_any_more_are_ended(children):
     results.close()
     assert time.monotonic() - begun < 500.0  # nobody slept on
     assert [one.poll() is not None for one in children] == [True, True]
-
-
-def test_a_study_in_several_processes_is_that_of_one(children, monkeypatch):
-    ball = trimesh.creation.icosphere(3, 10.0).apply_scale([2.0, 1.0, 1.0])
-    asked = {"kernels": ["cubic", "quintic", "gaussian"], "centres": [30, 50], "resolution": 24}
-    threads = kernel_study.processes_for(1000)
-    assert kernel_study.processes_for(kernel_study.MANY - 1) == 1
-    assert kernel_study.processes_for(kernel_study.MANY) == min(threads, kernel_study.MANY)
-    monkeypatch.setattr(kernel_study, "processes_for", lambda rows: 2)
-    several = rm.study_kernels(ball, **asked)
-    assert len(children) == 2
-    monkeypatch.setattr(kernel_study, "processes_for", lambda rows: 1)
-    one = rm.study_kernels(ball, **asked)
-    assert len(children) == 2
-    order = {(row["kernel"], row["centres"]): row for row in one.rows}
-    for row in several.rows:
-        same = order[row["kernel"], row["centres"]]
-        assert row["unfit"] == same["unfit"] and row["epsilon"] == pytest.approx(same["epsilon"], rel=1e-9)
-        if not row["unfit"]:
-            np.testing.assert_allclose(row["rms"], same["rms"], rtol=1e-6)
-            assert row["fit_time"] > 0.0 and row["evaluation_time"] > 0.0
