@@ -128,7 +128,7 @@ class _Helper:
     def begin(self, start: Any, measures: Any) -> None:
         """Let it go through the motion."""
         with contextlib.suppress(OSError):  # it is gone: the inbox says so
-            self._send((start, measures))
+            send(self.process.stdin, (start, measures))
 
     def take(self) -> tuple[str, Any]:
         """Its next message: a kind, and what it is about."""
@@ -148,12 +148,9 @@ class _Helper:
                 if pipe is not None:
                     pipe.close()
 
-    def _send(self, what):
-        send(self.process.stdin, what)
-
     def _listen(self, job):
         try:
-            self._send(job)
+            send(self.process.stdin, job)
             while self._room.acquire():
                 if self._closed:
                     return
@@ -162,6 +159,8 @@ class _Helper:
                 del what
         except (OSError, EOFError, pickle.UnpicklingError):
             self._inbox.put(("gone", how_it_ended(self.process)))
+        except MemoryError as error:  # of a frame that does not fit here: nobody else would tell
+            self._inbox.put(("failed", error))
 
 
 def _dealt(names, hands):
