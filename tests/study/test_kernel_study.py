@@ -12,7 +12,7 @@ from command_line import call
 
 import rbfmuscle as rm
 from rbfmuscle.compiled import child
-from rbfmuscle.study.experiment import kernel_study
+from rbfmuscle.study.experiment import kernel_row, kernel_study
 from rbfmuscle.study.experiment.kernel_choice import recommend
 from rbfmuscle.study.experiment.kernel_judge import SurfaceJudge
 from rbfmuscle.study.show.kernels.page import named, write_study
@@ -113,12 +113,17 @@ def test_a_study_in_several_processes_is_that_of_one(monkeypatch):
             assert row["fit_time"] > 0.0 and row["evaluation_time"] > 0.0
 
 
-def test_an_epsilon_beyond_sound_conditions_is_sought_again_with_a_bound():
-    """Without, this one has 6e13 at 0.123 mm; a ridge at that epsilon costs more than 2 %, at another it does not."""
+def test_an_epsilon_beyond_sound_conditions_is_sought_again_with_a_bound(monkeypatch):
+    """Beside the same search without the bound: what is best depends on the last digits, not what the bound costs."""
     mesh = rm.phantom_scene().muscle("extensor").mesh
     asked = {"kernels": ["wendland_c6"], "centres": [200], "placement": "greedy", "resolution": 64}
+    monkeypatch.setattr(kernel_row, "SECONDS", np.inf)
     row = rm.study_kernels(mesh, **asked).rows[0]
-    assert row["bound"] == 1e10 and row["condition"] <= 1e10 and row["rms"] < 1.02 * 0.1228
+    monkeypatch.setattr(kernel_row, "SOUND", np.inf)
+    plain = rm.study_kernels(mesh, **asked).rows[0]
+    assert not plain["bound"] and plain["condition"] > 1e10
+    # 2 % of the error at the held-out points is allowed; of the whole surface it differs by as much again
+    assert row["bound"] == 1e10 and row["condition"] <= 1e10 and row["rms"] < 1.05 * plain["rms"]
 
 
 def test_fitted_centres_halve_the_error_of_greedy_ones(ellipsoid, study):
