@@ -1,6 +1,8 @@
 """Normals, edges and enclosed volumes of triangle meshes."""
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats, Integers
@@ -46,6 +48,40 @@ def unique_edges(faces: Integers) -> Integers:
     ends = np.concatenate([sides[forward], sides[~forward][:, ::-1]])
     _, first = np.unique(ends[:, 0] * (faces.max(initial=0) + 1) + ends[:, 1], return_index=True)
     return ends[np.sort(first)]
+
+
+def split_pinched_vertices(vertices: Floats, faces: Integers) -> tuple[Floats, Integers]:
+    """Repeat each vertex where several fans of triangles meet, so that every fan has its own.
+
+    Parameters
+    ----------
+    vertices : (n, 3) ndarray
+    faces : (m, 3) ndarray of int
+        Closed and consistently oriented.
+
+    Returns
+    -------
+    vertices : (n + k, 3) ndarray
+        Those given, then the repeated ones.
+    faces : (m, 3) ndarray of int
+        The same triangles in the same order.
+    """
+    following = np.roll(faces, -1, axis=1)
+    size = len(vertices)
+    key, back = (faces * size + following).ravel(), (following * size + faces).ravel()
+    order = np.argsort(key)
+    twin = order[np.searchsorted(key, back, sorter=order)]
+    # the corner after the opposite side, in the neighbouring triangle, is at the same vertex
+    beside = twin - twin % 3 + (twin + 1) % 3
+    corners = len(key)
+    links = coo_matrix((np.ones(corners), (np.arange(corners), beside)), shape=(corners, corners))
+    count, fan = connected_components(links, directed=False)
+    at, first = faces.ravel(), np.unique(fan, return_index=True)[1]
+    number = at[first]
+    repeated = np.ones(count, dtype=bool)
+    repeated[np.unique(number, return_index=True)[1]] = False
+    number[repeated] = size + np.arange(repeated.sum())
+    return np.vstack([vertices, vertices[at[first][repeated]]]), number[fan].reshape(-1, 3)
 
 
 def edge_lengths(vertices: Floats, edges: Integers) -> Floats:

@@ -123,6 +123,21 @@ def test_scrambled_clusters_still_contract_to_a_manifold():
     assert mesh_of_points.euler_number == 0
 
 
+@pytest.mark.parametrize("placement", ["even", "adaptive", "greedy"])
+def test_sheets_that_meet_in_a_vertex_are_sampled_as_if_apart(placement):
+    """The same surface with a pole of its own on either side, or one pole for both, is the same field's."""
+    mesh = trimesh.creation.icosphere(3, 10.0)
+    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    upper, lower = vertices[:, 2].argmax(), vertices[:, 2].argmin()
+    vertices[[upper, lower]] = 0.0
+    apart = sample_surface(vertices, faces, 60, placement=placement)
+    joined = np.where(faces == lower, upper, faces)
+    sample = sample_surface(vertices, joined, 60, placement=placement)
+    check_control(mesh, sample, 60)
+    assert sample.areas.sum() == pytest.approx(apart.areas.sum(), rel=1e-12)
+    assert (joined[sample.face] == sample.vertex[:, None]).any(axis=1).all()
+
+
 def test_open_mesh_is_refused():
     mesh = trimesh.creation.icosphere(2)
     with pytest.raises(MeshError, match="closed"):

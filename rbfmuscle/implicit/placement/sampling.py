@@ -11,7 +11,12 @@ from numpy.typing import ArrayLike
 
 from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.surfaces import barycentric_weights, face_normals, vertex_normals
+from rbfmuscle.geometry.surfaces import (
+    barycentric_weights,
+    face_normals,
+    split_pinched_vertices,
+    vertex_normals,
+)
 from rbfmuscle.geometry.triangles import nearest_weights
 from rbfmuscle.implicit.placement.clustering import cluster_mesh, refine_mesh
 from rbfmuscle.implicit.placement.control_mesh import opposite_half_edges
@@ -65,7 +70,7 @@ def sample_surface(
     Parameters
     ----------
     vertices : (n, 3) array_like
-        Vertices of a closed, outward 2-manifold [scene unit].
+        Vertices of a closed, outward surface, each edge between two triangles [scene unit].
     faces : (m, 3) array_like of int
         Its triangles.
     count : int
@@ -96,7 +101,7 @@ def sample_surface(
     if placement not in PLACEMENTS:
         raise ValueError(f"placement must be one of {', '.join(PLACEMENTS)}, got {placement!r}")
     opposite_half_edges(faces)
-    fine = refine_mesh(vertices, faces, count)
+    fine = refine_mesh(*split_pinched_vertices(vertices, faces), count)
     if placement == "greedy":
         return greedy_sample(fine, count, seed, partial(_gather, vertices, faces, fine, count))
     density = curvature_density(fine, count) if placement == "adaptive" else np.ones(len(fine.vertices))
