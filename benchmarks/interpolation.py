@@ -1,4 +1,4 @@
-"""Fits, evaluation, leave-one-out, bands and condition estimates of the fields, as ratios: ``make bench``.
+"""Fits, evaluation, leave-one-out and condition estimates of the fields, as ratios: ``make bench``.
 
 As in `table`, both sides of a row work in one process, in turns, and the least of several rounds counts.
 """
@@ -15,7 +15,6 @@ from scipy.linalg import blas
 from table import ROUNDS, Table, machine
 
 from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.fit.banded import factorise_band
 from rbfmuscle.implicit.fit.condition import largest_eigenvalue, probe
 from rbfmuscle.implicit.fit.cross_validation import leave_one_out
 from rbfmuscle.implicit.fit.fitting import Basis, factorise, solve
@@ -27,7 +26,7 @@ from rbfmuscle.validation import NumericalWarning
 SHARED = {"linear": 1.0, "cubic": 1.0, "quintic": 1.0, "thin_plate_spline": 1.0, "multiquadric": 4.0,
           "inverse_multiquadric": 4.0, "inverse_quadratic": 4.0, "gaussian": 6.0}  # fmt: skip
 COUNTS = (500, 1000, 2000)
-PARTS = ("fit", "evaluate", "loo", "band", "condition")
+PARTS = ("fit", "evaluate", "loo", "condition")
 
 
 def scattered(count):
@@ -93,26 +92,6 @@ def bench_loo(table):
                   lambda b=basis, r=right: solve(b, r))  # fmt: skip
 
 
-def bench_band(table):
-    """Bands of compact kernels against full matrices, at several shares of centres in reach."""
-    for kind, counts in (
-        ("value", (1000, 2000, 4000)),
-        ("normal", (300, 1000)),
-        ("gradient", (300, 500)),
-    ):
-        for count in counts:
-            points, normals = ellipsoid(count)
-            for share in (0.01, 0.03):
-                apart = np.linalg.norm(points[:: count // 50, None] - points, axis=2)
-                reach = np.quantile(apart, share)
-                basis = Basis(points, KERNELS["wendland_c4"], 1.0 / reach, -1, kind=kind, normals=normals)
-                if factorise_band(basis) is None:
-                    print(f"band: {kind}, {count}, {share:.0%} in reach: left to the full matrix")
-                    continue
-                table.add("band", f"{kind}, {count}, {share:.0%} in reach", "full matrix",
-                          lambda b=basis: factorise_band(b), lambda b=basis: factorise(b))  # fmt: skip
-
-
 def bench_condition(table):
     """The estimate of the condition against the whole fit: the ratio is its share."""
     for name, basis, right in systems():
@@ -149,7 +128,7 @@ def main():
     print(f"{about['cpu']}, {about['usable_cores']} of {about['cores']} cores, {about['threads']} threads")
     warnings.simplefilter("ignore", NumericalWarning)
     table = Table()
-    work = (bench_fit, bench_evaluate, bench_loo, bench_band, bench_condition)
+    work = (bench_fit, bench_evaluate, bench_loo, bench_condition)
     for part, bench in zip(PARTS, work):
         if not chosen.part or part in chosen.part:
             bench(table)

@@ -26,9 +26,7 @@ EXAMPLES = (
 TOPICS = {
     "Scenes": ("Scene", "phantom_scene"),
     "Running and comparing": ("simulate", "Run", "compare_models"),
-    "Fields and kernels": (
-        "RBFField", "FlatField", "PartitionField", "reconstruct_surface", "study_kernels", "reach_error",
-    ),
+    "Fields and kernels": ("RBFField", "study_kernels", "reach_error"),
     "Muscles and bones": ("RBFMuscle", "BoneSDF"),
     "Errors and warnings": (
         "RBFMuscleError", "SceneError", "MeshError", "SolveError", "LimitExceededError", "MissingPartError",

@@ -13,12 +13,10 @@ __version__ = "0.1.0"
 
 _HOME = {
     "BoneSDF": "rbfmuscle.sim.distance.sdf",
-    "FlatField": "rbfmuscle.implicit.fit.flat_limit",
     "LimitExceededError": "rbfmuscle.validation",
     "MeshError": "rbfmuscle.validation",
     "MissingPartError": "rbfmuscle.validation",
     "NumericalWarning": "rbfmuscle.validation",
-    "PartitionField": "rbfmuscle.implicit.partition",
     "RBFField": "rbfmuscle.implicit.field",
     "RBFMuscle": "rbfmuscle.model.muscle",
     "RBFMuscleError": "rbfmuscle.validation",
@@ -29,7 +27,6 @@ _HOME = {
     "compare_models": "rbfmuscle.compare",
     "phantom_scene": "rbfmuscle.sim.scene.phantom",
     "reach_error": "rbfmuscle.study.experiment.wanted_error",
-    "reconstruct_surface": "rbfmuscle.implicit.reconstruction",
     "simulate": "rbfmuscle.run",
     "study_kernels": "rbfmuscle.study.experiment.kernel_study",
     "warm_up": "rbfmuscle.compiled.warm",

@@ -26,7 +26,6 @@ from rbfmuscle.commands.poses.ways import ways
 from rbfmuscle.commands.run import demo, run
 from rbfmuscle.commands.sdf import sdf
 from rbfmuscle.commands.show import export, render
-from rbfmuscle.commands.surface import surface
 from rbfmuscle.commands.sweep import sweep
 from rbfmuscle.commands.view import view
 from rbfmuscle.interruption import INTERRUPTED
@@ -51,7 +50,6 @@ for command in (
     ways,
     sdf,
     kernels,
-    surface,
 ):
     app.command(command)
 app.command(import_, name="import")

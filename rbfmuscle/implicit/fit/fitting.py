@@ -25,7 +25,6 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.fit import assembly
-from rbfmuscle.implicit.fit.banded import factorise_band
 from rbfmuscle.implicit.fit.condition import largest_eigenvalue, probe
 from rbfmuscle.implicit.fit.lapack import (
     factor_cholesky,
@@ -36,7 +35,6 @@ from rbfmuscle.implicit.fit.lapack import (
 from rbfmuscle.validation import NumericalWarning
 
 if TYPE_CHECKING:
-    from rbfmuscle.implicit.fit.contour import System
     from rbfmuscle.implicit.kernels.table import Kernel
 
 
@@ -151,7 +149,7 @@ def solve(
     NumericalWarning
         Where the condition makes the result doubtful.
     """
-    factor = factorise_band(basis, smoothing) or factorise(basis, smoothing)
+    factor = factorise(basis, smoothing)
     if factor is not None:
         solution = factor.solve(right)
         if solution[2] < DOUBTFUL:
@@ -300,7 +298,7 @@ def _nearest_pair(points: Floats) -> tuple[int, int, float]:
     return first, second, float(distance[nearest, 1])
 
 
-def raise_if_singular(basis: Basis | System) -> None:
+def raise_if_singular(basis: Basis) -> None:
     """Raise LinAlgError if centres coincide or the polynomials are dependent on them."""
     points, q = basis.points, len(basis.powers)
     first, second, apart = _nearest_pair(points)
