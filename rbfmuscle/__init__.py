@@ -38,8 +38,6 @@ __all__ = [*_HOME, "__version__"]
 def __getattr__(name: str) -> Callable[..., Any]:
     if name in _HOME:
         value = getattr(importlib.import_module(_HOME[name]), name)
-        if name == "Scene":  # the room that lets it read OpenSim models enters itself when it is loaded
-            importlib.import_module("rbfmuscle.opensim")
         globals()[name] = value
         return value
     raise AttributeError(f"module 'rbfmuscle' has no attribute {name!r}")

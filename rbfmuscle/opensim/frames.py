@@ -29,7 +29,7 @@ class Frames:
         self.problem = problem
         self.bodies = {"/ground": "ground"} | {f"/bodyset/{body.name}": body.name for body in bodies}
         self.offsets = {}
-        for child in model:
+        for child in model.nodes():
             if child.tag == "Ground":
                 self._take("/ground", child)
         for body in bodies:
@@ -40,18 +40,14 @@ class Frames:
             if part.tag == OFFSET:
                 self.offsets[f"/componentset/{part.name}"] = part
                 self._take(f"/componentset/{part.name}", part)
-        holder = model.child("components")
-        for part in [] if holder is None else holder:
-            if part.tag == OFFSET:
-                self.offsets[f"/{part.name}"] = part
-                self._take(f"/{part.name}", part)
+        self._take("", model)
 
     def of(self, owner: Node) -> list[Node]:
         """The offset frames that stand inside a body, a joint or another frame."""
         found = []
         for tag in ("components", "frames"):
             holder = owner.child(tag)
-            found += [] if holder is None else [child for child in holder if child.tag == OFFSET]
+            found += [] if holder is None else [child for child in holder.nodes() if child.tag == OFFSET]
         return found
 
     def _take(self, path, owner):

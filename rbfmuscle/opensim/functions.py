@@ -74,12 +74,16 @@ def find_function(node: Node | None) -> Node | None:
     """Return the element of the function that stands in a node, directly or one level deeper; None where none is."""
     if node is None:
         return None
-    known = [inner for inner in node if inner.tag in FUNCTIONS or inner.tag.endswith(("Function", "Spline"))]
+    known = [
+        inner
+        for inner in node.nodes()
+        if inner.tag in FUNCTIONS or inner.tag.endswith(("Function", "Spline"))
+    ]
     if known:
         return known[0]
-    for inner in node:
-        if inner.tag in ("function", "coupled_coordinates_function") and inner.children:
-            return inner.children[0]
+    for inner in node.nodes():
+        if inner.tag in ("function", "coupled_coordinates_function") and len(inner):
+            return inner.nodes()[0]
     return None
 
 

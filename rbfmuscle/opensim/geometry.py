@@ -35,14 +35,8 @@ def find_mesh(name: str, folders: list[Path]) -> Path | None:
     return None
 
 
-def search_folders(model: OsimModel, geometry: list[Path]) -> list[Path]:
-    """Return where meshes are looked for: beside the model, in its ``Geometry``, then where the user says."""
-    home = model.path.parent
-    return [home, home / "Geometry", *geometry]
-
-
 def body_meshes(
-    model: OsimModel, places: dict[str, np.ndarray], metre: float, folders: list[Path]
+    model: OsimModel, places: dict[str, np.ndarray], metre: float, geometry: list[Path]
 ) -> tuple[dict[str, ReadMesh], list[str]]:
     """Return one mesh for each body that shows any, in the scene's coordinates, and what could not be taken.
 
@@ -52,12 +46,14 @@ def body_meshes(
         From every body to the ground in the rest pose [metre].
     metre : float
         Scene units in a metre.
-    folders : list of path
+    geometry : list of path
+        Folders with meshes, after the model's own and its ``Geometry``.
 
     Returns
     -------
     meshes, notes
     """
+    folders = [model.path.parent, model.path.parent / "Geometry", *geometry]
     parts, notes = {}, []
     for mesh in model.meshes:
         try:
@@ -73,10 +69,10 @@ def body_meshes(
         parts.setdefault(mesh.body, []).append((vertices * metre, faces, file))
     meshes = {}
     for body, found in parts.items():
-        joined, lost = _joined(body, found)
-        notes += lost
-        if joined is not None:
-            meshes[body] = joined
+        try:
+            meshes[body] = _joined(body, found)
+        except MeshError as error:
+            notes.append(f"body {body!r}: its meshes are not taken: {error}")
     return meshes, notes
 
 
@@ -89,6 +85,8 @@ def _placed(mesh: ModelMesh, place: Any, folders: Any) -> Any:
     vertices, faces = read_arrays(file)
     if len(vertices) == 0 or len(faces) == 0:
         return f"mesh {mesh.file!r} has no triangles: not taken"
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        return f"mesh {mesh.file!r} is not taken: a triangle names a vertex that is not there"
     scale = np.array(mesh.scale)
     transform = place @ mesh.transform
     vertices = (vertices * scale) @ transform[:3, :3].T + transform[:3, 3]
@@ -102,27 +100,8 @@ def _placed(mesh: ModelMesh, place: Any, folders: Any) -> Any:
 
 
 def _joined(body, found):
-    """One mesh of all of a body's; where they cannot be mended together, of those that can be alone."""
+    """One mesh of all of a body's."""
     source = ", ".join(file.name for _, _, file in found)
-    try:
-        return _prepared(body, found, source), []
-    except MeshError as error:
-        if len(found) == 1:
-            return None, [f"body {body!r}: mesh {source!r} is not taken: {error}"]
-    good, notes = [], []
-    for part in found:
-        try:
-            _prepared(body, [part], part[2].name)
-            good.append(part)
-        except MeshError as error:
-            notes.append(f"body {body!r}: mesh {part[2].name!r} is not taken: {error}")
-    try:
-        return (_prepared(body, good, source) if good else None), notes
-    except MeshError as error:
-        return None, [*notes, f"body {body!r}: its meshes are not taken together: {error}"]
-
-
-def _prepared(body, found, source):
     starts = np.cumsum([0, *(len(vertices) for vertices, _, _ in found)])
     vertices = np.concatenate([part[0] for part in found])
     faces = np.concatenate([part[1] + start for part, start in zip(found, starts)])

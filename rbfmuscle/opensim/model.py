@@ -1,4 +1,4 @@
-"""An OpenSim model as read: bodies, joints, couplings, meshes and muscle paths, in metres and radians."""
+"""An OpenSim model as read: bodies, joints, couplings and meshes, in metres and radians."""
 
 import math
 from collections.abc import Iterator
@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.opensim.functions import Problem
-from rbfmuscle.sim.joints.functions import Function
 from rbfmuscle.sim.joints.joint import KINDS, Coordinate, Coupling, Joint, TransformAxis
 from rbfmuscle.sim.joints.skeleton import ordered
 
@@ -61,40 +60,6 @@ class ModelMesh:
 
 
 @dataclass
-class ModelPoint:
-    """A point of a muscle's path.
-
-    Attributes
-    ----------
-    place : (3,) ndarray
-        In the frame.
-    frame : (4, 4) ndarray
-        Of the point, in the body.
-    condition : (coordinate, low, high), optional
-        The point is part of the path where the coordinate lies in the range.
-    moving : tuple of (coordinate, Function), optional
-        For x, y, z; the coordinate may be None.
-    """
-
-    name: str
-    body: str
-    place: np.ndarray
-    frame: np.ndarray
-    condition: tuple[str, float, float] | None = None
-    moving: tuple[tuple[str | None, Function], ...] | None = None
-
-
-@dataclass
-class ModelPath:
-    """A muscle's path: points in order, and the names of the objects that it wraps about."""
-
-    name: str
-    kind: str
-    points: list[ModelPoint]
-    wraps: list[str] = field(default_factory=list)
-
-
-@dataclass
 class OsimModel:
     """All that is taken from an ``.osim`` file.
 
@@ -113,7 +78,6 @@ class OsimModel:
     joints: list[ModelJoint] = field(default_factory=list)
     couplings: list[Coupling] = field(default_factory=list)
     meshes: list[ModelMesh] = field(default_factory=list)
-    paths: list[ModelPath] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     def coordinates(self) -> dict[str, Coordinate]:

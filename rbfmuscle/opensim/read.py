@@ -16,8 +16,7 @@ from rbfmuscle.opensim.model import (
     joint_motion,
     motion_kinds,
 )
-from rbfmuscle.opensim.paths import read_paths
-from rbfmuscle.opensim.xml import Node, read_xml
+from rbfmuscle.opensim.xml import read_xml
 from rbfmuscle.sim.joints.functions import Linear, Scaled
 from rbfmuscle.sim.joints.joint import Coordinate, Coupling, TransformAxis, frame_at
 
@@ -52,10 +51,9 @@ def read_osim(path: Path | str) -> OsimModel:
     if root.tag not in ("OpenSimDocument", "Model") or node is None:
         raise problem(f"its root is <{root.tag[:40]}>, no OpenSim model; give an .osim file")
     try:
-        version = int(root.attributes.get("Version", "0"))
+        version = int(root.get("Version", "0"))
     except ValueError:
-        raise problem(f"version {root.attributes['Version'][:20]!r} is no number; correct it") from None
-    node.children = [child for child in node.children if child.tag != "defaults"]
+        raise problem(f"version {root.get('Version', '')[:20]!r} is no number; correct it") from None
     model = OsimModel(node.name or path.stem, version, path, [GROUND])
     units = node.word("length_units", "meters")
     if units not in ("meters", "m", "metres"):
@@ -70,15 +68,14 @@ def read_osim(path: Path | str) -> OsimModel:
     else:
         _read_old(model, bodies, problem)
     _read_constraints(model, node, problem)
-    model.paths = read_paths(model, node, frames, problem)
     return finish(model)
 
 
 def _read_new(model, node, bodies, frames, problem):
     for joint in node.objects("JointSet"):
         parts = [frames.of_joint(joint, role) for role in ("parent", "child")]
-        model.joints.append(_joint(joint, parts, joint.child("coordinates"), problem, model))
-    grounds = [child for child in node if child.tag == "Ground"]
+        model.joints.append(_joint(joint, parts, "coordinates", problem, model))
+    grounds = [child for child in node.nodes() if child.tag == "Ground"]
     for body in [*grounds, *bodies]:
         _meshes_of(model, body, body.name or GROUND, frames, problem)
     for joint in node.objects("JointSet"):
@@ -96,7 +93,7 @@ def _meshes_of(model, body, name, frames, problem):
 def _add_meshes(model, owner, body, transform, problem):
     """Geometry that hangs on a body or on a frame of it."""
     attached = owner.child("attached_geometry")
-    for shape in [] if attached is None else attached:
+    for shape in [] if attached is None else attached.nodes():
         if shape.tag != "Mesh":
             model.notes.append(
                 f"body {body!r}: geometry {shape.name or shape.tag!r} is a {shape.tag}, no mesh: not taken"
@@ -125,7 +122,7 @@ def _read_old(model, bodies, problem):
     """Versions before 4: each joint lies inside the body that is its child."""
     for body in bodies:
         holder = body.child("Joint")
-        for joint in [] if holder is None else holder:
+        for joint in [] if holder is None else holder.nodes():
             place = f"joint {joint.name!r}"
             ends = []
             for where, turn in (("location_in_parent", "orientation_in_parent"), ("location", "orientation")):
@@ -135,7 +132,7 @@ def _read_old(model, bodies, problem):
             names = [joint.word("parent_body"), body.name]
             if truth(joint, "reverse"):
                 names, ends = names[::-1], ends[::-1]
-            found = _joint(joint, list(zip(names, ends)), joint.child("CoordinateSet"), problem, model)
+            found = _joint(joint, list(zip(names, ends)), "CoordinateSet", problem, model)
             model.joints.append(found)
         _old_meshes(model, body, problem)
 
@@ -150,8 +147,7 @@ def _old_meshes(model, body, problem):
     if visible is None:
         return
     whole = np.array(vector(visible, "scale_factors", "1 1 1", place=f"body {body.name!r}", problem=problem))
-    files = visible.child("geometry_files")
-    for file in [] if files is None else files.text.split():
+    for file in visible.word("geometry_files").split():
         _add_mesh(model, file, body.name, whole.tolist(), np.eye(4), True)
     for shape in visible.objects("GeometrySet"):
         file = shape.word("geometry_file")
@@ -165,7 +161,7 @@ def _old_meshes(model, body, problem):
 
 
 def _joint(joint, ends, holder, problem, model):
-    """One joint from its element, its ends as (body, frame), and the element that holds its coordinates."""
+    """One joint from its element, its ends as (body, frame), and the tag of what holds its coordinates."""
     (parent, first), (child, second) = ends
     place = f"joint {joint.name!r} ({parent} to {child})"
     kind = JOINT_KINDS.get(joint.tag)
@@ -174,8 +170,7 @@ def _joint(joint, ends, holder, problem, model):
             f"{place}: a {joint.tag} is not in the table of joints, so body {child!r} cannot be placed; "
             "replace it by a CustomJoint in OpenSim"
         )
-    inner = (holder.child("objects") or holder) if holder is not None else Node("", {})
-    found = [node for node in inner if node.tag == "Coordinate"]
+    found = [node for node in joint.objects(holder) if node.tag == "Coordinate"]
     axes, slopes = ({}, {})
     if kind == "custom":
         axes, slopes = _axes(joint, place, problem)
@@ -206,7 +201,7 @@ def _axes(joint, place, problem):
             raise problem(f"{place}: is written as OpenSim 1 did; open the model in OpenSim 4 and save it")
         return {}, {}
     axes, slopes = {}, {}
-    for node in table:
+    for node in table.nodes():
         if node.tag != "TransformAxis":
             continue
         at = f"{place}: axis {node.name!r}"

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rbfmuscle.opensim.geometry import body_meshes, search_folders
+from rbfmuscle.opensim.geometry import body_meshes
 from rbfmuscle.opensim.model import OsimModel
 from rbfmuscle.opensim.read import read_osim
 from rbfmuscle.sim.joints.functions import Function
@@ -76,7 +76,7 @@ def import_osim(
     for body in model.bodies:
         names[body] = clean_name(body, set(names.values()))
     ground = model.transforms()
-    meshes, notes = body_meshes(model, ground, metre, search_folders(model, list(geometry or [])))
+    meshes, notes = body_meshes(model, ground, metre, list(geometry or []))
     notes = [*model.notes, *notes]
     notes += [f"body {body!r} is named {names[body]!r} here" for body in model.bodies if names[body] != body]
     for body in model.bodies:
@@ -127,7 +127,6 @@ def _keep(model, bodies):
     model.meshes = [mesh for mesh in model.meshes if mesh.body in kept]
     known = model.coordinates()
     model.couplings = [c for c in model.couplings if all(n in known for n in (c.coordinate, *c.of))]
-    model.paths = [path for path in model.paths if all(point.body in kept for point in path.points)]
 
 
 def _add_joints(scene, model, places, names, metre, notes):

@@ -1,15 +1,65 @@
 """Writing a scene to a folder: a TOML file that a person can read, and the meshes that it names."""
 
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rbfmuscle.opensim.scene import Imported
 from rbfmuscle.sim.scene.joint_tables import coupling_row, joint_row
+from rbfmuscle.sim.scene.options import MotionOptions
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.validation import UsageError
 
 BONES = "bones"
+
+
+def write_scene(found: Imported, directory: Path, *, motion: Path | None = None) -> Path:
+    """Write ``scene.toml`` and the bones' meshes to a folder, and return the scene file.
+
+    Parameters
+    ----------
+    found : Imported
+    directory : path
+        Made where it is missing.
+    motion : path, optional
+        A motion file that the scene shall follow; checked against its coordinates.
+
+    Raises
+    ------
+    SceneError
+        If the motion file does not fit.
+    UsageError
+        If the folder cannot be written to.
+    """
+    directory = Path(directory)
+    target, options = directory / "scene.toml", None
+    if motion is not None:
+        options = MotionOptions(file=os.path.relpath(Path(motion).resolve(), directory.resolve()))
+        found.scene.motion = found.scene.motion_from(options, folder=directory)
+        found.notes += found.scene.motion.notes
+    try:
+        meshes = write_meshes(found.scene, directory)
+        parts = [skeleton_text(found.scene, head_text(found), meshes)]
+        if options is not None:
+            parts.append(table_text("[motion]", {"file": options.file}))
+        target.write_text("\n".join(parts), encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"cannot write to {directory}: {error.strerror}; choose another --output") from None
+    return target
+
+
+def head_text(found: Imported) -> str:
+    """Return the comment that begins the file: where it is from, and what was not taken."""
+    model = found.model
+    lines = [
+        f"Scene from the OpenSim model {model.path.name} (version {model.version}).",
+        "Its meshes, authors and licence are the model's: see its <credits>.",
+        "Meshes stand in the model's default pose; angles are degrees. All keys: docs/scene_file.md.",
+        *(f"note: {note}" for note in found.notes),
+    ]
+    return "\n".join("# " + " ".join(line.split()) for line in lines) + "\n"
 
 
 def number(value: float) -> str:
@@ -79,14 +129,11 @@ def skeleton_text(scene: Scene, head: str, meshes: dict[str, str]) -> str:
 
 def write_meshes(scene: Scene, directory: Path) -> dict[str, str]:
     """Write every bone's mesh as PLY (float64) and return the files, relative to the folder."""
-    folder = directory / BONES
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for bone in scene.bones:
-            write_ply(folder / f"{bone.name}.ply", bone.mesh.vertices, bone.mesh.faces)
-    except OSError as error:
-        raise UsageError(f"cannot write to {folder}: {error.strerror}; choose another --output") from None
-    return {bone.name: f"{BONES}/{bone.name}.ply" for bone in scene.bones}
+    (directory / BONES).mkdir(parents=True, exist_ok=True)
+    files = {bone.name: f"{BONES}/{bone.name}.ply" for bone in scene.bones}
+    for bone in scene.bones:
+        write_ply(directory / files[bone.name], bone.mesh.vertices, bone.mesh.faces)
+    return files
 
 
 def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:

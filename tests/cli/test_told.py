@@ -22,7 +22,6 @@ from rbfmuscle.study.measure.summary import require_limits
 from rbfmuscle.study.show.comparison_page import cell
 from rbfmuscle.study.show.kernels.page import COLUMNS
 from rbfmuscle.study.show.kernels.page import _row as kernel_row
-from rbfmuscle.study.show.model_paths import _panel
 from rbfmuscle.study.show.report import _cell as report_cell
 from rbfmuscle.study.show.report import _facts, _stages, _summary, _verdict
 from rbfmuscle.study.show.sdf_report import report_lines
@@ -272,22 +271,6 @@ class TestPages:
         saved.info["limits"]["penetration_max"] = 0.61
         assert "within every limit" in _verdict(saved)
         assert report_cell("time_frame", {"worst": 1.0, "median": 0.0345}).startswith("34.5 ms")
-
-    def test_panels_draw_changes_from_the_first_frame_and_arms_as_they_are(self, monkeypatch):
-        from matplotlib.axes import Axes
-
-        drawn, plot = [], Axes.plot
-        monkeypatch.setattr(
-            Axes, "plot", lambda *a, **k: (drawn.append((list(a[1]), list(a[2]))), plot(*a, **k))[1]
-        )
-        own, theirs = {"run": ([0, 2], np.array([7.0, 9.0]))}, {"path": [3.0, 4.5]}
-        place = ({0: 10.0, 2: 30.0}, "flexion", "mm")
-        picture = _panel("Change of length", own, theirs, [0, 2], place, True)
-        assert drawn == [([10.0, 30.0], [0.0, 1.5]), ([10.0, 30.0], [0.0, 2.0])]
-        assert b"<svg" in picture
-        drawn.clear()
-        _panel("Moment arm", own, theirs, [0, 2], place, False)
-        assert drawn == [([10.0, 30.0], [3.0, 4.5]), ([10.0, 30.0], [7.0, 9.0])]
 
 
 class TestProgress:

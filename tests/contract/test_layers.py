@@ -23,7 +23,6 @@ ALLOWED = {
         *LEAVES,
         "rbfmuscle.implicit",
         "rbfmuscle.sim",
-        "rbfmuscle.opensim",
         "rbfmuscle.study",
     ),
     "rbfmuscle.model": (*LEAVES, "rbfmuscle.implicit", "rbfmuscle.sim", "rbfmuscle.model"),

@@ -7,11 +7,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from rbfmuscle.commands.opensim import sampling
-from rbfmuscle.commands.opensim.sampling import Sampling, parse_ranges, report_fits
+from rbfmuscle.commands.opensim.sampling import Samples, parse_ranges, report_fits, sample_muscles
 from rbfmuscle.opensim.fitted import FittedPath, exponents, fit_path, write_paths
 from rbfmuscle.sim.scene.phantom import phantom_scene
-from rbfmuscle.validation import UsageError
+from rbfmuscle.validation import SolveError, UsageError
 
 
 def smooth(q):
@@ -111,46 +110,36 @@ def scene():
 RANGES = {"hip.flexion": (0.0, 0.4), "hip.adduction": (-0.1, 0.1), "hip.internal_rotation": (-0.1, 0.1)}
 
 
-def test_sampling_goes_on_where_it_ended_and_is_fitted(scene, tmp_path):
-    first = Sampling(scene, tmp_path, RANGES, samples=6, kind="sobol")
-    assert first.needs == {"abductor": tuple(RANGES)} and first.missing == 6
-    first.run()
-    kept = (tmp_path / "samples.jsonl").read_text()
-    (tmp_path / "samples.jsonl").write_text(kept + '{"muscle": "abd')  # killed while it wrote
-    again = Sampling(scene, tmp_path, RANGES, samples=15, kind="sobol")
-    assert again.missing == 9
-    again.run()
-    assert (tmp_path / "samples.jsonl").read_text().startswith(kept)
-    values, lengths, arms, held = again.table("abductor")
-    assert values.shape == (15, 3) == arms.shape and held.sum() == 3 and np.ptp(lengths) > 0
-    lines = report_fits(again, 3)
+def test_muscle_is_sampled_over_what_moves_it_and_fitted(scene, tmp_path):
+    told = []
+    (found,) = sample_muscles(scene, RANGES, samples=15, progress=lambda *done: told.append(done))
+    assert found.coordinates == tuple(RANGES) and told[-1] == (15, 15)
+    assert found.values.shape == (15, 3) == found.arms.shape and np.ptp(found.lengths) > 0
+    low, high = np.array(list(RANGES.values())).T
+    assert (found.values >= low).all() and (found.values <= high).all()
+    assert (np.ptp(found.values, axis=0) > 0.8 * (high - low)).all()
+    lines = report_fits(scene, [found], tmp_path, 3)
     assert "3 poses held out" in lines[0] and (tmp_path / "errors.csv").is_file()
     assert ElementTree.parse(tmp_path / "paths.xml").getroot().find(".//order").text in "123"
-    with pytest.raises(UsageError, match="another scene or other ranges"):
-        Sampling(scene, tmp_path, {**RANGES, "hip.flexion": (0.0, 0.5)}, samples=6, kind="sobol")
 
 
-def test_a_pose_is_sampled_from_rest_whatever_was_sampled_before(scene, tmp_path):
-    found = []
-    for name, counts in (("at once", [4]), ("by halves", [2, 4])):
-        for count in counts:
-            run = Sampling(scene, tmp_path / name, RANGES, samples=count, kind="halton")
-            run.run()
-        found.append(run.table("abductor"))
-    for one, other in zip(*found):
-        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+def test_a_pose_is_sampled_from_rest_whatever_was_sampled_before(scene):
+    (four,) = sample_muscles(scene, RANGES, samples=4)
+    (two,) = sample_muscles(scene, RANGES, samples=2)
+    # Sobol's sequence is scrambled for its whole length: the same points first, whatever the count.
+    np.testing.assert_allclose(two.values, four.values[:2], rtol=1e-12)
+    np.testing.assert_allclose(two.lengths, four.lengths[:2], rtol=1e-12)
+    np.testing.assert_allclose(two.arms, four.arms[:2], rtol=1e-9)
 
 
-def test_what_moves_a_muscle_is_asked_over_the_ranges_from_end_to_end(scene, tmp_path, monkeypatch):
-    asked, really = [], sampling.moving_coordinates
-    monkeypatch.setattr(
-        sampling, "moving_coordinates", lambda *given: asked.append(given[2]) or really(*given)
-    )
-    Sampling(scene, tmp_path, RANGES, samples=6, kind="sobol")
-    for name, (low, high) in RANGES.items():
-        values = [pose[name] for pose in asked if pose]
-        assert min(values) == pytest.approx(low) and max(values) == pytest.approx(high)
-        assert len(set(values)) >= 3, "what moves it between the ends only is found too"
+def test_poses_that_fail_are_left_out_and_too_many_are_refused(tmp_path, scene):
+    values, lengths, arms = made(20)
+    lengths[3] = np.nan
+    found = Samples("m", ("hip.flexion", "hip.adduction"), values, lengths, arms)
+    assert "1 poses could not be solved" in report_fits(scene, [found], tmp_path, 2)[0]
+    lengths[:15] = np.nan
+    with pytest.raises(SolveError, match="15 of 20 poses failed"):
+        report_fits(scene, [found], tmp_path, 2)
 
 
 def test_ranges_are_checked(scene):

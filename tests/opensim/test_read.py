@@ -1,17 +1,15 @@
 """Models as OpenSim reads them: reference transforms of every model given, and a small one with known answers."""
 
 import json
-import math
 
 import numpy as np
 import pytest
-from straight_paths import straight_length
 
 import rbfmuscle as rm
-from rbfmuscle.opensim.folder import write_scene
 from rbfmuscle.opensim.model import motion_kinds
 from rbfmuscle.opensim.read import read_osim
 from rbfmuscle.opensim.scene import import_osim
+from rbfmuscle.opensim.write import write_scene
 from rbfmuscle.sim.joints.joint import TransformAxis, frame_at, rotation_about
 from rbfmuscle.sim.joints.skeleton import all_coordinates
 from rbfmuscle.sim.scene.motion import bone_poses
@@ -39,13 +37,13 @@ def reference(data, name):
 
 
 def poses_of(found):
-    """Every recorded pose: coordinates by name, body transforms and path lengths."""
+    """Every recorded pose: coordinates by name and body transforms."""
     names = [row["name"] for row in found["coordinates"]]
     sets = [found["default"], *({k: found["poses"][k][i] for k in found["poses"] if k != "moment_arms"}
                                 for i in range(len(found["poses"]["q"])))]  # fmt: skip
     for entry in sets:
         matrices = [np.array(row).reshape(3, 4) for row in entry["transforms"]]
-        yield dict(zip(names, entry["q"])), dict(zip(found["bodies"], matrices)), entry["lengths"]
+        yield dict(zip(names, entry["q"])), dict(zip(found["bodies"], matrices))
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -54,20 +52,13 @@ def test_body_transforms_are_opensims(osim_data, name):
     model = read_osim(path)
     kinds = {coordinate: facts.motion for coordinate, facts in model.coordinates().items()}
     assert kinds == {row["name"]: KINDS[row["motion"]] for row in found["coordinates"]}
-    paths = {path.name: path for path in model.paths}
-    for number, (values, bodies, lengths) in enumerate(poses_of(found)):
+    for values, bodies in poses_of(found):
         got = model.transforms(values)
         for body, wanted in bodies.items():
             assert np.abs(got[body][:3, 3] - wanted[:, 3]).max() <= 1e-8
             assert np.abs(got[body][:3, :3] - wanted[:, :3]).max() <= 1e-7
         # Assembly meets couplers to 1e-10.
         assert all(abs(value - values[n]) < 2e-10 for n, value in model.resolve(values).items())
-        if number < 5:
-            for muscle, length in zip(found["muscles"], lengths):
-                if not muscle["wraps"]:
-                    assert straight_length(model, paths[muscle["name"]], values) == pytest.approx(
-                        length, abs=2e-11
-                    )
 
 
 @pytest.mark.parametrize(
@@ -80,7 +71,7 @@ def test_poses_of_the_written_scene_are_opensims(osim_data, tmp_path, name, unit
     metre = scene.length(1000.0)
     facts = all_coordinates(scene.joints)
     full = {coordinate.split(".")[1]: coordinate for coordinate in facts}
-    for values, bodies, _ in list(poses_of(found))[:20]:
+    for values, bodies in list(poses_of(found))[:20]:
         asked = {
             full[n]: v * (metre if facts[full[n]].motion == "translation" else 1.0) for n, v in values.items()
         }
@@ -118,27 +109,6 @@ class TestSmall:
         assert got["shank"] == pytest.approx(thigh @ knee, abs=1e-15)
         assert got["cap"] == pytest.approx(thigh @ frame_at((-0.08, 0, 0)), abs=1e-15)
 
-    def test_conditional_point_counts_in_its_range_only(self, small):
-        model = read_osim(small)
-        path = model.paths[0]
-        shank = model.transforms({"knee_angle": -1.0})["shank"]
-        end = shank[:3, :3] @ [-0.04, -0.05, 0] + shank[:3, 3]
-        assert straight_length(model, path, {"knee_angle": -1.0}) == pytest.approx(
-            math.dist((-0.05, 0, 0), end)
-        )
-        assert straight_length(model, path, {"knee_angle": -0.6}) > straight_length(
-            model, path, {"knee_angle": -0.601}
-        )
-
-    def test_coordinate_is_found_by_its_path_or_its_bare_name(self, small):
-        wanted = [point.condition for point in read_osim(small).paths[0].points]
-        assert wanted[1] == ("knee_angle", -0.6, 0.2)
-        old = "<socket_coordinate>/jointset/knee/knee_angle</socket_coordinate>"
-        text = small.read_text()
-        assert old in text
-        small.write_text(text.replace(old, "<coordinate>knee_angle</coordinate>"))
-        assert [point.condition for point in read_osim(small).paths[0].points] == wanted
-
     def test_joint_that_closes_a_loop_is_left_out_and_named(self, small):
         joint = """<PinJoint name="strut"><socket_parent_frame>/ground</socket_parent_frame>
             <socket_child_frame>shank</socket_child_frame>
@@ -175,7 +145,7 @@ class TestSmall:
         assert all(np.array_equal(pose, np.eye(4)) for pose in bone_poses(scene, {}).values())
 
     def test_mirrored_mesh_is_outward_and_scaled(self, small):
-        mesh = rm.Scene.from_osim(small).bone("thigh").mesh
+        mesh = import_osim(small).scene.bone("thigh").mesh
         assert mesh.volume == pytest.approx(2 * 0.1**3 / 6)
         assert mesh.bounds[0][2] == pytest.approx(-0.2)
 

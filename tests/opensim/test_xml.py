@@ -7,7 +7,6 @@ import time
 
 import pytest
 
-from rbfmuscle.opensim import xml
 from rbfmuscle.opensim.xml import read_xml
 from rbfmuscle.validation import SceneError
 
@@ -46,22 +45,6 @@ def test_depth_is_bounded(tmp_path):
     assert "nested deeper" in refuse(tmp_path, "<a>" * 10_000 + "</a>" * 10_000)
 
 
-def test_text_and_elements_are_bounded(tmp_path, monkeypatch):
-    monkeypatch.setattr(xml, "MOST_TEXT", 1000)
-    assert "characters of text" in refuse(tmp_path, "<a>" + "x" * 2000 + "</a>")
-    monkeypatch.setattr(xml, "MOST_ELEMENTS", 100)
-    assert "elements" in refuse(tmp_path, "<a>" + "<b/>" * 200 + "</a>")
-
-
-def test_a_file_of_a_gigabyte_is_refused_by_its_size(tmp_path):
-    path = tmp_path / "big.osim"
-    with path.open("wb") as file:
-        file.write(b"<a>")
-        file.truncate(1 << 30)  # sparse: it takes no disk
-    with pytest.raises(SceneError, match=r"1074 MB, more than 200"):
-        read_xml(path)
-
-
 def test_a_gigabyte_from_a_pipe_is_refused_in_bounded_memory():
     code = (
         "import sys; from pathlib import Path; from rbfmuscle.opensim.xml import read_xml\n"
@@ -82,8 +65,8 @@ def test_a_gigabyte_from_a_pipe_is_refused_in_bounded_memory():
     reader.returncode = os.waitstatus_to_exitcode(status)
     first.wait()
     assert reader.returncode == 0
-    assert "characters of text" in told
-    assert used.ru_maxrss < 2_000_000  # [kB]
+    assert "more than 30 MB" in told
+    assert used.ru_maxrss < 500_000  # [kB]
 
 
 @pytest.mark.parametrize("text", ["", "no xml", "<a><b></a>", "<a", b"\xff\xfe<\x00", UNKNOWN])
@@ -95,7 +78,7 @@ def test_two_colons_in_a_name_and_what_is_not_ascii_are_read(tmp_path):
     path = tmp_path / "good.osim"
     path.write_text('<A::B name="é"><!-- x::y --><c> 1 </c></A::B>', encoding="utf-8")
     root = read_xml(path)
-    assert root.tag == "A::B" and root.name == "é" and root.word("c") == "1"
+    assert root.tag == "A__B" and root.name == "é" and root.word("c") == "1"
 
 
 def test_missing_file(tmp_path):

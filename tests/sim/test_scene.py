@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from rbfmuscle.sim.scene import options
 from rbfmuscle.sim.scene.check import bone_collisions, check_initial
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.validation import MeshError, SceneError, UsageError
@@ -41,6 +42,18 @@ initial = "keep"
 [detect]
 tunnelling = { angle = 120, action = "report" }
 """
+
+
+@pytest.mark.parametrize(
+    ("key", "place"), [("model.centres", "muscle.biceps."), ("detect.tunnelling.angle", "")]
+)
+def test_removed_key_is_an_error_that_names_what_replaces_it(tmp_path, monkeypatch, key, place):
+    monkeypatch.setitem(options.REMOVED_KEYS, key, "use another")
+    (tmp_path / "scene.toml").write_text(TEXT)
+    with pytest.raises(SceneError, match=rf"scene.toml: {key} was removed: use another"):
+        Scene.load(tmp_path / "scene.toml")
+    with pytest.raises(UsageError, match=rf"{key} was removed: use another"):
+        built().with_options({place + key: 1})
 
 
 def meshes():

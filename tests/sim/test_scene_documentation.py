@@ -42,7 +42,6 @@ def documented_tables():
         options.SurfaceOptions: "`[output]`",
         options.FibreOptions: "`[output]`",
         options.ArmOptions: "`[output]`",
-        options.OpenSimOptions: "`[opensim]`",
         keys.ContractionTable: CONTRACTION,
         keys.CourseTable: CONTRACTION,
         keys.TendonTable: CONTRACTION,

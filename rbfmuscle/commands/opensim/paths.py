@@ -1,7 +1,7 @@
 """``rbfmuscle paths``: fitted muscle paths for OpenSim."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
 
@@ -18,18 +18,15 @@ def paths(
     model: str | None = None,
     order: int = 7,
     settings: Annotated[list[str] | None, Parameter(name="--set", negative="")] = None,
-    kind: Annotated[Literal["sobol", "halton"], Parameter(name="--points")] = "sobol",
 ) -> None:
     """Sample a muscle's lengths and moment arms over its coordinates and fit a path that OpenSim loads.
-
-    What is sampled is kept: the same call goes on where it ended.
 
     Parameters
     ----------
     scene
         Scene file (TOML).
     output
-        Folder for samples.jsonl, paths.xml, paths.csv and errors.csv.
+        Folder for paths.xml, paths.csv and errors.csv.
     samples
         Poses for each muscle, of which every fifth is held out of the fit.
     muscles
@@ -42,10 +39,8 @@ def paths(
         Highest order of the polynomials.
     settings
         KEY=VALUE, as for run; may be repeated.
-    kind
-        Quasi-random points.
     """
-    from rbfmuscle.commands.opensim.sampling import Sampling, parse_ranges, report_fits
+    from rbfmuscle.commands.opensim.sampling import parse_ranges, report_fits, sample_muscles
     from rbfmuscle.compiled.progress import Progress
     from rbfmuscle.models import configure_scene
     from rbfmuscle.sim.scene.scene import Scene
@@ -58,8 +53,8 @@ def paths(
     if muscles is not None:
         chosen = [loaded.muscle(name.strip()).name for name in muscles.split(",")]
         loaded.muscles = [muscle for muscle in loaded.muscles if muscle.name in chosen]
-    sampling = Sampling(loaded, output, parse_ranges(loaded, ranges or []), samples=samples, kind=kind)
+    given = parse_ranges(loaded, ranges or [])
     with Progress(loaded.name, "pose") as progress:
-        sampling.run(progress)
-    for line in report_fits(sampling, order):
+        sampled = sample_muscles(loaded, given, samples=samples, progress=progress)
+    for line in report_fits(loaded, sampled, output, order):
         print(line)

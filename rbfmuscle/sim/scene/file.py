@@ -27,12 +27,12 @@ from rbfmuscle.sim.scene.options import (
     ContactOptions,
     DetectOptions,
     MotionOptions,
-    OpenSimOptions,
     OutputOptions,
     Positive,
     SlidingOptions,
     Table,
     check_plain,
+    check_removed,
     describe_error,
 )
 from rbfmuscle.validation import MeshError, SceneError, is_file, shown, shown_path
@@ -103,7 +103,6 @@ class SceneFile(Table):
     sliding: SlidingOptions | None = None
     detect: DetectOptions | None = None
     output: OutputOptions = OutputOptions()
-    opensim: OpenSimOptions | None = None
 
 
 def read_scene_file(path: Path) -> SceneFile:
@@ -116,6 +115,7 @@ def read_scene_file(path: Path) -> SceneFile:
     """
     data = _read_toml(path)
     check_plain(data, place=f"{path}: ")
+    check_removed(data, place=f"{path}: ")
     try:
         return SceneFile.model_validate(data)
     except ValidationError as error:
@@ -184,8 +184,6 @@ def _build(scene, tables, folder, path, skeleton):
     scene.sliding = tables.sliding
     scene.detect = tables.detect
     scene.output = tables.output
-    if tables.opensim is not None:
-        scene.opensim = tables.opensim.model_copy(update={"model": str(folder / tables.opensim.model)})
     return scene if skeleton and not tables.muscle else scene.validate()
 
 
@@ -268,7 +266,6 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
         "sliding": scene.sliding.model_dump() if scene.sliding else None,
         "detect": scene.detect.model_dump() if scene.detect else None,
         "output": scene.output.model_dump(),
-        "opensim": scene.opensim.model_dump() if scene.opensim else None,
     }
 
 

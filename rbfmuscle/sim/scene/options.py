@@ -28,6 +28,12 @@ from rbfmuscle.validation import SceneError, did_you_mean, shown
 DEEPEST = 20
 LARGEST_INTEGER = 2**53
 
+# Keys that were removed, and what to do instead; a key of a muscle or of its model (`model.KEY`) without the muscle.
+# The table is deleted at 1.0.
+REMOVED_KEYS: dict[str, str] = {
+    "opensim": "delete the table: runs are no longer compared with the muscle paths of an OpenSim model",
+}
+
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -70,6 +76,26 @@ def check_plain(value: object, *, place: str) -> None:
             raise SceneError(f"{where}: a whole number must be at most 2^53 in size, got {shown(part)}")
         elif isinstance(part, float) and not math.isfinite(part):
             raise SceneError(f"{where}: must be a finite number, got {part}")
+
+
+def check_removed(values: object, *, place: str, prefix: str = "") -> None:
+    """Raise SceneError where a table holds a key that was removed, naming what to do instead.
+
+    Parameters
+    ----------
+    values : object
+        A table, or a list of tables, as a TOML reader returned it.
+    place : str
+        Begins the message.
+    prefix : str
+        Dotted name of the table, with a full stop at its end.
+    """
+    for row in values if isinstance(values, list) else [values]:
+        for key, value in row.items() if isinstance(row, dict) else ():
+            name = f"{prefix}{key}".removeprefix("muscle.").removeprefix("defaults.")
+            if name in REMOVED_KEYS:
+                raise SceneError(f"{place}{name} was removed: {REMOVED_KEYS[name]}")
+            check_removed(value, place=place, prefix=f"{name}.")
 
 
 class Table(BaseModel):
@@ -216,13 +242,6 @@ class OutputOptions(Table):
     @classmethod
     def _true_means_defaults(cls, value):
         return {} if value is True else value
-
-
-class OpenSimOptions(Table):
-    """``[opensim]``: the model that a scene is of, and which of its muscles each muscle is."""
-
-    model: str
-    muscles: dict[str, Annotated[list[str], Field(min_length=1)]] = Field(default_factory=dict)
 
 
 class RampOptions(Table):

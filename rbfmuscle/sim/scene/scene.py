@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     import trimesh
 
 
-# What reads files of other programs as scenes, by suffix; the room that can do it enters itself here.
-IMPORTERS = {}
 MM_PER_UNIT = {"m": 1000.0, "cm": 10.0, "mm": 1.0}
 
 
@@ -64,8 +62,6 @@ class Scene:
     sliding : SlidingOptions or None
     detect : DetectOptions or None
     output : OutputOptions
-    opensim : OpenSimOptions or None
-        The model that the scene is of.
     path : pathlib.Path or None
         The file it was loaded from.
 
@@ -93,7 +89,6 @@ class Scene:
         self.sliding = None
         self.detect: Any = None
         self.output = OutputOptions()
-        self.opensim: Any = None
         self.path = None
 
     @classmethod
@@ -116,27 +111,6 @@ class Scene:
         from rbfmuscle.sim.scene.file import load_scene
 
         return load_scene(cls, Path(path), skeleton=skeleton)
-
-    @classmethod
-    def from_osim(cls, path: str | Path, **options: Any) -> Any:
-        """Return a scene with the bones and joints of an OpenSim model; muscles are still to be added.
-
-        Parameters
-        ----------
-        path : path
-            An ``.osim`` file.
-        **options
-            ``units`` ("m"), ``geometry`` (folders with meshes), ``bodies`` (which to take): see
-            `rbfmuscle.opensim.scene.import_osim`, which also returns what was not taken.
-
-        Raises
-        ------
-        SceneError
-            If the model cannot be read, or has a joint that the table of joints lacks.
-        """
-        if "osim" not in IMPORTERS:
-            raise SceneError("nothing here reads .osim files; import rbfmuscle.opensim first")
-        return IMPORTERS["osim"](path, **options)
 
     def length(self, millimetres: float) -> float:
         """Return a length given in millimetres in the scene's unit."""
@@ -316,8 +290,6 @@ class Scene:
                 )
             if muscle.contraction is not None:
                 self._check_contraction(muscle)
-        for name in self.opensim.muscles if self.opensim else ():
-            find_named(self.muscles, name, "muscle", place="[opensim]")
         return self
 
     def _check_contraction(self, muscle: Muscle) -> None:

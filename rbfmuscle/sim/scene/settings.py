@@ -10,7 +10,7 @@ import numpy as np
 
 from rbfmuscle.sim.contraction.keys import KEYS
 from rbfmuscle.sim.scene.objects import split_model
-from rbfmuscle.sim.scene.options import DetectOptions, SlidingOptions, check_plain
+from rbfmuscle.sim.scene.options import DetectOptions, SlidingOptions, check_plain, check_removed
 from rbfmuscle.validation import SceneError, UsageError, did_you_mean
 
 if TYPE_CHECKING:
@@ -78,10 +78,12 @@ def choose_frames(scene: Scene, frames: slice | str) -> None:
 
 def _apply(scene, key, value):
     head, _, rest = key.partition(".")
+    check_removed({key: value}, place="")
     if head == "model":
         _set_model(scene.muscles, scene, rest, value, key)
     elif head == "muscle":
         name, _, rest = rest.partition(".")
+        check_removed({rest: value}, place=f"{key}: ")
         head, _, rest = rest.partition(".")
         muscle = scene.muscle(name)
         if head in KEYS:

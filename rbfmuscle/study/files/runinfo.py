@@ -232,12 +232,11 @@ def content_hash(scene: Scene) -> str:
 
 
 def input_hashes(scene: Scene) -> dict[str, Any]:
-    """SHA-256 of the scene file and of the meshes, model and motion that it names; files that are gone are left out."""
-    model = scene.opensim.model if scene.opensim else None
+    """SHA-256 of the scene file and of the meshes and motion that it names; files that are gone are left out."""
     motion = scene.motion.options.file
     if motion is not None:
         motion = (Path(scene.path).parent if scene.path else Path()) / motion
-    sources = [scene.path, model, motion, *(item.source for item in [*scene.bones, *scene.muscles])]
+    sources = [scene.path, motion, *(item.source for item in [*scene.bones, *scene.muscles])]
     found = {}
     for source in dict.fromkeys(str(s) for s in sources if s):
         path = Path(source)

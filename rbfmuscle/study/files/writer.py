@@ -37,7 +37,6 @@ _OLD_FILES = (
     "fibres.pvd",
     "fibre_lengths.csv",
     "metrics.csv",
-    "opensim.csv",
     "report.html",
     "preview.webp",
     NAME,

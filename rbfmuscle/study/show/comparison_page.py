@@ -12,7 +12,6 @@ from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.quantities import ALL
 from rbfmuscle.study.show.appearance import line_colours
 from rbfmuscle.study.show.comparison_plots import plot_models
-from rbfmuscle.study.show.model_paths import beside_section
 from rbfmuscle.study.show.page import STYLE, embedded_image
 from rbfmuscle.study.show.render import chosen_frames, draw_pictures
 from rbfmuscle.validation import SolveError
@@ -45,7 +44,7 @@ and those within 5 % of it or nearer than what counts. Each row belongs to the r
 <div class="wide">{table}</div>
 <h2>Between the models</h2><p class="note">Distance of each pair of models in the last pose, root mean square over
 all muscles [{units}].</p><div class="wide">{matrix}</div>
-<h2>Over the motion</h2><p class="legend">{legend}</p><div class="plots">{plots}</div>{beside}
+<h2>Over the motion</h2><p class="legend">{legend}</p><div class="plots">{plots}</div>
 <h2>How to read this</h2>{explanation}<dl>{measures}</dl>
 <footer>{footer}</footer></main></body></html>
 """
@@ -143,7 +142,6 @@ def _page(folder, table, images, moving, missing):
         plots="".join(
             f"<figure>{embedded_image(svg, 'svg+xml', title)}</figure>" for title, svg in plot_models(runs)
         ),
-        beside=beside_section(runs),
         explanation=EXPLANATION,
         measures="".join(
             f"<dt>{html.escape(m.title)}</dt><dd>{html.escape(m.meaning)}</dd>" for m in MEASURES.values()

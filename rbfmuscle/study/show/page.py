@@ -88,7 +88,7 @@ PAGE = """<!doctype html>
 {verdict}
 <div class="facts">{facts}</div>
 <h2>Motion</h2>{pictures}
-<h2>Over the motion</h2><p class="legend">{legend}</p><div class="plots">{plots}</div>{beside}
+<h2>Over the motion</h2><p class="legend">{legend}</p><div class="plots">{plots}</div>
 <h2>Summary</h2><div class="wide">{table}</div>
 {neighbours}<h2>Events</h2>{events}
 <h2>Time of each stage</h2><p class="note">Milliseconds a frame: median, and the 95th percentile in grey; then in

@@ -12,7 +12,6 @@ from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.quantities import QUANTITIES
 from rbfmuscle.study.measure.summary import LEAST, exceeded
 from rbfmuscle.study.show.appearance import USUAL_VIEWS, line_colours
-from rbfmuscle.study.show.model_paths import beside_section
 from rbfmuscle.study.show.page import (
     EXPLANATION,
     MANY,
@@ -124,7 +123,6 @@ def _page(saved, plots, drawn):
         pictures=_pictures(*drawn),
         legend=_legend(saved),
         plots="".join(f"<figure>{embedded_image(data, 'svg+xml', title)}</figure>" for title, data in plots),
-        beside=beside_section({"run": saved}),
         table=_summary(saved),
         stages=_stages(saved),
         events=_events(saved),
