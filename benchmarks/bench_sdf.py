@@ -19,10 +19,10 @@ import trimesh
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.sim.distance.detectors import TreeDetector, VoxelDetector
+from rbfmuscle.sim.distance.errors import points_near
 from rbfmuscle.sim.distance.sdf import BoneSDF
 from rbfmuscle.sim.distance.serendipity import SerendipityField
 from rbfmuscle.sim.distance.spline import SplineField
-from rbfmuscle.study.show.sdf_report import points_near
 
 PSEUDONORMAL = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
 # Points for accuracy, for speed, and for the slow exact tools.

@@ -40,7 +40,6 @@ TASKS = {
     "kernels": KERNELS,
     "check": ["check", "scene/scene.toml"],
     "plan": ["plan", "scene/scene.toml"],
-    "sdf": ["sdf", "scene/femur.stl", "-o", "slice.png"],
 }
 
 

@@ -14,7 +14,6 @@ import warnings
 from cyclopts import App, CycloptsError
 
 from rbfmuscle import __version__
-from rbfmuscle.commands.cache import cache_app
 from rbfmuscle.commands.check import check
 from rbfmuscle.commands.compare import compare
 from rbfmuscle.commands.kernels import kernels
@@ -24,7 +23,6 @@ from rbfmuscle.commands.opensim.paths import paths
 from rbfmuscle.commands.plan import plan
 from rbfmuscle.commands.poses.ways import ways
 from rbfmuscle.commands.run import demo, run
-from rbfmuscle.commands.sdf import sdf
 from rbfmuscle.commands.show import export, render
 from rbfmuscle.commands.sweep import sweep
 from rbfmuscle.commands.view import view
@@ -48,13 +46,11 @@ for command in (
     new,
     view,
     ways,
-    sdf,
     kernels,
 ):
     app.command(command)
 app.command(import_, name="import")
 app.command(paths)
-app.command(cache_app)
 
 
 def run_command(arguments: list[str]) -> int:

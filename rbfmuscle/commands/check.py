@@ -20,6 +20,7 @@ def check(
     scene: Path,
     *,
     picture: Annotated[bool, Parameter(negative="")] = False,
+    fields: Annotated[bool, Parameter(negative="")] = False,
     as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
 ) -> int:
     """Check a scene file and its meshes; nothing is solved.
@@ -30,19 +31,25 @@ def check(
         Scene file (TOML).
     picture
         Draw patches, joint axes, far ends and overlaps to a PNG beside the scene file.
+    fields
+        Measure the bones' distance fields against exact distances.
     as_json
         Print JSON and nothing else.
     """
     with Progress(f"check {scene.name}"):
         loaded, findings = _findings(scene)
+        errors_of = _measure_fields(loaded) if fields else {}
     drawn = _draw(loaded, scene) if picture else None
     errors = [finding for finding in findings if finding.level == "error"]
     if as_json:
         shown = [{"level": f.level, "place": f.place, "message": f.message} for f in findings]
         facts = {"scene": loaded.resolved(), "findings": shown}
-        print(json.dumps(facts if drawn is None else {**facts, "picture": drawn}, indent=1))
+        more = {"picture": drawn, "fields": errors_of}
+        print(json.dumps({**facts, **{key: value for key, value in more.items() if value}}, indent=1))
     else:
         _print_scene(loaded)
+        for name, found in errors_of.items():
+            print(_describe_field(name, found, loaded.units))
         for finding in findings:
             print(finding)
         if drawn is not None:
@@ -97,6 +104,23 @@ def _field_notes(scene):
     finally:
         logger.setLevel(level)
     return found
+
+
+def _measure_fields(scene):
+    """Errors of the distance field of each bone, by name."""
+    from rbfmuscle.sim.distance.errors import measure_field
+    from rbfmuscle.sim.distance.sdf import BoneSDF
+
+    with tell_stage("errors of the bones' fields"):
+        return {b.name: measure_field(BoneSDF.from_mesh(b.mesh, name=b.name)) for b in scene.bones}
+
+
+def _describe_field(name, found, units):
+    return (
+        f"  field of {name}: within {found['width']:.3g} {units} of the surface {found['error_rms']:.2g} {units} RMS, "
+        f"{found['error_max']:.2g} at most; sign wrong for {100 * found['sign_wrong']:.4f} %; direction off by "
+        f"{found['angle_median']:.2g} degrees in the median"
+    )
 
 
 def _print_scene(scene):

@@ -47,29 +47,6 @@ def cache_path() -> Path:
     return Path(place) if place else Path(platformdirs.user_cache_dir("rbfmuscle", appauthor=False)) / "sdf"
 
 
-def cache_list() -> list[dict[str, Any]]:
-    """Entries as a list of dict: name, bytes, modified (seconds since the epoch), latest first."""
-    found = []
-    for path in cache_path().glob("*" + SUFFIX):
-        with contextlib.suppress(FileNotFoundError):
-            state = path.stat()
-            found.append(
-                {"name": path.name.removesuffix(SUFFIX), "bytes": state.st_size, "modified": state.st_mtime}
-            )
-    return sorted(found, key=lambda entry: -entry["modified"])
-
-
-def cache_clear() -> tuple[int, int]:
-    """Remove all entries, and what an interrupted process left; return their number and bytes."""
-    count = size = 0
-    for path in cache_path().glob("*" + SUFFIX + "*"):
-        with contextlib.suppress(FileNotFoundError):
-            size += path.stat().st_size
-            path.unlink()
-            count += 1
-    return count, size
-
-
 def content_key(vertices: Floats, faces: Integers, options: tuple[Any, ...]) -> str:
     """Name of an entry: a digest of the mesh and of all options that shape the field."""
     digest = hashlib.sha256(repr((VERSION, np.dtype(float).byteorder, options)).encode())

@@ -306,40 +306,7 @@ class TestOtherCommands:
         assert held == {"gluteus_maximus": {"pelvis", "sacrum", "femur"}, "iliacus": {"pelvis", "femur"}}
 
     def test_every_command_has_help(self, capsys):
-        for name in ("demo", "check", "run", "export", "render", "new", "cache"):
+        for name in ("demo", "check", "run", "export", "render", "new"):
             assert name in app
             code, out, _ = call(capsys, name, "--help")
             assert code == 0 and "Usage" in out
-
-    def test_cache(self, capsys, tmp_path, monkeypatch):
-        monkeypatch.setenv("RBFMUSCLE_CACHE", str(tmp_path))
-        assert call(capsys, "cache", "path") == (0, f"{tmp_path}\n", "")
-        assert call(capsys, "cache", "clear")[1].startswith("0 entries")
-
-
-class TestSDF:
-    def test_measures_a_bone_and_draws_a_slice(self, phantom_folder, tmp_path, capsys):
-        mesh = phantom_folder / "femur.ply"
-        code, out, _ = call(capsys, "sdf", mesh, "-o", tmp_path / "slice.png", "--units", "mm", "--no-cache")
-        assert code == 0 and "mm RMS" in out and "ns" in out
-        assert (tmp_path / "slice.png").read_bytes().startswith(b"\x89PNG")
-        code, out, _ = call(capsys, "sdf", mesh, "-o", tmp_path / "slice.png", "--axis", "z", "--json")
-        report = json.loads(out)
-        assert code == 0 and report["sign_wrong"] < 1e-3 and report["error_rms"] < 0.01
-
-    @pytest.mark.parametrize(
-        ("arguments", "code", "word"),
-        [
-            (["no.ply"], 4, "no such mesh"),
-            (["MESH", "-o", "x.jpg"], 2, ".png"),
-            (["MESH", "--tolerance", "-1"], 2, "positive"),
-            (["MESH", "--axis", "w"], 2, "x, y or z"),
-        ],
-    )
-    def test_bad_input_is_one_line(
-        self, arguments, code, word, phantom_folder, capsys, monkeypatch, tmp_path
-    ):
-        monkeypatch.chdir(tmp_path)
-        mesh = str(phantom_folder / "femur.ply")
-        found, _, err = call(capsys, "sdf", *[mesh if a == "MESH" else a for a in arguments])
-        assert found == code and word in err and err.count("\n") == 1

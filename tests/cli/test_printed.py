@@ -73,33 +73,6 @@ def test_export_counts_files_and_names_folders_once(ran, printed, tmp_path, caps
     assert len(list(one.iterdir())) == 1
 
 
-def test_cache_lists_names_and_sizes_the_latest_first_and_clears(capsys, tmp_path, monkeypatch):
-    import os
-
-    monkeypatch.setenv("RBFMUSCLE_CACHE", str(tmp_path))
-    for k, (name, size) in enumerate((("old", 3_000_000), ("new", 1_250_000))):
-        (tmp_path / f"{name}.sdf.npz").write_bytes(b"x" * size)
-        os.utime(tmp_path / f"{name}.sdf.npz", (1e9 + k, 1e9 + k))
-    (tmp_path / "other.txt").write_text("stays")
-    assert call(capsys, "cache", "list") == (0, "new  1.2 MB\nold  3.0 MB\n", "")
-    (tmp_path / "half.sdf.npz.part").write_bytes(b"x" * 50_000)
-    assert call(capsys, "cache", "clear") == (0, "3 entries removed, 4.3 MB\n", "")
-    assert [path.name for path in tmp_path.iterdir()] == ["other.txt"]
-    assert call(capsys, "cache", "list") == (0, "", "")
-
-
-def test_compiled_loops_are_cleared_apart(capsys, tmp_path, monkeypatch):
-    from rbfmuscle.compiled import store
-
-    monkeypatch.setenv("RBFMUSCLE_CACHE", str(tmp_path))
-    (tmp_path / "field.sdf.npz").write_bytes(b"x")
-    (tmp_path / "loops").mkdir()
-    (tmp_path / "loops" / "a.loop").write_bytes(b"x" * 2_500_000)
-    monkeypatch.setattr(store, "folders", lambda: (tmp_path / "loops",))
-    assert call(capsys, "cache", "clear", "--loops") == (0, "1 loops removed, 2.5 MB\n", "")
-    assert (tmp_path / "field.sdf.npz").exists() and not list((tmp_path / "loops").iterdir())
-
-
 def table(statuses):
     jobs = [
         {"subject": f"s{k}", "trial": "walk", "status": s, "error": f"why {k}" if s == "failed" else ""}

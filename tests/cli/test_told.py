@@ -5,6 +5,7 @@ wrong place, or scaled wrongly, cannot hide.
 """
 
 import html
+import json
 import re
 from types import SimpleNamespace
 
@@ -24,7 +25,6 @@ from rbfmuscle.study.show.kernels.page import COLUMNS
 from rbfmuscle.study.show.kernels.page import _row as kernel_row
 from rbfmuscle.study.show.report import _cell as report_cell
 from rbfmuscle.study.show.report import _facts, _stages, _summary, _verdict
-from rbfmuscle.study.show.sdf_report import report_lines
 from rbfmuscle.study.show.sweep_page import _cell as sweep_cell
 from rbfmuscle.validation import LimitExceededError, MeshError, SceneError
 
@@ -80,23 +80,6 @@ class TestCommands:
             "a frame 71 ms (solve 61, show 67)",
         ]
 
-    @pytest.mark.parametrize(("units", "length"), [("", ""), ("mm", " mm")])
-    def test_sdf_tells_each_figure_of_its_report(self, units, length):
-        report = {
-            "name": "femur", "vertices": 211, "faces": 223, "closed": True, "notes": ["mended"], "build_time": 1.25,
-            "memory": 17e6, "fine_cells": 227, "spacing": 1.9, "width": 2.3, "error_rms": 0.029, "error_max": 0.31,
-            "sign_wrong": 0.0037, "angle_median": 0.41, "angle_p99": 4.3, "time_value": 47e-9, "time_gradient": 53e-9,
-        }  # fmt: skip
-        assert report_lines(report, units) == [
-            "femur: 211 vertices, 223 faces, closed",
-            "  mended",
-            f"  built or loaded in 1.250 s, 17.0 MB, 227 fine cells of 1.9{length}",
-            f"  within 2.3{length} of the surface: 0.029{length} RMS, 0.31{length} worst, sign wrong for 0.3700 %",
-            "  direction of the gradient: 0.41 degrees median, 4.3 degrees for 99 %",
-            "  a value 47 ns, with gradient 53 ns",
-        ]
-        assert "signed by winding numbers" in report_lines({**report, "closed": False})[0]
-
     def test_check_tells_the_volume_in_cubic_centimetres_and_what_is_held(self, tmp_path, capsys):
         path = arm_files(tmp_path)
         code, out, _ = call(capsys, "check", path)
@@ -107,6 +90,17 @@ class TestCommands:
         assert f"attached: {held}" in out and f"{len(scene.motion)} frames, lengths in mm" in out
         path.write_text(path.read_text().replace('units = "mm"', 'units = "cm"'))
         assert f"{muscle.mesh.volume:.4g} cm3" in call(capsys, "check", path)[1]
+
+    def test_check_measures_the_fields_of_the_bones_where_it_is_asked(self, tmp_path, capsys):
+        path = arm_files(tmp_path)
+        assert "field of" not in call(capsys, "check", path)[1]
+        code, out, _ = call(capsys, "check", path, "--fields")
+        bones = [bone.name for bone in rm.Scene.load(path).bones]
+        assert code == 0 and [name for name in bones if f"field of {name}: within" in out] == bones
+        found = json.loads(call(capsys, "check", path, "--fields", "--json")[1])["fields"]
+        assert list(found) == bones and all(
+            0 <= f["error_rms"] <= f["error_max"] < 0.5 for f in found.values()
+        )
 
     @pytest.mark.parametrize("report", [True, False])
     def test_run_names_the_report_where_there_is_one(self, tmp_path, monkeypatch, capsys, report):

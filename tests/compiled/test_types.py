@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numba
 import numpy as np
 import pytest
-from command_line import call
 from numba.core import types
 
 from rbfmuscle.compiled import store
@@ -93,20 +92,6 @@ def test_watchers_are_told_of_stages_in_turn_and_only_what_they_listen_to():
 def loops(tmp_path, monkeypatch):
     monkeypatch.setattr(store, "folders", lambda: (tmp_path,))
     return tmp_path
-
-
-def test_clearing_tells_how_many_loops_and_bytes_there_were(loops, capsys):
-    for name, size in (
-        ("a.loop", 1_200_000),
-        ("b.loop", 300_000),
-        ("c.part", 50_000),
-        ("d.lock", 0),
-        ("swept", 9),
-    ):
-        (loops / name).write_bytes(b"x" * size)
-    code, out, _ = call(capsys, "cache", "clear", "--loops")
-    assert code == 0 and out.strip() == "2 loops removed, 1.6 MB"  # 1.55 MB
-    assert [path.name for path in loops.iterdir()] == ["swept"]
 
 
 def test_sweeping_removes_what_is_old_or_beyond_the_size_once_a_day(loops, monkeypatch):

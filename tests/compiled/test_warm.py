@@ -58,7 +58,7 @@ def test_type_without_a_spelling_is_refused():
 def test_the_table_is_not_far_behind_the_code():
     rows = needs._rows()
     tasks = set(needs.task_names())
-    assert {"rbf", "pbd", "kernels", "sdf", "plan"} <= tasks
+    assert {"rbf", "pbd", "kernels", "check", "plan"} <= tasks
     found = needs.loops_needed(tasks)
     gone = {row["loop"] for row in rows} - {need.name for need in found}
     # A row behind costs time alone, so that a rename need not wait for the table; many rows say that it is time.
@@ -67,14 +67,14 @@ def test_the_table_is_not_far_behind_the_code():
 
 @with_jit
 def test_an_entry_says_which_loop_it_is():
-    for need in needs.loops_needed(["sdf"]):
+    for need in needs.loops_needed(["check"]):
         module, function = need.name.split(":")
         assert need.entry.startswith(f"{module.split('.')[-1]}.{function}-")
 
 
 @with_jit
 def test_a_task_needs_only_its_own():
-    names = {need.name for need in needs.loops_needed(["sdf"])}
+    names = {need.name for need in needs.loops_needed(["check"])}
     assert names
     assert not any(name.startswith(("pbd_baseline", "rbfmuscle.model")) for name in names)
     assert needs.loops_needed(["no such task"]) == []
@@ -149,8 +149,8 @@ def test_two_cold_processes_share_the_work_and_a_third_has_none(tmp_path):
 
 @with_jit
 def test_nothing_is_missing_the_second_time(monkeypatch):
-    compile_ahead(["sdf"], jobs=1)
-    assert compile_ahead(["sdf"], jobs=1) == 0
+    compile_ahead(["check"], jobs=1)
+    assert compile_ahead(["check"], jobs=1) == 0
 
 
 @with_jit
