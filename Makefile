@@ -64,8 +64,6 @@ check: $(STAMP)
 	$(BIN)/python -m pytest -q tests/contract/test_layers.py
 
 bench: $(STAMP)
-	$(BIN)/python -m pip install --quiet -e ".[bench]" || echo "some peers are not to be had; the table says which"
-	$(BIN)/python benchmarks/table.py -o benchmarks/last.json
 	$(BIN)/python benchmarks/interpolation.py
 
 # Measures what the tables of the pages show, writes the JSON files of docs/evidence and the tables from them.

@@ -2,12 +2,48 @@
 
 import datetime
 import json
+import os
+import platform
 import subprocess
+from importlib import metadata
 from pathlib import Path
 
-from table import machine
-
 ROOT = Path(__file__).resolve().parent.parent
+
+
+def data_folder(name):
+    """The folder of that name in the data, or an end with what to do."""
+    for place in (os.environ.get("RBFMUSCLE_DATA"), ROOT.parent / "shared" / "data"):
+        if place and (Path(place) / name).is_dir():
+            return Path(place) / name
+    raise SystemExit(f"data/{name} is not here; set RBFMUSCLE_DATA to the folder that holds {name}/")
+
+
+def machine():
+    """What the figures hold for."""
+    model = platform.processor()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        names = [
+            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line
+        ]
+        model = names[0] if names else model
+    versions = {name: version(name) for name in ("numpy", "numba", "rbfmuscle", "scipy")}
+    import numba
+
+    return {
+        "cpu": model, "cores": os.cpu_count(), "usable_cores": len(os.sched_getaffinity(0)),
+        "threads": numba.get_num_threads(), "system": platform.platform(), "python": platform.python_version(),
+        "versions": versions,
+    }  # fmt: skip
+
+
+def version(name):
+    """Installed version of a distribution, or None."""
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
 
 
 def commit():

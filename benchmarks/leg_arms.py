@@ -12,7 +12,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from leg_joints import leg_folder
+from evidence import data_folder
 
 from rbfmuscle.run import simulate
 from rbfmuscle.sim.scene.motion import Motion
@@ -141,7 +141,7 @@ def main():
     parser.add_argument("--osim", type=Path)
     parser.add_argument("--joints", default="hip,knee,ankle")
     arguments = parser.parse_args()
-    folder, models = leg_folder().parent, arguments.models.split(",")
+    folder, models = data_folder("leg").parent, arguments.models.split(",")
     osim = arguments.osim or folder / "osim" / "gait2392" / "gait2392_thelen2003muscle.osim"
     print(
         f"| joint | muscle | {' | '.join(models)} | gait2392 | published | source | {models[0]}: mean outside by |"

@@ -1,29 +1,23 @@
-"""Muscles that slide on each other over a squat of the whole leg: overlap, gaps, cost, order.
+"""Muscles that slide on each other over a squat of the whole leg: overlap and gaps.
 
-    python benchmarks/leg_neighbours.py cost order pairs [--frames 0:37:6] [--model rbf] [--muscles A,B]
-    python benchmarks/leg_neighbours.py pairs --without
+    python benchmarks/leg_neighbours.py [--frames 0:37:6] [--model rbf] [--muscles A,B] [--without]
 
-``pairs`` runs ``data/leg/squat.toml`` with ``[sliding]`` through its whole motion and measures the shown surfaces of
+Runs ``data/leg/squat.toml`` with ``[sliding]`` through its whole motion and measures the shown surfaces of
 the chosen frames by exact distances, which the solver does not use: how deep a vertex of one muscle lies in another,
 and for vertices nearer than the threshold at rest how much farther they are now (RMS by pair). Both are listed by pair,
 the worst first. What two bones hold on both sides is counted apart: where a vertex and what it meets of the other
 muscle both go along with bones, these decide how far they come apart or into each other. Told beside the gap, RMS
 over the same vertices: of those that the neighbour still faces, without what slid past its rim (the way to the
-neighbour is more than 60 degrees off the vertex's own normal); and what of all is left beyond the gap that bones force
-even where both muscles are straight and stretched by a fifth (`tethers.least_gap`). ``--without`` measures the same
-run without sliding. ``cost`` compares processor time of a frame with surfaces, one thread, with and without
-sliding in turn; ``order`` solves with the file's order of muscles and with its reverse, and compares the surfaces.
+neighbour is more than 60 degrees off the vertex's own normal). ``--without`` measures the same
+run without sliding.
 """
 
 import argparse
 import itertools
-import time
 
-import numba
 import numpy as np
-from leg_joints import leg_folder
+from evidence import data_folder
 from scipy.spatial import cKDTree
-from tethers import Tethered, least_gap
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.surfaces import vertex_normals
@@ -35,16 +29,14 @@ from rbfmuscle.study.measure.mesh_distance import MeshDistance
 
 THRESHOLD = 2.0  # mm: nearer at rest is touching, as `[sliding]` has it
 FACING = 0.5  # cosine between a vertex's normal and the way to its neighbour, from which on it faces that
-STRETCH = 0.2  # of ways between held ends, in the gap that bones force
 TOLD = 12  # pairs listed of these
-FIRST = 2  # frames gone to before the cost is measured
 
 
 class Bench:
     """The scene with and without sliding; models and bones' fields are built once for all runs."""
 
     def __init__(self, arguments):
-        scene = Scene.load(leg_folder() / arguments.scene)
+        scene = Scene.load(data_folder("leg") / arguments.scene)
         asked = {key: float(value) for key, value in (pair.split("=") for pair in arguments.set)}
         self.scenes = {
             True: scene.with_options({"sliding.threshold": THRESHOLD, **asked}, model=arguments.model),
@@ -58,14 +50,11 @@ class Bench:
         self.rest = [model.snapshot() for model in self.models]
         self.fields = build_fields(self.scenes[True], reached_bones(self.scenes[True]))
 
-    def loop(self, *, sliding=True, reverse=False):
+    def loop(self, *, sliding=True):
         """A loop at rest, to be closed."""
         for model, state in zip(self.models, self.rest):
             model.restore(state)
-        scene, models = self.scenes[sliding].copy(), list(self.models)
-        if reverse:
-            scene.muscles, models = scene.muscles[::-1], models[::-1]
-        return FrameLoop(scene, models, fields=self.fields)
+        return FrameLoop(self.scenes[sliding], self.models, fields=self.fields)
 
     @property
     def path(self):
@@ -90,7 +79,6 @@ class Touching:
 
     def __init__(self, surfaces, holder):
         self.held, self.found = {name: bones != "" for name, bones in holder.items()}, {}
-        self.tethered = {name: Tethered(*surfaces[name], holder[name]) for name in surfaces}
         for one, other in itertools.permutations(surfaces, 2):
             near = _near(surfaces[one], surfaces[other], THRESHOLD)
             if len(near):
@@ -105,21 +93,18 @@ class Touching:
         nearest = cKDTree(surfaces[other][0]).query(surfaces[one][0][index])[1]
         return self.held[one][index] & self.held[other][nearest]
 
-    def opened(self, surfaces, poses):
+    def opened(self, surfaces):
         """RMS of how much farther these are, by pair of sorted names, and the same of those held on both sides; of the
-        first those that the neighbour faces, and all of them beyond what bones force.
+        first those that the neighbour faces.
         """
-        found = {}, {}, {}, {}
+        found = {}, {}, {}
         for (one, other), (index, rest, both) in self.found.items():
             now = MeshDistance(*surfaces[other]).signed(surfaces[one][0][index])
-            gap, forced = now - rest, np.zeros(len(index))
+            gap = now - rest
             facing = _facing(surfaces[one], surfaces[other], index)
-            if (gap > 1.0).any():
-                forced = least_gap(self.tethered[one], self.tethered[other], index, poses, STRETCH)
-            beyond = now - np.maximum(rest, forced)
-            kinds = (gap, ~both), (gap, both), (gap, ~both & facing), (beyond, ~both)
-            for parts, (values, which) in zip(found, kinds):
-                square = np.maximum(values[which], 0.0) ** 2
+            kinds = ~both, both, ~both & facing
+            for parts, which in zip(found, kinds):
+                square = np.maximum(gap[which], 0.0) ** 2
                 parts.setdefault(tuple(sorted((one, other))), []).append(square)
         return tuple(_rms_by_pair(squares) for squares in found)
 
@@ -185,25 +170,25 @@ def pairs(bench, arguments):
             frame = loop.advance(coordinates)
             surfaces = _surfaces(frame)
             touching = touching or Touching(surfaces, holders(bench.scenes[True], bench.models, surfaces))
-            opened = touching.opened(surfaces, frame.poses)
-            # Overlap, gap; the same of what is held on both sides; the gap of what is faced, and beyond bones' share.
+            opened = touching.opened(surfaces)
+            # Overlap, gap; the same of what is held on both sides; the gap of what is faced.
             found = [one for pair in zip(touching.overlaps(surfaces), opened) for one in pair]
             found += opened[2:]
             for place, values in enumerate(found):
                 for pair, value in values.items():
-                    row = worst.setdefault(pair, [(0.0, 0)] * 6)
+                    row = worst.setdefault(pair, [(0.0, 0)] * 5)
                     row[place] = max(row[place], (value, k))
             _tell_frame(k, frame, found[:2])
     print(f"{len(touching.found) // 2} pairs touch at rest, {len(worst)} pairs meet")
     for name, places in (("muscle against muscle", (0, 1)), ("held by bones on both sides", (2, 3))):
         _tell_pairs(name, {pair: [row[k] for k in places] for pair, row in worst.items()})
-    for place, name in ((4, "faced by the neighbour"), (5, "beyond what bones force")):
-        wide = np.array([row[place][0] for row in worst.values()])
-        print(
-            f"opened, {name}: {(wide > 1.0).sum()} of {len(wide)} pairs beyond 1 mm RMS, worst {wide.max():.3f}"
-        )
-        for pair, row in sorted(worst.items(), key=lambda item: -item[1][place][0])[:TOLD]:
-            print(f"    {' and '.join(pair):60} {row[place][0]:7.3f} {row[place][1]:2d}", flush=True)
+    wide = np.array([row[4][0] for row in worst.values()])
+    print(
+        f"opened, faced by the neighbour: {(wide > 1.0).sum()} of {len(wide)} pairs beyond 1 mm RMS, "
+        f"worst {wide.max():.3f}"
+    )
+    for pair, row in sorted(worst.items(), key=lambda item: -item[1][4][0])[:TOLD]:
+        print(f"    {' and '.join(pair):60} {row[4][0]:7.3f} {row[4][1]:2d}", flush=True)
 
 
 def _tell_pairs(name, worst):
@@ -231,65 +216,16 @@ def _tell_frame(k, frame, values):
     print(f"; events {', '.join(' '.join(one) for one in told)}" if told else "", flush=True)
 
 
-def cost(bench, arguments):
-    numba.set_num_threads(1)
-    found = {False: [], True: []}
-    for _ in range(arguments.rounds):
-        for sliding, seconds in found.items():
-            with bench.loop(sliding=sliding) as loop:
-                for coordinates in bench.path[:FIRST]:
-                    loop.advance(coordinates)
-                for coordinates in bench.path[FIRST : FIRST + arguments.measured]:
-                    start = time.process_time()
-                    frame = loop.advance(coordinates)
-                    seconds.append(time.process_time() - start)
-    without, together = (np.array(found[sliding]) for sliding in (False, True))
-    stages = {}
-    for times in frame.times.values():
-        for name, seconds in times.items():
-            stages[name] = stages.get(name, 0.0) + seconds
-    print(
-        f"without {1e3 * np.median(without):.0f} ms, with {1e3 * np.median(together):.0f} ms of processor time a frame"
-    )
-    print(f"cost of neighbours: {np.median(together / without):.2f} times")
-    print("last frame, wall: " + ", ".join(f"{n} {1e3 * s:.0f} ms" for n, s in stages.items()))
-    steps = [work.substeps for work in frame.work.values()]
-    print(f"sub-steps in it: {min(steps)} to {max(steps)}, mean {np.mean(steps):.1f}", flush=True)
-    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
-
-
-def order(bench, arguments):
-    shapes = []
-    for reverse in (False, True):
-        with bench.loop(reverse=reverse) as loop:
-            for coordinates in bench.path[: arguments.until]:
-                loop.skip(coordinates)
-            shapes.append(_surfaces(loop.advance(bench.path[arguments.until])))
-    apart = {}
-    for name, one in shapes[0].items():
-        other = shapes[1][name]
-        ways = [MeshDistance(*b).unsigned(a[0]) for a, b in ((one, other), (other, one))]
-        apart[name] = float(np.sqrt(np.mean([np.mean(way**2) for way in ways])))
-    worst = max(apart, key=apart.get)
-    print(f"order reversed, frame {arguments.until}: worst {apart[worst]:.2e} mm RMS ({worst})", flush=True)
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("what", nargs="+", choices=("pairs", "cost", "order"))
     parser.add_argument("--scene", default="squat.toml")
     parser.add_argument("--model", default=None)
     parser.add_argument("--muscles", default="", help="some of them, by comma")
-    parser.add_argument("--frames", default="0:1000:6", help="of pairs: A:B:S")
-    parser.add_argument("--measured", type=int, default=4, help="frames whose cost is measured")
-    parser.add_argument("--rounds", type=int, default=2, help="of the cost")
-    parser.add_argument("--until", type=int, default=4, help="frame at which orders are compared")
+    parser.add_argument("--frames", default="0:1000:6", help="A:B:S")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of the scene")
-    parser.add_argument("--without", action="store_true", help="pairs of a run without sliding")
+    parser.add_argument("--without", action="store_true", help="measure a run without sliding")
     arguments = parser.parse_args()
-    bench = Bench(arguments)
-    for what in arguments.what:
-        {"pairs": pairs, "cost": cost, "order": order}[what](bench, arguments)
+    pairs(Bench(arguments), arguments)
 
 
 if __name__ == "__main__":

@@ -18,10 +18,9 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from evidence import commit
+from evidence import commit, machine
 from peers.finite_element import TetSolid, follow, nearest_bone
 from scipy.spatial import cKDTree
-from table import machine
 
 from rbfmuscle.run import simulate
 from rbfmuscle.sim.plan.reach import build_fields, reached_bones

@@ -25,8 +25,6 @@ _VALUE = re.compile(r"<!-- value: ([\w]+)\.([\w]+) -->.*?<!-- end -->", re.S)
 COMMANDS = {
     "headline": ["benchmarks/headline.py", "DATA/hip/flexion.toml", "-o", "OUT"],
     "rest_fits": ["benchmarks/rest_fits.py", "DATA/hip/flexion.toml", "-o", "OUT"],
-    "chosen_centres": ["benchmarks/chosen_centres.py", "DATA/leg/leg.toml", "-o", "OUT"],
-    "lengths": ["benchmarks/lengths.py", "DATA/hip/flexion.toml", "-o", "OUT"],
     "plan": ["benchmarks/plan_check.py", "-", "DATA/hip/flexion.toml", "--remake", "-o", "OUT"],
     "real_solids": ["benchmarks/real_solids.py", "compare", "gluteus_maximus", "rectus_femoris", "-o", "OUT"],
 }
@@ -119,36 +117,8 @@ def plan_table(facts):
     return lines
 
 
-def chosen_centres_table(facts):
-    """Muscles that need more centres than their area asks for."""
-    lines = ["| muscle | by area | error mm | chosen | error mm |", "|---|---|---|---|---|"]
-    for name, row in facts["rows"].items():
-        (usual, before), (count, after) = row["by_area"], row["chosen"]
-        if count > usual:
-            lines.append(f"| {name.replace('_', ' ')} | {usual} | {before:.2f} | {count} | {after:.2f} |")
-    return lines
-
-
-def signed(value):
-    """A figure with a digit behind the point and a proper minus."""
-    return f"{value:.1f}".replace("-", "−")
-
-
-def lengths_table(facts):
-    """Lengths and moment arms at some angles, and how far arms are from summing up to lengths."""
-    angles = [f"{angle:g}°" for angle in facts["angles"]]
-    head = [*angles, f"arm {angles[0]}", *angles[1:], "sum rule"]
-    lines = [f"| muscle | {' | '.join(head)} |", "|---" * (len(head) + 1) + "|"]
-    for name, row in facts["rows"].items():
-        cells = [*(signed(v) for v in row["lengths"] + row["arms"]), f"{100 * row['sum_rule']:.2f} %"]
-        lines.append(f"| {name.replace('_', ' ')} | {' | '.join(cells)} |")
-    return lines
-
-
 TABLES = {
-    "chosen_centres": chosen_centres_table,
     "headline": headline_table,
-    "lengths": lengths_table,
     "plan": plan_table,
     "real_solids": real_solids_table,
     "rest_fits": rest_fits_table,
@@ -161,20 +131,7 @@ def span(rows, key):
     return f"{min(values):.2f} to {max(values):.2f}"
 
 
-def others(rows):
-    """The range of the errors of muscles that their area serves."""
-    errors = [row["chosen"][1] for row in rows.values() if row["chosen"][0] == row["by_area"][0]]
-    return f"{min(errors):.2f} to {max(errors):.2f}"
-
-
 VALUES = {
-    ("chosen_centres", "more"): lambda facts: str(
-        sum(row["chosen"][0] > row["by_area"][0] for row in facts["rows"].values())
-    ),
-    ("chosen_centres", "others"): lambda facts: others(facts["rows"]),
-    ("chosen_centres", "mean"): lambda facts: (
-        f"{sum(row['chosen'][0] for row in facts['rows'].values()) / len(facts['rows']):.0f}"
-    ),
     ("headline", "steps_apart"): lambda facts: (
         f"{largest(r['steps_apart'] for r in facts['rows'].values()):.2f}"
     ),

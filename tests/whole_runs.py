@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from peers.contraction_scenes import spindle_scene
+from contraction_scenes import spindle_scene
 
 import rbfmuscle as rm
 from rbfmuscle.sim.scene.options import ContactOptions, DetectOptions, SlidingOptions, TunnellingOptions

@@ -4,7 +4,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from peers.contraction_scenes import MUSCLE, bar_scene, spindle_scene, with_frames
+from contraction_scenes import (
+    MUSCLE,
+    bar_scene,
+    belly_length,
+    compare_spindle,
+    panel_pennation,
+    panel_scene,
+    settings,
+    spindle_scene,
+    with_frames,
+)
 from peers.known_scenes import Bar
 
 import rbfmuscle as rm
@@ -71,8 +81,6 @@ def test_free_bar_is_as_thick_as_its_volume_says(model, stretch):
 
 
 def test_spindle_lies_near_finite_elements():
-    from contraction_measures import belly_length, compare_spindle, settings
-
     kept = np.load(DATA)
     run = rm.simulate(spindle_scene(model=settings("rbf"), frames=2, tendon=TENDON))
     surface = run.frames[-1].surfaces[MUSCLE]
@@ -86,8 +94,6 @@ def test_spindle_lies_near_finite_elements():
 
 @pytest.mark.parametrize("model", ("rbf", "arap-volume"))
 def test_pennate_panel_turns_its_fibres_as_its_volume_says(model):
-    from peers.contraction_scenes import panel_pennation, panel_scene
-
     from rbfmuscle.models import build_model
     from rbfmuscle.study.measure.centreline import MuscleAtRest
     from rbfmuscle.study.measure.contraction import ContractionStudy, pennation

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from peers.contraction_scenes import MUSCLE, spindle_scene
+from contraction_scenes import MUSCLE, spindle_scene
 
 from rbfmuscle.sim.contraction.course import SETTLING, STEP, Activations, activation_course
 from rbfmuscle.sim.contraction.keys import Contraction

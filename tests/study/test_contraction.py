@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from peers.contraction_scenes import MUSCLE, SPINDLE, spindle_scene
+from contraction_scenes import MUSCLE, SPINDLE, spindle_scene
 
 import rbfmuscle as rm
 from rbfmuscle.models import build_model

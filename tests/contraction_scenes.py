@@ -7,11 +7,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-
 from peers.known_scenes import FAR, Bar, _block
+
 from rbfmuscle.sim.scene.attachments import Attachment
 from rbfmuscle.sim.scene.phantom_shapes import stitch
 from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.study.measure.contraction import belly_measures
+from rbfmuscle.study.measure.mesh_distance import MeshDistance
 
 MUSCLE = "muscle"
 # Long against its radius: the ends keep theirs, over about one radius each, and that volume goes to the middle.
@@ -244,3 +246,56 @@ def _box(divisions):
             vertices.append(points)
     mesh = trimesh.Trimesh(np.concatenate(vertices) - [0.5, 0.5, 0.0], np.concatenate(faces), process=True)
     return np.asarray(mesh.vertices).copy(), np.asarray(mesh.faces)
+
+
+# Ends of the spindle's line of action.
+ENDS = np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]]) * SPINDLE.length
+
+
+def settings(model):
+    """Slender muscles want finer cells and more centres than the defaults of the RBF model."""
+    return {"name": "rbf", "centres": 400, "resolution": 140} if model == "rbf" else model
+
+
+def compare_spindle(vertices, faces, activation, kept):
+    """Distances [mm] and relative errors of a spindle's surface against finite elements.
+
+    Parameters
+    ----------
+    vertices, faces : (n, 3) and (m, 3) ndarray
+        Closed, outward.
+    activation : float
+        One of ``kept["activations"]``.
+    kept : mapping
+        The arrays of the data file.
+
+    Returns
+    -------
+    dict
+        ``rms`` and ``worst`` [mm] of the reference's vertices between the held ends, ``csa`` (relative error of the
+        greatest section) and ``place`` (its place, error as a share of the length).
+    """
+    row = int(np.argmin(np.abs(kept["activations"] - activation)))
+    wanted = kept["vertices"][row].astype(float)
+    between = np.abs(wanted[:, 0]) < 0.5 * SPINDLE.length - 5.0
+    away = MeshDistance(vertices, faces).unsigned(wanted[between])
+    mine = belly_measures(vertices, np.asarray(faces), *ENDS)
+    theirs = belly_measures(wanted, kept["faces"], *ENDS)
+    return {
+        "rms": float(np.sqrt(np.mean(away**2))),
+        "worst": float(away.max()),
+        "csa": mine["csa_max"] / theirs["csa_max"] - 1.0,
+        "place": mine["csa_place"] - theirs["csa_place"],
+    }
+
+
+def belly_length(rest, now):
+    """Length between the sections that lay at the ends of the belly at rest, of points that move with the muscle."""
+    half = 0.5 * SPINDLE.belly_length
+    moved = now[:, 0] - rest[:, 0]
+    ends = []
+    for side in (-half, half):
+        near = np.abs(rest[:, 0] - side) < 6.0
+        # A line through the points about the section, as they do not lie evenly on both sides of it.
+        ends.append(side + np.polyval(np.polyfit(rest[near, 0] - side, moved[near], 1), 0.0))
+    return ends[1] - ends[0]
