@@ -10,7 +10,9 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from contraction_scenes import spindle_scene
+from spindle_scene import CENTRE, build_scene
 
 import rbfmuscle as rm
 from rbfmuscle.sim.scene.options import ContactOptions, DetectOptions, SlidingOptions, TunnellingOptions
@@ -19,6 +21,14 @@ FOLDER = Path(__file__).resolve().parent / "data" / "references"
 # A few points of each muscle say where all are: they hang together through one matrix.
 POINTS = 12
 RBF = {"name": "rbf", "centres": 80, "samples": 300, "resolution": 20}
+# PBD as its paper prints it: velocities are kept, all edges are alike, one bone answers.
+PAPER = {
+    "name": "pbd",
+    "prediction": "velocity",
+    "soft_length": 0.0,
+    "limits": [0.01, 100.0],
+    "response": "nearest",
+}
 QUANTITIES = ("volume_error", "penetration_max", "length", "moment_arm", "edge_strain_rms", "rest_error_rms")
 
 
@@ -33,6 +43,17 @@ def _phantom(muscles, model, *, end=20.0, step=10.0, **tables):
 
 def _contact(model):
     return _phantom(["extensor"], model, end=40.0, step=20.0)
+
+
+def _bent(model, detector="sdf"):
+    """A spindle is bent over a ball by 30 degrees to either side and pressed on it."""
+    scene = build_scene().with_options({"contact.detector": detector}, model=model)
+    scene.muscles[0].mesh.apply_translation([0.7, -4.0, 0.3])
+    for name, bone in (("bend", "upper"), ("other", "lower")):
+        scene.add_joint(name, "ball", bone, CENTRE.tolist(), {"flexion": (1, 0, 0)})
+    stops = [{}, {"bend.flexion": 30.0, "other.flexion": -30.0}]
+    scene.set_motion(waypoints=stops, step=15.0)
+    return scene
 
 
 def _sliding(model):
@@ -53,23 +74,54 @@ def _contraction(model):
     )
 
 
+def _tunnelling(model, **options):
+    """A bag held at both ends is swung through a fixed plate of 6 mm, by 40 degrees in one sub-step."""
+    bag = trimesh.creation.icosphere(subdivisions=3).apply_scale([25, 25, 120]).apply_translation([201, 0, 1])
+    bag.apply_transform(trimesh.transformations.rotation_matrix(math.radians(-21.0), [0.1, 0, 1]))
+    ends = {
+        "upper": np.flatnonzero(bag.vertices[:, 2] > 100),
+        "lower": np.flatnonzero(bag.vertices[:, 2] < -100),
+    }
+    scene = rm.Scene("plate", units="mm")
+    scene.add_bone("plate", trimesh.creation.box((240, 6, 800)).apply_translation([200, 0, 0]))
+    for name, height in (("upper", 0), ("lower", 100)):
+        scene.add_bone(name, trimesh.creation.box((20, 20, 20)).apply_translation([600, 0, height]))
+    scene.add_joint("hinge", "plate", "upper", (0, 0, 0), {"turn": (0, 0, 1)})
+    scene.add_joint("second", "upper", "lower", (0, 0, 0), {"turn": (1, 0, 0)})
+    scene.add_muscle(
+        "bag", bag, model=model, attach=[{"bone": b, "vertices": held.tolist()} for b, held in ends.items()]
+    )
+    scene.set_motion(ramp={"hinge.turn": {"to": 40.0, "step": 40.0}})
+    scene.contact = ContactOptions(substep_angle=40.0)
+    scene.detect = DetectOptions(tunnelling=TunnellingOptions(**options))
+    return scene
+
+
 SCENES = {
     "contact_rbf": lambda: _contact(RBF),
     "contact_rbf_marching": lambda: _contact({**RBF, "surface": "marching", "placement": "even"}),
     "contact_rbf_inside": lambda: _contact({**RBF, "inside": 120, "fibre_ratio": 4.0}),
-    "contact_pbd": lambda: _contact("pbd"),
-    "contact_arap_volume": lambda: _contact("arap-volume"),
+    "contact_pbd": lambda: _bent("pbd"),
+    "contact_pbd_serendipity": lambda: _bent("pbd", "serendipity"),
+    "contact_pbd_voxel": lambda: _bent("pbd", "voxel"),
+    "contact_pbd_paper": lambda: _bent(PAPER),
+    "contact_xpbd": lambda: _bent("xpbd"),
+    "contact_arap_pbd": lambda: _bent("arap-pbd"),
+    "contact_arap_volume": lambda: _bent("arap-volume"),
     "sliding_rbf": lambda: _sliding(RBF),
     "sliding_xpbd": lambda: _sliding("xpbd"),
     "substeps_rbf": lambda: _substeps(RBF),
     "substeps_arap_interleaved": lambda: _substeps("arap-interleaved"),
     "contraction_rbf": lambda: _contraction(RBF),
     "contraction_arap_volume": lambda: _contraction("arap-volume"),
+    "tunnelling_arap_volume": lambda: _tunnelling("arap-volume", action="rotate"),
+    "tunnelling_rbf": lambda: _tunnelling(RBF, action="substep"),
+    "tunnelling_rbf_angle": lambda: _tunnelling(RBF, action="report", swept=False),
 }
 
 
 def measure(scene):
-    """What is kept of a run: some carried points, moments of each surface, rows of the metrics.
+    """What is kept of a run: some carried points, moments of each surface, rows of the metrics, points that tunnelled.
 
     Lengths stand in shares of the muscle's longest side, areas and volumes in shares of its square and cube, so one
     tolerance is for all.
@@ -102,6 +154,9 @@ def measure(scene):
             share = 1.0 if name in ("volume_error", "edge_strain_rms") else 1.0 / size
             metrics[name] = [None if np.isnan(v) else float(v * share) for v in values]
         found[muscle.name] = {"frames": frames, "metrics": metrics}
+        events = [event for frame in run.frames for event in frame.events if event.muscle == muscle.name]
+        if events:
+            found[muscle.name]["events"] = {f"{event.action} {event.bone}": event.count for event in events}
     return found
 
 

@@ -62,13 +62,16 @@ def _change_number(content, rng, *, head):
     return content[: place.start()] + pick(rng, NUMBERS) + content[place.end() :]
 
 
-def damaged_shape(rng: np.random.Generator) -> trimesh.Trimesh:
+KINDS = 14
+
+
+def damaged_shape(rng: np.random.Generator, kind: int | None = None) -> trimesh.Trimesh:
     """The muscle's mesh with vertices moved, joined or lost, or with triangles lost, turned or repeated."""
     mesh = muscle_mesh()
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
     few = rng.choice(len(faces), int(rng.integers(1, 12)), replace=False)
     axis = int(rng.integers(3))
-    kind = rng.integers(14)
+    kind = rng.integers(KINDS) if kind is None else kind
     if kind == 0:
         vertices[faces[few]] = vertices[faces[few]].mean(axis=1)[:, None]
     elif kind == 1:

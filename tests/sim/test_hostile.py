@@ -5,6 +5,7 @@ import pytest
 import trimesh
 from fuzz.base import base_scene, muscle_mesh, write_base
 from fuzz.harness import check_volume
+from fuzz.meshes import KINDS, damaged_shape
 from fuzz.scenes import Raw, nested, to_toml
 
 from rbfmuscle.models import build_model, check_models
@@ -175,7 +176,25 @@ def inside_out_half(vertices, faces):
     vertices[upper, 2] = -20 - vertices[upper, 2]
 
 
+@pytest.fixture(params=[(kind, seed) for kind in range(KINDS) for seed in range(3)], ids=str)
+def hostile_mesh(request):
+    """A mesh damaged in one of many kinds."""
+    kind, seed = request.param
+    return damaged_shape(np.random.default_rng(seed), kind)
+
+
 class TestMeshes:
+    def test_damaged_mesh_is_mended_with_its_volume_or_refused_in_one_line(self, hostile_mesh, tmp_path):
+        path = tmp_path / "a.stl"
+        hostile_mesh.export(path)
+        try:
+            mesh = read_mesh(path).mesh
+        except MeshError as error:
+            assert "a.stl" in str(error) and "\n" not in str(error)
+        else:
+            assert mesh.is_watertight
+            check_volume(np.asarray(mesh.vertices), np.asarray(mesh.faces), "a.stl")
+
     @pytest.mark.parametrize("change", [flat, inside_out_half], ids=lambda change: change.__name__)
     def test_surface_without_an_inside_is_refused(self, change):
         with pytest.raises(MeshError, match=r"encloses no volume|passes through itself"):

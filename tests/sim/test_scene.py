@@ -10,7 +10,14 @@ import trimesh
 from rbfmuscle.sim.scene import options
 from rbfmuscle.sim.scene.check import bone_collisions, check_initial
 from rbfmuscle.sim.scene.scene import Scene
-from rbfmuscle.validation import MeshError, SceneError, UsageError
+from rbfmuscle.validation import (
+    LimitExceededError,
+    MeshError,
+    MissingPartError,
+    SceneError,
+    SolveError,
+    UsageError,
+)
 
 TEXT = """
 [scene]
@@ -375,3 +382,12 @@ def test_exit_codes_are_the_promised_ones(folder):
     with pytest.raises(MeshError) as mesh:
         load(folder, ('"biceps.ply"', '"bicep.ply"'))
     assert (scene.value.exit_code, mesh.value.exit_code) == (3, 4)
+    promised = {
+        UsageError: 2,
+        SceneError: 3,
+        MeshError: 4,
+        SolveError: 5,
+        LimitExceededError: 6,
+        MissingPartError: 7,
+    }
+    assert all(error.exit_code == code for error, code in promised.items())

@@ -83,6 +83,21 @@ def test_angle_test_has_the_known_recall(shape, step, recall):
     assert sweep.flagged.sum() / crossing.sum() == pytest.approx(recall, abs=0.03)
 
 
+def test_angle_test_alone_decides_where_it_is_asked_for():
+    """Straight across a cylinder, across beside its middle (a turn of 131 degrees), and past it."""
+    start = np.array([[-1.1, 0.0, 0.0], [-1.1, 0.5, 0.0], [-1.1, 1.1, 0.0]])
+    end = start * [-1.0, 1.0, 1.0]
+    contacts = BoneContacts(["bone"], [cylinder(1.0)], contact_bone=np.full(3, -1))
+    poses = {"bone": np.eye(4)}, {"bone": np.eye(4)}
+    contacts.move(poses[1])
+    found = {}
+    for swept in (True, False):
+        options = TunnellingOptions(swept=swept)
+        (crossing,) = find_crossings(contacts, start, end, *poses, options, tolerance=TOLERANCE)
+        found[swept] = crossing.index.tolist()
+    assert found == {True: [0, 1], False: [0]}
+
+
 def test_sliding_around_a_bone_is_no_crossing():
     angle = np.radians(np.linspace(0, 40, 9))[:, None]
     start = np.tile([[1.0, 0.0, 0.0]], (9, 1))

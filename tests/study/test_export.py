@@ -140,6 +140,25 @@ class TestExport:
             volume = trimesh.Trimesh(vertices, faces).volume
             assert volume == pytest.approx(exact, rel=1e-5)
 
+    @pytest.mark.parametrize("name", ["pvd", "vtp", "ply", "obj"])
+    def test_vertices_and_faces_come_back_in_their_order(self, run, tmp_path, name):
+        made, folder = run
+        written = [p for p in export_run(folder, name, output=tmp_path) if p.stem.startswith("biceps_")]
+        assert len(written) == len(made.frames)
+        for path, frame in zip(sorted(written), made.frames):
+            vertices, faces = read_mesh(path)
+            np.testing.assert_allclose(vertices, frame.surfaces["biceps"].vertices, rtol=1e-6, atol=1e-5)
+            np.testing.assert_array_equal(faces, frame.surfaces["biceps"].faces)
+
+    def test_exported_series_has_every_time_and_muscle(self, run, tmp_path):
+        export_run(run[1], "pvd", output=tmp_path, units="cm")
+        reader = pyvista.get_reader(next(tmp_path.rglob("*surfaces.pvd")))
+        assert list(reader.time_values) == [0, 1, 2]
+        for time, frame in enumerate(run[0].frames):
+            reader.set_active_time_value(float(time))
+            expected = frame.surfaces["biceps"].vertices / 10.0
+            np.testing.assert_allclose(reader.read()[0].points, expected, rtol=1e-6, atol=1e-6)
+
     def test_posed_bones_are_exported(self, run, tmp_path):
         made, folder = run
         export_run(folder, ["stl", "obj"], output=tmp_path)

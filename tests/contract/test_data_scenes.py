@@ -1,0 +1,65 @@
+"""Every scene of the real hip and the whole leg: its meshes load, its settings hold, and its motion can be planned."""
+
+import pytest
+
+from rbfmuscle.models import check_models
+from rbfmuscle.run import simulate
+from rbfmuscle.sim.plan.plan import plan_scene
+from rbfmuscle.sim.scene.check import check_initial
+from rbfmuscle.sim.scene.scene import Scene
+
+# Muscles and bones of each scene.
+SCENES = {
+    "hip/adduction": (4, 3),
+    "hip/apriori": (4, 3),
+    "hip/extension": (4, 3),
+    "hip/external_rotation": (4, 3),
+    "hip/flexion": (4, 3),
+    "hip/gluteus": (1, 3),
+    "hip/internal_rotation": (4, 3),
+    "leg/gait": (12, 15),
+    "leg/hip_flexion": (8, 9),
+    "leg/knee_flexion": (6, 10),
+    "leg/leg": (38, 11),
+    "leg/neighbours": (4, 7),
+    "leg/quadriceps": (4, 6),
+    "leg/slender": (4, 6),
+    "leg/squat": (38, 21),
+}
+COARSE = {
+    "rbf": {"name": "rbf", "centres": 40, "samples": 150, "resolution": 16},
+    "pbd": {"name": "pbd", "iterations": 3},
+}
+
+
+@pytest.fixture(scope="module")
+def data(hip_data, leg_data):
+    return hip_data.parent
+
+
+def test_table_names_every_scene(data):
+    found = {
+        f"{path.parent.name}/{path.stem}" for name in ("hip", "leg") for path in (data / name).glob("*.toml")
+    }
+    assert found == set(SCENES)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_scene_loads_and_is_planned(data, name):
+    scene = Scene.load(data / f"{name}.toml")
+    check_models(scene)
+    check_initial(scene)
+    assert (len(scene.muscles), len(scene.bones)) == SCENES[name]
+    plan = plan_scene(scene)
+    assert plan["frames"] == len(scene.motion) > 1 and plan["substeps"] >= len(scene.motion) - 1
+    assert {pair["muscle"] for pair in plan["pairs"]} <= {muscle.name for muscle in scene.muscles}
+
+
+@pytest.mark.parametrize("model", COARSE)
+@pytest.mark.parametrize("name", ["hip/flexion", "leg/knee_flexion"])
+def test_first_frames_are_solved_by_coarse_models(data, name, model):
+    scene = Scene.load(data / f"{name}.toml").with_options(frames="0:2:1", model=COARSE[model])
+    scene.muscles = scene.muscles[:2]
+    run = simulate(scene)
+    for muscle in scene.muscles:
+        assert max(abs(run.values(muscle.name, "volume_error"))) < 0.02
