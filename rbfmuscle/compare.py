@@ -24,6 +24,7 @@ from rbfmuscle.study.experiment.comparison import (
 from rbfmuscle.study.files.checkpoint import read_checkpoint, write_checkpoint
 from rbfmuscle.study.files.resume import left_behind
 from rbfmuscle.study.files.saved import SavedRun
+from rbfmuscle.study.files.writer import check_writable
 from rbfmuscle.validation import SolveError, UsageError
 
 if TYPE_CHECKING:
@@ -96,6 +97,7 @@ def compare_models(
     """
     variants = _variants(configure_scene(scene, frames=frames), list(models), settings or {})
     folder = Path(directory)
+    check_writable(folder)
     poses = chosen_poses(next(iter(variants.values())))
     results, failed = {}, {}
     for name, variant in variants.items():

@@ -17,7 +17,7 @@ from rbfmuscle.sim.loop.frame import Event, Frame
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.study.files.resume import left_behind
 from rbfmuscle.study.files.sinks import MemorySink
-from rbfmuscle.study.files.writer import RunWriter
+from rbfmuscle.study.files.writer import RunWriter, check_writable
 from rbfmuscle.study.measure.quantities import Row
 from rbfmuscle.study.measure.summary import parse_limits, require_limits
 from rbfmuscle.validation import SolveError, UsageError
@@ -136,6 +136,7 @@ def stream_run(
     if kept is not None and kept.state is None:
         require_limits(kept.info["muscles"], limits)
         return kept.info
+    check_writable(directory)
     recording = Recording(
         scene, options=_asked(model, settings, frames), resumable=True, models_here=watch is not None
     )

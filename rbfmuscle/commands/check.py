@@ -10,6 +10,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from rbfmuscle.commands.scenes import load_scene
 from rbfmuscle.compiled.progress import Progress
 from rbfmuscle.compiled.warm import compile_ahead
 from rbfmuscle.compiled.watch import tell_stage
@@ -28,7 +29,7 @@ def check(
     Parameters
     ----------
     scene
-        Scene file (TOML).
+        Scene file (TOML), or "phantom" for the embedded hip.
     picture
         Draw patches, joint axes, far ends and overlaps to a PNG beside the scene file.
     fields
@@ -74,9 +75,8 @@ def _findings(path):
     from rbfmuscle.sim.plan.ahead import ahead_findings
     from rbfmuscle.sim.scene.attachments import ExactMeshes
     from rbfmuscle.sim.scene.check import check_scene
-    from rbfmuscle.sim.scene.scene import Scene
 
-    loaded = Scene.load(path, skeleton=True)
+    loaded = load_scene(path, skeleton=True)
     check_models(loaded)
     compile_ahead(["check"])
     exact = ExactMeshes()

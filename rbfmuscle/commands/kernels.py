@@ -83,7 +83,7 @@ def kernels(
         Print JSON and nothing else.
     """
     from rbfmuscle.study.experiment.kernel_study import study_kernels
-    from rbfmuscle.study.files.writer import json_text
+    from rbfmuscle.study.files.writer import check_writable, json_text
     from rbfmuscle.study.show.kernels.page import write_study
 
     names, counts = _split(names), _checked_counts(derivatives, criterion, centres)
@@ -98,6 +98,7 @@ def kernels(
                            kernels=names, placement=placement, most=most)  # fmt: skip
     with Progress("kernels", what="fit") as bar:
         scene, mesh, title = _surface(source, muscle)
+        check_writable(output)
         compile_ahead(["kernels"])
         study = study_kernels(
             mesh, kernels=names, centres=counts, derivatives=derivatives, placement=placement,

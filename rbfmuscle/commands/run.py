@@ -9,6 +9,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from rbfmuscle.commands.scenes import PHANTOM, load_scene
 from rbfmuscle.compiled.progress import Progress
 from rbfmuscle.validation import RBFMuscleError
 
@@ -43,16 +44,9 @@ def demo(
     as_json
         Print JSON and nothing else.
     """
-
-    def load():
-        from rbfmuscle.sim.scene.phantom import phantom_scene
-
-        return phantom_scene()
-
     _run_scene(
-        load,
+        PHANTOM,
         output,
-        title="phantom_hip",
         model=model,
         frames=frames,
         settings={},
@@ -77,7 +71,7 @@ def run(
     Parameters
     ----------
     scene
-        Scene file (TOML).
+        Scene file (TOML), or "phantom" for the embedded hip.
     output
         Folder for the results.
     model
@@ -96,16 +90,9 @@ def run(
     from rbfmuscle.sim.scene.settings import parse_settings
 
     changes = parse_settings(settings)
-
-    def load():
-        from rbfmuscle.sim.scene.scene import Scene
-
-        return Scene.load(scene)
-
     _run_scene(
-        load,
+        scene,
         output,
-        title=scene.stem,
         model=model,
         frames=frames,
         settings=changes,
@@ -115,15 +102,15 @@ def run(
     )
 
 
-def _run_scene(load, output, *, as_json, title, resume=False, **asked):
+def _run_scene(scene, output, *, as_json, resume=False, **asked):
     from rbfmuscle import interruption
 
     start = time.perf_counter()
     done = 0
-    with Progress(title) as progress, interruption.keeping(lambda: done > 0):
+    with Progress(Path(scene).stem) as progress, interruption.keeping(lambda: done > 0):
         from rbfmuscle.run import stream_run
 
-        scene = load()
+        loaded = load_scene(scene)
 
         def advance(count, total):
             nonlocal done
@@ -133,7 +120,7 @@ def _run_scene(load, output, *, as_json, title, resume=False, **asked):
 
         try:
             info = stream_run(
-                scene,
+                loaded,
                 output,
                 progress=advance,
                 resume=resume,
@@ -150,7 +137,10 @@ def _run_scene(load, output, *, as_json, title, resume=False, **asked):
 
         print(json_text({"directory": str(output), **info}))
     else:
-        _print_summary(info["muscles"], scene.units)
+        from rbfmuscle.study.measure.summary import describe_verdict
+
+        _print_summary(info["muscles"], loaded.units)
+        print(f"verdict: {describe_verdict(info['muscles'], info['limits'])}")
         report = output / "report.html"
         there = f"in {output}, open {report}" if report.exists() else f"in {output}"
         print(f"{len(info['frames'])} frames in {time.perf_counter() - start:.1f} s, {there}")

@@ -17,12 +17,12 @@ def is_mesh(source: str) -> bool:
     return source != PHANTOM and Path(source).suffix.lower() != ".toml"
 
 
-def load_scene(scene: str) -> Scene:
-    """The scene of a file, or the embedded hip for "phantom" where there is no file of that name."""
+def load_scene(scene: str | Path, *, skeleton: bool = False) -> Scene:
+    """The scene of a file, or the embedded hip for "phantom" where there is no file of that name; see `Scene.load`."""
     from rbfmuscle.sim.scene.scene import Scene
 
     if str(scene) == PHANTOM and not Path(scene).exists():
         from rbfmuscle.sim.scene.phantom import phantom_scene
 
         return phantom_scene()
-    return Scene.load(Path(scene))
+    return Scene.load(Path(scene), skeleton=skeleton)

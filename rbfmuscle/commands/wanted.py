@@ -45,6 +45,7 @@ def find_wanted(
     """
     from rbfmuscle.study.experiment.wanted_error import reach_error
     from rbfmuscle.study.experiment.wanted_files import describe_wanted, write_wanted
+    from rbfmuscle.study.files.writer import check_writable
 
     error, error_max = errors
     if (error is None) == (error_max is None):
@@ -54,6 +55,7 @@ def find_wanted(
         raise UsageError(f"the wanted error must be a positive length, got {wanted}")
     settings = {name: value for name, value in settings.items() if value is not None}
     meshes, unit = _meshes(source, muscle, units)
+    check_writable(output)
     results = {}
     for name, mesh in meshes.items():
         with Progress(f"kernels of {name}", what="fit") as bar:

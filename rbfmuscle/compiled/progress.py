@@ -1,4 +1,4 @@
-"""What goes on, shown on stderr: a bar on a terminal, else a line every two seconds; nothing for what is quick."""
+"""What goes on, shown on stderr: a bar on a terminal, else a line after two seconds and then every ten."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any
 
 from rbfmuscle.compiled.watch import current_stage, loop_in_work, tell_stage
 
-EVERY = 1.4  # seconds between lines: two, less what the start of Python and a loop that holds its lock take
+FIRST = 1.4  # seconds before anything: two, less what the start of Python and a loop that holds its lock take
+EVERY = 10.0  # seconds between lines
 _TICK = 0.1
 
 
@@ -63,7 +64,7 @@ def describe_stage(stage: Any) -> str:
 
 
 class _Lines:
-    """A line whenever EVERY seconds have passed, and one for the last count."""
+    """A line after FIRST seconds and every EVERY from then on, and one for the last count."""
 
     def start(self, title: Any) -> None:
         self.title, self.begun, self.said = title, time.monotonic(), 0
@@ -72,7 +73,7 @@ class _Lines:
         self.thread.start()
 
     def _beat(self):
-        while not self.ended.wait(EVERY):
+        while not self.ended.wait(EVERY if self.said else FIRST):
             stage = current_stage()
             if stage is not None:
                 spent = time.monotonic() - self.begun
@@ -99,7 +100,7 @@ class _Bar:
         self.thread.start()
 
     def _beat(self):
-        if self.ended.wait(EVERY):
+        if self.ended.wait(FIRST):
             return
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn

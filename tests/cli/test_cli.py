@@ -10,6 +10,7 @@ import time
 
 import numpy as np
 import pytest
+import trimesh
 from command_line import call
 
 from rbfmuscle.app import app
@@ -73,6 +74,21 @@ class TestRun:
         assert {"run.json", "metrics.csv", "events.csv", "poses.csv", "surfaces.pvd", "bones.pvd"} <= names
         assert len(list((tmp_path / "out" / "surfaces").iterdir())) == 5
 
+    def test_spike_in_a_mesh_is_in_the_verdict(self, phantom_folder, tmp_path, capsys):
+        """A vertex 60 mm off the muscle, which no field follows; without it all is well."""
+        command = ("run", phantom_folder / "hip.toml", "-o", tmp_path / "out", "--frames", "0:1")
+        assert "verdict: every muscle stays within every limit in every frame" in call(capsys, *command)[1]
+        mesh = trimesh.load(phantom_folder / "adductor_posterior.ply", process=False)
+        vertices = np.array(mesh.vertices)
+        middle = np.linalg.norm(vertices - vertices.mean(axis=0), axis=1).argmin()
+        vertices[middle] += 60.0 * mesh.vertex_normals[middle]
+        trimesh.Trimesh(vertices, mesh.faces, process=False).export(phantom_folder / "spike.ply")
+        (phantom_folder / "spike.toml").write_text(SCENE.replace("adductor_posterior.ply", "spike.ply"))
+        code, out, _ = call(capsys, "run", phantom_folder / "spike.toml", *command[2:])
+        assert code == 0 and re.search(
+            r"verdict: beyond a limit: .*adductor: (unfitted_fraction|rest_error)", out
+        )
+
     def test_json_is_all_there_is_on_stdout(self, phantom_folder, tmp_path, capsys):
         code, out, _ = call(
             capsys, "run", phantom_folder / "hip.toml", "-o", tmp_path / "o", "--frames", "0:2", "--json",
@@ -117,9 +133,22 @@ class TestRun:
         info = json.loads((out / "run.json").read_text())
         assert info["status"] == "interrupted" and len(info["frames"]) >= 3
 
-    def test_output_that_cannot_be_written(self, phantom_folder, tmp_path, capsys):
+    @pytest.mark.parametrize(
+        ("words", "work"),
+        [
+            (("run",), "rbfmuscle.run.Recording"),
+            (("compare",), "rbfmuscle.compare._measure"),
+            (("kernels",), "rbfmuscle.study.experiment.kernel_study.study_kernels"),
+            (("kernels", "--error", "1"), "rbfmuscle.study.experiment.wanted_error.reach_error"),
+            (("paths",), "rbfmuscle.commands.opensim.sampling.sample_muscles"),
+        ],
+    )
+    def test_output_that_cannot_be_written_is_told_before_any_work(
+        self, tmp_path, capsys, monkeypatch, words, work
+    ):
+        monkeypatch.setattr(work, lambda *given, **named: pytest.fail("work was begun"))
         (tmp_path / "file").write_text("in the way")
-        code, _, err = call(capsys, "run", phantom_folder / "hip.toml", "-o", tmp_path / "file" / "out")
+        code, _, err = call(capsys, *words, "phantom", "-o", tmp_path / "file" / "out")
         assert code == 2 and "cannot write to" in one_line(err)
 
     @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full to play a full disk")

@@ -52,13 +52,14 @@ def test_run_prints_the_worst_of_every_muscle(ran, printed):
     info = json.loads((ran[1] / "run.json").read_text())
     assert printed[0] == "worst over the frames; lengths in mm"
     assert printed[1].split() == list(SHOWN)
-    rows = {line.split()[0]: line.split()[1:] for line in printed[2:-1]}
+    rows = {line.split()[0]: line.split()[1:] for line in printed[2:-2]}
     assert list(rows) == [name for name, _ in TWO]
     for name, cells in rows.items():
         facts = info["muscles"][name]
         for key, cell in zip(SHOWN, cells, strict=True):
             worst = facts.get(key, {}).get("worst")
             assert cell == ("nan" if worst is None else f"{abs(worst):.3g}")
+    assert re.match(r"verdict: (every muscle stays within|beyond a limit: \w+: \w+ [\d.])", printed[-2])
     assert re.match(rf"{len(info['frames'])} frames in [\d.]+ s, in ", printed[-1])
 
 

@@ -246,7 +246,7 @@ class TestPages:
                 },
             },
         )  # fmt: skip
-        assert "Beyond a limit: strap: penetration_max." in _verdict(saved)
+        assert "Beyond a limit: strap: penetration_max 0.61 (limit 0.5) at frame 7." in _verdict(saved)
         rows = {row[0][0]: row[1:] for row in texts(_summary(saved))[1:]}
         assert rows["penetration_max"] == [["0.61", "frame", "7"], ["0"], ["≤", "0.5"]]
         assert rows["length"] == [["11.1", "…", "13.3"], ["-"], []]

@@ -258,7 +258,7 @@ class TestProgress:
     def test_last_line_is_for_what_ended_well_and_was_begun(
         self, capsys, monkeypatch, done, total, said, failed, last
     ):
-        monkeypatch.setattr(progress, "EVERY", 60.0)
+        monkeypatch.setattr(progress, "FIRST", 60.0)
         lines = progress._Lines()
         lines.start("hip")
         lines.said = said

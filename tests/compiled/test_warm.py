@@ -213,6 +213,7 @@ def said(monkeypatch, capsys):
             self.text += capsys.readouterr().err
             return self.text
 
+    monkeypatch.setattr(progress, "FIRST", 0.2)
     monkeypatch.setattr(progress, "EVERY", 0.2)
     return Said()
 

@@ -5,6 +5,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from rbfmuscle.commands.scenes import load_scene
 from rbfmuscle.validation import UsageError
 
 
@@ -24,7 +25,7 @@ def paths(
     Parameters
     ----------
     scene
-        Scene file (TOML).
+        Scene file (TOML), or "phantom" for the embedded hip.
     output
         Folder for paths.xml, paths.csv and errors.csv.
     samples
@@ -43,17 +44,18 @@ def paths(
     from rbfmuscle.commands.opensim.sampling import parse_ranges, report_fits, sample_muscles
     from rbfmuscle.compiled.progress import Progress
     from rbfmuscle.models import configure_scene
-    from rbfmuscle.sim.scene.scene import Scene
     from rbfmuscle.sim.scene.settings import parse_settings
+    from rbfmuscle.study.files.writer import check_writable
 
     if samples < 10:
         raise UsageError(f"--samples {samples} is too few to fit anything, give 10 or more")
     changes = parse_settings(settings)
-    loaded = configure_scene(Scene.load(scene), changes, model=model)
+    loaded = configure_scene(load_scene(scene), changes, model=model)
     if muscles is not None:
         chosen = [loaded.muscle(name.strip()).name for name in muscles.split(",")]
         loaded.muscles = [muscle for muscle in loaded.muscles if muscle.name in chosen]
     given = parse_ranges(loaded, ranges or [])
+    check_writable(output)
     with Progress(loaded.name, "pose") as progress:
         sampled = sample_muscles(loaded, given, samples=samples, progress=progress)
     for line in report_fits(loaded, sampled, output, order):

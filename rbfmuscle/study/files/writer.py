@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import os
+import tempfile
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -43,6 +44,23 @@ _OLD_FILES = (
 )
 # Share of a run's time that goes into checkpoints, at most.
 KEEPING_SHARE = 0.02
+
+
+def check_writable(directory: str | Path) -> None:
+    """Write to a folder, or to the one that it would be made in, before what takes time is begun.
+
+    Raises
+    ------
+    UsageError
+        If the folder cannot be written to.
+    """
+    path = Path(directory).absolute()
+    there = next(place for place in (path, *path.parents) if place.exists())
+    try:
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        raise UsageError(f"cannot write to {directory}: {error.strerror}; choose another folder") from None
 
 
 class RunWriter:

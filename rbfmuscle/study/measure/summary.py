@@ -29,8 +29,10 @@ LIMITS = {
     "flicker_max": 0.5,
     "tunnelled": 0.0,
     "rest_error_rms": 0.6,
+    "rest_error_max": 5.0,
 }
 
+MOST_NAMED = 6  # exceeded limits that a verdict names
 # Quantities of which too little is wrong: their limit is the least allowed value.
 LEAST = {"euler"}
 
@@ -144,6 +146,27 @@ def exceeded(table: dict[str, Any], limits: dict[str, Any]) -> list[Any]:
             if not within(name, worst, limit):
                 found.append((muscle, name, worst, limit, facts.get("worst_frame")))
     return found
+
+
+def describe_verdict(table: dict[str, Any], limits: dict[str, Any]) -> str:
+    """One sentence: all muscles within their limits, or what exceeds one, with its value, the worst ratio first."""
+    found = exceeded(table, limits)
+    if not found:
+        return "every muscle stays within every limit in every frame"
+    found.sort(key=_excess, reverse=True)
+    parts = [
+        f"{muscle}: {name} {worst:.3g} (limit {limit:g}) at frame {frame}"
+        for muscle, name, worst, limit, frame in found[:MOST_NAMED]
+    ]
+    more = f" and {len(found) - MOST_NAMED} more" if len(found) > MOST_NAMED else ""
+    return f"beyond a limit: {'; '.join(parts)}{more}"
+
+
+def _excess(row):
+    """How many times its limit a worst value is, as far as that can be said."""
+    _, quantity, worst, limit, _ = row
+    bounded = quantity not in LEAST and limit > 0 and math.isfinite(worst)
+    return abs(worst) / limit if bounded else math.inf
 
 
 def require_limits(table: dict[str, Any], limits: dict[str, Any]) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.quantities import QUANTITIES
-from rbfmuscle.study.measure.summary import LEAST, exceeded
+from rbfmuscle.study.measure.summary import LEAST, describe_verdict, exceeded
 from rbfmuscle.study.show.appearance import USUAL_VIEWS, line_colours
 from rbfmuscle.study.show.page import (
     EXPLANATION,
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 _PICTURE_SIZE = (330, 400)
 _PREVIEW_SIZE = (330, 400)
-_MOST_EVENTS, _MOST_NAMED = 60, 16
+_MOST_EVENTS = 60
 # What frames took of a muscle.
 _WORK = ("solved", "carried", "skipped", "substeps")
 # Volume, moment arms and stage times have tables or plots of their own.
@@ -170,12 +170,8 @@ def _verdict(saved):
     if saved.info["status"] != "complete":
         message = html.escape(saved.info["message"] or "")
         return f'<p class="bad">The run ended early ({saved.info["status"]}): {message}</p>'
-    found = sorted(_beyond(saved))
-    if not found:
-        return '<p class="good">Every muscle stays within every limit in every frame.</p>'
-    listed = ", ".join(f"{muscle}: {name}" for muscle, name in found[:_MOST_NAMED])
-    listed += f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
-    return f'<p class="bad">Beyond a limit: {html.escape(listed)}. See the table below.</p>'
+    text = html.escape(describe_verdict(saved.info["muscles"], saved.info["limits"]))
+    return f'<p class="{"bad" if _beyond(saved) else "good"}">{text[0].upper()}{text[1:]}.</p>'
 
 
 def _pictures(images, moving, reason):
