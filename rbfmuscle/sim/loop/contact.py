@@ -231,7 +231,7 @@ class BoneContacts:
         points = check_points(points)
         parts = [(*found, 0.0) for found in self._of_bones(points, reach)]
         for k, neighbour in enumerate(self.neighbours):
-            found = neighbour.contacts(points, np.max(reach))
+            found = neighbour.contacts(points, float(np.asarray(reach).max()))
             if len(found[0]):
                 parts.append((*found, -1 - k, neighbour.give))
         if not parts:

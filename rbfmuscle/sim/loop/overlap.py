@@ -50,7 +50,7 @@ def settle_rest(stepper: MuscleStepper) -> None:
     for b, depth in overlap.items():
         contacts.allow(b, depth)
         action = "overlap_kept" if scene.contact.initial == "keep" else "overlap_resolved"
-        stepper.report(contacts.names[b], (depth > least).sum(), action)
+        stepper.report(contacts.names[b], int((depth > least).sum()), action)
     if scene.contact.initial == "resolve":
         _resolve(stepper, overlap)
     _settle_rest_of(stepper)
