@@ -59,7 +59,7 @@ def test_run_prints_the_worst_of_every_muscle(ran, printed):
         for key, cell in zip(SHOWN, cells, strict=True):
             worst = facts.get(key, {}).get("worst")
             assert cell == ("nan" if worst is None else f"{abs(worst):.3g}")
-    assert re.match(r"verdict: (every muscle stays within|beyond a limit: \w+: \w+ [\d.])", printed[-2])
+    assert re.match(r"verdict: (every muscle stays within|beyond a limit: \w+: \w+ -?[\d.]+ )", printed[-2])
     assert re.match(rf"{len(info['frames'])} frames in [\d.]+ s, in ", printed[-1])
 
 
