@@ -16,7 +16,8 @@ demo: $(STAMP)
 	@echo "The first run compiles what it needs; later ones start at once."
 	$(BIN)/rbfmuscle demo --model rbf -o demo_output/rbf
 	$(BIN)/rbfmuscle demo --model pbd -o demo_output/pbd
-	@echo "Open demo_output/rbf/report.html and demo_output/pbd/report.html"
+	@echo "Reports: demo_output/rbf/report.html and demo_output/pbd/report.html"
+	@echo "Next: $(BIN)/rbfmuscle new examples/meshes --units mm"
 
 # A worker for each core (WORKERS=0 for none, as plain pytest has it); whoever is done takes tests from the others.
 WORKERS ?= auto

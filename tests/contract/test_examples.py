@@ -2,11 +2,14 @@
 
 import ast
 import os
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from command_line import call
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "docs"))
@@ -35,3 +38,17 @@ def test_example_passes_its_own_check(name, tmp_path):
         capture_output=True, text=True, timeout=600, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+def test_meshes_become_a_report_by_the_lines_of_the_readme(tmp_path, monkeypatch, capsys):
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    lines = re.findall(r"^rbfmuscle (.*examples/meshes[^#\n]*)", text, re.MULTILINE)
+    assert [line.split()[0] for line in lines] == ["new", "check", "run"]
+    kept = shutil.ignore_patterns("scene.toml", "attachments")
+    shutil.copytree(ROOT / "examples" / "meshes", tmp_path / "examples" / "meshes", ignore=kept)
+    monkeypatch.chdir(tmp_path)
+    for line in lines:
+        code, out, err = call(capsys, *line.split())
+        assert code == 0, err
+    assert "verdict: every muscle stays within every limit in every frame" in out
+    assert "gluteus_maximus" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
