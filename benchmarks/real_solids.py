@@ -69,7 +69,7 @@ def tetrahedra(mesh, edge):
         import pytetwild
     except ImportError as error:
         raise MissingPartError(
-            "pytetwild is not installed, which makes tetrahedra: pip install 'rbfmuscle[fem]'"
+            "pytetwild is not installed, which makes tetrahedra: pip install -e '.[fem]' in rbfmuscle's folder"
         ) from error
     size = float(np.linalg.norm(mesh.extents))
     # The mesher leaves a file of its own where it runs.

@@ -3,7 +3,7 @@
 Five commands lead from a volume of labels, as segmentation programs write it, to a report of moment arms and tables
 for OpenSim:
 
-    pip install 'rbfmuscle[labels]'
+    pip install -e '.[labels]'
     rbfmuscle new hip.nii.gz --labels names.json
     rbfmuscle check hip_scene/scene.toml --picture
     rbfmuscle run hip_scene/scene.toml -o out --set output.moment_arms=true

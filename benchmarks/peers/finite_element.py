@@ -33,7 +33,7 @@ def _skfem():
         import skfem
     except ImportError as error:
         raise MissingPartError(
-            "scikit-fem is not installed, which solids of finite elements need: pip install 'rbfmuscle[fem]'"
+            "solids of finite elements need scikit-fem: pip install -e '.[fem]' in rbfmuscle's folder"
         ) from error
     return skfem
 

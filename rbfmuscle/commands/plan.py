@@ -8,6 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from rbfmuscle.commands.scenes import load_scene
 from rbfmuscle.compiled.progress import Progress
 from rbfmuscle.compiled.warm import compile_ahead
 from rbfmuscle.compiled.watch import tell_stage
@@ -31,9 +32,8 @@ def plan(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", negat
 def _plan(path):
     from rbfmuscle.models import check_models, estimate_model
     from rbfmuscle.sim.plan.plan import plan_scene
-    from rbfmuscle.sim.scene.scene import Scene
 
-    loaded = Scene.load(path)
+    loaded = load_scene(path)
     check_models(loaded)
     compile_ahead(["plan"])
     with tell_stage("measuring this machine"):

@@ -151,7 +151,7 @@ class TestUsd:
 def test_usd_without_its_package_is_one_line(folder, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
     monkeypatch.setitem(sys.modules, "pxr.Usd", None)
-    with pytest.raises(MissingPartError, match=r"usd-core: pip install 'rbfmuscle\[usd\]'") as told:
+    with pytest.raises(MissingPartError, match=r"usd-core: pip install -e '\.\[usd\]'") as told:
         export_run(folder, ["ply", "usd"], output=tmp_path)
     assert told.value.exit_code == 7
     assert not list(tmp_path.iterdir())

@@ -145,7 +145,9 @@ def _read_nifti(path):
         import nibabel
         from nibabel.filebasedimages import ImageFileError
     except ImportError:
-        raise MissingPartError("reading .nii needs nibabel: pip install 'rbfmuscle[labels]'") from None
+        raise MissingPartError(
+            "reading .nii needs nibabel: pip install -e '.[labels]' in rbfmuscle's folder"
+        ) from None
     try:
         image = nibabel.load(path)
         shape, itemsize = image.shape, image.get_data_dtype().itemsize
@@ -178,7 +180,9 @@ def _read_nrrd(path):
     try:
         import nrrd
     except ImportError:
-        raise MissingPartError("reading .nrrd needs pynrrd: pip install 'rbfmuscle[labels]'") from None
+        raise MissingPartError(
+            "reading .nrrd needs pynrrd: pip install -e '.[labels]' in rbfmuscle's folder"
+        ) from None
     try:
         header = nrrd.read_header(str(path))
         shape = tuple(int(size) for size in header["sizes"])

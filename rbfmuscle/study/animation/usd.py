@@ -25,7 +25,9 @@ def check_usd() -> None:
     try:
         import pxr.Usd  # noqa: F401
     except ImportError:
-        raise MissingPartError("export to usd needs usd-core: pip install 'rbfmuscle[usd]'") from None
+        raise MissingPartError(
+            "export to usd needs usd-core: pip install -e '.[usd]' in rbfmuscle's folder"
+        ) from None
 
 
 def write_usd(path: Path, run: MovingRun, *, normals: bool = False) -> None:

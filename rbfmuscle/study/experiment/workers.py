@@ -51,7 +51,7 @@ def connect_cluster(scheduler: str, least: int) -> Any:
         from distributed import Client
     except ImportError as error:
         raise MissingPartError(
-            "Dask is not installed, which --scheduler needs: pip install 'rbfmuscle[cluster]'"
+            "Dask is not installed, which --scheduler needs: pip install -e '.[cluster]' in rbfmuscle's folder"
         ) from error
     try:
         client = Client(scheduler, timeout=CONNECT_WITHIN)
