@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test fuzz test-fast test-nojit coverage mutants references check bench figures docs release-check clean
+.PHONY: demo test portability fuzz test-fast test-nojit coverage mutants references check bench figures docs release-check clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -39,6 +39,12 @@ coverage: $(STAMP)
 	NUMBA_DISABLE_JIT=1 $(PYTEST) -q --cov --cov-report= $$(grep -v '^#' tests/nojit.txt)
 	$(PYTEST) -q --cov --cov-append --cov-report=term:skip-covered
 	@for room in $(ROOMS); do echo "$$room $$($(BIN)/python -m coverage report --include="$$room/*" --format=total) %"; done
+
+# The tests under other BLAS kernels, processor features, threads, versions, and with vertices moved by last digits.
+# Hours for all; a part by TESTS="tests/implicit tests/model" ONLY="haswell oldest".
+TESTS ?= tests
+portability: $(STAMP)
+	$(BIN)/python benchmarks/portability.py $(TESTS) $(if $(ONLY),--only $(ONLY))
 
 # Damaged scenes and meshes by the thousand; ends with a table of what became of them.
 fuzz: $(STAMP)

@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,44 @@ ROOT = Path(__file__).resolve().parent.parent
 # they wait for, at two to six times the processor time. Loops keep theirs, so what runs side by side is tested as such.
 for _name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+
+# Vertices of every scene, and of the shapes that tests make, moved at random by this share of their size. What
+# another processor rounds otherwise differs by less: a test that fails then hangs on last digits (make portability).
+MOVED = float(os.environ.get("RBFMUSCLE_MOVED_VERTICES", "0"))
+
+
+def _moved(vertices):
+    import numpy as np  # behind the numbers of threads
+
+    vertices = np.array(vertices, dtype=float)
+    step = MOVED * np.linalg.norm(np.ptp(vertices, axis=0))
+    return vertices + step * np.random.default_rng(32).uniform(-1.0, 1.0, vertices.shape)
+
+
+def _move_vertices():
+    import numpy as np
+    import trimesh
+
+    from rbfmuscle.sim.scene import meshes
+
+    def prepared(vertices, faces, prepare=meshes.prepare_mesh, **named):
+        sound = np.ndim(vertices) == 2 and np.size(vertices) and np.isfinite(vertices).all()
+        return prepare(_moved(vertices) if sound else vertices, faces, **named)
+
+    def shape(make):
+        def made(*given, **named):
+            mesh = make(*given, **named)
+            return trimesh.Trimesh(_moved(mesh.vertices), mesh.faces, process=False)
+
+        return made
+
+    meshes.prepare_mesh = prepared
+    for name in ("box", "capsule", "cylinder", "icosphere", "torus"):
+        setattr(trimesh.creation, name, shape(getattr(trimesh.creation, name)))
+
+
+if MOVED:
+    _move_vertices()
 
 
 def _find_hip():
@@ -63,3 +102,21 @@ def benchmark_script(name):
         return importlib.import_module(name)
     finally:
         sys.path.remove(str(ROOT / "benchmarks"))
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Why tests were skipped, in one line."""
+    reasons = [str(report.longrepr[-1]) for report in terminalreporter.stats.get("skipped", [])]
+    if reasons:
+        data = sum("RBFMUSCLE_DATA" in reason for reason in reasons)
+        packages = sorted(
+            {m[1] for reason in reasons if (m := re.search(r"could not import '(\w+)", reason))}
+        )
+        parts = (
+            [f"{data} need data (RBFMUSCLE_DATA names the folder that holds hip/, leg/ and osim/)"]
+            if data
+            else []
+        )
+        parts += [f"packages not installed: {', '.join(packages)}"] if packages else []
+        line = f"{len(reasons)} skipped: {'; '.join([*parts, 'pytest -rs lists all'])}"
+        terminalreporter.write_line(line)
