@@ -38,7 +38,6 @@ def solid():
     rows += [(f"{n} nodes", {"model.inside": n}) for n in NODES]
     rows += [(f"{INSIDE} nodes, {k} centres", {"model.inside": INSIDE, "model.centres": k}) for k in CENTRES]
     for name, settings in rows:
-        settings = {"model.placement": "even", **settings} if "centres" in name else settings
         found = distances("rbf", DATA, settings=settings)
         print(f"{name:28}" + "".join(f"{rms:7.2f} ({worst:4.1f})" for _, rms, worst, _ in found), flush=True)
 
@@ -70,7 +69,7 @@ def centres(path):
         for nodes in (0, INSIDE):
             runs = []
             for k in CENTRES:
-                settings = {"model.placement": "even", "model.resolution": 64}
+                settings = {"model.resolution": 64}
                 part = scene.with_options({**settings, "model.centres": k, "model.inside": nodes})
                 runs.append(
                     [f.surfaces[name] for f in simulate_frames(part, [build_model(part.muscles[0], part)])]

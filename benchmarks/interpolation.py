@@ -1,4 +1,4 @@
-"""Fits, evaluation, leave-one-out and condition estimates of the fields, as ratios: ``make bench``.
+"""Fits, evaluation and condition estimates of the fields, as ratios: ``make bench``.
 
 Both sides of a row work in one process, in turns, and the least of several rounds counts: on a shared machine ratios
 hold, milliseconds do not.
@@ -17,7 +17,6 @@ from scipy.linalg import blas
 
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit.condition import largest_eigenvalue, probe
-from rbfmuscle.implicit.fit.cross_validation import leave_one_out
 from rbfmuscle.implicit.fit.fitting import Basis, factorise, solve
 from rbfmuscle.implicit.fit.lapack import solve_cholesky
 from rbfmuscle.implicit.fit.systems import hermite_system
@@ -27,7 +26,7 @@ from rbfmuscle.validation import NumericalWarning
 SHARED = {"linear": 1.0, "cubic": 1.0, "quintic": 1.0, "thin_plate_spline": 1.0, "multiquadric": 4.0,
           "inverse_multiquadric": 4.0, "inverse_quadratic": 4.0, "gaussian": 6.0}  # fmt: skip
 COUNTS = (500, 1000, 2000)
-PARTS = ("fit", "evaluate", "loo", "condition")
+PARTS = ("fit", "evaluate", "condition")
 
 
 ROUNDS = 5
@@ -122,7 +121,7 @@ def bench_evaluate(table):
 
 
 def systems():
-    """Name, basis and right side of the fits that leave-one-out and the condition are measured on."""
+    """Name, basis and right side of the fits that the condition is measured on."""
     for kernel, epsilon in (("cubic", 1.0), ("matern_52", 3.0), ("wendland_c4", 1.0)):
         for count in (500, 1000):
             points, values = scattered(count)
@@ -132,13 +131,6 @@ def systems():
             for count in counts:
                 system = hermite_system(*ellipsoid(count), KERNELS[kernel], epsilon, derivatives)
                 yield f"{kernel}, {count} Hermite, {derivatives}", *system[:2]
-
-
-def bench_loo(table):
-    """Leaving every centre out, against one fit: a ratio of 0.5 is the time of two fits."""
-    for name, basis, right in systems():
-        table.add("loo", name, "one fit", lambda b=basis, r=right: leave_one_out(b, r),
-                  lambda b=basis, r=right: solve(b, r))  # fmt: skip
 
 
 def bench_condition(table):
@@ -177,7 +169,7 @@ def main():
     print(f"{about['cpu']}, {about['usable_cores']} of {about['cores']} cores, {about['threads']} threads")
     warnings.simplefilter("ignore", NumericalWarning)
     table = Table()
-    work = (bench_fit, bench_evaluate, bench_loo, bench_condition)
+    work = (bench_fit, bench_evaluate, bench_condition)
     for part, bench in zip(PARTS, work):
         if not chosen.part or part in chosen.part:
             bench(table)

@@ -41,7 +41,7 @@ from rbfmuscle.sim.scene.phantom import phantom_scene
 from rbfmuscle.study.measure.metrics import surface_distance
 
 CENTRES = (150, 300, 600, 1200)
-EVEN = {"name": "rbf", "placement": "even"}
+RBF = {"name": "rbf"}
 STRETCHES = (0.8, 1.2, 1.3)
 BEND, TURNS = 60.0, {"cylinder": 90.0, "sphere": 40.0}  # degrees
 IMAGE = Path(__file__).resolve().parents[1] / "docs" / "images" / "known_answers.webp"
@@ -104,7 +104,7 @@ def wrapped(over, model, spacing):
 
 def rbf_levels(spacing, **options):
     """Refinements of the RBF muscle on one input mesh: (label, size, model, spacing)."""
-    return [(f"{k} centres", k**-0.5, {**EVEN, "centres": k, **options}, spacing) for k in CENTRES]
+    return [(f"{k} centres", k**-0.5, {**RBF, "centres": k, **options}, spacing) for k in CENTRES]
 
 
 def mesh_levels(name, spacings, options=None):
@@ -139,7 +139,6 @@ def stretched_tables():
     for stretch in STRETCHES:
         for name, levels in (
             ("rbf", rbf_levels(1.5)),
-            ("rbf, greedy placement", rbf_levels(1.5, placement="greedy")[:3]),
             ("pbd", mesh_levels("pbd", meshes)),
             ("pbd with swelling_reach 0.01", mesh_levels("pbd", meshes, lambda h: {"swelling_reach": 0.01})),
             ("xpbd", mesh_levels("xpbd", meshes)),
@@ -276,7 +275,7 @@ def centre_tables():
         ("rbf over centres, links across of constant weight", lambda k: k / levels[0]),
     ):
         fine = [
-            {**EVEN, "centres": k, "across_weight": across(k), "samples": 6000, "resolution": 64}
+            {**RBF, "centres": k, "across_weight": across(k), "samples": 6000, "resolution": 64}
             for k in levels
         ]
         runs = [(f"{m['centres']} centres", m["centres"] ** -0.5, flexed(m)) for m in fine]
@@ -321,7 +320,7 @@ def picture(path):
     from PIL import Image
 
     models = (
-        ("rbf", lambda sweeps, side: {**EVEN, "centres": 600}),
+        ("rbf", lambda sweeps, side: {**RBF, "centres": 600}),
         ("pbd", lambda sweeps, side: {"name": "pbd"}),
         ("pbd settled", lambda sweeps, side: {"name": "pbd", **settled(sweeps, side)(side)}),
         ("arap-volume", lambda sweeps, side: {"name": "arap-volume"}),

@@ -24,7 +24,6 @@ _VALUE = re.compile(r"<!-- value: ([\w]+)\.([\w]+) -->.*?<!-- end -->", re.S)
 # Name: what measures it. DATA stands for the folder of the real hip.
 COMMANDS = {
     "headline": ["benchmarks/headline.py", "DATA/hip/flexion.toml", "-o", "OUT"],
-    "rest_fits": ["benchmarks/rest_fits.py", "DATA/hip/flexion.toml", "-o", "OUT"],
     "plan": ["benchmarks/plan_check.py", "-", "DATA/hip/flexion.toml", "--remake", "-o", "OUT"],
     "real_solids": ["benchmarks/real_solids.py", "compare", "gluteus_maximus", "rectus_femoris", "-o", "OUT"],
 }
@@ -89,15 +88,6 @@ def real_solids_table(facts):
     return lines
 
 
-def rest_fits_table(facts):
-    """How far fits of all derivatives and of normal ones miss the mesh."""
-    lines = ["| | all, 150 / 300 / 600 | normal only, 150 / 300 / 600 |", "|---|---|---|"]
-    for name, row in facts["rows"].items():
-        cells = [" / ".join(f"{value:.2f}" for value in row[kind]) for kind in ("all", "normal")]
-        lines.append(f"| {name.replace('_', ' ')} | {' | '.join(cells)} |")
-    return lines
-
-
 # What a row of a forecast holds: how a table calls it, and what of the unit it is in.
 PLANNED = {"build": ("muscles s", 1), "checks": ("checks s", 1), "lines": ("lines s", 1),
            "motion": ("a frame: muscles ms", 1e3), "metrics": ("metrics ms", 1e3), "write": ("files ms", 1e3),
@@ -121,7 +111,6 @@ TABLES = {
     "headline": headline_table,
     "plan": plan_table,
     "real_solids": real_solids_table,
-    "rest_fits": rest_fits_table,
 }
 
 

@@ -15,7 +15,7 @@ import rbfmuscle as rm
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.kernels.table import KERNELS
 from rbfmuscle.implicit.placement.sampling import sample_surface
-from rbfmuscle.implicit.selection import spacing_epsilon
+from rbfmuscle.implicit.selection import spacing
 from rbfmuscle.study.measure.metrics import surface_distance
 
 out = folder("choosing_a_kernel")
@@ -43,7 +43,7 @@ def measure(name, epsilon):
 rows = []
 for name in ("cubic", "quintic", "gaussian", "matern_52", "matern_72", "wendland_c4", "inverse_multiquadric"):
     factors = (0.1, 0.25, 0.5, 1.0) if KERNELS[name].has_epsilon else (0.5,)
-    trials = [measure(name, spacing_epsilon(sample.points, factor=factor)) for factor in factors]
+    trials = [measure(name, factor / spacing(sample.points).mean()) for factor in factors]
     rows.append(min(trials))
 
 print(f"{'kernel':22}{'epsilon':>9}{'RMS mm':>9}{'max mm':>9}{'condition':>11}{'fit ms':>8}")

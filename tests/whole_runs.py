@@ -99,7 +99,7 @@ def _tunnelling(model, **options):
 
 SCENES = {
     "contact_rbf": lambda: _contact(RBF),
-    "contact_rbf_marching": lambda: _contact({**RBF, "surface": "marching", "placement": "even"}),
+    "contact_rbf_marching": lambda: _contact({**RBF, "surface": "marching"}),
     "contact_rbf_inside": lambda: _contact({**RBF, "inside": 120, "fibre_ratio": 4.0}),
     "contact_pbd": lambda: _bent("pbd"),
     "contact_pbd_serendipity": lambda: _bent("pbd", "serendipity"),

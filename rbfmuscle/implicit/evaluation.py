@@ -1,4 +1,4 @@
-"""Evaluation of an RBF field: values, gradients and Hessians at many points.
+"""Evaluation of an RBF field: values and gradients at many points.
 
 Points are handled in blocks that stay in the first-level cache; the inner loops run over the points of
 a block. Large sets are split over threads.
@@ -18,7 +18,6 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.implicit.kernels.radial import _radial_loop
 from rbfmuscle.implicit.kernels.shares import (
     _add_gradient_loop,
-    _add_hessian_loop,
     _add_value_loop,
     _cubic_gradient_loop,
     _cubic_hermite_gradient_loop,
@@ -139,13 +138,13 @@ def _value_block_loop(terms, form, p, acc):
 
 
 @compiled(error_model="numpy")
-def _general_block_loop(terms, form, order, p, acc, g, h):
+def _general_block_loop(terms, form, gradient, p, acc, g):
     """Any kernel: radial functions into scratch blocks, then their sums."""
     d, u = np.empty_like(p), np.empty_like(acc)
-    work, radial = np.empty((3, u.size)), np.empty((4, u.size))
+    work, radial = np.empty((3, u.size)), np.empty((3, u.size))
     hermite, centres, epsilon = terms.hermite, terms.centres, terms.epsilon
     weight, slope = terms.a, terms.b
-    wanted = (2 << (order + hermite)) - 1
+    wanted = (2 << (int(gradient) + int(hermite))) - 1
     ball = _ball(p)
     for j in range(centres.shape[1]):
         at, e2 = (centres[0, j], centres[1, j], centres[2, j]), epsilon[j] * epsilon[j]
@@ -155,10 +154,8 @@ def _general_block_loop(terms, form, order, p, acc, g, h):
         _offsets_loop(p, at, e2, d, u)
         _radial_loop(form, wanted, u, work, radial)
         _add_value_loop(a, b, e2, hermite, radial, d, acc)
-        if order > 0:
+        if gradient:
             _add_gradient_loop(a, b, e2, hermite, radial, d, g)
-        if order > 1:
-            _add_hessian_loop(a, b, e2, hermite, radial, d, h)
 
 
 @compiled(error_model="numpy")
@@ -239,21 +236,17 @@ def _evaluate_values_loop(points, terms, form, start, stop, value):
 
 
 @compiled(error_model="numpy")
-def _evaluate_loop(points, terms, form, order, start, stop, out):
-    """Value, gradient and radial part of the Hessian (order 0, 1, 2) of any kernel at points[start:stop]."""
-    value, gradient, hessian = out
+def _evaluate_loop(points, terms, form, start, stop, value, gradient):
+    """Value and, where there is room for it, gradient of any kernel at points[start:stop]."""
+    wanted = len(gradient) > 0
     for low in range(start, stop, _BLOCK):
         n = min(_BLOCK, stop - low)
         size = (n + 7) // 8 * 8
-        p, acc, g, h = np.empty((3, size)), np.zeros(size), np.zeros((3, size)), np.zeros((6, size))
+        p, acc, g = np.empty((3, size)), np.zeros(size), np.zeros((3, size))
         _fill_block_loop(points, terms, low, n, p)
-        _general_block_loop(terms, form, order, p, acc, g, h)
-        _polynomial_loop(terms, order > 0, p, acc, g)
+        _general_block_loop(terms, form, wanted, p, acc, g)
+        _polynomial_loop(terms, wanted, p, acc, g)
         _give_block_loop(terms.scale, low, n, acc, g, value, gradient)
-        if order > 1:
-            for c in range(6):
-                for i in range(n):
-                    hessian[c, low + i] = h[c, i]
 
 
 def evaluate(
@@ -264,9 +257,9 @@ def evaluate(
     kernel: Kernel,
     epsilon: Floats,
     polynomial: tuple[Floats, Integers],
-    order: int,
-) -> tuple[Floats, Floats, Floats]:
-    """A field, its gradient, and the radial part of its Hessian.
+    with_gradient: bool,
+) -> tuple[Floats, Floats]:
+    """A field and its gradient.
 
     Parameters
     ----------
@@ -282,22 +275,18 @@ def evaluate(
         In scaled coordinates.
     polynomial : pair of (q,) and (q, 3) ndarrays
         Coefficients and powers of the monomials in scaled coordinates.
-    order : int
-        0 value, 1 with gradient, 2 with Hessian.
+    with_gradient : bool
 
     Returns
     -------
     value : (n,) ndarray
     gradient : (n, 3) ndarray
-        With respect to points; empty for order 0.
-    hessian : (6, n) ndarray
-        xx, yy, zz, xy, xz, yz, with respect to scaled coordinates, without the polynomial; empty below order 2.
+        With respect to points; empty where it is not wanted.
     """
     hermite, count = len(weights) == 4, len(points)
     b = weights[1:] if hermite else np.zeros((3, weights.shape[1]))
     cubic = kernel.plain_cube and bool((epsilon == 1.0).all())
-    value, gradient = np.empty(count), np.empty((count if order > 0 else 0, 3))
-    hessian = np.empty((6, count if order > 1 else 0))
+    value, gradient = np.empty(count), np.empty((count if with_gradient else 0, 3))
     sort = kernel.compact and centres.shape[1] >= _SORT_FROM and count > 4 * _BLOCK and epsilon.min() > 2.0
     if sort:
         places = _by_cells(points)
@@ -305,19 +294,19 @@ def evaluate(
     terms, form = Terms(*frame, centres, weights[0], b, hermite, epsilon, *polynomial), kernel.form
 
     def loop(start, stop):
-        if cubic and order < 2:
+        if cubic:
             _evaluate_cubic_loop(points, terms, start, stop, value, gradient)
-        elif order == 0 and not hermite:
+        elif not with_gradient and not hermite:
             _evaluate_values_loop(points, terms, form, start, stop, value)
         else:
-            _evaluate_loop(points, terms, form, order, start, stop, (value, gradient, hessian))
+            _evaluate_loop(points, terms, form, start, stop, value, gradient)
 
     run_in_chunks(loop, count, count * centres.shape[1])
     if not sort:
-        return value, gradient, hessian
+        return value, gradient
     back = np.empty_like(places)
     back[places] = np.arange(count)
-    return value[back], gradient[back] if order > 0 else gradient, hessian[:, back] if order > 1 else hessian
+    return value[back], gradient[back] if with_gradient else gradient
 
 
 def _by_cells(points: Floats) -> Integers:

@@ -14,12 +14,8 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.implicit.evaluation import evaluate
-from rbfmuscle.implicit.fit import assembly
-from rbfmuscle.implicit.fit.bounded import solve_bounded
-from rbfmuscle.implicit.fit.cross_validation import LeastSquaresPath
-from rbfmuscle.implicit.fit.fitting import Basis, solve, solve_least_squares
-from rbfmuscle.implicit.fit.regularisation import basis_smoothing, resolve_smoothing
-from rbfmuscle.implicit.fit.systems import check_degree, collocation, frame, hermite_system, hermite_weights
+from rbfmuscle.implicit.fit.fitting import Basis, solve, solve_bounded
+from rbfmuscle.implicit.fit.systems import check_degree, frame, hermite_system, hermite_weights
 from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
 from rbfmuscle.implicit.placement.off_surface import off_surface_points
 from rbfmuscle.validation import (
@@ -40,7 +36,7 @@ class RBFField:
     centres : (K, 3) ndarray
         In the coordinates of the caller.
     kernel : Kernel
-    epsilon : float or (K,) ndarray
+    epsilon : float
         Shape parameter [1/length]; multiplies r.
     weights : (K,) or (K, 4) ndarray
         a_j, or for a Hermite fit a_j and B_j, for centred and scaled coordinates.
@@ -51,7 +47,7 @@ class RBFField:
     condition : float
         Estimate for the matrix that was factored.
     smoothing : float
-        As given, or as chosen.
+        As given.
 
     Examples
     --------
@@ -95,8 +91,8 @@ class RBFField:
         kernel: Kernel | str = "cubic",
         epsilon: float = 1.0,
         degree: int | None = None,
-        smoothing: float | str = 0.0,
-        truncate: bool = True,
+        smoothing: float = 0.0,
+        condition: float = np.inf,
     ) -> RBFField:
         """Interpolate values at points.
 
@@ -110,11 +106,10 @@ class RBFField:
             Shape parameter [1/scene unit]; without effect on the interpolant of polyharmonic kernels.
         degree : int, optional
             Of the polynomial part, -1 for none; the kernel's least by default.
-        smoothing : float or {"gcv", "loo"}
-            Added to the diagonal, in coordinates scaled to order one; 0 interpolates. A criterion chooses it
-            (see `regularisation`), for one eigen-decomposition.
-        truncate : bool
-            Solve by a truncated eigen-decomposition where the condition is beyond 1e13; else raise there.
+        smoothing : float
+            Added to the diagonal, in coordinates scaled to order one; 0 interpolates.
+        condition : float
+            Bound, at least 1 [1]: a ridge keeps it (see `solve_bounded`).
 
         Returns
         -------
@@ -134,8 +129,7 @@ class RBFField:
         origin, scale = frame(points)
         shape = epsilon * scale if kernel.has_epsilon else 1.0
         basis = Basis((points - origin) / scale, kernel, shape, degree)
-        smoothing = basis_smoothing(smoothing, basis, values)
-        weights, coefficients, condition = solve(basis, values, smoothing=smoothing, truncate=truncate)
+        weights, coefficients, condition = _solve(basis, values, smoothing, condition)
         polynomial = coefficients, basis.powers
         return cls(points, (origin, scale), kernel, epsilon, weights, polynomial, condition, smoothing)
 
@@ -147,9 +141,8 @@ class RBFField:
         *,
         kernel: Kernel | str = "cubic",
         epsilon: float = 1.0,
-        smoothing: float | str = 0.0,
+        smoothing: float = 0.0,
         derivatives: str = "all",
-        truncate: bool = True,
         condition: float = np.inf,
     ) -> RBFField:
         """Fit f = 0 and grad f = normal at every point (Hermite RBF, Macedo 2011).
@@ -160,13 +153,11 @@ class RBFField:
             Points of the surface [scene unit].
         normals : (K, 3) array_like
             Gradients wanted there, outward; unit vectors make f a distance near the surface.
-        kernel, epsilon, smoothing, truncate
+        kernel, epsilon, smoothing, condition
             As in `fit`; the kernel must be C2.
         derivatives : {"all", "normal"}
             "normal" asks only for the derivative along the normal: 2K unknowns in place of 4K, a quarter
             of the time for nearly the same surface (see ``docs/field.md``).
-        condition : float
-            Bound, at least 1 [1]: a ridge keeps it, in units of the spacing (see `bounded`); without ``smoothing``.
 
         Returns
         -------
@@ -175,7 +166,7 @@ class RBFField:
         Raises
         ------
         UsageError
-            For a kernel that is not smooth enough, a normal of length zero, or a condition below 1 or beside smoothing.
+            For a kernel that is not smooth enough, a normal of length zero, or a condition below 1.
         numpy.linalg.LinAlgError
             If the system is singular.
         """
@@ -188,16 +179,8 @@ class RBFField:
             )
         if derivatives not in ("all", "normal"):
             raise UsageError(f"derivatives must be 'all' or 'normal', got {derivatives!r}")
-        if not condition >= 1.0:
-            raise UsageError(f"condition must be at least 1, got {condition}")
-        if np.isfinite(condition) and smoothing != 0.0:
-            raise UsageError("a bound of the condition sets the ridge by itself; leave smoothing out")
         basis, right, origin, scale = hermite_system(points, normals, kernel, epsilon, derivatives)
-        smoothing = basis_smoothing(smoothing, basis, right)
-        if np.isfinite(condition):
-            weights, coefficients, condition = solve_bounded(basis, right, condition)
-        else:
-            weights, coefficients, condition = solve(basis, right, smoothing=smoothing, truncate=truncate)
+        weights, coefficients, condition = _solve(basis, right, smoothing, condition)
         weights, polynomial = hermite_weights(basis, weights), (coefficients, basis.powers)
         fitted = cls(points, (origin, scale), kernel, epsilon, weights, polynomial, condition, smoothing)
         if kernel.has_epsilon:
@@ -214,7 +197,6 @@ class RBFField:
         epsilon: float = 1.0,
         smoothing: float = 0.0,
         derivatives: str = "all",
-        truncate: bool = True,
         condition: float = np.inf,
     ) -> RBFField:
         """Fit a surface through points with normals, whatever the kernel.
@@ -226,8 +208,8 @@ class RBFField:
         ----------
         points : (K, 3) array_like
         normals : (K, 3) array_like
-        kernel, epsilon, smoothing, derivatives, truncate, condition
-            As in `fit_hermite`; fits to values have no bound.
+        kernel, epsilon, smoothing, derivatives, condition
+            As in `fit_hermite`.
 
         Returns
         -------
@@ -237,74 +219,19 @@ class RBFField:
         if kernel.hermite:
             return cls.fit_hermite(
                 points, normals, kernel=kernel, epsilon=epsilon, smoothing=smoothing, derivatives=derivatives,
-                truncate=truncate, condition=condition,
+                condition=condition,
             )  # fmt: skip
         fitted = cls.fit(
             *off_surface_points(points, normals), kernel=kernel, epsilon=epsilon, smoothing=smoothing,
-            truncate=truncate,
+            condition=condition,
         )  # fmt: skip
         if kernel.has_epsilon:
             _warn_if_narrow(fitted, points, normals)
         return fitted
 
-    @classmethod
-    def fit_least_squares(
-        cls,
-        points: ArrayLike,
-        values: ArrayLike,
-        centres: ArrayLike,
-        *,
-        kernel: Kernel | str = "cubic",
-        epsilon: float = 1.0,
-        degree: Any = None,
-        smoothing: float = 0.0,
-        cutoff: float = 1e-14,
-    ) -> RBFField:
-        """Fit values at more points than centres, by truncated SVD; the remedy for flat kernels.
-
-        Parameters
-        ----------
-        points : (n, 3) array_like
-            Where the values are known, n >= K.
-        values : (n,) array_like
-        centres : (K, 3) array_like
-        kernel, epsilon, degree
-            As in `fit`.
-        smoothing : float or {"gcv", "loo"}
-            Tikhonov: adds smoothing * (sum of squared weights) to the squared residual; or how it is chosen.
-        cutoff : float
-            Singular values below cutoff times the largest are dropped.
-
-        Returns
-        -------
-        RBFField
-
-        Warns
-        -----
-        NumericalWarning
-            Where singular values are dropped; `FlatField.fit_least_squares` needs to drop none.
-        """
-        points, centres = check_points(points), check_points(centres, name="centres")
-        values = check_values(values, len(points))
-        kernel, epsilon = get_kernel(kernel), check_positive(epsilon, name="epsilon")
-        degree = check_degree(kernel, degree, len(points))
-        if len(points) < len(centres):
-            raise UsageError(
-                f"least squares needs at least {len(centres)} points (one a centre), got {len(points)}"
-            )
-        origin, scale = frame(centres)
-        matrix, powers = collocation(points, centres, kernel, epsilon, degree, origin, scale)
-        smoothing = resolve_smoothing(smoothing, lambda: LeastSquaresPath(matrix, values, cutoff=cutoff))
-        solution, condition, rank = solve_least_squares(matrix, values, smoothing=smoothing, cutoff=cutoff)
-        if rank < matrix.shape[1]:
-            _warn_if_truncated(kernel, rank, matrix.shape[1])
-        weights, coefficients = solution[: len(centres)], solution[len(centres) :]
-        polynomial = coefficients, powers
-        return cls(centres, (origin, scale), kernel, epsilon, weights, polynomial, condition, smoothing)
-
     def __call__(self, points: ArrayLike) -> Floats:
         """Field value at (n, 3) points: (n,), negative inside."""
-        return self._evaluate(check_points(points), 0)[0]
+        return self._evaluate(check_points(points), False)[0]
 
     def gradient(self, points: Floats) -> Floats:
         """Gradient at (n, 3) points: (n, 3)."""
@@ -312,28 +239,7 @@ class RBFField:
 
     def value_and_gradient(self, points: Floats) -> tuple[Floats, Floats]:
         """Value (n,) and gradient (n, 3) at (n, 3) points, for little more than the value alone."""
-        return self._evaluate(check_points(points), 1)[:2]
-
-    def hessian(self, points: Floats) -> Floats:
-        """Second derivatives at (n, 3) points: (n, 3, 3) [1/scene unit]."""
-        return self._derivatives(check_points(points))[1]
-
-    def mean_curvature(self, points: Floats) -> Floats:
-        """Mean curvature of the level sets (n,): 1/R on a sphere of radius R, positive where convex.
-
-        (|g|^2 tr H - g^T H g) / (2 |g|^3) with gradient g and Hessian H.
-        """
-        g, h = self._derivatives(check_points(points))
-        length = np.linalg.norm(g, axis=1)
-        bend = np.einsum("ni,nij,nj->n", g, h, g)
-        return (length**2 * np.trace(h, axis1=1, axis2=2) - bend) / (2 * length**3)
-
-    def gaussian_curvature(self, points: Floats) -> Floats:
-        """Gaussian curvature of the level sets (n,): g^T adj(H) g / |g|^4, 1/R^2 on a sphere."""
-        g, h = self._derivatives(check_points(points))
-        rows = [np.cross(h[:, (i + 1) % 3], h[:, (i + 2) % 3]) for i in range(3)]
-        adjugate = np.stack(rows, axis=1)
-        return np.einsum("ni,nij,nj->n", g, adjugate, g) / (g * g).sum(axis=1) ** 2
+        return self._evaluate(check_points(points), True)
 
     def surface(self, resolution: int = 64) -> Any:
         """Zero set as a closed outward ``trimesh.Trimesh``; resolution in cells along the longest side."""
@@ -344,21 +250,22 @@ class RBFField:
         result = extract_surface(self, points=self.centres, resolution=resolution)
         return trimesh.Trimesh(result.vertices, result.faces, process=False)
 
-    def _derivatives(self, points: Floats) -> tuple[Floats, Floats]:
-        _, gradient, flat = self._evaluate(points, 2)
-        hessian = flat[[0, 3, 4, 3, 1, 5, 4, 5, 2]].T.reshape(-1, 3, 3)
-        if len(self.powers):
-            scaled = (points - self.origin) / self.scale
-            hessian = hessian + np.einsum(
-                "q,ceqn->nce", self.coefficients, assembly.monomial_hessians(scaled, self.powers)
-            )
-        return gradient, hessian / self.scale**2
-
-    def _evaluate(self, points: Floats, order: int) -> tuple[Floats, Floats, Floats]:
+    def _evaluate(self, points: Floats, with_gradient: bool) -> tuple[Floats, Floats]:
         return evaluate(
             points, (self.origin, self.scale), self._scaled, self._rows, self.kernel, self._shape,
-            self._polynomial, order,
+            self._polynomial, with_gradient,
         )  # fmt: skip
+
+
+def _solve(basis: Basis, right: Floats, smoothing: float, condition: float) -> tuple[Floats, Floats, float]:
+    """Weights, coefficients and condition, with a ridge where the condition has a bound."""
+    if not (np.isfinite(smoothing) and smoothing >= 0.0):
+        raise UsageError(f"smoothing must be a number of at least 0, got {smoothing}")
+    if not condition >= 1.0:
+        raise UsageError(f"condition must be at least 1, got {condition}")
+    if np.isfinite(condition):
+        return solve_bounded(basis, right, condition, smoothing=smoothing)
+    return solve(basis, right, smoothing=smoothing)
 
 
 def _warn_if_narrow(fitted: RBFField, points: ArrayLike, normals: ArrayLike) -> None:
@@ -369,21 +276,9 @@ def _warn_if_narrow(fitted: RBFField, points: ArrayLike, normals: ArrayLike) -> 
     near = cKDTree(points).query(points, k=6)[1][:, 5]
     slope = np.einsum("ij,ij->i", fitted.gradient(0.5 * (points + points[near])), normals)
     if np.median(slope) < 0.5 * np.median(np.linalg.norm(normals, axis=1)):
-        shape = float(np.median(np.atleast_1d(fitted.epsilon)))
         warnings.warn(
-            f"kernel '{fitted.kernel.name}' with epsilon {shape:.3g} does not reach from centre to centre: the field "
-            "is flat between them and shows no surface; lower epsilon or add centres",
+            f"kernel '{fitted.kernel.name}' with epsilon {fitted.epsilon:.3g} does not reach from centre to centre: "
+            "the field is flat between them and shows no surface; lower epsilon or add centres",
             NumericalWarning,
             stacklevel=4,
         )
-
-
-def _warn_if_truncated(kernel: Kernel, rank: int, size: int) -> None:
-    analytic = kernel.smoothness == 99
-    remedy = "raise epsilon or fit with FlatField.fit_least_squares" if analytic else "spread the centres"
-    warnings.warn(
-        f"least-squares fit with kernel '{kernel.name}' leaves {size - rank} of {size} directions out, which rounding "
-        f"has taken; {remedy}",
-        NumericalWarning,
-        stacklevel=3,
-    )

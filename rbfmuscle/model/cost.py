@@ -10,12 +10,14 @@ import numpy as np
 
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.implicit.field import RBFField
+from rbfmuscle.implicit.field_fit import wanted_derivatives
 from rbfmuscle.implicit.fit.lapack import factor_cholesky
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.placement.lattice import AREA_A_POINT, MOST_HALVINGS
+from rbfmuscle.implicit.placement.refinement import FITTED
 from rbfmuscle.model.drawing import MARCHING_CELLS
 from rbfmuscle.model.options import RBFOptions
-from rbfmuscle.model.placement import MOST_WITH_ALL_DERIVATIVES, choose_centres, sample_is_cached
+from rbfmuscle.model.placement import choose_centres, sample_is_cached
 from rbfmuscle.model.shown import shown_vertices
 from rbfmuscle.sim.plan.forecast import MuscleCost
 from rbfmuscle.sim.plan.rates import shortest
@@ -25,7 +27,7 @@ from rbfmuscle.sim.scene.scene import Scene
 # Vertices of the surface on an area of one cell squared; nodes of the grid kept beside them, bytes of each.
 VERTICES_A_CELL, NODE_BYTES, VERTEX_BYTES = 1.5, 10, 400
 # Work to build: visits for a sample, for a vertex of the mesh and more for each centre, a tenth without rounds.
-SAMPLE_VISITS, VERTEX_VISITS, CENTRE_VISITS, ROUNDS = 240_000, 120_000, 240, 10
+SAMPLE_VISITS, VERTEX_VISITS, CENTRE_VISITS = 240_000, 120_000, 240
 # Share of that work which is left where the samples are kept on disk already.
 KEPT = 0.15
 # A sub-step: calls; then of each iteration calls, visits for a centre and for a contact point; the search for
@@ -63,14 +65,13 @@ def estimate_muscle(
     pair, flop = _field_rates(options.kernel)
     call, visit = rates["call"], rates["visit"]
     bones = sum(len(bone.mesh.vertices) for bone in scene.bones)
-    rounds = 1.0 if options.placement == "greedy" else 1.0 / ROUNDS
     mesh_visits = len(muscle.mesh.vertices) * (VERTEX_VISITS + CENTRE_VISITS * centres)
     frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
     mesh = frame.local, np.asarray(muscle.mesh.faces)
-    sampling, placing = SAMPLE_VISITS * options.samples, rounds * mesh_visits
+    sampling, placing = SAMPLE_VISITS * options.samples, mesh_visits
     if sample_is_cached(*mesh, options.samples, seed=options.seed, placement="even"):
         sampling *= KEPT
-    if sample_is_cached(*mesh, centres, seed=options.seed, placement=options.placement):
+    if sample_is_cached(*mesh, centres, seed=options.seed, placement="greedy"):
         placing *= KEPT
     search = CROSSING_VISITS * points if scene.detect is not None else 0
     iteration = ITERATION_CALLS * call + visit * (SOLVE_VISITS * centres + CONTACT_VISITS * points)
@@ -116,14 +117,12 @@ def _surface_size(muscle: Muscle, options: Any) -> Any:
     return VERTICES_A_CELL * muscle.mesh.area / cell**2, float(np.prod(extent / cell + 7.0))
 
 
-def _unknowns(options: Any, centres: int) -> Any:
+def _unknowns(options: RBFOptions, centres: int) -> int:
     """Order of the matrix that is factored in each frame."""
     if not get_kernel(options.kernel).hermite:
         return 3 * centres
-    every = options.derivatives == "all" or (
-        options.derivatives == "auto" and centres <= MOST_WITH_ALL_DERIVATIVES
-    )
-    return (4 if every else 2) * centres
+    derivatives = wanted_derivatives(centres, fitted=options.placement == FITTED)
+    return (4 if derivatives == "all" else 2) * centres
 
 
 @lru_cache(maxsize=8)

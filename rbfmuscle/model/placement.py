@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import asdict, dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import asdict, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,14 +13,12 @@ from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction.surface import extract_surface
-from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
+from rbfmuscle.implicit.field_fit import FieldFit, wanted_derivatives
+from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.placement.density import GREEDY_LARGEST
 from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
 from rbfmuscle.implicit.placement.sampling import SurfaceSample, sample_surface
-from rbfmuscle.implicit.selection import spacing, surface_miss
-from rbfmuscle.implicit.shape_search import Limits
-from rbfmuscle.implicit.surface_epsilon import choose_surface_epsilon
+from rbfmuscle.implicit.selection import BOUND, choose_epsilon, spacing, surface_miss
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.sim.cache import content_key, has_arrays, load_arrays, store_arrays
 from rbfmuscle.sim.scene.objects import Muscle
@@ -30,8 +28,6 @@ from rbfmuscle.validation import NumericalWarning, SceneError
 # Area for each centre [mm²], from which their number follows where the scene names none, and the least number.
 AREA_FOR_EACH = 212.0
 LEAST_CENTRES = 150
-# With more centres than these a fit to normal derivatives alone errs less for the same time.
-MOST_WITH_ALL_DERIVATIVES = 200
 # A field at rest that is looked at before it is used: cells along its longest side, and the share of the mesh's volume
 # by which its level zero may be off.
 CELLS, VOLUME_BOUND = 48, 0.2
@@ -43,34 +39,6 @@ FALL, TRIALS, MOST_CENTRES = 1.2, 5, 4.0
 AIM = 0.97
 # Part of the name under which samples are cached: raise it when they are made in another way.
 SAMPLING = 1
-
-
-@dataclass(frozen=True)
-class FieldFit:
-    """How the field through a muscle's centres is fitted.
-
-    Attributes
-    ----------
-    kernel : Kernel
-    epsilon : float
-        Its shape parameter [1 / scene unit].
-    derivatives : {"all", "normal"}
-        What the fit meets at a centre.
-    condition : float
-        Bound of its condition, which a ridge keeps.
-    """
-
-    kernel: Kernel
-    epsilon: float
-    derivatives: str
-    condition: float = np.inf
-
-    def fit(self, centres: np.ndarray, normals: np.ndarray) -> RBFField:
-        """The field through centres (K, 3) with unit normals (K, 3)."""
-        return RBFField.fit_surface(
-            centres, normals, kernel=self.kernel, epsilon=self.epsilon, derivatives=self.derivatives,
-            condition=self.condition,
-        )  # fmt: skip
 
 
 def default_centres(area: float, scene: Scene) -> int:
@@ -120,9 +88,7 @@ def choose_centres(muscle: Muscle, scene: Scene, options: RBFOptions, *, known_o
         return Chosen(options.centres, np.nan, "as given")
     usual, wanted = default_centres(muscle.mesh.area, scene), wanted_error(muscle, scene, options)
     frame, faces = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)), np.asarray(muscle.mesh.faces)
-    fit = (
-        options.kernel, options.epsilon, options.condition, options.derivatives, options.placement, options.seed,
-    )  # fmt: skip
+    fit = (options.kernel, options.epsilon, options.condition, options.placement, options.seed)
     key = content_key(frame.local, faces, ("centres", SAMPLING, usual, round(wanted / frame.size, 9), *fit))
     found = load_arrays(key)
     if found is None and known_only:
@@ -141,9 +107,7 @@ def _search_centres(
     muscle: Muscle, frame: RestFrame, options: RBFOptions, usual: int, wanted: float
 ) -> tuple[int, float]:
     """The number of centres that errs little enough, or the best within reach, and its error."""
-    most, count, tried = int(MOST_CENTRES * usual), usual, []
-    if options.placement in ("greedy", FITTED):
-        most = min(most, GREEDY_LARGEST)
+    most, count, tried = min(int(MOST_CENTRES * usual), GREEDY_LARGEST), usual, []
     for _ in range(TRIALS):
         centres, _, fit = place_points(muscle, frame, options, count)
         error = _rest_miss(frame, centres, fit)
@@ -190,17 +154,11 @@ def place_points(
     Raises
     ------
     SceneError
-        If the placement cannot be had with so many centres or with this kernel.
+        If the placement cannot be had with this kernel.
     """
     fitted = options.placement == FITTED
-    placement = "greedy" if fitted else options.placement
-    if placement == "greedy" and count > GREEDY_LARGEST:
-        raise SceneError(
-            f"muscle {muscle.name!r}: placement {options.placement!r} takes at most {GREEDY_LARGEST} "
-            f"centres, got {count}; take placement 'adaptive'"
-        )
     faces = np.asarray(muscle.mesh.faces)
-    centres = cached_sample(frame.local, faces, count, seed=options.seed, placement=placement)
+    centres = cached_sample(frame.local, faces, count, seed=options.seed, placement="greedy")
     samples = cached_sample(frame.local, faces, options.samples, seed=options.seed, placement="even")
     surface = frame, faces
     fit = _choose_fit(muscle.name, surface, options, centres, samples)
@@ -213,14 +171,22 @@ def place_points(
     return centres, samples, fit
 
 
-def _choose_fit(name: str, mesh: tuple[Any, Any], options: Any, centres: SurfaceSample, samples: Any) -> Any:
+def _choose_fit(
+    name: str,
+    mesh: tuple[RestFrame, Integers],
+    options: RBFOptions,
+    centres: SurfaceSample,
+    samples: SurfaceSample,
+) -> FieldFit:
     """The kernel, and its shape parameter where the scene leaves it open: by the error at the samples at rest."""
     frame, faces = mesh
-    derivatives = options.derivatives
-    if derivatives == "auto":
-        few = len(centres.points) <= MOST_WITH_ALL_DERIVATIVES
-        derivatives = "all" if options.placement == FITTED or few else "normal"
     kernel = get_kernel(options.kernel)
+    fit = FieldFit(
+        kernel,
+        options.epsilon or 1.0,
+        wanted_derivatives(len(centres.points), fitted=options.placement == FITTED),
+        options.condition or (BOUND if kernel.has_epsilon else np.inf),
+    )
     if not kernel.hermite:
         warnings.warn(
             f"muscle {name!r}: kernel {kernel.name!r} is C{kernel.smoothness} only; the field is "
@@ -228,21 +194,25 @@ def _choose_fit(name: str, mesh: tuple[Any, Any], options: Any, centres: Surface
             NumericalWarning,
             stacklevel=6,
         )
-    epsilon = options.epsilon or 1.0
-    if kernel.has_epsilon and not options.epsilon:
-        try:
-            # In the muscle's own frame, so that a scene that is turned chooses the same.
-            epsilon = choose_surface_epsilon(
-                centres.points, centres.normals, kernel=kernel, held_out=samples.points,
-                distance=ExactDistance(frame.local, faces).signed_distance, derivatives=derivatives,
-                limits=Limits(condition=options.condition or np.inf),
-            ).epsilon / frame.size  # fmt: skip
-        except np.linalg.LinAlgError as error:
-            raise SceneError(f"muscle {name!r}: {error}") from None
-    return FieldFit(kernel, epsilon, derivatives, options.condition or np.inf)
+    if not kernel.has_epsilon or options.epsilon:
+        return fit
+    try:
+        # In the muscle's own frame, so that a scene that is turned chooses the same.
+        chosen = choose_epsilon(
+            centres.points,
+            centres.normals,
+            fit,
+            held_out=samples.points,
+            distance=ExactDistance(frame.local, faces).signed_distance,
+        )
+    except np.linalg.LinAlgError as error:
+        raise SceneError(f"muscle {name!r}: {error}") from None
+    return replace(fit, epsilon=chosen.epsilon / frame.size)
 
 
-def _refuse_broken(name: str, mesh: tuple[Any, Any], fit: Any, centres: SurfaceSample) -> None:
+def _refuse_broken(
+    name: str, mesh: tuple[RestFrame, Integers], fit: FieldFit, centres: SurfaceSample
+) -> None:
     """Raise where the level zero at rest is open, in more sheets than one, or of another volume."""
     frame, faces = mesh
     local = replace(fit, epsilon=fit.epsilon * frame.size)
@@ -264,17 +234,17 @@ def _refuse_broken(name: str, mesh: tuple[Any, Any], fit: Any, centres: SurfaceS
         )
 
 
-def _fit_centres(name: str, mesh: tuple[Any, Any], options: Any, centres: SurfaceSample, fit: Any) -> Any:
+def _fit_centres(
+    name: str, mesh: tuple[RestFrame, Integers], options: RBFOptions, centres: SurfaceSample, fit: FieldFit
+) -> SurfaceSample:
     """Centres beside the surface, whose field lies nearer to all of it."""
     frame, faces = mesh
-    if not fit.kernel.hermite or fit.derivatives != "all":
+    if not fit.kernel.hermite:
         raise SceneError(
-            f"muscle {name!r}: placement {FITTED!r} needs a C2 kernel and derivatives 'all', got "
-            f"{fit.kernel.name!r} and {fit.derivatives!r}; take placement 'greedy'"
+            f"muscle {name!r}: placement {FITTED!r} needs a C2 kernel, got {fit.kernel.name!r}; take placement 'greedy'"
         )
-    return fit_sample(
-        centres, frame.local, faces, kernel=fit.kernel, epsilon=fit.epsilon * frame.size, seed=options.seed
-    )  # fmt: skip
+    local = replace(fit, epsilon=fit.epsilon * frame.size)
+    return fit_sample(centres, frame.local, faces, fit=local, seed=options.seed)
 
 
 def cached_sample(
@@ -297,5 +267,5 @@ def sample_is_cached(
     return has_arrays(_sample_key(vertices, faces, count, seed, placement))
 
 
-def _sample_key(vertices: Floats, faces: Integers, count: int, seed: int, placement: Any) -> Any:
+def _sample_key(vertices: Floats, faces: Integers, count: int, seed: int, placement: str) -> str:
     return content_key(vertices, faces, ("surface sample", SAMPLING, count, seed, placement))

@@ -12,11 +12,12 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import harmonic_weights, surface_gradient
 from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.implicit.field_fit import FieldFit
 from rbfmuscle.implicit.placement.sampling import SurfaceSample
 from rbfmuscle.model.clusters import bind_samples, build_clusters
 from rbfmuscle.model.fibres import fibre_directions
 from rbfmuscle.model.options import RBFOptions
-from rbfmuscle.model.placement import FieldFit, choose_centres, default_centres, place_points
+from rbfmuscle.model.placement import choose_centres, default_centres, place_points
 from rbfmuscle.sim.scene.objects import Muscle
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.validation import SceneError

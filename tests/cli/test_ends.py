@@ -195,7 +195,7 @@ class TestOutputs:
     def test_full_disk_for_kernels_names_the_folder(self, tmp_path, capsys, monkeypatch):
         import errno
 
-        from rbfmuscle.study.show.kernels import page as kernel_page
+        from rbfmuscle.study.show import kernel_page
 
         trimesh.creation.icosphere(subdivisions=2, radius=20).export(tmp_path / "ball.ply")
 
@@ -213,7 +213,7 @@ class TestOutputs:
             "--centres",
             "40",
         ]
-        code, _, err = call(capsys, *words, "--resolution", "16", "--no-pictures")
+        code, _, err = call(capsys, *words, "--resolution", "16")
         busy = re.compile(r".*: (fit .*|[a-z ]+ \(\d+ s\)|.*compiling.* \(\d+ s\))")
         lines = [line for line in err.splitlines() if not busy.fullmatch(line) and "warning" not in line]
         assert (

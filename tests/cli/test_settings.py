@@ -60,7 +60,7 @@ MODELS = {
         {
             "centres": 60, "samples": 300, "iterations": 3, "contacts": 12, "resolution": 16, "kernel": "quintic",
             "epsilon": 0.02, "stretch_low": 0.6, "stretch_high": 1.8, "stretch_hold": 0.2, "across": 2,
-            "across_weight": 0.5, "acceleration": 0, "placement": "even", "derivatives": "all", "inside": 40,
+            "across_weight": 0.5, "acceleration": 0, "placement": "fitted", "inside": 40,
             "surface": "marching",
             "fibre_ratio": 2.0, "condition": 1e12, "seed": 3, "rest_error": 0.4,
         },

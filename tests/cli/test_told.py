@@ -21,8 +21,8 @@ from rbfmuscle.compiled.progress import describe_stage
 from rbfmuscle.sim.scene.check import check_centre, check_extents, check_scene
 from rbfmuscle.study.measure.summary import require_limits
 from rbfmuscle.study.show.comparison_page import cell
-from rbfmuscle.study.show.kernels.page import COLUMNS
-from rbfmuscle.study.show.kernels.page import _row as kernel_row
+from rbfmuscle.study.show.kernel_page import COLUMNS
+from rbfmuscle.study.show.kernel_page import _row as kernel_row
 from rbfmuscle.study.show.report import _cell as report_cell
 from rbfmuscle.study.show.report import _facts, _stages, _summary, _verdict
 from rbfmuscle.study.show.sweep_page import _cell as sweep_cell
@@ -197,7 +197,7 @@ class TestLimits:
 class TestPages:
     def test_row_of_kernels_shows_each_quantity_in_its_column_and_unit(self):
         row = {name: 1.01 + 0.1 * k for k, name in enumerate(COLUMNS)}
-        row |= {"kernel": "cubic", "note": "a <note>", "front_time": True, "centres": 80, "placement": None}
+        row |= {"kernel": "cubic", "note": "a <note>", "front": True, "centres": 80, "placement": None}
         shown = texts(kernel_row(row))[0]
         scale = {"volume, %": 100.0, "fit, ms": 1000.0, "20,000 values, ms": 1000.0}
         for (name, head), found in zip(COLUMNS.items(), shown, strict=True):

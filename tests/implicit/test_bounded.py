@@ -6,7 +6,7 @@ import trimesh
 from scipy import linalg
 
 from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.fit.bounded import solve_bounded
+from rbfmuscle.implicit.fit.fitting import solve_bounded
 from rbfmuscle.implicit.fit.systems import hermite_system
 from rbfmuscle.implicit.kernels.table import KERNELS
 from rbfmuscle.implicit.placement.sampling import sample_surface
@@ -96,8 +96,3 @@ def test_polynomials_that_are_not_determined_are_refused_with_a_bound_too(plate)
 def test_a_bound_that_is_none_is_refused(plate, condition):
     with pytest.raises(UsageError, match="condition must be at least 1"):
         RBFField.fit_hermite(plate[0], plate[1], condition=condition)
-
-
-def test_a_bound_and_a_smoothing_exclude_each_other(plate):
-    with pytest.raises(UsageError, match="leave smoothing out"):
-        RBFField.fit_hermite(plate[0], plate[1], condition=1e10, smoothing=1e-3)

@@ -186,10 +186,12 @@ def test_adapted_placements_halve_the_largest_miss_of_a_fit(muscle, count):
     assert misses[2].max() < 0.8 * misses[0].max()
 
 
-def test_greedy_placement_of_thousands_is_refused():
+def test_greedy_placement_of_thousands_follows_the_curvature_alone():
     mesh = trimesh.creation.icosphere(2)
-    with pytest.raises(ValueError, match="greedy"):
-        sample_surface(mesh.vertices, mesh.faces, 2000, placement="greedy")
+    greedy, adaptive = (
+        sample_surface(mesh.vertices, mesh.faces, 1001, placement=p) for p in ("greedy", "adaptive")
+    )
+    np.testing.assert_array_equal(greedy.points, adaptive.points)
 
 
 def test_unknown_placement_is_refused():

@@ -68,7 +68,7 @@ def test_chunks_cover_every_point_once(count):
 
 @pytest.mark.parametrize("kernel", EVERY, ids=lambda kernel: f"{kernel.name}-{kernel.parameter}")
 @pytest.mark.parametrize("dipoles", [False, True], ids=["values", "hermite"])
-def test_slopes_and_curvatures_are_those_of_the_literal_sum(kernel, dipoles):
+def test_values_and_slopes_are_those_of_the_literal_sum(kernel, dipoles):
     """A few centres, in scaled coordinates off the origin, with a linear polynomial; slopes by central differences."""
     rng = np.random.default_rng(3)
     origin, scale, epsilon = np.array([3.0, -2.0, 1.0]), 2.5, 0.8
@@ -76,9 +76,11 @@ def test_slopes_and_curvatures_are_those_of_the_literal_sum(kernel, dipoles):
     coefficients, powers = np.array([0.3, -1.2, 0.7]), np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1]])
     points = origin + scale * rng.uniform(-1, 1, (11, 3))
 
-    def found(at, order):
+    def found(at, with_gradient=True):
         shape = np.full(7, epsilon)
-        return evaluate(at, (origin, scale), centres, weights, kernel, shape, (coefficients, powers), order)
+        return evaluate(
+            at, (origin, scale), centres, weights, kernel, shape, (coefficients, powers), with_gradient
+        )
 
     def phi(at, shift=0.0):
         way = at[:, None] - centres.T - shift
@@ -94,18 +96,12 @@ def test_slopes_and_curvatures_are_those_of_the_literal_sum(kernel, dipoles):
             total = total + (phi(local, way) - phi(local, -way)) / (2 * step) @ weights[1 + k]
         return total
 
-    value, gradient, hessian = found(points, 2)
+    value, gradient = found(points)
     smooth = 2e-7 if dipoles else 1e-12
     np.testing.assert_allclose(value, literal(points), atol=smooth * 100, rtol=1e-7)
-    np.testing.assert_allclose(found(points, 0)[0], value, atol=1e-12)
-    np.testing.assert_allclose(found(points, 1)[1], gradient, atol=1e-11)
+    np.testing.assert_allclose(found(points, False)[0], value, atol=1e-12)
     step = 6e-6 * scale
-    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
     for k in range(3):
         way = step * np.eye(3)[k]
-        ahead, behind = found(points + way, 1), found(points - way, 1)
+        ahead, behind = found(points + way), found(points - way)
         np.testing.assert_allclose(gradient[:, k], (ahead[0] - behind[0]) / (2 * step), atol=2e-7, rtol=2e-7)
-        slope = (ahead[1] - behind[1]) / (2 * step) * scale**2
-        for row, (i, j) in enumerate(pairs):
-            if i == k:
-                np.testing.assert_allclose(hessian[row], slope[:, j], atol=2e-6, rtol=2e-6)

@@ -126,7 +126,7 @@ class TestMeasures:
 
 
 # What the page of accuracy promises: shares of the closed form, at a refinement that runs in a second.
-FINE_RBF = {"name": "rbf", "placement": "even", "centres": 600}
+FINE_RBF = {"name": "rbf", "centres": 600}
 
 
 class TestStretchedBar:

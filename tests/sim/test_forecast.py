@@ -65,7 +65,7 @@ def test_what_a_surface_takes_while_it_is_made_grows_with_the_matrix_of_the_fit(
 
     working = [
         estimate_muscle(
-            scene.muscles[0], scene, RATES, RBFOptions(centres=count, resolution=48, derivatives="all")
+            scene.muscles[0], scene, RATES, RBFOptions(centres=count, resolution=48, placement="fitted")
         ).working
         for count in (100, 200, 400)
     ]

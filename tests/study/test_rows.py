@@ -7,8 +7,6 @@ import pytest
 
 from rbfmuscle.study.experiment.sweep import SweepPoint, check_key
 from rbfmuscle.study.experiment.sweep_table import sweep_rows
-from rbfmuscle.study.experiment.wanted_error import WantedError
-from rbfmuscle.study.experiment.wanted_files import describe_wanted
 from rbfmuscle.validation import UsageError
 
 POINTS = [
@@ -50,26 +48,3 @@ def test_unknown_quantity_is_told_with_the_nearest():
     check_key("volume", ("volume", "length"))
     with pytest.raises(UsageError, match="unknown quantity 'volum', did you mean 'volume'"):
         check_key("volum", ("volume", "length"))
-
-
-def found(**facts):
-    row = {"kernel": "cubic", "centres": 123, "condition": 4.5e6, "fit_time": 0.0067, "unfit": ""}
-    plain = {"reached": True, "row": row, "error": 0.0891, "wanted": 0.1, "greatest": False}
-    return WantedError(**plain | facts)
-
-
-@pytest.mark.parametrize(("units", "unit"), [("", ""), ("mm", " mm")])
-@pytest.mark.parametrize(("greatest", "kind"), [(False, "RMS"), (True, "greatest")])
-def test_wanted_error_is_told_with_its_figures_and_kind(units, unit, greatest, kind):
-    assert describe_wanted("iliacus", found(greatest=greatest), units) == (
-        f"iliacus: cubic with 123 centres reaches 0.0891{unit} {kind} on unseen points, wanted 0.1 "
-        "(condition 4.5e+06, fit 6.7 ms)"
-    )
-    told = describe_wanted("iliacus", found(reached=False, error=0.3, greatest=greatest), units)
-    assert told.startswith(
-        f"iliacus: 0.1{unit} {kind} is not reached; the best, cubic with 123 centres, reaches 0.3;"
-    )
-    none = found(reached=False, row={"kernel": "cubic", "centres": 5, "unfit": "singular"})
-    assert describe_wanted("iliacus", none, units) == (
-        "iliacus: no field is fit; take more centres or another kernel"
-    )

@@ -47,17 +47,6 @@ def monomial_gradients(points: Floats, powers: Integers) -> Floats:
     return out
 
 
-def monomial_hessians(points: Floats, powers: Integers) -> Floats:
-    """Second derivatives of the monomials at points: (3, 3, q, n)."""
-    out = np.zeros((3, 3, len(powers), len(points)))
-    for axis in range(3):
-        lower = powers.copy()
-        lower[:, axis] -= 1
-        some = lower[:, axis] >= 0
-        out[axis][:, some] = powers[some, axis, None] * monomial_gradients(points, lower[some])
-    return out
-
-
 def hermite_polynomials(points: Floats, powers: Integers) -> Floats:
     """Polynomial block (q, 4n): values, then the three derivatives, at each point."""
     return np.hstack([monomials(points, powers), *monomial_gradients(points, powers)])
@@ -90,7 +79,7 @@ def _value_matrix_loop(x, epsilon, form, out):
 def _hermite_matrix_loop(x, epsilon, form, out):
     """Lower triangle of the Hermite matrix; out[column, row] is its transpose."""
     n = x.shape[1]
-    d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((3, n)), np.empty((4, n))
+    d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((3, n)), np.empty((3, n))
     for j in range(n):
         _offsets_loop(x, j, epsilon * epsilon, 0, d, u)
         _radial_loop(form, 7, u, work, radial)
@@ -154,7 +143,7 @@ def _normal_matrix_loop(x, normals, epsilon, form, out):
     """
     n = x.shape[1]
     e2 = epsilon * epsilon
-    d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((3, n)), np.empty((4, n))
+    d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((3, n)), np.empty((3, n))
     for j in range(n):
         _offsets_loop(x, j, e2, 0, d, u)
         _radial_loop(form, 7, u, work, radial)

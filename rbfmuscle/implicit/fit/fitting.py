@@ -39,8 +39,9 @@ if TYPE_CHECKING:
 
 
 DOUBTFUL = 1e13
-"""Condition above which a fit is reported as doubtful."""
-_CUTOFF = 1e-14
+"""Condition above which a fit is reported as doubtful, and a ridge takes part."""
+KEPT = 1e12
+"""Condition that this ridge keeps: with a greater one Cholesky may still fail."""
 _DEPENDENT = 1e-9
 
 
@@ -116,9 +117,7 @@ class Basis:
         return full
 
 
-def solve(
-    basis: Basis, right: Floats, *, smoothing: float = 0.0, truncate: bool = True
-) -> tuple[Floats, Floats, float]:
+def solve(basis: Basis, right: Floats, *, smoothing: float = 0.0) -> tuple[Floats, Floats, float]:
     """Weights, polynomial coefficients and an estimate of the condition.
 
     Parameters
@@ -127,9 +126,6 @@ def solve(
     right : (size,) ndarray
     smoothing : float
         Added to the diagonal (scaled coordinates).
-    truncate : bool
-        Where the condition is beyond `DOUBTFUL`, solve by a truncated eigen-decomposition, which takes thirty times
-        as long; else raise.
 
     Returns
     -------
@@ -137,7 +133,7 @@ def solve(
     coefficients : (q,) ndarray
     condition : float
         Of the matrix on the weights that annihilate polynomials, 2-norm, by power iteration (a lower bound, usually
-        within 10).
+        within 10). Where it is beyond `DOUBTFUL` that number, and a ridge keeps it at `KEPT`.
 
     Raises
     ------
@@ -147,7 +143,7 @@ def solve(
     Warns
     -----
     NumericalWarning
-        Where the condition makes the result doubtful.
+        Where a ridge was needed.
     """
     factor = factorise(basis, smoothing)
     if factor is not None:
@@ -155,9 +151,72 @@ def solve(
         if solution[2] < DOUBTFUL:
             return solution
     raise_if_singular(basis)
-    if not truncate:
-        raise np.linalg.LinAlgError(f"the condition is beyond {DOUBTFUL:g}")
-    return _solve_truncated(basis, right, smoothing)
+    weights, coefficients, _ = solve_bounded(basis, right, KEPT, smoothing=smoothing)
+    _warn(basis)
+    return weights, coefficients, DOUBTFUL
+
+
+def solve_bounded(
+    basis: Basis, right: Floats, condition: float, *, smoothing: float = 0.0
+) -> tuple[Floats, Floats, float]:
+    """Weights, polynomial coefficients and an estimate of the condition, which a ridge keeps below the given one.
+
+    Values and derivatives are unknowns of different units. Cholesky's digits do not depend on the choice (van der
+    Sluis 1969), an estimate of the condition does: with derivatives in units of the centres' spacing, and on the
+    weights that annihilate polynomials alone, `quintic` with 300 centres has 2e9 where unit-ball coordinates say 4e11.
+    The ridge is the largest eigenvalue over the bound, in these units.
+
+    Parameters
+    ----------
+    basis : Basis
+    right : (size,) ndarray
+    condition : float
+        Bound [1]; the conditions of the fit are met to about one part in so many.
+    smoothing : float
+        As in `solve`.
+
+    Returns
+    -------
+    weights : (size,) ndarray
+    coefficients : (q,) ndarray
+    condition : float
+        Of the matrix with its ridge, in units of the spacing, on the weights that annihilate polynomials.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the system is singular, or the bound is more than floating-point numbers hold.
+    """
+    factor, scale = _factorise_bounded(basis, condition, smoothing)
+    weights, coefficients, found = factor.solve(scale * right)
+    return scale * weights, coefficients, min(found, condition)
+
+
+def bounding_ridge(basis: Basis, condition: float) -> Floats:
+    """What `solve_bounded` adds to the diagonal (size,) for this bound."""
+    factor, scale = _factorise_bounded(basis, condition, 0.0)
+    return np.asarray(factor.norm / condition / scale**2)
+
+
+def _factorise_bounded(basis: Basis, condition: float, smoothing: float) -> tuple[Factor, Floats]:
+    """Factor with a ridge, and the units (size,) of its unknowns."""
+    # about the spacing of so many centres in the unit ball; a factor of three either way changes little
+    count, unit = len(basis.points), 1.0 / math.sqrt(len(basis.points))
+    matrix = basis.matrix()
+    if smoothing:
+        matrix.ravel(order="K")[:: basis.size + 1] += smoothing
+    with np.errstate(all="ignore"):  # the upper triangle, which is never read, holds anything
+        matrix[count:, :count] *= unit
+        matrix[count:, count:] *= unit**2
+    scale = np.ones(basis.size)
+    scale[count:] = unit
+    factor = factorise_matrix(matrix, np.ascontiguousarray(basis.polynomials * scale), condition=condition)
+    if factor is None:
+        raise_if_singular(basis)
+        raise np.linalg.LinAlgError(
+            f"no Cholesky factor with a condition of {condition:g}; lower the bound or raise epsilon"
+        )
+    return factor, scale
 
 
 @dataclass(frozen=True)
@@ -259,33 +318,17 @@ def factorise_matrix(matrix: Floats, polynomials: Floats, *, condition: float = 
     return Factor(matrix, gamma, directions, triangle, products, norm)
 
 
-def _solve_truncated(basis: Basis, right: Floats, smoothing: float) -> tuple[Floats, Floats, float]:
-    """Least-squares solution of the augmented system without its smallest eigenvalues (rank 1e-14)."""
-    full = basis.full_matrix(smoothing)
-    values, vectors = linalg.eigh(full, overwrite_a=True, driver="evd")
-    sizes = np.abs(values)
-    keep = sizes > _CUTOFF * sizes.max()
-    right = np.append(right, np.zeros(len(full) - basis.size))
-    solution = vectors[:, keep] @ ((vectors[:, keep].T @ right) / values[keep])
-    condition = sizes.max() / max(sizes.min(), np.finfo(float).tiny)
-    dropped = len(keep) - int(keep.sum())
-    if dropped or condition >= DOUBTFUL:
-        _warn(basis, condition, dropped)
-    return solution[: basis.size], solution[basis.size :], condition
-
-
-def _warn(basis: Basis, condition: float, dropped: int) -> None:
+def _warn(basis: Basis) -> None:
     remedy = "spread the centres or add smoothing"
     if basis.kernel.has_epsilon:
         remedy = f"raise epsilon (it is {basis.epsilon:.2g} in units of the extent), {remedy}"
     close = _nearest_pair(basis.points)
     pair = f"; centres {close[0]} and {close[1]} are only {close[2]:.1e} of the extent apart"
     warnings.warn(
-        f"fit with kernel '{basis.kernel.name}' has condition {condition:.1e}: its conditions are met to a "
-        f"few digits only ({dropped} of {basis.size} directions left out)"
-        f"{pair if close[2] < 1e-5 else ''}; {remedy}",
+        f"fit with kernel '{basis.kernel.name}' has a condition beyond {DOUBTFUL:g}: a ridge keeps it at {KEPT:g} and "
+        f"its conditions are met to a few digits only{pair if close[2] < 1e-5 else ''}; {remedy}",
         NumericalWarning,
-        stacklevel=5,
+        stacklevel=4,
     )
 
 
@@ -320,31 +363,3 @@ def raise_if_singular(basis: Basis) -> None:
             f"singular fit: the {len(points)} centres are {shape}, so a polynomial of degree {degree} "
             f"({q} terms) is not determined; degree too high: lower it or use a kernel of lower order"
         )
-
-
-def solve_least_squares(
-    matrix: Floats, right: Floats, *, smoothing: float = 0.0, cutoff: float = _CUTOFF
-) -> tuple[Floats, float, int]:
-    """Truncated SVD solution of an over- or undetermined system, with optional Tikhonov term.
-
-    Parameters
-    ----------
-    matrix : (n, m) ndarray
-    right : (n,) ndarray
-    smoothing : float
-        Adds smoothing * |x|^2 to the squared residual.
-    cutoff : float
-        Singular values below cutoff times the largest are dropped.
-
-    Returns
-    -------
-    solution : (m,) ndarray
-    condition : float
-        Ratio of the extreme singular values.
-    rank : int
-    """
-    left, values, back = linalg.svd(matrix, full_matrices=False, check_finite=False)
-    keep = values > cutoff * values[0]
-    filtered = values[keep] / (values[keep] ** 2 + smoothing)
-    solution = back[keep].T @ (filtered * (left[:, keep].T @ right))
-    return solution, float(values[0] / max(values[-1], np.finfo(float).tiny)), int(keep.sum())

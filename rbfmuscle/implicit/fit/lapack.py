@@ -73,20 +73,6 @@ def solve_cholesky(factor: Floats, right: Floats) -> None:
             routine(b"L", turned, b"N", size, factor.ctypes.data, size, column.ctypes.data, one)
 
 
-def invert_factor(factor: Floats) -> None:
-    """Replace the lower triangle of a Cholesky factor by that of its inverse.
-
-    Parameters
-    ----------
-    factor : (n, n) ndarray, Fortran order
-        Changed in place; the upper triangle is neither read nor written.
-    """
-    _check(factor)
-    size, info = ctypes.c_int(len(factor)), ctypes.c_int(0)
-    routine = _routine("dtrtri", _CHAR, _CHAR, _INT, _ARRAY, _INT, _INT)
-    routine(b"L", b"N", size, factor.ctypes.data, size, info)
-
-
 def multiply_symmetric(matrix: Floats, right: Floats) -> Floats:
     """Product of a symmetric matrix (lower triangle) and a few columns.
 

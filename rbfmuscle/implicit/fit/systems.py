@@ -5,10 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
-from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.implicit.fit import assembly
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.fit.fitting import Basis
 from rbfmuscle.validation import UsageError
 
@@ -49,23 +47,6 @@ def hermite_weights(basis: Basis, weights: Floats) -> Floats:
         return weights.reshape(4, -1).T.copy()
     value, along = weights.reshape(2, -1)
     return np.column_stack([value, along[:, None] * basis.normals])
-
-
-def collocation(
-    points: Floats,
-    centres: Floats,
-    kernel: Kernel,
-    epsilon: Floats | float,
-    degree: int,
-    origin: Floats,
-    scale: float,
-) -> tuple[Floats, Integers]:
-    """Matrix (n, K + q) that maps weights and polynomial coefficients to values at points, and the powers."""
-    shape = epsilon * scale if kernel.has_epsilon else 1.0
-    at, centred = (points - origin) / scale, (centres - origin) / scale
-    powers = assembly.exponents(degree)
-    radial = kernel.phi(cdist(at, centred) * shape)
-    return np.hstack([radial, assembly.monomials(at, powers).T]), powers
 
 
 def check_degree(kernel: Kernel, degree: int | None, count: int) -> int:

@@ -177,7 +177,7 @@ def _inner_loop(base, row, u, s, b, out):
 
 @compiled(error_model="numpy")
 def _radial_loop(form, wanted, u, work, out):
-    """Fill out[k] (4, n) with the k-th radial function of s**2 = u for every bit k set in wanted.
+    """Fill out[k] (3, n) with the k-th radial function of s**2 = u for every bit k set in wanted.
 
     work is a (3, n) scratch array. Where a function is infinite at u = 0 a finite value stands in: it is
     only ever multiplied by components of the zero vector.
@@ -185,7 +185,7 @@ def _radial_loop(form, wanted, u, work, out):
     base, parameter, compact, table = form
     s, b, more = work[0][: u.size], work[1][: u.size], work[2][: u.size]
     _base_loop(base, parameter, u, s, b, more)
-    for k in range(4):
+    for k in range(3):
         if not (wanted >> k) & 1:
             continue
         row = table[k]

@@ -1,4 +1,4 @@
-"""What one centre adds to values, gradients and Hessians of a field at a block of points."""
+"""What one centre adds to values and gradients of a field at a block of points."""
 
 import numpy as np
 
@@ -89,30 +89,3 @@ def _add_gradient_loop(a, b, e2, hermite, radial, d, g):
         g[0, i] += w * d[0, i] - f * bx
         g[1, i] += w * d[1, i] - f * by
         g[2, i] += w * d[2, i] - f * bz
-
-
-@compiled(error_model="numpy", fastmath={"contract"})
-def _add_hessian_loop(a, b, e2, hermite, radial, d, h):
-    """Add the second derivatives to h (6: xx yy zz xy xz yz).
-
-    a (first I + second d d^T), less second ((B . d) I + d B^T + B d^T) + third (B . d) d d^T for Hermite weights B.
-    """
-    bx, by, bz = b
-    first, second, third = radial[1], radial[2], radial[3]
-    e4 = e2 * e2
-    for i in range(d.shape[1]):
-        x, y, z = d[0, i], d[1, i], d[2, i]
-        s = e4 * second[i]
-        on, outer = a * e2 * first[i], a * s
-        if hermite:
-            bd = bx * x + by * y + bz * z
-            on -= s * bd
-            outer -= e4 * e2 * third[i] * bd
-        else:
-            s = 0.0
-        h[0, i] += on + outer * x * x - 2.0 * s * bx * x
-        h[1, i] += on + outer * y * y - 2.0 * s * by * y
-        h[2, i] += on + outer * z * z - 2.0 * s * bz * z
-        h[3, i] += outer * x * y - s * (bx * y + by * x)
-        h[4, i] += outer * x * z - s * (bx * z + bz * x)
-        h[5, i] += outer * y * z - s * (by * z + bz * y)

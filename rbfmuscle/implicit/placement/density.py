@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 # Densities stay within this ratio, so that no part of the surface is left without centres that carry it.
 LARGEST_DENSITY = 30.0
 GREEDY_ROUNDS = 10
-# More centres than this cost seconds a round.
+# Centres beyond which a round costs seconds: more of them follow the curvature alone.
 GREEDY_LARGEST = 1000
 
 
@@ -83,6 +83,8 @@ def greedy_sample(fine: FineMesh, count: int, seed: int, gather: Callable[..., A
     -------
     SurfaceSample
     """
+    if count > GREEDY_LARGEST:
+        return gather(*cluster_mesh(fine, curvature_density(fine, count), count, seed))
     best: SurfaceSample | None = None
     least = np.inf
     for density in (np.ones(len(fine.vertices)), curvature_density(fine, count)):

@@ -8,6 +8,7 @@ zeros and unit normals, refitted in motion like any other, and takes no more num
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -17,10 +18,10 @@ from scipy import linalg
 from scipy.spatial.distance import cdist
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.implicit.field import RBFField
+from rbfmuscle.implicit.field_fit import FieldFit
 from rbfmuscle.implicit.fit import assembly
+from rbfmuscle.implicit.fit.fitting import bounding_ridge
 from rbfmuscle.implicit.fit.systems import hermite_system
-from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.placement.sampling import spread_points
 from rbfmuscle.implicit.selection import spacing, surface_miss
 from rbfmuscle.validation import UsageError, check_points, check_vectors
@@ -46,8 +47,7 @@ def fit_sample(
     vertices: ArrayLike,
     faces: ArrayLike,
     *,
-    kernel: Kernel | str = "cubic",
-    epsilon: float = 1.0,
+    fit: FieldFit,
     seed: int = 0,
 ) -> SurfaceSample:
     """A `SurfaceSample` with points and normals as `fit_centres` finds them; the points then lie beside the surface.
@@ -58,8 +58,8 @@ def fit_sample(
     vertices : (n, 3) array_like
     faces : (m, 3) array_like of int
         The mesh that was sampled.
-    kernel, epsilon
-        Of the field that will be fitted to it.
+    fit : FieldFit
+        Of the field that will be fitted to it, to all derivatives.
     seed : int
 
     Returns
@@ -67,7 +67,7 @@ def fit_sample(
     SurfaceSample
     """
     where, _ = spread_points(np.asarray(vertices), np.asarray(faces), SAMPLES, seed=seed)
-    points, normals = fit_centres(sample.points, sample.normals, where, kernel=kernel, epsilon=epsilon)
+    points, normals = fit_centres(sample.points, sample.normals, where, fit)
     return replace(sample, points=points, normals=normals)
 
 
@@ -75,9 +75,8 @@ def fit_centres(
     points: ArrayLike,
     normals: ArrayLike,
     samples: ArrayLike,
+    fit: FieldFit,
     *,
-    kernel: Kernel | str = "cubic",
-    epsilon: float = 1.0,
     rounds: int = ROUNDS,
 ) -> tuple[Floats, Floats]:
     """Move centres along their normals and turn the normals, so that the field is small at the samples.
@@ -88,8 +87,8 @@ def fit_centres(
         Of a Hermite fit to all derivatives; unit normals.
     samples : (n, 3) array_like
         Points of the surface, spread evenly, ten and more for each centre.
-    kernel, epsilon
-        As in `RBFField.fit_hermite`.
+    fit : FieldFit
+        To all derivatives.
     rounds : int
         The least-squares problem is that of the given centres; what their moves leave is met by further rounds of it.
 
@@ -101,22 +100,22 @@ def fit_centres(
     Raises
     ------
     UsageError
-        For a kernel that is not smooth enough for a Hermite fit.
+        For a kernel that is not smooth enough for a Hermite fit, or a fit to normal derivatives alone.
     """
-    points, samples, kernel = check_points(points), check_points(samples, name="samples"), get_kernel(kernel)
+    points, samples = check_points(points), check_points(samples, name="samples")
     normals = check_vectors(normals, len(points))
-    if not kernel.hermite:
+    if not fit.kernel.hermite or fit.derivatives != "all":
         raise UsageError(
-            f"kernel '{kernel.name}' has no Hermite fit, whose centres and normals could be fitted"
+            f"kernel '{fit.kernel.name}' has no Hermite fit to all derivatives, whose centres could be fitted"
         )
     reach = spacing(points).mean()
 
     def fitted(where: Floats, direction: Floats) -> tuple[Floats, float]:
-        field = RBFField.fit_hermite(where, direction, kernel=kernel, epsilon=epsilon)
+        field = fit.fit(where, direction)
         return field(samples), surface_miss(field, samples, reach)
 
     value, least = fitted(points, normals)
-    best, problem = (points, normals), _problem(points, normals, samples, kernel, epsilon, reach)
+    best, problem = (points, normals), _problem(points, normals, samples, fit, reach)
     for _ in range(rounds):
         points, normals = _step(points, normals, value, problem)
         value, now = fitted(points, normals)
@@ -133,14 +132,15 @@ class _Problem(NamedTuple):
     scale: float
 
 
-def _problem(
-    points: Floats, normals: Floats, samples: Floats, kernel: Kernel, epsilon: float, reach: float
-) -> _Problem:
+def _problem(points: Floats, normals: Floats, samples: Floats, fit: FieldFit, reach: float) -> _Problem:
     """The problem of some centres."""
-    count = len(points)
-    basis, _, origin, scale = hermite_system(points, normals, kernel, epsilon, "all")
-    scaled, shape = (samples - origin) / scale, epsilon * scale if kernel.has_epsilon else 1.0
-    factor = linalg.lu_factor(basis.full_matrix(), overwrite_a=True, check_finite=False)
+    count, kernel = len(points), fit.kernel
+    basis, _, origin, scale = hermite_system(points, normals, kernel, fit.epsilon, "all")
+    scaled, shape = (samples - origin) / scale, fit.epsilon * scale if kernel.has_epsilon else 1.0
+    full = basis.full_matrix()
+    if math.isfinite(fit.condition):
+        full[np.diag_indices(basis.size)] += bounding_ridge(basis, fit.condition)
+    factor = linalg.lu_factor(full, overwrite_a=True, check_finite=False)
     cardinal = np.empty((basis.size, len(scaled)), order="F")
     for low in range(0, len(scaled), _CHUNK):
         rows = _rows(basis, kernel, shape, scaled[low : low + _CHUNK])

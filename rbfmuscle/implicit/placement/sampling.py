@@ -20,7 +20,7 @@ from rbfmuscle.geometry.surfaces import (
 from rbfmuscle.geometry.triangles import nearest_weights
 from rbfmuscle.implicit.placement.clustering import cluster_mesh, refine_mesh
 from rbfmuscle.implicit.placement.control_mesh import opposite_half_edges
-from rbfmuscle.implicit.placement.density import GREEDY_LARGEST, curvature_density, greedy_sample
+from rbfmuscle.implicit.placement.density import curvature_density, greedy_sample
 from rbfmuscle.validation import check_mesh
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def sample_surface(
         Chooses the first point; the rest follows.
     placement : {"even", "adaptive", "greedy"}
         Cells of equal size; smaller where the surface bends; smaller where a cubic Hermite fit misses the
-        mesh (the most accurate, at 0.2 to 1 s; up to 1000 points).
+        mesh (the most accurate, at 0.2 to 1 s; beyond 1000 points as adaptive).
 
     Returns
     -------
@@ -96,8 +96,6 @@ def sample_surface(
     count = int(count)
     if count < 4:
         raise ValueError(f"count must be at least 4, got {count}")
-    if placement == "greedy" and count > GREEDY_LARGEST:
-        raise ValueError(f"count must be at most {GREEDY_LARGEST} for placement greedy, got {count}")
     if placement not in PLACEMENTS:
         raise ValueError(f"placement must be one of {', '.join(PLACEMENTS)}, got {placement!r}")
     opposite_half_edges(faces)

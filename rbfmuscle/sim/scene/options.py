@@ -31,6 +31,7 @@ LARGEST_INTEGER = 2**53
 # Keys that were removed, and what to do instead; a key of a muscle or of its model (`model.KEY`) without the muscle.
 # The table is deleted at 1.0.
 REMOVED_KEYS: dict[str, str] = {
+    "model.derivatives": "delete the key: up to 200 centres, and fitted ones, meet all derivatives",
     "opensim": "delete the table: runs are no longer compared with the muscle paths of an OpenSim model",
 }
 

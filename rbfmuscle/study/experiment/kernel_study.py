@@ -1,34 +1,35 @@
 """Which kernel, which shape parameter, how many centres: one surface fitted by all of them, and a table.
 
-Accuracy, conditioning, time and data size are measured together, since each can be bought with the others.
+Accuracy, conditioning and time are measured together, since each can be bought with the others.
 """
 
 from __future__ import annotations
 
 import functools
 import pickle
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
-import numpy as np
-
-from rbfmuscle.compiled.child import calls_apart
-from rbfmuscle.geometry.arrays import MeshLike
-from rbfmuscle.implicit import shape_search
-from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
+from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
+from rbfmuscle.implicit.kernels.table import KERNELS, Kernel, get_kernel
 from rbfmuscle.implicit.placement.refinement import FITTED
-from rbfmuscle.implicit.placement.sampling import PLACEMENTS, SurfaceSample, sample_surface
-from rbfmuscle.study.experiment.kernel_choice import Recommendation, mark_unfit, recommend
+from rbfmuscle.implicit.placement.sampling import SurfaceSample, sample_surface
 from rbfmuscle.study.experiment.kernel_judge import SurfaceJudge
-from rbfmuscle.study.experiment.kernel_row import Measured, Request, measure_row, time_row
+from rbfmuscle.study.experiment.kernel_row import Measured, measure_row, time_row
 from rbfmuscle.study.experiment.sweep_table import pareto_front
+from rbfmuscle.study.experiment.workers import available_cores
 from rbfmuscle.validation import UsageError, check_mesh
 
 CENTRES = (150, 300)
+PLACEMENTS = ("greedy", FITTED)
 # Rows that are worth the start of other processes.
 MANY = 6
+# Errors this much apart are alike: points of another seed move them as far.
+ALIKE = 1.05
+# Rows beyond this condition are taken only where none that is as accurate is below it.
+SOUND = 1e10
+# The coarsest sensible kernel, |r|: what errs more than it is unfit.
+COARSEST = "linear"
 
 
 @dataclass
@@ -39,40 +40,33 @@ class KernelStudy:
     ----------
     rows : list of dict
         One for each kernel and number of centres, the smallest error first; unfit ones (``unfit`` says why) last.
-    scan : list of dict
-        ``kernel, centres, shape`` (epsilon times the spacing), ``error, condition`` of all that the search tried.
-    decimated : dict of int to dict
-        For each number of stored numbers, the decimated mesh that takes as many: ``vertices, rms, hausdorff``.
-    surfaces : list of (vertices, faces, error)
-        Of the rows, in their order, the error signed, positive outside the mesh; None where there is none.
+        Lengths are in the mesh's unit, times in seconds of one thread.
+    surfaces : list of (vertices, faces)
+        Of the rows, in their order; None where there is none.
     units : str
-    recommended : Recommendation or None
-        The row to take and why; None where every one is unfit.
+    recommended : dict or None
+        The quickest row that errs at most 5 % more than the best; None where every one is unfit.
     """
 
-    rows: list
-    scan: list = field(default_factory=list)
-    decimated: dict = field(default_factory=dict)
-    surfaces: list = field(default_factory=list)
+    rows: list[dict]
+    surfaces: list[tuple[Floats, Integers] | None] = field(default_factory=list)
     units: str = ""
-    recommended: Recommendation | None = None
+    recommended: dict | None = None
 
-    def toml(self, row: dict[str, Any]) -> str:
-        """The lines of a scene file's model table that give this row."""
-        lines = [
-            "[muscle.model]",
-            'name = "rbf"',
-            f'kernel = "{row["kernel"]}"',
-            f"centres = {row['centres']}",
-        ]
-        if row["epsilon"]:
-            lines.append(f"epsilon = {row['epsilon']:.6g}")
-        if row["bound"]:
-            lines.append(f"condition = {row['bound']:g}")
-        if row["fit"] != "values":
-            lines.append(f'derivatives = "{row["fit"]}"')
-        lines.append(f'placement = "{row["placement"]}"')
-        return "\n".join(lines)
+
+def row_toml(row: dict) -> str:
+    """The lines of a scene file's model table that give a row of a study."""
+    lines = ["[muscle.model]", 'name = "rbf"', f'kernel = "{row["kernel"]}"', f"centres = {row['centres']}"]
+    if row["epsilon"]:
+        lines.append(f"epsilon = {row['epsilon']:.6g}")
+    if row["bound"]:
+        lines.append(f"condition = {row['bound']:g}")
+    return "\n".join([*lines, f'placement = "{row["placement"]}"'])
+
+
+def row_name(row: dict) -> str:
+    """A row in words."""
+    return f"{row['kernel']}, {row['centres']} centres"
 
 
 def study_kernels(
@@ -80,18 +74,15 @@ def study_kernels(
     *,
     kernels: Sequence[str] | None = None,
     centres: Sequence[int] = CENTRES,
-    derivatives: str = "all",
     placement: str = FITTED,
     resolution: int = 0,
-    criterion: str = "held_out",
-    condition: float = np.inf,
     seed: int = 0,
     units: str = "",
     progress: Callable[[int, int], None] | None = None,
 ) -> KernelStudy:
     """Fit a surface with many kernels and numbers of centres, and measure each fit.
 
-    Six rows and more are measured in as many processes as there are threads.
+    Six rows and more are measured in as many processes as there are cores.
 
     Parameters
     ----------
@@ -100,17 +91,11 @@ def study_kernels(
     kernels : list of str, optional
         All by default.
     centres : sequence of int
-    derivatives : {"all", "normal"}
-        Of Hermite fits; kernels that are not smooth enough are fitted to values on and off the surface.
-    placement : {"even", "adaptive", "greedy", "fitted"}
+    placement : {"greedy", "fitted"}
         Fitted centres lie beside the surface, so that the whole of it is met in the least-squares sense
-        (`fit_centres`); for Hermite fits to all derivatives, greedy ones for the others.
+        (`fit_centres`); kernels that are not C2 have greedy ones.
     resolution : int
         Cells along the longest side of the extracted surfaces; as many as a muscle so slender needs by default.
-    criterion : {"held_out", "loo", "gcv", "condition"}
-        How epsilon is chosen: by the error at other points of the mesh, or from the centres alone.
-    condition : float
-        No epsilon beyond it is chosen, and a ridge keeps it in fits to normals; others beyond it are unfit.
     seed : int
     units : str
         Name of the mesh's unit, for the page.
@@ -127,74 +112,65 @@ def study_kernels(
         On an unknown kernel or placement, or a number of centres below 8.
     MeshError
         On an unusable mesh.
-    SolveError
-        If a process was ended.
 
     Examples
     --------
     >>> import trimesh
     >>> ball = trimesh.creation.icosphere(3, 10.0)
-    >>> study = study_kernels(ball, kernels=["cubic"], centres=[40], placement="even", resolution=16)
+    >>> study = study_kernels(ball, kernels=["cubic"], centres=[40], placement="greedy", resolution=16)
     >>> study.rows[0]["kernel"]
     'cubic'
     """
     vertices, faces = check_mesh(*(mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)))
-    kernels = [get_kernel(name) for name in (kernels or KERNELS)]
-    if placement not in (*PLACEMENTS, FITTED):
-        raise UsageError(f"placement must be one of {', '.join((*PLACEMENTS, FITTED))}, got {placement!r}")
+    chosen = [get_kernel(name) for name in (kernels or KERNELS)]
+    check_placement(placement)
     if min(centres, default=0) < 8:
         raise UsageError(f"centres must be numbers of at least 8, got {list(centres)}")
-    if not condition >= 1.0:
-        raise UsageError(f"condition must be a bound of at least 1, got {condition:g}")
-    surface = (vertices, faces, resolution, seed)
-    judge, study, found = SurfaceJudge(*surface), KernelStudy([], units=units), []
-    ask = Request(derivatives, criterion, placement, float(condition))
-    base = "greedy" if placement == FITTED else placement
-    calls = []
+    judge, found, calls = SurfaceJudge(vertices, faces, resolution, seed), [], []
     for count in centres:
-        sample = sample_surface(vertices, faces, int(count), seed=seed, placement=base)
-        calls += [(sample, kernel.name, ask) for kernel in kernels]
-    for one in _measured(judge, surface, calls):
-        study.scan += one.tried
+        sample = sample_surface(vertices, faces, int(count), seed=seed, placement="greedy")
+        calls += [(sample, kernel, placement) for kernel in chosen]
+    for one in _measure_all((vertices, faces, resolution, seed), judge, calls):
         found.append(one)
         if progress is not None:
             progress(len(found), len(calls))
-    mark_unfit([one.row for one in found], sheets=judge.sheets, condition=condition)
+    _refuse_coarse([one.row for one in found])
     for one in found:  # when nothing else runs
         if not one.row["unfit"]:
-            time_row(one.row, one.sample, derivatives, judge.points)
+            time_row(one, judge.points)
     found.sort(key=lambda one: (bool(one.row["unfit"]), one.row["rms"] is None, one.row["rms"] or 0.0))
-    study.rows, study.surfaces = [one.row for one in found], [one.surface for one in found]
-    for row in study.rows:
-        numbers = row["numbers"]
-        if numbers not in study.decimated:
-            study.decimated[numbers] = judge.decimated(numbers)
-        row["decimated_rms"] = study.decimated[numbers]["rms"]
-    _mark_fronts(study.rows)
-    study.recommended = recommend(study.rows)
-    return study
+    rows = [one.row for one in found]
+    _mark_front(rows)
+    return KernelStudy(rows, [one.surface for one in found], units, recommend(rows))
 
 
-def processes_for(rows: int) -> int:
-    """Processes that share so many rows: one for each thread, where they are worth their start."""
-    import numba
+def check_placement(placement: str) -> None:
+    """Raise UsageError for a placement that centres of a muscle cannot have."""
+    if placement not in PLACEMENTS:
+        raise UsageError(f"placement must be one of {', '.join(PLACEMENTS)}, got {placement!r}")
 
-    return min(numba.get_num_threads(), rows) if rows >= MANY else 1
 
-
-def _measured(judge: SurfaceJudge, surface: tuple[Any, ...], calls: Sequence[Any]) -> Iterator[Measured]:
-    """What the rows of calls (sample, kernel's name, ask) found, in their order."""
-    jobs = processes_for(len(calls))
+def _measure_all(
+    surface: tuple[Floats, Integers, int, int],
+    judge: SurfaceJudge,
+    calls: list[tuple[SurfaceSample, Kernel, str]],
+) -> Iterable[Measured]:
+    """What the rows of calls found, in their order."""
+    jobs = min(available_cores(), len(calls)) if len(calls) >= MANY else 1
     if jobs == 1:
-        return (measure_row(judge, sample, get_kernel(name), ask) for sample, name, ask in calls)
+        return (measure_row(judge, *call) for call in calls)
+    from joblib import Parallel, delayed
+
     pickled = pickle.dumps(surface)
-    return calls_apart(_row_apart, [(pickled, *call) for call in calls], jobs)
+    workers = Parallel(n_jobs=jobs, return_as="generator", batch_size=1)
+    return workers(
+        delayed(_row_apart)(pickled, sample, kernel.name, place) for sample, kernel, place in calls
+    )
 
 
-def _row_apart(surface: bytes, sample: SurfaceSample, kernel: str, ask: Request) -> Measured:
-    """One row, in a process of its own: its searches are bounded by its processor time, however busy the machine."""
-    shape_search.CLOCK = time.process_time
-    return measure_row(_judge(surface), sample, get_kernel(kernel), ask)
+def _row_apart(surface: bytes, sample: SurfaceSample, kernel: str, placement: str) -> Measured:
+    """One row, in a process of its own."""
+    return measure_row(_judge(surface), sample, get_kernel(kernel), placement)
 
 
 @functools.lru_cache(maxsize=1)
@@ -203,15 +179,48 @@ def _judge(surface: bytes) -> SurfaceJudge:
     return SurfaceJudge(*pickle.loads(surface))
 
 
-def _mark_fronts(rows):
-    """Mark what no other row beats both in error and in time (or in size)."""
-    good = [row for row in rows if not row["unfit"]]
+def _refuse_coarse(rows: list[dict]) -> None:
+    """Name rows unfit that err more than `linear` with as many centres."""
+    bounds = {row["centres"]: row["rms"] for row in rows if row["kernel"] == COARSEST and not row["unfit"]}
     for row in rows:
-        row["front_time"] = row["front_size"] = False
+        bound = bounds.get(row["centres"])
+        if not row["unfit"] and bound is not None and row["rms"] > bound:
+            row["unfit"] = f"an error of {row['rms']:.3g}, beyond that of {COARSEST}, {bound:.3g}"
+
+
+def cost(row: dict) -> float:
+    """What a frame pays for a row's field: a fit and the values at 20,000 points [s of processor time]."""
+    return float(row["fit_time"] + row["evaluation_time"])
+
+
+def recommend(rows: list[dict]) -> dict | None:
+    """The quickest of the rows that err at most 5 % more than the best, None where every one is unfit.
+
+    Sound conditions come first; of rows alike in time, within 15 %, those without a parameter to choose.
+
+    Parameters
+    ----------
+    rows : list of dict
+        With ``rms, fit_time, evaluation_time, condition, epsilon, unfit``.
+    """
+    good = [row for row in rows if not row["unfit"]]
     if not good:
-        return
-    errors = np.array([row["rms"] for row in good])
-    times = np.array([row["fit_time"] + row["evaluation_time"] for row in good])
-    for name, cost in (("front_time", times), ("front_size", np.array([float(r["numbers"]) for r in good]))):
-        for index in pareto_front(errors, cost):
-            good[index][name] = True
+        return None
+    least = min(row["rms"] for row in good)
+    alike = [row for row in good if row["rms"] <= ALIKE * least]
+    sound = [row for row in alike if row["condition"] <= SOUND] or alike
+    quick = min(cost(row) for row in sound)
+    return min(
+        (row for row in sound if cost(row) <= 1.15 * quick),
+        key=lambda row: (bool(row["epsilon"]), row["condition"]),
+    )
+
+
+def _mark_front(rows: list[dict]) -> None:
+    """Mark what no other row beats both in error and in time."""
+    good = [row for row in rows if not row["unfit"]]
+    front = pareto_front([row["rms"] for row in good], [cost(row) for row in good])
+    for row in rows:
+        row["front"] = False
+    for index in front:
+        good[index]["front"] = True

@@ -4,11 +4,13 @@ import warnings
 
 import numpy as np
 import pytest
+from conftest import benchmark_script
 
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels.table import KERNELS
-from rbfmuscle.study.experiment import extremes
-from rbfmuscle.study.experiment.extremes import extremes_matrix, study_extremes, write_extremes
+from rbfmuscle.implicit.placement.sampling import sample_surface
+from rbfmuscle.implicit.selection import spacing
+from rbfmuscle.sim.scene.phantom import phantom_scene
 from rbfmuscle.validation import NumericalWarning
 
 WITH_EPSILON = [name for name, kernel in KERNELS.items() if kernel.has_epsilon]
@@ -30,7 +32,7 @@ def watched(call):
         try:
             return call(), bool(heard)
         except np.linalg.LinAlgError as error:
-            assert "singular fit" in str(error)
+            assert "singular fit" in str(error) or "no Cholesky factor" in str(error)
             return None, True
 
 
@@ -129,47 +131,61 @@ def test_single_precision_input_is_computed_in_double():
     assert np.abs(field(points)).max() < 1e-12 and field(points).dtype == np.float64
 
 
-def test_nothing_is_wrong_without_a_word(tmp_path, monkeypatch):
-    # Fits of thousands of centres take most of the time of the study; the test above makes one.
-    monkeypatch.setattr(extremes, "COUNTS", (4, 10, 50, 300))
-    monkeypatch.setattr(extremes, "MOST_VALUES", 900)
-    rows = study_extremes(kernels=["cubic", "inverse_multiquadric", "matern_12", "wendland_c2"])
-    outcomes = {(row["case"], row["kernel"]): row["outcome"] for row in rows}
+def test_nothing_is_wrong_without_a_word(monkeypatch):
+    extremes = benchmark_script("extremes")
+    # Fits of thousands of unknowns take most of the time.
+    monkeypatch.setattr(extremes, "COUNTS", {4: 1.0, 10: 1.0, 50: 0.5, 300: 0.05})
+    names = ("cubic", "inverse_multiquadric", "matern_12", "wendland_c2")
+    rows = list(extremes.study([KERNELS[name] for name in names]))
+    outcomes = {(case, kernel): outcome for case, kernel, outcome, *_ in rows}
     assert "silent" not in outcomes.values()
-    for row in rows:
-        if row["outcome"] == "right":
-            assert row["error"] <= row["bound"]
-        else:
-            assert len(row["said"]) > 20
+    assert all(outcome == "right" or len(said) > 5 for _, _, outcome, _, said in rows)
     assert outcomes["1e6 from the origin", "cubic"] == "right"
     assert outcomes["two centres in one place", "cubic"] == "refused"
     assert outcomes["epsilon h = 1000", "wendland_c2"] == "warned"
-    write_extremes(rows, tmp_path)
-    assert (tmp_path / "extremes.md").read_text() == extremes_matrix(rows)
-    assert (tmp_path / "extremes.csv").read_text().count("\n") >= len(rows)
+
+
+@pytest.fixture(scope="module")
+def muscle():
+    """Centres, normals and vertices of a muscle of the phantom."""
+    mesh = phantom_scene().muscle("adductor_posterior").mesh
+    sample = sample_surface(mesh.vertices, mesh.faces, 120)
+    return sample.points, sample.normals, np.asarray(mesh.vertices)
+
+
+def missed(field, vertices, reach):
+    """RMS distance of vertices from the surface to first order, in units of the spacing."""
+    value, gradient = field.value_and_gradient(vertices)
+    return np.sqrt((np.minimum(np.abs(value / np.linalg.norm(gradient, axis=1)), reach) ** 2).mean()) / reach
+
+
+@pytest.mark.parametrize("kernel", WITH_EPSILON)
+@pytest.mark.parametrize("shape", [1e-3, 0.1, 1.0, 1e3])
+def test_flat_and_peaked_kernels_on_a_muscle_are_right_or_say_so(muscle, kernel, shape):
+    points, normals, vertices = muscle
+    reach = spacing(points).mean()
+    field, said = watched(lambda: RBFField.fit_surface(points, normals, kernel=kernel, epsilon=shape / reach))
+    assert said or missed(field, vertices, reach) < 0.2
+    assert field is None or np.isfinite(field(vertices)).all()
+
+
+@pytest.mark.parametrize("size", [1e-6, 1e6])
+def test_a_muscle_in_tiny_and_huge_units_is_the_same(muscle, size):
+    points, normals, vertices = muscle
+    plain, other = (RBFField.fit_hermite(points * s, normals)(vertices * s) / s for s in (1.0, size))
+    np.testing.assert_allclose(other, plain, atol=1e-8 * np.ptp(vertices))
+
+
+def test_a_muscle_with_two_centres_almost_in_one_place_is_right_or_says_so(muscle):
+    points, normals, vertices = (part.copy() for part in muscle)
+    reach = spacing(points).mean()
+    for apart in (1e-3, 1e-6, 1e-9):
+        points[10], normals[10] = points[20] + apart * reach * normals[20][[1, 2, 0]], normals[20]
+        field, said = watched(lambda: RBFField.fit_hermite(points, normals))
+        assert said or missed(field, vertices, reach) < 0.2
 
 
 def test_a_kernel_that_does_not_reach_its_neighbours_says_so():
     points = sphere(200)
     with pytest.warns(NumericalWarning, match="does not reach from centre to centre.*lower epsilon"):
         RBFField.fit_hermite(points, points, kernel="wendland_c2", epsilon=10.0)
-
-
-@pytest.mark.parametrize("steep", [0.5, 1.0, 5.0])
-@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
-def test_a_field_is_judged_by_the_way_to_its_surface_whatever_its_slope(steep, size):
-    judge = extremes._ellipsoid(10, size=size)[2]
-
-    class Off:
-        """A field whose surface lies 1 % of the shortest half axis below an ellipsoid, or that falls outwards."""
-
-        def __init__(self, sign):
-            self.sign = sign
-
-        def value_and_gradient(self, points):
-            normals = points / size / np.array([3.0, 2.0, 1.0]) ** 2
-            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-            return np.full(len(points), steep * 0.01 * size), self.sign * steep * normals
-
-    assert judge(Off(1.0)) == pytest.approx(0.01)
-    assert judge(Off(-1.0)) == pytest.approx(1.0)

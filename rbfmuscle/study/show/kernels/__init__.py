@@ -1,1 +1,0 @@
-"""The page of a kernel study: its table, its plots, its surfaces."""
