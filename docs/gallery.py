@@ -19,7 +19,6 @@ EXAMPLES = (
     "tunnelling",
     "sliding",
     "sweep",
-    "fibres_and_moment_arms",
     "exporting",
 )
 # The Python reference: public names by topic.

@@ -1,13 +1,11 @@
 """# From a segmentation to moment arms
 
-Five commands lead from a volume of labels, as segmentation programs write it, to a report of moment arms and tables
-for OpenSim:
+Three commands lead from a volume of labels, as segmentation programs write it, to a report of moment arms:
 
     pip install -e '.[labels]'
     rbfmuscle new hip.nii.gz --labels names.json
     rbfmuscle check hip_scene/scene.toml --picture
-    rbfmuscle run hip_scene/scene.toml -o out --set output.moment_arms=true
-    rbfmuscle export out --format sto
+    rbfmuscle run hip_scene/scene.toml -o out
 
 The volume here is made of the embedded hip first, so that this page needs no data; take your own in its place.
 """
@@ -65,10 +63,9 @@ command("new", out / "hip.nii.gz", "--labels", out / "names.json", "--force")
 command("check", out / "hip_scene" / "scene.toml", "--picture")
 shutil.copy(out / "hip_scene" / "scene.png", out / "guesses.png")
 
-# Moment arms are taken by nudging each coordinate at each written frame; out/report.html draws them.
-arms = ["--set", "output.moment_arms=true", "--set", "output.preview=false", "--frames", "0:9:4"]
+# Moment arms follow from the lengths along the motion; out/report.html draws them.
+arms = ["--set", "output.preview=false", "--frames", "0:9:4"]
 command("run", out / "hip_scene" / "scene.toml", "-o", out / "run", *arms)
-command("export", out / "run", "--format", "sto")
 
 # The check of this page: the same through the meshes that the labels were made of. The surfaces are less than a voxel
 # apart, but each scene has guessed patches of its own, and arms differ by some millimetres: correct the guesses.
@@ -78,9 +75,7 @@ for part in parts:
     part.mesh.export(meshes / f"{part.name}.ply")
 command("new", meshes, "--units", "mm", "--force")
 found = SavedRun(out / "run")
-true = rm.simulate(
-    rm.Scene.load(meshes / "scene.toml"), settings={"output.moment_arms": True}, frames="0:9:4"
-)
+true = rm.simulate(rm.Scene.load(meshes / "scene.toml"), frames="0:9:4")
 worst = 0.0
 for muscle in true:
     off = found.series(muscle.name, "moment_arm")[1] - muscle.values("moment_arm")

@@ -107,9 +107,6 @@ class PBDMuscle:
         if self.untangling is not None:
             self.untangling.untangle(self.points, lambda: self._settle(contacts))
 
-    def respond(self, contacts: BoneContacts, before: Mapping, after: Mapping) -> None:
-        """None: a mesh muscle has no linearised equilibrium, and is nudged."""
-
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next `solve` settles under."""
         self.fibres.law.activate(activation)

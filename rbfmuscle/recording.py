@@ -138,7 +138,8 @@ class Recording:
             raise
         finally:
             self.close()
-            rows = self.recorder.finish() if self.recorder is not None else []
+            kept = {entry["frame"] for entry in self.written}
+            rows = [] if self.recorder is None else [r for r in self.recorder.finish() if r.frame in kept]
             self.summary.add(rows)
             # What ended the run says more than a disk that then refuses the rest.
             with suppress(*((SolveError,) if self.status == "failed" else ())):

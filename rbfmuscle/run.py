@@ -278,19 +278,6 @@ class MuscleRun:
         surface = self._frame(frame).surfaces[self.name]
         return trimesh.Trimesh(surface.vertices, surface.faces, process=False)
 
-    def fibres(self, frame: int = -1) -> Any:
-        """Fibres in a frame of the run, `FibreLines`: points, lengths and lengths at rest.
-
-        Raises
-        ------
-        UsageError
-            If the frame is out of range, or the scene did not ask for fibres.
-        """
-        found = self._frame(frame).fibres
-        if self.name not in found:
-            raise UsageError("the run has no fibres: set output.fibres = true in the scene")
-        return found[self.name]
-
     def values(self, quantity: str) -> np.ndarray:
         """Values of a quantity over the frames, (n,) ndarray."""
         return self.run.values(self.name, quantity)

@@ -60,9 +60,6 @@ class BlendMuscle:
     def continue_drawing(self, quantities):
         pass
 
-    def respond(self, contacts, before, after):
-        return None
-
     def carried_mesh(self):
         return self.x.copy(), self.faces
 

@@ -165,9 +165,6 @@ class ToyMuscle:
     def continue_drawing(self, quantities):
         pass
 
-    def respond(self, contacts, before, after):
-        return None
-
     def carried_mesh(self):
         return self.x.copy(), self.faces
 

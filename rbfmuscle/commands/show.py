@@ -18,9 +18,7 @@ def export(
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     units: str | None = None,
     frames: str | None = None,
-    ascii: Annotated[bool, Parameter(negative="")] = False,
     up: str = "z",
-    values: Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)] = None,
 ) -> None:
     """Write the surfaces of a run in other formats and units.
 
@@ -29,30 +27,23 @@ def export(
     directory
         Folder of the run.
     formats
-        pvd, vtp, ply, stl, obj or glb: files for each frame; usd, animated-glb or vtkhdf: all frames as an
-        animation; html: a page that turns and scrubs it; sto: lengths and moment arms. Several may be given.
+        pvd, vtp, ply, stl, obj or glb: files for each frame; usd or animated-glb: all frames as an animation;
+        html: a page that turns and scrubs it. Several may be given.
     output
         Folder to write to, DIR/export by default.
     units
         m, cm or mm; the scene's by default (glb, animated-glb, html: m).
     frames
         Of the written frames, as A:B:S.
-    ascii
-        VTP as text, as OpenSim reads it.
     up
-        z or y: the scene's axis that points up, for usd, animated-glb and html.
-    values
-        stretch, activation or bone_distance of every vertex, in pvd, vtp, ply, usd and vtkhdf, or normals, in usd;
-        several may be given.
+        z or y: the scene's axis that points up, for usd, glb, animated-glb and html.
     """
     with Progress(f"export {directory}"):
         from rbfmuscle.sim.scene.settings import parse_slice
         from rbfmuscle.study.files.export import export_run
 
         chosen = parse_slice(frames) if frames is not None else None
-        written = export_run(
-            directory, formats, output=output, units=units, frames=chosen, ascii=ascii, up=up, values=values
-        )
+        written = export_run(directory, formats, output=output, units=units, frames=chosen, up=up)
     folders = sorted({str(path.parent) for path in written})
     print(f"{len(written)} file{'s'[: len(written) != 1]} in {', '.join(folders)}")
 
@@ -64,7 +55,7 @@ def render(
     frame: int | None = None,
     view: Annotated[list[str] | None, Parameter(negative="")] = None,
     seconds: float = 5.0,
-    colour: Literal["muscle", "activation", "stretch"] = "muscle",
+    colour: Literal["muscle", "activation"] = "muscle",
 ) -> None:
     """Draw a run: a picture (.png) or an animation (.gif, .webp).
 
@@ -81,7 +72,7 @@ def render(
     seconds
         Length of an animation.
     colour
-        What muscles are coloured by: themselves, their activation, or the stretch of their fibres (output.fibres).
+        What muscles are coloured by: themselves, or their activation.
     """
     with Progress(f"render {directory}"):
         from rbfmuscle.study.show.render import render_run

@@ -100,17 +100,6 @@ class RBFMuscle:
         """Settle the centres under shape, volume and contact at the contacts' present poses."""
         self.points = self.solver.solve(self.points, contacts)
 
-    def respond(
-        self, contacts: BoneContacts, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]
-    ) -> np.ndarray | None:
-        """Vertices of the carried mesh at poses near the present ones, by the linearised equilibrium of an inside."""
-        if self.interior is None:
-            return None
-        motions = {bone: after[bone] @ np.linalg.inv(before[bone]) for bone in after}
-        points = self.interior.respond(contacts, motions, [after[bone] for bone in self.rest.bones])
-        first = len(self.points)
-        return points[first : first + len(self.rest.samples)]
-
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next `solve` settles under."""
         self.law.activate(activation)

@@ -41,7 +41,7 @@ class Crew:
     Attributes
     ----------
     times : dict of str to float
-        Wall time spent so far [s], of the helper that spent most: ``simulate``, ``metrics``, ``fibres``.
+        Wall time spent so far [s], of the helper that spent most: ``simulate``, ``metrics``.
     compiled : dict of str to float
         Loops that helpers compiled, and the processor time they took.
     """
@@ -176,7 +176,7 @@ def _joined(parts, order):
         return {name: found.pop(name) for name in order if name in found} | found
 
     first, frames = parts[0].frame, [part.frame for part in parts]
-    by_muscle = ("surfaces", "carried", "times", "fibres", "nudged", "work")
+    by_muscle = ("surfaces", "carried", "times", "work")
     state = {
         key: value if key in ("index", "here", "activations") else joined(f.state[key] for f in frames)
         for key, value in first.state.items()

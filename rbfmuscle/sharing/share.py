@@ -48,7 +48,7 @@ class Share:
     ----------
     models : list of MuscleModel
     times : dict of str to float
-        Wall time spent so far [s]: ``simulate``, ``metrics``, ``fibres``.
+        Wall time spent so far [s]: ``simulate``, ``metrics``.
     compiled : dict of str to float
         What other processes compiled for it: nothing.
 
@@ -67,7 +67,6 @@ class Share:
         self.models = build_models(scene, names)
         carried = {model.name: model.carried_mesh() for model in self.models}
         self._measures = MuscleMeasures(scene, carried) if scene.output.metrics else None
-        self._fibres = _fibre_study(scene, carried) if scene.output.fibres else None
 
     def frames(
         self, start: Mapping[str, Any] | None = None, measures: Mapping[str, Any] | None = None
@@ -99,9 +98,6 @@ class Share:
             first = False
             if frame is None:
                 return
-            if self._fibres is not None:
-                with timed(self.times, "fibres"):
-                    frame.fibres = self._fibres.at(frame)
             measured: dict[str, Measured] = {}
             known: dict[str, Any] = {}
             if self._measures is not None:
@@ -127,9 +123,3 @@ def timed(times: dict[str, float], part: str) -> Iterator[None]:
 def _first(frames):
     with tell_stage("solving the first frame"):
         return next(frames, None)
-
-
-def _fibre_study(scene, carried):
-    from rbfmuscle.study.measure.fibre_study import FibreStudy
-
-    return FibreStudy(scene, carried)

@@ -43,13 +43,10 @@ TABLES = {
         {"angle": 120.0, "action": "report", "swept": False, "smallest_step": 0.5},
     ),
     "output.surfaces": (options.SurfaceOptions, {"format": "stl"}),
-    "output.fibres": (options.FibreOptions, {"count": 8, "segments": 4}),
-    "output.moment_arms": (options.ArmOptions, {"step": 2.0}),
     "output": (
         options.OutputOptions,
         {
-            "surfaces": {"format": "ply"}, "fibres": {"count": 8, "segments": 4}, "moment_arms": {"step": 2.0},
-            "metrics": False,
+            "surfaces": {"format": "ply"}, "metrics": False,
             "report": False, "preview": False,
         },
     ),

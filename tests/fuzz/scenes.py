@@ -196,7 +196,6 @@ def _tables(scene, rng):
                 [{}, {"smallest_step": 1e-300}, {"angle": 1e-9}, {"action": "rotate"}, 1],
             ),
             ("output", "surfaces", [False, True, {"format": "stl"}, {"format": "glb"}, {"format": "x"}]),
-            ("output", "fibres", [True, {"count": 1, "segments": 2}, {"count": 10**9}, {"segments": 0}]),
             ("motion", "max_substeps", [0, 1, 10**15, -1]),
             ("scene", "units", ["m", "cm", "km", 1]),
         ],

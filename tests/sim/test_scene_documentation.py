@@ -40,8 +40,6 @@ def documented_tables():
         options.TunnellingOptions: "`[detect]`",
         options.OutputOptions: "`[output]`",
         options.SurfaceOptions: "`[output]`",
-        options.FibreOptions: "`[output]`",
-        options.ArmOptions: "`[output]`",
         keys.ContractionTable: CONTRACTION,
         keys.CourseTable: CONTRACTION,
         keys.TendonTable: CONTRACTION,

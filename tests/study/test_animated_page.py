@@ -37,8 +37,8 @@ def moving():
         MovingBone("shin", white, np.array(box.vertices), np.array(box.faces), poses),
         MovingBone("thigh", white, np.array(box.vertices) + 0.3, np.array(box.faces), poses[:1].repeat(4, 0)),
     ]
-    muscle = MovingMuscle("calf </script><b>", red, shapes, [faces] * 4, {})
-    return MovingRun("knee & calf", "m", np.array([2, 3, 4, 7]) / 24.0, [muscle], bones, "z")
+    muscle = MovingMuscle("calf </script><b>", red, shapes, [faces] * 4)
+    return MovingRun("knee & calf", "m", np.array([2, 3, 4, 7]) / 24.0, False, [muscle], bones, "z")
 
 
 @pytest.fixture(scope="module")
@@ -80,8 +80,8 @@ def test_slider_brings_every_vertex_of_every_frame_to_its_place(written, moving)
 
 def test_surfaces_that_change_are_refused_with_a_remedy(moving, tmp_path):
     muscle = moving.muscles[0]
-    other = MovingMuscle(muscle.name, muscle.colour, muscle.vertices, [f.copy() for f in muscle.faces], {})
-    run = MovingRun(moving.name, "m", moving.times, [other], moving.bones, "z")
+    other = MovingMuscle(muscle.name, muscle.colour, muscle.vertices, [f.copy() for f in muscle.faces])
+    run = MovingRun(moving.name, "m", moving.times, False, [other], moving.bones, "z")
     with pytest.raises(UsageError, match="html needs surfaces that keep their vertices"):
         page.write_animated_page(tmp_path / "x.html", run, CAPTIONS)
     assert not (tmp_path / "x.html").exists()

@@ -15,6 +15,7 @@ from rbfmuscle.sim.scene.motion import Motion
 from rbfmuscle.study.measure.centreline import Centreline, MuscleAtRest, slice_operator, split_ends
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.measure.metrics import MuscleMeasures, edge_strain, surface_distance
+from rbfmuscle.study.measure.moment_arms import moment_arms
 from rbfmuscle.study.measure.occupancy import OccupancyGrid
 from rbfmuscle.study.measure.penetration import (
     BoneProbe,
@@ -22,7 +23,7 @@ from rbfmuscle.study.measure.penetration import (
     bones_about,
     surface_depth,
 )
-from rbfmuscle.study.measure.recorder import MetricsRecorder, moment_arms
+from rbfmuscle.study.measure.recorder import MetricsRecorder
 from rbfmuscle.study.measure.topology import SurfaceForm, count_components
 
 EYE = np.eye(4)
@@ -345,31 +346,39 @@ class TestLength:
 
 
 class TestMomentArm:
-    def path(self, angles, lengths, name="joint.bend"):
-        return [({name: a}, {"m": length}) for a, length in zip(angles, lengths)]
+    def arms(self, angles, lengths, name="joint.bend"):
+        return [found.get(name) for found in moment_arms([{name: a} for a in angles], lengths)]
 
     def test_string_over_a_pulley_has_the_pulleys_radius(self):
         angles = np.radians([0, 5, 10, 20, 40])
-        path = self.path(angles, 200 + 23.5 * angles)
-        for k in range(5):
-            assert moment_arms(path, k, "m") == [("joint.bend", pytest.approx(-23.5))]
+        assert self.arms(angles, 200 + 23.5 * angles) == pytest.approx([-23.5] * 5)
 
-    def test_uneven_steps_are_second_order(self):
+    def test_parabola_has_its_slope_however_the_steps_are(self):
         angles = np.array([0.1, 0.2, 0.5])
-        path = self.path(angles, 3 * angles**2 - angles)
-        assert moment_arms(path, 1, "m")[0][1] == pytest.approx(-(6 * 0.2 - 1))
+        assert self.arms(angles, 3 * angles**2 - angles)[1] == pytest.approx(-(6 * 0.2 - 1))
+        angles = np.cumsum(np.radians([0.0, 1.0, 0.3, 2.0, 0.7, 1.1, 0.2, 3.0, 1.0]))
+        assert self.arms(angles, 3 * angles**2 - angles) == pytest.approx(-(6 * angles - 1), rel=1e-6)
 
-    def test_turning_point_takes_one_side(self):
-        angles = np.array([0.2, 0.3, 0.2])
-        assert moment_arms(self.path(angles, [10, 11, 10]), 1, "m")[0][1] == pytest.approx(-10)
+    def test_ripple_of_lengths_is_smoothed_where_frames_are_near(self):
+        angles = np.radians(np.arange(41.0))
+        ripple = 0.05 * np.random.default_rng(2).normal(size=len(angles))
+        arms = np.array(self.arms(angles, 40.0 * np.cos(angles) + ripple))
+        plain = -np.gradient(40.0 * np.cos(angles) + ripple, angles)
+        away, before = arms - 40.0 * np.sin(angles), plain - 40.0 * np.sin(angles)
+        assert np.abs(away[8:-8]).max() < 0.2 * np.abs(before[8:-8]).max()
+
+    def test_turning_point_takes_the_way_there(self):
+        assert self.arms([0.2, 0.3, 0.2], [10, 11, 10.4])[1] == pytest.approx(-10)
 
     def test_two_coordinates_at_once_give_none(self):
-        path = [({"a": 0.0, "b": 0.0}, {"m": 1.0}), ({"a": 0.1, "b": 0.1}, {"m": 1.2})]
-        assert moment_arms(path, 0, "m") == []
+        assert moment_arms([{"a": 0.0, "b": 0.0}, {"a": 0.1, "b": 0.1}], [1.0, 1.2]) == [{}, {}]
 
     def test_each_leg_of_a_path_has_its_coordinate(self):
-        path = [({"a": 0.0}, {"m": 1.0}), ({"a": 0.1}, {"m": 1.1}), ({"a": 0.1, "b": 0.2}, {"m": 1.5})]
-        assert dict(moment_arms(path, 1, "m")) == {"a": pytest.approx(-1.0), "b": pytest.approx(-2.0)}
+        found = moment_arms([{"a": 0.0}, {"a": 0.1}, {"a": 0.1, "b": 0.2}], [1.0, 1.1, 1.5])
+        assert found[1] == {"a": pytest.approx(-1.0), "b": pytest.approx(-2.0)}
+
+    def test_unknown_lengths_and_rest_give_none(self):
+        assert self.arms([0.0, 0.1, 0.2, 0.2], [1.0, np.nan, 2.0, 2.0]) == [None] * 4
 
 
 class TestRecorder:
@@ -414,7 +423,9 @@ class TestRecorder:
 
     def test_values_units_and_order(self, scene):
         rows = self.rows(scene)
-        assert [r.frame for r in rows] == sorted(r.frame for r in rows)
+        for arms in (False, True):  # those of all frames come last
+            frames = [r.frame for r in rows if (r.quantity == "moment_arm") == arms]
+            assert frames == sorted(frames)
         assert {r.coordinate for r in rows} == {"joint.bend"}
         at = {(r.frame, r.muscle, r.quantity): r for r in rows}
         assert at[2, "rod", "volume_error"].value == pytest.approx(0.02)

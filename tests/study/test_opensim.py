@@ -1,4 +1,4 @@
-"""What goes to OpenSim and comes from it: storage files, geometry in metres, motions; and the sum rule."""
+"""Motions from OpenSim; moment arms and the sum rule."""
 
 import math
 
@@ -9,8 +9,6 @@ from blend_model import arm_scene, use_blend_model
 from rbfmuscle.run import simulate
 from rbfmuscle.sim.scene.motion import Motion
 from rbfmuscle.sim.scene.options import MotionOptions
-from rbfmuscle.study.files.export import export_run
-from rbfmuscle.study.files.saved import SavedRun
 
 
 @pytest.fixture(scope="module")
@@ -24,32 +22,6 @@ def run(tmp_path_factory):
     return made, folder
 
 
-def read_sto(path):
-    """Header as a dict, labels, table; what OpenSim's own reader asks for is asserted."""
-    lines = path.read_text().splitlines()
-    end = lines.index("endheader")
-    header = dict(line.split("=") for line in lines[1:end])
-    labels = lines[end + 1].split("\t")
-    table = np.array([[float(x) for x in line.split("\t")] for line in lines[end + 2 :]])
-    assert table.shape == (int(header["nRows"]), int(header["nColumns"])) == (len(table), len(labels))
-    assert labels[0] == "time" and np.all(np.diff(table[:, 0]) > 0)
-    return header, labels, table
-
-
-def test_sto_holds_lengths_and_arms_in_metres(run, tmp_path):
-    made, folder = run
-    written = export_run(folder, "sto", output=tmp_path, units="m")
-    assert {path.suffix for path in written} == {".sto", ".csv"}
-    lengths = tmp_path / "sto" / "Length.sto"
-    assert lengths in written
-    for path in (path for path in written if path.suffix == ".sto"):
-        header, labels, table = read_sto(path)
-        assert header["inDegrees"] == "no" and header["version"] == "1"
-        quantity = "length" if path == lengths else "moment_arm"
-        for k, muscle in enumerate(labels[1:], start=1):
-            np.testing.assert_allclose(table[:, k], made.values(muscle, quantity) * 1e-3, rtol=1e-12)
-
-
 def test_arms_sum_to_the_change_of_length(run):
     """l(q) = l(0) - integral r dq, trapezoidal; 1 % of the greatest change, as one-sided ends err."""
     made, _ = run
@@ -60,20 +32,6 @@ def test_arms_sum_to_the_change_of_length(run):
         change = -np.cumsum(0.5 * (arm[1:] + arm[:-1]) * np.diff(angle))
         worst = np.abs(length[1:] - length[0] - change).max()
         assert worst <= 0.01 * np.abs(length - length[0]).max()
-
-
-def test_geometry_in_metres_is_plain_text_and_reads_back(run, tmp_path):
-    pyvista = pytest.importorskip("pyvista")
-    _, folder = run
-    written = export_run(folder, "vtp", output=tmp_path, units="m", ascii=True)
-    saved = SavedRun(folder)
-    for muscle in saved.muscles:
-        path = next(p for p in written if p.name == f"{muscle}_{saved.frames[-1]:04d}.vtp")
-        assert 'format="binary"' not in path.read_text()
-        data = pyvista.read(path)
-        vertices, faces = saved.surface(muscle, saved.frames[-1])
-        np.testing.assert_allclose(data.points, vertices * 1e-3, rtol=1e-12)
-        np.testing.assert_array_equal(data.regular_faces, faces)
 
 
 @pytest.mark.parametrize(("degrees", "factor"), [("yes", math.pi / 180), ("no", 1.0)])

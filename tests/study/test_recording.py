@@ -64,7 +64,6 @@ def test_sink_hears_of_the_start_every_frame_and_the_end():
     assert seen[0] is None and seen[1::2] == sink.frames
     assert seen[2::2] == [(k + 1, count) for k in range(count)]
     assert sink.closed is not None
-    assert not any(frame.fibres for frame in sink.frames)
 
 
 def test_states_are_given_only_where_they_are_asked_for():

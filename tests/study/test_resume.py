@@ -59,7 +59,6 @@ VARIANTS = {
     "velocity": {"model": "pbd", "model.prediction": "velocity"},
     "marching": {"model.surface": "marching"},
     "inside": {"model.inside": 150},
-    "moment arms and fibres": {"output.moment_arms": True, "output.fibres": {"count": 5, "segments": 4}},
     "sliding": {"sliding.bones": True, "muscles": 3},
     "kept overlap": {"contact.initial": "keep", "output.surfaces": {"format": "ply"}},
 }
@@ -139,7 +138,6 @@ class TestBlend:
         [
             ({"end": 30}, "motion ramp elbow.flexion to is 20.0 there and 30.0 here"),
             ({"units": "m"}, 'units is "mm" there and "m" here'),
-            ({"fibres": {"count": 5}}, "output fibres is false there"),
         ],
     )
     @pytest.mark.parametrize("complete", [True, False])

@@ -1,6 +1,7 @@
 """What ``rbfmuscle paths`` does: sample muscles over their coordinates, fit, and say how well the fits hold."""
 
 import csv
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,6 @@ import numpy as np
 from rbfmuscle.models import build_models
 from rbfmuscle.opensim.fitted import MOST_COORDINATES, FittedPath, exponents, fit_path, write_paths
 from rbfmuscle.sim.joints.skeleton import all_coordinates
-from rbfmuscle.sim.loop.nudge import moving_coordinates, nudge, settle
 from rbfmuscle.sim.loop.simulate import FrameLoop
 from rbfmuscle.sim.plan.reach import build_fields, reached_bones
 from rbfmuscle.sim.scene.joint_tables import full_name
@@ -21,6 +21,10 @@ from rbfmuscle.validation import SceneError, SolveError, UsageError
 
 # Every fifth sample is held out of the fit.
 HELD_OUT = 5
+# Of the central differences, to either side [degree, or mm of a shift].
+STEP = 1.0
+# A muscle has settled where no contact point moves by more than this share of its size in a solve.
+MOST_SOLVES, SETTLED = 60, 3e-7
 
 Ranges = dict[str, tuple[float, float]]
 
@@ -68,8 +72,8 @@ def sample_muscles(
 ) -> list[Samples]:
     """Return lengths and moment arms of every muscle at quasi-random poses of the coordinates that it depends on.
 
-    Each pose is reached from rest in a straight line, the muscle settles there, and each coordinate is nudged for its
-    moment arm.
+    Each pose is reached from rest in a straight line and the muscle settles there. A moment arm is minus the central
+    difference of the length over `STEP` to both sides, the muscle settling there too.
 
     Parameters
     ----------
@@ -85,7 +89,7 @@ def sample_muscles(
         raise SceneError(f"scene {scene.name!r} has no muscles, add a [[muscle]]")
     scene = scene.validate().copy()
     scene.sliding = None
-    groups = _groups(scene, _ranges(scene, given))
+    groups = _groups(scene, given)
     found, done = [], 0
     for ranges, muscles in groups:
         part = scene.copy()
@@ -119,23 +123,41 @@ def _measured(scene, poses):
             model.restore(state)
         try:
             with FrameLoop(scene, models, fields=fields, surfaces=False) as loop:
-                loop.skip(pose)
-                with loop.workers.one_thread_each():
-                    yield loop.workers.each(
-                        lambda stepper, loop=loop, pose=pose: _measure(stepper, loop.here, lines, pose),
-                        loop.steppers,
-                    )
+                yield _row(loop, lines, pose)
         except SolveError:
-            yield [[np.nan] * (1 + len(pose))] * len(models)
+            yield np.full((len(models), 1 + len(pose)), np.nan)
 
 
-def _measure(stepper, here, lines, names):
-    settle(stepper, here)
-    line = lines[stepper.name]
-    length = line.length(stepper.model.carried_mesh()[0], bone_poses(stepper.scene, here))
-    nudged = nudge(stepper, here)
-    arms = {name: -(line.length(*n.above) - line.length(*n.below)) / n.span for name, n in nudged.items()}
-    return [length, *(arms.get(name, 0.0) for name in names)]
+def _row(loop, lines, pose):
+    """Length and moment arms (n, 1 + d) of the muscles at a pose."""
+    here, arms = _settled(loop, lines, pose), []
+    facts = all_coordinates(loop.scene.joints)
+    for name, value in pose.items():
+        turns = facts[name].motion != "translation"
+        step = math.radians(STEP) if turns else loop.scene.length(STEP)
+        ends = [facts[name].honoured(value + side * step) for side in (-1.0, 1.0)]
+        below, above = (_settled(loop, lines, {**pose, name: end}) for end in ends)
+        arms.append(-(above - below) / (ends[1] - ends[0]))
+    return np.stack([here, *arms], axis=1)
+
+
+def _settled(loop, lines, pose):
+    """Lengths (n,) of the muscles when they have come to rest at a pose, or have had `MOST_SOLVES`."""
+    loop.skip(pose)
+    with loop.workers.one_thread_each():
+        loop.workers.each(lambda stepper: _settle(stepper, loop.here), loop.steppers)
+    poses = bone_poses(loop.scene, loop.here)
+    return np.array([lines[s.name].length(s.model.carried_mesh()[0], poses) for s in loop.steppers])
+
+
+def _settle(stepper, here):
+    points = stepper.model.contact_points().copy()
+    small = SETTLED * float(np.linalg.norm(np.ptp(points, axis=0)))
+    for _ in range(MOST_SOLVES):
+        stepper.solve(dict(here))
+        before, points = points, stepper.model.contact_points().copy()
+        if np.abs(points - before).max() <= small:
+            return
 
 
 def _poses(ranges, samples):
@@ -147,39 +169,43 @@ def _poses(ranges, samples):
     return [dict(zip(ranges, row)) for row in (low + points[:samples] * (high - low)).tolist()]
 
 
-def _groups(scene, ranges):
-    """Ranges that muscles depend on, with the names of these muscles, which are sampled together."""
+def _groups(scene, given):
+    """Ranges of the coordinates that muscles depend on, with the names of these muscles, which are sampled together."""
+    facts, followers = all_coordinates(scene.joints), {coupling.coordinate for coupling in scene.couplings}
+    free = [name for name, fact in facts.items() if name not in followers and not fact.locked]
     groups = {}
     for muscle in scene.muscles:
-        bones, names = sorted({a.bone for a in muscle.attachments}), set()
-        for share in (0.0, 0.37, 0.71, 1.0):
-            pose = {name: low + share * (high - low) for name, (low, high) in ranges.items()}
-            names |= set(moving_coordinates(scene, bones, pose))
-        needed = tuple(name for name in ranges if name in names)
+        bones = sorted({attachment.bone for attachment in muscle.attachments})
+        needed = tuple(name for name in free if _moves(scene, bones, name))
         if not 1 <= len(needed) <= MOST_COORDINATES:
             raise SceneError(
                 f"muscle {muscle.name!r} depends on {len(needed)} coordinates ({', '.join(needed)}); OpenSim takes "
                 f"1 to {MOST_COORDINATES}: lock some in the scene"
             )
         groups.setdefault(needed, []).append(muscle.name)
-    return [({name: ranges[name] for name in needed}, names) for needed, names in groups.items()]
+    return [
+        ({name: _range(scene, name, given) for name in needed}, names) for needed, names in groups.items()
+    ]
 
 
-def _ranges(scene, given):
-    """The range of every coordinate that moves a muscle: as given, its own, or what the motion covers."""
-    moving = set()
-    for muscle in scene.muscles:
-        moving |= set(moving_coordinates(scene, sorted({a.bone for a in muscle.attachments}), {}))
-    found = {}
-    for name, facts in all_coordinates(scene.joints).items():
-        if name not in moving:
-            continue
-        moved = [frame[name] for frame in scene.motion.frames if name in frame]
-        ends = (given.get(name), facts.range, (min(moved, default=0.0), max(moved, default=0.0)))
-        found[name] = next((pair for pair in ends if pair is not None and pair[0] < pair[1]), None)
-        if found[name] is None:
-            raise UsageError(f"coordinate {name!r} has no range; give --range {name}=LOW:HIGH")
-    return found
+def _moves(scene, bones, name):
+    """Whether a coordinate moves some bones against each other, from where all others rest."""
+    fact, places = all_coordinates(scene.joints)[name], []
+    for value in (fact.rest, fact.rest + 0.1, fact.rest - 0.1):
+        poses = bone_poses(scene, {name: fact.honoured(value)})
+        back = np.linalg.inv(poses[bones[0]])
+        places.append([back @ poses[bone] for bone in bones])
+    return np.ptp(np.array(places), axis=0).max() > 1e-6
+
+
+def _range(scene, name, given):
+    """The range of a coordinate: as given, its own, or what the motion covers."""
+    moved = [frame[name] for frame in scene.motion.frames if name in frame]
+    own = all_coordinates(scene.joints)[name].range
+    for ends in (given.get(name), own, (min(moved, default=0.0), max(moved, default=0.0))):
+        if ends is not None and ends[0] < ends[1]:
+            return ends
+    raise UsageError(f"coordinate {name!r} has no range; give --range {name}=LOW:HIGH")
 
 
 def report_fits(scene: Scene, sampled: list[Samples], directory: Path, order: int) -> list[str]:

@@ -36,7 +36,6 @@ from rbfmuscle.model.inside.loops import (
     turn_loop,
 )
 from rbfmuscle.model.inside.obstacles import Near, Obstacles
-from rbfmuscle.model.inside.response import Response
 
 # Times the iterations of a muscle without an inside: they end by the residual, mostly sooner.
 LEAST_ROUNDS = 3
@@ -88,7 +87,7 @@ class Interior:
     ) -> None:
         self.rest = frame.points(lattice.rest)
         self.points, self.owner, self.held = points, owner, held
-        self.count, self.free, self._carried, self._followed, self._response = count, free, None, None, None
+        self.count, self.free, self._carried, self._followed = count, free, None, None
         self.lattice, self.frame = lattice, frame
         self.iterations, self.batch, self.memory = LEAST_ROUNDS * iterations, contacts, memory
         self.scale, self.side = diameter(points), float(np.prod(lattice.spacing)) ** (1 / 3) * frame.size
@@ -241,12 +240,6 @@ class Interior:
             here, pose = own == bone, poses[bone]
             ends[here] = self.points[self.held[here]] @ pose[:3, :3].T + pose[:3, 3]
         return ends
-
-    def respond(self, contacts: Any, motions: Any, poses: Any) -> Floats:
-        """Contact points (n, 3) at other poses (by bone), to first order in all bones' motions (by name) to there."""
-        if self._response is None or self._response[0] is not self.y:
-            self._response = self.y, Response(self, contacts)
-        return self.carry() + self._response[1].carried(self._ends(poses) - self.anchor, motions)
 
     def turn(self, which: Any, transform: Floats) -> None:
         """Nodes go along with a rigid transform as far as they carry free points of the mask ``which``."""

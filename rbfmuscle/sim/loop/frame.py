@@ -94,10 +94,6 @@ class Frame:
     wall : float
         Time for all muscles together [s], since the frame before. Where the next frame is solved while this one
         is drawn, both are in it; over a motion the sum is what counts.
-    fibres : dict of str to FibreLines
-        Empty where no fibres were asked for.
-    nudged : dict of str to dict
-        For each muscle and each coordinate that moves it, a `Nudged`; empty where no moment arms were asked for.
     activations : dict of str to float
         Of the muscles that contract.
     state : dict
@@ -116,8 +112,6 @@ class Frame:
     events: list
     times: dict
     wall: float
-    fibres: dict = field(default_factory=dict)
-    nudged: dict = field(default_factory=dict)
     activations: dict = field(default_factory=dict)
     state: dict = field(default_factory=dict)
     work: dict = field(default_factory=dict)
@@ -191,11 +185,6 @@ class MuscleModel(Protocol):
 
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next :meth:`solve` settles under; for muscles that contract."""
-
-    def respond(
-        self, contacts: BoneContacts, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]
-    ) -> np.ndarray | None:
-        """Vertices of the carried mesh when the bones go a little from their present poses; None where unknown."""
 
     def carried_mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and faces of a surface that moves with the material, of constant topology."""

@@ -153,14 +153,12 @@ class FrameLoop:
     def collect(self) -> Frame:
         """The frame where the muscles are now, without its surfaces."""
         carried = {stepper.name: stepper.model.carried_mesh() for stepper in self.steppers}
-        nudged = self._nudged()
         times, events = {}, []
         for stepper in self.steppers:
             times[stepper.name], happened = stepper.collect()
             events.extend(happened)
         poses = dict(self._poses(self.here))
         frame = Frame(self._next_index - 1, dict(self.here), poses, {}, carried, events, times, 0.0)
-        frame.nudged.update(nudged)
         frame.activations.update(self.activations.here)
         if self.resumable:
             frame.state.update(self._state())
@@ -202,17 +200,6 @@ class FrameLoop:
             stepper.go_on(state["carriers"].get(stepper.name), state["drawn"].get(stepper.name))
         if self._sliding is not None:
             self._sliding.restore(state["links"])
-
-    def _nudged(self) -> dict:
-        """How each muscle answers a small change of each coordinate, where moment arms are asked for."""
-        output = self.scene.output
-        if output is None or not output.moment_arms:
-            return {}
-        from rbfmuscle.sim.loop.nudge import nudge
-
-        with self.workers.one_thread_each():
-            found = self.workers.each(lambda stepper: nudge(stepper, self.here), self.steppers)
-        return {stepper.name: answers for stepper, answers in zip(self.steppers, found)}
 
     def finish(self, frame: Frame, drawn: Iterable[tuple[ModelSurface, float]]) -> Frame:
         """The frame with its surfaces, and the time since the one before."""

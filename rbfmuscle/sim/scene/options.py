@@ -16,7 +16,6 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
-    field_validator,
     model_validator,
 )
 from pydantic_core import PydanticCustomError
@@ -32,6 +31,8 @@ LARGEST_INTEGER = 2**53
 # The table is deleted at 1.0.
 REMOVED_KEYS: dict[str, str] = {
     "model.derivatives": "delete the key: up to 200 centres, and fitted ones, meet all derivatives",
+    "output.fibres": "delete the key: fibres of a run are no longer followed; those of a scene still steer its muscles",
+    "output.moment_arms": "delete the key: moment arms are measured along every motion, about what moves alone",
     "opensim": "delete the table: runs are no longer compared with the muscle paths of an OpenSim model",
 }
 
@@ -216,33 +217,13 @@ class SurfaceOptions(Table):
     format: Literal["pvd", "vtp", "ply", "stl", "obj", "glb"] = "pvd"
 
 
-class FibreOptions(Table):
-    """``output.fibres``: fibres of every muscle, carried along and written for every frame."""
-
-    count: Annotated[int, Field(ge=1, le=10_000)] = 100
-    segments: Annotated[int, Field(ge=2, le=200)] = 15
-
-
-class ArmOptions(Table):
-    """``output.moment_arms``: how far each coordinate is nudged to either side [degree, or mm for a shift]."""
-
-    step: Annotated[float, Field(gt=0, le=10)] = 1.0
-
-
 class OutputOptions(Table):
     """``[output]``: what a run leaves behind."""
 
     surfaces: SurfaceOptions | Literal[False] = SurfaceOptions()
-    fibres: FibreOptions | Literal[False] = False
-    moment_arms: ArmOptions | Literal[False] = False
     metrics: bool = True
     report: bool = True
     preview: bool = True
-
-    @field_validator("fibres", "moment_arms", mode="before")
-    @classmethod
-    def _true_means_defaults(cls, value):
-        return {} if value is True else value
 
 
 class RampOptions(Table):

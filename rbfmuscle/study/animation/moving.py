@@ -1,4 +1,4 @@
-"""A saved run as muscles and bones over time, which the writers of animations turn into files."""
+"""A saved run as muscles and bones over time, which exports turn into files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.sim.scene.scene import MM_PER_UNIT
-from rbfmuscle.study.animation.values import VertexValues
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.show.appearance import BONE_COLOUR, muscle_colours
 
@@ -19,47 +18,29 @@ FRAMES_A_SECOND = 24.0
 
 @dataclass(frozen=True)
 class MovingMuscle:
-    """The surface of a muscle in all frames.
+    """The surface of a muscle: vertices (n, 3) and faces (m, 3) of each frame, the same array of faces where it stays.
 
-    Attributes
-    ----------
-    name : str
-    colour : (3,) ndarray
-        Red, green and blue, 0 to 1, as screens show them.
-    vertices : list of (n, 3) ndarray
-        One of each frame [wanted unit].
-    faces : list of (m, 3) ndarray of int
-        One of each frame, all the same array where the surface keeps its vertices.
-    values : dict of str to list of (n,) ndarray
-        What is told of each vertex in each frame.
+    ``colour`` (3,) is red, green and blue, 0 to 1, as screens show them.
     """
 
     name: str
     colour: Floats
     vertices: list[Floats]
     faces: list[Integers]
-    values: dict[str, list[Floats]]
 
     @property
     def keeps_vertices(self) -> bool:
         """Whether all frames have the same triangles of the same vertices."""
         return all(faces is self.faces[0] for faces in self.faces)
 
+    def mesh(self, k: int) -> tuple[Floats, Integers]:
+        """Vertices and faces in the k-th frame."""
+        return self.vertices[k], self.faces[k]
+
 
 @dataclass(frozen=True)
 class MovingBone:
-    """A rigid bone and where it is in all frames.
-
-    Attributes
-    ----------
-    name : str
-    colour : (3,) ndarray
-    vertices : (n, 3) ndarray
-        At rest [wanted unit].
-    faces : (m, 3) ndarray of int
-    poses : (T, 4, 4) ndarray
-        From rest to the world [wanted unit].
-    """
+    """A rigid bone: vertices (n, 3) and faces (m, 3) at rest, and poses (T, 4, 4) from there to the world."""
 
     name: str
     colour: Floats
@@ -72,6 +53,10 @@ class MovingBone:
         """Whether it is ever anywhere else than in the first frame."""
         return bool(np.ptp(self.poses, axis=0).max() > 0.0)
 
+    def mesh(self, k: int) -> tuple[Floats, Integers]:
+        """Vertices and faces in the k-th frame."""
+        return self.vertices @ self.poses[k, :3, :3].T + self.poses[k, :3, 3], self.faces
+
 
 @dataclass(frozen=True)
 class MovingRun:
@@ -81,12 +66,12 @@ class MovingRun:
     ----------
     name : str
         Of the scene.
-    unit : str
-        ``"m"``, ``"cm"`` or ``"mm"``: of all lengths here.
+    unit : {"m", "cm", "mm"}
+        Of all lengths here.
     times : (T,) ndarray
         Of the frames [s].
-    muscles : list of MovingMuscle
-    bones : list of MovingBone
+    timed : bool
+        Whether these are the motion's own.
     up : {"z", "y"}
         The axis that points up.
     """
@@ -94,57 +79,36 @@ class MovingRun:
     name: str
     unit: str
     times: Floats
+    timed: bool
     muscles: list[MovingMuscle]
     bones: list[MovingBone]
     up: str
 
 
-def read_moving(
-    saved: SavedRun, frames: list[int], *, unit: str, up: str = "z", values: VertexValues | None = None
-) -> MovingRun:
-    """All frames of a saved run at once.
-
-    Parameters
-    ----------
-    saved : SavedRun
-    frames : list of int
-        Frames to read.
-    unit : {"m", "cm", "mm"}
-        Of the lengths returned.
-    up : {"z", "y"}
-    values : VertexValues, optional
-        What to tell of the vertices.
-
-    Returns
-    -------
-    MovingRun
-    """
+def read_moving(saved: SavedRun, frames: list[int], *, unit: str, up: str = "z") -> MovingRun:
+    """Some frames of a saved run at once, lengths in ``unit``."""
     factor = MM_PER_UNIT[saved.units] / MM_PER_UNIT[unit]
-    muscles = [_read_muscle(saved, name, frames, factor, values) for name in saved.muscles]
+    muscles = [_read_muscle(saved, name, frames, factor) for name in saved.muscles]
     bones = []
     for name in saved.bones:
         vertices, faces = saved.bone(name)
         poses = np.array([saved.poses[frame][name] for frame in frames])
         poses[:, :3, 3] *= factor
         bones.append(MovingBone(name, _rgb(BONE_COLOUR), vertices * factor, faces, poses))
-    scene = saved.info["scene"]
-    times = np.array([saved.times[frame] for frame in frames]) if saved.times else None
-    if times is None:
-        times = np.array(frames, dtype=float) / FRAMES_A_SECOND
-    return MovingRun(str(scene.get("name") or Path(saved.directory).name), unit, times, muscles, bones, up)
+    times = saved.times or {frame: frame / FRAMES_A_SECOND for frame in frames}
+    name = str(saved.info["scene"].get("name") or Path(saved.directory).name)
+    at = np.array([times[frame] for frame in frames], dtype=float)
+    return MovingRun(name, unit, at, bool(saved.times), muscles, bones, up)
 
 
-def _read_muscle(saved, name, frames, factor, told):
-    vertices, faces, values = [], [], {}
+def _read_muscle(saved, name, frames, factor):
+    vertices, faces = [], []
     for frame in frames:
         points, triangles = saved.surface(name, frame)
-        if faces and faces[0].shape == triangles.shape and np.array_equal(faces[0], triangles):
-            triangles = faces[0]
+        same = faces and np.array_equal(faces[0], triangles)
         vertices.append(points * factor)
-        faces.append(triangles)
-        for key, value in (told.of(name, frame, points, factor=factor) if told else {}).items():
-            values.setdefault(key, []).append(value)
-    return MovingMuscle(name, _rgb(muscle_colours(saved.muscles)[name]), vertices, faces, values)
+        faces.append(faces[0] if same else triangles)
+    return MovingMuscle(name, _rgb(muscle_colours(saved.muscles)[name]), vertices, faces)
 
 
 def _rgb(colour):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,14 +14,7 @@ from rbfmuscle.validation import MeshError
 SUFFIXES = {"pvd": ".vtp", "vtp": ".vtp", "ply": ".ply", "stl": ".stl", "obj": ".obj", "glb": ".glb"}
 
 
-def write_mesh(
-    path: str | Path,
-    vertices: ArrayLike,
-    faces: ArrayLike,
-    *,
-    single: bool = False,
-    values: dict[str, Any] | None = None,
-) -> None:
+def write_mesh(path: str | Path, vertices: ArrayLike, faces: ArrayLike) -> None:
     """Write a triangle mesh in the format of the file's suffix.
 
     Parameters
@@ -31,22 +23,18 @@ def write_mesh(
         ``.vtp``, ``.ply``, ``.stl``, ``.obj`` or ``.glb``. PLY, STL and GLB hold single precision.
     vertices : (n, 3) array_like
     faces : (m, 3) array_like of int
-    single : bool
-        Positions in single precision where the format leaves the choice.
-    values : dict of str to (n,) array_like, optional
-        Of the vertices; VTP and PLY hold them.
     """
     path = Path(path)
     if path.suffix == ".vtp":
-        write_vtp(path, vertices, faces, single=single, values=values)
+        write_vtp(path, vertices, faces)
         return
     import trimesh
 
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    for name, value in (values or {}).items():
-        mesh.vertex_attributes[name] = np.asarray(value, dtype=np.float32)
     if path.suffix == ".obj":
-        path.write_text(_obj_text(mesh), encoding="ascii")
+        path.write_text(
+            trimesh.exchange.obj.export_obj(mesh, include_normals=False, digits=12), encoding="ascii"
+        )
     else:
         path.write_bytes(mesh.export(file_type=path.suffix[1:]))
 
@@ -82,8 +70,3 @@ def read_mesh(path: str | Path) -> tuple[Floats, Integers]:
     if not len(getattr(mesh, "faces", ())):
         raise MeshError(f"{path} holds no triangles")
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
-
-
-def _obj_text(mesh):
-    points = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in mesh.vertices.tolist())
-    return points + "".join(f"f {a} {b} {c}\n" for a, b, c in (mesh.faces + 1).tolist())

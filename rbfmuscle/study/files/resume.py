@@ -143,7 +143,7 @@ def _damaged(directory: Path, scene: Scene, state: dict[str, Any]) -> Iterator[P
                 path = directory / "surfaces" / f"{muscle.name}_{frame['frame']:04d}{suffix}"
                 if not _is_at_least(path, 1):
                     yield path
-    for folder in ("surfaces", "bones", "fibres"):
+    for folder in ("surfaces", "bones"):
         for path in sorted((directory / folder).glob("*_[0-9][0-9][0-9][0-9]*.*")):
             if int(path.stem.rpartition("_")[2]) <= files["last"] and not _is_whole(path):
                 yield path

@@ -14,7 +14,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.study.files.meshfiles import SUFFIXES, read_mesh
 from rbfmuscle.study.measure.quantities import Row
-from rbfmuscle.validation import MeshError, UsageError
+from rbfmuscle.validation import UsageError
 
 
 class SavedRun:
@@ -132,50 +132,20 @@ class SavedRun:
         """Whether there is something to draw."""
         return self.suffix is not None and bool(self.frames)
 
-    def has_fibres(self) -> bool:
-        """Whether the run wrote fibres."""
-        return bool(self.info["scene"]["output"].get("fibres"))
-
-    def fibres(self, muscle: str, frame: int) -> tuple[Floats, dict[str, Floats]]:
-        """Points (count, k, 3) of the fibres of a muscle in a frame, and their ``length`` and ``stretch``.
-
-        Raises
-        ------
-        UsageError
-            If the run wrote none.
-        """
-        from rbfmuscle.study.files.fibre_files import read_fibres
-
-        if not self.has_fibres():
-            raise UsageError(f"{self.directory} has no fibres: set output.fibres = true in the run's scene")
-        return read_fibres(self.directory / "fibres" / f"{muscle}_{frame:04d}.vtp")
-
     def _whole_frames(self):
         """Entries of ``run.json`` for the frames of which every file is there.
 
-        A frame's surfaces are on the disk before its poses, its fibres after them: only those of the last frame
-        can be cut short.
+        A frame's surfaces are on the disk before its poses.
         """
         planned = self.info.get("planned", [])
-        found = [
+        return [
             {"frame": frame, "coordinates": planned[frame] if frame < len(planned) else {}, "wall": None}
             for frame, poses in self.poses.items()
             if set(poses) >= set(self.bones) and self._has_files(frame)
         ]
-        if found and self.has_fibres() and not self._fibres_are_whole(found[-1]["frame"]):
-            found.pop()
-        return found
 
     def _has_files(self, frame):
         return self.suffix is None or all(self._file("surfaces", m, frame).is_file() for m in self.muscles)
-
-    def _fibres_are_whole(self, frame):
-        try:
-            for muscle in self.muscles:
-                self.fibres(muscle, frame)
-        except (MeshError, ValueError):
-            return False
-        return True
 
     def _file(self, folder, name, frame):
         if self.suffix is None:

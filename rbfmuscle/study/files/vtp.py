@@ -8,103 +8,48 @@ import os
 import zlib
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-_BLOCK = 1 << 20
-_TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32", "i8": "Int64"}
+_TYPES = {"f8": "Float64", "i4": "Int32"}
 
 
-def write_vtp(
-    path: str | Path,
-    vertices: ArrayLike,
-    faces: ArrayLike,
-    *,
-    ascii: bool = False,
-    single: bool = False,
-    values: dict[str, Any] | None = None,
-) -> None:
-    """Write a triangle mesh as VTK XML PolyData.
+def write_vtp(path: str | Path, vertices: ArrayLike, faces: ArrayLike) -> None:
+    """Write a triangle mesh as VTK XML PolyData, positions in double precision.
 
     Parameters
     ----------
     path : path
     vertices : (n, 3) array_like
     faces : (m, 3) array_like of int
-    ascii : bool
-        Plain numbers, as OpenSim reads them; else compressed base64, for which no reader needs a setting.
-    single : bool
-        Positions in single precision.
-    values : dict of str to (n,) array_like, optional
-        Of the vertices.
     """
-    vertices = np.ascontiguousarray(vertices, dtype=np.float32 if single else np.float64)
-    faces = np.ascontiguousarray(faces, dtype=np.int32)
-    ends = np.arange(3, 3 * len(faces) + 1, 3, dtype=np.int32)
-    _write_polydata(path, vertices, ("Polys", faces.ravel(), ends), ("PointData", values or {}), ascii)
+    points = np.ascontiguousarray(vertices, dtype="<f8")
+    corners = np.ascontiguousarray(faces, dtype="<i4")
+    ends = np.arange(3, 3 * len(corners) + 1, 3, dtype="<i4")
+    text = (
+        '<?xml version="1.0"?>\n'
+        '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt32" '
+        'compressor="vtkZLibDataCompressor">\n<PolyData>\n'
+        f'<Piece NumberOfPoints="{len(points)}" NumberOfVerts="0" NumberOfLines="0" NumberOfStrips="0" '
+        f'NumberOfPolys="{len(corners)}">\n'
+        f"<Points>\n{_array(points, 'Points', 3)}</Points>\n"
+        f"<Polys>\n{_array(corners.ravel(), 'connectivity')}{_array(ends, 'offsets')}</Polys>\n"
+        "</Piece>\n</PolyData>\n</VTKFile>\n"
+    )
+    Path(path).write_text(text, encoding="ascii")
 
 
-def write_vtp_lines(
-    path: str | Path, points: ArrayLike, *, cells: dict[str, Any] | None = None, ascii: bool = False
-) -> None:
-    """Write polylines of equally many points as VTK XML PolyData.
-
-    Parameters
-    ----------
-    path : path
-    points : (count, k, 3) array_like
-    cells : dict of str to (count,) array_like, optional
-        Values of each line.
-    ascii : bool
-        Plain numbers; else compressed base64.
-    """
-    points = np.asarray(points, dtype=np.float64)
-    count, each = points.shape[:2]
-    numbers = np.arange(count * each, dtype=np.int32)
-    ends = each * np.arange(1, count + 1, dtype=np.int32)
-    positions = np.ascontiguousarray(points.reshape(-1, 3))
-    _write_polydata(path, positions, ("Lines", numbers, ends), ("CellData", cells or {}), ascii)
-
-
-def _write_polydata(path, points, cells, values, ascii):
-    """Points, one kind of cells as (kind, point numbers, ends), and values of (whom, by name)."""
-    whose, values = values
-    kind, numbers, ends = cells
-    counts = {name: len(ends) * (name == kind) for name in ("Verts", "Lines", "Strips", "Polys")}
-    numbered = " ".join(f'NumberOf{name}="{count}"' for name, count in counts.items())
-    compressor = "" if ascii else ' compressor="vtkZLibDataCompressor"'
-    numbered_values = {name: np.ascontiguousarray(value, dtype=np.float64) for name, value in values.items()}
-    data = [_array(value, name, ascii) for name, value in numbered_values.items()]
-    parts = [
-        '<?xml version="1.0"?>\n',
-        '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt32"',
-        f'{compressor}>\n<PolyData>\n<Piece NumberOfPoints="{len(points)}" {numbered}>\n<Points>\n',
-        _array(points, "Points", ascii, components=3),
-        f"</Points>\n<{kind}>\n",
-        _array(numbers, "connectivity", ascii),
-        _array(ends, "offsets", ascii),
-        f"</{kind}>\n",
-        *([f"<{whose}>\n", *data, f"</{whose}>\n"] if data else []),
-        "</Piece>\n</PolyData>\n</VTKFile>\n",
-    ]
-    Path(path).write_text("".join(parts), encoding="ascii")
-
-
-def _array(values, name, ascii, *, components=1):
-    kind = _TYPES[values.dtype.str[1:]]
-    many = f' NumberOfComponents="{components}"' if components > 1 else ""
-    head = f'<DataArray type="{kind}" Name="{name}"{many} format="{"ascii" if ascii else "binary"}">\n'
-    if ascii:
-        rows = values.reshape(-1, 3) if values.size % 3 == 0 else values.reshape(-1, 1)
-        text = "\n".join(" ".join(map(repr, row)) for row in rows.tolist())
-    else:
-        data = values.astype(values.dtype.newbyteorder("<"), copy=False).tobytes()
-        # Digits of positions are as good as random: zlib would take forty times as long to save 7 %.
-        text = _compressed(data, 0) if values.dtype.kind == "f" else _compressed_again(data)
-    return f"{head}{text}\n</DataArray>\n"
+def _array(values, name, components=1):
+    # Digits of positions are as good as random: zlib would take forty times as long to save 7 %.
+    text = (
+        _compressed(values.tobytes(), 0) if values.dtype.kind == "f" else _compressed_again(values.tobytes())
+    )
+    return (
+        f'<DataArray type="{_TYPES[values.dtype.str[1:]]}" Name="{name}" NumberOfComponents="{components}" '
+        f'format="binary">\n{text}\n</DataArray>\n'
+    )
 
 
 @lru_cache(maxsize=128)
@@ -114,11 +59,10 @@ def _compressed_again(data: bytes) -> str:
 
 
 def _compressed(data, level):
-    """VTK's inline form: a header of block sizes, then the zlib blocks, each part in base64."""
-    blocks = [zlib.compress(data[start : start + _BLOCK], level) for start in range(0, len(data), _BLOCK)]
-    last = len(data) % _BLOCK
-    header = np.array([len(blocks), _BLOCK, last, *map(len, blocks)], dtype="<u4")
-    return (base64.b64encode(header.tobytes()) + base64.b64encode(b"".join(blocks))).decode("ascii")
+    """VTK's inline form: a header with the sizes of one zlib block, then the block, each in base64."""
+    block = zlib.compress(data, level)
+    header = np.array([1, len(data), 0, len(block)], dtype="<u4")
+    return (base64.b64encode(header.tobytes()) + base64.b64encode(block)).decode("ascii")
 
 
 class Collection:

@@ -35,8 +35,6 @@ _OLD_FILES = (
     "run.json",
     "surfaces.pvd",
     "bones.pvd",
-    "fibres.pvd",
-    "fibre_lengths.csv",
     "metrics.csv",
     "report.html",
     "preview.webp",
@@ -94,12 +92,8 @@ class RunWriter:
             self._clear(everything=not kept["sizes"])
             self._tables = {name: self._table(name, columns, kept) for name, columns in _tables(output)}
             names = ("surfaces", "bones") if self.format == "pvd" else ()
-            ends = {name: kept["ends"].get(name) for name in (*names, "fibres")}
+            ends = {name: kept["ends"].get(name) for name in names}
             self._collections = {n: Collection(self.directory / f"{n}.pvd", ends[n]) for n in names}
-            self._fibres = None
-            if output.fibres:
-                self._fibres = _fibre_files(self.directory, self._tables["fibre_lengths.csv"], ends["fibres"])
-                self._collections["fibres"] = self._fibres.collection
         except OSError as error:
             raise UsageError(
                 f"cannot write to {self.directory}: {error.strerror}; choose another folder"
@@ -122,7 +116,7 @@ class RunWriter:
         try:
             self._write(frame, rows)
         except OSError as error:
-            self._roll_back(frame.index, rows)
+            self._roll_back(frame.index)
             kept = f"{self.count} frames are kept in {self.directory}"
             raise SolveError(f"cannot write frame {frame.index}: {error.strerror}; {kept}") from None
         self.count, self._last = self.count + 1, frame.index
@@ -185,8 +179,6 @@ class RunWriter:
         events.writerows([e.frame, e.muscle, e.bone, e.count, e.action] for e in frame.events)
         poses_file.flush()
         events_file.flush()
-        if self._fibres is not None:
-            self._fibres.write(frame)
         self._add_rows(rows)
 
     def _add_rows(self, rows):
@@ -217,13 +209,13 @@ class RunWriter:
             if known is None or np.abs(known[0] - pose).max() > 0.0:
                 file = f"bones/{bone.name}_{frame.index:04d}{SUFFIXES[self.format]}"
                 vertices = np.asarray(bone.mesh.vertices) @ pose[:3, :3].T + pose[:3, 3]
-                write_mesh(self.directory / file, vertices, bone.mesh.faces, single=True)
+                write_mesh(self.directory / file, vertices, bone.mesh.faces)
                 known = self._bone_files[bone.name] = (pose.copy(), file)
             entries.append((bone.name, known[1]))
         return entries
 
-    def _roll_back(self, frame, rows):
-        """Leave the folder as it was before a frame that could not be written, with the rows of the one before.
+    def _roll_back(self, frame):
+        """Leave the folder as it was before a frame that could not be written.
 
         What the disk still allows: nothing here can be told better than the first refusal.
         """
@@ -238,17 +230,10 @@ class RunWriter:
                 collection.roll_back(self._good["ends"][name])
                 collection.close()
         self._remove(frame - 1)
-        if self.scene.output.metrics:
-            table = self.directory / "metrics.csv"
-            try:
-                with open(table, "a", encoding="utf-8", newline="") as file:
-                    csv.writer(file, lineterminator="\n").writerows(rows)
-            except OSError:
-                os.truncate(table, self._good["sizes"][table.name])
 
     def _remove(self, last):
         """Take the meshes of all frames after ``last`` away."""
-        for folder in ("surfaces", "bones", "fibres"):
+        for folder in ("surfaces", "bones"):
             for file in (self.directory / folder).glob("*_[0-9][0-9][0-9][0-9]*.*"):
                 if int(file.stem.rpartition("_")[2]) > last:
                     file.unlink(missing_ok=True)
@@ -305,21 +290,11 @@ def _tables(output):
     found = [("poses.csv", POSES_COLUMNS), ("events.csv", EVENTS_COLUMNS)]
     if output.metrics:
         found.append(("metrics.csv", METRICS_COLUMNS))
-    if output.fibres:
-        from rbfmuscle.study.files.fibre_files import COLUMNS
-
-        found.append(("fibre_lengths.csv", COLUMNS))
     return found
 
 
 def _degrees(coordinates):
     return {name: math.degrees(value) for name, value in coordinates.items()}
-
-
-def _fibre_files(directory, table, end):
-    from rbfmuscle.study.files.fibre_files import FibreFiles
-
-    return FibreFiles(directory, table, end)
 
 
 def write_json(path: Path, data: dict[str, Any]) -> None:

@@ -38,16 +38,6 @@ class MuscleAtRest(NamedTuple):
     faces: Integers
     moving: Collection[str] | None = None
 
-    def grown_fibres(self, count: int, segments: int) -> Floats:
-        """Fibres (count, segments + 1, 3) of the input mesh from origin to insertion, as `grow_fibres` has them."""
-        from rbfmuscle.study.measure.fibre_lines import grow_fibres
-
-        groups = split_ends(self.muscle, self.joints, self.moving)
-        ends = [np.concatenate([np.asarray(a.vertices) for a in group]) for group in groups]
-        mesh = self.muscle.mesh
-        vertices = np.asarray(mesh.vertices, dtype=np.float64)
-        return grow_fibres(vertices, np.asarray(mesh.faces), ends, count=count, segments=segments)
-
 
 class Centreline:
     """The centreline of one muscle on a mesh of constant topology.

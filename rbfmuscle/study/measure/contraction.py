@@ -1,4 +1,4 @@
-"""What is measured of muscles that contract: fibres, pennation, thickness and greatest section."""
+"""What is measured of muscles that contract: fibres of the scene, thickness and greatest section."""
 
 from __future__ import annotations
 
@@ -14,11 +14,9 @@ from rbfmuscle.geometry.mean_value import mean_value_weights
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.sim.contraction.resolve import resolve_contraction
 from rbfmuscle.study.measure.centreline import MuscleAtRest, carried_middle, end_groups
-from rbfmuscle.study.measure.fibre_lines import resampled
 from rbfmuscle.validation import SolveError
 
-# Fibres that are grown where the scene gives none, and the segments of each.
-COUNT, SEGMENTS = 40, 16
+SEGMENTS = 16  # of each fibre
 STATIONS = 48  # sections along the line of action
 SKIN = 0.004  # of the muscle's diagonal: how deep below the surface a fibre is kept
 CALIPERS = 36  # directions in which a section's width is taken
@@ -30,37 +28,31 @@ class ContractionStudy:
     Parameters
     ----------
     rest : MuscleAtRest
-        Its muscle has keys of contraction. Fibres are followed where the scene gives them, else streamlines of
-        the harmonic field (`grow_fibres`).
+        Its muscle has keys of contraction. Fibres are followed where the scene gives them; without any there is
+        nothing to tell of them.
     """
 
     def __init__(self, rest: MuscleAtRest) -> None:
         muscle, vertices, faces = rest.muscle, rest.vertices, rest.faces
         self.name = muscle.name
-        mesh = np.asarray(muscle.mesh.vertices, dtype=np.float64)
-        if muscle.fibres:
-            lines = np.array([resampled(np.asarray(line, dtype=float), SEGMENTS) for line in muscle.fibres])
-        else:
-            lines = rest.grown_fibres(COUNT, SEGMENTS)
+        self.ends = end_groups(muscle, rest.joints, rest.moving)
+        self.weights = None
+        if not muscle.fibres:
+            return
+        lines = np.array([resampled(np.asarray(line, dtype=float), SEGMENTS) for line in muscle.fibres])
         lines = _kept_inside(lines, vertices, faces)
         self.shape = lines.shape
         self.weights = mean_value_weights(lines.reshape(-1, 3), vertices, faces)
-        tendon = resolve_contraction(muscle).tendon[cKDTree(mesh).query(lines)[1]]
+        nearest = cKDTree(np.asarray(muscle.mesh.vertices, dtype=float)).query(lines)[1]
+        tendon = resolve_contraction(muscle).tendon[nearest]
         # A segment is belly where neither end is tendon; a line of tendon alone counts for nothing.
         self.belly = ~(tendon[:, 1:] | tendon[:, :-1])
         self.rest_lengths = _segments(self.lines(vertices))
-        self.ends = end_groups(muscle, rest.joints, rest.moving)
 
     def lines(self, vertices: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The fibres (n, k, 3) that a carried mesh with these vertices holds."""
+        """The fibres (n, k, 3) that a carried mesh with these vertices holds; there must be some."""
         middle = vertices.mean(axis=0)
         return (self.weights @ (vertices - middle) + middle).reshape(self.shape)
-
-    def stretches(self, vertices: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Middles (s, 3) of the fibres' segments in belly, and their stretch against the scan (s,)."""
-        lines = self.lines(vertices)
-        middles = 0.5 * (lines[:, 1:] + lines[:, :-1])
-        return middles[self.belly], (_segments(lines) / self.rest_lengths)[self.belly]
 
     def measure(self, vertices: Floats, poses: dict[str, Any], surface: Any = None) -> dict[str, float]:
         """Quantities of a frame.
@@ -78,19 +70,17 @@ class ContractionStudy:
         dict of str to float
             Lengths in scene units, ``pennation`` in degrees, ``csa_place`` as a share of the line of action.
         """
-        lines = self.lines(vertices)
-        lengths = _segments(lines)
-        counted = self.belly.any(axis=1)
-        stretch = (lengths / self.rest_lengths)[self.belly]
         first, last = (carried_middle(end, poses) for end in self.ends)
-        axis = (last - first) / np.linalg.norm(last - first)
-        found = {
-            "fibre_length": float((lengths * self.belly).sum(axis=1)[counted].mean()),
-            "fibre_stretch": float(stretch.mean()),
-            "fibre_stretch_5": float(np.quantile(stretch, 0.05)),
-            "fibre_stretch_95": float(np.quantile(stretch, 0.95)),
-            "pennation": pennation(lines, self.belly, axis),
-        }
+        found = {}
+        if self.weights is not None:
+            lines = self.lines(vertices)
+            lengths = _segments(lines)
+            counted = self.belly.any(axis=1)
+            found = {
+                "fibre_length": float((lengths * self.belly).sum(axis=1)[counted].mean()),
+                "fibre_stretch": float((lengths / self.rest_lengths)[self.belly].mean()),
+                "pennation": pennation(lines, self.belly, (last - first) / np.linalg.norm(last - first)),
+            }
         if surface is not None:
             found.update(belly_measures(surface.vertices, np.asarray(surface.faces), first, last))
         return found
@@ -197,6 +187,13 @@ def _kept_inside(lines, vertices, faces):
     if not good.any():
         raise SolveError("no fibre lies inside the muscle's mesh, so none can be followed; check fibres")
     return points.reshape(lines.shape)[good]
+
+
+def resampled(line: Floats, segments: int) -> Floats:
+    """Points (segments + 1, 3) at even distances along a polyline."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    even = np.linspace(0.0, along[-1], segments + 1)
+    return np.stack([np.interp(even, along, line[:, k]) for k in range(3)], axis=1)
 
 
 def _segments(lines):

@@ -12,12 +12,10 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import Layout
 from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.sim.joints.skeleton import all_coordinates
-from rbfmuscle.sim.scene.motion import shown_value
 from rbfmuscle.study.measure.centreline import Centreline, MuscleAtRest, moving_joints
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.measure.penetration import BoneProbe, bone_depth, surface_depth
-from rbfmuscle.study.measure.quantities import QUANTITIES, Row
+from rbfmuscle.study.measure.quantities import QUANTITIES
 from rbfmuscle.study.measure.topology import SurfaceForm
 
 if TYPE_CHECKING:
@@ -40,13 +38,10 @@ class Measured(NamedTuple):
         By quantity, in the order of `QUANTITIES`.
     length : float
         Along its centreline [scene unit], NaN where it has none.
-    arms : list of Row or None
-        Moment arms by small motions of the bones; None where they follow from lengths frame by frame.
     """
 
     values: dict[str, float]
     length: float
-    arms: list[Row] | None
 
 
 class MuscleMeasures:
@@ -93,14 +88,10 @@ class _Tracker:
         self.mesh = muscle.mesh
         self.edges = unique_edges(faces)
         self.rest_lengths = edge_lengths(vertices, self.edges)
-        has_line = len(muscle.attachments) > 1
         rest = MuscleAtRest(muscle, scene.joints, vertices, faces, moving_joints(scene))
-        self.line = Centreline(rest) if has_line else None
+        self.line = Centreline(rest) if len(muscle.attachments) > 1 else None
         self.contraction = _contraction(rest)
         self.rest_measured = False
-        output = getattr(scene, "output", None)
-        self.nudged = output is not None and bool(output.moment_arms) and has_line
-        self.scene = scene
         self.offset = None
         self.form = SurfaceForm()
         # Of the last surface: its faces, and what its distance can be had quicker with while they stay.
@@ -135,25 +126,12 @@ class _Tracker:
             found["activation"] = frame.activations[self.name]
             surface = frame.surfaces.get(self.name)
             found.update(self.contraction.measure(frame.carried[self.name][0], frame.poses, surface))
-        if self.name in frame.fibres:
-            lengths = frame.fibres[self.name].lengths
-            found.update(fibre_length_mean=np.mean(lengths), fibre_length_std=np.std(lengths))
         times = frame.times.get(self.name, {})
         if times:
             found["time_solve"] = times.get("time_predict", 0.0) + times.get("time_solve", 0.0)
             found["time_frame"] = times["time_frame"]
         values = {quantity: found[quantity] for quantity in QUANTITIES if quantity in found}
-        return Measured(values, length, self._nudged_arms(frame) if self.nudged else None)
-
-    def _nudged_arms(self, frame):
-        """A row for each coordinate that moves the muscle: minus the change of length with it."""
-        facts, rows = all_coordinates(self.scene.joints), []
-        for name, (span, below, above) in frame.nudged.get(self.name, {}).items():
-            arm = -(self.line.length(*above) - self.line.length(*below)) / span
-            unit = "1" if facts[name].motion == "translation" else self.scene.units
-            value = shown_value(self.scene, name, frame.coordinates.get(name, facts[name].rest))
-            rows.append(Row(frame.index, name, value, self.name, "moment_arm", arm, unit))
-        return rows
+        return Measured(values, length)
 
     def _of_surface(self, surface, frame, probes, first_rest):
         vertices, faces = surface.vertices, np.asarray(surface.faces)

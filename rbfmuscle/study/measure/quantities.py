@@ -32,19 +32,13 @@ QUANTITIES = {
     "condition": ("1", "condition estimate of the fit"),
     "length": ("length", "centreline from origin to insertion"),
     "moment_arm": ("length", "minus the change of length with the coordinate's angle"),
-    "activation": ("1", "activation, 0 to 1; this and the next seven for muscles that contract"),
-    "fibre_length": ("length", "mean length of the fibres without their tendon"),
+    "activation": ("1", "activation, 0 to 1; this and the next six for muscles that contract"),
+    "fibre_length": ("length", "mean length of the scene's fibres without their tendon"),
     "fibre_stretch": ("1", "mean stretch of these against the scan"),
-    "fibre_stretch_5": ("1", "the stretch that 5 % of their segments stay below"),
-    "fibre_stretch_95": ("1", "the stretch that 5 % of their segments exceed"),
     "pennation": ("deg", "mean angle of these to the line between the middles of origin and insertion"),
     "belly_thickness": ("length", "least width of the greatest section across that line"),
     "csa_max": ("area", "area of the greatest section across that line"),
     "csa_place": ("1", "where it lies: 0 at the origin, 1 at the insertion"),
-    "fibre_length_mean": ("length", "mean length of the fibres"),
-    "fibre_length_std": ("length", "standard deviation of the fibres' lengths"),
-    "fibre_moment_arm_mean": ("length", "mean over the fibres of their moment arms"),
-    "fibre_moment_arm_std": ("length", "standard deviation of the fibres' moment arms"),
     "time": ("s", "time of the frame in the motion file; muscle 'all'"),
     "time_solve": ("s", "prediction, solution and contacts"),
     "time_fit": ("s", "fit of the field"),
@@ -52,7 +46,6 @@ QUANTITIES = {
     "time_frame": ("s", "all of the frame; muscle 'all': wall time of all muscles together"),
 }
 ALL = "all"
-FIBRES = "fibres"
 
 
 class Row(NamedTuple):

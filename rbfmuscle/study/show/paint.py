@@ -1,4 +1,4 @@
-"""What pictures of a run may colour its muscles by: themselves, their activation, the stretch of their fibres."""
+"""What pictures of a run may colour its muscles by: themselves or their activation."""
 
 from __future__ import annotations
 
@@ -7,19 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.show.appearance import muscle_colours
 from rbfmuscle.validation import UsageError
 
-COLOURINGS = ("muscle", "activation", "stretch")
+COLOURINGS = ("muscle", "activation")
 PAINT_COLOURS = "viridis"
 CHIPS = 5
-# Stretch of 1 is the middle of its colours; they end so far from it where no fibre goes farther.
-LEAST_SPAN = 0.05
-# Segments of fibres that a point takes its stretch from. Over a few: one fibre's edge beside another's would be a
-# pattern of the fibres, not of the muscle.
-NEAREST = 4
 
 Paint = Callable[[SavedRun, str, int, Floats], Floats]
 
@@ -30,8 +25,6 @@ def check_colouring(saved: SavedRun, colour: str) -> None:
         raise UsageError(f"unknown colouring {colour!r}; known: {', '.join(COLOURINGS)}")
     if colour == "activation" and not activations(saved):
         raise UsageError(f"{saved.directory} has no activation: none of its muscles contracts")
-    if colour == "stretch" and not saved.has_fibres():
-        raise UsageError(f"{saved.directory} has no fibres: set output.fibres = true in the run's scene")
 
 
 def painting(saved: SavedRun, colour: str, frames: list[int]) -> tuple[Paint | None, dict[str, Any]]:
@@ -56,15 +49,6 @@ def painting(saved: SavedRun, colour: str, frames: list[int]) -> tuple[Paint | N
         return _Activation(saved), scale_chips(
             [f"activation {share:g}" for share in np.linspace(0, 1, CHIPS)]
         )
-    if colour == "stretch":
-        away = [
-            np.abs(saved.fibres(m, frame)[1]["stretch"] - 1.0).max()
-            for m in saved.muscles
-            for frame in frames
-        ]
-        span = max(LEAST_SPAN, *away)
-        texts = [f"stretch {1.0 + span * place:.2f}" for place in np.linspace(-1, 1, CHIPS)]
-        return _Stretch(span), scale_chips(texts)
     return None, muscle_colours(saved.muscles)
 
 
@@ -90,34 +74,3 @@ class _Activation:
 
     def __call__(self, _saved: SavedRun, muscle: str, frame: int, vertices: Floats) -> Floats:
         return np.full(len(vertices), self.known.get((muscle, frame), 0.0))
-
-
-def local_stretch(saved: SavedRun, muscle: str, frame: int) -> Floats:
-    """Stretch (count, segments) along each fibre of a run, against its first frame."""
-    ends = [
-        np.linalg.norm(np.diff(saved.fibres(muscle, f)[0], axis=1), axis=2) for f in (saved.frames[0], frame)
-    ]
-    return ends[1] / ends[0]
-
-
-def near_segments(saved: SavedRun, muscle: str, frame: int, vertices: Floats) -> tuple[Integers, Floats]:
-    """Segments of fibres (n, k) near each of some points (n, 3) of a muscle, by their place, and their shares."""
-    points = saved.fibres(muscle, frame)[0]
-    middles = (0.5 * (points[:, 1:] + points[:, :-1])).reshape(-1, 3)
-    from scipy.spatial import cKDTree
-
-    away, nearest = cKDTree(middles).query(vertices, k=[*range(1, min(NEAREST, len(middles)) + 1)])
-    weight = 1.0 / np.maximum(away, 1e-9)
-    return nearest, weight / weight.sum(axis=1, keepdims=True)
-
-
-class _Stretch:
-    """Each point by the stretch of the nearest segment of a fibre."""
-
-    def __init__(self, span: float) -> None:
-        self.span = span
-
-    def __call__(self, saved: SavedRun, muscle: str, frame: int, vertices: Floats) -> Floats:
-        nearest, shares = near_segments(saved, muscle, frame, vertices)
-        mean = (local_stretch(saved, muscle, frame).ravel()[nearest] * shares).sum(axis=1)
-        return np.clip(0.5 + 0.5 * (mean - 1.0) / self.span, 0.0, 1.0)

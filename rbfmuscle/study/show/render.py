@@ -59,7 +59,7 @@ def render_run(
         Of one view [pixel].
     seconds : float
         Length of an animation.
-    colour : {"muscle", "activation", "stretch"}
+    colour : {"muscle", "activation"}
         What muscles are coloured by.
 
     Raises

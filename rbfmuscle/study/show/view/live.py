@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
 from rbfmuscle.sim.scene.motion import inner_value, shown_value
@@ -20,8 +19,6 @@ if TYPE_CHECKING:
 
 
 ACTIVATION = "activation "  # what the name of a muscle's slider begins with
-CONTRACTION = ("fibres", "activation")  # colourings of muscles that contract
-NEAREST_FIBRES = 4  # segments that speak for one vertex
 # Coordinates advance by so many sub-steps a picture, so that a picture never waits for a long way.
 SUBSTEPS_A_PICTURE = 1
 
@@ -55,7 +52,6 @@ class LiveViewer(Viewer):
         self.stride = SUBSTEPS_A_PICTURE * math.radians(scene.contact.substep_angle)
         self._built, self._edges, self._rate = {}, {}, 0.0
         self._frame: Any = None
-        self._studies, self._rests = {}, {}
         self._stale = True
         self._switch()
 
@@ -76,7 +72,6 @@ class LiveViewer(Viewer):
                 carried, faces = model.carried_mesh()
                 edges = unique_edges(faces)
                 self._edges[model.name] = edges, edge_lengths(carried, edges)
-                self._rests[(*key, model.name)] = carried, faces
         self._stale, self.message = True, ""
 
     @property
@@ -150,31 +145,12 @@ class LiveViewer(Viewer):
                 found = self._values(
                     name, surface.vertices, surface.faces, frame.poses, frame.carried[name], error
                 )
-                if self.colouring in CONTRACTION and name in self.session.activation:
-                    found = self._contraction(name, frame)
+                if self.colouring == "activation" and name in self.session.activation:
+                    found = np.full(len(surface.vertices), frame.activations[name])
                 view.values[name] = found
         if self.message:
             view.lines.append(self.message)
         return view
-
-    def _contraction(self, name, frame):
-        """Activation of a muscle, or the stretch of its nearest fibres, at each vertex of its surface."""
-        vertices = frame.surfaces[name].vertices
-        if self.colouring == "activation":
-            return np.full(len(vertices), frame.activations[name])
-        key = (self.model, self.quality, name)
-        if key not in self._studies:
-            from rbfmuscle.study.measure.centreline import MuscleAtRest
-            from rbfmuscle.study.measure.contraction import ContractionStudy
-
-            scene = self.session.scene
-            self._studies[key] = ContractionStudy(
-                MuscleAtRest(scene.muscle(name), scene.joints, *self._rests[key])
-            )
-        middles, stretch = self._studies[key].stretches(frame.carried[name][0])
-        distance, index = cKDTree(middles).query(vertices, k=min(NEAREST_FIBRES, len(middles)))
-        share = 1.0 / np.maximum(distance, 1e-9 * np.ptp(vertices)) ** 2
-        return (share * stretch[index]).sum(axis=1) / share.sum(axis=1)
 
     def _rest_edges(self, name, carried, faces):
         return self._edges[name]

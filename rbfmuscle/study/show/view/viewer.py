@@ -27,7 +27,6 @@ COLOURINGS = {
     "distance": ("distance to bone", (0.0, 20.0), "viridis"),
     "stretch": ("stretch of edges", (-0.5, 0.5), "coolwarm"),
     "volume": ("volume error", (-0.01, 0.01), "coolwarm"),
-    "fibres": ("stretch of fibres", (0.5, 1.5), "coolwarm"),
     "activation": ("activation", (0.0, 1.0), "Reds"),
 }
 LENGTHS = ("penetration", "distance")

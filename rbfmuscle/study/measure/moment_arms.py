@@ -1,0 +1,65 @@
+"""Moment arms: minus the derivative of a muscle's length with a coordinate, from what a motion recorded."""
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+# A slope is fitted over the frames within so many degrees, or millimetres of a shift, and over the frames next to it.
+# Of motions by one degree the ripple of the arms about smooth curves is then at most 0.3 mm RMS (docs/moment_arms.md).
+REACH = 8.0
+# Coordinates that change by less [radian or scene unit] rest.
+_STILL = 1e-9
+
+
+def moment_arms(
+    path: Sequence[Mapping[str, float]], lengths: Sequence[float], reach: Mapping[str, float] | None = None
+) -> list[dict[str, float]]:
+    """Moment arms -dl/dq along a motion.
+
+    A parabola is fitted to the lengths of the frames within ``reach``, and always of both neighbours, as far as the
+    coordinate goes on alone and in one direction: with two neighbours it is the central difference, at an end
+    the difference to the one neighbour.
+
+    Parameters
+    ----------
+    path : sequence of mapping of str to float
+        Coordinates of each frame [radian or scene unit].
+    lengths : sequence of float
+        Length in each frame [scene unit]; NaN where it is not known.
+    reach : mapping of str to float, optional
+        Of each coordinate [radian or scene unit]; `REACH` degrees where not given.
+
+    Returns
+    -------
+    list of dict of str to float
+        For each frame the arm about each coordinate that moves alone before or after it [scene unit a radian, or 1].
+    """
+    values, found = np.asarray(lengths, dtype=float), [dict[str, float]() for _ in path]
+    for name, first, last in _single_motions(path, values):
+        at = np.array([path[k].get(name, 0.0) for k in range(first, last + 1)])
+        wide = math.radians(REACH) if reach is None else reach[name]
+        for k in range(first, last + 1):
+            near = np.abs(at - at[k - first]) <= wide
+            near[max(0, k - first - 1) : k - first + 2] = True
+            away, long = at[near] - at[k - first], values[first : last + 1][near]
+            slope = np.polyfit(away, long, min(2, len(away) - 1))[-2]
+            found[k].setdefault(name, -float(slope))
+    return found
+
+
+def _single_motions(path, lengths):
+    """Name, first and last frame of each stretch in which one coordinate moves alone and in one direction."""
+    stretches = []
+    for k, (before, after) in enumerate(itertools.pairwise(path)):
+        moved = {n: after.get(n, 0.0) - before.get(n, 0.0) for n in {*before, *after}}
+        moved = {name: way for name, way in moved.items() if abs(way) > _STILL}
+        if len(moved) != 1 or not np.isfinite(lengths[k : k + 2]).all():
+            continue
+        ((name, way),) = moved.items()
+        if stretches and stretches[-1][:2] == (name, way > 0) and stretches[-1][3] == k:
+            stretches[-1] = (*stretches[-1][:3], k + 1)
+        else:
+            stretches.append((name, way > 0, k, k + 1))
+    return [(name, first, last) for name, _, first, last in stretches]
