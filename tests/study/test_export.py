@@ -45,6 +45,11 @@ class TestVtp:
         np.testing.assert_array_equal(data.regular_faces, mesh[1])
         assert data.n_open_edges == 0
 
+    def test_values_of_vertices_are_point_data(self, tmp_path, mesh):
+        values = {"distance": np.linspace(-1.0, 1.0, len(mesh[0]))}
+        write_vtp(tmp_path / "a.vtp", *mesh, values=values)
+        np.testing.assert_array_equal(pyvista.read(tmp_path / "a.vtp")["distance"], values["distance"])
+
     def test_large_arrays_too(self, tmp_path):
         rng = np.random.default_rng(0)
         vertices = rng.normal(size=(120_000, 3))

@@ -6,6 +6,7 @@ import base64
 import errno
 import os
 import zlib
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -16,7 +17,9 @@ from numpy.typing import ArrayLike
 _TYPES = {"f8": "Float64", "i4": "Int32"}
 
 
-def write_vtp(path: str | Path, vertices: ArrayLike, faces: ArrayLike) -> None:
+def write_vtp(
+    path: str | Path, vertices: ArrayLike, faces: ArrayLike, *, values: Mapping[str, ArrayLike] | None = None
+) -> None:
     """Write a triangle mesh as VTK XML PolyData, positions in double precision.
 
     Parameters
@@ -24,10 +27,13 @@ def write_vtp(path: str | Path, vertices: ArrayLike, faces: ArrayLike) -> None:
     path : path
     vertices : (n, 3) array_like
     faces : (m, 3) array_like of int
+    values : mapping of str to (n,) array_like, optional
+        Of the vertices, by name.
     """
     points = np.ascontiguousarray(vertices, dtype="<f8")
     corners = np.ascontiguousarray(faces, dtype="<i4")
     ends = np.arange(3, 3 * len(corners) + 1, 3, dtype="<i4")
+    data = "".join(_array(np.ascontiguousarray(v, dtype="<f8"), name) for name, v in (values or {}).items())
     text = (
         '<?xml version="1.0"?>\n'
         '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt32" '
@@ -36,7 +42,7 @@ def write_vtp(path: str | Path, vertices: ArrayLike, faces: ArrayLike) -> None:
         f'NumberOfPolys="{len(corners)}">\n'
         f"<Points>\n{_array(points, 'Points', 3)}</Points>\n"
         f"<Polys>\n{_array(corners.ravel(), 'connectivity')}{_array(ends, 'offsets')}</Polys>\n"
-        "</Piece>\n</PolyData>\n</VTKFile>\n"
+        f"<PointData>\n{data}</PointData>\n</Piece>\n</PolyData>\n</VTKFile>\n"
     )
     Path(path).write_text(text, encoding="ascii")
 

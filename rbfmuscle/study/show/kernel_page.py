@@ -9,10 +9,8 @@ import io
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from rbfmuscle.study.experiment.kernel_study import cost, row_name, row_toml
-from rbfmuscle.study.files.meshfiles import write_mesh
+from rbfmuscle.study.files.vtp import write_vtp
 from rbfmuscle.study.files.writer import json_text
 from rbfmuscle.study.measure.mesh_distance import MeshDistance
 from rbfmuscle.study.show.page import STYLE
@@ -71,8 +69,8 @@ def write_study(
         surfaces = dict(zip(map(row_name, study.rows), study.surfaces, strict=True))
         surface = surfaces[row_name(best)]
         if surface is not None:
-            values = {"distance": np.asarray(mesh.signed(surface[0]), dtype=np.float32)}
-            write_mesh(directory / "recommended.vtp", *surface, values=values)
+            values = {"distance": mesh.signed(surface[0])}
+            write_vtp(directory / "recommended.vtp", *surface, values=values)
     bad = "".join(
         f"<li>{html.escape(row_name(row))}: {html.escape(row['unfit'])}</li>"
         for row in study.rows
