@@ -21,7 +21,6 @@ from rbfmuscle.commands.new import new
 from rbfmuscle.commands.opensim.import_model import import_
 from rbfmuscle.commands.opensim.paths import paths
 from rbfmuscle.commands.plan import plan
-from rbfmuscle.commands.poses.ways import ways
 from rbfmuscle.commands.run import demo, run
 from rbfmuscle.commands.show import export, render
 from rbfmuscle.commands.sweep import sweep
@@ -45,7 +44,6 @@ for command in (
     render,
     new,
     view,
-    ways,
     kernels,
 ):
     app.command(command)

@@ -1,1 +1,0 @@
-"""Commands that ask where muscles rest in a pose."""
