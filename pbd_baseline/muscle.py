@@ -146,9 +146,6 @@ class PBDMuscle:
         self.points[:], self.before = points, before.copy()
         self.shape.restore(shape)
 
-    def continue_drawing(self, quantities: Mapping[str, float]) -> None:
-        """Nothing: every drawing of a mesh stands alone."""
-
     def carried_mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and faces, numbered as in the muscle's mesh but for the order of the faces."""
         vertices = np.empty_like(self.points)

@@ -21,8 +21,6 @@ from rbfmuscle.study.experiment.comparison import (
     measure_run,
     write_tables,
 )
-from rbfmuscle.study.files.checkpoint import read_checkpoint, write_checkpoint
-from rbfmuscle.study.files.resume import left_behind
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.files.writer import check_writable
 from rbfmuscle.validation import SolveError, UsageError
@@ -31,8 +29,6 @@ if TYPE_CHECKING:
     from rbfmuscle.sim.scene.scene import Scene
 
 
-# In each model's folder, for a comparison that resumes.
-MEASURES = "measures.npz"
 # The motion is repeated with steps this many times as long.
 COARSER = 5
 
@@ -46,7 +42,6 @@ def compare_models(
     settings: dict[str, Any] | None = None,
     pictures: bool = True,
     progress: Callable[..., Any] | None = None,
-    resume: bool = False,
 ) -> dict[str, Any]:
     """Run every model on a scene, measure all alike, and write tables, a report and pictures.
 
@@ -66,9 +61,6 @@ def compare_models(
     pictures : bool
     progress : callable, optional
         Called as ``progress(model, done, total)``.
-    resume : bool
-        Keep the models that the folder holds measured, of the same scene and settings; one that was under way is run
-        from its first frame, as what is measured beside its run is of all frames.
 
     Returns
     -------
@@ -78,7 +70,7 @@ def compare_models(
     Raises
     ------
     UsageError
-        On an unknown model or setting, and where what shall be resumed is another scene's.
+        On an unknown model or setting.
     SceneError, MeshError
         If the scene cannot be simulated.
     SolveError
@@ -102,8 +94,7 @@ def compare_models(
     results, failed = {}, {}
     for name, variant in variants.items():
         try:
-            kept = _kept(folder / name, variant) if resume else None
-            results[name] = kept or _measure(name, variant, folder / name, poses, progress)
+            results[name] = _measure(name, variant, folder / name, poses, progress)
         except SolveError as error:
             failed[name] = str(error)
     if not results:
@@ -148,15 +139,8 @@ def _variants(scene, models, settings):
     return variants
 
 
-def _kept(folder, scene):
-    """What was measured of a model that is done; None where it is not."""
-    found = left_behind(folder, scene)
-    return None if found is None or found.state is not None else read_checkpoint(folder / MEASURES)
-
-
 def _measure(name, scene, folder, poses, progress):
     """One model: warm up, run and watch, then there and back by coarser steps."""
-    (folder / MEASURES).unlink(missing_ok=True)
     _surfaces(_with_frames(scene, scene.motion.frames[:2]))
     probe = ModelProbe(scene, poses)
     report = None if progress is None else (lambda done, total: progress(name, done, total))
@@ -164,9 +148,7 @@ def _measure(name, scene, folder, poses, progress):
     with tell_stage(f"{name}: there and back by coarser steps"):
         again = _there_and_back(scene)
     with tell_stage(f"{name}: measuring"):
-        found = measure_run(SavedRun(folder), probe, again)
-    write_checkpoint(folder / MEASURES, found)
-    return found
+        return measure_run(SavedRun(folder), probe, again)
 
 
 def _there_and_back(scene):

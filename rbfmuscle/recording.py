@@ -35,8 +35,6 @@ class Recording:
         As it shall be run.
     options : dict, optional
         What the caller asked for, for ``run.json``.
-    resumable : bool
-        Give the sink what `go_on` needs, frame by frame.
     models_here : bool
         Build the models in this process, for who wants to watch them, however many they are.
     """
@@ -46,7 +44,6 @@ class Recording:
         scene: Scene,
         *,
         options: dict | None = None,
-        resumable: bool = False,
         models_here: bool = True,
     ) -> None:
         self.started, self._start = datetime.now(UTC), time.perf_counter()
@@ -57,7 +54,6 @@ class Recording:
         self.status, self.message = "running", ""
         self.summary, self.stages = Summary(), Stages()
         self.written: list[dict] = []
-        self.resumable, self._behind, self._measures = resumable, None, None
         self._place = {muscle.name: k for k, muscle in enumerate(scene.muscles)}
         with self.timed("compile"):
             compile_ahead({muscle.model for muscle in scene.muscles})
@@ -71,8 +67,8 @@ class Recording:
         """All muscles, here or in helpers' hands, and the events of bones; a scene that is refused ends the helpers."""
         if helpers < 2:
             check_initial(self.scene)
-            return Share(self.scene, resumable=self.resumable), _bones_driven_together(self.scene)
-        crew = Crew(self.scene, helpers, resumable=self.resumable)
+            return Share(self.scene), _bones_driven_together(self.scene)
+        crew = Crew(self.scene, helpers)
         try:
             check_initial(self.scene)
             driven = _bones_driven_together(self.scene)
@@ -85,29 +81,6 @@ class Recording:
     def timed(self, part: str) -> AbstractContextManager[None]:
         """Context whose time is added to one entry of ``times`` [s]."""
         return timed(self.times, part)
-
-    def go_on(self, state: dict, rows: list[Row]) -> None:
-        """Go on behind a frame: what a sink was given to keep with it, and the rows that were complete by then."""
-        self._behind, self.written = state["loop"], list(state["written"])
-        self._start -= state["times"].pop("wall", 0.0)
-        for part, seconds in state["times"].items():
-            self.times[part] = self.times.get(part, 0.0) + seconds
-        self.stages.go_on(state["stages"])
-        self.summary.add(rows)
-        self._measures = state["measures"]
-        if self.recorder is not None:
-            self.recorder.go_on(state["recorder"])
-
-    def _state(self, frame):
-        """What `go_on` needs behind a frame."""
-        return {
-            "loop": frame.state,
-            "written": self.written,
-            "times": {**self._spent(), "wall": time.perf_counter() - self._start},
-            "stages": self.stages.state(),
-            "measures": self._measures,
-            "recorder": None if self.recorder is None else self.recorder.state(),
-        }
 
     def feed(
         self,
@@ -128,8 +101,6 @@ class Recording:
                 with self.timed("write"):
                     sink.write(frame, rows)
                     self.written.append(frame_facts(self.scene, frame))
-                    if self.resumable:
-                        sink.keep(self._state(frame))
                 if progress is not None:
                     progress(len(self.written), len(self.scene.motion))
             self.status, self.message = "complete", ""
@@ -152,12 +123,12 @@ class Recording:
 
     def frames(self) -> Iterator[tuple[Frame, list[Row]]]:
         """The frames as they are solved, each with the rows of metrics that became complete with it."""
-        for frame, measured, measures in self.share.frames(self._behind, self._measures):
+        for frame, measured in self.share.frames():
             # By muscle, whoever solved it.
             frame.events.sort(key=lambda event: self._place[event.muscle])
             frame.events.extend(self._driven.get(frame.index, []))
             self.stages.add(frame)
-            self._measures, rows = measures, []
+            rows: list[Row] = []
             if self.recorder is not None:
                 rows = self.recorder.add(frame, measured)
                 self.summary.add(rows)

@@ -15,7 +15,6 @@ from rbfmuscle.models import configure_scene
 from rbfmuscle.recording import Recording
 from rbfmuscle.sim.loop.frame import Event, Frame
 from rbfmuscle.sim.scene.scene import Scene
-from rbfmuscle.study.files.resume import left_behind
 from rbfmuscle.study.files.sinks import MemorySink
 from rbfmuscle.study.files.writer import RunWriter, check_writable
 from rbfmuscle.study.measure.quantities import Row
@@ -92,7 +91,6 @@ def stream_run(
     pictures: bool = True,
     progress: Callable[[int, int], None] | None = None,
     watch: Callable[[list, Frame | None], None] | None = None,
-    resume: bool = False,
 ) -> dict:
     """Run a scene and write it to a folder frame by frame; memory does not grow with the frames.
 
@@ -109,9 +107,6 @@ def stream_run(
         Draw pictures for the report and the preview.
     watch : callable, optional
         Called as ``watch(models, None)`` before the motion and ``watch(models, frame)`` with every frame.
-    resume : bool
-        Go on behind the last whole frame of the run that the folder holds, if it holds one; the folder then is
-        the same as that of a run that was not interrupted, but for times.
 
     Returns
     -------
@@ -121,8 +116,7 @@ def stream_run(
     Raises
     ------
     UsageError
-        If a setting is unknown or impossible, the folder cannot be written to, or what shall be resumed is another
-        scene's run, or another version's.
+        If a setting is unknown or impossible, or the folder cannot be written to.
     SolveError
         If a frame cannot be solved or written; frames so far are kept.
     LimitExceededError
@@ -132,18 +126,10 @@ def stream_run(
     """
     scene = configure_scene(scene, settings, model=model, frames=frames)
     limits = parse_limits(fail_on, scene)
-    kept = left_behind(directory, scene) if resume else None
-    if kept is not None and kept.state is None:
-        require_limits(kept.info["muscles"], limits)
-        return kept.info
     check_writable(directory)
-    recording = Recording(
-        scene, options=_asked(model, settings, frames), resumable=True, models_here=watch is not None
-    )
+    recording = Recording(scene, options=_asked(model, settings, frames), models_here=watch is not None)
     with closing(recording):
-        writer = RunWriter(directory, scene, kept and kept.state["files"])
-        if kept is not None:
-            recording.go_on(kept.state, kept.rows)
+        writer = RunWriter(directory, scene)
         recording.feed(writer, progress=progress, watch=watch)
     return _finish(recording, writer, limits, pictures)
 
@@ -166,7 +152,6 @@ def _finish(recording, writer, limits, pictures):
             )
     info = recording.info()
     writer.write_info(info)
-    writer.finish()
     require_limits(recording.summary.table(), limits)
     if missing is not None:
         raise missing

@@ -57,9 +57,6 @@ class BlendMuscle:
     def settle(self, contacts):
         pass
 
-    def continue_drawing(self, quantities):
-        pass
-
     def carried_mesh(self):
         return self.x.copy(), self.faces
 

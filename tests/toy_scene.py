@@ -162,9 +162,6 @@ class ToyMuscle:
     def settle(self, contacts):
         pass
 
-    def continue_drawing(self, quantities):
-        pass
-
     def carried_mesh(self):
         return self.x.copy(), self.faces
 

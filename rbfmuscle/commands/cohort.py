@@ -48,10 +48,9 @@ def sweep_cohort(
 
 
 def run_job(job: CohortJob, directory: Path) -> dict[str, Any]:
-    """One run of a cohort into its folder, behind what is there of it; module-level, so that it can be sent away."""
+    """One run of a cohort into its folder; module-level, so that it can be sent away."""
     from rbfmuscle.commands.scenes import load_scene
     from rbfmuscle.run import stream_run
-    from rbfmuscle.study.files.resume import OtherRunError
 
     scene = load_scene(job.scene)
     if job.motion:
@@ -62,10 +61,7 @@ def run_job(job: CohortJob, directory: Path) -> dict[str, Any]:
         "settings": job.settings,
         "pictures": False,
     }
-    try:
-        return stream_run(scene, directory, resume=True, **options)
-    except OtherRunError:
-        return stream_run(scene, directory, **options)
+    return stream_run(scene, directory, **options)
 
 
 def _tell(table, output, as_json):

@@ -36,7 +36,6 @@ def compare(
     settings: Annotated[list[str] | None, Parameter(name="--set", negative="")] = None,
     frames: str | None = None,
     pictures: bool = True,
-    resume: Annotated[bool, Parameter(negative="")] = False,
     as_json: Json = False,
 ) -> None:
     """Run models on one scene: the same motion, contacts and measures; tables, report, pictures.
@@ -55,8 +54,6 @@ def compare(
         Frames of the motion, as A:B:S (B not included).
     pictures
         Draw pictures and the animation.
-    resume
-        Keep the models that the folder holds finished, of the same scene and settings.
     as_json
         Print JSON and nothing else.
     """
@@ -84,7 +81,6 @@ def compare(
                 settings=changes,
                 pictures=pictures,
                 progress=advance,
-                resume=resume,
             )
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"interrupted; finished runs are kept in {output}") from None

@@ -63,7 +63,6 @@ def run(
     settings: Annotated[list[str] | None, Parameter(name="--set", negative="")] = None,
     frames: str | None = None,
     fail_on: str | None = None,
-    resume: Annotated[bool, Parameter(negative="")] = False,
     as_json: Json = False,
 ) -> None:
     """Run a scene through its motion and write surfaces, metrics and a report.
@@ -82,8 +81,6 @@ def run(
         Frames of the motion, as A:B:S (B not included).
     fail_on
         Limits that end with exit code 6, for instance volume_error=0.001,penetration_max, or all.
-    resume
-        Go on behind the last whole frame of the run that the folder holds, if it holds one.
     as_json
         Print JSON and nothing else.
     """
@@ -98,11 +95,10 @@ def run(
         settings=changes,
         fail_on=fail_on,
         as_json=as_json,
-        resume=resume,
     )
 
 
-def _run_scene(scene, output, *, as_json, resume=False, **asked):
+def _run_scene(scene, output, *, as_json, **asked):
     from rbfmuscle import interruption
 
     start = time.perf_counter()
@@ -123,7 +119,6 @@ def _run_scene(scene, output, *, as_json, resume=False, **asked):
                 loaded,
                 output,
                 progress=advance,
-                resume=resume,
                 **asked,
             )
         except KeyboardInterrupt:

@@ -135,7 +135,7 @@ class ElasticSolver:
         return *parts, np.array(forces.shape), pushing, forces.ravel()[pushing]
 
     def restore(self, state: tuple[np.ndarray, ...]) -> None:
-        """Return to an earlier ``snapshot``, to the last digit: a run that resumes goes on from one."""
+        """Return to an earlier ``snapshot``."""
         shape = self.shape
         shape.quaternion[:], shape.target[:], shape.deformation[:], size, pushing, strength = state
         self.contact.forces = np.zeros(size)

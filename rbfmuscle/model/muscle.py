@@ -133,10 +133,6 @@ class RBFMuscle:
         self.points = points.copy()
         self.solver.restore(solver)
 
-    def continue_drawing(self, quantities: Mapping[str, float]) -> None:
-        """Begin the next drawing where one with these quantities ended."""
-        self.drawer.level = quantities.get("level", 0.0)
-
     def normals(self) -> np.ndarray:
         """Unit normals at the centres, turned with the local deformation by its cofactor, (K, 3)."""
         f = self.solver.deformation()

@@ -12,7 +12,7 @@ import pickle
 import queue
 import threading
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -35,8 +35,6 @@ class Crew:
     scene : Scene
     helpers : int
         At least two.
-    resumable : bool
-        As for `Share`.
 
     Attributes
     ----------
@@ -46,14 +44,14 @@ class Crew:
         Loops that helpers compiled, and the processor time they took.
     """
 
-    def __init__(self, scene: Scene, helpers: int, *, resumable: bool = False) -> None:
+    def __init__(self, scene: Scene, helpers: int) -> None:
         self.scene = scene
         threads = max(1, numba.get_num_threads() // helpers)
         self._told: set[str] = set()
         self._helpers: list[_Helper] = []
         try:
             for names in _dealt([muscle.name for muscle in scene.muscles], helpers):
-                self._helpers.append(_Helper((scene, names, resumable), threads))
+                self._helpers.append(_Helper((scene, names), threads))
         except BaseException:
             self.close()
             raise
@@ -75,12 +73,10 @@ class Crew:
         for helper in self._helpers:
             self._next(helper)
 
-    def frames(
-        self, start: Mapping[str, Any] | None = None, measures: Mapping[str, Any] | None = None
-    ) -> Iterator[Solved]:
+    def frames(self) -> Iterator[Solved]:
         """As of a `Share`."""
         for helper in self._helpers:
-            helper.begin(start, measures)
+            helper.begin()
         with tell_stage("solving the first frame"):
             parts = [self._next(helper) for helper in self._helpers]
         while not any(part is None for part in parts):
@@ -125,10 +121,10 @@ class _Helper:
         self._thread = threading.Thread(target=self._listen, args=(job,), daemon=True)
         self._thread.start()
 
-    def begin(self, start: Any, measures: Any) -> None:
+    def begin(self) -> None:
         """Let it go through the motion."""
         with contextlib.suppress(OSError):  # it is gone: the inbox says so
-            send(self.process.stdin, (start, measures))
+            send(self.process.stdin, "begin")
 
     def take(self) -> tuple[str, Any]:
         """Its next message: a kind, and what it is about."""
@@ -177,15 +173,10 @@ def _joined(parts, order):
 
     first, frames = parts[0].frame, [part.frame for part in parts]
     by_muscle = ("surfaces", "carried", "times", "work")
-    state = {
-        key: value if key in ("index", "here", "activations") else joined(f.state[key] for f in frames)
-        for key, value in first.state.items()
-    }
     frame = replace(
         first,
         events=[event for f in frames for event in f.events],
         wall=max(f.wall for f in frames),
-        state=state,
         **{part: joined(getattr(f, part) for f in frames) for part in by_muscle},
     )
-    return Solved(frame, joined(p.measured for p in parts), joined(p.measures for p in parts))
+    return Solved(frame, joined(p.measured for p in parts))

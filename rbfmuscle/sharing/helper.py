@@ -46,12 +46,12 @@ class _Forward(logging.Handler):
 def main() -> None:
     """Build, wait for the word, go through the motion."""
     outbox, words = _Outbox(), listen()
-    scene, names, resumable = words.get()
+    scene, names = words.get()
     warnings.simplefilter("always")
     warnings.showwarning = lambda message, *_: outbox.say("warned", message)
     logging.getLogger("rbfmuscle").addHandler(_Forward(outbox))
     try:
-        _work(outbox, words, Share(scene, names, resumable=resumable))
+        _work(outbox, words, Share(scene, names))
     except (RBFMuscleError, MemoryError, OSError) as error:  # what the command line tells in one line
         outbox.say("failed", error)
     except Exception:  # noqa: BLE001 - whatever it is, it is told where the run was asked for
@@ -63,7 +63,8 @@ def main() -> None:
 def _work(outbox, words, share):
     outbox.clock = lambda: {"times": dict(share.times), "compiled": compiled_so_far()}
     outbox.say("done", None)
-    for solved in share.frames(*words.get()):
+    words.get()
+    for solved in share.frames():
         outbox.say("done", solved)
     outbox.say("done", None)
 

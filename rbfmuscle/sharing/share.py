@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rbfmuscle.compiled.watch import tell_stage
 from rbfmuscle.models import build_models
@@ -23,13 +23,10 @@ class Solved(NamedTuple):
     frame : Frame
     measured : dict of str to Measured
         By muscle; empty where metrics are not asked for.
-    measures : dict
-        What a `Share` that goes on behind this frame needs beside the frame's own state; empty where that is.
     """
 
     frame: Frame
     measured: dict[str, Measured]
-    measures: dict[str, Any]
 
 
 class Share:
@@ -41,8 +38,6 @@ class Share:
         Whole: what does not belong to a muscle is the same in every share.
     names : collection of str, optional
         Of the muscles; all where not given.
-    resumable : bool
-        Give each frame the state that a share needs to go on behind it.
 
     Attributes
     ----------
@@ -58,40 +53,25 @@ class Share:
         If a muscle cannot be built.
     """
 
-    def __init__(
-        self, scene: Scene, names: Collection[str] | None = None, *, resumable: bool = False
-    ) -> None:
-        self.scene, self.resumable = scene, resumable
+    def __init__(self, scene: Scene, names: Collection[str] | None = None) -> None:
+        self.scene = scene
         self.times: dict[str, float] = {}
         self.compiled = {"loops": 0.0, "seconds": 0.0}
         self.models = build_models(scene, names)
         carried = {model.name: model.carried_mesh() for model in self.models}
         self._measures = MuscleMeasures(scene, carried) if scene.output.metrics else None
 
-    def frames(
-        self, start: Mapping[str, Any] | None = None, measures: Mapping[str, Any] | None = None
-    ) -> Iterator[Solved]:
+    def frames(self) -> Iterator[Solved]:
         """The frames as they are solved and measured.
-
-        Parameters
-        ----------
-        start : mapping, optional
-            The state of the frame to go on behind.
-        measures : mapping, optional
-            What came with it in its `Solved`.
 
         Raises
         ------
         SolveError
             If a muscle cannot be solved, naming muscle, frame and coordinates.
         """
-        if measures and self._measures is not None:
-            self._measures.go_on(measures)
         wanted = bool(self.scene.output.surfaces) or self._measures is not None
-        frames = simulate_frames(
-            self.scene, self.models, surfaces=wanted, resumable=self.resumable, start=start
-        )
-        first = start is None
+        frames = simulate_frames(self.scene, self.models, surfaces=wanted)
+        first = True
         while True:
             with timed(self.times, "simulate"):
                 frame = _first(frames) if first else next(frames, None)
@@ -99,12 +79,10 @@ class Share:
             if frame is None:
                 return
             measured: dict[str, Measured] = {}
-            known: dict[str, Any] = {}
             if self._measures is not None:
                 with timed(self.times, "metrics"):
                     measured = self._measures.measure(frame)
-                    known = self._measures.state() if self.resumable else {}
-            yield Solved(frame, measured, known)
+            yield Solved(frame, measured)
 
     def close(self) -> None:
         """Nothing is held."""

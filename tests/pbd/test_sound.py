@@ -14,7 +14,7 @@ from pbd_baseline.sound.ridges import NOTHING, Ridges
 from pbd_baseline.sound.untangling import Untangling
 from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.sim.loop.contact import HalfSpaces
-from rbfmuscle.sim.loop.simulate import FrameLoop, simulate_frames
+from rbfmuscle.sim.loop.simulate import simulate_frames
 from rbfmuscle.sim.scene.motion import rotation_about
 from rbfmuscle.study.measure.penetration import BoneProbe, bone_depth, surface_depth
 
@@ -109,21 +109,6 @@ def test_what_smoothing_does_not_untangle_is_calmed():
     turn = rotation_about([0.3, 1.0, -0.2], 0.7, np.array([5.0, 1.0, -9.0]))
     moved = rest @ turn[:3, :3].T + turn[:3, 3]
     np.testing.assert_allclose(untangling.calmed(moved, 40), moved, atol=1e-9)
-
-
-def test_a_run_goes_on_from_a_snapshot_to_the_last_digit():
-    scene = turning_scene()
-    loops = [FrameLoop(scene, [PBDMuscle(scene.muscles[0], scene, PBDOptions(sound=True))]) for _ in range(2)]
-    loops[0].resumable = True
-    frames = [loops[0].advance(coordinates) for coordinates in scene.motion.frames]
-    loops[1].go_on(frames[2].state)
-    for k in (3, 4):
-        again = loops[1].advance(scene.motion.frames[k])
-        np.testing.assert_array_equal(
-            again.surfaces["spindle"].vertices, frames[k].surfaces["spindle"].vertices
-        )
-    for loop in loops:
-        loop.close()
 
 
 def test_a_sound_surface_is_left_as_it_is():

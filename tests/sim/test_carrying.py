@@ -192,18 +192,3 @@ def test_whole_leg_moved_at_the_hip_is_solved_where_muscles_cross_the_hip(leg_da
     assert len(work) == 38 and len(solved) == 22
     assert all(work[name]["carried"] == 10 for name in work if name not in solved)
     assert "soleus" not in solved and "rectus_femoris" in solved
-
-
-def test_going_on_behind_a_frame_carries_the_same_surface():
-    path = [(0, 0), (5, 4), (10, 4), (20, 4), (20, 6), (30, 6)]
-    scene = _arm(path, muscles=("brachialis", "deltoid"))
-    every = _run(scene, "rbf", ahead=False, resumable=True)
-    for last in (1, 2, 4):
-        rest = _run(scene, "rbf", ahead=False, start=every[last].state)
-        for frame in rest:
-            for muscle in ("brachialis", "deltoid"):
-                there = every[frame.index]
-                assert frame.work[muscle] == there.work[muscle]
-                np.testing.assert_array_equal(
-                    frame.surfaces[muscle].vertices, there.surfaces[muscle].vertices
-                )

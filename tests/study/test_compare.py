@@ -3,7 +3,6 @@
 import csv
 import json
 import math
-import shutil
 
 import numpy as np
 import pytest
@@ -131,24 +130,6 @@ class TestComparison:
             assert found[model]["all"]["components"] == 1
             assert 0 <= found[model]["all"]["return_rms"] < 1.5
         assert found["pbd"]["all"]["rest_error_rms"] < 1e-9 < found["rbf"]["all"]["rest_error_rms"]
-
-    def test_resumed_comparison_runs_only_what_was_not_measured(self, compared, tmp_path):
-        folder, table = compared
-        left = shutil.copytree(folder, tmp_path / "left")
-        (left / "pbd" / "measures.npz").unlink()
-        before = (left / "rbf" / "run.json").read_bytes()
-        scene, ran = phantom_scene(step=6.0).with_options(frames="0:4"), set()
-        asked = {"settings": {"rbf:model.centres": 100}, "pictures": False, "resume": True}
-        again = compare_models(
-            scene, left, ["rbf", "pbd"], progress=lambda model, *_: ran.add(model), **asked
-        )
-        assert ran == {"pbd"} and (left / "rbf" / "run.json").read_bytes() == before
-        for model, found in table["results"].items():
-            for quantity, value in found["all"].items():
-                if not quantity.startswith("time_") and quantity != "memory":
-                    assert again["results"][model]["all"][quantity] == value, (model, quantity)
-        with pytest.raises(UsageError, match="centres is 100 there"):
-            compare_models(scene, left, ["rbf", "pbd"], resume=True, pictures=False)
 
     def test_distances_are_symmetric_and_belong_to_the_first(self, compared):
         table = compared[1]

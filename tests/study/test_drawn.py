@@ -220,18 +220,3 @@ def test_stages_sum_times_and_work_and_keep_the_worst_of_neighbours():
         "gap_rms": 0.7,
         "gap_frame": 4,
     }
-
-
-@pytest.mark.parametrize("broken", range(1, len(FRAMES)))
-def test_stages_that_go_on_are_those_of_the_unbroken_run(broken):
-    whole, before, after = Stages(), Stages(), Stages()
-    for k, each in enumerate(FRAMES):
-        whole.add(each)
-        if k < broken:
-            before.add(each)
-    after.go_on(before.state())
-    for each in FRAMES[broken:]:
-        after.add(each)
-    assert after.table() == whole.table()
-    assert after.work() == whole.work()
-    assert after.neighbours() == whole.neighbours()

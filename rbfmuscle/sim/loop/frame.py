@@ -53,23 +53,6 @@ class ModelSurface:
     notes: list = field(default_factory=list)
     origin: Any = None
 
-    def origin_state(self) -> dict:
-        """What `from_state` makes the surface that was drawn of, and its motion since."""
-        drawn, motion = self.origin or (self, np.eye(4))
-        return {
-            "vertices": np.asarray(drawn.vertices),
-            "faces": np.asarray(drawn.faces),
-            "quantities": {name: float(value) for name, value in drawn.quantities.items()},
-            "notes": [list(note) for note in drawn.notes],
-            "motion": motion,
-        }
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> "ModelSurface":
-        """The surface that was drawn."""
-        notes = [tuple(note) for note in state["notes"]]
-        return cls(state["vertices"], state["faces"], dict(state["quantities"]), notes)
-
 
 @dataclass
 class Frame:
@@ -96,8 +79,6 @@ class Frame:
         is drawn, both are in it; over a motion the sum is what counts.
     activations : dict of str to float
         Of the muscles that contract.
-    state : dict
-        What a loop needs to go on from this frame; empty where it was not asked for.
     work : dict of str to Work
         Whether each muscle was solved for the frame, carried along as it was, or left where it was, and why.
     neighbours : dict of (str, str) to (float, float)
@@ -113,7 +94,6 @@ class Frame:
     times: dict
     wall: float
     activations: dict = field(default_factory=dict)
-    state: dict = field(default_factory=dict)
     work: dict = field(default_factory=dict)
     neighbours: dict = field(default_factory=dict)
 
@@ -179,9 +159,6 @@ class MuscleModel(Protocol):
 
     def restore(self, state: Any) -> None:
         """Go back to a snapshot; it can be used again."""
-
-    def continue_drawing(self, quantities: Mapping[str, float]) -> None:
-        """Begin the next drawing where one with these quantities ended: for a run that resumes."""
 
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next :meth:`solve` settles under; for muscles that contract."""

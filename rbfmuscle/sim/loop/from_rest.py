@@ -80,4 +80,4 @@ class Trail:
         stepper.excite(stop.activation)
         stepper.model.restore(stop.model)
         stepper.contacts.restore(stop.contacts)
-        stepper.go_on(stop.carrier, None)
+        stepper.restore_carrier(stop.carrier)

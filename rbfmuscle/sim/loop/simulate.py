@@ -55,8 +55,6 @@ class FrameLoop:
         Where the bones are [radian]; empty at rest, before the first frame.
     activations : Activations
         Of the muscles that contract.
-    resumable : bool
-        Whether frames carry the state that `go_on` needs; False to begin with.
 
     Raises
     ------
@@ -81,7 +79,6 @@ class FrameLoop:
             for model, contacts in zip(models, _obstacles(scene, models, fields))
         ]
         self.here: dict[str, float] = {}
-        self.resumable = False
         self.activations = Activations(scene)
         self._sub_steps, self._own_sub_steps = SubSteps(scene, poses=self._poses), {}
         for stepper in self.steppers:
@@ -160,55 +157,14 @@ class FrameLoop:
         poses = dict(self._poses(self.here))
         frame = Frame(self._next_index - 1, dict(self.here), poses, {}, carried, events, times, 0.0)
         frame.activations.update(self.activations.here)
-        if self.resumable:
-            frame.state.update(self._state())
         frame.neighbours.update(self._pairs)
         frame.work.update({stepper.name: stepper.work for stepper in self.steppers})
         return frame
-
-    def _state(self) -> dict:
-        """What `go_on` needs, but for what the frame's surfaces say."""
-        muscles = {s.name: (s.model.snapshot(), s.contacts.snapshot()) for s in self.steppers}
-        return {
-            "index": self._next_index,
-            "here": dict(self.here),
-            "activations": dict(self.activations.here),
-            "muscles": muscles,
-            "links": {} if self._sliding is None else self._sliding.snapshot(),
-            "carriers": {s.name: s.carrier.snapshot() for s in self.steppers if s.carrier is not None},
-            "shown": {},
-            "drawn": {},
-        }
-
-    def go_on(self, state: Mapping) -> None:
-        """Put a new loop where another one was when it made a frame.
-
-        Parameters
-        ----------
-        state : mapping
-            The frame's ``state``. What follows is then the same to the last digit.
-        """
-        self._next_index, self.here = state["index"], dict(state["here"])
-        self.activations.here.update(state["activations"])
-        for stepper in self.steppers:
-            model, contacts = state["muscles"][stepper.name]
-            stepper.collect()
-            stepper.excite(state["activations"])
-            stepper.model.restore(model)
-            stepper.contacts.restore(contacts)
-            stepper.model.continue_drawing(state["shown"].get(stepper.name, {}))
-            stepper.go_on(state["carriers"].get(stepper.name), state["drawn"].get(stepper.name))
-        if self._sliding is not None:
-            self._sliding.restore(state["links"])
 
     def finish(self, frame: Frame, drawn: Iterable[tuple[ModelSurface, float]]) -> Frame:
         """The frame with its surfaces, and the time since the one before."""
         for name, (surface, seconds) in zip(frame.carried, drawn):
             frame.surfaces[name] = surface
-            if frame.state:
-                frame.state["shown"][name] = dict(surface.quantities)
-                if name in self._own_sub_steps:
-                    frame.state["drawn"][name] = surface.origin_state()
             frame.events.extend(Event(frame.index, name, *note) for note in surface.notes)
             for key in ("time_surface", "time_frame"):
                 frame.times[name][key] = frame.times[name].get(key, 0.0) + seconds
@@ -312,8 +268,6 @@ def simulate_frames(
     written: Collection[int] | None = None,
     fields: Mapping[str, object] | None = None,
     ahead: bool = True,
-    resumable: bool = False,
-    start: Mapping | None = None,
 ) -> Iterator[Frame]:
     """Run models through a scene's motion, from the rest pose on, and yield its frames one by one.
 
@@ -328,10 +282,6 @@ def simulate_frames(
         Indices of the frames to yield; all where not given. The others are simulated and not shown.
     ahead : bool
         Solve a frame while the one before is drawn, where there are threads for both.
-    resumable : bool
-        Give each frame the ``state`` that ``start`` takes.
-    start : mapping, optional
-        State of the last frame that is there already: go on behind it.
 
     Raises
     ------
@@ -341,15 +291,11 @@ def simulate_frames(
         If muscles overlap bones at rest and the scene's ``initial`` is ``"error"``.
     """
     with FrameLoop(scene, models, fields=fields, surfaces=surfaces) as loop:
-        loop.resumable, first = resumable, 0
-        if start is not None:
-            loop.go_on(start)
-            first = start["index"]
-        path = scene.motion.frames[first:]
+        path = scene.motion.frames
         if ahead and loop.can_run_ahead:
-            yield from run_ahead(loop, path, written and {index - first for index in written})
+            yield from run_ahead(loop, path, written)
             return
-        for index, coordinates in enumerate(path, start=first):
+        for index, coordinates in enumerate(path):
             if written is None or index in written:
                 yield loop.advance(coordinates)
             else:

@@ -13,7 +13,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.sim.loop.carrying import SOLVED, Carrier, Work
-from rbfmuscle.sim.loop.frame import Drawing, Event, FinishedDrawing, ModelSurface
+from rbfmuscle.sim.loop.frame import Drawing, Event, ModelSurface
 from rbfmuscle.sim.loop.tunnelling import fence, find_crossings, only_grazed, turn_back
 from rbfmuscle.sim.scene.motion import bone_poses, interpolate, shown_value, step_angle, unit_sign
 from rbfmuscle.validation import NotFiniteError, SolveError
@@ -44,13 +44,6 @@ class TimedDrawing:
     def __init__(self, stepper: MuscleStepper, drawing: Drawing, measured: dict) -> None:
         self.stepper, self.drawing, self.measured = stepper, drawing, measured
         self._finished: ModelSurface | None = None
-
-    @classmethod
-    def of(cls, stepper: MuscleStepper, surface: ModelSurface) -> TimedDrawing:
-        """The drawing of a surface that is at hand."""
-        found = cls(stepper, FinishedDrawing(surface), {})
-        found._finished = surface
-        return found
 
     def surface(self) -> ModelSurface:
         """The surface with what was measured; drawn once."""
@@ -232,14 +225,11 @@ class MuscleStepper:
             self._shown, self._since = shown, np.eye(4)
         return shown
 
-    def go_on(self, carrier: Any, drawn: Any) -> None:
-        """Take over what another stepper's `Carrier.snapshot` and last surface were, to carry that one on."""
+    def restore_carrier(self, carrier: Any) -> None:
+        """Take over what another stepper's `Carrier.snapshot` was."""
         if carrier is not None and self.carrier is not None:
             self.carrier.restore(carrier)
         self._shown = None
-        if drawn is not None:
-            self._shown = TimedDrawing.of(self, ModelSurface.from_state(drawn))
-            self._since = np.array(drawn["motion"])
 
     def report(self, bone: Any, count: int, action: Any) -> None:
         """Note an event of the present frame; of one kind the most points at one time are kept."""

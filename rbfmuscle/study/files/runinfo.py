@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
-import json
 import os
 import platform
 from collections import Counter, defaultdict
@@ -15,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import rbfmuscle
-from rbfmuscle.sim.contraction.course import activation_course
 from rbfmuscle.sim.loop.frame import Frame
 from rbfmuscle.sim.scene.motion import shown_value
 from rbfmuscle.sim.scene.scene import Scene
@@ -86,7 +84,6 @@ def build_info(
         "versions": versions(),
         "machine": machine(),
         "inputs": input_hashes(scene),
-        "content": content_hash(scene),
         "times": clock.times,
         "compiled": clock.compiled,
         "stages": clock.stages.table(),
@@ -137,29 +134,6 @@ class Stages:
                 for key, value in source.items():
                     if key.startswith("time_"):
                         self._values[name][key].append(float(value))
-
-    def state(self) -> dict[str, Any]:
-        """All times and work so far, for `go_on`."""
-        times = {
-            name: {key: np.array(values) for key, values in found.items()}
-            for name, found in self._values.items()
-        }
-        work = {name: dict(count) for name, count in self._work.items()}
-        reasons = [[*key, reason, n] for key, found in self._reasons.items() for reason, n in found.items()]
-        pairs = [[*pair, *found] for pair, found in self.pairs.items()]
-        return {"times": times, "work": work, "reasons": reasons, "pairs": pairs}
-
-    def go_on(self, state: dict[str, Any]) -> None:
-        """Take over the times and work of the frames before."""
-        for name, found in state["times"].items():
-            for key, values in found.items():
-                self._values[name][key].extend(values.tolist())
-        for name, count in state["work"].items():
-            self._work[name].update(count)
-        for name, kind, reason, count in state["reasons"]:
-            self._reasons[name, kind][reason] += count
-        for one, other, *found in state["pairs"]:
-            self.pairs[one, other] = tuple(found)
 
     def neighbours(self) -> list[dict[str, Any]]:
         """Pairs of neighbours, the deepest overlap first [scene unit]."""
@@ -218,17 +192,6 @@ def machine() -> dict[str, Any]:
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "threads": numba.get_num_threads(),
     }
-
-
-def content_hash(scene: Scene) -> str:
-    """SHA-256 of what the resolved scene names or counts only: attached vertices, fibres, activations, frames."""
-    held = [[[a.bone, [int(v) for v in a.vertices]] for a in muscle.attachments] for muscle in scene.muscles]
-    fibres = [[np.asarray(line).tolist() for line in muscle.fibres or []] for muscle in scene.muscles]
-    courses = [activation_course(m, scene.motion) for m in scene.muscles if m.contraction is not None]
-    track = [sorted(frame.items()) for frame in scene.motion.frames]
-    facts = [held, fibres, courses, track, scene.motion.times]
-    text = json.dumps(facts, default=lambda value: np.asarray(value).tolist())
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def input_hashes(scene: Scene) -> dict[str, Any]:

@@ -10,15 +10,11 @@ from rbfmuscle.study.measure.quantities import Row
 class Sink(Protocol):
     """What takes the frames of a run, one by one, as they come.
 
-    Every frame comes once, in the order of the motion; whatever ends the run, the sink is closed. A sink may be
-    given frames from the middle of a motion on: what stands in it already is its own affair.
+    Every frame comes once, in the order of the motion; whatever ends the run, the sink is closed.
     """
 
     def write(self, frame: Frame, rows: Sequence[Row] = ()) -> None:
         """Take a frame, and the rows of metrics that are complete by now: those of the frame before."""
-
-    def keep(self, state: dict[str, Any]) -> None:
-        """Take what a resumed run needs beside the frame just written."""
 
     def close(self, rows: Sequence[Row] = ()) -> None:
         """Take the last rows; nothing follows but `write_info`."""
@@ -47,9 +43,6 @@ class MemorySink:
         self.frames.append(frame)
         self.rows.extend(rows)
         self._complete.append(len(self.rows))
-
-    def keep(self, state: dict[str, Any]) -> None:
-        """Nothing: memory ends with the process."""
 
     def close(self, rows: Sequence[Row] = ()) -> None:
         """Keep the last rows."""

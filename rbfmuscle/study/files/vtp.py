@@ -80,19 +80,15 @@ class Collection:
     ----------
     path : path
         The files that it names are relative to its folder.
-    end : int, optional
-        Go on with the collection that is there, of which so many bytes count; else begin a new one.
     """
 
     _HEAD = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n<Collection>\n'
     _TAIL = "</Collection>\n</VTKFile>\n"
 
-    def __init__(self, path: str | Path, end: int | None = None) -> None:
+    def __init__(self, path: str | Path) -> None:
         # Unbuffered: entries and closing tags go to the disk in one piece.
-        self._file = open(path, "wb" if end is None else "r+b", buffering=0)  # noqa: SIM115
-        if end is None:
-            end = self._file.write(self._HEAD.encode())
-        self.roll_back(end)
+        self._file = open(path, "wb", buffering=0)  # noqa: SIM115
+        self.roll_back(self._file.write(self._HEAD.encode()))
 
     def add(self, time: float, entries: list[tuple[str, str]]) -> None:
         """Add one time step.

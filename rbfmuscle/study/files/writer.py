@@ -7,7 +7,6 @@ import json
 import math
 import os
 import tempfile
-import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -15,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.study.files.checkpoint import NAME, write_checkpoint
 from rbfmuscle.study.files.meshfiles import SUFFIXES, write_mesh
 from rbfmuscle.study.files.vtp import Collection
 from rbfmuscle.validation import SolveError, UsageError
@@ -38,10 +37,7 @@ _OLD_FILES = (
     "metrics.csv",
     "report.html",
     "preview.webp",
-    NAME,
 )
-# Share of a run's time that goes into checkpoints, at most.
-KEEPING_SHARE = 0.02
 
 
 def check_writable(directory: str | Path) -> None:
@@ -70,9 +66,6 @@ class RunWriter:
         Made where it is missing. A run that lies there already is replaced.
     scene : Scene
         Its ``output`` table says which parts are written.
-    kept : dict, optional
-        What `state` gave after the last frame of the run that lies there and is to go on; what was written
-        since is taken away.
 
     Raises
     ------
@@ -80,25 +73,23 @@ class RunWriter:
         If the folder cannot be written to.
     """
 
-    def __init__(self, directory: str | Path, scene: Scene, kept: dict[str, Any] | None = None) -> None:
+    def __init__(self, directory: str | Path, scene: Scene) -> None:
         self.directory = Path(directory)
         self.scene = scene
         output = scene.output
         self.format = output.surfaces.format if output.surfaces else None
-        kept = kept or {"last": -1, "count": 0, "sizes": {}, "ends": {}, "bones": {}}
-        self.count, self._last, self._bone_files = kept["count"], kept["last"], dict(kept["bones"])
-        self._keeper, self._failed = _Keeper(self.directory / NAME), False
+        self.count, self._failed = 0, False
+        self._bone_files: dict[str, tuple[Floats, str]] = {}
         try:
-            self._clear(everything=not kept["sizes"])
-            self._tables = {name: self._table(name, columns, kept) for name, columns in _tables(output)}
+            self._clear()
+            self._tables = {name: self._table(name, columns) for name, columns in _tables(output)}
             names = ("surfaces", "bones") if self.format == "pvd" else ()
-            ends = {name: kept["ends"].get(name) for name in names}
-            self._collections = {n: Collection(self.directory / f"{n}.pvd", ends[n]) for n in names}
+            self._collections = {name: Collection(self.directory / f"{name}.pvd") for name in names}
         except OSError as error:
             raise UsageError(
                 f"cannot write to {self.directory}: {error.strerror}; choose another folder"
             ) from None
-        self._good = self.state()
+        self._good = self._sizes()
 
     def write(self, frame: Frame, rows: Sequence[Any] = ()) -> None:
         """Write one frame and the rows of metrics that are complete by now.
@@ -119,16 +110,11 @@ class RunWriter:
             self._roll_back(frame.index)
             kept = f"{self.count} frames are kept in {self.directory}"
             raise SolveError(f"cannot write frame {frame.index}: {error.strerror}; {kept}") from None
-        self.count, self._last = self.count + 1, frame.index
-        self._good = self.state()
-
-    def keep(self, state: dict[str, Any]) -> None:
-        """Keep what a resumed run needs beside the frame just written; not after every one, if that takes long."""
-        self._keeper.take({**state, "files": self._good})
+        self.count += 1
+        self._good = self._sizes()
 
     def close(self, rows: Sequence[Any] = ()) -> None:
         """Write the last rows of metrics and close all files; after a frame that could not be written, nothing."""
-        self._keeper.flush()
         if self._failed:
             return
         try:
@@ -140,19 +126,12 @@ class RunWriter:
         except OSError as error:
             raise SolveError(f"cannot finish the tables in {self.directory}: {error.strerror}") from None
 
-    def state(self) -> dict[str, Any]:
-        """What stands in the folder now, for a writer that goes on: sizes [byte], and the bones written last."""
+    def _sizes(self):
+        """Bytes of the tables and of the collections as they stand."""
         return {
-            "last": self._last,
-            "count": self.count,
             "sizes": {name: os.fstat(file.fileno()).st_size for name, (_, file) in self._tables.items()},
             "ends": {name: collection.end for name, collection in self._collections.items()},
-            "bones": dict(self._bone_files),
         }
-
-    def finish(self) -> None:
-        """Nothing is left to resume."""
-        (self.directory / NAME).unlink(missing_ok=True)
 
     def write_info(self, info: dict[str, Any]) -> None:
         """Write ``run.json`` in one piece: a reader finds the old one or the new one, never half of it.
@@ -238,51 +217,21 @@ class RunWriter:
                 if int(file.stem.rpartition("_")[2]) > last:
                     file.unlink(missing_ok=True)
 
-    def _clear(self, everything):
-        """Make the folders, without the files of a run that was here before, or of frames that are not kept."""
+    def _clear(self):
+        """Make the folders, without the files of a run that was here before."""
         self.directory.mkdir(parents=True, exist_ok=True)
-        for old in _OLD_FILES if everything else ():
+        for old in _OLD_FILES:
             (self.directory / old).unlink(missing_ok=True)
-        self._remove(self._last)
+        self._remove(-1)
         for folder in ("surfaces", "bones") if self.format is not None else ():
             (self.directory / folder).mkdir(exist_ok=True)
 
-    def _table(self, name, columns, kept):
-        size = kept["sizes"].get(name)
-        mode = "w" if size is None else "r+"
-        file = open(self.directory / name, mode, encoding="utf-8", newline="")  # noqa: SIM115
+    def _table(self, name, columns):
+        file = open(self.directory / name, "w", encoding="utf-8", newline="")  # noqa: SIM115
         writer = csv.writer(file, lineterminator="\n")
-        if size is None:
-            writer.writerow(columns)
-            file.flush()
-        else:
-            file.truncate(size)
-            file.seek(size)
+        writer.writerow(columns)
+        file.flush()
         return writer, file
-
-
-class _Keeper:
-    """Writes checkpoints as often as takes a small share of the time; the last one in any case."""
-
-    def __init__(self, path: Path) -> None:
-        self.path, self.cost, self.written = path, 0.0, -math.inf
-        self.waiting: dict[str, Any] | None = None
-
-    def take(self, state: dict[str, Any]) -> None:
-        """Write a state, or hold it until the next one or the end."""
-        self.waiting = state
-        if time.perf_counter() - self.written >= self.cost / KEEPING_SHARE:
-            self.flush()
-
-    def flush(self) -> None:
-        """Write what is held; a full disk keeps the one before."""
-        if self.waiting is None:
-            return
-        start, state, self.waiting = time.perf_counter(), self.waiting, None
-        with suppress(OSError):
-            write_checkpoint(self.path, state)
-        self.written = time.perf_counter()
-        self.cost = self.written - start
 
 
 def _tables(output):

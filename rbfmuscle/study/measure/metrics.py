@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -69,15 +68,6 @@ class MuscleMeasures:
         found = each(lambda tracker: tracker.measure(frame, self.probes, at_rest), trackers)
         return dict(zip(self.trackers, found))
 
-    def state(self) -> dict[str, Any]:
-        """What `go_on` needs behind the frame measured last, by muscle."""
-        return {name: tracker.state() for name, tracker in self.trackers.items()}
-
-    def go_on(self, state: Mapping[str, Any]) -> None:
-        """Take over what others knew of the same muscles."""
-        for name, tracker in self.trackers.items():
-            tracker.go_on(state[name])
-
 
 class _Tracker:
     """What has to be kept of one muscle from frame to frame."""
@@ -96,12 +86,6 @@ class _Tracker:
         self.form = SurfaceForm()
         # Of the last surface: its faces, and what its distance can be had quicker with while they stay.
         self.layout: tuple[Integers, Layout] | None = None
-
-    def state(self) -> tuple[Any, ...]:
-        return self.rest_measured, self.offset
-
-    def go_on(self, state: tuple[Any, ...]) -> None:
-        self.rest_measured, self.offset = state
 
     def length_of(self, frame: Frame) -> float:
         if self.line is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rbfmuscle.sim.joints.skeleton import all_coordinates
 from rbfmuscle.sim.scene.motion import shown_value
@@ -58,15 +58,6 @@ class MetricsRecorder:
         for name, found in measured.items():
             self._lengths.setdefault(name, []).append(found.length)
         return rows
-
-    def state(self) -> dict[str, Any]:
-        """What `go_on` needs behind the frame taken in last."""
-        return {"path": self._path, "lengths": self._lengths}
-
-    def go_on(self, state: Mapping[str, Any]) -> None:
-        """Take over what another recorder knew."""
-        self._path = [(index, dict(coordinates)) for index, coordinates in state["path"]]
-        self._lengths = {name: list(lengths) for name, lengths in state["lengths"].items()}
 
     def finish(self) -> list[Row]:
         """Rows of the moment arms of all frames, which follow from the lengths of all."""
