@@ -15,4 +15,4 @@ if TYPE_CHECKING:
 
     MeshLike = trimesh.Trimesh | tuple[ArrayLike, ArrayLike]
 else:
-    MeshLike = Any
+    MeshLike = object

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
@@ -14,7 +13,7 @@ from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Array, Floats, Integers
 
 
-def cotangent_laplacian(vertices: Floats, faces: Integers) -> Any:
+def cotangent_laplacian(vertices: Floats, faces: Integers) -> sparse.csc_matrix:
     """Positive semi-definite cotangent Laplacian with weights clamped from below.
 
     Parameters

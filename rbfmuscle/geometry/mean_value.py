@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.threads import in_chunks
 
 # A triangle whose plane the point lies in, seen from outside it, adds nothing.
@@ -17,7 +16,7 @@ _LEAST_SHARE = 16
 _EXACT = 1e-8
 
 
-def mean_value_weights(points: ArrayLike, vertices: ArrayLike, faces: ArrayLike) -> Any:
+def mean_value_weights(points: ArrayLike, vertices: ArrayLike, faces: ArrayLike) -> Floats:
     """Weights of a mesh's vertices that give back each point.
 
     They are smooth inside, sum to one and reproduce every affine motion of the vertices exactly, so a point that

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 
@@ -15,7 +15,7 @@ def diameter(points: Floats) -> float:
     return 2.0 * float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
 
 
-def box_corners(bounds: Any) -> Floats:
+def box_corners(bounds: ArrayLike) -> Floats:
     """Corners (8, 3) of a box (2, 3)."""
     return np.array(np.meshgrid(*np.transpose(bounds))).reshape(3, -1).T
 
@@ -115,7 +115,7 @@ class BoneFrame:
         self.local = np.round(frame.local @ turn.T, 8)
         self._placed = lru_cache(maxsize=16)(self._place)
 
-    def box(self, bounds: Any) -> Any:
+    def box(self, bounds: ArrayLike) -> Floats:
         """Local box (2, 3) that holds a box given in bone coordinates."""
         local = (box_corners(bounds) - self.origin) @ self.axes.T / self.size
         return np.array([local.min(axis=0), local.max(axis=0)])

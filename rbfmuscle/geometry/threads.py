@@ -6,23 +6,25 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any
+from typing import TypeVar
 
 import numba
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 # Fewer points than this a thread cost more to hand over than to do.
 LEAST_SHARE = 1024
 
 
 @lru_cache(maxsize=4)
-def _pool(workers: int) -> Any:
+def _pool(workers: int) -> ThreadPoolExecutor:
     # What runs in these threads has one of them: a loop inside that splits itself stays serial.
     return ThreadPoolExecutor(
         workers, thread_name_prefix="rbfmuscle", initializer=numba.set_num_threads, initargs=(1,)
     )
 
 
-def each(act: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
+def each(act: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     """``[act(item) for item in items]``, on at most ``numba.get_num_threads()`` threads."""
     workers = min(numba.get_num_threads(), len(items))
     if workers < 2:
@@ -30,7 +32,7 @@ def each(act: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
     return list(_pool(workers).map(act, items))
 
 
-def in_chunks(count: int, work: Callable[..., Any], *, least: int = LEAST_SHARE) -> None:
+def in_chunks(count: int, work: Callable[[int, int], object], *, least: int = LEAST_SHARE) -> None:
     """Call ``work(start, stop)`` over the range of ``count``, on at most ``numba.get_num_threads()`` threads.
 
     The number of threads is the caller's own (numba keeps it for each thread), so what already runs in

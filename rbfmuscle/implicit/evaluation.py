@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numba
 import numpy as np
@@ -66,7 +66,7 @@ class Terms(NamedTuple):
     powers: np.ndarray
 
 
-def run_in_chunks(loop: Callable[..., Any], count: int, cost: int) -> None:
+def run_in_chunks(loop: Callable[[int, int], None], count: int, cost: int) -> None:
     """Call ``loop(start, stop)`` over 0 ... count, on threads where ``cost`` (pairs) is worth it."""
     # Asked for last: it takes longer than a small question.
     threads = 1 if cost < _SERIAL else min(numba.get_num_threads(), -(-count // _BLOCK))

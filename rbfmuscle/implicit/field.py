@@ -6,7 +6,7 @@ f(x) = sum_j a_j phi(|x - c_j|) - B_j . grad phi(x - c_j) + p(x), with B = 0 for
 from __future__ import annotations
 
 import warnings
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,6 +26,9 @@ from rbfmuscle.validation import (
     check_values,
     check_vectors,
 )
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 class RBFField:
@@ -241,7 +244,7 @@ class RBFField:
         """Value (n,) and gradient (n, 3) at (n, 3) points, for little more than the value alone."""
         return self._evaluate(check_points(points), True)
 
-    def surface(self, resolution: int = 64) -> Any:
+    def surface(self, resolution: int = 64) -> trimesh.Trimesh:
         """Zero set as a closed outward ``trimesh.Trimesh``; resolution in cells along the longest side."""
         import trimesh
 

@@ -68,3 +68,29 @@ def test_planted_train_is_found():
     assert trains("def f(a, b, c, d, *, e, g, h, i, j): ...\ndef g(self, a, b, c, d, e, f, g, h): ...") == [
         "f"
     ]
+
+
+def vague(source):
+    """Functions whose signature says `Any`."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.FunctionDef):
+            said = [x.annotation for x in parameters(node)] + [node.returns]
+            names = {n.id for part in said if part for n in ast.walk(part) if isinstance(n, ast.Name)}
+            found += [node.name] if "Any" in names else []
+    return found
+
+
+def test_signatures_of_fields_and_geometry_name_their_types():
+    places = [path for room in ("implicit", "geometry") for path in (ROOT / "rbfmuscle" / room).rglob("*.py")]
+    found = {str(path.relative_to(ROOT)): vague(path.read_text(encoding="utf-8")) for path in places}
+    assert {path: names for path, names in found.items() if names} == {}
+
+
+def test_planted_vagueness_is_found():
+    assert vague(
+        "def a(x: int) -> dict[str, Any]: ...\ndef b(x: Any) -> int: ...\ndef c(x: int) -> int: ..."
+    ) == [
+        "a",
+        "b",
+    ]

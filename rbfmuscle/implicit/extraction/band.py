@@ -7,7 +7,6 @@ crosses, so it follows the surface wherever it went, and the field is evaluated 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -98,7 +97,7 @@ class BandGrid:
         """Step in flat node number along each axis."""
         return np.array([self.shape[1] * self.shape[2], self.shape[2], 1])
 
-    def coordinates(self, points: Floats) -> Any:
+    def coordinates(self, points: Floats) -> Floats:
         """Positions in cells from the origin, (n, 3)."""
         return (points - self.origin) @ self.axes.T / self.spacing
 

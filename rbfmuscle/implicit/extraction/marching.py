@@ -10,7 +10,7 @@ and its edge would have four triangles. Each crossed edge then has one ring of c
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -83,7 +83,7 @@ def marching_tables() -> Tables:
     ambiguous = np.full((256, 6), -1)
     first = np.zeros(256, dtype=np.int64)
     start = [0]
-    triangles: list[Any] = []
+    triangles: list[tuple[int, int, int]] = []
     for case in range(256):
         inside = [(case >> c) & 1 for c in range(8)]
         unclear = [k for k, face in enumerate(FACE_CORNERS) if _is_ambiguous([inside[c] for c in face])]
@@ -117,7 +117,7 @@ _FACE_EDGES = [[_edge_between(face[i], face[(i + 1) % 4]) for i in range(4)] for
 _FACES_OF_EDGE = [{k for k, edges in enumerate(_FACE_EDGES) if e in edges} for e in range(12)]
 
 
-def _trace_loops(inside: list[int], joined: set[Any]) -> list[Any]:
+def _trace_loops(inside: list[int], joined: set[int]) -> list[list[int]]:
     """Loops of crossed edges; a segment runs from an edge that leaves the inside to one that enters."""
     following = {}
     for k, face in enumerate(FACE_CORNERS):
@@ -141,7 +141,7 @@ def _trace_loops(inside: list[int], joined: set[Any]) -> list[Any]:
     return loops
 
 
-def _triangulate(loop: list[int]) -> list[Any] | None:
+def _triangulate(loop: list[int]) -> list[tuple[int, int, int]] | None:
     """Triangles of a loop of edges with no diagonal inside a face of the cell; None where there are none."""
     if len(loop) < 3:
         return []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,7 +46,7 @@ class Sheets(NamedTuple):
 def count_sheets(
     field: Field,
     points: Floats,
-    distance: Callable[..., Any],
+    distance: Callable[[Floats], Floats],
     *,
     boxes: tuple[int, ...] = BOXES,
     wanted: int = 1,

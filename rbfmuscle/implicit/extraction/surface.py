@@ -8,7 +8,7 @@ and Newton steps put each vertex onto the zero set itself: all that is left of t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,6 +24,9 @@ from rbfmuscle.validation import check_finite, check_points, check_positive
 
 if TYPE_CHECKING:
     from rbfmuscle.implicit.extraction.obstacles import ObstaclePoints
+
+    # Points of bones with their poses, and the tolerance.
+    Obstacles = tuple[list[tuple[ObstaclePoints, Floats]], float]
 
 
 @dataclass(frozen=True)
@@ -151,7 +154,7 @@ def _start(band: Band, points: Floats, level: float, search: str) -> None:
 
 
 def _reach_volume(
-    band: Band, target: float | None, level: float, keep: str, obstacles: tuple[Any, ...]
+    band: Band, target: float | None, level: float, keep: str, obstacles: Obstacles
 ) -> ExtractedSurface | None:
     """Mesh at the level that gives the target volume; None where the surface leaves the grid."""
     spacing = band.grid.spacing
@@ -193,7 +196,7 @@ def _finish(
     level: float,
     components: int,
     spurious: int,
-    obstacles: tuple[Any, ...],
+    obstacles: Obstacles,
 ) -> ExtractedSurface:
     bones, tolerance = obstacles
     if bones:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from rbfmuscle.geometry.arrays import Floats
 
 
 def largest_eigenvalue(
-    size: int, multiply: Callable[..., Any], *, steps: int = 2, start: Floats | None = None
+    size: int, multiply: Callable[[Floats], Floats], *, steps: int = 2, start: Floats | None = None
 ) -> float:
     """Largest eigenvalue of a symmetric matrix by a few steps of power iteration, a lower bound.
 

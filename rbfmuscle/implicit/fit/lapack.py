@@ -7,8 +7,8 @@ the same routines called through their published addresses (`scipy.linalg.cython
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,7 @@ _CHAR, _ARRAY = ctypes.c_char_p, ctypes.c_void_p
 
 
 @lru_cache(maxsize=8)
-def _routine(name: str, *types: Any) -> Any:
+def _routine(name: str, *types: type) -> Callable[..., None]:
     from scipy.linalg import cython_blas, cython_lapack
 
     published = {**cython_blas.__pyx_capi__, **cython_lapack.__pyx_capi__}

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -120,7 +119,9 @@ class Kernel:
         return limit if power == 0 or limit == 0 else math.copysign(math.inf, limit)
 
 
-def _row(power: int, inner: tuple[Any, ...] = (), outer: tuple[Any, ...] = (), extra: int = 0) -> Floats:
+def _row(
+    power: float, inner: tuple[float, ...] = (), outer: tuple[float, ...] = (), extra: int = 0
+) -> Floats:
     """One radial function: s**power (base * inner(s) + outer(s)); extra is the base's own exponent."""
     row = np.zeros(2 + 2 * _TERMS)
     row[0], row[1] = power, extra

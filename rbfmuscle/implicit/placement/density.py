@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -65,7 +65,9 @@ def _edge_sum(i: Integers, j: Integers, values: Floats, size: int) -> Floats:
     return np.asarray(np.bincount(i, values, size) + np.bincount(j, values, size), dtype=np.float64)
 
 
-def greedy_sample(fine: FineMesh, count: int, seed: int, gather: Callable[..., Any]) -> SurfaceSample:
+def greedy_sample(
+    fine: FineMesh, count: int, seed: int, gather: Callable[[Integers, Integers], SurfaceSample]
+) -> SurfaceSample:
     """Cells made smaller, round by round, where a cubic Hermite fit misses the mesh.
 
     Each round fits the field to the centres, takes |f| at the mesh's vertices as the distance missed, and

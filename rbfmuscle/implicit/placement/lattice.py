@@ -7,7 +7,6 @@ however many centres there are. Where material is, the signed distance to the re
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -95,7 +94,7 @@ class Lattice:
         self.full = (depth < -half)[used]
         self.cells = every[used]
 
-    def _key(self, cells: Integers) -> Any:
+    def _key(self, cells: Integers) -> Integers:
         return (cells[:, 0] * self.count[1] + cells[:, 1]) * self.count[2] + cells[:, 2]
 
     def _number_nodes(self) -> None:
@@ -181,7 +180,7 @@ class Lattice:
             out[group] = k
         return out[self.cell]
 
-    def second_differences(self) -> Any:
+    def second_differences(self) -> Floats:
         """Σ over axes of the squared second differences of the nodes along them, (N, N).
 
         Zero for every linear map of the nodes, so that it resists neither turning nor stretching; it carries
@@ -199,7 +198,7 @@ class Lattice:
         return out
 
 
-def _axes(points: Floats) -> Any:
+def _axes(points: Floats) -> Floats:
     """Right-handed principal axes as rows, signs by the points' skewness; the identity where they are not clear."""
     offset = points - points.mean(axis=0)
     _, sizes, axes = np.linalg.svd(offset, full_matrices=False)
@@ -211,7 +210,7 @@ def _axes(points: Floats) -> Any:
     return axes
 
 
-def _basis(s: Floats, degree: int) -> Any:
+def _basis(s: Floats, degree: int) -> tuple[Floats, Floats]:
     """Values and slopes (n, 3, degree + 1) of the uniform B-splines of a cell at s in [0, 1]^3."""
     one = np.ones_like(s)
     if degree == 1:
@@ -220,7 +219,7 @@ def _basis(s: Floats, degree: int) -> Any:
     return value, np.stack([s - 1, 1 - 2 * s, s], -1)
 
 
-def _split(points: Floats) -> Any:
+def _split(points: Floats) -> tuple[Floats, Floats]:
     """Eight points with the middle and the spread of many: halved along each axis, then moved apart."""
     groups = [points]
     for axis in range(3):
@@ -242,7 +241,7 @@ def _split(points: Floats) -> Any:
     return middle + (spots - middle) * widen, size
 
 
-def dense_points(vertices: Floats, faces: Integers, samples: Floats, sample_faces: Integers) -> Any:
+def dense_points(vertices: Floats, faces: Integers, samples: Floats, sample_faces: Integers) -> Floats:
     """Points (n, 3) of a mesh between its samples: middles of their edges, again and again, on to the surface."""
     corners = samples[sample_faces]
     area = 0.5 * np.linalg.norm(np.cross(*(corners[:, k] - corners[:, 0] for k in (1, 2))), axis=1).sum()

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -128,7 +128,7 @@ class _Problem(NamedTuple):
     """Linear least squares for values and gradients at the centres; they change too little for another matrix."""
 
     cardinal: np.ndarray  # (4K, n), values at the samples for unit values and gradients: of order one
-    factor: Any  # of its normal matrix
+    factor: tuple[np.ndarray, bool]  # of its normal matrix
     scale: float
 
 
