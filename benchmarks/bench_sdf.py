@@ -16,13 +16,13 @@ import igl
 import numba
 import numpy as np
 import trimesh
+from peers.detectors import TreeDetector, VoxelDetector
+from peers.serendipity import SerendipityField
+from peers.spline import SplineField
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.sim.distance.detectors import TreeDetector, VoxelDetector
 from rbfmuscle.sim.distance.errors import points_near
 from rbfmuscle.sim.distance.sdf import BoneSDF
-from rbfmuscle.sim.distance.serendipity import SerendipityField
-from rbfmuscle.sim.distance.spline import SplineField
 
 PSEUDONORMAL = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
 # Points for accuracy, for speed, and for the slow exact tools.

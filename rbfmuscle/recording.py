@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, suppress
 from datetime import UTC, datetime
 
@@ -12,6 +12,7 @@ import numba
 
 from rbfmuscle.compiled.warm import compile_ahead
 from rbfmuscle.compiled.watch import compiled_so_far, tell_stage
+from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.sharing.crew import Crew
 from rbfmuscle.sharing.share import Share, timed
 from rbfmuscle.sim.loop.frame import Event, Frame
@@ -37,6 +38,8 @@ class Recording:
         What the caller asked for, for ``run.json``.
     models_here : bool
         Build the models in this process, for who wants to watch them, however many they are.
+    fields : mapping of str to BoneField, optional
+        Of the bones, by name, in place of `BoneSDF`; all muscles are then in this process.
     """
 
     def __init__(
@@ -45,6 +48,7 @@ class Recording:
         *,
         options: dict | None = None,
         models_here: bool = True,
+        fields: Mapping[str, BoneField] | None = None,
     ) -> None:
         self.started, self._start = datetime.now(UTC), time.perf_counter()
         self.scene = scene.validate()
@@ -59,15 +63,15 @@ class Recording:
             compile_ahead({muscle.model for muscle in scene.muscles})
         with self.timed("build"), tell_stage("building"):
             self.recorder = MetricsRecorder(scene) if scene.output.metrics else None
-            self.share, self._driven = self._build(
-                0 if models_here else helpers_for(scene, numba.get_num_threads())
-            )
+            alone = models_here or fields is not None
+            helpers = 0 if alone else helpers_for(scene, numba.get_num_threads())
+            self.share, self._driven = self._build(helpers, fields)
 
-    def _build(self, helpers):
+    def _build(self, helpers, fields):
         """All muscles, here or in helpers' hands, and the events of bones; a scene that is refused ends the helpers."""
         if helpers < 2:
             check_initial(self.scene)
-            return Share(self.scene), _bones_driven_together(self.scene)
+            return Share(self.scene, fields=fields), _bones_driven_together(self.scene)
         crew = Crew(self.scene, helpers)
         try:
             check_initial(self.scene)

@@ -11,6 +11,7 @@ import numpy as np
 
 from rbfmuscle.compiled.progress import Progress
 from rbfmuscle.compiled.watch import tell_stage
+from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.models import configure_scene
 from rbfmuscle.recording import Recording
 from rbfmuscle.sim.loop.frame import Event, Frame
@@ -29,6 +30,7 @@ def simulate(
     settings: Mapping[str, Any] | None = None,
     frames: slice | str | None = None,
     progress: Callable[[int, int], None] | bool | None = None,
+    fields: Mapping[str, BoneField] | None = None,
 ) -> "Run":
     """Run a scene through its motion and keep every frame in memory.
 
@@ -44,6 +46,8 @@ def simulate(
     progress : callable or bool, optional
         Called as ``progress(done, total)`` after each frame; ``True`` shows on stderr what goes on, compiling and
         building included.
+    fields : mapping of str to BoneField, optional
+        What tells the distance to each bone, by the bone's name; `BoneSDF` where not given.
 
     Returns
     -------
@@ -67,10 +71,13 @@ def simulate(
     """
     if progress is True:
         with Progress(scene.name) as shown:
-            return simulate(scene, model, settings=settings, frames=frames, progress=shown)
+            return simulate(scene, model, settings=settings, frames=frames, progress=shown, fields=fields)
     scene = configure_scene(scene, settings, model=model, frames=frames)
+    if fields is not None and set(fields) != {bone.name for bone in scene.bones}:
+        bones = ", ".join(bone.name for bone in scene.bones)
+        raise UsageError(f"fields must name each bone ({bones}), got {', '.join(fields) or 'none'}")
     options = _asked(model, settings, frames)
-    recording, memory = Recording(scene, options=options, models_here=False), MemorySink()
+    recording, memory = Recording(scene, options=options, models_here=False, fields=fields), MemorySink()
     run = Run(recording, memory)
     try:
         recording.feed(memory, progress=progress or None)

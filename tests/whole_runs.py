@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from contraction_scenes import spindle_scene
+from peers.detectors import VoxelDetector
+from peers.serendipity import SerendipityField
 from spindle_scene import CENTRE, build_scene
 
 import rbfmuscle as rm
@@ -45,9 +47,9 @@ def _contact(model):
     return _phantom(["extensor"], model, end=40.0, step=20.0)
 
 
-def _bent(model, detector="sdf"):
+def _bent(model):
     """A spindle is bent over a ball by 30 degrees to either side and pressed on it."""
-    scene = build_scene().with_options({"contact.detector": detector}, model=model)
+    scene = build_scene().with_options({}, model=model)
     scene.muscles[0].mesh.apply_translation([0.7, -4.0, 0.3])
     for name, bone in (("bend", "upper"), ("other", "lower")):
         scene.add_joint(name, "ball", bone, CENTRE.tolist(), {"flexion": (1, 0, 0)})
@@ -102,8 +104,8 @@ SCENES = {
     "contact_rbf_marching": lambda: _contact({**RBF, "surface": "marching"}),
     "contact_rbf_inside": lambda: _contact({**RBF, "inside": 120, "fibre_ratio": 4.0}),
     "contact_pbd": lambda: _bent("pbd"),
-    "contact_pbd_serendipity": lambda: _bent("pbd", "serendipity"),
-    "contact_pbd_voxel": lambda: _bent("pbd", "voxel"),
+    "contact_pbd_serendipity": lambda: _bent("pbd"),
+    "contact_pbd_voxel": lambda: _bent("pbd"),
     "contact_pbd_paper": lambda: _bent(PAPER),
     "contact_xpbd": lambda: _bent("xpbd"),
     "contact_arap_pbd": lambda: _bent("arap-pbd"),
@@ -120,13 +122,19 @@ SCENES = {
 }
 
 
-def measure(scene):
+# Runs whose bones have other fields than `BoneSDF`.
+FIELDS = {"contact_pbd_serendipity": SerendipityField, "contact_pbd_voxel": VoxelDetector}
+
+
+def measure(name):
     """What is kept of a run: some carried points, moments of each surface, rows of the metrics, points that tunnelled.
 
     Lengths stand in shares of the muscle's longest side, areas and volumes in shares of its square and cube, so one
     tolerance is for all.
     """
-    run = rm.simulate(scene)
+    scene, kind = SCENES[name](), FIELDS.get(name)
+    fields = {bone.name: kind.from_mesh(bone.mesh) for bone in scene.bones} if kind else None
+    run = rm.simulate(scene, fields=fields)
     found = {}
     for muscle in scene.muscles:
         low, high = muscle.mesh.bounds
@@ -188,7 +196,7 @@ def _compare(kept, found, place, kind, worst):
 
 def write(name):
     """Write one reference anew; twelve digits, a number a line, so that a change reads as a difference."""
-    text = json.dumps(measure(SCENES[name]()), indent=0)
+    text = json.dumps(measure(name), indent=0)
     rounded = json.loads(text, parse_float=lambda t: float(f"{float(t):.12g}"))
     FOLDER.mkdir(parents=True, exist_ok=True)
     (FOLDER / f"{name}.json").write_text(json.dumps(rounded, indent=0) + "\n", encoding="utf-8")
@@ -204,7 +212,7 @@ def main(arguments):
     names = [name for name in arguments if not name.startswith("-")] or list(SCENES)
     for name in names:
         if "--compare" in arguments:
-            worst = differences(read(name), measure(SCENES[name]()))
+            worst = differences(read(name), measure(name))
             print(name, " ".join(f"{kind} {value:.1e}" for kind, (value, _) in worst.items()), flush=True)
         else:
             write(name)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from typing import NamedTuple
 
 from rbfmuscle.compiled.watch import tell_stage
+from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.models import build_models
 from rbfmuscle.sim.loop.frame import Frame
 from rbfmuscle.sim.loop.simulate import simulate_frames
@@ -38,6 +39,8 @@ class Share:
         Whole: what does not belong to a muscle is the same in every share.
     names : collection of str, optional
         Of the muscles; all where not given.
+    fields : mapping of str to BoneField, optional
+        Of the bones, by name; `BoneSDF` where not given.
 
     Attributes
     ----------
@@ -53,8 +56,14 @@ class Share:
         If a muscle cannot be built.
     """
 
-    def __init__(self, scene: Scene, names: Collection[str] | None = None) -> None:
-        self.scene = scene
+    def __init__(
+        self,
+        scene: Scene,
+        names: Collection[str] | None = None,
+        *,
+        fields: Mapping[str, BoneField] | None = None,
+    ) -> None:
+        self.scene, self._fields = scene, fields
         self.times: dict[str, float] = {}
         self.compiled = {"loops": 0.0, "seconds": 0.0}
         self.models = build_models(scene, names)
@@ -70,7 +79,7 @@ class Share:
             If a muscle cannot be solved, naming muscle, frame and coordinates.
         """
         wanted = bool(self.scene.output.surfaces) or self._measures is not None
-        frames = simulate_frames(self.scene, self.models, surfaces=wanted)
+        frames = simulate_frames(self.scene, self.models, fields=self._fields, surfaces=wanted)
         first = True
         while True:
             with timed(self.times, "simulate"):

@@ -23,7 +23,6 @@ TABLES = {
         options.ContactOptions,
         {
             "initial": "keep",
-            "detector": "bvh",
             "tolerance": 0.1,
             "substep_angle": 4.0,
             "still_angle": 0.5,

@@ -16,7 +16,7 @@ UNSETTLED = {"contact_rbf_inside": 1e-6}
 
 @pytest.mark.parametrize("name", SCENES)
 def test_run_gives_what_is_kept(name):
-    worst = differences(read(name), measure(SCENES[name]()), name)
+    worst = differences(read(name), measure(name), name)
     limit = UNSETTLED.get(name, TOLERANCE)
     assert not {kind: told for kind, told in worst.items() if not told[0] <= limit}, (
         "make references, if meant"

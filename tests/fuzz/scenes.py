@@ -187,7 +187,6 @@ def _tables(scene, rng):
             ("contact", "tolerance", [1e-300, 1e-9, 1e-3, 0.5, 1e9, 0]),
             ("contact", "margin", [0, 1e-3, 5.0, 1e9, -1]),
             ("contact", "initial", ["keep", "error", "resolv"]),
-            ("contact", "detector", ["sdf", "spline", "voxel", "bvh", "serendipity", "x"]),
             ("sliding", "threshold", [1e-300, 0.5, 1e300, -1]),
             ("sliding", "pairs", [[], [["muscle", "muscle"]], [["a", "b"]], [["muscle"]], 1]),
             (

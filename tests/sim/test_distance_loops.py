@@ -9,8 +9,6 @@ from rbfmuscle.geometry.exact_distance import STACK, ExactDistance, record_squar
 from rbfmuscle.sim.distance import build, lists, query
 from rbfmuscle.sim.distance.query import _mixed_side
 from rbfmuscle.sim.distance.sdf import BoneSDF
-from rbfmuscle.sim.distance.serendipity import SerendipityField
-from rbfmuscle.sim.distance.spline import SplineField
 
 
 def angle_iron():
@@ -105,43 +103,6 @@ def test_answers_do_not_depend_on_company(field):
     near = alone <= 0.5
     np.testing.assert_array_equal(together[near], alone[near])
     assert (together[~near] > 0.5).all() and (alone[~near] > 0.5).all()
-
-
-def cubic(points):
-    x, y, z = points.T
-    return x**3 - 2 * y**3 + z**3 + x * y * z + x * x * y - z * z * x + y - 0.3
-
-
-def cubic_gradient(points):
-    x, y, z = points.T
-    return np.column_stack(
-        [3 * x**2 + y * z + 2 * x * y - z * z, -6 * y**2 + x * z + x * x + 1, 3 * z**2 + x * y - 2 * z * x]
-    )
-
-
-def test_serendipity_cells_hold_cubics_and_their_gradients():
-    """Cells of different edges along each axis, so that no axis stands for another."""
-    field = SerendipityField(cubic, [-1.0, -0.8, -0.5], [1.0, 0.7, 0.9], (2, 3, 1))
-    points = np.random.default_rng(0).uniform([-1, -0.8, -0.5], [1, 0.7, 0.9], (40, 3))
-    distance, gradient = field.distance_and_gradient(points)
-    np.testing.assert_allclose(distance, cubic(points), atol=1e-12)
-    np.testing.assert_allclose(gradient, cubic_gradient(points), atol=1e-11)
-
-
-def test_spline_meets_its_nodes_and_its_gradient_is_that_of_its_values():
-    field = SplineField(cubic, [-1.0] * 3, [1.0, 0.9, 0.8], 0.25)
-    nodes = np.stack(np.meshgrid(*[np.arange(-0.5, 0.6, 0.25)] * 3), axis=-1).reshape(-1, 3)
-    np.testing.assert_allclose(field.distance(nodes), cubic(nodes), atol=1e-12)
-    points = np.random.default_rng(1).uniform(-0.6, 0.6, (30, 3))
-    distance, gradient = field.distance_and_gradient(points)
-    # Natural ends leave an error of their own, which falls by a quarter with each node inward.
-    np.testing.assert_allclose(distance, cubic(points), atol=2e-2)
-    step = 6e-6
-    for k in range(3):
-        way = step * np.eye(3)[k]
-        slope = (field.distance(points + way) - field.distance(points - way)) / (2 * step)
-        np.testing.assert_allclose(gradient[:, k], slope, atol=1e-8)
-    assert np.ptp(field.distance(points + [1e-9, 0, 0]) - distance) < 1e-7
 
 
 def test_a_mixed_cell_interpolates_what_its_corners_say_and_ends_at_its_sides():

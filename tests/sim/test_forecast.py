@@ -13,7 +13,6 @@ from rbfmuscle.models import MODEL_NAMES, build_model, estimate_model
 from rbfmuscle.sim.distance.sdf import BoneSDF
 from rbfmuscle.sim.loop.contact import BoneContacts
 from rbfmuscle.sim.plan.forecast import FieldCost, MuscleCost, estimate_field, forecast, side_by_side
-from rbfmuscle.sim.plan.plan import plan_scene
 from rbfmuscle.sim.plan.rates import _bumpy_sphere, measure_rates, scales
 from rbfmuscle.sim.scene.phantom import phantom_scene
 
@@ -143,11 +142,6 @@ def test_time_and_memory_add_up(scene):
     assert time["total"] == pytest.approx(time["build"]["total"] + 10 * 0.2)
     assert (memory["fields"], memory["muscles"], memory["metrics"]) == (4e6, 1e6, 0.0)
     assert memory["peak"] > memory["total"] + 5e7
-
-
-def test_other_detectors_are_not_foretold(scene):
-    made = plan_scene(scene.with_options({"contact.detector": "bvh"}), estimate_model)
-    assert made["memory"]["fields"] == 0.0 and "memory" not in made["fields"][0]
 
 
 def test_rates_are_measured_on_a_closed_outward_mesh():

@@ -5,6 +5,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 
+from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.sim.contraction.course import Activations
 from rbfmuscle.sim.loop.carrying import Carrier
 from rbfmuscle.sim.loop.contact import BoneContacts
@@ -69,7 +70,7 @@ class FrameLoop:
         scene: Scene,
         models: Sequence[MuscleModel] | Mapping[str, MuscleModel],
         *,
-        fields: Mapping[str, object] | None = None,
+        fields: Mapping[str, BoneField] | None = None,
         surfaces: bool = True,
     ) -> None:
         models = list(models.values()) if isinstance(models, Mapping) else list(models)
@@ -266,7 +267,7 @@ def simulate_frames(
     *,
     surfaces: bool = True,
     written: Collection[int] | None = None,
-    fields: Mapping[str, object] | None = None,
+    fields: Mapping[str, BoneField] | None = None,
     ahead: bool = True,
 ) -> Iterator[Frame]:
     """Run models through a scene's motion, from the rest pose on, and yield its frames one by one.

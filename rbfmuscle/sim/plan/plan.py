@@ -101,8 +101,7 @@ def _forecast(scene, made, regions, estimate):
         )
     fields = []
     meshes = {bone.name: bone.mesh for bone in scene.bones}
-    # Other detectors have fields of other kinds, or none.
-    for field in made["fields"] if scene.contact.detector == "sdf" else []:
+    for field in made["fields"]:
         boxes = [box for (_, name), box in regions.items() if name == field["bone"]]
         cost = estimate_field(meshes[field["bone"]], union_of(boxes), scene.contact.tolerance)
         field.update(cells=cost.cells, memory=cost.memory, kept=cost.kept)

@@ -12,12 +12,11 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import moved_box
-from rbfmuscle.sim.distance.detectors import build_detector
+from rbfmuscle.sim.distance.sdf import BoneSDF
 from rbfmuscle.sim.loop.substeps import check_substeps, path_angle
 from rbfmuscle.sim.scene.motion import bone_poses, completed, interpolate, rest_coordinates
 
 if TYPE_CHECKING:
-    from rbfmuscle.sim.distance.sdf import BoneSDF
     from rbfmuscle.sim.scene.objects import Muscle
     from rbfmuscle.sim.scene.scene import Scene
 
@@ -81,18 +80,13 @@ def reached_bones(scene: Scene) -> dict[tuple[Any, ...], Floats]:
 
 
 def build_fields(scene: Scene, regions: dict[tuple[Any, ...], Floats]) -> dict[str, BoneSDF]:
-    """Distance fields of the bones that some muscle can reach, in parallel: dict of bone name to field.
-
-    The scene's ``[contact] detector`` says of which kind; only the default is built for the reached part alone.
-    """
-    kind, tolerance = scene.contact.detector, scene.contact.tolerance
+    """Distance fields of the parts of bones that some muscle can reach, in parallel: dict of bone name to field."""
+    tolerance = scene.contact.tolerance
 
     def build(bone):
-        if kind != "sdf":
-            return build_detector(kind, bone.mesh)
         boxes = [box for (_, name), box in regions.items() if name == bone.name]
         options = {} if tolerance is None else {"tolerance": tolerance}
-        return build_detector(kind, bone.mesh, region=union_of(boxes), **options)
+        return BoneSDF.from_mesh(bone.mesh, region=union_of(boxes), **options)
 
     bones = [bone for bone in scene.bones if any(name == bone.name for _, name in regions)]
     if len(bones) < 2:

@@ -30,6 +30,7 @@ LARGEST_INTEGER = 2**53
 # Keys that were removed, and what to do instead; a key of a muscle or of its model (`model.KEY`) without the muscle.
 # The table is deleted at 1.0.
 REMOVED_KEYS: dict[str, str] = {
+    "contact.detector": "delete the key; for other fields call simulate(scene, fields={bone: field}) in Python",
     "model.derivatives": "delete the key: up to 200 centres, and fitted ones, meet all derivatives",
     "output.fibres": "delete the key: fibres of a run are no longer followed; those of a scene still steer its muscles",
     "output.moment_arms": "delete the key: moment arms are measured along every motion, about what moves alone",
@@ -167,7 +168,6 @@ class ContactOptions(Table):
     """``[contact]``: how muscles meet bones."""
 
     initial: Literal["resolve", "keep", "error"] = "resolve"
-    detector: Literal["sdf", "spline", "serendipity", "voxel", "bvh"] = "sdf"
     tolerance: Positive | None = None
     substep_angle: Annotated[float, Field(gt=0, le=90)] = 2.0
     still_angle: Annotated[float, Field(ge=0, le=90)] = 0.0

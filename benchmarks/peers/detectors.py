@@ -1,24 +1,19 @@
 """Other ways to detect that a point is in a bone, behind the interface of `BoneSDF`, to be compared with it.
 
-They are baselines, correct and small. None is a default.
+A run is driven by them with ``rbfmuscle.simulate(scene, fields={bone: field})``.
 """
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, MeshLike
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.sim.distance.mesh import prepare_bone, winding_test
-from rbfmuscle.validation import UsageError, check_mesh, check_points
-
-if TYPE_CHECKING:
-    pass
-
+from rbfmuscle.validation import check_mesh, check_points
 
 # Share of the longest side that a baseline's grid reaches beyond the mesh.
 MARGIN = 0.1
@@ -168,29 +163,3 @@ def sample_nodes(function: Callable[[Floats], Floats], axes: Sequence[Floats]) -
     """Values of a function at the nodes of a grid given by its three axes."""
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     return function(nodes.reshape(-1, 3)).reshape(nodes.shape[:3])
-
-
-def build_detector(name: str, mesh: MeshLike, **options: Any) -> Any:
-    """Detector of a bone by name: ``sdf`` (`BoneSDF`), ``spline``, ``serendipity``, ``voxel`` or ``bvh``.
-
-    Options are those of the detector's ``from_mesh``.
-
-    Raises
-    ------
-    UsageError
-        If there is no detector of that name.
-    """
-    if name not in _HOME:
-        raise UsageError(f"no detector is called {name!r}; there are {', '.join(DETECTOR_NAMES)}")
-    module, kind = _HOME[name]
-    return getattr(importlib.import_module(module), kind).from_mesh(mesh, **options)
-
-
-_HOME = {
-    "sdf": ("rbfmuscle.sim.distance.sdf", "BoneSDF"),
-    "spline": ("rbfmuscle.sim.distance.spline", "SplineField"),
-    "serendipity": ("rbfmuscle.sim.distance.serendipity", "SerendipityField"),
-    "voxel": ("rbfmuscle.sim.distance.detectors", "VoxelDetector"),
-    "bvh": ("rbfmuscle.sim.distance.detectors", "TreeDetector"),
-}
-DETECTOR_NAMES = tuple(_HOME)

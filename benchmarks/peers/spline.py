@@ -1,7 +1,4 @@
-"""Distance field on a tricubic B-spline over an isotropic grid.
-
-It stands beside `BoneSDF` to be compared with it; nothing uses it by default.
-"""
+"""Distance field on a tricubic B-spline over an isotropic grid."""
 
 from __future__ import annotations
 
@@ -9,12 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike
 
-from rbfmuscle.compiled.loop import compiled
+from peers.detectors import PointDetector, grid_of, sample_nodes
 from rbfmuscle.geometry.arrays import MeshLike
 from rbfmuscle.geometry.bsplines import bspline_sum, bspline_weights
-from rbfmuscle.sim.distance.detectors import PointDetector, grid_of, sample_nodes
 from rbfmuscle.validation import check_points
 
 
@@ -62,7 +59,7 @@ class SplineField(PointDetector):
         return distance, gradient
 
 
-@compiled
+@njit
 def _spline_loop(points, origin, spacing, coefficients, distance, gradient):
     weight, slope, base = np.empty((3, 4)), np.empty((3, 4)), np.empty(3, np.int64)
     for n in range(len(points)):

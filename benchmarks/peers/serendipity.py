@@ -1,7 +1,4 @@
-"""Distance field on 32-node cubic serendipity cells, as in Discregrid (Koschier & Bender 2017).
-
-It stands beside `BoneSDF` to be compared with it; nothing uses it by default.
-"""
+"""Distance field on 32-node cubic serendipity cells, as in Discregrid (Koschier & Bender 2017)."""
 
 from __future__ import annotations
 
@@ -9,11 +6,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike
 
-from rbfmuscle.compiled.loop import compiled
+from peers.detectors import PointDetector, grid_of, sample_nodes
 from rbfmuscle.geometry.arrays import MeshLike
-from rbfmuscle.sim.distance.detectors import PointDetector, grid_of, sample_nodes
 from rbfmuscle.validation import check_points
 
 
@@ -64,7 +61,7 @@ class SerendipityField(PointDetector):
         return distance, gradient
 
 
-@compiled
+@njit
 def _serendipity_loop(points, low, edge, nodes, distance, gradient):
     corners, on_x, on_y, on_z = nodes
     cell, t, grad = np.empty(3, np.int64), np.empty(3), np.empty(3)
@@ -94,7 +91,7 @@ def _serendipity_loop(points, low, edge, nodes, distance, gradient):
             gradient[n, k] = 2.0 * grad[k] / edge[k]
 
 
-@compiled
+@njit
 def _corner(t, a, b, c, square, node, grad):
     """Add (1/64)(1 + a x)(1 + b y)(1 + c z)(9 (x^2 + y^2 + z^2) - 19) times the node to the gradient."""
     x, y, z, w = 1.0 + a * t[0], 1.0 + b * t[1], 1.0 + c * t[2], 9.0 * square - 19.0
@@ -105,7 +102,7 @@ def _corner(t, a, b, c, square, node, grad):
     return s * x * y * z * w
 
 
-@compiled
+@njit
 def _edge(t, axes, sides, node, grad):
     """Add (9/64)(1 - x^2)(1 + 9 x_i x)(1 + b y)(1 + c z), x_i = a/3, x along axis i, times the node."""
     i, j, k = axes
