@@ -67,7 +67,6 @@ class Start:
             "first_frame_processor": round(first[0], 2), "first_frame_wall": round(first[1], 2),
             "all_processor": round(self.used, 2), "all_wall": round(end - self.begun, 2),
             "longest_silence": round(max(b - a for a, b in itertools.pairwise(times)), 2),
-            "loops_compiled": info.get("compiled", {}).get("loops"),
             "frame_median": round(info["frame_time"]["median"], 4),
         }  # fmt: skip
 

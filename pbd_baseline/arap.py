@@ -13,10 +13,10 @@ import numpy as np
 import scipy.sparse as sparse
 
 from pbd_baseline.topology import colour
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.harmonic import cotangent_laplacian
 from rbfmuscle.geometry.rotations import quaternion_matrix, rotate, turn_quaternion
+from rbfmuscle.jit import compiled
 
 if TYPE_CHECKING:
     from pbd_baseline.topology import Topology

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from pbd_baseline.topology import colour, spread
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.jit import compiled
 
 # A gradient shorter than this share of its natural size belongs to a collapsed element: it has no direction.
 TINY = 1e-12

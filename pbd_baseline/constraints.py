@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from pbd_baseline.topology import colour, spread
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import volume_about, volume_cubic
+from rbfmuscle.jit import compiled
 
 # A gradient shorter than this share of its natural size belongs to a collapsed element: it has no direction.
 TINY = 1e-12

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.jit import compiled
 
 # A half-space counts as violated below this share of the search reach.
 TOUCHING = 1e-9

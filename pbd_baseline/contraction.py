@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.jit import compiled
 from rbfmuscle.sim.contraction.law import FibreLaw
 from rbfmuscle.sim.contraction.resolve import resolve_contraction
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from scipy.sparse.linalg import splu
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.jit import compiled
 
 
 class SymmetricFactor:

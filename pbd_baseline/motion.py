@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.harmonic import blended_motion
+from rbfmuscle.jit import compiled
 
 
 def carry(points: Floats, weights: Floats, motions: Floats) -> None:

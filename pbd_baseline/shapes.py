@@ -21,9 +21,9 @@ from pbd_baseline.factor import SymmetricFactor
 from pbd_baseline.fibres import edge_stiffness, vertex_areas
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.rest import Rest
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rotations import turned_quaternions
+from rbfmuscle.jit import compiled
 
 
 class Shape:

@@ -8,8 +8,8 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.jit import compiled
 from rbfmuscle.validation import MeshError, check_mesh
 
 

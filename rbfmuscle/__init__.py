@@ -29,7 +29,6 @@ _HOME = {
     "reach_error": "rbfmuscle.study.experiment.wanted_error",
     "simulate": "rbfmuscle.run",
     "study_kernels": "rbfmuscle.study.experiment.kernel_study",
-    "warm_up": "rbfmuscle.compiled.warm",
 }
 
 __all__ = [*_HOME, "__version__"]

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rbfmuscle.compiled.watch import tell_stage
 from rbfmuscle.models import MODEL_NAMES, build_models, check_model_name, configure_scene
+from rbfmuscle.progress import stage
 from rbfmuscle.run import stream_run
 from rbfmuscle.sim.loop.simulate import simulate_frames
 from rbfmuscle.sim.scene.motion import Motion
@@ -99,13 +99,13 @@ def compare_models(
             failed[name] = str(error)
     if not results:
         raise SolveError("; ".join(f"{name}: {reason}" for name, reason in failed.items()))
-    with tell_stage("distances between models"):
+    with stage("distances between models"):
         matrix = add_distances(results, folder, poses)
     table = write_tables(folder, next(iter(variants.values())), results, failed, matrix, poses)
 
     from rbfmuscle.study.show.comparison_page import write_page
 
-    with tell_stage("drawing pictures" if pictures else "writing the report"):
+    with stage("drawing pictures" if pictures else "writing the report"):
         missing = write_page(folder, table, pictures=pictures)
     if missing is not None:
         raise missing
@@ -145,9 +145,9 @@ def _measure(name, scene, folder, poses, progress):
     probe = ModelProbe(scene, poses)
     report = None if progress is None else (lambda done, total: progress(name, done, total))
     stream_run(scene, folder, pictures=False, progress=report, watch=probe)
-    with tell_stage(f"{name}: there and back by coarser steps"):
+    with stage(f"{name}: there and back by coarser steps"):
         again = _there_and_back(scene)
-    with tell_stage(f"{name}: measuring"):
+    with stage(f"{name}: measuring"):
         return measure_run(SavedRun(folder), probe, again)
 
 

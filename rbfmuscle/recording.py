@@ -10,9 +10,8 @@ from datetime import UTC, datetime
 
 import numba
 
-from rbfmuscle.compiled.warm import compile_ahead
-from rbfmuscle.compiled.watch import compiled_so_far, tell_stage
 from rbfmuscle.geometry.fields import BoneField
+from rbfmuscle.progress import stage
 from rbfmuscle.sharing.crew import Crew
 from rbfmuscle.sharing.share import Share, timed
 from rbfmuscle.sim.loop.frame import Event, Frame
@@ -53,15 +52,12 @@ class Recording:
         self.started, self._start = datetime.now(UTC), time.perf_counter()
         self.scene = scene.validate()
         self.options = options or {}
-        self._compiled = compiled_so_far()
         self.times: dict[str, float] = {}
         self.status, self.message = "running", ""
         self.summary, self.stages = Summary(), Stages()
         self.written: list[dict] = []
         self._place = {muscle.name: k for k, muscle in enumerate(scene.muscles)}
-        with self.timed("compile"):
-            compile_ahead({muscle.model for muscle in scene.muscles})
-        with self.timed("build"), tell_stage("building"):
+        with self.timed("build"), stage("building"):
             self.recorder = MetricsRecorder(scene) if scene.output.metrics else None
             alone = models_here or fields is not None
             helpers = 0 if alone else helpers_for(scene, numba.get_num_threads())
@@ -148,12 +144,10 @@ class Recording:
     def info(self, status: str | None = None) -> dict:
         """What ``run.json`` holds by now."""
         self.times["wall"] = time.perf_counter() - self._start
-        found, there = compiled_so_far(), self.share.compiled
-        compiled = {name: found[name] - self._compiled[name] + there[name] for name in found}
         return build_info(
             self.scene,
             ending=(status or self.status, self.message),
-            clock=Clock(self.started, self._spent(), self.stages, compiled),
+            clock=Clock(self.started, self._spent(), self.stages),
             frames=self.written,
             summary=self.summary.table(),
             limits={name: default_limit(name, self.scene) for name in LIMITS},

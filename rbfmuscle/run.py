@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from rbfmuscle.compiled.progress import Progress
-from rbfmuscle.compiled.watch import tell_stage
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.models import configure_scene
+from rbfmuscle.progress import Progress, stage
 from rbfmuscle.recording import Recording
 from rbfmuscle.sim.loop.frame import Event, Frame
 from rbfmuscle.sim.scene.scene import Scene
@@ -150,7 +149,7 @@ def _finish(recording, writer, limits, pictures):
     """Report and pictures, then the limits: a missing part must not hide a broken limit."""
     output = recording.scene.output
     missing = None
-    with recording.timed("report"), tell_stage("drawing pictures"):
+    with recording.timed("report"), stage("drawing pictures"):
         if output.report or output.preview:
             from rbfmuscle.study.show.report import write_report
 

@@ -15,8 +15,7 @@ def timeless(path):
 
 def without_times(value):
     """A JSON value whose clock readings are None: their keys stay."""
-    # What was compiled meanwhile depends on what had been before, by anyone.
-    clocks = ("started", "written", "wall", "times", "stages", "frame_time", "compiled")
+    clocks = ("started", "written", "wall", "times", "stages", "frame_time")
     if isinstance(value, dict):
         return {
             key: (sorted(item) if isinstance(item, dict) else None)

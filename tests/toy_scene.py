@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import trimesh
 
-from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.jit import compiled
 from rbfmuscle.sim.loop.frame import FinishedDrawing, ModelSurface
 from rbfmuscle.sim.scene.joint_tables import JointTable
 from rbfmuscle.sim.scene.motion import Motion

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
+from rbfmuscle.jit import compiled
 
 # Most cells of a bone's grid.
 MOST_CELLS = 200_000

@@ -8,10 +8,10 @@ import numpy as np
 
 from pbd_baseline.rest import Rest
 from pbd_baseline.sound.ridges import faces_of
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.geometry.crossing import FaceTree, creased_faces
 from rbfmuscle.geometry.rigid import calmed
+from rbfmuscle.jit import compiled
 
 # Rounds of smoothing, how many of them until the smoothed region grows by a ring, and sweeps in each.
 ROUNDS, GROWTH, SWEEPS = 48, 4, 4

@@ -11,9 +11,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from rbfmuscle.commands.scenes import load_scene
-from rbfmuscle.compiled.progress import Progress
-from rbfmuscle.compiled.warm import compile_ahead
-from rbfmuscle.compiled.watch import tell_stage
+from rbfmuscle.progress import Progress, stage
 from rbfmuscle.validation import SceneError
 
 
@@ -78,12 +76,11 @@ def _findings(path):
 
     loaded = load_scene(path, skeleton=True)
     check_models(loaded)
-    compile_ahead(["check"])
     exact = ExactMeshes()
-    with tell_stage("fields of the bones"):
+    with stage("fields of the bones"):
         findings = [*check_scene(loaded, exact), *_field_notes(loaded)]
     if not any(finding.level == "error" for finding in findings):
-        with tell_stage("looking ahead along the motion"):
+        with stage("looking ahead along the motion"):
             findings += ahead_findings(loaded, exact)
     order = {"error": 0, "warning": 1, "note": 2}
     return loaded, sorted(findings, key=lambda finding: order[finding.level])
@@ -111,7 +108,7 @@ def _measure_fields(scene):
     from rbfmuscle.sim.distance.errors import measure_field
     from rbfmuscle.sim.distance.sdf import BoneSDF
 
-    with tell_stage("errors of the bones' fields"):
+    with stage("errors of the bones' fields"):
         return {b.name: measure_field(BoneSDF.from_mesh(b.mesh, name=b.name)) for b in scene.bones}
 
 

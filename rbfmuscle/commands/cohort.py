@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rbfmuscle.compiled.progress import Progress
+from rbfmuscle.progress import Progress
 from rbfmuscle.validation import SolveError, UsageError
 
 if TYPE_CHECKING:

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from rbfmuscle.commands.scenes import is_mesh, load_scene
-from rbfmuscle.compiled.progress import Progress
-from rbfmuscle.compiled.warm import compile_ahead
+from rbfmuscle.progress import Progress
 from rbfmuscle.validation import UsageError
 
 if TYPE_CHECKING:
@@ -72,7 +71,6 @@ def kernels(
         return _find_wanted(meshes, output, error, chosen, placement, units, as_json)
     (title, mesh), *_ = meshes.items()
     with Progress("kernels", what="fit") as bar:
-        compile_ahead(["kernels"])
         study = study_kernels(
             mesh, kernels=chosen, centres=counts, placement=placement, resolution=resolution, units=units,
             progress=bar,

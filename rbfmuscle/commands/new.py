@@ -79,7 +79,7 @@ def _beside(source, output):
 
 def _write_surfaces(source, labels, folder):
     """Surfaces of all labels as PLY beside the scene; their folder."""
-    from rbfmuscle.compiled.progress import Progress
+    from rbfmuscle.progress import Progress
     from rbfmuscle.sim.guess.anatomy import bone_class, says_muscle
     from rbfmuscle.sim.volumes.read import read_labels
     from rbfmuscle.sim.volumes.surfaces import label_surface

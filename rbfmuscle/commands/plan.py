@@ -9,9 +9,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from rbfmuscle.commands.scenes import load_scene
-from rbfmuscle.compiled.progress import Progress
-from rbfmuscle.compiled.warm import compile_ahead
-from rbfmuscle.compiled.watch import tell_stage
+from rbfmuscle.progress import Progress, stage
 
 
 def plan(scene: Path, *, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False) -> None:
@@ -35,8 +33,7 @@ def _plan(path):
 
     loaded = load_scene(path)
     check_models(loaded)
-    compile_ahead(["plan"])
-    with tell_stage("measuring this machine"):
+    with stage("measuring this machine"):
         return plan_scene(loaded, estimate_model)
 
 

@@ -10,7 +10,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from rbfmuscle.commands.scenes import PHANTOM, load_scene
-from rbfmuscle.compiled.progress import Progress
+from rbfmuscle.progress import Progress
 from rbfmuscle.validation import RBFMuscleError
 
 Output = Annotated[Path, Parameter(name=["--output", "-o"])]

@@ -7,8 +7,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from rbfmuscle.compiled.progress import Progress
-from rbfmuscle.compiled.watch import tell_stage
+from rbfmuscle.progress import Progress, stage
 
 
 def export(
@@ -77,6 +76,6 @@ def render(
     with Progress(f"render {directory}"):
         from rbfmuscle.study.show.render import render_run
 
-        with tell_stage("drawing pictures"):
+        with stage("drawing pictures"):
             render_run(directory, output, frame=frame, views=view, seconds=seconds, colour=colour)
     print(output)

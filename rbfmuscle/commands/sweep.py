@@ -11,7 +11,7 @@ from cyclopts import Parameter
 
 from rbfmuscle.commands.run import Json, Output
 from rbfmuscle.commands.scenes import load_scene
-from rbfmuscle.compiled.progress import Progress
+from rbfmuscle.progress import Progress
 from rbfmuscle.validation import SolveError, UsageError
 
 if TYPE_CHECKING:

@@ -9,9 +9,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from rbfmuscle.commands.scenes import load_scene
-from rbfmuscle.compiled.progress import Progress
-from rbfmuscle.compiled.warm import compile_ahead
-from rbfmuscle.compiled.watch import tell_stage
+from rbfmuscle.progress import Progress, stage
 from rbfmuscle.validation import UsageError
 
 # What each quality changes in a muscle's model table; "as given" changes nothing.
@@ -61,7 +59,7 @@ def view(
     with Progress(f"view {scene.name}"):
         viewer, motion, title = _open_saved(opened) if scene.is_dir() else _open_scene(opened, model)
         viewer.colour_by(colour)
-        with tell_stage("building"):
+        with stage("building"):
             _begin_at(viewer, stops)
     window = Window(viewer, output, motion=motion, title=title)
     window.open(until_closed=screenshot is None)
@@ -109,7 +107,6 @@ def _open_scene(loaded, model):
 
     scene = configure_scene(loaded, model=model)
     scene.validate()
-    compile_ahead({muscle.model for muscle in scene.muscles})
     print(f"rbfmuscle: preparing {scene.name}", file=sys.stderr)
     models = [scene.muscles[0].model]
     models += [name for name in ("rbf", "pbd", "xpbd", "arap-volume") if name not in models]

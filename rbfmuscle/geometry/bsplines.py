@@ -1,6 +1,6 @@
 """Uniform cubic B-splines on a lattice, for compiled loops: weights of the nodes about a place, and their sum."""
 
-from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.jit import compiled
 
 
 @compiled(error_model="numpy")

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.geometry.triangles import triangle_normal
+from rbfmuscle.jit import compiled
 
 # Triangles in a leaf of the tree, and bits of their places along each axis by which they are sorted.
 LEAF, BITS = 4, 10

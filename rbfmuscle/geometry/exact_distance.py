@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.geometry.triangles import (
     BX,
@@ -29,6 +28,7 @@ from rbfmuscle.geometry.triangles import (
     opposite_faces,
     vertex_faces,
 )
+from rbfmuscle.jit import compiled
 
 # Triangles in a leaf, at most.
 LEAF = 4

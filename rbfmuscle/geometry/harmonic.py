@@ -9,8 +9,8 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Array, Floats, Integers
+from rbfmuscle.jit import compiled
 
 
 def cotangent_laplacian(vertices: Floats, faces: Integers) -> sparse.csc_matrix:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.threads import in_chunks
+from rbfmuscle.jit import compiled
 
 # A triangle whose plane the point lies in, seen from outside it, adds nothing.
 _FLAT = 1e-12

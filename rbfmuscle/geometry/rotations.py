@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.jit import compiled
 
 
 def turned_quaternions(quaternions: Floats, rotation: Floats) -> Floats:

@@ -4,8 +4,8 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.jit import compiled
 
 
 def face_normals(vertices: Floats, faces: Integers) -> Floats:

@@ -8,7 +8,7 @@ computation using the angle weighted pseudonormal").
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.jit import compiled
 
 # Columns of a record: corner A, x-axis, y-axis, normal, then x of B, x and y of C, and 1/|BC|^2, 1/|CA|^2.
 WIDTH = 18

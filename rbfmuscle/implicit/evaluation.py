@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numba
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.implicit.kernels.radial import _radial_loop
 from rbfmuscle.implicit.kernels.shares import (
@@ -25,6 +24,7 @@ from rbfmuscle.implicit.kernels.shares import (
     _offsets_loop,
 )
 from rbfmuscle.implicit.kernels.values import _add_values_loop, _cubic_loop
+from rbfmuscle.jit import compiled
 
 if TYPE_CHECKING:
     from rbfmuscle.implicit.kernels.table import Kernel

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.rotations import quaternion_matrix
 from rbfmuscle.geometry.surfaces import volume_and_gradient
+from rbfmuscle.jit import compiled
 from rbfmuscle.sim.contraction.law import FibreLaw
 
 

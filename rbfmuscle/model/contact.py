@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.jit import compiled
 from rbfmuscle.sim.loop.contact import HalfSpaces
 
 # Rounds in which contacts join the working set, and sweeps over it in each.

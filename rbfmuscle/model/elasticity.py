@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.rest_frame import diameter
 from rbfmuscle.geometry.rotations import turned_quaternions
+from rbfmuscle.jit import compiled
 from rbfmuscle.model.constraints import ShapeConstraint, VolumeConstraint
 from rbfmuscle.model.contact import ContactConstraint
 from rbfmuscle.model.options import RBFOptions

@@ -18,8 +18,8 @@ from typing import Any
 
 import numba
 
-from rbfmuscle.compiled.child import gone, how_it_ended, send, start_child
-from rbfmuscle.compiled.watch import tell_stage
+from rbfmuscle.child import gone, how_it_ended, send, start_child
+from rbfmuscle.progress import stage
 from rbfmuscle.sharing.share import Solved
 from rbfmuscle.sim.scene.scene import Scene
 
@@ -40,8 +40,6 @@ class Crew:
     ----------
     times : dict of str to float
         Wall time spent so far [s], of the helper that spent most: ``simulate``, ``metrics``.
-    compiled : dict of str to float
-        Loops that helpers compiled, and the processor time they took.
     """
 
     def __init__(self, scene: Scene, helpers: int) -> None:
@@ -62,12 +60,6 @@ class Crew:
         every = [helper.clock.get("times", {}) for helper in self._helpers]
         return {part: max(times.get(part, 0.0) for times in every) for part in {p for t in every for p in t}}
 
-    @property
-    def compiled(self) -> dict[str, float]:
-        """See the class."""
-        every = [helper.clock.get("compiled", {}) for helper in self._helpers]
-        return {name: sum(found.get(name, 0.0) for found in every) for name in ("loops", "seconds")}
-
     def built(self) -> None:
         """Wait until all muscles are built, or raise what went wrong."""
         for helper in self._helpers:
@@ -77,7 +69,7 @@ class Crew:
         """As of a `Share`."""
         for helper in self._helpers:
             helper.begin()
-        with tell_stage("solving the first frame"):
+        with stage("solving the first frame"):
             parts = [self._next(helper) for helper in self._helpers]
         while not any(part is None for part in parts):
             yield _joined(parts, [muscle.name for muscle in self.scene.muscles])

@@ -13,8 +13,7 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
-from rbfmuscle.compiled.child import Outbox, listen
-from rbfmuscle.compiled.watch import compiled_so_far
+from rbfmuscle.child import Outbox, listen
 from rbfmuscle.sharing.share import Share
 from rbfmuscle.validation import RBFMuscleError
 
@@ -61,7 +60,7 @@ def main() -> None:
 
 
 def _work(outbox, words, share):
-    outbox.clock = lambda: {"times": dict(share.times), "compiled": compiled_so_far()}
+    outbox.clock = lambda: {"times": dict(share.times)}
     outbox.say("done", None)
     words.get()
     for solved in share.frames():

@@ -7,9 +7,9 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from typing import NamedTuple
 
-from rbfmuscle.compiled.watch import tell_stage
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.models import build_models
+from rbfmuscle.progress import stage
 from rbfmuscle.sim.loop.frame import Frame
 from rbfmuscle.sim.loop.simulate import simulate_frames
 from rbfmuscle.sim.scene.scene import Scene
@@ -47,8 +47,6 @@ class Share:
     models : list of MuscleModel
     times : dict of str to float
         Wall time spent so far [s]: ``simulate``, ``metrics``.
-    compiled : dict of str to float
-        What other processes compiled for it: nothing.
 
     Raises
     ------
@@ -65,7 +63,6 @@ class Share:
     ) -> None:
         self.scene, self._fields = scene, fields
         self.times: dict[str, float] = {}
-        self.compiled = {"loops": 0.0, "seconds": 0.0}
         self.models = build_models(scene, names)
         carried = {model.name: model.carried_mesh() for model in self.models}
         self._measures = MuscleMeasures(scene, carried) if scene.output.metrics else None
@@ -108,5 +105,5 @@ def timed(times: dict[str, float], part: str) -> Iterator[None]:
 
 
 def _first(frames):
-    with tell_stage("solving the first frame"):
+    with stage("solving the first frame"):
         return next(frames, None)

@@ -214,7 +214,7 @@ class TestOutputs:
             "40",
         ]
         code, _, err = call(capsys, *words, "--resolution", "16")
-        busy = re.compile(r".*: (fit .*|[a-z ]+ \(\d+ s\)|.*compiling.* \(\d+ s\))")
+        busy = re.compile(r".*: (fit .*|[a-z ]+ \(\d+ s\)|compiling loops .*)")
         lines = [line for line in err.splitlines() if not busy.fullmatch(line) and "warning" not in line]
         assert (
             code == 2 and len(lines) == 1 and "No space left" in lines[0] and str(tmp_path / "o") in lines[0]

@@ -17,7 +17,6 @@ from command_line import call
 
 import rbfmuscle as rm
 from rbfmuscle.commands.plan import _lines as plan_lines
-from rbfmuscle.compiled.progress import describe_stage
 from rbfmuscle.sim.scene.check import check_centre, check_extents, check_scene
 from rbfmuscle.study.measure.summary import require_limits
 from rbfmuscle.study.show.comparison_page import cell
@@ -228,7 +227,6 @@ class TestPages:
                 "status": "complete", "message": "", "times": {"wall": 12.34}, "frame_time": {"median": 0.0567},
                 "scene": {"muscles": [{"model": {"name": "rbf"}}, {"model": {"name": "pbd"}}]},
                 "limits": {"penetration_max": 0.5, "volume_error": 0.01},
-                "compiled": {"loops": 3, "seconds": 4.5},
                 "muscles": {
                     "strap": {
                         "penetration_max": {"worst": 0.61, "worst_frame": 7, "unit": "mm"},
@@ -261,24 +259,6 @@ class TestPages:
         )
         assert facts["time a frame, median"] == "57 ms" and facts["whole run"] == "12.3 s"
         assert facts["model"] == "pbd, rbf" and facts["muscles"] == "2" and facts["frames"] == "3"
-        assert facts["of which compiling, this once"] == "4.5 s, 3 loops"
         saved.info["limits"]["penetration_max"] = 0.61
         assert "within every limit" in _verdict(saved)
         assert report_cell("time_frame", {"worst": 1.0, "median": 0.0345}).startswith("34.5 ms")
-
-
-class TestProgress:
-    @pytest.mark.parametrize(
-        ("text", "total", "loop", "told"),
-        [
-            ("building", 0, None, "building"),
-            ("building", 0, "query_loop", "building, compiling query_loop"),
-            ("", 0, "query_loop", "compiling query_loop"),
-            ("compiling ahead", 7, "query_loop", "compiling ahead: loop 3 of 7"),
-            ("", 7, None, "loop 3 of 7"),
-            ("", 0, None, "starting"),
-        ],
-    )
-    def test_stage_is_told_with_its_loop_and_count(self, monkeypatch, text, total, loop, told):
-        monkeypatch.setattr("rbfmuscle.compiled.progress.loop_in_work", lambda: loop)
-        assert describe_stage(SimpleNamespace(text=text, total=total, what="loop", done=3)) == told

@@ -232,7 +232,7 @@ def test_muscles_are_dealt_whole():
 def test_a_message_that_is_cut_is_the_last_one():
     """What follows it would be read as its rest: the process ends, and its end tells."""
     said = """
-from rbfmuscle.compiled.child import Outbox
+from rbfmuscle.child import Outbox
 box = Outbox()
 try:
     box.put(("done", ["first", lambda: 0]))

@@ -42,8 +42,8 @@ def paths(
         KEY=VALUE, as for run; may be repeated.
     """
     from rbfmuscle.commands.opensim.sampling import parse_ranges, report_fits, sample_muscles
-    from rbfmuscle.compiled.progress import Progress
     from rbfmuscle.models import configure_scene
+    from rbfmuscle.progress import Progress
     from rbfmuscle.sim.scene.settings import parse_settings
     from rbfmuscle.study.files.writer import check_writable
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.fields import Cut, Field
 from rbfmuscle.implicit.extraction.marching import (
@@ -22,6 +21,7 @@ from rbfmuscle.implicit.extraction.marching import (
     _march_loop,
     marching_tables,
 )
+from rbfmuscle.jit import compiled
 from rbfmuscle.validation import check_points
 
 # More nodes than this are refused: 2 bytes of state and 8 of index each.

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Array, Booleans, Floats, Integers
 from rbfmuscle.geometry.fields import Cut, Field
 from rbfmuscle.geometry.surfaces import vertex_normals
@@ -10,6 +9,7 @@ from rbfmuscle.implicit.extraction.band import BandGrid
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
 from rbfmuscle.implicit.extraction.obstacles import CHORD, ObstaclePoints, faces_within, points_near_cells
 from rbfmuscle.implicit.extraction.projection import CutBounds, Projector
+from rbfmuscle.jit import compiled
 
 # What is within this many mean edges of the bones may come to lie on them.
 NEAR_CUT = 1.5

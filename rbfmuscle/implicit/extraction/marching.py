@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Array, Floats, Integers
+from rbfmuscle.jit import compiled
 
 # Corner c of a cell sits at (c & 1, c >> 1 & 1, c >> 2). Edge e runs from its corner along its axis.
 EDGE_CORNER = np.array([c for axis in range(3) for c in range(8) if not c >> axis & 1])

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.fields import Cut, Field
 from rbfmuscle.geometry.surfaces import mesh_volume, vertex_normals
@@ -20,6 +19,7 @@ from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
 from rbfmuscle.implicit.extraction.obstacles import ObstaclePoints
 from rbfmuscle.implicit.extraction.surface import ExtractedSurface
 from rbfmuscle.implicit.extraction.untangling import gather, untangle
+from rbfmuscle.jit import compiled
 from rbfmuscle.validation import check_finite
 
 # No vertex goes farther than this from where the material carries it, in mean edges; and where the field's slope

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.crossing import FaceTree
+from rbfmuscle.jit import compiled
 
 
 class MaterialMesh:

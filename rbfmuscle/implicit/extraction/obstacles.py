@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Array, Booleans, Floats, Integers
+from rbfmuscle.jit import compiled
 from rbfmuscle.validation import check_points
 
 if TYPE_CHECKING:

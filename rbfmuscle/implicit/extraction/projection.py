@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.fields import Cut, Field
 from rbfmuscle.geometry.surfaces import volume_cubic
 from rbfmuscle.implicit.extraction.obstacles import push_off_points
+from rbfmuscle.jit import compiled
 
 if TYPE_CHECKING:
     from rbfmuscle.implicit.extraction.band import BandGrid

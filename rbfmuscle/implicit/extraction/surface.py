@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.fields import Cut, Field
 from rbfmuscle.geometry.surfaces import corner_from, mesh_volume, six_volumes
 from rbfmuscle.implicit.extraction.band import Band, BandGrid
 from rbfmuscle.implicit.extraction.obstacles import CHORD, points_near_cells
 from rbfmuscle.implicit.extraction.projection import Projector
+from rbfmuscle.jit import compiled
 from rbfmuscle.validation import check_finite, check_points, check_positive
 
 if TYPE_CHECKING:

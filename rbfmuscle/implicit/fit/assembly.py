@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.implicit.kernels.radial import _radial_loop
 from rbfmuscle.implicit.kernels.values import _add_values_loop
+from rbfmuscle.jit import compiled
 
 
 def exponents(degree: int) -> Integers:

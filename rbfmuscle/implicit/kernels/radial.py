@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.jit import compiled
 
 ONE, EXP, GAUSS, BINOMIAL, CUT, LOG, POWER = range(7)
 """Bases: 1, exp(-s), exp(-s^2), (1+s^2)^beta, (1-s)+, log s, s^a."""

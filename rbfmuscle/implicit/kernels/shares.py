@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.jit import compiled
 
 
 @compiled(error_model="numpy", fastmath={"contract"})

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.implicit.kernels.radial import BINOMIAL, CUT, EXP, GAUSS, LOG, ONE, _exp, _log
+from rbfmuscle.jit import compiled
 
 _FAST: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
 

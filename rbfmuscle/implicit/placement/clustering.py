@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import face_normals, unique_edges
 from rbfmuscle.implicit.placement.control_mesh import contract_clusters
+from rbfmuscle.jit import compiled
 
 # Least ratio of cell size to edge length: about ten mesh vertices a cell, or cells get ragged.
 FINENESS = 2.5

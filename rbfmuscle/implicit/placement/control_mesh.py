@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.jit import compiled
 from rbfmuscle.validation import MeshError
 
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import (
     barycentric_weights,
@@ -21,6 +20,7 @@ from rbfmuscle.geometry.triangles import nearest_weights
 from rbfmuscle.implicit.placement.clustering import cluster_mesh, refine_mesh
 from rbfmuscle.implicit.placement.control_mesh import opposite_half_edges
 from rbfmuscle.implicit.placement.density import curvature_density, greedy_sample
+from rbfmuscle.jit import compiled
 from rbfmuscle.validation import check_mesh
 
 if TYPE_CHECKING:

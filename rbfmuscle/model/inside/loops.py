@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.rotations import quaternion_matrix
+from rbfmuscle.jit import compiled
 from rbfmuscle.model.constraints import _rotation_loop
 from rbfmuscle.model.contact import solve_contact_forces
 

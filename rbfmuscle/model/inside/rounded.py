@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.bsplines import bspline_sum, bspline_weights
+from rbfmuscle.jit import compiled
 
 SIDE = 4  # cells along a block
 WIDE = SIDE + 3  # nodes along it, those of the splines that reach into it too

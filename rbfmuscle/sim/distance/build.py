@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Array, Booleans, Floats, Integers
 from rbfmuscle.geometry.exact_distance import STACK, nearest_triangle, record_square, signed_side
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.geometry.triangles import FIRST
+from rbfmuscle.jit import compiled
 from rbfmuscle.sim.distance.cells import BLOCK
 from rbfmuscle.sim.distance.lattice import corner_ids, lattice, mark_corners, mark_loop, small_ids_loop
 from rbfmuscle.sim.distance.lists import LONGEST, SLACK, folded_list, list_loop

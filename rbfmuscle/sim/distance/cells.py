@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.jit import compiled
 
 # Lower bits of a header below the lower bound of its cell.
 BOUND = 6

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Array, Integers
+from rbfmuscle.jit import compiled
 
 
 def lattice(shape: Iterable[int]) -> Integers:

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.exact_distance import STACK, nearest_triangle, record_feature, record_square
 from rbfmuscle.geometry.triangles import CORNER, EDGE, FACE
+from rbfmuscle.jit import compiled
 from rbfmuscle.sim.distance.cells import BOUND
 from rbfmuscle.sim.distance.query import CROSSED, INSIDE, MIXED, OUTSIDE, SIDE
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.triangles import CORNER, EDGE, FACE, nearest_in_frame
+from rbfmuscle.jit import compiled
 from rbfmuscle.sim.distance.cells import BOUND, INVERSE, UNIT, _beyond, _block_entry, _common_bound, _placed
 
 # What a cell says of its side.

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.geometry.touching_balls import touching_balls
 from rbfmuscle.geometry.triangles import nearest_weights, triangle_normal
 from rbfmuscle.geometry.winding import wound_around
+from rbfmuscle.jit import compiled
 from rbfmuscle.sim.loop.neighbours.lead import Lead
 
 if TYPE_CHECKING:

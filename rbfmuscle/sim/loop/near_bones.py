@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
+from rbfmuscle.jit import compiled
 
 # Share of a queried distance that later calls rely on: a field is exact near its bone, coarser far away.
 TRUSTED_SHARE = 0.8

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.rigid import rigid_fit
+from rbfmuscle.jit import compiled
 from rbfmuscle.sim.loop.near_bones import box_loop, boxes_apart
 from rbfmuscle.sim.loop.neighbours.links import Planes
 

@@ -31,14 +31,11 @@ class Clock(NamedTuple):
     times : dict of str to float
         Wall time of the parts of the run [s].
     stages : Stages
-    compiled : dict
-        Loops that this process compiled meanwhile and the processor time they took [s].
     """
 
     started: datetime
     times: dict[str, float]
     stages: Stages
-    compiled: dict[str, float]
 
 
 def build_info(
@@ -85,7 +82,6 @@ def build_info(
         "machine": machine(),
         "inputs": input_hashes(scene),
         "times": clock.times,
-        "compiled": clock.compiled,
         "stages": clock.stages.table(),
         "work": clock.stages.work(),
         **({"neighbours": clock.stages.neighbours()} if clock.stages.pairs else {}),

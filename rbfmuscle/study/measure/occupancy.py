@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbfmuscle.compiled.loop import compiled
 from rbfmuscle.geometry.arrays import Integers
+from rbfmuscle.jit import compiled
 from rbfmuscle.validation import check_mesh, check_points
 
 _UNKNOWN, _SURFACE, _OUTSIDE = 0, 1, 2

@@ -146,19 +146,9 @@ def _facts(saved):
         ("frames", len(saved.frames)),
         ("time a frame, median", f"{1000 * frame['median']:.0f} ms" if frame.get("median") else "-"),
         ("whole run", f"{info['times']['wall']:.1f} s"),
-        *_compiling(info),
         ("status", info["status"]),
     ]
     return "".join(f"<div><b>{html.escape(str(value))}</b><span>{name}</span></div>" for name, value in facts)
-
-
-def _compiling(info):
-    """What of the time was the compiling of a first run, where there was any."""
-    loops = info.get("compiled", {}).get("loops", 0)
-    if not loops:
-        return []
-    ahead, own = info["times"].get("compile", 0.0), info["compiled"]["seconds"]
-    return [("of which compiling, this once", f"{max(ahead, own):.1f} s, {loops:.0f} loops")]
 
 
 def _beyond(saved):

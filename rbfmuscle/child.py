@@ -1,7 +1,7 @@
 """Processes of ours beside this one: how they are started, how they listen and answer, and calls made in several.
 
 They are started by command, not forked or spawned by Python's own means, so that a script needs no guard of its main
-part and no thread is cut in two. ``python -m rbfmuscle.compiled.child`` is one that answers calls.
+part and no thread is cut in two. ``python -m rbfmuscle.child`` is one that answers calls.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def child_call(module: str, *arguments: str) -> tuple[list[str], dict[str, str]]
     Nothing that lies in the present folder takes the place of a module there.
     """
     command = [sys.executable, "-P", "-m", module, *arguments]
-    places = [str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")]
+    places = [str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
     return command, {**os.environ, "PYTHONPATH": os.pathsep.join(place for place in places if place)}
 
 

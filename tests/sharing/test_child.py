@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from rbfmuscle.compiled import child
+from rbfmuscle import child
 from rbfmuscle.validation import SolveError
 
 

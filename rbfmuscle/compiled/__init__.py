@@ -1,1 +1,0 @@
-"""Compiled loops: how one is declared, what names its cache, where that lies, and what compiles ahead."""

@@ -1,0 +1,82 @@
+"""What a command does, on stderr: a bar on a terminal, else a line per stage and now and then one for the count."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, ClassVar
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as Bar
+
+FIRST, EVERY = 2.0, 10.0  # Time before the first line for a count, and then between them [s].
+
+
+class Progress:
+    """Context manager; call it with (done, total). What is inside another is shown under the title of that one.
+
+    Parameters
+    ----------
+    title : str
+        Of the command or scene.
+    what : str
+        What is counted.
+    """
+
+    shown: ClassVar[Progress | None] = None
+
+    def __init__(self, title: str, what: str = "frame") -> None:
+        self.title, self.what = title, what
+        self.bar: Bar | None = None
+        self.begun = time.monotonic()
+        self.last = self.begun - EVERY + FIRST
+
+    def __enter__(self) -> Progress:
+        if Progress.shown is None:
+            Progress.shown = self
+            self.bar = _bar() if sys.stderr.isatty() else None
+            if self.bar is not None:
+                self.bar.start()
+                self.bar.add_task(self.title, total=None)
+        return self
+
+    def __call__(self, done: int, total: int) -> None:
+        """Show how much is done."""
+        shown = Progress.shown or self
+        if shown.bar is not None or done == total or time.monotonic() - shown.last > EVERY:
+            shown.show(f"{self.what} {done} of {total}", done, total)
+
+    def show(self, text: str, done: int = 0, total: int | None = None) -> None:
+        """Show a text, and a count."""
+        self.last = time.monotonic()
+        if self.bar is not None:
+            self.bar.update(
+                self.bar.task_ids[0], description=f"{self.title}: {text}", completed=done, total=total
+            )
+        else:
+            print(f"{self.title}: {text} ({self.last - self.begun:.0f} s)", file=sys.stderr, flush=True)
+
+    def __exit__(self, *error: object) -> None:
+        if Progress.shown is self:
+            Progress.shown = None
+            if self.bar is not None:
+                self.bar.stop()
+
+
+@contextlib.contextmanager
+def stage(text: str) -> Iterator[None]:
+    """Show what goes on, where something is shown."""
+    if Progress.shown is not None:
+        Progress.shown.show(text)
+    yield
+
+
+def _bar() -> Bar:
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    return Bar(*columns, console=Console(stderr=True), transient=True)

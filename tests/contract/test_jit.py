@@ -1,0 +1,160 @@
+"""Compiled loops on disk: loaded by a second process, never stale, whole or absent, and removed when unused."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+needs_compiler = pytest.mark.skipif(numba.config.DISABLE_JIT, reason="nothing is compiled")
+SOURCES = {
+    "__init__": "",
+    "constants": "SHIFT = 0.5\n",
+    "fields": "from typing import NamedTuple\n\nclass Pair(NamedTuple):\n    a: float\n    b: float\n",
+    "inner": """
+from rbfmuscle.jit import compiled
+from loops.constants import SHIFT
+
+@compiled(inline="always")
+def inner(x):
+    return 2.0 * x + SHIFT
+
+@compiled
+def difference(pair):
+    return pair.a - pair.b
+""",
+    "outer": """
+from rbfmuscle.jit import compiled
+from loops import inner as other
+
+@compiled
+def outer(x):
+    return other.inner(x) + later(x)
+
+@compiled
+def later(x):
+    return 100.0 * x
+""",
+}
+MAIN = """
+from loops import fields, inner, outer
+print(outer.outer(1.0), inner.difference(fields.Pair(a=3.0, b=2.0)))
+"""
+SAID = "rbfmuscle: compiling loops for this processor, once; a first run takes half a minute longer\n"
+
+
+@pytest.fixture
+def place(tmp_path):
+    """A package whose loops call each other across files, and the name of a folder that is not there yet."""
+    (tmp_path / "loops").mkdir()
+    for name, text in SOURCES.items():
+        (tmp_path / "loops" / f"{name}.py").write_text(text)
+    return tmp_path
+
+
+def start(place, cache="cache", **settings):
+    paths = os.pathsep.join([str(place), str(ROOT)])
+    settings = {"PYTHONPATH": paths, "RBFMUSCLE_LOOPS": str(place / cache), **settings}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen([sys.executable, "-c", MAIN], env={**os.environ, **settings}, cwd=place, **pipes)
+
+
+def finish(process):
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 0, err
+    return [float(word) for word in out.split()], err
+
+
+def run(place, **settings):
+    return finish(start(place, **settings))
+
+
+def edit(path, old, new):
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+def files(place):
+    return {path: path.stat().st_mtime_ns for path in (place / "cache").glob("*/*")}
+
+
+@needs_compiler
+def test_second_process_and_a_copy_of_the_sources_compile_nothing(place):
+    assert run(place) == ([102.5, 1.0], SAID)
+    kept = files(place)
+    assert len(kept) == 3  # the inlined loop has no code of its own
+    (place / "copy").mkdir()
+    (place / "loops").rename(place / "copy" / "loops")
+    assert run(place, PYTHONPATH=os.pathsep.join([str(place / "copy"), str(ROOT)])) == ([102.5, 1.0], "")
+    assert files(place) == kept
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("name", "old", "new", "expected"),
+    [
+        ("inner", "2.0 * x", "3.0 * x", [103.5, 1.0]),
+        ("constants", "0.5", "7.0", [109.0, 1.0]),
+        ("outer", "100.0", "200.0", [202.5, 1.0]),
+        # The module of the loop does not import this class.
+        ("fields", "    a: float\n    b: float", "    b: float\n    a: float", [102.5, 1.0]),
+    ],
+)
+def test_edit_of_what_a_loop_uses_reaches_it(place, name, old, new, expected):
+    run(place)
+    edit(place / "loops" / f"{name}.py", old, new)
+    assert run(place)[0] == expected
+
+
+@needs_compiler
+@pytest.mark.parametrize("damage", [b"", b"no such thing", None])
+def test_damaged_file_is_compiled_again(place, damage):
+    run(place)
+    for path in files(place):
+        path.write_bytes(path.read_bytes()[:-100] if damage is None else damage)
+    assert run(place) == ([102.5, 1.0], SAID)
+    assert run(place) == ([102.5, 1.0], "")
+
+
+@needs_compiler
+def test_folder_that_cannot_be_written_costs_one_line(place):
+    (place / "file").write_text("not a folder")
+    values, err = run(place, cache="file/cache")
+    assert values == [102.5, 1.0]
+    assert len(err.splitlines()) == 2
+    assert f"cannot keep compiled loops in {place / 'file' / 'cache'} (" in err
+
+
+@needs_compiler
+def test_processes_that_compile_at_once_are_right(place):
+    both = [start(place), start(place)]
+    assert [finish(process)[0] for process in both] == 2 * [[102.5, 1.0]]
+    assert run(place) == ([102.5, 1.0], "")
+
+
+@needs_compiler
+def test_folders_that_are_unused_are_removed(place):
+    run(place)
+    used = {path.parent for path in files(place)}
+    names = {"loops.old-" + 24 * "0": 61, "loops.new-" + 24 * "1": 59, "foreign": 999}
+    for path, days in [
+        *((place / "cache" / name, days) for name, days in names.items()),
+        *((p, 2) for p in used),
+    ]:
+        path.mkdir(exist_ok=True)
+        then = path.stat().st_mtime - days * 86400.0
+        os.utime(path, (then, then))
+    before = {path: path.stat().st_mtime for path in used}
+    run(place)
+    left = {path.name for path in (place / "cache").iterdir()}
+    assert left == {path.name for path in used} | {"loops.new-" + 24 * "1", "foreign"}
+    assert all(path.stat().st_mtime > before[path] + 86400.0 for path in used)
+
+
+def test_nothing_is_compiled_where_numba_is_switched_off(place):
+    assert run(place, NUMBA_DISABLE_JIT="1") == ([102.5, 1.0], "")
+    assert not (place / "cache").exists()
