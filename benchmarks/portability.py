@@ -48,25 +48,21 @@ def interpreter(name: str, folder: Path) -> Path:
 
 
 def run_tests(name: str, tests: list[str], folder: Path) -> tuple[str, int]:
-    """What pytest counted in a configuration, and how many failed."""
-    python = interpreter(name, folder)
-    with tempfile.TemporaryDirectory() as cache:
+    """What pytest counted in a configuration, and how many failed; all it printed is in the folder."""
+    python, log = interpreter(name, folder), folder / f"{name}.log"
+    with tempfile.TemporaryDirectory() as cache, log.open("w") as printed:
         environment = {**os.environ, **CONFIGURATIONS[name], "RBFMUSCLE_CACHE": cache}
-        if subprocess.run(
-            [python, "-c", TRIAL], env=environment, capture_output=True, check=False
-        ).returncode:
+        trial = subprocess.run([python, "-c", TRIAL], env=environment, capture_output=True, check=False)
+        if trial.returncode:
             return "not run: this processor has not the instructions", 0
         command = [python, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "--tb=short", *tests]
-        done = subprocess.run(
-            command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True, check=False
-        )
-    (folder / f"{name}.log").write_text(done.stdout)
-    last = done.stdout.strip().splitlines()[-1] if done.stdout.strip() else "nothing"
-    for line in done.stdout.splitlines():
+        done = subprocess.run(command, cwd=ROOT, env=environment, stdout=printed, check=False)
+    lines = log.read_text().splitlines() or ["nothing"]
+    for line in lines:
         if line.startswith(("FAILED", "ERROR")):
             print(f"    {line}", flush=True)
-    failed = sum(int(count) for count in re.findall(r"(\d+) (?:failed|error)", last))
-    return last, failed or int(done.returncode != 0)
+    failed = sum(int(count) for count in re.findall(r"(\d+) (?:failed|error)", lines[-1]))
+    return lines[-1], failed or int(done.returncode != 0)
 
 
 def main() -> int:
