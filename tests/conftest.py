@@ -36,7 +36,7 @@ def _move_vertices():
     from rbfmuscle.sim.scene import meshes
 
     def prepared(vertices, faces, prepare=meshes.prepare_mesh, **named):
-        sound = np.ndim(vertices) == 2 and np.size(vertices) and np.isfinite(vertices).all()
+        sound = np.ndim(vertices) == 2 and np.size(vertices) and (np.abs(vertices) < 1e30).all()
         return prepare(_moved(vertices) if sound else vertices, faces, **named)
 
     def shape(make):

@@ -278,7 +278,7 @@ def test_contact_of_faces_leaves_no_middle_of_a_face_in_a_bone(method):
     faces, edges = model.rest.topology.faces, model.rest.topology.edges
     points = model.contact_points()
     assert len(points) == len(model.points) + len(edges) + len(faces) == len(model.contact_bone)
-    np.testing.assert_allclose(points[-len(faces) :], model.points[faces].mean(axis=1))
+    np.testing.assert_allclose(points[-len(faces) :], model.points[faces].mean(axis=1), atol=1e-12)
     held = (model.rest.holder >= 0)[faces].any(axis=1)
     assert (model.contact_bone[-len(faces) :] >= 0).tolist() == held.tolist()
 

@@ -45,7 +45,7 @@ class TestFormats:
             "\n".join([*(f"v {x} {y} {z}" for x, y, z in corners), "vt 0 0", *(f"f {q}" for q in quads)])
         )
         read = read_mesh(path)
-        assert read.mesh.vertices.tolist() == [list(map(float, c)) for c in corners]
+        np.testing.assert_allclose(read.mesh.vertices, corners, atol=1e-9)
         assert read.mesh.volume == pytest.approx(729)
 
     def test_scale(self, tmp_path):

@@ -330,7 +330,7 @@ def test_cut_is_midway_between_overlapping_muscles():
     sliding = Sliding(made, steppers)
     for stepper in steppers:
         sliding.measure(stepper)
-    points = np.array([[0, 0, 2.5], [0, 0, 3.0], [0, 0, 3.5], [1, 1, 3.0], [0, 0, -4.0], [0, 30, 0]])
+    points = np.array([[0, 0, 2.5], [0, 0, 3.0], [0, 0, 3.5], [1, 1, 3.0], [0, 0, -4.5], [0, 30, 0]])
     lower, upper = (stepper.contacts.nearest(points) for stepper in steppers)
     assert np.allclose(lower[:3], [0.5, 0.0, -0.5], atol=0.1)
     assert np.allclose(lower[:4], -upper[:4], atol=1e-12)
