@@ -7,9 +7,7 @@ import pytest
 from blend_model import arm_files, use_blend_model
 from command_line import call
 
-from rbfmuscle.commands import cohort as cohort_command
 from rbfmuscle.commands.run import SHOWN
-from rbfmuscle.validation import SolveError
 
 TWO = (("biceps", 0.0), ("long_head", 60.0))
 
@@ -72,34 +70,3 @@ def test_export_counts_files_and_names_folders_once(ran, printed, tmp_path, caps
     code, out, _ = call(capsys, "export", ran[1], "--format", "animated-glb", "-o", one.parent)
     assert code == 0 and out == f"1 file in {one}\n"
     assert len(list(one.iterdir())) == 1
-
-
-def table(statuses):
-    jobs = [
-        {"subject": f"s{k}", "trial": "walk", "status": s, "error": f"why {k}" if s == "failed" else ""}
-        for k, s in enumerate(statuses)
-    ]
-    return {
-        "jobs": jobs,
-        "done": statuses.count("done"),
-        "failed": statuses.count("failed"),
-        "outliers": [],
-        "values": [1],
-    }
-
-
-def test_cohort_that_is_whole_ends_well(capsys, tmp_path):
-    cohort_command._tell(table(["done", "done"]), tmp_path, False)
-    out, err = capsys.readouterr()
-    assert out.startswith("2 jobs done, 0 failed, 0 values apart") and err == ""
-    cohort_command._tell(table(["done"]), tmp_path, True)
-    facts = json.loads(capsys.readouterr().out)
-    assert facts["directory"] == str(tmp_path) and facts["done"] == 1 and "values" not in facts
-
-
-def test_cohort_names_jobs_that_failed_or_were_not_run(capsys, tmp_path):
-    with pytest.raises(SolveError, match="2 of 3 jobs failed"):
-        cohort_command._tell(table(["done", "failed", "missing"]), tmp_path, False)
-    out, err = capsys.readouterr()
-    assert "1 jobs done, 1 failed" in out
-    assert [line.rsplit(": ", 1)[1] for line in err.splitlines()] == ["why 1", "missing"]

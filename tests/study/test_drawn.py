@@ -15,7 +15,6 @@ from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.quantities import ALL
 from rbfmuscle.study.show.comparison_plots import plot_models
 from rbfmuscle.study.show.plots import plot_panels
-from rbfmuscle.study.show.sweep_page import draw_front
 
 QUANTITY = {
     "Volume error": "volume_error",
@@ -141,38 +140,6 @@ def test_worst_of_several_muscles_is_the_greatest_in_size_with_its_sign(figures)
     (line,) = series_drawn(figures[0])
     assert list(line.get_ydata()) == pytest.approx([-30.0, -50.0, 20.0])
     assert list(line.get_xdata()) == [0, 2, 4]
-
-
-def point(**facts):
-    plain = {"model": "rbf", "role": "", "front": False, "time_frame": 0.02, "error_rms": 0.5}
-    return plain | facts
-
-
-@pytest.mark.parametrize("most", [0.03, 9.0])
-def test_front_is_drawn_in_milliseconds_with_plain_ticks(tmp_path, figures, most):
-    rows = [
-        point(time_frame=0.02, error_rms=0.5, front=True),
-        point(time_frame=most, error_rms=0.3, front=True, role="default"),
-        point(time_frame=0.025, error_rms=0.6),
-        point(time_frame=0.5, error_rms=0.1, role="reference"),
-    ]
-    draw_front({"quantity": "error_rms", "rows": rows, "units": "cm", "scene": "hip"}, tmp_path / "a.png")
-    (axes,) = figures
-    front, plain, default = (
-        [line for line in axes.lines if word in line.get_label()]
-        for word in ("on the front", "rbf", "default")
-    )
-    np.testing.assert_allclose(front[0].get_xydata(), [(20.0, 0.5), (1e3 * most, 0.3)])
-    np.testing.assert_allclose(plain[0].get_xydata(), [(25.0, 0.6)])
-    np.testing.assert_allclose(default[0].get_xydata(), [(1e3 * most, 0.3)])
-    assert len(axes.lines) == 3  # the reference is no point of the plot
-    assert axes.get_ylabel() == "error_rms [cm]" and "hip: 4 points" in axes.get_title(loc="left")
-    for axis in (axes.xaxis, axes.yaxis):
-        assert len(axis.get_minorticklocs()) == 0
-        low, high = axis.get_view_interval()
-        ticks = [t for t in axis.get_majorticklocs() if low <= t <= high]
-        assert len(ticks) >= 2
-        assert axis.get_major_formatter()(20.0, 0) == "20"
 
 
 def frame(index, times, *, state="solved", substeps=1, reason="bones turn", pairs=None, inner=None):

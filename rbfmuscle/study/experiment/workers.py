@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING
 
 from rbfmuscle.validation import MissingPartError, UsageError
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 CONNECT_WITHIN = 20  # seconds for a scheduler and its first two workers
 
@@ -30,40 +32,32 @@ class threads_limited:
         numba.set_num_threads(max(1, min(self.count, numba.config.NUMBA_NUM_THREADS)))
         self.limits = threadpool_limits(self.count)
 
-    def __exit__(self, *error: Any) -> None:
+    def __exit__(self, *error: object) -> None:
         import numba
 
         self.limits.restore_original_limits()
         numba.set_num_threads(self.before)
 
 
-def connect_cluster(scheduler: str, least: int) -> Any:
-    """A client of a Dask scheduler, as soon as so many workers are there.
+def connect_cluster(address: str) -> Client:
+    """A client of a Dask scheduler, as soon as two workers are there: to one alone joblib sends nothing.
 
     Raises
     ------
     MissingPartError
         If Dask is not installed.
     UsageError
-        If no scheduler with workers answers.
+        If no scheduler with two workers answers.
     """
     try:
         from distributed import Client
     except ImportError as error:
         raise MissingPartError(
-            "Dask is not installed, which --scheduler needs: pip install -e '.[cluster]' in rbfmuscle's folder"
+            "Dask is not installed, which --cluster needs: pip install 'rbfmuscle[cluster]'"
         ) from error
     try:
-        client = Client(scheduler, timeout=CONNECT_WITHIN)
-        client.wait_for_workers(least, timeout=CONNECT_WITHIN)
+        client = Client(address, timeout=CONNECT_WITHIN)
+        client.wait_for_workers(2, timeout=CONNECT_WITHIN)
     except (OSError, ValueError) as error:
-        many = "two workers" if least == 2 else "a worker"
-        raise UsageError(f"no Dask scheduler with {many} answers at {scheduler!r} ({error})") from None
+        raise UsageError(f"no Dask scheduler with two workers answers at {address!r} ({error})") from None
     return client
-
-
-def delayed_calls(function: Callable[..., Any], calls: Iterator[Any], **options: Any) -> Iterator[Any]:
-    """joblib's tasks for calls with these positional arguments."""
-    from joblib import delayed
-
-    return (delayed(function)(*arguments, **options) for arguments in calls)

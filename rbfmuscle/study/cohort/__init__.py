@@ -1,1 +1,0 @@
-"""Many scenes as one study: subjects and trials."""
