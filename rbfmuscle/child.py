@@ -1,12 +1,11 @@
-"""Processes of ours beside this one: how they are started, how they listen and answer, and calls made in several.
+"""Processes of ours beside this one: how they are started, how they listen and answer.
 
 They are started by command, not forked or spawned by Python's own means, so that a script needs no guard of its main
-part and no thread is cut in two. ``python -m rbfmuscle.child`` is one that answers calls.
+part and no thread is cut in two.
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
 import pickle
 import queue
@@ -14,8 +13,6 @@ import subprocess
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -99,89 +96,3 @@ def _listen(words: queue.Queue[Any]) -> None:
     except BaseException:  # noqa: BLE001 - what was told needs what is not there: nobody would answer
         traceback.print_exc()
         os._exit(1)
-
-
-def calls_apart(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], jobs: int) -> Iterator[Any]:
-    """What a function returns, in the order of the calls, from so many processes of one thread each.
-
-    They are ended with the iteration, however it ends, so that an interrupt leaves nothing behind.
-
-    Parameters
-    ----------
-    function : callable
-        Of a module, which a process can import.
-    calls : sequence of tuple
-        Positional arguments.
-    jobs : int
-
-    Raises
-    ------
-    SolveError
-        Where a process was ended; what the function raises is raised, with a note of where.
-    """
-    children: list[Any] = []
-    pool, waiting = ThreadPoolExecutor(jobs), []
-    try:
-        idle: queue.Queue[Any] = queue.Queue()
-        for _ in range(min(jobs, len(calls))):
-            children.append(start_child(__name__, 1))
-            idle.put(children[-1])
-        waiting = [pool.submit(_ask, idle, function, call) for call in calls]
-        for one in waiting:
-            yield one.result()
-        for child in children:
-            child.stdin.close()
-            child.wait()
-    finally:
-        for one in waiting:
-            one.cancel()
-        for child in children:
-            child.kill()
-            child.wait()
-        pool.shutdown()
-        for child in children:
-            for pipe in (child.stdin, child.stdout):
-                with contextlib.suppress(OSError):
-                    pipe.close()
-
-
-def _ask(idle, function, call):
-    """One call, by the next process that is idle."""
-    child = idle.get()
-    try:
-        send(child.stdin, (function, call))
-        found, failed = pickle.load(child.stdout)
-    except (OSError, EOFError, pickle.UnpicklingError):
-        raise gone(how_it_ended(child)) from None
-    finally:
-        idle.put(child)
-    if failed is not None:
-        raise failed
-    return found
-
-
-def _answer() -> None:
-    """The life of a process that is given functions and their arguments, and gives what they return or raise."""
-    outbox, asked = Outbox(), listen()
-    while True:
-        function, call = asked.get()
-        found = failed = None
-        try:
-            found = function(*call)
-        except Exception as error:  # noqa: BLE001 - whatever it is, it is raised where the call was made
-            error.add_note(traceback.format_exc())
-            failed = _that_travels(error)
-        outbox.put((found, failed))
-
-
-def _that_travels(error: Exception) -> Exception:
-    """The error, or where it cannot be pickled one that says the same."""
-    try:
-        pickle.loads(pickle.dumps(error))
-    except Exception:  # noqa: BLE001 - whatever pickling says
-        return RuntimeError("".join(traceback.format_exception(error)))
-    return error
-
-
-if __name__ == "__main__":
-    _answer()

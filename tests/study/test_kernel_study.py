@@ -3,8 +3,10 @@
 import html
 import json
 import tomllib
+import warnings
 from dataclasses import replace
 
+import numba
 import numpy as np
 import pytest
 import trimesh
@@ -76,15 +78,16 @@ def test_lines_to_paste_give_the_row(study):
     assert "condition = 1e+10" in row_toml(row | {"bound": 1e10})
 
 
-def test_a_study_in_several_processes_is_that_of_one(monkeypatch):
+def test_a_study_on_several_threads_is_that_of_one():
     ball = trimesh.creation.icosphere(3, 10.0).apply_scale([2.0, 1.0, 1.0])
     asked = {"kernels": ["cubic", "quintic", "gaussian"], "centres": [30, 50], "resolution": 24}
-    rows = {}
-    for cores in (1, 2):
-        monkeypatch.setattr(kernel_study, "available_cores", lambda cores=cores: cores)
-        rows[cores] = {(row["kernel"], row["centres"]): row for row in rm.study_kernels(ball, **asked).rows}
+    rows, threads, filters = {}, numba.get_num_threads(), list(warnings.filters)
+    for count in (1, threads):
+        numba.set_num_threads(count)
+        rows[count] = {(row["kernel"], row["centres"]): row for row in rm.study_kernels(ball, **asked).rows}
+    assert warnings.filters == filters
     for key, row in rows[1].items():
-        same = rows[2][key]
+        same = rows[threads][key]
         assert row["unfit"] == same["unfit"] and row["epsilon"] == pytest.approx(same["epsilon"], rel=1e-9)
         if not row["unfit"]:
             assert row["rms"] == pytest.approx(same["rms"], rel=1e-6)

@@ -5,25 +5,23 @@ Accuracy, conditioning and time are measured together, since each can be bought 
 
 from __future__ import annotations
 
-import functools
-import pickle
-from collections.abc import Callable, Iterable, Sequence
+import threading
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
+from rbfmuscle.geometry.threads import each
 from rbfmuscle.implicit.kernels.table import KERNELS, Kernel, get_kernel
 from rbfmuscle.implicit.placement.refinement import FITTED
 from rbfmuscle.implicit.placement.sampling import SurfaceSample, sample_surface
 from rbfmuscle.study.experiment.kernel_judge import SurfaceJudge
 from rbfmuscle.study.experiment.kernel_row import Measured, measure_row, time_row
 from rbfmuscle.study.experiment.sweep_table import pareto_front
-from rbfmuscle.study.experiment.workers import available_cores
-from rbfmuscle.validation import UsageError, check_mesh
+from rbfmuscle.validation import NumericalWarning, UsageError, check_mesh
 
 CENTRES = (150, 300)
 PLACEMENTS = ("greedy", FITTED)
-# Rows that are worth the start of other processes.
-MANY = 6
 # Errors this much apart are alike: points of another seed move them as far.
 ALIKE = 1.05
 # Rows beyond this condition are taken only where none that is as accurate is below it.
@@ -82,8 +80,6 @@ def study_kernels(
 ) -> KernelStudy:
     """Fit a surface with many kernels and numbers of centres, and measure each fit.
 
-    Six rows and more are measured in as many processes as there are cores.
-
     Parameters
     ----------
     mesh : trimesh.Trimesh or pair of (n, 3) vertices and (m, 3) faces
@@ -126,14 +122,11 @@ def study_kernels(
     check_placement(placement)
     if min(centres, default=0) < 8:
         raise UsageError(f"centres must be numbers of at least 8, got {list(centres)}")
-    judge, found, calls = SurfaceJudge(vertices, faces, resolution, seed), [], []
+    judge, calls = SurfaceJudge(vertices, faces, resolution, seed), []
     for count in centres:
         sample = sample_surface(vertices, faces, int(count), seed=seed, placement="greedy")
         calls += [(sample, kernel, placement) for kernel in chosen]
-    for one in _measure_all((vertices, faces, resolution, seed), judge, calls):
-        found.append(one)
-        if progress is not None:
-            progress(len(found), len(calls))
+    found = _measure_all(judge, calls, progress)
     _refuse_coarse([one.row for one in found])
     for one in found:  # when nothing else runs
         if not one.row["unfit"]:
@@ -151,32 +144,27 @@ def check_placement(placement: str) -> None:
 
 
 def _measure_all(
-    surface: tuple[Floats, Integers, int, int],
     judge: SurfaceJudge,
     calls: list[tuple[SurfaceSample, Kernel, str]],
-) -> Iterable[Measured]:
-    """What the rows of calls found, in their order."""
-    jobs = min(available_cores(), len(calls)) if len(calls) >= MANY else 1
-    if jobs == 1:
-        return (measure_row(judge, *call) for call in calls)
-    from joblib import Parallel, delayed
+    progress: Callable[[int, int], None] | None,
+) -> list[Measured]:
+    """What the rows of calls found, in their order, measured side by side on threads."""
+    from threadpoolctl import threadpool_limits
 
-    pickled = pickle.dumps(surface)
-    workers = Parallel(n_jobs=jobs, return_as="generator", batch_size=1)
-    return workers(
-        delayed(_row_apart)(pickled, sample, kernel.name, place) for sample, kernel, place in calls
-    )
+    lock, done = threading.Lock(), []
 
+    def measure(call: tuple[SurfaceSample, Kernel, str]) -> Measured:
+        found = measure_row(judge, *call)
+        with lock:
+            done.append(found)
+            if progress is not None:
+                progress(len(done), len(calls))
+        return found
 
-def _row_apart(surface: bytes, sample: SurfaceSample, kernel: str, placement: str) -> Measured:
-    """One row, in a process of its own."""
-    return measure_row(_judge(surface), sample, get_kernel(kernel), placement)
-
-
-@functools.lru_cache(maxsize=1)
-def _judge(surface: bytes) -> SurfaceJudge:
-    """The judge of a pickled surface, made once in a process."""
-    return SurfaceJudge(*pickle.loads(surface))
+    # Filters of warnings belong to all threads: what each row sets is undone here.
+    with warnings.catch_warnings(), threadpool_limits(1, user_api="blas"):
+        warnings.simplefilter("ignore", NumericalWarning)
+        return each(measure, calls)
 
 
 def _refuse_coarse(rows: list[dict]) -> None:
