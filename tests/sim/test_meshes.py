@@ -163,7 +163,7 @@ class TestUnusable:
     def test_mesh_without_triangles(self, tmp_path):
         path = tmp_path / "points.obj"
         path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
-        with pytest.raises(MeshError, match=r"points\.obj.*empty \(3 vertices, 0 triangles\)"):
+        with pytest.raises(MeshError, match=r"points\.obj.*the mesh is empty"):
             read_mesh(path)
 
     def test_nan_vertex_is_named(self, tmp_path):
@@ -178,7 +178,7 @@ class TestUnusable:
     def test_face_out_of_range(self, tmp_path):
         path = tmp_path / "a.obj"
         path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n")
-        with pytest.raises(MeshError, match=r"a\.obj.*outside its 3 vertices"):
+        with pytest.raises(MeshError, match=r"a\.obj.*out of bounds .* size 3"):
             read_mesh(path)
 
     def test_unknown_suffix(self, tmp_path):

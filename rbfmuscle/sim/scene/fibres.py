@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 from pathlib import Path
 from typing import Any
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.sim.polydata import read_polydata
 from rbfmuscle.validation import MeshError, SceneError, check_points, is_file, shown
 
 
@@ -67,11 +67,8 @@ def _read_lines(path, place):
 
 
 def _read_polydata_lines(path, place):
-    from rbfmuscle.sim.formats.polydata import read_polydata
-
     try:
         data = read_polydata(path)
     except MeshError as error:
         raise SceneError(f"{place}: {error}") from None
-    ends, numbers = data.lines
-    return [data.points[numbers[a:b]] for a, b in itertools.pairwise([0, *ends.tolist()])]
+    return [data.points[line] for line in data.lines]

@@ -5,7 +5,10 @@ Vertex numbers in files stay usable: a read mesh knows which of its vertices eac
 
 from __future__ import annotations
 
+import io
 import os
+import re
+import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.sim.polydata import read_polydata
 from rbfmuscle.sim.scene.mesh_repair import repair
 from rbfmuscle.validation import (
     MeshError,
@@ -158,13 +162,17 @@ def read_arrays(path: Path) -> Any:
             pass
     except OSError as error:
         raise MeshError(f"{path}: cannot read the mesh: {error.strerror}") from None
-    if suffix == ".obj":
-        return _read_obj(path)
     if suffix in (".vtk", ".vtp"):
-        return _read_vtk(path, suffix)
-    if suffix == ".stl":
-        return _read_stl(path)
-    return _read_ply(path)
+        data = read_polydata(path)
+        return data.points, data.triangles
+    try:
+        if suffix == ".stl":
+            # It repeats each vertex for every triangle.
+            vertices, corners = _unique_rows(_read_stl(path.read_bytes()))
+            return vertices, corners.reshape(-1, 3)
+        return _read_trimesh(path.read_bytes(), suffix[1:])
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError, EOFError, struct.error) as error:
+        raise MeshError(f"{path}: not a readable {suffix[1:].upper()} file ({_short(error)})") from None
 
 
 def _neighbours(path):
@@ -179,29 +187,38 @@ def _neighbours(path):
     return ", " + did_you_mean(path.name, names[:50]) if names else " (no meshes in that folder)"
 
 
-def _read_ply(path):
-    import struct
+def _read_stl(content):
+    """Corners (3 m, 3). Trimesh logs tracebacks of damaged files, and leaves bytes out that are no text."""
+    count = int.from_bytes(content[80:84], "little")
+    if content.lstrip()[:5].lower() == b"solid" and b"facet" in content.lower()[:5000]:
+        rows = [line.split() for line in content.lower().splitlines()]
+        corners = np.array([row[1:] for row in rows if row[:1] == [b"vertex"]], dtype=np.float64).reshape(
+            -1, 3
+        )
+        if len(corners) % 3 or not any(row[:1] == [b"endsolid"] for row in rows[-5:]):
+            raise ValueError("it ends before 'endsolid', or has not three vertices for each triangle")
+        return corners
+    if len(content) < 84 + 50 * count or len(content) < 84:
+        raise ValueError(f"neither text nor the {count} triangles that it promises")
+    triangles = np.frombuffer(content, "(3,)<f4, (3,3)<f4, <u2", count, 84)
+    return triangles["f1"].astype(np.float64).reshape(-1, 3)
 
+
+def _read_trimesh(content, kind):
+    """Vertices and triangles of an OBJ or PLY file, with the vertex numbers of the file."""
     import trimesh
 
-    try:
-        mesh = trimesh.load(path, file_type="ply", process=False, force="mesh", skip_materials=True)
-    except (ValueError, KeyError, IndexError, TypeError, AttributeError, EOFError, struct.error) as error:
-        raise MeshError(f"{path}: not a readable PLY file ({_short(error)})") from None
-    vertices = np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3)
-    faces = np.asarray(getattr(mesh, "faces", np.zeros((0, 3))), dtype=np.int64).reshape(-1, 3)
-    return vertices, faces
-
-
-def _read_stl(path):
-    from rbfmuscle.sim.formats.stl import read_stl
-
-    corners = read_stl(path)
-    if not len(corners):
-        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
-    # An STL file repeats each vertex for every triangle.
-    vertices, inverse = _unique_rows(corners.reshape(-1, 3))
-    return vertices, inverse.reshape(-1, 3)
+    if kind == "obj":
+        # Positions and corners alone: numbers of textures and normals would split vertices.
+        lines = [line for line in content.splitlines() if line.split(None, 1)[:1] in ([b"v"], [b"f"])]
+        content = re.sub(rb"#[^\n]*|/\S*", b"", b"\n".join(lines))
+        content.decode("ascii")  # else trimesh leaves out what is not
+    options = {"process": False, "force": "mesh", "skip_materials": True, "maintain_order": True}
+    mesh = trimesh.load(io.BytesIO(content), file_type=kind, **options)
+    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(getattr(mesh, "faces", ()), np.int64)
+    if len(vertices) and vertices.shape[1] != 3:
+        raise ValueError("a vertex has fewer than three coordinates")
+    return vertices.reshape(-1, 3), faces.reshape(-1, 3)
 
 
 def _unique_rows(vertices):
@@ -211,38 +228,6 @@ def _unique_rows(vertices):
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
     return vertices[first[order]], rank[inverse.ravel()]
-
-
-def _read_obj(path):
-    """Positions and faces only: texture and normal numbers would split vertices and break their numbering."""
-    vertices, faces = [], []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-        parts = line.split("#", 1)[0].split()
-        if not parts:
-            continue
-        try:
-            if parts[0] == "v":
-                vertices.append([float(x) for x in parts[1:4]])
-            elif parts[0] == "f":
-                corners = [int(part.split("/")[0]) for part in parts[1:]]
-                corners = [c - 1 if c > 0 else c + len(vertices) for c in corners]
-                faces.extend([corners[0], corners[k], corners[k + 1]] for k in range(1, len(corners) - 1))
-        except ValueError as error:
-            raise MeshError(f"{path}: line {number} is not readable as OBJ ({_short(error)})") from None
-    if any(len(vertex) != 3 for vertex in vertices):
-        raise MeshError(f"{path}: a vertex has fewer than three coordinates")
-    try:
-        triangles = np.array(faces, dtype=np.int64).reshape(-1, 3)
-    except OverflowError:
-        raise MeshError(f"{path}: a face names a vertex far outside its {len(vertices)} vertices") from None
-    return np.array(vertices, dtype=np.float64).reshape(-1, 3), triangles
-
-
-def _read_vtk(path, suffix):
-    from rbfmuscle.sim.formats.polydata import read_polydata, triangles_of
-
-    data = read_polydata(path, suffix)
-    return data.points, triangles_of(data)
 
 
 def _short(error):

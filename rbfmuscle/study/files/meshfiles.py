@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.sim.polydata import read_polydata
 from rbfmuscle.study.files.vtp import write_vtp
 from rbfmuscle.validation import MeshError
 
@@ -60,10 +61,8 @@ def read_mesh(path: str | Path) -> tuple[Floats, Integers]:
     if not path.is_file():
         raise MeshError(f"{path} is missing")
     if path.suffix == ".vtp":
-        from rbfmuscle.sim.formats.polydata import read_polydata, triangles_of
-
         data = read_polydata(path)
-        return data.points, triangles_of(data)
+        return data.points, data.triangles
     import trimesh
 
     mesh = trimesh.load_mesh(path, process=path.suffix == ".stl")
