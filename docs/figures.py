@@ -24,7 +24,6 @@ _VALUE = re.compile(r"<!-- value: ([\w]+)\.([\w]+) -->.*?<!-- end -->", re.S)
 # Name: what measures it. DATA stands for the folder of the real hip.
 COMMANDS = {
     "headline": ["benchmarks/headline.py", "DATA/hip/flexion.toml", "-o", "OUT"],
-    "plan": ["benchmarks/plan_check.py", "-", "DATA/hip/flexion.toml", "--remake", "-o", "OUT"],
     "real_solids": ["benchmarks/real_solids.py", "compare", "gluteus_maximus", "rectus_femoris", "-o", "OUT"],
 }
 
@@ -88,28 +87,8 @@ def real_solids_table(facts):
     return lines
 
 
-# What a row of a forecast holds: how a table calls it, and what of the unit it is in.
-PLANNED = {"build": ("muscles s", 1), "checks": ("checks s", 1), "lines": ("lines s", 1),
-           "motion": ("a frame: muscles ms", 1e3), "metrics": ("metrics ms", 1e3), "write": ("files ms", 1e3),
-           "total": ("all s", 1), "peak": ("peak MB", 1e-6)}  # fmt: skip
-
-
-def plan_table(facts):
-    """What a plan foretold and what its run took, by part, with the factor of both."""
-    titles = [title for title, _ in PLANNED.values()]
-    lines = [f"| scene: model | {' | '.join(titles)} |", "|---" * (len(titles) + 1) + "|"]
-    for name, row in facts["rows"].items():
-        cells = [
-            f"{scale * row[part][0]:.3g} / {scale * row[part][1]:.3g} ({row[part][0] / row[part][1]:.2f})"
-            for part, (_, scale) in PLANNED.items()
-        ]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return lines
-
-
 TABLES = {
     "headline": headline_table,
-    "plan": plan_table,
     "real_solids": real_solids_table,
 }
 

@@ -226,32 +226,25 @@ class InterleavedARAPShape(GlobalARAPShape):
 
 
 class Method(NamedTuple):
-    """All that is said of one way: its shape, its sweeps a solve, and what these take (`pbd_baseline.cost`).
+    """All that is said of one way: its shape, and its sweeps a solve.
 
     Attributes
     ----------
     shape : type of Shape
     sweeps : int
         The authors' three for PBD; sub-steps of one sweep for XPBD.
-    calls, visits : int
-        Of one sweep: calls, and visits for a vertex.
-    factored : bool
-        Whether a sparse factor is held.
     """
 
     shape: type[Shape]
     sweeps: int
-    calls: int
-    visits: int
-    factored: bool = False
 
 
 METHODS = {
-    "pbd": Method(PBDShape, 3, 150, 160),
-    "xpbd": Method(XPBDShape, 10, 330, 250),
-    "arap-pbd": Method(ARAPShape, 10, 450, 500),
-    "arap-volume": Method(GlobalARAPShape, 6, 1330, 750, factored=True),
-    "arap-interleaved": Method(InterleavedARAPShape, 6, 1030, 600, factored=True),
+    "pbd": Method(PBDShape, 3),
+    "xpbd": Method(XPBDShape, 10),
+    "arap-pbd": Method(ARAPShape, 10),
+    "arap-volume": Method(GlobalARAPShape, 6),
+    "arap-interleaved": Method(InterleavedARAPShape, 6),
 }
 
 

@@ -5,8 +5,6 @@ from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 from rbfmuscle.sim.loop.frame import MuscleModel
-from rbfmuscle.sim.plan.forecast import MuscleCost
-from rbfmuscle.sim.plan.rates import scales
 from rbfmuscle.sim.scene.objects import Muscle
 from rbfmuscle.sim.scene.options import Table
 from rbfmuscle.sim.scene.scene import Scene
@@ -60,24 +58,17 @@ def build_model(muscle: Muscle, scene: Scene, name: str | None = None) -> Muscle
     return _part(home, "muscle", home.muscle)(muscle, scene, options)
 
 
-def estimate_model(muscle: Muscle, scene: Scene, rates: Mapping[str, float]) -> MuscleCost:
-    """What the model of one muscle will take, without building it.
+def solved_points(muscle: Muscle, scene: Scene) -> str:
+    """The points that the model of a muscle solves for, in words; nothing is built.
 
     Parameters
     ----------
     muscle : Muscle
     scene : Scene
-    rates : dict of str to float
-        From `rbfmuscle.sim.plan.rates.measure_rates`.
-
-    Returns
-    -------
-    MuscleCost
     """
     home = _HOME[check_model_name(muscle.model)]
     options = _read_options(muscle, home, muscle.options)
-    cost = _part(home, "cost", "estimate_muscle")(muscle, scene, rates, options)
-    return cost.scaled(**scales()["models"][muscle.model])
+    return _part(home, "rest", "solved_points")(muscle, scene, options)
 
 
 def build_models(scene: Scene, names: Collection[str] | None = None) -> list[MuscleModel]:

@@ -203,3 +203,9 @@ def _principal_axes(points: Floats) -> Any:
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     axes[2] *= np.sign(np.linalg.det(axes))
     return axes
+
+
+def solved_points(muscle: Muscle, scene: Scene, options: RBFOptions) -> str:
+    """How many centres a muscle will have, and why."""
+    chosen = choose_centres(muscle, scene, options, known_only=True)
+    return f"{chosen.centres} centres ({chosen.reason})"

@@ -13,12 +13,11 @@ PACKAGES = {"rbfmuscle.model": ROOT / "rbfmuscle" / "model", "pbd_baseline": ROO
 SHARED = {
     "muscle": {"RBFMuscle": "PBDMuscle"},
     "options": {"RBFOptions": "PBDOptions"},
-    "rest": {"Rest": "Rest"},
+    "rest": {"Rest": "Rest", "solved_points": "solved_points"},
     "constraints": {"VolumeConstraint": "VolumeConstraint"},
     "contact": {"ContactConstraint": "ContactConstraint"},
     "fibres": {"fibre_directions": "fibre_directions"},
     "contraction": {},
-    "cost": {"estimate_muscle": "estimate_muscle"},
 }
 
 

@@ -40,7 +40,7 @@ def test_every_folder_with_modules_is_a_package():
 def test_typed_marker_and_table_of_loops_travel_with_the_packages():
     data = PROJECT["tool"]["setuptools"]["package-data"]
     assert data == {
-        "rbfmuscle": ["py.typed", "sim/plan/scales.json"],
+        "rbfmuscle": ["py.typed"],
         "pbd_baseline": ["py.typed"],
     }
 

@@ -23,8 +23,7 @@ from rbfmuscle.run import simulate, stream_run
 from rbfmuscle.sharing import crew as sharing
 from rbfmuscle.sharing.crew import Crew
 from rbfmuscle.sharing.share import Share
-from rbfmuscle.sim.plan.forecast import _memory
-from rbfmuscle.sim.plan.processes import HELPER_MEMORY, helpers_for
+from rbfmuscle.sim.plan.processes import helpers_for
 from rbfmuscle.sim.scene.motion import Motion
 from rbfmuscle.sim.scene.phantom import phantom_scene
 from rbfmuscle.study.files.saved import SavedRun
@@ -194,14 +193,6 @@ class TestHelpersFor:
 
     def test_muscles_that_slide_stay_together(self):
         assert helpers_for(self.scene(38, 37, sliding=object()), 4) < 2
-
-    def test_forecast_adds_what_each_process_takes(self):
-        output = SimpleNamespace(metrics=False, report=False)
-        scene = SimpleNamespace(bones=[], output=output, **vars(self.scene(38, 37)))
-        memory = [_memory(scene, [], [], 1e8, threads) for threads in (1, 2, 4)]
-        assert [found["helpers"] for found in memory] == [1, 2, 4]
-        more = np.diff([found["together"] - found["peak"] for found in memory])
-        assert list(more) == [2 * HELPER_MEMORY, 2 * HELPER_MEMORY]
 
 
 def test_what_helpers_say_is_said_once(caplog):

@@ -174,7 +174,7 @@ def test_going_nowhere_is_skipped_and_shows_the_same_surface():
 def test_plan_counts_what_a_run_then_does():
     path = [(0, 0), (5, 4), (10, 4), (20, 4), (20, 6), (20, 6)]
     scene = _arm(path, muscles=("brachialis", "deltoid"))
-    planned = {muscle["name"]: muscle["work"] for muscle in plan_scene(scene)["muscles"]}
+    planned = {muscle["name"]: muscle for muscle in plan_scene(scene)["muscles"]}
     frames = _run(scene, "pbd")
     for muscle, work in planned.items():
         done = [frame.work[muscle] for frame in frames]
@@ -187,7 +187,7 @@ def test_plan_counts_what_a_run_then_does():
 
 def test_whole_leg_moved_at_the_hip_is_solved_where_muscles_cross_the_hip(leg_data):
     scene = rm.Scene.load(leg_data / "leg.toml")
-    work = {muscle["name"]: muscle["work"] for muscle in plan_scene(scene)["muscles"]}
+    work = {muscle["name"]: muscle for muscle in plan_scene(scene)["muscles"]}
     solved = sorted(name for name, done in work.items() if done["solved"])
     assert len(work) == 38 and len(solved) == 22
     assert all(work[name]["carried"] == 10 for name in work if name not in solved)

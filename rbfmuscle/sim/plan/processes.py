@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from rbfmuscle.sim.scene.scene import Scene
 
-# A process more takes about two seconds to begin, and memory of its own [byte]: libraries, scene, fields. Fewer
-# muscles, or fewer muscles times frames, are quicker in one.
+# A process more takes about two seconds to begin: fewer muscles, or fewer muscles times frames, are quicker in one.
 LEAST_MUSCLES, LEAST_WORK = 5, 400
-MOST_HELPERS, HELPER_MEMORY = 4, 2e8
+MOST_HELPERS = 4
 
 
 def helpers_for(scene: Scene, threads: int) -> int:
