@@ -19,25 +19,18 @@ from typing import Any, BinaryIO
 from rbfmuscle.validation import SolveError
 
 
-def child_call(module: str, *arguments: str) -> tuple[list[str], dict[str, str]]:
-    """Command and environment of a process that runs one of our modules with this interpreter.
+def start_child(module: str, threads: int) -> subprocess.Popen[bytes]:
+    """A process that runs one of our modules, spoken to by its pipes, whose loops and BLAS use so many threads.
 
     Nothing that lies in the present folder takes the place of a module there.
     """
-    command = [sys.executable, "-P", "-m", module, *arguments]
     places = [str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
-    return command, {**os.environ, "PYTHONPATH": os.pathsep.join(place for place in places if place)}
-
-
-def start_child(module: str, threads: int) -> subprocess.Popen[bytes]:
-    """Such a process, spoken to by its pipes, whose loops and BLAS use so many threads."""
-    command, environment = child_call(module)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(place for place in places if place)}
     counts = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     environment |= dict.fromkeys(counts, str(threads))
+    command, pipe = [sys.executable, "-P", "-m", module], subprocess.PIPE
     # A group of its own: an interrupt is for this process, which ends the child.
-    return subprocess.Popen(
-        command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, process_group=0
-    )
+    return subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, process_group=0)
 
 
 def send(pipe: BinaryIO | Any, what: Any) -> None:
