@@ -9,6 +9,7 @@ import warnings
 
 import numpy as np
 
+from rbfmuscle.implicit.extraction.sheets import count_sheets
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels.table import KERNELS
@@ -102,11 +103,13 @@ def outcome(kernel, points, normals, shape, judge, bound):
     if error <= bound:
         return "right", error, ""
     try:  # what showing the surface says of it
-        found = extract_surface(field, points=np.asarray(points, dtype=float), resolution=32, search="box")
+        where = np.asarray(points, dtype=float)
+        extract_surface(field, points=where, resolution=32)
+        sheets = count_sheets(field, where, lambda at: np.full(len(at), np.inf)).number
     except ValueError as failed:
         return "refused", error, str(failed)
-    if found.components > 1:
-        return "warned", error, f"{found.components} sheets"
+    if sheets > 1:
+        return "warned", error, f"{sheets} sheets"
     return "silent", error, ""
 
 

@@ -136,11 +136,11 @@ def test_vertices_equal_those_of_scikit_image(field, points):
 
 
 def test_band_follows_the_surface_from_a_single_point_and_evaluates_little():
-    whole = extract_surface(sphere(), points=on_sphere(), search="box")
     few = np.vstack([on_sphere().min(axis=0), on_sphere().max(axis=0), CENTRE + [50.0, 0, 0]])
     surface = extract_surface(sphere(), points=few)
+    whole = extract_surface(sphere(), points=on_sphere())
     np.testing.assert_allclose(np.sort(surface.vertices, axis=0), np.sort(whole.vertices, axis=0), atol=1e-9)
-    assert surface.evaluations < 0.2 * whole.evaluations
+    assert surface.evaluations < 0.2 * np.prod(BandGrid.around(few, resolution=48).shape)
 
 
 def test_band_finds_a_surface_that_predicted_points_miss():
@@ -233,9 +233,6 @@ def test_spurious_sheets_are_counted_and_left_out():
     assert surface.vertices[:, 0].max() < CENTRE[0] + 20.1
     wide = np.vstack([points, CENTRE + [36.0, 0, 0]])
     assert extract_surface(two, points=wide).spurious == 1
-    both = extract_surface(two, points=wide, keep="all")
-    assert (both.components, both.spurious) == (2, 0)
-    assert both.vertices[:, 0].max() > CENTRE[0] + 35
 
 
 def test_surface_that_outgrows_the_box_is_still_closed():
@@ -267,9 +264,7 @@ def test_volume_out_of_reach_is_refused():
         extract_surface(lambda x: np.tanh(sphere()(x)), points=on_sphere(), volume=1e9, resolution=12)
 
 
-@pytest.mark.parametrize(
-    "bad", [{"keep": "some"}, {"search": "far"}, {"resolution": 2}, {"axes": np.ones((3, 3))}]
-)
+@pytest.mark.parametrize("bad", [{"resolution": 2}, {"axes": np.ones((3, 3))}])
 def test_bad_arguments_are_refused(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         extract_surface(sphere(), points=on_sphere(), **bad)

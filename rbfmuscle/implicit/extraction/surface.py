@@ -70,8 +70,6 @@ def extract_surface(
     cut: Cut | None = None,
     volume: float | None = None,
     level: float = 0.0,
-    keep: str = "largest",
-    search: str = "band",
     axes: ArrayLike | None = None,
     obstacles: list[tuple[ObstaclePoints, Floats]] | None = None,
     obstacle_tolerance: float | None = None,
@@ -92,10 +90,6 @@ def extract_surface(
         Wanted volume of the mesh; the level is then moved from ``level`` until the mesh has it, to 1e-9.
     level : float
         Level of the field, or the first guess of it.
-    keep : {"largest", "all"}
-        The closed sheet of largest volume, or all of them.
-    search : {"band", "box"}
-        Follow the surface from the points, or visit the whole box (finds every spurious sheet in it).
     axes : (3, 3) array_like, optional
         Rotation whose rows are the grid's axes. In a frame that moves with the scene the mesh does too.
     obstacles : list of pairs of ObstaclePoints and (4, 4) ndarrays, optional
@@ -117,16 +111,14 @@ def extract_surface(
     points = check_points(points)
     level = float(level)
     check_finite(np.array([level]), name="level")
-    if keep not in ("largest", "all") or search not in ("band", "box"):
-        raise ValueError(f"keep must be largest or all, search band or box, got {keep!r} and {search!r}")
     target = None if volume is None else check_positive(volume, name="volume")
     padding = 3
     while True:
         grid = BandGrid.around(points, resolution=resolution, padding=padding, axes=axes)
         band = Band(grid, field, cut)
-        _start(band, points, level, search)
+        _start(band, points, level)
         tolerance = 0.01 * grid.spacing if obstacle_tolerance is None else float(obstacle_tolerance)
-        surface = _reach_volume(band, target, level, keep, (obstacles or [], tolerance))
+        surface = _reach_volume(band, target, level, (obstacles or [], tolerance))
         if surface is not None:
             return surface
         if padding >= resolution:
@@ -137,12 +129,9 @@ def extract_surface(
         padding = min(4 * padding, int(resolution))
 
 
-def _start(band: Band, points: Floats, level: float, search: str) -> None:
+def _start(band: Band, points: Floats, level: float) -> None:
     """Visit first cells until some are crossed."""
-    if search == "box":
-        band.visit_all()
-    else:
-        band.seed(points)
+    band.seed(points)
     band.grow(level)
     while not band.crosses(level):
         if not band.widen():
@@ -154,7 +143,7 @@ def _start(band: Band, points: Floats, level: float, search: str) -> None:
 
 
 def _reach_volume(
-    band: Band, target: float | None, level: float, keep: str, obstacles: Obstacles
+    band: Band, target: float | None, level: float, obstacles: Obstacles
 ) -> ExtractedSurface | None:
     """Mesh at the level that gives the target volume; None where the surface leaves the grid."""
     spacing = band.grid.spacing
@@ -162,7 +151,7 @@ def _reach_volume(
         if target is not None and not band.crosses(level):
             raise ValueError(f"no level gives a volume of {target:g}: the level set is empty at {level:g}")
         band.grow(level)
-        found = _closed_sheets(band, level, keep)
+        found = _closed_sheets(band, level)
         if found is None:
             return None
         vertices, faces, near_cut, components, spurious = found
@@ -221,8 +210,11 @@ def _finish(
     )
 
 
-def _closed_sheets(band: Band, level: float, keep: str) -> tuple[Floats, Integers, Booleans, int, int] | None:
-    """Vertices, faces, which are near the cut, number of sheets and of those left out; None where open."""
+def _closed_sheets(band: Band, level: float) -> tuple[Floats, Integers, Booleans, int, int] | None:
+    """The largest closed sheet: vertices, faces, which are near the cut, number of sheets and of the others.
+
+    None where it is open.
+    """
     coordinates, faces, on_border, near_cut = band.march(level)
     label, sheets = _label_sheets_loop(faces, len(coordinates))
     volume = _sheet_volumes_loop(coordinates, faces, label, coordinates.mean(axis=0), np.zeros(sheets))
@@ -231,18 +223,13 @@ def _closed_sheets(band: Band, level: float, keep: str) -> tuple[Floats, Integer
     closed = np.flatnonzero(~is_open)
     if len(closed) == 0 or (is_open.any() and size[is_open].max() > size[closed].max()):
         return None
-    if keep == "all":
-        chosen = ~is_open
-    else:
-        chosen = np.zeros(sheets, dtype=bool)
-        chosen[closed[np.argmax(volume[closed])]] = True
-    if chosen.all():
-        return band.grid.positions(coordinates), faces, near_cut, sheets, 0
-    used = chosen[label]
+    if sheets == 1:
+        return band.grid.positions(coordinates), faces, near_cut, 1, 0
+    used = label == closed[np.argmax(volume[closed])]
     number = np.cumsum(used) - 1
     faces = number[faces[used[faces[:, 0]]]]
     vertices = band.grid.positions(coordinates[used])
-    return vertices, faces, near_cut[used], sheets, sheets - int(chosen.sum())
+    return vertices, faces, near_cut[used], sheets, sheets - 1
 
 
 @compiled(error_model="numpy")
