@@ -5,6 +5,7 @@ Where a difference is meant, ``make references`` writes the kept results anew.
 
 import numpy as np
 import pytest
+from conftest import MOVED
 from whole_runs import SCENES, differences, measure, read
 
 # Of the muscle's size. Over one and two threads and the code that OpenBLAS has for four generations of processors
@@ -12,6 +13,9 @@ from whole_runs import SCENES, differences, measure, read
 # has settled to the last digit and amplifies rounding: 3.4e-8.
 TOLERANCE = 1e-9
 UNSETTLED = {"contact_rbf_inside": 1e-6}
+# Vertices that are moved by 1e-12 move results by up to 2e-6, a muscle at full activation most.
+if MOVED:
+    TOLERANCE = 1e7 * MOVED
 
 
 @pytest.mark.parametrize("name", SCENES)

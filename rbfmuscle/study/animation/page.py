@@ -173,7 +173,7 @@ def viewer_library() -> str:
     except (OSError, KeyError, ValueError, ModuleNotFoundError, zipfile.BadZipFile):
         raise MissingPartError(
             "export to html takes its viewer from trimesh, and the version installed brings none that is known; "
-            "pip install 'trimesh>=4.4,<6', or export to animated-glb"
+            "pip install 'trimesh>=4.6.4,<6', or export to animated-glb"
         ) from None
     # A script must not hold its own closing tag.
     return library.replace(_CLOSING, "<\\/script")
