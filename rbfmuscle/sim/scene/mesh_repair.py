@@ -341,30 +341,23 @@ def _orient(state, place):
 
 def _consistent_turns(faces, place):
     """Which faces to turn so that each shared edge is used once in either direction."""
-    sides = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    forward = sides[:, 0] < sides[:, 1]
-    keys, _ = _edge_keys(faces)
-    order = np.argsort(keys, kind="stable")
-    sorted_edges = keys[order]
-    pair = np.flatnonzero(sorted_edges[1:] == sorted_edges[:-1])
-    first, second = order[pair], order[pair + 1]
-    clash = forward[first] == forward[second]
-    one, two = first // 3, second // 3
-    m = len(faces)
-    if not clash.any():
-        return np.zeros(m, dtype=bool)
-    # A double cover: face k and its turned copy m + k; a clash joins a face to the other's turned copy.
-    rows = np.concatenate([one, one + m])
-    columns = np.concatenate([np.where(clash, two + m, two), np.where(clash, two, two + m)])
-    _, label = connected_components(
-        coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(2 * m, 2 * m)), directed=False
-    )
-    if (label[:m] == label[m:]).any():
+    if _sides_agree(faces):
+        return np.zeros(len(faces), dtype=bool)
+    import igl
+
+    oriented, _ = igl.bfs_orient(np.ascontiguousarray(faces))
+    if not _sides_agree(oriented):
         raise MeshError(f"{place}: the surface has one side only (no consistent orientation); remesh it")
-    turned = label[:m] > label[m:]
+    turned = (oriented != faces).any(axis=1)
     part, count = _parts(faces, int(faces.max()) + 1)
     most = np.bincount(part, weights=turned, minlength=count) * 2 > np.bincount(part, minlength=count)
     return turned ^ most[part]
+
+
+def _sides_agree(faces):
+    """Whether no two faces use an edge in the same direction."""
+    sides = faces * (int(faces.max()) + 1) + faces[:, [1, 2, 0]]
+    return len(np.unique(sides)) == sides.size
 
 
 def _check_one_part(state, place):
