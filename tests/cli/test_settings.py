@@ -26,7 +26,6 @@ TABLES = {
             "tolerance": 0.1,
             "substep_angle": 4.0,
             "still_angle": 0.5,
-            "from_rest": True,
             "margin": 0.05,
         },
     ),

@@ -88,9 +88,6 @@ def test_what_settling_does_is_expected_again_as_far_as_the_motion_goes_on(way, 
     assert lead.ahead([before], way)[0] is before
     lead.learn({"q": 2.0, "p": 0.0}, [before], [before + moved])
     np.testing.assert_allclose(lead.ahead([before], way)[0], before + share * moved, atol=1e-12)
-    other = Lead()
-    other.restore(lead.snapshot())
-    assert np.array_equal(other.ahead([before], way)[0], lead.ahead([before], way)[0])
     lead.learn({"q": 0.0}, [before], [before + moved])
     assert lead.share(way) == 0.0
 

@@ -202,14 +202,6 @@ class Carrier:
             return before
         return self.own.lagging(before, self.solved)
 
-    def snapshot(self) -> dict[str, Floats]:
-        """Where its bones were when the muscle was solved last; empty before it ever was."""
-        return {name: np.array(self.solved[name]) for name in self.own.names} if self.solved else {}
-
-    def restore(self, state: Mapping[str, Floats]) -> None:
-        """Go back to a `snapshot`."""
-        self.solved = dict(state) or None
-
     def collect(self, substeps: int) -> Work:
         """What was done since the last call."""
         moved, reason = self.moved, self.reason

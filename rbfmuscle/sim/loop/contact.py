@@ -95,16 +95,6 @@ class BoneContacts:
             raise ValueError(f"poses lack the bone {missing[0]!r}")
         self._take(poses)
 
-    def snapshot(self) -> tuple[Any, ...]:
-        """What `restore` needs: the poses, and what earlier queries left behind."""
-        return dict(self.poses), tuple(part.copy() for part in self._known)
-
-    def restore(self, state: tuple[Any, ...]) -> None:
-        """Go back to a snapshot."""
-        poses, (anchor, bound) = state
-        self._take(dict(poses))
-        self._known = anchor.copy(), bound.copy()
-
     def stacked(self, poses: dict[str, Floats]) -> Floats:
         """Poses (r, 4, 4) of the bones that the muscle can reach, in their order."""
         return np.array([poses[self.names[b]] for b in self.reached]).reshape(-1, 4, 4)

@@ -11,7 +11,6 @@ from rbfmuscle.sim.loop.carrying import Carrier
 from rbfmuscle.sim.loop.contact import BoneContacts
 from rbfmuscle.sim.loop.driving.ahead import run_ahead
 from rbfmuscle.sim.loop.frame import Event, FinishedDrawing, Frame, ModelSurface, MuscleModel
-from rbfmuscle.sim.loop.from_rest import Trail
 from rbfmuscle.sim.loop.overlap import settle_rest
 from rbfmuscle.sim.loop.stepper import MuscleStepper, TimedDrawing
 from rbfmuscle.sim.loop.substeps import PoseMemo, SubSteps
@@ -94,7 +93,6 @@ class FrameLoop:
                 self.workers.each(settle_rest, self.steppers)
                 self._sliding = _sliding(scene, self.steppers)
                 self._together = self._side_by_side()
-            self._links = self._from_rest() if scene.contact.from_rest else None
         except BaseException:
             self.close()
             raise
@@ -197,13 +195,6 @@ class FrameLoop:
         met = [contacts.names[b] for b in contacts.reached]
         return SubSteps(self.scene, carrier.muscle, bones=met, poses=self._poses)
 
-    def _from_rest(self) -> dict:
-        """Keep all muscles as they are at rest; the links between them."""
-        rest, idle = completed(self.scene, {}), dict(self.activations.here)
-        for stepper in self.steppers:
-            stepper.trail = Trail(stepper, rest, idle)
-        return {} if self._sliding is None else self._sliding.snapshot()
-
     def _side_by_side(self) -> Together | None:
         """What brings muscles that slide through a frame; those that contract take every sub-step."""
         if self._sliding is None:
@@ -221,16 +212,10 @@ class FrameLoop:
         for stepper in self.steppers:
             stepper.frame = self._next_index
         self._next_index += 1
-        split = SubSteps.split
-        if self._links is not None:
-            split, here = SubSteps.from_rest, completed(self.scene, {})
-            self.activations.here = dict.fromkeys(self.activations.here, 0.0)
-        found = {
-            name: ([here, *split(cut, here, self.here)], []) for name, cut in self._own_sub_steps.items()
-        }
+        found = {name: ([here, *cut.split(here, self.here)], []) for name, cut in self._own_sub_steps.items()}
         if len(found) < len(self.steppers):
             # Muscles that slide see each other on the way, at stops of the fastest.
-            stops = [here, *split(self._sub_steps, here, self.here)]
+            stops = [here, *self._sub_steps.split(here, self.here)]
             shared = self.activations.refine(self._next_index - 1, stops)
             found.update({s.name: shared for s in self.steppers if s.name not in found})
         return found
@@ -241,12 +226,7 @@ class FrameLoop:
             self.workers.each(lambda stepper: stepper.advance(*paths[stepper.name]), self.steppers)
             return
         stops, activations = paths[self.steppers[0].name]
-        if self._links is not None:
-            for stepper in self.steppers:
-                if stepper.trail is not None:
-                    stepper.trail.rewind(stops[:1])
-            self._sliding.restore(self._links)
-        self._together.go(stops, activations, self.workers, all_stops=self._links is not None)
+        self._together.go(stops, activations, self.workers)
 
     def _drawings(self) -> list[TimedDrawing]:
         """What draws all muscles as they are now."""
@@ -301,6 +281,39 @@ def simulate_frames(
                 yield loop.advance(coordinates)
             else:
                 loop.skip(coordinates)
+
+
+def solve_pose(
+    scene: Scene,
+    models: Sequence[MuscleModel],
+    coordinates: Mapping[str, float],
+    *,
+    fields: Mapping[str, BoneField] | None = None,
+) -> Frame:
+    """Solve one pose straight from rest, so that the shapes depend on the pose alone.
+
+    Parameters
+    ----------
+    scene : Scene
+    models : sequence of MuscleModel
+        In their rest state, to which they return.
+    coordinates : mapping of str to float
+        Where the joints shall be [radian]; absent ones are at rest.
+    fields : mapping of str to BoneField, optional
+        As for `FrameLoop`.
+
+    Raises
+    ------
+    SolveError
+        If a muscle cannot be solved.
+    """
+    rest = [model.snapshot() for model in models]
+    try:
+        with FrameLoop(scene, models, fields=fields) as loop:
+            return loop.advance(coordinates)
+    finally:
+        for model, state in zip(models, rest):
+            model.restore(state)
 
 
 def _obstacles(scene, models, fields):

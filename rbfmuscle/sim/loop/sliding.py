@@ -114,27 +114,6 @@ class Sliding:
             for link in [*self.links[stepper.name], *self.bone_links[stepper.name]]:
                 link.update()
 
-    def snapshot(self) -> dict[str, Any]:
-        """What `restore` needs: by muscle, what is linked and where its links were measured last, and its lead."""
-        return {
-            name: (
-                [(link.linked.copy(), link.before) for link in links],
-                [link.linked.copy() for link in self.bone_links[name]],
-                self.surfaces[name].lead.snapshot() if name in self.surfaces else None,
-            )
-            for name, links in self.links.items()
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go back to a snapshot."""
-        for name, (links, bones, lead) in state.items():
-            for link, (linked, before) in zip(self.links[name], links):
-                link.linked, link.before = linked.copy(), before
-            for held, linked in zip(self.bone_links[name], bones):
-                held.linked = linked.copy()
-            if lead is not None:
-                self.surfaces[name].lead.restore(lead)
-
     def measure(self, stepper: Any) -> Any:
         """Worst of what a muscle's links say: a dict of quantities, empty without neighbours."""
         with stepper.timed("sliding"):

@@ -21,7 +21,6 @@ from rbfmuscle.validation import NotFiniteError, SolveError
 if TYPE_CHECKING:
     from rbfmuscle.sim.loop.contact import BoneContacts
     from rbfmuscle.sim.loop.frame import MuscleModel
-    from rbfmuscle.sim.loop.from_rest import Trail
     from rbfmuscle.sim.scene.scene import Scene
 
 
@@ -100,8 +99,6 @@ class MuscleStepper:
         What carries the muscle along where it need not be solved; none unless a loop gives one.
     work : Work
         What the frame that was collected last took.
-    trail : Trail or None
-        What brings the muscle back to rest before each frame, where the scene asks for that.
     """
 
     def __init__(
@@ -119,7 +116,6 @@ class MuscleStepper:
         self.poses = poses or (lambda coordinates: bone_poses(scene, coordinates))
         self.carrier: Carrier | None = None
         self.solves, self.work = 0, Work(SOLVED, 0, "")
-        self.trail: Trail | None = None
         self._shown: TimedDrawing | None = None
         self._since = np.eye(4)
 
@@ -138,14 +134,10 @@ class MuscleStepper:
 
         ``activations`` holds, for muscles that contract, the activation by muscle at the end of each.
         """
-        if self.trail is not None:
-            stops, activations = self.trail.rewind(stops, activations)
         for before, after, activation in itertools.zip_longest(stops[:-1], stops[1:], activations):
             self.excite(activation)
             if not self._carries(before, after):
                 self.step(before, after)
-            if self.trail is not None:
-                self.trail.passed(after, activation)
 
     def _carries(self, before: Mapping[str, float], after: Mapping[str, float]) -> bool:
         """Whether a step asks no more of the muscle than to be carried along, which is then done."""
@@ -224,12 +216,6 @@ class MuscleStepper:
         if self.carrier is not None and not self.carrier.never:
             self._shown, self._since = shown, np.eye(4)
         return shown
-
-    def restore_carrier(self, carrier: Any) -> None:
-        """Take over what another stepper's `Carrier.snapshot` was."""
-        if carrier is not None and self.carrier is not None:
-            self.carrier.restore(carrier)
-        self._shown = None
 
     def report(self, bone: Any, count: int, action: Any) -> None:
         """Note an event of the present frame; of one kind the most points at one time are kept."""

@@ -103,42 +103,6 @@ class SubSteps:
             return [*self._stops_on_grid(before, after, moving[0]), dict(after)]
         return self._even_stops(before, after)
 
-    def from_rest(self, rest: dict[str, Any], after: dict[str, float]) -> list[Any]:
-        """Coordinates of the sub-steps straight from rest to a frame, which depend on that frame alone.
-
-        Frames that lie in one direction from rest have their first sub-steps in common, to the last digit: all
-        values are rounded to ten places.
-
-        Returns
-        -------
-        list of dict
-            ``rest`` left out and ``after`` last; empty where nothing moves.
-        """
-        rest, after = completed(self.scene, rest), completed(self.scene, after)
-        moving = [k for k in {*rest, *after} if rest.get(k, 0.0) != after.get(k, 0.0)]
-        turning = [k for k in moving if k in self.relevant]
-        if len(moving) == 1 and turning and self._facts[moving[0]].motion == "rotation":
-            stops = self._stops_on_grid(rest, after, moving[0])
-        elif turning:
-            stops = self._stops_on_ray(rest, after)
-        else:
-            stops = []
-        return [{k: round(v, 10) for k, v in stop.items()} for stop in [*stops, *[after][: len(moving)]]]
-
-    def _stops_on_ray(self, rest, after):
-        """Stops strictly between rest and a frame at which several coordinates have moved."""
-        cells = path_angle(self.scene, rest, after) / self.limit
-        if cells == 0.0:
-            return self._even_stops(rest, after)[:-1]
-        found = []
-        for cell in range(math.ceil(cells - 1e-9)):
-            # The whole cell decides how it is split, also where the frame lies in it.
-            ends = [interpolate(rest, after, (cell + k) / cells) for k in range(2)]
-            parts = len(self._even_stops(*ends))
-            shares = [(cell + (k + 1) / parts) / cells for k in range(parts)]
-            found += [share for share in shares if share < 1.0 - 1e-6 / cells]
-        return [interpolate(rest, after, share) for share in found]
-
     def _even_stops(self, before, after):
         """The fewest equal sub-steps that are short enough."""
         # What does not move these bones against each other does not count.
@@ -275,14 +239,12 @@ def estimate_substeps(scene: Any) -> dict[str, float]:
     Found from one probe a coordinate: how far a small change of it, from rest, moves what is attached.
     """
     cut, frames, rest = SubSteps(scene), scene.motion.frames, rest_coordinates(scene)
-    # From rest, frames that lie in several directions have nothing of their ways in common.
-    apart = scene.contact.from_rest and len(scene.motion.coordinates) > 1
     found = {}
     for name in sorted({name for frame in frames for name in frame}):
         start = rest.get(name, 0.0)
         path = np.array([start, *(frame.get(name, start) for frame in frames)])
         with np.errstate(all="ignore"):
-            change = np.abs(path[1:] - start if apart else np.diff(path))
+            change = np.abs(np.diff(path))
             steps = np.ceil(change * cut.rate_of(name) - 1e-9)
             total = float(steps[change > 0].sum())
         # Not a number, where numbers overflow, is more than any limit.

@@ -33,21 +33,9 @@ class Together:
     def __init__(self, steppers: list[MuscleStepper], sliding: Sliding, cuts: Mapping[str, SubSteps]) -> None:
         self.steppers, self.sliding, self.cuts = steppers, sliding, dict(cuts)
 
-    def go(
-        self,
-        stops: list[dict],
-        activations: Sequence[Mapping[str, float]],
-        workers: Workers,
-        *,
-        all_stops: bool = False,
-    ) -> None:
-        """Solve all muscles through coordinates of sub-steps, the first of which is where they are.
-
-        With ``all_stops`` each takes every one, so that two ways with the same first stops are the same that far.
-        """
-        strides = {
-            stepper.name: 1 if all_stops else self._stride(stepper.name, stops) for stepper in self.steppers
-        }
+    def go(self, stops: list[dict], activations: Sequence[Mapping[str, float]], workers: Workers) -> None:
+        """Solve all muscles through coordinates of sub-steps, the first of which is where they are."""
+        strides = {stepper.name: self._stride(stepper.name, stops) for stepper in self.steppers}
         last, here = len(stops) - 1, dict.fromkeys(strides, 0)
         for stop in range(1, last + 1):
             due = [s for s in self.steppers if stop == last or stop % strides[s.name] == 0]

@@ -30,6 +30,7 @@ LARGEST_INTEGER = 2**53
 # Keys that were removed, and what to do instead; a key of a muscle or of its model (`model.KEY`) without the muscle.
 # The table is deleted at 1.0.
 REMOVED_KEYS: dict[str, str] = {
+    "contact.from_rest": "delete the key: solve_pose(scene, models, coordinates) in Python solves a pose from rest",
     "contact.detector": "delete the key; for other fields call simulate(scene, fields={bone: field}) in Python",
     "model.derivatives": "delete the key: up to 200 centres, and fitted ones, meet all derivatives",
     "output.fibres": "delete the key: fibres of a run are no longer followed; those of a scene still steer its muscles",
@@ -171,7 +172,6 @@ class ContactOptions(Table):
     tolerance: Positive | None = None
     substep_angle: Annotated[float, Field(gt=0, le=90)] = 2.0
     still_angle: Annotated[float, Field(ge=0, le=90)] = 0.0
-    from_rest: bool = False
     margin: NotNegative = 0.0
 
     @model_validator(mode="after")

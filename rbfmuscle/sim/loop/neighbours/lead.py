@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
-
-import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 
@@ -51,12 +48,3 @@ class Lead:
         """Arrays of predicted points, moved on to where a step will settle them."""
         share = self.share(way) if self.parts else 0.0
         return [part + share * moved for part, moved in zip(parts, self.parts)] if share else parts
-
-    def snapshot(self) -> tuple[dict[str, float], list[Floats]]:
-        """What `restore` needs."""
-        return dict(self.way), [np.array(part) for part in self.parts]
-
-    def restore(self, state: Any) -> None:
-        """Go back to a snapshot."""
-        way, parts = state
-        self.way, self.parts = dict(way), [np.array(part) for part in parts]
