@@ -60,7 +60,7 @@ preview = false
 
 def one_line(err):
     # A slow machine tells what it is busy with: "hip: building (1 s)".
-    busy = re.compile(r".*: ([a-z ]+|.*compiling.*) \(\d+ s\)")
+    busy = re.compile(r".*: ([a-z ]+ \(\d+ s\)|compiling loops .*)")
     lines = [line for line in err.strip().splitlines() if not busy.fullmatch(line)]
     assert len(lines) == 1 and lines[0].startswith("rbfmuscle: ") and "Traceback" not in err
     return lines[0]
