@@ -55,9 +55,8 @@ fuzz: $(STAMP)
 MINUTES ?= 10
 SEED ?= 24
 mutants: $(STAMP)
-	$(BIN)/python -c "import cosmic_ray" 2>/dev/null || $(BIN)/python -m pip install --quiet -e ".[mutants]"
-	PYTHONPATH=benchmarks $(BIN)/python -m mutants record
-	PYTHONPATH=benchmarks $(BIN)/python -m mutants run --minutes $(MINUTES) --seed $(SEED)
+	test -f .mutants/compiled.json || $(BIN)/python benchmarks/mutants.py record
+	$(BIN)/python benchmarks/mutants.py run --minutes $(MINUTES) --seed $(SEED)
 
 # Results of small whole runs that tests compare with, written anew; what differs is reviewed as part of the change.
 references: $(STAMP)
