@@ -20,7 +20,6 @@ from peers.detectors import TreeDetector, VoxelDetector
 from peers.serendipity import SerendipityField
 from peers.spline import SplineField
 
-from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.sim.distance.errors import points_near
 from rbfmuscle.sim.distance.sdf import BoneSDF
 
@@ -138,15 +137,12 @@ def exact_tools(mesh, vertices, faces):
 
 
 def build_stages(mesh):
-    """Cache, larger mesh, open bone."""
+    """Cache, open bone."""
     vertices, faces = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.int64)
     with tempfile.TemporaryDirectory() as folder:
         os.environ["RBFMUSCLE_CACHE"] = folder
         print(f"cache hit: {1e3 * least(lambda: BoneSDF.from_mesh(mesh), 5)[0]:.1f} ms")
         del os.environ["RBFMUSCLE_CACHE"]
-    larger = split_largest(vertices, faces, 45_000)
-    spent, field = least(lambda: BoneSDF.from_mesh(larger, cache=False))
-    print(f"split to {len(larger[0])} vertices: built in {spent:.3f} s, {field.memory / 1e6:.1f} MB")
     centres = vertices[faces].mean(axis=1)
     place = centres[len(faces) // 3]
     hole = np.argsort(np.linalg.norm(centres - place, axis=1))[: len(faces) // 100]
@@ -160,45 +156,6 @@ def build_stages(mesh):
     print(
         f"1 % of the faces removed: built in {spent:.3f} s, sign right for {100 * right:.4f} % away from the hole"
     )
-
-
-def split_largest(vertices, faces, count):
-    """The mesh with its largest faces split in three, so that it has ``count`` vertices."""
-    corners = vertices[faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    chosen = np.argsort(-area)[: max(0, count - len(vertices))]
-    middle = len(vertices) + np.arange(len(chosen))
-    a, b, c = faces[chosen].T
-    parts = [np.column_stack(pair) for pair in ((a, b, middle), (b, c, middle), (c, a, middle))]
-    kept = np.delete(faces, chosen, axis=0)
-    return np.vstack([vertices, corners[chosen].mean(axis=1)]), np.vstack([kept, *parts])
-
-
-def muscle_tree(mesh):
-    """Build of the exact tree on a muscle's surface."""
-    vertices = np.asarray(mesh.vertices, dtype=float)
-    spent, _ = least(lambda: ExactDistance(vertices, mesh.faces), 5)
-    print(f"\nexact tree, {len(mesh.faces)} triangles: build {1e3 * spent:.1f} ms")
-
-
-def sphere_table():
-    """Largest errors within 0.1 of a sphere of 0.7 in [-1, 1]^3."""
-    rng = np.random.default_rng(0)
-    unit = rng.normal(size=(ACCURACY, 3))
-    points = (
-        unit / np.linalg.norm(unit, axis=1, keepdims=True) * (0.7 + rng.uniform(-0.1, 0.1, (ACCURACY, 1)))
-    )
-
-    def sphere(at):
-        return np.linalg.norm(at, axis=1) - 0.7
-
-    print("\nsphere, largest error in the band at 8 / 16 / 32 / 64 cells")
-    for name, build in (
-        ("serendipity", lambda n: SerendipityField(sphere, [-1.0] * 3, [1.0] * 3, n)),
-        ("tricubic B-spline", lambda n: SplineField(sphere, [-1.0] * 3, [1.0] * 3, 2.0 / n)),
-    ):
-        errors = [np.abs(build(n).distance(points) - sphere(points)).max() for n in (8, 16, 32, 64)]
-        print(f"{name:18s} " + "  ".join(f"{error:.1e}" for error in errors))
 
 
 def main():
@@ -217,10 +174,8 @@ def main():
             mesh = trimesh.load(folder / f"{name}.ply", process=False)
             bone_table(name, mesh)
             build_stages(mesh)
-        muscle_tree(trimesh.load(folder / "gluteus_medius.ply", process=False))
     for name, mesh in shapes.items():
         bone_table(name, mesh)
-    sphere_table()
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Fits, evaluation and condition estimates of the fields, as ratios: ``make bench``.
+"""Fits and evaluation of the fields, as ratios: ``make bench``.
 
 Both sides of a row work in one process, in turns, and the least of several rounds counts: on a shared machine ratios
 hold, milliseconds do not.
@@ -13,20 +13,15 @@ from pathlib import Path
 import numpy as np
 from evidence import machine
 from scipy.interpolate import RBFInterpolator
-from scipy.linalg import blas
 
 from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.fit.condition import largest_eigenvalue, probe
-from rbfmuscle.implicit.fit.fitting import Basis, factorise, solve
-from rbfmuscle.implicit.fit.lapack import solve_cholesky
-from rbfmuscle.implicit.fit.systems import hermite_system
 from rbfmuscle.implicit.kernels.table import KERNELS
 from rbfmuscle.validation import NumericalWarning
 
 SHARED = {"linear": 1.0, "cubic": 1.0, "quintic": 1.0, "thin_plate_spline": 1.0, "multiquadric": 4.0,
           "inverse_multiquadric": 4.0, "inverse_quadratic": 4.0, "gaussian": 6.0}  # fmt: skip
 COUNTS = (500, 1000, 2000)
-PARTS = ("fit", "evaluate", "condition")
+PARTS = ("fit", "evaluate")
 
 
 ROUNDS = 5
@@ -83,15 +78,6 @@ def scattered(count):
     return points, np.sin(2 * points[:, 0]) + points[:, 1] * points[:, 2]
 
 
-def ellipsoid(count):
-    """Points and normals, evenly over an ellipsoid, in random order."""
-    i = np.random.default_rng(0).permutation(count) + 0.5
-    z, angle = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
-    unit = np.c_[np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z]
-    normals = unit / [0.4, 0.5, 1.0]
-    return unit * [0.4, 0.5, 1.0], normals / np.linalg.norm(normals, axis=1)[:, None]
-
-
 def both_fits(kernel, count):
     """Our fit and SciPy's, to be called."""
     points, values = scattered(count)
@@ -120,46 +106,6 @@ def bench_evaluate(table):
                   lambda ours=ours: ours(where), lambda theirs=theirs: theirs(where), apart=True)  # fmt: skip
 
 
-def systems():
-    """Name, basis and right side of the fits that the condition is measured on."""
-    for kernel, epsilon in (("cubic", 1.0), ("matern_52", 3.0), ("wendland_c4", 1.0)):
-        for count in (500, 1000):
-            points, values = scattered(count)
-            basis = Basis(points, KERNELS[kernel], epsilon, KERNELS[kernel].degree)
-            yield f"{kernel}, {count} values", basis, values
-        for derivatives, counts in (("normal", (300, 600)), ("all", (150, 300))):
-            for count in counts:
-                system = hermite_system(*ellipsoid(count), KERNELS[kernel], epsilon, derivatives)
-                yield f"{kernel}, {count} Hermite, {derivatives}", *system[:2]
-
-
-def bench_condition(table):
-    """The estimate of the condition against the whole fit: the ratio is its share."""
-    for name, basis, right in systems():
-        whole = share = np.inf
-        for _ in range(3 * ROUNDS):
-            start = time.perf_counter()
-            solve(basis, right)
-            whole = min(whole, time.perf_counter() - start)
-            share = min(share, estimate(basis))
-        table.keep("condition", name, "the estimate in it", whole, share)
-
-
-def estimate(basis):
-    """Time [s] of what a fit does for its condition, each at its place.
-
-    Two products with the matrix when it is filled, one solution when it is factored.
-    """
-    matrix = basis.matrix()
-    start = time.perf_counter()
-    largest_eigenvalue(len(matrix), lambda vector: blas.dsymv(1.0, matrix, vector, lower=1))
-    spent = time.perf_counter() - start
-    lower = factorise(basis).lower
-    start = time.perf_counter()
-    solve_cholesky(lower, np.asfortranarray(probe(np.diagonal(lower))[:, None]))
-    return spent + time.perf_counter() - start
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path)
@@ -169,7 +115,7 @@ def main():
     print(f"{about['cpu']}, {about['usable_cores']} of {about['cores']} cores, {about['threads']} threads")
     warnings.simplefilter("ignore", NumericalWarning)
     table = Table()
-    work = (bench_fit, bench_evaluate, bench_condition)
+    work = (bench_fit, bench_evaluate)
     for part, bench in zip(PARTS, work):
         if not chosen.part or part in chosen.part:
             bench(table)

@@ -1,9 +1,9 @@
 """Errors of the models against answers in closed form, and runs refined until they no longer move.
 
-    python benchmarks/known_answers.py [PART ...] [--picture FILE]
+    python benchmarks/known_answers.py [PART ...]
 
 Parts are ``stretched``, ``bent``, ``wrapped`` (against closed forms), ``solid`` (what held ends do; needs the extra
-``fem``), ``centres``, ``meshes``, ``iterations``, ``substeps`` (converged runs on the phantom) and ``picture``. Without
+``fem``), ``centres``, ``meshes``, ``iterations``, ``substeps`` (converged runs on the phantom). Without
 any, all tables are printed: some ten minutes on one thread. Errors are in per cent; the order is the slope of the
 error's logarithm over that of the spacing (1 / sqrt(centres), or the mesh's edge).
 """
@@ -12,7 +12,6 @@ import argparse
 import math
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from peers.known_answers import (
@@ -44,7 +43,6 @@ CENTRES = (150, 300, 600, 1200)
 RBF = {"name": "rbf"}
 STRETCHES = (0.8, 1.2, 1.3)
 BEND, TURNS = 60.0, {"cylinder": 90.0, "sphere": 40.0}  # degrees
-IMAGE = Path(__file__).resolve().parents[1] / "docs" / "images" / "known_answers.webp"
 
 
 @dataclass
@@ -311,63 +309,6 @@ def substep_tables():
         converged(f"{name} over the sub-step", runs, same_mesh=True)
 
 
-def picture(path):
-    """Side views of the bent bar and the wrapped strip, with the closed form's centreline."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-    from PIL import Image
-
-    models = (
-        ("rbf", lambda sweeps, side: {**RBF, "centres": 600}),
-        ("pbd", lambda sweeps, side: {"name": "pbd"}),
-        ("pbd settled", lambda sweeps, side: {"name": "pbd", **settled(sweeps, side)(side)}),
-        ("arap-volume", lambda sweeps, side: {"name": "arap-volume"}),
-    )
-    figure, axes = plt.subplots(2, len(models), figsize=(11.0, 5.0), layout="constrained")
-    for column, (name, options) in enumerate(models):
-        bar = play(bent_bar(BEND, spacing=3.0, model=options(3000, 3.0)))
-        _draw(axes[0, column], bar, _arc_answer(), f"{name}, bent by 60°")
-        strip = play(wrapped_strip(TURNS["cylinder"], spacing=2.0, model=options(300, 2.0)), surfaces=False)
-        axes[1, column].add_patch(plt.Circle((0, 0), DRUM_RADIUS, color="#cfc8b8"))
-        _draw(axes[1, column], strip, _wrap_answer(), f"{name}, wrapped by 90°")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=9)
-    figure.savefig(path.with_suffix(".png"), dpi=100)
-    plt.close(figure)
-    Image.open(path.with_suffix(".png")).convert("RGB").save(path, quality=80, method=6)
-    path.with_suffix(".png").unlink()
-
-
-def _draw(axis, played, answer, title):
-    """Side view: the material surface's triangles, its centreline, the answer's."""
-    places, faces = played.carried
-    axis.triplot(places[:, 0], places[:, 2], faces, color="#c0504d", alpha=0.25, linewidth=0.4)
-    line = played.lines()[1]
-    axis.plot(*answer.T, color="black", linewidth=2.2, label="closed form")
-    axis.plot(line[:, 0], line[:, 2], color="#2a6fbb", linestyle="--", linewidth=1.4, label="model")
-    axis.set_title(title, fontsize=9)
-    axis.set_aspect("equal")
-    axis.tick_params(labelsize=7)
-
-
-def _arc_answer():
-    turn = math.radians(BEND) * np.linspace(0, 1, 100)
-    radius = BENT_BAR.length / math.radians(BEND)
-    return np.column_stack([radius * np.sin(turn) - 0.5 * BENT_BAR.length, radius * (np.cos(turn) - 1.0)])
-
-
-def _wrap_answer():
-    turn = math.radians(TURNS["cylinder"])
-    bar = STRIPS["cylinder"]
-    lifted = wrapped_path(turn, bar=bar)[1]
-    q = turn * np.linspace(0, 1, 60)
-    arc = lifted * np.column_stack([np.sin(q), np.cos(q)])
-    along = 0.5 * bar.length * np.array([math.cos(turn), -math.sin(turn)])
-    return np.vstack([arc[0] - [0.5 * bar.length, 0], arc, arc[-1] + along])
-
-
 PARTS = {
     "stretched": stretched_tables,
     "solid": solid_table,
@@ -382,16 +323,9 @@ PARTS = {
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("parts", nargs="*", metavar="PART", help=", ".join([*PARTS, "picture"]))
-    parser.add_argument("--picture", type=Path, default=IMAGE, metavar="FILE")
-    given = parser.parse_args()
-    for part in given.parts or PARTS:
-        if part == "picture":
-            picture(given.picture)
-        elif part in PARTS:
-            PARTS[part]()
-        else:
-            parser.error(f"unknown part {part!r}, known: {', '.join([*PARTS, 'picture'])}")
+    parser.add_argument("parts", nargs="*", metavar="PART", choices=[*PARTS, []], help=", ".join(PARTS))
+    for part in parser.parse_args().parts or PARTS:
+        PARTS[part]()
 
 
 if __name__ == "__main__":
