@@ -223,7 +223,7 @@ class TestErrors:
             (
                 ("kernels", "phantom", "-o", "o", "--centres", "100,many"),
                 2,
-                "--centres must be whole numbers of 4 and more",
+                "--centres must be whole numbers of 8 and more",
             ),
             (
                 ("check", "metres.toml"),
