@@ -20,7 +20,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.validation import MeshError
 
 PATIENCE = 120.0  # Time after which a file that VTK has not read is refused [s].
-MEMORY = 16 << 30  # Address space of the process that reads [bytes]: a small file may unpack to anything.
+MEMORY = 8 << 30  # Address space of the process that reads [bytes]: a small file may unpack to anything.
 MOST_CORNERS = 100  # From which a polygon is split: trying each takes time with their square.
 _TURN = threading.Lock()
 
