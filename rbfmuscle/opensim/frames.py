@@ -1,13 +1,13 @@
 """The frames of a model: bodies, and what is offset from them, found by the paths that files name them by."""
 
 import posixpath
-from collections.abc import Callable
 
 import numpy as np
 
 from rbfmuscle.opensim.functions import vector
 from rbfmuscle.opensim.xml import Node
 from rbfmuscle.sim.joints.joint import frame_at
+from rbfmuscle.validation import SceneError
 
 OFFSET = "PhysicalOffsetFrame"
 _DEEPEST = 50
@@ -21,12 +21,9 @@ class Frames:
     model : Node
         The element ``<Model>``.
     bodies : list of Node
-    problem : callable
-        Makes the errors about this file.
     """
 
-    def __init__(self, model: Node, bodies: list[Node], problem: Callable) -> None:
-        self.problem = problem
+    def __init__(self, model: Node, bodies: list[Node]) -> None:
         self.bodies = {"/ground": "ground"} | {f"/bodyset/{body.name}": body.name for body in bodies}
         self.offsets = {}
         for child in model.nodes():
@@ -59,7 +56,7 @@ class Frames:
         """Body and frame in it (4, 4) of a joint's end, ``role`` being parent or child."""
         name = _socket(joint, f"{role}_frame")
         if not name:
-            raise self.problem(f"joint {joint.name!r}: names no {role} frame; give it one")
+            raise SceneError(f"joint {joint.name!r}: names no {role} frame; give it one")
         return self.place(name, inside=f"/jointset/{joint.name}")
 
     def place(self, name: str, *, inside: str = "/") -> tuple[str, np.ndarray]:
@@ -76,11 +73,11 @@ class Frames:
                 return self.bodies[path], transform
             frame = self.offsets[path]
             at = f"frame {path!r}"
-            origin = vector(frame, "translation", "0 0 0", place=at, problem=self.problem)
-            angles = vector(frame, "orientation", "0 0 0", place=at, problem=self.problem)
+            origin = vector(frame, "translation", "0 0 0", place=at)
+            angles = vector(frame, "orientation", "0 0 0", place=at)
             transform = frame_at(np.array(origin), angles) @ transform
             path = self._find(_socket(frame, "parent") or "..", path)
-        raise self.problem(f"frame {path!r} hangs on itself; correct its parent")
+        raise SceneError(f"frame {path!r} hangs on itself; correct its parent")
 
     def _find(self, name, inside):
         name = name.strip()
@@ -90,7 +87,7 @@ class Frames:
         for guess in guesses:
             if guess in self.bodies or guess in self.offsets:
                 return guess
-        raise self.problem(f"{inside}: there is no frame {name!r}; correct the socket")
+        raise SceneError(f"{inside}: there is no frame {name!r}; correct the socket")
 
 
 def _socket(node, name):

@@ -2,8 +2,6 @@
 
 import itertools
 import math
-from collections.abc import Callable
-from pathlib import Path
 
 from rbfmuscle.opensim.xml import Node
 from rbfmuscle.sim.joints.functions import (
@@ -29,18 +27,7 @@ FUNCTIONS = (
 )
 
 
-class Problem:
-    """Makes the errors about one file."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __call__(self, message: str) -> SceneError:
-        """The error, its message headed by the file."""
-        return SceneError(f"{self.path}: {message}")
-
-
-def numbers(text: str, *, place: str, problem: Callable, count: int | None = None) -> list[float]:
+def numbers(text: str, *, place: str, count: int | None = None) -> list[float]:
     """Return the finite numbers in a text, or raise, naming the place.
 
     Parameters
@@ -52,17 +39,17 @@ def numbers(text: str, *, place: str, problem: Callable, count: int | None = Non
     try:
         values = [float(word) for word in words]
     except ValueError:
-        raise problem(f"{place}: {text.strip()[:60]!r} is no list of numbers; correct it") from None
+        raise SceneError(f"{place}: {text.strip()[:60]!r} is no list of numbers; correct it") from None
     if not all(math.isfinite(value) for value in values):
-        raise problem(f"{place}: {text.strip()[:60]!r} is not finite; correct it")
+        raise SceneError(f"{place}: {text.strip()[:60]!r} is not finite; correct it")
     if count is not None and len(values) != count:
-        raise problem(f"{place}: {count} numbers are needed, got {text.strip()[:60]!r}")
+        raise SceneError(f"{place}: {count} numbers are needed, got {text.strip()[:60]!r}")
     return values
 
 
-def vector(node: Node, tag: str, default: str, *, place: str, problem: Callable) -> list[float]:
+def vector(node: Node, tag: str, default: str, *, place: str) -> list[float]:
     """Return the three numbers of a child element."""
-    return numbers(node.word(tag, default), place=f"{place}: {tag}", problem=problem, count=3)
+    return numbers(node.word(tag, default), place=f"{place}: {tag}", count=3)
 
 
 def truth(node: Node, tag: str, default: bool = False) -> bool:
@@ -87,7 +74,7 @@ def find_function(node: Node | None) -> Node | None:
     return None
 
 
-def read_function(node: Node, *, place: str, problem: Callable, depth: int = 0) -> Function:
+def read_function(node: Node, *, place: str, depth: int = 0) -> Function:
     """Return the function that an element describes.
 
     Raises
@@ -97,7 +84,7 @@ def read_function(node: Node, *, place: str, problem: Callable, depth: int = 0) 
     """
 
     def values(tag):
-        return numbers(node.word(tag), place=f"{place}: {tag}", problem=problem)
+        return numbers(node.word(tag), place=f"{place}: {tag}")
 
     if node.tag == "Constant":
         return Constant((values("value") or [0.0])[0])
@@ -109,16 +96,16 @@ def read_function(node: Node, *, place: str, problem: Callable, depth: int = 0) 
     if node.tag == "MultiplierFunction":
         inner = find_function(node)
         if inner is None or depth > 20:
-            raise problem(f"{place}: a MultiplierFunction without a function; give it one")
+            raise SceneError(f"{place}: a MultiplierFunction without a function; give it one")
         scale = (values("scale") or [1.0])[0]
-        return Scaled(scale, read_function(inner, place=place, problem=problem, depth=depth + 1))
+        return Scaled(scale, read_function(inner, place=place, depth=depth + 1))
     if node.tag == "PiecewiseLinearFunction" or node.tag in SPLINES:
         x, y = values("x"), values("y")
         if not x or len(x) != len(y) or any(b <= a for a, b in itertools.pairwise(x)):
-            raise problem(
+            raise SceneError(
                 f"{place}: {node.tag} needs as many y as x, and x that increase, got {len(x)} and {len(y)}"
             )
         return Spline(tuple(x), tuple(y)) if node.tag in SPLINES else PiecewiseLinear(tuple(x), tuple(y))
-    raise problem(
+    raise SceneError(
         f"{place}: a function {node.tag!r} is not in our table; put a SimmSpline or a PolynomialFunction in its place"
     )

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rbfmuscle.opensim.functions import Problem
 from rbfmuscle.sim.joints.joint import KINDS, Coordinate, Coupling, Joint, TransformAxis
 from rbfmuscle.sim.joints.skeleton import ordered
+from rbfmuscle.validation import SceneError
 
 GROUND = "ground"
 # What OpenSim calls a joint -> kind in our table, where the coordinates are in the same order.
@@ -142,7 +142,6 @@ def finish(model: OsimModel) -> OsimModel:
     SceneError
         If two bodies or two coordinates share a name, or a joint names a body that is not there.
     """
-    problem = Problem(model.path)
     for what, names in (
         ("bodies", model.bodies),
         ("joints", [joint.name for joint in model.joints]),
@@ -150,11 +149,13 @@ def finish(model: OsimModel) -> OsimModel:
     ):
         for name in names:
             if names.count(name) > 1:
-                raise problem(f"two {what} are named {name!r}; rename one")
+                raise SceneError(f"two {what} are named {name!r}; rename one")
     for joint in model.joints:
         for body in (joint.parent, joint.child):
             if body not in model.bodies:
-                raise problem(f"joint {joint.name!r}: there is no body {body!r}; correct the joint's frames")
+                raise SceneError(
+                    f"joint {joint.name!r}: there is no body {body!r}; correct the joint's frames"
+                )
     used = [joint for joint, _ in model.tree()]
     for joint in model.joints:
         if joint not in used:
@@ -169,7 +170,7 @@ def finish(model: OsimModel) -> OsimModel:
     for coupling in list(model.couplings):
         lost = [name for name in (coupling.coordinate, *coupling.of) if name not in known]
         if lost:
-            raise problem(
+            raise SceneError(
                 f"a coupling names coordinate {lost[0]!r}, which no joint has; correct the constraint"
             )
     model.couplings = ordered(model.couplings)

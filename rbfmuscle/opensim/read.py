@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.opensim.frames import Frames
-from rbfmuscle.opensim.functions import Problem, find_function, numbers, read_function, truth, vector
+from rbfmuscle.opensim.functions import find_function, numbers, read_function, truth, vector
 from rbfmuscle.opensim.model import (
     GROUND,
     JOINT_KINDS,
@@ -19,6 +19,7 @@ from rbfmuscle.opensim.model import (
 from rbfmuscle.opensim.xml import read_xml
 from rbfmuscle.sim.joints.functions import Linear, Scaled
 from rbfmuscle.sim.joints.joint import Coordinate, Coupling, TransformAxis, frame_at
+from rbfmuscle.validation import SceneError
 
 # From this version on joints stand in a set of their own and name their frames.
 SOCKETS = 40000
@@ -46,14 +47,20 @@ def read_osim(path: Path | str) -> OsimModel:
     """
     path = Path(path)
     root = read_xml(path)
-    problem = Problem(path)
+    try:
+        return _read_model(root, path)
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from None
+
+
+def _read_model(root, path):
     node = root if root.tag == "Model" else root.child("Model")
     if root.tag not in ("OpenSimDocument", "Model") or node is None:
-        raise problem(f"its root is <{root.tag[:40]}>, no OpenSim model; give an .osim file")
+        raise SceneError(f"its root is <{root.tag[:40]}>, no OpenSim model; give an .osim file")
     try:
         version = int(root.get("Version", "0"))
     except ValueError:
-        raise problem(f"version {root.get('Version', '')[:20]!r} is no number; correct it") from None
+        raise SceneError(f"version {root.get('Version', '')[:20]!r} is no number; correct it") from None
     model = OsimModel(node.name or path.stem, version, path, [GROUND])
     units = node.word("length_units", "meters")
     if units not in ("meters", "m", "metres"):
@@ -62,35 +69,35 @@ def read_osim(path: Path | str) -> OsimModel:
         )
     bodies = [body for body in node.objects("BodySet") if body.tag == "Body"]
     model.bodies += [body.name for body in bodies if body.name != GROUND]
-    frames = Frames(node, bodies, problem)
+    frames = Frames(node, bodies)
     if version >= SOCKETS or node.child("JointSet") is not None:
-        _read_new(model, node, bodies, frames, problem)
+        _read_new(model, node, bodies, frames)
     else:
-        _read_old(model, bodies, problem)
-    _read_constraints(model, node, problem)
+        _read_old(model, bodies)
+    _read_constraints(model, node)
     return finish(model)
 
 
-def _read_new(model, node, bodies, frames, problem):
+def _read_new(model, node, bodies, frames):
     for joint in node.objects("JointSet"):
         parts = [frames.of_joint(joint, role) for role in ("parent", "child")]
-        model.joints.append(_joint(joint, parts, "coordinates", problem, model))
+        model.joints.append(_joint(joint, parts, "coordinates", model))
     grounds = [child for child in node.nodes() if child.tag == "Ground"]
     for body in [*grounds, *bodies]:
-        _meshes_of(model, body, body.name or GROUND, frames, problem)
+        _meshes_of(model, body, body.name or GROUND, frames)
     for joint in node.objects("JointSet"):
         for frame in frames.of(joint):
-            _add_meshes(model, frame, *frames.place(f"/jointset/{joint.name}/{frame.name}"), problem)
+            _add_meshes(model, frame, *frames.place(f"/jointset/{joint.name}/{frame.name}"))
 
 
-def _meshes_of(model, body, name, frames, problem):
-    _add_meshes(model, body, name, np.eye(4), problem)
+def _meshes_of(model, body, name, frames):
+    _add_meshes(model, body, name, np.eye(4))
     owner = "/ground" if name == GROUND else f"/bodyset/{name}"
     for frame in frames.of(body):
-        _add_meshes(model, frame, *frames.place(f"{owner}/{frame.name}"), problem)
+        _add_meshes(model, frame, *frames.place(f"{owner}/{frame.name}"))
 
 
-def _add_meshes(model, owner, body, transform, problem):
+def _add_meshes(model, owner, body, transform):
     """Geometry that hangs on a body or on a frame of it."""
     attached = owner.child("attached_geometry")
     for shape in [] if attached is None else attached.nodes():
@@ -102,7 +109,7 @@ def _add_meshes(model, owner, body, transform, problem):
         place = f"body {body!r}: mesh {shape.name!r}"
         look = shape.child("Appearance")
         visible = truth(look, "visible", True) if look is not None else True
-        scale = vector(shape, "scale_factors", "1 1 1", place=place, problem=problem)
+        scale = vector(shape, "scale_factors", "1 1 1", place=place)
         _add_mesh(model, shape.word("mesh_file"), body, scale, transform, visible)
 
 
@@ -118,7 +125,7 @@ def _add_mesh(model, file, body, scale, transform, visible):
     model.meshes.append(ModelMesh(file, body, tuple(scale), transform))
 
 
-def _read_old(model, bodies, problem):
+def _read_old(model, bodies):
     """Versions before 4: each joint lies inside the body that is its child."""
     for body in bodies:
         holder = body.child("Joint")
@@ -126,15 +133,15 @@ def _read_old(model, bodies, problem):
             place = f"joint {joint.name!r}"
             ends = []
             for where, turn in (("location_in_parent", "orientation_in_parent"), ("location", "orientation")):
-                origin = _as_upgraded(vector(joint, where, "0 0 0", place=place, problem=problem))
-                angles = _as_upgraded(vector(joint, turn, "0 0 0", place=place, problem=problem))
+                origin = _as_upgraded(vector(joint, where, "0 0 0", place=place))
+                angles = _as_upgraded(vector(joint, turn, "0 0 0", place=place))
                 ends.append(frame_at(np.array(origin), angles))
             names = [joint.word("parent_body"), body.name]
             if truth(joint, "reverse"):
                 names, ends = names[::-1], ends[::-1]
-            found = _joint(joint, list(zip(names, ends)), "CoordinateSet", problem, model)
+            found = _joint(joint, list(zip(names, ends)), "CoordinateSet", model)
             model.joints.append(found)
-        _old_meshes(model, body, problem)
+        _old_meshes(model, body)
 
 
 def _as_upgraded(values):
@@ -142,104 +149,100 @@ def _as_upgraded(values):
     return [float(f"{value:.6g}") for value in values]
 
 
-def _old_meshes(model, body, problem):
+def _old_meshes(model, body):
     visible = body.child("VisibleObject")
     if visible is None:
         return
-    whole = np.array(vector(visible, "scale_factors", "1 1 1", place=f"body {body.name!r}", problem=problem))
+    whole = np.array(vector(visible, "scale_factors", "1 1 1", place=f"body {body.name!r}"))
     for file in visible.word("geometry_files").split():
         _add_mesh(model, file, body.name, whole.tolist(), np.eye(4), True)
     for shape in visible.objects("GeometrySet"):
         file = shape.word("geometry_file")
         place = f"body {body.name!r}: mesh {file!r}"
-        six = numbers(
-            shape.word("transform", "0 0 0 0 0 0"), place=f"{place}: transform", problem=problem, count=6
-        )
-        scale = whole * vector(shape, "scale_factors", "1 1 1", place=place, problem=problem)
+        six = numbers(shape.word("transform", "0 0 0 0 0 0"), place=f"{place}: transform", count=6)
+        scale = whole * vector(shape, "scale_factors", "1 1 1", place=place)
         shown = shape.word("display_preference", "4") != "0"
         _add_mesh(model, file, body.name, scale.tolist(), frame_at(np.array(six[3:]), six[:3]), shown)
 
 
-def _joint(joint, ends, holder, problem, model):
+def _joint(joint, ends, holder, model):
     """One joint from its element, its ends as (body, frame), and the tag of what holds its coordinates."""
     (parent, first), (child, second) = ends
     place = f"joint {joint.name!r} ({parent} to {child})"
     kind = JOINT_KINDS.get(joint.tag)
     if kind is None:
-        raise problem(
+        raise SceneError(
             f"{place}: a {joint.tag} is not in the table of joints, so body {child!r} cannot be placed; "
             "replace it by a CustomJoint in OpenSim"
         )
     found = [node for node in joint.objects(holder) if node.tag == "Coordinate"]
     axes, slopes = ({}, {})
     if kind == "custom":
-        axes, slopes = _axes(joint, place, problem)
+        axes, slopes = _axes(joint, place)
     names = [node.name for node in found]
     for axis in axes.values():
         for name in axis.coordinates:
             if name not in names:
-                raise problem(f"{place}: an axis follows {name!r}, which is no coordinate of this joint")
+                raise SceneError(f"{place}: an axis follows {name!r}, which is no coordinate of this joint")
     kinds = motion_kinds(kind, names, axes, slopes)
     needed = {"fixed": 0, "custom": len(names), "ball": 3, "universal": 2, "planar": 3, "free": 6}.get(
         kind, 1
     )
     if len(names) != needed:
-        raise problem(f"{place}: a {joint.tag} has {needed} coordinates, {len(names)} are given")
-    coordinates = {
-        node.name: _coordinate(node, motion, place, problem, model) for node, motion in zip(found, kinds)
-    }
+        raise SceneError(f"{place}: a {joint.tag} has {needed} coordinates, {len(names)} are given")
+    coordinates = {node.name: _coordinate(node, motion, place, model) for node, motion in zip(found, kinds)}
     return ModelJoint(
         joint.name, kind, parent, child, first, second, joint_motion(joint.name, kind, coordinates, axes)
     )
 
 
-def _axes(joint, place, problem):
+def _axes(joint, place):
     """The axes of a custom joint by name, and the slopes of those that are plain linear functions."""
     table = joint.child("SpatialTransform")
     if table is None:
         if joint.child("TransformAxisSet") is not None:
-            raise problem(f"{place}: is written as OpenSim 1 did; open the model in OpenSim 4 and save it")
+            raise SceneError(f"{place}: is written as OpenSim 1 did; open the model in OpenSim 4 and save it")
         return {}, {}
     axes, slopes = {}, {}
     for node in table.nodes():
         if node.tag != "TransformAxis":
             continue
         at = f"{place}: axis {node.name!r}"
-        direction = np.array(vector(node, "axis", "1 0 0", place=at, problem=problem))
+        direction = np.array(vector(node, "axis", "1 0 0", place=at))
         size = np.linalg.norm(direction)
         names = tuple(name for name in node.word("coordinates").split())
         inner = find_function(node)
         if inner is None:
             if names:
-                raise problem(f"{at}: follows {' '.join(names)} by no function; give it one")
+                raise SceneError(f"{at}: follows {' '.join(names)} by no function; give it one")
             continue
-        function = read_function(inner, place=at, problem=problem)
+        function = read_function(inner, place=at)
         if size == 0:
-            raise problem(f"{at}: its direction is zero; give it one")
-        _check_count(function, len(names), at, problem)
+            raise SceneError(f"{at}: its direction is zero; give it one")
+        _check_count(function, len(names), at)
         axes[node.name] = TransformAxis(tuple((direction / size).tolist()), names, function)
         if isinstance(function, Linear) and len(function.slopes) == 1:
             slopes[node.name] = function.slopes[0]
     return axes, slopes
 
 
-def _check_count(function, count, at, problem):
+def _check_count(function, count, at):
     while isinstance(function, Scaled):
         function = function.inner
     slopes = len(function.slopes) if isinstance(function, Linear) else None
     if slopes is not None and slopes > count:
-        raise problem(f"{at}: a linear function of {slopes} coordinates, {count} are named")
+        raise SceneError(f"{at}: a linear function of {slopes} coordinates, {count} are named")
     if slopes is None and count == 0 and type(function).__name__ != "Constant":
-        raise problem(f"{at}: a function of a coordinate, and none is named")
+        raise SceneError(f"{at}: a function of a coordinate, and none is named")
 
 
-def _coordinate(node, motion, place, problem, model):
+def _coordinate(node, motion, place, model):
     at = f"{place}: coordinate {node.name!r}"
-    rest = numbers(node.word("default_value", "0"), place=f"{at}: default_value", problem=problem, count=1)[0]
+    rest = numbers(node.word("default_value", "0"), place=f"{at}: default_value", count=1)[0]
     text = node.word("range")
-    limits = numbers(text, place=f"{at}: range", problem=problem, count=2) if text else None
+    limits = numbers(text, place=f"{at}: range", count=2) if text else None
     if limits is not None and limits[0] > limits[1]:
-        raise problem(f"{at}: its range {text!r} goes downwards; turn it round")
+        raise SceneError(f"{at}: its range {text!r} goes downwards; turn it round")
     if truth(node, "prescribed"):
         model.notes.append(
             f"{at.split(': ')[-1]} is prescribed by a function of time: not taken, it stays at {rest:g}"
@@ -254,7 +257,7 @@ def _coordinate(node, motion, place, problem, model):
     )
 
 
-def _read_constraints(model, node, problem):
+def _read_constraints(model, node):
     for constraint in node.objects("ConstraintSet"):
         if constraint.tag != "CoordinateCouplerConstraint":
             model.notes.append(
@@ -266,13 +269,13 @@ def _read_constraints(model, node, problem):
             continue
         inner = find_function(constraint.child("coupled_coordinates_function"))
         if inner is None:
-            raise problem(f"{place}: has no function; give it one")
-        function = read_function(inner, place=place, problem=problem)
-        scale = numbers(constraint.word("scale_factor", "1"), place=place, problem=problem, count=1)[0]
+            raise SceneError(f"{place}: has no function; give it one")
+        function = read_function(inner, place=place)
+        scale = numbers(constraint.word("scale_factor", "1"), place=place, count=1)[0]
         of = tuple(constraint.word("independent_coordinate_names").split())
         target = constraint.word("dependent_coordinate_name")
         if not of or not target:
-            raise problem(f"{place}: names no coordinates; give it some")
+            raise SceneError(f"{place}: names no coordinates; give it some")
         model.couplings.append(Coupling(target, of, function if scale == 1.0 else Scaled(scale, function)))
     dependents = {coupling.coordinate for coupling in model.couplings}
     for name, facts in model.coordinates().items():

@@ -13,6 +13,7 @@ from rbfmuscle.opensim.read import read_osim
 from rbfmuscle.sim.joints.functions import Function
 from rbfmuscle.sim.joints.joint import Coordinate, Coupling, Joint, TransformAxis
 from rbfmuscle.sim.scene.scene import MM_PER_UNIT, Scene
+from rbfmuscle.validation import SceneError, did_you_mean
 
 
 @dataclass
@@ -108,9 +109,6 @@ def clean_name(name: str, taken: set[str]) -> str:
 
 def _keep(model, bodies):
     """Leave out every body that is neither named nor on the way from one of those to the ground."""
-    from rbfmuscle.opensim.functions import Problem
-    from rbfmuscle.validation import did_you_mean
-
     towards = {}
     for joint, backward in model.tree():
         child, parent = (joint.parent, joint.child) if backward else (joint.child, joint.parent)
@@ -118,7 +116,7 @@ def _keep(model, bodies):
     kept = {model.bodies[0]}
     for body in bodies:
         if body not in model.bodies:
-            raise Problem(model.path)(f"there is no body {body!r}, {did_you_mean(body, model.bodies)}")
+            raise SceneError(f"{model.path}: there is no body {body!r}, {did_you_mean(body, model.bodies)}")
         while body is not None and body not in kept:
             kept.add(body)
             body = towards.get(body)

@@ -27,7 +27,7 @@ def paths(
     scene
         Scene file (TOML), or "phantom" for the embedded hip.
     output
-        Folder for paths.xml, paths.csv and errors.csv.
+        Folder for paths.xml and errors.csv.
     samples
         Poses for each muscle, of which every fifth is held out of the fit.
     muscles

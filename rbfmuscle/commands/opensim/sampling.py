@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.models import build_models
-from rbfmuscle.opensim.fitted import MOST_COORDINATES, FittedPath, exponents, fit_path, write_paths
+from rbfmuscle.opensim.fitted import MOST_COORDINATES, FittedPath, fit_path, write_paths
 from rbfmuscle.sim.joints.skeleton import all_coordinates
 from rbfmuscle.sim.loop.simulate import FrameLoop
 from rbfmuscle.sim.plan.reach import build_fields, reached_bones
@@ -237,7 +237,6 @@ def report_fits(scene: Scene, sampled: list[Samples], directory: Path, order: in
         directory.mkdir(parents=True, exist_ok=True)
         write_paths(directory / "paths.xml", fitted, scene.length(1000.0), turning)
         _write_csv(directory / "errors.csv", errors)
-        _write_csv(directory / "paths.csv", _terms_table(scene, fitted))
     except OSError as error:
         raise UsageError(f"cannot write to {directory}: {error.strerror}; choose another folder") from None
     lines.append(
@@ -258,17 +257,6 @@ def held_out_errors(
         "arm_rms": float(np.sqrt(np.mean(arm**2))),
         "arm_max": float(np.abs(arm).max()),
     }
-
-
-def _terms_table(scene, fitted):
-    rows = []
-    for path in fitted:
-        for power, value in zip(exponents(len(path.coordinates), path.order), path.coefficients):
-            term = " ".join(f"{n}^{p}" for n, p in zip(path.coordinates, power) if p) or "1"
-            rows.append(
-                {"muscle": path.muscle, "term": term, "coefficient": repr(float(value)), "unit": scene.units}
-            )
-    return rows
 
 
 def _write_csv(file, rows):
