@@ -1,9 +1,9 @@
-"""Frames a second of a scene, a surface in every frame: drawn beside the next solution, and one after the other.
+"""Frames per second of a scene, a surface in every frame.
 
     python benchmarks/frame_rate.py SCENE.toml [...] [--set KEY=VALUE ...] [--repeat N]
 
-The median time from frame to frame without the first, which loads and compiles; the repetitions take turns, so that
-a machine that gets slower does so for all. Then the median of each stage of each muscle [ms].
+The median time from frame to frame without the first, which loads and compiles. Then the median of each stage
+of each muscle [ms].
 """
 
 import argparse
@@ -17,10 +17,10 @@ from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.sim.scene.settings import parse_setting
 
 
-def frames_of(scene, ahead):
+def frames_of(scene):
     """Median time from frame to frame [ms], and the frames without surfaces."""
     frames = []
-    for frame in simulate_frames(scene, build_models(scene), ahead=ahead):
+    for frame in simulate_frames(scene, build_models(scene)):
         frame.surfaces = {}
         frames.append(frame)
     return 1e3 * float(np.median([frame.wall for frame in frames[1:]])), frames[1:]
@@ -28,16 +28,12 @@ def frames_of(scene, ahead):
 
 def measure(path, settings, repeat):
     scene = Scene.load(path).with_options(dict(parse_setting(text) for text in settings))
-    walls = {True: [], False: []}
+    walls = []
     for _ in range(repeat):
-        for ahead, found in walls.items():
-            wall, frames = frames_of(scene, ahead)
-            found.append(wall)
-    for ahead, words in ((True, "beside the next solution"), (False, "one after the other")):
-        low, middle, high = np.percentile(walls[ahead], [0, 50, 100])
-        print(
-            f"{path.stem}, {words}: {middle:.1f} ms ({low:.1f} to {high:.1f}), {1e3 / middle:.0f} frames a second"
-        )
+        wall, frames = frames_of(scene)
+        walls.append(wall)
+    low, middle, high = np.percentile(walls, [0, 50, 100])
+    print(f"{path.stem}: {middle:.1f} ms ({low:.1f} to {high:.1f}), {1e3 / middle:.0f} frames per second")
     for muscle in scene.muscles:
         times = [frame.times[muscle.name] for frame in frames]
         stages = {key: 1e3 * np.median([t.get(key, 0.0) for t in times]) for key in times[0]}

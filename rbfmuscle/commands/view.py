@@ -101,7 +101,7 @@ def _open_saved(run):
 
 def _open_scene(loaded, model):
     from rbfmuscle.models import build_models, configure_scene
-    from rbfmuscle.sim.loop.driving.live import LiveSession
+    from rbfmuscle.sim.loop.live import LiveSession
     from rbfmuscle.sim.scene.motion import shown_value
     from rbfmuscle.study.show.view.live import LiveViewer
 

@@ -204,5 +204,3 @@ def test_nothing_starts_beside_a_single_thread(monkeypatch):
     monkeypatch.setattr("rbfmuscle.sim.loop.workers.numba", SimpleNamespace(get_num_threads=lambda: 1))
     workers = Workers(5)
     assert workers.each(abs, [-1, -2]) == [1, 2] and not workers.parallel
-    with pytest.raises(RuntimeError, match="one thread only"):
-        workers.start(abs, [-1])

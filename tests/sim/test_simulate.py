@@ -4,7 +4,6 @@ import sys
 import threading
 from itertools import pairwise
 
-import numba
 import numpy as np
 import pytest
 from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, hinged_scene, joint, muscle, scene, sphere
@@ -39,9 +38,7 @@ def test_frames_carry_what_they_promise():
     assert sum(f.wall for f in frames) >= sum(f.times["strap"].get("time_solve", 0.0) for f in frames)
 
 
-@pytest.mark.parametrize("ahead", [True, False])
-def test_a_failing_frame_leaves_those_before(ahead):
-    """A frame is yielded though the next one, solved while it is drawn, cannot be solved."""
+def test_a_failing_frame_leaves_those_before():
     made, fields = hinged_scene([0, 10, 20, 30])
     model = ToyMuscle(made.muscles[0], made)
     predict = model.predict
@@ -54,25 +51,9 @@ def test_a_failing_frame_leaves_those_before(ahead):
     model.predict = fails_in_the_third
     seen = []
     with pytest.raises(SolveError, match="planted"):
-        for frame in simulate_frames(made, [model], fields=fields, ahead=ahead):
+        for frame in simulate_frames(made, [model], fields=fields):
             seen.append((frame.index, sorted(frame.surfaces)))
     assert seen == [(0, ["strap"]), (1, ["strap"])]
-
-
-def test_drawing_beside_the_next_solution_changes_nothing(hip_scene):
-    made = hip_scene.with_options(frames="0:4")
-    made.muscles = made.muscles[-2:]
-    runs = []
-    for ahead in (True, False):
-        built = [models.build_model(m, made) for m in made.muscles]
-        runs.append(list(simulate_frames(made, built, ahead=ahead)))
-    for one, other in zip(*runs):
-        for name in one.surfaces:
-            a, b = one.surfaces[name], other.surfaces[name]
-            assert np.array_equal(a.faces, b.faces)
-            # Factors by one or two threads of BLAS differ in rounding.
-            assert np.abs(a.vertices - b.vertices).max() < 1e-6
-            assert np.array_equal(one.carried[name][0], other.carried[name][0])
 
 
 def test_muscle_stays_out_of_the_bone_it_wraps():
@@ -208,8 +189,7 @@ def test_leaving_early_ends_the_workers():
     course = simulate_frames(made, parts, fields=fields)
     next(course)
     course.close()
-    # The five sub-steps of frame 1 where it was solved while frame 0 was drawn; none of frame 2.
-    assert parts[0].solves == (5 if numba.get_num_threads() > 1 else 0)
+    assert parts[0].solves == 0  # the frames to come are not begun
     assert set(threading.enumerate()) == before
 
 

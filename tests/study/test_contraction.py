@@ -7,7 +7,7 @@ from contraction_scenes import MUSCLE, SPINDLE, spindle_scene
 
 import rbfmuscle as rm
 from rbfmuscle.models import build_model
-from rbfmuscle.sim.loop.driving.live import LiveSession
+from rbfmuscle.sim.loop.live import LiveSession
 from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.study.measure.centreline import MuscleAtRest
 from rbfmuscle.study.measure.contraction import ContractionStudy, belly_measures, pennation, section_area

@@ -12,7 +12,7 @@ import pytest
 import toy_scene
 
 from rbfmuscle.commands.view import _begin_at
-from rbfmuscle.sim.loop.driving.live import LiveSession, coordinate_limits
+from rbfmuscle.sim.loop.live import LiveSession, coordinate_limits
 from rbfmuscle.study.show.view.live import LiveViewer
 from rbfmuscle.study.show.view.saved import SavedViewer
 from rbfmuscle.validation import UsageError

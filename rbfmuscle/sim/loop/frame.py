@@ -75,8 +75,7 @@ class Frame:
         For each muscle ``time_predict``, ``time_solve``, ... and their sum ``time_frame`` [s], since the
         frame before.
     wall : float
-        Time for all muscles together [s], since the frame before. Where the next frame is solved while this one
-        is drawn, both are in it; over a motion the sum is what counts.
+        Time for all muscles together [s], since the frame before.
     activations : dict of str to float
         Of the muscles that contract.
     work : dict of str to Work

@@ -2,14 +2,12 @@
 
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
 from contextlib import contextmanager
 
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.sim.contraction.course import Activations
 from rbfmuscle.sim.loop.carrying import Carrier
 from rbfmuscle.sim.loop.contact import BoneContacts
-from rbfmuscle.sim.loop.driving.ahead import run_ahead
 from rbfmuscle.sim.loop.frame import Event, FinishedDrawing, Frame, ModelSurface, MuscleModel
 from rbfmuscle.sim.loop.overlap import settle_rest
 from rbfmuscle.sim.loop.stepper import MuscleStepper, TimedDrawing
@@ -97,11 +95,6 @@ class FrameLoop:
             self.close()
             raise
 
-    @property
-    def can_run_ahead(self) -> bool:
-        """Whether a frame may be solved while the one before is drawn: muscles that slide wait for each other."""
-        return self.surfaces and self._sliding is None and self.workers.threads > 1
-
     def advance(self, coordinates: Mapping[str, float]) -> Frame:
         """Go on to a frame and show it.
 
@@ -140,11 +133,6 @@ class FrameLoop:
         """Go on to a frame and show nothing: its times and events are in the next frame that is shown."""
         with self.clocked(), self.workers.one_thread_each():
             self._solve(self._path_to(coordinates))
-
-    def start(self, coordinates: Mapping[str, float]) -> list[Future]:
-        """Set out for a frame: for each muscle what will be its `TimedDrawing`, for `run_ahead`."""
-        paths = self._path_to(coordinates)
-        return self.workers.start(lambda stepper: stepper.go(*paths[stepper.name]), self.steppers)
 
     def collect(self) -> Frame:
         """The frame where the muscles are now, without its surfaces."""
@@ -248,7 +236,6 @@ def simulate_frames(
     surfaces: bool = True,
     written: Collection[int] | None = None,
     fields: Mapping[str, BoneField] | None = None,
-    ahead: bool = True,
 ) -> Iterator[Frame]:
     """Run models through a scene's motion, from the rest pose on, and yield its frames one by one.
 
@@ -261,8 +248,6 @@ def simulate_frames(
         As for `FrameLoop`.
     written : collection of int, optional
         Indices of the frames to yield; all where not given. The others are simulated and not shown.
-    ahead : bool
-        Solve a frame while the one before is drawn, where there are threads for both.
 
     Raises
     ------
@@ -272,11 +257,7 @@ def simulate_frames(
         If muscles overlap bones at rest and the scene's ``initial`` is ``"error"``.
     """
     with FrameLoop(scene, models, fields=fields, surfaces=surfaces) as loop:
-        path = scene.motion.frames
-        if ahead and loop.can_run_ahead:
-            yield from run_ahead(loop, path, written)
-            return
-        for index, coordinates in enumerate(path):
+        for index, coordinates in enumerate(scene.motion.frames):
             if written is None or index in written:
                 yield loop.advance(coordinates)
             else:

@@ -1,7 +1,7 @@
 """Threads for what can go side by side."""
 
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -25,24 +25,17 @@ class Workers:
         from threadpoolctl import ThreadpoolController
 
         self._blas = ThreadpoolController()
-        self._muscles, self.threads = muscles, numba.get_num_threads()
+        self.threads = numba.get_num_threads()
         self._pool: ThreadPoolExecutor | None = None
-        self.widen(muscles)
+        if min(muscles, self.threads) > 1:
+            self._pool = ThreadPoolExecutor(
+                min(muscles, self.threads), initializer=numba.set_num_threads, initargs=(1,)
+            )
 
     @property
     def parallel(self) -> bool:
         """Whether there is more than one thread."""
         return self._pool is not None
-
-    def widen(self, tasks: int) -> None:
-        """Be ready for so many things at a time: more than muscles where a frame is drawn beside the next."""
-        workers = min(tasks, self.threads)
-        if workers < 2:
-            return
-        self.close()
-        # A muscle that is alone draws with every thread that its solver leaves free.
-        each = 1 if self._muscles > 1 else self.threads
-        self._pool = ThreadPoolExecutor(workers, initializer=numba.set_num_threads, initargs=(each,))
 
     def one_thread_each(self) -> AbstractContextManager:
         """Context in which BLAS uses one thread: its workers spin, and take the cores from the loops."""
@@ -51,12 +44,6 @@ class Workers:
     def all_threads(self) -> AbstractContextManager:
         """Context for work of large matrices: a muscle that is alone takes every thread."""
         return self._blas.limit(limits=1 if self.parallel else self.threads, user_api="blas")
-
-    def start(self, act: Callable[[Any], Any], items: Iterable[Any]) -> list[Future]:
-        """Begin ``act(item)`` for every item; needs more than one thread."""
-        if self._pool is None:
-            raise RuntimeError("there is one thread only: nothing can be started beside it")
-        return [self._pool.submit(act, item) for item in items]
 
     def each(self, act: Callable[[Any], Any], items: Sequence[Any]) -> list:
         """``[act(item) for item in items]``, in parallel where that pays."""

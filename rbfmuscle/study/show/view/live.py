@@ -15,7 +15,7 @@ from rbfmuscle.study.show.view.viewer import View, Viewer
 from rbfmuscle.validation import SolveError
 
 if TYPE_CHECKING:
-    from rbfmuscle.sim.loop.driving.live import LiveSession
+    from rbfmuscle.sim.loop.live import LiveSession
 
 
 ACTIVATION = "activation "  # what the name of a muscle's slider begins with
@@ -28,7 +28,7 @@ class LiveViewer(Viewer):
 
     Parameters
     ----------
-    session : rbfmuscle.sim.loop.driving.live.LiveSession
+    session : rbfmuscle.sim.loop.live.LiveSession
     build : callable
         ``build(model, quality)`` returns new models, one a muscle.
     models, qualities : list of str
