@@ -13,7 +13,7 @@ from pbd_baseline.topology import Topology, cache_order
 from pbd_baseline.weights import even_weights
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.harmonic import surface_gradient
-from rbfmuscle.sim.cache import content_key, has_arrays, load_arrays, store_arrays
+from rbfmuscle.sim.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.sim.scene.objects import Muscle
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.validation import SceneError
@@ -103,12 +103,6 @@ class Rest:
         length = np.linalg.norm(one - two, axis=1)
         median = np.median(length)
         return np.maximum(length / median, 1e-3)
-
-
-def weights_are_cached(muscle: Muscle, swelling_reach: float) -> bool:
-    """Whether what takes nearly all the time of a muscle's build is in the cache on disk."""
-    _, vertices, faces, _, holder = _renumbered(muscle)
-    return has_arrays(_weights_key(vertices, faces, holder, swelling_reach))
 
 
 def _renumbered(muscle):

@@ -20,7 +20,7 @@ from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
 from rbfmuscle.implicit.placement.sampling import SurfaceSample, sample_surface
 from rbfmuscle.implicit.selection import BOUND, choose_epsilon, spacing, surface_miss
 from rbfmuscle.model.options import RBFOptions
-from rbfmuscle.sim.cache import content_key, has_arrays, load_arrays, store_arrays
+from rbfmuscle.sim.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.sim.scene.objects import Muscle
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.validation import NumericalWarning, SceneError
@@ -258,13 +258,6 @@ def cached_sample(
     sample = sample_surface(vertices, faces, count, seed=seed, placement=placement)
     store_arrays(key, asdict(sample))
     return sample
-
-
-def sample_is_cached(
-    vertices: np.ndarray, faces: np.ndarray, count: int, *, seed: int, placement: str
-) -> bool:
-    """Whether `cached_sample` has these already."""
-    return has_arrays(_sample_key(vertices, faces, count, seed, placement))
 
 
 def _sample_key(vertices: Floats, faces: Integers, count: int, seed: int, placement: str) -> str:

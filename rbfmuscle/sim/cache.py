@@ -56,11 +56,6 @@ def content_key(vertices: Floats, faces: Integers, options: tuple[Any, ...]) -> 
     return digest.hexdigest()[:32]
 
 
-def has_arrays(key: str) -> bool:
-    """Whether there is an entry of this name; it may still turn out to be damaged."""
-    return (cache_path() / (key + SUFFIX)).exists()
-
-
 def load_arrays(key: str) -> dict[str, Array] | None:
     """Arrays of an entry by name, or None where there is none; a damaged entry is removed."""
     path = cache_path() / (key + SUFFIX)

@@ -19,7 +19,7 @@ from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.rest_frame import BoneFrame, on_one_line
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.geometry.triangles import FIRST
-from rbfmuscle.sim.cache import content_key, has_arrays, load_arrays, store_arrays
+from rbfmuscle.sim.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.sim.distance.build import build_cells, grid_shape
 from rbfmuscle.sim.distance.cells import BLOCK
 from rbfmuscle.sim.distance.mesh import prepare_bone, winding_test
@@ -101,12 +101,6 @@ class BoneSDF:
     def exact(self) -> ExactDistance:
         """The exact distance to the mesh (:class:`ExactDistance`), built when first asked for."""
         return ExactDistance(self.vertices, self.faces)
-
-    @staticmethod
-    def is_kept(mesh: MeshLike, *, tolerance: float | None = None, region: ArrayLike | None = None) -> bool:
-        """Whether :meth:`from_mesh` would find this field in the cache on disk."""
-        vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
-        return has_arrays(_key(vertices, faces, tolerance, region, MEMORY_LIMIT))
 
     @classmethod
     def from_mesh(
