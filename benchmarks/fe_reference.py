@@ -34,7 +34,7 @@ STEP, SMALLEST_STEP = 1.0, 0.05  # degrees
 SPACING = 3.0  # of the phantom's surface mesh [mm]
 END = 0.5  # share of the largest section's area that the cube's end faces take
 CELLS = (40, 12, 8)
-FIBRE_NODES = 1200  # of the inside whose fibres a reinforced solid takes
+FIBRE_NODES = 1200  # of the model's solid whose fibres a reinforced solid takes
 DATA = Path(__file__).resolve().parents[1] / "tests" / "data" / "fe_reference.npz"
 
 
@@ -162,9 +162,9 @@ def model_fibres(points):
     """Unit directions (n, 3) of the model's own fibres at points of the muscle at rest."""
     scene = phantom_scene(end=0.0, spacing=SPACING)
     scene.muscles = [scene.muscle(MUSCLE)]
-    options = RBFOptions(inside=FIBRE_NODES, fibre_ratio=2.0)
-    inside = RBFMuscle(scene.muscles[0], scene, options).interior
-    return inside.fibres.direction[cKDTree(inside.quad_points).query(points)[1]]
+    options = RBFOptions(nodes=FIBRE_NODES, fibre_ratio=2.0)
+    solid = RBFMuscle(scene.muscles[0], scene, options).solid
+    return solid.fibres.direction[cKDTree(solid.quad_points).query(points)[1]]
 
 
 def carried(course, displacement):

@@ -200,7 +200,6 @@ def wrapped_tables():
 
         title = f"over a {over} by {turn:g} degrees"
         table(f"{title}, rbf", rbf_levels(1.0), measure, keys)
-        table(f"{title}, rbf with stretch_hold 1", rbf_levels(1.0, stretch_hold=1.0), measure, keys)
         table(f"{title}, pbd by default", mesh_levels("pbd", meshes), measure, keys)
         table(f"{title}, pbd settled", mesh_levels("pbd", meshes, settled(300, 2.0)), measure, keys)
         table(f"{title}, xpbd settled", mesh_levels("xpbd", meshes, lambda h: stiff), measure, keys)
@@ -265,19 +264,13 @@ def converged(title, runs, *, same_mesh):
 
 def centre_tables():
     """RBF muscles over the number of centres."""
-    levels = (150, 300, 600, 1200, 2400)
-    for title, across in (
-        ("rbf over centres", lambda k: 1.0),
-        # In-plane edges resist alike at any spacing; those across are as long as the muscle is thick and become
-        # more. The model lets each count less in return, which this takes back.
-        ("rbf over centres, links across of constant weight", lambda k: k / levels[0]),
-    ):
-        fine = [
-            {**RBF, "centres": k, "across_weight": across(k), "samples": 6000, "resolution": 64}
-            for k in levels
-        ]
-        runs = [(f"{m['centres']} centres", m["centres"] ** -0.5, flexed(m)) for m in fine]
-        converged(title, runs, same_mesh=False)
+    levels = (150, 300, 600, 1200)
+    fine = [{**RBF, "nodes": n, "centres": 600, "samples": 6000, "resolution": 64} for n in levels]
+    converged(
+        "rbf over nodes",
+        [(f"{m['nodes']} nodes", m["nodes"] ** (-1 / 3), flexed(m)) for m in fine],
+        same_mesh=False,
+    )
 
 
 def mesh_tables():

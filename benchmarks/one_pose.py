@@ -1,7 +1,7 @@
-"""One pose reached over six ways: how far the muscle's material lies apart, with and without an inside.
+"""One pose reached over six ways: how far the muscle's material lies apart.
 
     python benchmarks/one_pose.py SCENE --muscle NAME [--pose hip.flexion=60 hip.adduction=-25]
-                                  [--set inside=300 ...]
+                                  [--set nodes=300 ...]
 
 The ways to a pose of two coordinates, by default in sub-steps of 2 degrees: both at once, either one first, a detour
 through the third coordinate, a seeded random walk that ends there, both at once in sub-steps of half a degree and of

@@ -14,7 +14,7 @@ from rbfmuscle.study.measure.mesh_distance import MeshDistance
 out = folder("sliding")
 scene = rm.phantom_scene()
 scene.muscles = [muscle for muscle in scene.muscles if muscle.name.startswith("adductor")]
-scene.set_motion(ramp={"hip.internal_rotation": {"from": 0.0, "to": 40.0, "step": 10.0}})
+scene.set_motion(ramp={"hip.internal_rotation": {"from": 0.0, "to": 70.0, "step": 10.0}})
 
 
 def gap(run, frame):

@@ -102,7 +102,7 @@ def _tunnelling(model, **options):
 SCENES = {
     "contact_rbf": lambda: _contact(RBF),
     "contact_rbf_marching": lambda: _contact({**RBF, "surface": "marching"}),
-    "contact_rbf_inside": lambda: _contact({**RBF, "inside": 120, "fibre_ratio": 4.0}),
+    "contact_rbf_fibres": lambda: _contact({**RBF, "nodes": 120, "fibre_ratio": 4.0}),
     "contact_pbd": lambda: _bent("pbd"),
     "contact_pbd_serendipity": lambda: _bent("pbd"),
     "contact_pbd_voxel": lambda: _bent("pbd"),
@@ -117,7 +117,7 @@ SCENES = {
     "contraction_rbf": lambda: _contraction(RBF),
     "contraction_arap_volume": lambda: _contraction("arap-volume"),
     "tunnelling_arap_volume": lambda: _tunnelling("arap-volume", action="rotate"),
-    "tunnelling_rbf": lambda: _tunnelling(RBF, action="substep"),
+    "tunnelling_rbf": lambda: _tunnelling(RBF, action="rotate"),
     "tunnelling_rbf_angle": lambda: _tunnelling(RBF, action="report", swept=False),
 }
 

@@ -68,7 +68,8 @@ def compare(
     with Progress("compare") as progress, interruption.keeping(lambda: output.exists()):
 
         def advance(model, done, total):
-            progress.stage.text = model
+            if done == 0:
+                progress.show(model, done, total)
             progress(done, total)
             interruption.check()
 

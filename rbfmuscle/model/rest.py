@@ -1,4 +1,4 @@
-"""What is known of an RBF muscle at rest, found once: where its points lie, what holds them, how they hang together."""
+"""What is known of an RBF muscle at rest, found once: where its points lie and what holds them."""
 
 from __future__ import annotations
 
@@ -9,15 +9,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.harmonic import harmonic_weights, surface_gradient
+from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.harmonic import harmonic_weights
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.implicit.field_fit import FieldFit
-from rbfmuscle.implicit.placement.sampling import SurfaceSample
-from rbfmuscle.model.clusters import bind_samples, build_clusters
-from rbfmuscle.model.fibres import fibre_directions
 from rbfmuscle.model.options import RBFOptions
-from rbfmuscle.model.placement import choose_centres, default_centres, place_points
+from rbfmuscle.model.placement import choose_centres, place_points
 from rbfmuscle.sim.scene.objects import Muscle
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.validation import SceneError
@@ -28,7 +25,7 @@ LEAST_ATTACHED = 4
 
 @dataclass(frozen=True)
 class Rest:
-    """An RBF muscle at rest: K centres, whose field is its surface, and S samples of the surface that hang on them.
+    """An RBF muscle at rest: K centres, whose field is its surface, and S samples of the surface.
 
     Attributes
     ----------
@@ -46,12 +43,6 @@ class Rest:
         Position in ``bones`` of the bone that holds a contact point (centres, then samples), -1 where it is free.
     free, held : ndarray of int
         Centres that move, and those that their bones carry.
-    fibres : (K, 3) ndarray
-        Unit direction of the fibres at each centre.
-    start, other, weight : CSR lists
-        Directed edges of the clusters and their weights.
-    columns, shares : (K + S, 6) ndarray
-        Centres that carry each contact point, and with what share.
     mesh_volume : float
         Of the muscle's mesh [scene unit cubed].
     axes : (3, 3) ndarray
@@ -68,12 +59,6 @@ class Rest:
     holder: np.ndarray
     free: np.ndarray
     held: np.ndarray
-    fibres: np.ndarray
-    start: np.ndarray
-    other: np.ndarray
-    weight: np.ndarray
-    columns: np.ndarray
-    shares: np.ndarray
     mesh_volume: float
     axes: np.ndarray
 
@@ -93,7 +78,6 @@ class Rest:
             If the placement cannot be had or no centre is left free to move.
         """
         frame, faces = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)), np.asarray(muscle.mesh.faces)
-        usual = default_centres(muscle.mesh.area, scene)
         count = choose_centres(muscle, scene, options).centres
         centres, samples, fit = place_points(muscle, frame, options, count)
         points = frame.points(centres.points)
@@ -106,21 +90,6 @@ class Rest:
         on_mesh = harmonic_weights(frame.local, faces, held_by.groups)
         weights = on_mesh[held_by.nearest]
         weights[held] = np.arange(len(held_by.bones)) == held_by.centres[held, None]
-        # Fibres run up the harmonic field from the first attachment to the last.
-        level = on_mesh @ np.arange(len(held_by.bones))
-        fibres = fibre_directions(
-            points,
-            frame.directions(surface_gradient(frame.local, faces, level)[held_by.nearest]),
-            muscle.fibres,
-            fallback=points[held].mean(axis=0) - points[free].mean(axis=0),
-        )
-        # Links through the thickness are one a centre: with more of them each counts less, so that the muscle
-        # resists alike however many centres it has.
-        start, other, weight = build_clusters(
-            centres.points, centres.normals, centres.control_faces, samples.points, samples.normals,
-            across=options.across, across_weight=options.across_weight * usual / count,
-        )  # fmt: skip
-        columns, shares = _hang(centres, samples)
         holder = np.concatenate([held_by.centres, held_by.samples])
         return cls(
             points,
@@ -130,15 +99,9 @@ class Rest:
             fit,
             held_by.bones,
             weights,
-            _with_hanging(holder, columns, shares),
+            holder,
             free,
             held,
-            fibres,
-            start,
-            other,
-            weight,
-            columns,
-            shares,
             float(muscle.mesh.volume),
             # Cells along the muscle's own axes are smaller than along the scene's, and turn with the scene.
             frame.directions(_principal_axes(samples.points)),
@@ -174,28 +137,6 @@ class _Attachment:
             if number >= 0 and np.isin(self.nearest, patch).sum() < LEAST_ATTACHED:
                 distance = cKDTree(frame.local[patch]).query(centres)[0]
                 self.centres[np.argsort(distance, kind="stable")[:LEAST_ATTACHED]] = number
-
-
-def _hang(centres: SurfaceSample, samples: SurfaceSample) -> tuple[Integers, Floats]:
-    """Columns and shares of all contact points: a centre hangs on itself, a sample on the centres around it."""
-    columns, shares = bind_samples(samples.points, samples.normals, centres.points, centres.normals)
-    count = len(centres.points)
-    alone = np.repeat(np.arange(count)[:, None], columns.shape[1], axis=1)
-    whole = np.eye(1, columns.shape[1]).repeat(count, axis=0)
-    return np.concatenate([alone, columns]), np.concatenate([whole, shares])
-
-
-def _with_hanging(holder: Any, columns: Any, shares: Any) -> Any:
-    """Count contact points that hang for the most part on held centres to the bone that holds these.
-
-    Contact could lift them only by moving the few free centres they hang on a long way.
-    """
-    held = shares * (holder[columns] >= 0)
-    hanging = np.flatnonzero((held.sum(axis=1) > 0.5) & (holder < 0))
-    carrier = columns[hanging, held[hanging].argmax(axis=1)]
-    holder = holder.copy()
-    holder[hanging] = holder[carrier]
-    return holder
 
 
 def _principal_axes(points: Floats) -> Any:

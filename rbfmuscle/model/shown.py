@@ -1,4 +1,4 @@
-"""The mesh of a muscle's material that shows it: where its vertices lie at rest, and where the centres carry them."""
+"""The mesh of a muscle's material that shows it: where its vertices lie at rest."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from rbfmuscle.geometry.rigid import calmed
 from rbfmuscle.implicit.extraction.material import fit_material
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
 from rbfmuscle.implicit.extraction.slivers import mend_slivers
-from rbfmuscle.model.clusters import bind_samples
-from rbfmuscle.model.elasticity import ElasticSolver, carry_points
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.model.placement import cached_sample
 from rbfmuscle.model.rest import Rest
@@ -44,7 +42,7 @@ def shown_vertices(muscle: Muscle, resolution: int) -> int:
 
 
 class ShownMesh:
-    """A triangulation of the rest surface that the centres carry along.
+    """A triangulation of the rest surface that the solid carries along.
 
     Parameters
     ----------
@@ -67,13 +65,6 @@ class ShownMesh:
         points = frame.points(sample.points)
         self.mesh = MaterialMesh(points, sample.control_faces)
         self.rest = self._on_level(rest, points)
-        # Rounded as the frame rounds, so that a scene that is turned binds alike.
-        local, centres = (
-            np.round((part - frame.origin) @ frame.axes.T / frame.size, 8)
-            for part in (self.rest, rest.centres)
-        )
-        normals = rest.normals @ frame.axes.T
-        self.columns, self.shares = bind_samples(local, sample.normals, centres, normals)
         self._sides = self._lengths(self.rest)
 
     def _on_level(self, rest: Rest, points: np.ndarray) -> np.ndarray:
@@ -90,10 +81,6 @@ class ShownMesh:
             return points
         self.mesh.slope = np.linalg.norm(field.value_and_gradient(vertices)[1], axis=1)
         return vertices
-
-    def carried(self, centres: np.ndarray, solver: ElasticSolver) -> np.ndarray:
-        """Where the material takes the vertices (n, 3) for centres (K, 3) and the solver's present targets."""
-        return carry_points(centres, solver.shape, self.rest, self.columns, self.shares)
 
     def calmed(self, vertices: np.ndarray, sweeps: int) -> np.ndarray:
         """The shape at rest, moved as the material on the whole and deformed as it is where that is smooth.

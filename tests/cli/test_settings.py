@@ -53,9 +53,8 @@ MODELS = {
     "rbf": (
         RBFOptions,
         {
-            "centres": 60, "samples": 300, "iterations": 3, "contacts": 12, "resolution": 16, "kernel": "quintic",
-            "epsilon": 0.02, "stretch_low": 0.6, "stretch_high": 1.8, "stretch_hold": 0.2, "across": 2,
-            "across_weight": 0.5, "acceleration": 0, "placement": "fitted", "inside": 40,
+            "centres": 60, "samples": 300, "iterations": 3, "nodes": 60, "resolution": 16, "kernel": "quintic",
+            "epsilon": 0.02, "slack": 1.3, "placement": "fitted",
             "surface": "marching",
             "fibre_ratio": 2.0, "condition": 1e12, "seed": 3, "rest_error": 0.4,
         },

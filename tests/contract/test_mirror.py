@@ -14,10 +14,7 @@ SHARED = {
     "muscle": {"RBFMuscle": "PBDMuscle"},
     "options": {"RBFOptions": "PBDOptions"},
     "rest": {"Rest": "Rest", "solved_points": "solved_points"},
-    "constraints": {"VolumeConstraint": "VolumeConstraint"},
-    "contact": {"ContactConstraint": "ContactConstraint"},
     "fibres": {"fibre_directions": "fibre_directions"},
-    "contraction": {},
 }
 
 
@@ -93,7 +90,7 @@ def test_what_is_known_at_rest_has_the_same_names_and_types():
         for package in PACKAGES
     ]
     shared = fields[0].keys() & fields[1].keys()
-    assert shared >= {"bones", "weights", "holder", "fibres"}
+    assert shared >= {"bones", "weights", "holder"}
     assert [name for name in shared if fields[0][name] != fields[1][name]] == []
 
 

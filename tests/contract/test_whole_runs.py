@@ -9,10 +9,9 @@ from conftest import MOVED
 from whole_runs import SCENES, differences, measure, read
 
 # Of the muscle's size. Over one and two threads and the code that OpenBLAS has for four generations of processors
-# (Nehalem, Haswell, SkylakeX, its own) results differed by 5e-12. The solid inside ends its iteration before it
-# has settled to the last digit and amplifies rounding: 3.4e-8.
-TOLERANCE = 1e-9
-UNSETTLED = {"contact_rbf_inside": 1e-6}
+# (Nehalem, Haswell, SkylakeX, its own) results of the mesh models differed by 5e-12. An RBF muscle's solve ends where
+# an iteration moves no node by more than 2e-5: a rounding error may take or save one iteration.
+TOLERANCE, SETTLED = 1e-9, 1e-4
 # Vertices that are moved by 1e-12 move results by up to 2e-6, a muscle at full activation most.
 if MOVED:
     TOLERANCE = 1e7 * MOVED
@@ -21,7 +20,7 @@ if MOVED:
 @pytest.mark.parametrize("name", SCENES)
 def test_run_gives_what_is_kept(name):
     worst = differences(read(name), measure(name), name)
-    limit = UNSETTLED.get(name, TOLERANCE)
+    limit = SETTLED if "rbf" in name else TOLERANCE
     assert not {kind: told for kind, told in worst.items() if not told[0] <= limit}, (
         "make references, if meant"
     )

@@ -155,8 +155,8 @@ def _attach(scene, rng):
 
 
 OPTIONS = (
-    "centres", "samples", "iterations", "contacts", "epsilon", "stretch_low", "stretch_high", "stretch_hold",
-    "across", "across_weight", "acceleration", "placement", "seed", "kernel", "edge", "bending",
+    "centres", "samples", "iterations", "nodes", "slack", "fibre_ratio", "epsilon",
+    "placement", "seed", "kernel", "edge", "bending",
     "arap_compliance", "limits", "damping", "prediction", "response", "contact", "soft_length", "fibre_exponent",
 )  # fmt: skip
 # What an option may be set to: out of its range, or in it and quick. What is allowed and slow is not an error.

@@ -272,7 +272,7 @@ def test_a_chosen_epsilon_never_gives_a_broken_field():
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("stretch_hold", 5.0, "less than or equal to 1, got 5.0"),
+        ("slack", 7.0, "less than or equal to 5, got 7.0"),
         ("centres", -3, "greater than or equal to 0, got -3"),
         ("centres", 150.5, "a valid integer, got 150.5"),
         ("placement", "even", "'greedy' or 'fitted', got 'even'"),

@@ -222,7 +222,7 @@ def test_without_the_reader_the_message_names_the_extra(tmp_path, capsys, monkey
     monkeypatch.setitem(sys.modules, "nibabel", None)
     (tmp_path / "a.nii").write_bytes(b"")
     code, _, err = call(capsys, "new", tmp_path / "a.nii")
-    assert code == 7 and "rbfmuscle[labels]" in err
+    assert code == 7 and "'.[labels]'" in err
 
 
 def test_smoothing_treats_inside_and_outside_alike():

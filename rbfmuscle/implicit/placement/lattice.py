@@ -20,11 +20,6 @@ LEAST_FILLED = 1e-3  # of a cell: the weight of one that only touches the surfac
 # Quadrature points move apart at most by this factor to give the material's second moments.
 MOST_WIDENED = 1.3
 
-# Contact points: one for so much of the muscle's surface, in shares of its square size. A ridge of a bone that fits
-# between points would hold them like a ratchet, and one pose would have several shapes.
-AREA_A_POINT = 2.4e-4
-MOST_HALVINGS = 3
-
 
 @dataclass(frozen=True)
 class Embedding:
@@ -239,20 +234,3 @@ def _split(points: Floats) -> tuple[Floats, Floats]:
     between = size @ (spots - middle) ** 2
     widen = np.minimum(np.sqrt(spread / np.maximum(between, 1e-12)), MOST_WIDENED)
     return middle + (spots - middle) * widen, size
-
-
-def dense_points(vertices: Floats, faces: Integers, samples: Floats, sample_faces: Integers) -> Floats:
-    """Points (n, 3) of a mesh between its samples: middles of their edges, again and again, on to the surface."""
-    corners = samples[sample_faces]
-    area = 0.5 * np.linalg.norm(np.cross(*(corners[:, k] - corners[:, 0] for k in (1, 2))), axis=1).sum()
-    points, triangles = samples, np.asarray(sample_faces)
-    for _ in range(MOST_HALVINGS):
-        if len(points) >= area / AREA_A_POINT:
-            break
-        edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2)
-        known, which = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
-        a, b, c = (which.reshape(-1, 3) + len(points)).T
-        i, j, k = triangles.T
-        points = np.concatenate([points, points[known].mean(axis=1)])
-        triangles = np.concatenate([np.stack(t, 1) for t in ((i, a, c), (a, j, b), (c, b, k), (a, b, c))])
-    return ExactDistance(vertices, faces).closest_point(points[len(samples) :])

@@ -103,9 +103,12 @@ class Contraction:
         Vertices of the muscle's mesh that are tendon.
     tendon_strain : float
         At full activation.
+    slack : bool
+        Whether the scene says where passive fibres are slack; the model's own slack band holds where not.
     """
 
     stretch_at_rest: float
     shortening: float
     tendon: object
     tendon_strain: float
+    slack: bool = False

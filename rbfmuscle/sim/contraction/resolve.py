@@ -93,7 +93,8 @@ def resolve_contraction(muscle: Any) -> Any:
     if keys.optimal_fibre_length is not None:
         stretch = _stretch_from_length(muscle, keys.optimal_fibre_length)
     strain = keys.tendon.strain if keys.tendon is not None else 0.0
-    return Contraction(stretch, keys.shortening, _tendon(muscle, keys.tendon), strain)
+    given = keys.fibre_stretch_at_rest is not None or keys.optimal_fibre_length is not None
+    return Contraction(stretch, keys.shortening, _tendon(muscle, keys.tendon), strain, given)
 
 
 def _stretch_from_length(muscle, optimal):

@@ -49,7 +49,6 @@ def _head(guess):
         f'[scene]\nformat = 1\nname = "{guess.name}"\n'
         f'units = "{guess.units}"   # of every length here; a mesh in another unit takes scale = ...\n\n'
         f'[defaults]\nmodel = "rbf"   # or a table: {{ name = "rbf", centres = 300 }}\n'
-        "# Moment arms, and muscles that slip over bones: inside = 300 is steadier, at twice the time.\n"
     )
 
 

@@ -211,7 +211,9 @@ def _read_trimesh(content, kind):
     if kind == "obj":
         # Positions and corners alone: numbers of textures and normals would split vertices.
         lines = [line for line in content.splitlines() if line.split(None, 1)[:1] in ([b"v"], [b"f"])]
-        content = re.sub(rb"#[^\n]*|/\S*", b"", b"\n".join(lines))
+        content = b"\n".join(
+            _counted_from_first(re.sub(rb"#[^\n]*|/\S*", b"", b"\n".join(lines)).splitlines())
+        )
         content.decode("ascii")  # else trimesh leaves out what is not
     options = {"process": False, "force": "mesh", "skip_materials": True, "maintain_order": True}
     mesh = trimesh.load(io.BytesIO(content), file_type=kind, **options)
@@ -219,6 +221,20 @@ def _read_trimesh(content, kind):
     if len(vertices) and vertices.shape[1] != 3:
         raise ValueError("a vertex has fewer than three coordinates")
     return vertices.reshape(-1, 3), faces.reshape(-1, 3)
+
+
+def _counted_from_first(lines):
+    """Lines of an OBJ file whose faces count vertices from the first, where some count back from the last so far."""
+    count = 0
+    for line in lines:
+        words = line.split()
+        count += words[:1] == [b"v"]
+        if words[:1] == [b"f"] and b"-" in line:
+            back = [int(word) for word in words if word.startswith(b"-")]
+            if min(back, default=0) < -count:
+                raise ValueError(f"a face counts back by {-min(back)}, {count} vertices stand before it")
+            words = [b"%d" % (int(word) + count + 1) if word.startswith(b"-") else word for word in words]
+        yield b" ".join(words)
 
 
 def _unique_rows(vertices):

@@ -1,4 +1,4 @@
-"""Muscles with an inside that contract: beside finite elements, and laws."""
+"""RBF muscles that contract: beside finite elements, and laws."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.sim.contraction.keys import ContractionTable
 
 DATA = Path(__file__).resolve().parents[1] / "data" / "contraction_spindle.npz"
-INSIDE = {"name": "rbf", "centres": 300, "inside": 300}
+INSIDE = {"name": "rbf", "centres": 300, "nodes": 300}
 TENDON = {"length": 100.0, "strain": 0.08}
 QUIET = {"output.surfaces": False}
 
@@ -22,7 +22,7 @@ def test_spindle_lies_near_the_one_of_finite_elements():
     run = rm.simulate(spindle_scene(model=INSIDE, frames=2, tendon=TENDON))
     surface = run.frames[-1].surfaces[MUSCLE]
     found = compare_spindle(surface.vertices, surface.faces, 1.0, kept)
-    # Measured 0.18 mm and 0.6 % with 400 centres (docs/contraction.md); without an inside 0.29 mm and 3.5 %.
+    # Measured 0.18 mm and 0.6 % with 400 centres (docs/contraction.md).
     assert found["rms"] < 0.35
     assert abs(found["csa"]) < 0.04
     rest, now = (run.frames[k].carried[MUSCLE][0] for k in (0, -1))
@@ -34,7 +34,7 @@ def test_spindle_lies_near_the_one_of_finite_elements():
 def test_activation_zero_changes_nothing_and_all_of_it_comes_back():
     phantom = rm.phantom_scene(end=10.0, step=10.0, spacing=4.0)
     phantom.muscles = [phantom.muscle("extensor")]
-    asked = {**QUIET, "model.inside": 150}
+    asked = QUIET
     plain = rm.simulate(phantom, settings=asked)
     phantom.muscles[0].contraction = ContractionTable(activation=0.0)
     active = rm.simulate(phantom, settings=asked)
@@ -52,10 +52,10 @@ def test_activation_zero_changes_nothing_and_all_of_it_comes_back():
 
 def test_fibres_through_a_unit_area_are_those_of_the_belly_over_its_girth():
     scene = spindle_scene(model=INSIDE, tendon=TENDON)
-    model = RBFMuscle(scene.muscles[0], scene, RBFOptions(centres=150, inside=600))
-    x = np.abs(model.interior.quad_points[:, 0])
+    model = RBFMuscle(scene.muscles[0], scene, RBFOptions(centres=150, nodes=600))
+    x = np.abs(model.solid.quad_points[:, 0])
     middle, tendon = (
-        np.average(model.law.density[there], weights=model.interior.weights[there])
+        np.average(model.law.density[there], weights=model.solid.weights[there])
         for there in (x < 10.0, (x > 90.0) & (x < 120.0))
     )
     assert middle == pytest.approx(1.0, abs=0.1)

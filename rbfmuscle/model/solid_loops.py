@@ -1,4 +1,4 @@
-"""Loops over the quadrature points of a muscle's inside."""
+"""Loops over the quadrature points and the contacts of a muscle's elastic solid."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.geometry.rotations import quaternion_matrix
+from rbfmuscle.geometry.rotations import quaternion_matrix, rotation_loop
 from rbfmuscle.jit import compiled
-from rbfmuscle.model.constraints import _rotation_loop
-from rbfmuscle.model.contact import solve_contact_forces
 
 
 class Fibres(NamedTuple):
@@ -34,8 +32,13 @@ class Fibres(NamedTuple):
 
 
 @compiled(error_model="numpy")
-def turn_loop(y, columns, slopes, q, f, target):
-    """Deformation gradients F and their rotations at all points."""
+def target_loop(y, columns, slopes, fibre, least, tone, q, t, f, target):
+    """Deformation gradients F and their targets R (t aaᵀ + t^(-1/2) (I - aaᵀ)) at all points.
+
+    R is the rotation of F D(t) for the last t, then t minimises |RᵀF - D(t)|² - tone (1 - t)² in [least, 1] by
+    Newton's method; over the iterations both converge.
+    """
+    fd = np.empty((3, 3))
     for i in range(len(columns)):
         for a in range(3):
             for b in range(3):
@@ -47,10 +50,39 @@ def turn_loop(y, columns, slopes, q, f, target):
                 f[i, a, 0] += v * slopes[i, k, 0]
                 f[i, a, 1] += v * slopes[i, k, 1]
                 f[i, a, 2] += v * slopes[i, k, 2]
-        _rotation_loop(f[i], q[i])
+        e = fibre[i]
+        u = 1.0 / np.sqrt(t[i])
+        for a in range(3):
+            along = f[i, a, 0] * e[0] + f[i, a, 1] * e[1] + f[i, a, 2] * e[2]
+            for b in range(3):
+                fd[a, b] = u * f[i, a, b] + (t[i] - u) * along * e[b]
+        rotation_loop(fd, q[i])
+        r = target[i]
         first, second, third = quaternion_matrix(q[i])
         for b in range(3):
-            target[i, 0, b], target[i, 1, b], target[i, 2, b] = first[b], second[b], third[b]
+            r[0, b], r[1, b], r[2, b] = first[b], second[b], third[b]
+        if least[i] < 1.0:
+            # S = RᵀF: s is its part along the fibre, m the sum of those across.
+            s, m = 0.0, 0.0
+            for a in range(3):
+                fa = f[i, a, 0] * e[0] + f[i, a, 1] * e[1] + f[i, a, 2] * e[2]
+                ra = r[a, 0] * e[0] + r[a, 1] * e[1] + r[a, 2] * e[2]
+                s += ra * fa
+                for b in range(3):
+                    m += r[a, b] * f[i, a, b]
+            m -= s
+            v = t[i]
+            for _ in range(4):
+                v15 = v * np.sqrt(v)
+                g = v - 1.0 / (v * v) - s + 0.5 * m / v15 - tone * (v - 1.0)
+                h = 1.0 + 2.0 / (v * v * v) - 0.75 * m / (v15 * v) - tone
+                v = min(max(v - g / max(h, 0.5), least[i]), 1.0)
+            t[i] = v
+            u = 1.0 / np.sqrt(v)
+            for a in range(3):
+                ra = r[a, 0] * e[0] + r[a, 1] * e[1] + r[a, 2] * e[2]
+                for b in range(3):
+                    r[a, b] = u * r[a, b] + (v - u) * ra * e[b]
 
 
 @compiled(error_model="numpy")
@@ -214,17 +246,101 @@ def mobility_loop(columns, shares, inverse, out):
 
 
 @compiled(error_model="numpy")
-def touch_loop(
-    index, gap, normal, source, motion, inverse, columns, shares, response, table,
-    batch, rounds, sweeps, tolerance, yielding, push, taken,
-):  # fmt: skip
+def solve_contact_forces(gram, need, force, sweeps, tolerance, most):
+    """Contact forces with 0 <= force <= most and gram · force >= need where force < most.
+
+    By projected Gauss-Seidel.
+
+    Parameters
+    ----------
+    gram : (c, c) ndarray
+        Motion at contact i for a unit force at contact j; symmetric, positive diagonal.
+    need : (c,) ndarray
+        Motion each contact asks for.
+    force : (c,) ndarray
+        First guess, changed in place to the solution.
+    sweeps : int
+    tolerance : float
+        Stop when no gap moves by more.
+    most : float
+    """
+    for _ in range(sweeps):
+        largest = 0.0
+        for c in range(len(need)):
+            residual = need[c]
+            for d in range(len(need)):
+                residual -= gram[c, d] * force[d]
+            new = min(max(0.0, force[c] + residual / gram[c, c]), most)
+            largest = max(largest, abs(new - force[c]) * gram[c, c])
+            force[c] = new
+        if largest < tolerance:
+            break
+
+
+@compiled(error_model="numpy")
+def _deepest(lacking, is_chosen, tolerance, most):
+    """Contacts, not yet chosen, that lack the most motion, deepest first; of equals the first."""
+    found = np.empty(most, np.int64)
+    count = 0
+    for c in range(len(lacking)):
+        if not lacking[c] > tolerance or is_chosen[c]:
+            continue
+        if count == most and lacking[c] <= lacking[found[count - 1]]:
+            continue
+        count = min(count + 1, most)
+        place = count - 1
+        while place > 0 and lacking[found[place - 1]] < lacking[c]:
+            found[place] = found[place - 1]
+            place -= 1
+        found[place] = c
+    return found[:count]
+
+
+@compiled(error_model="numpy")
+def _push_loop(normal, strength, rows, answers, response, push, taken):
+    """Motion of the nodes by contact forces, and what these take from the whitened pressures."""
+    push[:] = 0.0
+    taken[:] = 0.0
+    for c in range(len(strength)):
+        if strength[c] == 0.0:
+            continue
+        for j in range(len(push)):
+            for a in range(3):
+                push[j, a] += answers[c, j] * strength[c] * normal[c, a]
+        for r in range(len(taken)):
+            taken[r] += strength[c] * rows[c, r]
+    for r in range(len(taken)):
+        for j in range(len(push)):
+            for a in range(3):
+                push[j, a] -= taken[r] * response[r, a, j]
+
+
+@compiled(error_model="numpy")
+def _lacking_loop(index, normal, need, columns, shares, push, lacking):
+    """Motion that each contact still needs after a push of the nodes."""
+    for c in range(len(index)):
+        i, value = index[c], need[c]
+        for k in range(columns.shape[1]):
+            j = columns[i, k]
+            value -= shares[i, k] * (
+                normal[c, 0] * push[j, 0] + normal[c, 1] * push[j, 1] + normal[c, 2] * push[j, 2]
+            )
+        lacking[c] = value
+
+
+@compiled(error_model="numpy")
+def contact_loop(
+    index, gap, normal, source, motion, inverse, columns, shares, response, table, effort, law, push, taken
+):
     """Contact: fill the nodes' ``push`` (N, 3), what it takes from the whitened pressures (M,), and the forces.
 
     The working set starts from the contacts that pushed before and takes in the deepest violations until none is
     left; forces solve the complementarity problem on it.
     """
+    batch, rounds, sweeps, tolerance = effort
+    yielding, most = law
     count = len(index)
-    need, force, lacking = np.empty(count), np.empty(count), np.empty(count)
+    need, force = np.empty(count), np.empty(count)
     for c in range(count):
         i = index[c]
         need[c] = -gap[c]
@@ -236,13 +352,13 @@ def touch_loop(
     taken[:] = 0.0
     is_chosen = force > 0.0
     chosen = np.flatnonzero(is_chosen)
-    lacking[:] = need
+    lacking = need.copy()
     for _ in range(rounds):
-        wanting = np.flatnonzero((lacking > tolerance) & ~is_chosen)
-        added = wanting[np.argsort(-lacking[wanting], kind="mergesort")[:batch]]
+        added = _deepest(lacking, is_chosen, tolerance, batch)
         if len(added) == 0 and len(chosen) == 0:
             break
-        is_chosen[added] = True
+        for c in added:
+            is_chosen[c] = True
         chosen = np.concatenate((chosen, added))
         rows = np.empty((len(chosen), response.shape[0]))
         _rows_loop(index[chosen], normal[chosen], response, columns, shares, rows)
@@ -250,32 +366,12 @@ def touch_loop(
         _answers_loop(index[chosen], columns, shares, inverse, answers)
         gram = _pairs_loop(index[chosen], normal[chosen], rows, answers, columns, shares, yielding)
         strength = force[chosen]
-        solve_contact_forces(gram, need[chosen], strength, sweeps, 0.1 * tolerance)
-        force[chosen] = strength
-        push[:] = 0.0
-        taken[:] = 0.0
-        for e in range(len(chosen)):
-            if strength[e] == 0.0:
-                continue
-            c = chosen[e]
-            for j in range(len(push)):
-                for a in range(3):
-                    push[j, a] += answers[e, j] * strength[e] * normal[c, a]
-            for r in range(len(taken)):
-                taken[r] += strength[e] * rows[e, r]
-        for r in range(len(taken)):
-            for j in range(len(push)):
-                for a in range(3):
-                    push[j, a] -= taken[r] * response[r, a, j]
+        solve_contact_forces(gram, need[chosen], strength, sweeps, 0.1 * tolerance, most)
+        for k in range(len(chosen)):
+            force[chosen[k]] = strength[k]
+        _push_loop(normal[chosen], strength, rows, answers, response, push, taken)
         if len(added) == 0:
             break
-        for c in range(count):
-            i, value = index[c], need[c]
-            for k in range(columns.shape[1]):
-                j = columns[i, k]
-                value -= shares[i, k] * (
-                    normal[c, 0] * push[j, 0] + normal[c, 1] * push[j, 1] + normal[c, 2] * push[j, 2]
-                )
-            lacking[c] = value
+        _lacking_loop(index, normal, need, columns, shares, push, lacking)
     for c in chosen:
         table[index[c], source[c]] = force[c]
