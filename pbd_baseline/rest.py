@@ -108,7 +108,7 @@ class Rest:
 def _renumbered(muscle):
     """Order of the vertices, vertices and faces in it, bones that hold the muscle, and who holds each vertex."""
     order = cache_order(np.asarray(muscle.mesh.faces), len(muscle.mesh.vertices))
-    place = np.argsort(order)
+    place = np.argsort(order, kind="stable")
     vertices = np.ascontiguousarray(muscle.mesh.vertices, dtype=np.float64)[order]
     faces = _sorted_faces(place[np.asarray(muscle.mesh.faces)])
     bones = list(dict.fromkeys(attachment.bone for attachment in muscle.attachments))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
-from scipy.sparse.csgraph import reverse_cuthill_mckee
+from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.jit import compiled
@@ -164,7 +164,14 @@ def cache_order(faces: Integers, count: int) -> Integers:
     -------
     (count,) ndarray of int
     """
-    rows = np.concatenate([faces[:, 0], faces[:, 1], faces[:, 2]])
-    columns = np.concatenate([faces[:, 1], faces[:, 2], faces[:, 0]])
+    ends = np.concatenate([faces[:, :2], faces[:, 1:], faces[:, ::2]])
+    degree = np.bincount(ends.ravel(), minlength=count)
+    # SciPy's own reverse_cuthill_mckee begins at a vertex that depends on the processor, by an unstable sort.
+    by_degree = np.argsort(degree, kind="stable")
+    rows, columns = np.argsort(by_degree, kind="stable")[ends].T
     graph = sparse.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
-    return reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).astype(np.int64)
+    graph = (graph + graph.T).tocsr()
+    _, part = connected_components(graph, directed=False)
+    starts = np.unique(part, return_index=True)[1]
+    orders = [breadth_first_order(graph, start, return_predecessors=False) for start in starts]
+    return by_degree[np.concatenate(orders)[::-1]].astype(np.int64)

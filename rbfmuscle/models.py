@@ -78,8 +78,7 @@ def build_models(scene: Scene, names: Collection[str] | None = None) -> list[Mus
     muscles = [muscle for muscle in scene.muscles if names is None or muscle.name in names]
     workers = Workers(len(muscles))
     try:
-        # BLAS under threads of ours would spin for cores that they hold.
-        with workers.all_threads():
+        with workers.one_thread_each():
             return workers.each(lambda muscle: build_model(muscle, scene), muscles)
     finally:
         workers.close()

@@ -69,7 +69,7 @@ def split_pinched_vertices(vertices: Floats, faces: Integers) -> tuple[Floats, I
     following = np.roll(faces, -1, axis=1)
     size = len(vertices)
     key, back = (faces * size + following).ravel(), (following * size + faces).ravel()
-    order = np.argsort(key)
+    order = np.argsort(key, kind="stable")
     twin = order[np.searchsorted(key, back, sorter=order)]
     # the corner after the opposite side, in the neighbouring triangle, is at the same vertex
     beside = twin - twin % 3 + (twin + 1) % 3

@@ -80,7 +80,7 @@ def fibre_density(solid: EmbeddedSolid, belly: Booleans) -> Floats:
     """
     flux = solid.flux()
     size = np.linalg.norm(flux, axis=1)
-    order = np.argsort(size[belly])
+    order = np.argsort(size[belly], kind="stable")
     weight = np.cumsum(solid.weights[belly][order])
     widest = size[belly][order][np.searchsorted(weight, 0.5 * WIDEST * weight[-1])]
     return np.minimum(size / max(float(widest), 1e-300), DENSEST)

@@ -76,7 +76,7 @@ class RoundedField:
             places = self.frame.origin + nodes.reshape(-1, 3) * self.edge @ self.frame.axes
             found = self.field.distance(places) / self.edge
             keys = np.concatenate([self.keys, wanted[new]])
-            order = np.argsort(keys)
+            order = np.argsort(keys, kind="stable")
             filled = np.concatenate([self.nodes, found.reshape(-1, WIDE, WIDE, WIDE)])
             self.keys, self.nodes = keys[order], np.ascontiguousarray(filled[order])
         return np.searchsorted(self.keys, key)

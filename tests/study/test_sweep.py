@@ -196,12 +196,7 @@ class TestRun:
 
     def test_processes_give_the_same_table(self, finished, tmp_path):
         points, count = sweep(tmp_path, jobs=2)
-        assert count == POINTS
-        for row, other in zip(rows_of(points, tmp_path), rows_of(*finished), strict=True):
-            # Processes have other threads of BLAS, whose rounding decides where solves that do not settle end.
-            assert row.keys() == other.keys()
-            for key in row:
-                assert row[key] == other[key] or float(row[key]) == pytest.approx(float(other[key]), rel=0.1)
+        assert count == POINTS and rows_of(points, tmp_path) == rows_of(*finished)
         assert os.getpid() not in {SweepFolder(tmp_path).read(p.key)["process"] for p in points}
 
     def test_failed_points_leave_the_others_and_are_tried_again(self, tmp_path):

@@ -80,7 +80,7 @@ def opposite_half_edges(faces: Integers) -> Integers:
     end = np.roll(faces, -1, axis=1).ravel()
     size = int(faces.max()) + 1
     key = start * size + end
-    order = np.argsort(key)
+    order = np.argsort(key, kind="stable")
     place = np.searchsorted(key[order], end * size + start)
     place[place == len(key)] = 0
     twin = order[place]

@@ -19,6 +19,7 @@ GROUPS = 8  # quadrature points in a cell
 LEAST_FILLED = 1e-3  # of a cell: the weight of one that only touches the surface
 # Quadrature points move apart at most by this factor to give the material's second moments.
 MOST_WIDENED = 1.3
+LEAST_REGION = 0.3  # of the mean volume of the regions
 
 
 @dataclass(frozen=True)
@@ -158,20 +159,28 @@ class Lattice:
         self.quadrature = self._at(self.cell, np.concatenate(local))
 
     def regions(self, count: int) -> Integers:
-        """Region of each quadrature point: whole cells, halved by volume until there are ``count`` regions."""
+        """Region of each quadrature point: whole cells, halved by volume until there are ``count`` regions.
+
+        A group of cells of which no part is large enough, by `LEAST_REGION`, stays whole: the pressure of a sliver
+        would grow without bounds.
+        """
         volume = np.bincount(self.cell, self.weights, minlength=len(self.cells))
-        groups = [np.arange(len(self.cells))]
-        while len(groups) < min(count, len(self.cells)):
-            sizes = [volume[g].sum() if len(g) > 1 else -1.0 for g in groups]
-            group = groups.pop(int(np.argmax(sizes)))
+        least = LEAST_REGION * volume.sum() / count
+        open_groups, whole = [np.arange(len(self.cells))], []
+        while open_groups and len(open_groups) + len(whole) < count:
+            group = open_groups.pop(int(np.argmax([volume[g].sum() for g in open_groups])))
             middle = self.cells[group] * self.spacing
             axis = int(np.argmax(np.ptp(middle, axis=0)))
             order = group[np.argsort(middle[:, axis], kind="stable")]
-            total = np.cumsum(volume[order])
-            cut = int(np.clip(np.searchsorted(total, 0.5 * total[-1]) + 1, 1, len(order) - 1))
-            groups += [order[:cut], order[cut:]]
+            below = np.cumsum(volume[order])[:-1]
+            smaller = np.minimum(below, volume[group].sum() - below)
+            if smaller.max(initial=0.0) < least:
+                whole.append(group)
+                continue
+            cut = int(np.argmax(smaller)) + 1
+            open_groups += [order[:cut], order[cut:]]
         out = np.empty(len(self.cells), dtype=np.int64)
-        for k, group in enumerate(groups):
+        for k, group in enumerate(whole + open_groups):
             out[group] = k
         return out[self.cell]
 

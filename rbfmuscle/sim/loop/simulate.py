@@ -112,20 +112,17 @@ class FrameLoop:
         SolveError
             If a muscle cannot be solved, naming muscle, frame and coordinates.
         """
-        with self.clocked():
+        with self.clocked(), self.workers.one_thread_each():
             paths = self._path_to(coordinates)
             if self.surfaces and self._sliding is None and self.workers.parallel:
                 # Nothing waits for another muscle: each goes all the way, and no thread idles in between.
-                with self.workers.one_thread_each():
-                    drawn = self.workers.each(
-                        lambda stepper: stepper.go(*paths[stepper.name]).draw(), self.steppers
-                    )
+                drawn = self.workers.each(
+                    lambda stepper: stepper.go(*paths[stepper.name]).draw(), self.steppers
+                )
             else:
-                with self.workers.one_thread_each():
-                    self._solve(paths)
-                    drawings = self._drawings() if self.surfaces else []
-                with self.workers.all_threads():
-                    drawn = self.workers.each(TimedDrawing.draw, drawings)
+                self._solve(paths)
+                drawings = self._drawings() if self.surfaces else []
+                drawn = self.workers.each(TimedDrawing.draw, drawings)
             frame = self.collect()
         return self.finish(frame, drawn)
 

@@ -38,12 +38,11 @@ class Workers:
         return self._pool is not None
 
     def one_thread_each(self) -> AbstractContextManager:
-        """Context in which BLAS uses one thread: its workers spin, and take the cores from the loops."""
-        return self._blas.limit(limits=1, user_api="blas")
+        """Context in which BLAS uses one thread.
 
-    def all_threads(self) -> AbstractContextManager:
-        """Context for work of large matrices: a muscle that is alone takes every thread."""
-        return self._blas.limit(limits=1 if self.parallel else self.threads, user_api="blas")
+        More would spin and take the cores from the loops, and results would depend on how many there are.
+        """
+        return self._blas.limit(limits=1, user_api="blas")
 
     def each(self, act: Callable[[Any], Any], items: Sequence[Any]) -> list:
         """``[act(item) for item in items]``, in parallel where that pays."""

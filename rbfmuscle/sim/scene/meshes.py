@@ -240,7 +240,7 @@ def _counted_from_first(lines):
 def _unique_rows(vertices):
     """Vertices without repeats in order of first use, and the new number of each old one."""
     _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first)
+    order = np.argsort(first, kind="stable")
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
     return vertices[first[order]], rank[inverse.ravel()]
