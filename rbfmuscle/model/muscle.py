@@ -4,7 +4,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.model.build import build_solid
 from rbfmuscle.model.drawing import Moment, RBFDrawing, SurfaceDrawer
@@ -77,12 +76,12 @@ class RBFMuscle:
         """Go along with the bones; held centres arrive exactly."""
         rest = self.rest
         motions = np.array([after[bone] @ np.linalg.inv(before[bone]) for bone in rest.bones])
-        self.points = blended_motion(self.points, rest.weights, motions)
+        points = self.points.copy()
         for b, bone in enumerate(rest.bones):
             held = rest.held[rest.holder[rest.held] == b]
-            self.points[held] = rest.centres[held] @ after[bone][:3, :3].T + after[bone][:3, 3]
+            points[held] = rest.centres[held] @ after[bone][:3, :3].T + after[bone][:3, 3]
         self.solid.move(motions, [after[bone] for bone in rest.bones])
-        self.points = self.solid.centres(self.points)
+        self.points = self.solid.centres(points)
 
     def solve(self, contacts: BoneContacts) -> None:
         """Solve for the equilibrium under elasticity, volume and contact at the bones' present poses."""

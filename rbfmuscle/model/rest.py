@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +9,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.harmonic import harmonic_weights
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.implicit.field_fit import FieldFit
 from rbfmuscle.model.options import RBFOptions
@@ -37,8 +35,6 @@ class Rest:
         How the field through the centres is fitted.
     bones : list of str
         Bones that hold the muscle, in the order of the scene.
-    weights : (K, len(bones)) ndarray
-        Weights of their motions, 1 on a bone's own centres.
     holder : (K + S,) ndarray of int
         Position in ``bones`` of the bone that holds a contact point (centres, then samples), -1 where it is free.
     free, held : ndarray of int
@@ -55,7 +51,6 @@ class Rest:
     sample_faces: np.ndarray
     fit: FieldFit
     bones: list[str]
-    weights: np.ndarray
     holder: np.ndarray
     free: np.ndarray
     held: np.ndarray
@@ -77,7 +72,7 @@ class Rest:
         SceneError
             If the placement cannot be had or no centre is left free to move.
         """
-        frame, faces = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)), np.asarray(muscle.mesh.faces)
+        frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
         count = choose_centres(muscle, scene, options).centres
         centres, samples, fit = place_points(muscle, frame, options, count)
         points = frame.points(centres.points)
@@ -87,9 +82,6 @@ class Rest:
             raise SceneError(
                 f"muscle {muscle.name!r}: every centre lies on an attachment; nothing is free to move"
             )
-        on_mesh = harmonic_weights(frame.local, faces, held_by.groups)
-        weights = on_mesh[held_by.nearest]
-        weights[held] = np.arange(len(held_by.bones)) == held_by.centres[held, None]
         holder = np.concatenate([held_by.centres, held_by.samples])
         return cls(
             points,
@@ -98,7 +90,6 @@ class Rest:
             samples.control_faces,
             fit,
             held_by.bones,
-            weights,
             holder,
             free,
             held,
@@ -130,11 +121,10 @@ class _Attachment:
         place[used] = np.arange(len(used))
         owner, numbers = place[owner], place[numbers]
         tree = cKDTree(frame.local)
-        self.nearest = tree.query(centres)[1]
-        self.groups: Sequence[np.ndarray] = [np.flatnonzero(owner == b) for b in range(len(self.bones))]
-        self.centres, self.samples = owner[self.nearest], owner[tree.query(samples)[1]]
+        nearest = tree.query(centres)[1]
+        self.centres, self.samples = owner[nearest], owner[tree.query(samples)[1]]
         for number, patch in zip(numbers, patches):
-            if number >= 0 and np.isin(self.nearest, patch).sum() < LEAST_ATTACHED:
+            if number >= 0 and np.isin(nearest, patch).sum() < LEAST_ATTACHED:
                 distance = cKDTree(frame.local[patch]).query(centres)[0]
                 self.centres[np.argsort(distance, kind="stable")[:LEAST_ATTACHED]] = number
 

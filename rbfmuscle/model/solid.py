@@ -327,18 +327,13 @@ class EmbeddedSolid:
         FloatingPointError
             If the iteration diverges.
         """
-        state, size = np.concatenate([self.y.ravel(), self.pressure]), self.y.size
-        mixer, least, near = Anderson(MEMORY, size), np.inf, None
         self.history, self._pull = [], self.spring @ self.anchor
         self.localise()
         self._find_responses()
-        most = self.iterations * (ROUNDS_STILL if self.still else 1)
-        settled = self.scale * (SETTLED_STILL if self.still else SETTLED)
-        for step in range(most):
-            if step:
-                self.localise()
-            if near is None or np.abs(self.y - near.y).max() > 0.4 * near.reach:
-                near = self.contact.near(contacts, near)
+        near = self.contact.near(contacts, None)
+        rounds, settled = (ROUNDS_STILL, SETTLED_STILL) if self.still else (1, SETTLED)
+        mixer, least = Anderson(MEMORY, self.y.size), np.inf
+        while True:
             new, pressure = self._iterate(near)
             moved = float(np.sqrt(((new - self.y) ** 2).sum(axis=1).max()))
             if not np.isfinite(moved):
@@ -355,17 +350,24 @@ class EmbeddedSolid:
                     self.pressure + part * (pressure - self.pressure),
                 )
                 mixer.restart()
-            image = np.concatenate([new.ravel(), pressure])
-            last = step + 1 == most or moved < settled
-            state = image if last else mixer.mix(state, image)
-            self.y, self.pressure = state[:size].reshape(-1, 3).copy(), state[size:].copy()
-            if last:
+            if moved < settled * self.scale or len(self.history) == self.iterations * rounds:
                 break
-        assert near is not None
+            self.y, self.pressure = self._mixed(mixer, new, pressure)
+            self.localise()
+            if np.abs(self.y - near.y).max() > 0.4 * near.reach:
+                near = self.contact.near(contacts, near)
+        self.y, self.pressure = new, pressure
         self.forces[:] = 0.0
         self.forces[near.which] = near.forces
         self.shown = self.contact.lifted(near)
         self._note_trend()
+
+    def _mixed(self, mixer: Anderson, new: Floats, pressure: Floats) -> tuple[Floats, Floats]:
+        """Nodes and pressures to go on from, after an iteration has brought the present ones to ``new``."""
+        size = self.y.size
+        state, image = (np.concatenate([y.ravel(), p]) for y, p in ((self.y, self.pressure), (new, pressure)))
+        mixed = mixer.mix(state, image)
+        return mixed[:size].reshape(-1, 3).copy(), mixed[size:].copy()
 
     def _note_trend(self) -> None:
         if self.begun is not None:
