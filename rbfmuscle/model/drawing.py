@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypedDict
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.fields import LevelField
+from rbfmuscle.geometry.fields import BoneField, Cut, LevelField
 from rbfmuscle.implicit.extraction.band import box_along
 from rbfmuscle.implicit.extraction.material import FittedMesh, carry_material, fit_material
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
@@ -33,7 +33,7 @@ REACH = 3.0
 # A tenth of the edges this much longer than at rest is the cause of what cannot be fitted.
 STRETCHED = 1.6
 # Bones' vertices, sorted, by the bone's distance field.
-_BONE_POINTS: WeakKeyDictionary[Any, ObstaclePoints] = WeakKeyDictionary()
+_BONE_POINTS: WeakKeyDictionary[BoneField, ObstaclePoints] = WeakKeyDictionary()
 
 # Where the material is no sound surface, what it does beside a rigid motion is smoothed so often, until it is one;
 # how deep in a bone a vertex of a sound one may be, in mean edges, and how much volume may be lacking.
@@ -63,6 +63,14 @@ class _Neighbours(NamedTuple):
 
     points: bool
     cut: bool
+
+
+class _Surroundings(TypedDict):
+    """Cut, obstacles and axes, as `fit_material` takes them."""
+
+    cut: Cut | None
+    obstacles: list[tuple[ObstaclePoints, Floats]]
+    axes: Floats
 
 
 class SurfaceDrawer:
@@ -149,8 +157,7 @@ class SurfaceDrawer:
 
     def _surroundings(
         self, mesh: MaterialMesh, carried: Floats, contacts: BoneContacts, neighbours: _Neighbours
-    ) -> dict[str, Any]:
-        """Cut, obstacles and axes, as `fit_material` takes them."""
+    ) -> _Surroundings:
         reach = REACH * mesh.edge(carried)
         return {
             "cut": _BoneCut(contacts, reach, neighbours=neighbours.cut) if contacts.names else None,
@@ -159,7 +166,7 @@ class SurfaceDrawer:
         }
 
     def _sounder(
-        self, fitted: FittedMesh, mesh: MaterialMesh, carried: Floats, volume: float, where: dict[str, Any]
+        self, fitted: FittedMesh, mesh: MaterialMesh, carried: Floats, volume: float, where: _Surroundings
     ) -> FittedMesh:
         """What was fitted and crosses itself, or the surface without a fit where that has fewer faults."""
         try:
@@ -168,7 +175,7 @@ class SurfaceDrawer:
             return fitted
         return min(fitted, other, key=lambda result: _faults(result, where["cut"], volume))
 
-    def _carry(self, mesh: MaterialMesh, carried: Floats, volume: float, where: dict[str, Any]) -> FittedMesh:
+    def _carry(self, mesh: MaterialMesh, carried: Floats, volume: float, where: _Surroundings) -> FittedMesh:
         """The mesh where the material is; where no sound surface comes of that, where the material is on the whole."""
         found: list[tuple[float, FittedMesh]] = []
         reason: ValueError | None = None
@@ -244,7 +251,7 @@ class SurfaceDrawer:
         return "", "stretched" if self.shown.stretch(now.carried) > STRETCHED else "sheets"
 
 
-def _faults(result: FittedMesh, cut: Any, volume: float) -> float:
+def _faults(result: FittedMesh, cut: Cut | None, volume: float) -> float:
     """Triangles that cross others, mean edges of depth in a bone, thousandths of volume lost; 0 where it is sound."""
     deep = 0.0 if cut is None else -float(cut(result.vertices).min()) / result.spacing
     lost = abs(result.volume / volume - 1.0)
@@ -297,13 +304,13 @@ class RBFDrawing:
 class _BoneCut:
     """What the bones cut away: their smallest distance, a lower bound where it is beyond ``reach``."""
 
-    def __init__(self, contacts: Any, reach: Any, *, neighbours: bool = True) -> None:
+    def __init__(self, contacts: BoneContacts, reach: float, *, neighbours: bool = True) -> None:
         self.contacts, self.reach, self.neighbours = contacts, reach, neighbours
         # Distances to bones change as fast as one walks; half the difference of two muscles' fields is no distance.
         self.steepest = np.inf if contacts.cuts and neighbours else 1.0
 
-    def __call__(self, points: Floats) -> Any:
+    def __call__(self, points: Floats) -> Floats:
         return self.contacts.nearest(points, self.reach, neighbours=self.neighbours)
 
-    def value_and_gradient_below(self, points: Floats, limit: Any) -> Any:
+    def value_and_gradient_below(self, points: Floats, limit: Floats) -> tuple[Floats, Floats]:
         return self.contacts.nearest_with_gradient(points, limit, neighbours=self.neighbours)

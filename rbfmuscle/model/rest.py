@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -129,7 +128,7 @@ class _Attachment:
                 self.centres[np.argsort(distance, kind="stable")[:LEAST_ATTACHED]] = number
 
 
-def _principal_axes(points: Floats) -> Any:
+def _principal_axes(points: Floats) -> Floats:
     """Right-handed principal axes as rows."""
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     axes[2] *= np.sign(np.linalg.det(axes))

@@ -8,12 +8,12 @@ its gradient turns steadily. Only blocks of the lattice that are asked for are e
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.bsplines import bspline_sum, bspline_weights
+from rbfmuscle.geometry.fields import BoneField
+from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.jit import compiled
 
 SIDE = 4  # cells along a block
@@ -35,7 +35,7 @@ class RoundedField:
         Of a cell [scene unit].
     """
 
-    def __init__(self, field: Any, frame: Any, edge: float) -> None:
+    def __init__(self, field: BoneField, frame: RestFrame, edge: float) -> None:
         self.field, self.frame, self.edge = field, frame, float(edge)
         self.bounds = field.bounds
         self.keys: Integers = np.zeros(0, dtype=np.int64)
@@ -65,7 +65,7 @@ class RoundedField:
         gradient[near] = (slope[good] / steep[:, None]) @ axes
         return distance, gradient
 
-    def _blocks(self, block: Integers) -> Any:
+    def _blocks(self, block: Integers) -> Integers:
         """Rows of ``nodes`` for blocks (n, 3) of the lattice; those that are new are filled."""
         key = ((block[:, 0] + MOST) * 2 * MOST + block[:, 1] + MOST) * 2 * MOST + block[:, 2] + MOST
         wanted, first = np.unique(key, return_index=True)
@@ -82,7 +82,7 @@ class RoundedField:
         return np.searchsorted(self.keys, key)
 
 
-def bone_thickness(field: Any, vertices: Floats, faces: Integers, most: float) -> float:
+def bone_thickness(field: BoneField, vertices: Floats, faces: Integers, most: float) -> float:
     """Thickness that nine tenths of a bone's surface exceed, at most ``most`` [scene unit].
 
     Twice the depth that a path into the bone, from the middle of a face against its normal, reaches.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
@@ -99,6 +97,6 @@ class ShownMesh:
         """Length of edges relative to rest that a tenth of them exceeds."""
         return float(np.percentile(self._lengths(vertices) / self._sides, 90.0))
 
-    def _lengths(self, vertices: Floats) -> Any:
+    def _lengths(self, vertices: Floats) -> Floats:
         sides = vertices[self.mesh.faces] - vertices[np.roll(self.mesh.faces, 1, axis=1)]
         return np.maximum(np.linalg.norm(sides, axis=2), np.finfo(float).tiny)

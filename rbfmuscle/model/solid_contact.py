@@ -9,11 +9,12 @@ volumes kept. The next sub-step starts from the settled shape, not from the lift
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.model.rounded import RoundedField, bone_thickness
 from rbfmuscle.model.solid_loops import carry_loop, contact_loop
 from rbfmuscle.sim.loop.contact import BoneContacts, HalfSpaces
@@ -27,7 +28,7 @@ NEAR = 0.03  # contact points nearer to an obstacle than this take part in a sol
 BATCH, ROUNDS, SWEEPS = 24, 10, 400  # contacts that join the working set in one round, rounds, sweeps in each
 # How far a contact yields under a pressure of 2 μ, of the muscle's size, and the greatest pressure that it takes, over
 # 2 μ: a muscle that bones squeeze from two sides would otherwise be turned inside out.
-YIELDING, MOST_PRESSURE = 1e-4, 5.0
+YIELDING, MOST_FORCE = 1e-4, 5.0
 # Edge of the cells that a bone is rounded over, relative to the spacing of the samples. With 0.7 to 1.0 one pose of the
 # phantom's extensor has shapes 0.6 to 1.6 mm RMS apart, from 1.5 to 2 at most 0.06.
 ROUNDING = 1.7
@@ -87,16 +88,16 @@ class SolidContact:
         self.bones = bones
         self.solid, self.reach = solid, NEAR * solid.scale
         self.tolerance, self.margin = TOLERANCE * solid.scale, REACH_MARGIN * solid.scale
-        self.yielding, self.most = YIELDING * solid.scale / area, MOST_PRESSURE * area
+        self.yielding, self.most = YIELDING * solid.scale / area, MOST_FORCE * area
         self.edge = ROUNDING * float(np.sqrt(area))
         self._round: dict[int, RoundedField] = {}
-        self._last = np.zeros((0, 3))
+        self._push = np.zeros_like(solid.rest)
 
     def near(self, contacts: BoneContacts, before: NearPoints | None) -> NearPoints:
         """The contact points near an obstacle, with the forces on them until now."""
         solid = self.solid
         if before is None:
-            self._last = np.zeros_like(solid.y)
+            self._push = np.zeros_like(solid.y)
         else:
             solid.forces[:] = 0.0
             solid.forces[before.which] = before.forces
@@ -125,7 +126,7 @@ class SolidContact:
             other.fields[b] = self._round[b]
         return other
 
-    def _edge(self, field: Any, bone: str) -> float:
+    def _edge(self, field: BoneField, bone: str) -> float:
         """Cells over which a bone is rounded: no larger than it is thick, or a thin plate would vanish."""
         if bone not in self.bones:
             return self.edge
@@ -144,10 +145,10 @@ class SolidContact:
         here = near.carry(y)
         motion = near.carry(step) - here
         # Contacts that push now push in the next iteration too: where the points will then go decides what they meet.
-        ahead = near.carry(step + self._last) - here
+        ahead = near.carry(step + self._push) - here
         spaces = near.contacts.half_spaces(here, 1.5 * np.sqrt((ahead**2).sum(axis=1)) + self.margin)
         push, taken = self._touch(near, spaces, motion, near.forces, self.yielding / part, self.most * part)
-        self._last = push
+        self._push = push
         return push, taken
 
     def lifted(self, near: NearPoints) -> Floats:

@@ -1,6 +1,7 @@
 """Every public function says what it takes and gives; few take more than eight things."""
 
 import ast
+import re
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -50,6 +51,19 @@ def trains(source):
 def test_public_functions_are_annotated():
     found = {str(p.relative_to(ROOT)): lacking(p.read_text(encoding="utf-8")) for p in MODULES}
     assert {path: names for path, names in found.items() if names} == {}
+
+
+def test_signatures_of_the_core_name_every_type():
+    """Fields, geometry and the RBF model: no parameter or result is `Any`."""
+    found = []
+    for room in ("implicit", "geometry", "model"):
+        for path in sorted((ROOT / "rbfmuscle" / room).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.FunctionDef):
+                    given = [x.annotation for x in parameters(node)] + [node.returns]
+                    if any("Any" in re.findall(r"\w+", ast.unparse(x)) for x in given if x is not None):
+                        found.append(f"{path.name} {node.name}")
+    assert found == []
 
 
 def test_planted_lack_is_found():
