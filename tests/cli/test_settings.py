@@ -25,20 +25,18 @@ TABLES = {
             "initial": "keep",
             "tolerance": 0.1,
             "substep_angle": 4.0,
-            "still_angle": 0.5,
             "margin": 0.05,
         },
     ),
     "sliding": (
         options.SlidingOptions,
         {
-            "threshold": 1.5, "strip": 0.5, "release": 1.0, "bones": True, "pairs": [["biceps", "brachialis"]],
-            "join": False, "cut": False,
+            "threshold": 1.5, "bones": True, "pairs": [["biceps", "brachialis"]],
         },
     ),
     "detect.tunnelling": (
         options.TunnellingOptions,
-        {"angle": 120.0, "action": "report", "swept": False, "smallest_step": 0.5},
+        {"angle": 120.0, "action": "report", "swept": False},
     ),
     "output.surfaces": (options.SurfaceOptions, {"format": "stl"}),
     "output": (

@@ -10,7 +10,6 @@ from rbfmuscle.sim.loop.simulate import FrameLoop, simulate_frames
 from rbfmuscle.sim.loop.substeps import SubSteps
 from rbfmuscle.sim.plan.plan import plan_scene
 from rbfmuscle.sim.scene.motion import Motion
-from rbfmuscle.sim.scene.options import ContactOptions
 
 MODELS = ("rbf", "pbd", "arap-volume")
 DEG = np.pi / 180.0
@@ -119,26 +118,6 @@ def test_bone_that_comes_near_makes_a_muscle_solved():
     # Carried along it would lie 2.6 mm deep in the bar.
     field = rm.BoneSDF.from_mesh(bar)
     assert field.distance(frames[-1].surfaces["brachialis"].vertices).min() > -0.05
-
-
-def test_still_angle_waits_until_bones_have_moved_by_it():
-    path = [(0, 0)] + [(0, k) for k in (0.4, 0.8, 1.2, 1.6, 2.0)]
-    scene = _arm(path)
-    scene.contact = ContactOptions(still_angle=1.0)
-    frames = _run(scene, "rbf")
-    states = [frame.work["brachialis"].state for frame in frames]
-    assert states.count("solved") < 5 and states[-1] in ("solved", "skipped")
-    assert any(s == "skipped" for s in states[1:])
-    exact = _run(_arm(path), "rbf")
-    # An arm of 25 mm turned by a degree: half a millimetre, and never more, however long it waits.
-    for one, other in zip(frames, exact):
-        gap = one.carried["brachialis"][0] - other.carried["brachialis"][0]
-        assert np.abs(gap).max() < 0.6
-
-
-def test_still_angle_beyond_a_sub_step_is_refused():
-    with pytest.raises(rm.SceneError, match="still_angle must not exceed substep_angle"):
-        ContactOptions.build({"still_angle": 3.0}, place="[contact] ")
 
 
 def test_sub_steps_are_those_of_a_muscles_own_bones():

@@ -166,7 +166,7 @@ def test_rigid_fit_gives_back_the_motion():
     assert np.allclose(shift[:3, 3], 3.0)
 
 
-def _swing(action, *, carrier=None, **options):
+def _swing(action):
     """A bag hung on a turning frame is swung against a fixed thin plate by 40 degrees in one step."""
     fields = {"plate": box((12, 0.3, 40), (20, 0, 0)), "frame": box((1, 1, 1), (60, 0, 0))}
     mesh = ellipsoid((2.5, 2.5, 12), (20, 0, 0), subdivisions=3)
@@ -177,13 +177,12 @@ def _swing(action, *, carrier=None, **options):
         [joint("hinge", "plate", "frame", (0, 0, 0), turn=(0, 0, 1))],
         [muscle("bag", mesh, ends)],
         [{}],
-        tunnelling=None if action is None else TunnellingOptions(action=action, **options),
+        tunnelling=None if action is None else TunnellingOptions(action=action),
     )
     model = ToyMuscle(made.muscles[0], made)
     model.reach = 15.0
     contacts = BoneContacts(list(fields), list(fields.values()), contact_bone=model.contact_bone)
     stepper = MuscleStepper(model, contacts, made)
-    stepper.carrier = carrier
     start = model.x.copy()
     before, after = {"hinge.turn": 0.0}, {"hinge.turn": np.radians(40)}
     stepper.step(before, after)
@@ -208,37 +207,11 @@ def test_correction_leaves_no_point_behind_the_plate(action):
     assert "unresolved" not in actions
 
 
-class _Carried:
-    """Notes where the muscle was solved last whenever a step begins."""
-
-    def __init__(self):
-        self.solved, self.begun = None, []
-
-    def begin(self, before):
-        self.begun.append((before, self.solved))
-        return before
-
-    def collect(self, substeps):
-        return None
-
-
-def test_halved_step_begins_from_where_the_muscle_was_solved_before(monkeypatch):
-    monkeypatch.setattr("rbfmuscle.sim.loop.stepper.turn_back", lambda *given: None)
-    carrier = _Carried()
-    stepper, _ = _swing("substep", carrier=carrier, smallest_step=12.0)
-    assert "halved" in {event.action for event in stepper.collect()[1]}
-    here = carrier.begun[0][0]
-    for before, solved in carrier.begun:
-        if solved is None:
-            assert np.array_equal(before["frame"], here["frame"])
-        else:
-            assert np.array_equal(before["frame"], solved["frame"])
-
-
 def test_what_cannot_be_turned_back_is_held_on_its_side(monkeypatch):
     monkeypatch.setattr("rbfmuscle.sim.loop.stepper.turn_back", lambda *given: None)
     # As the step may not be halved, all depends on the planes.
-    stepper, crossed = _swing("substep", smallest_step=40.0)
+    monkeypatch.setattr("rbfmuscle.sim.loop.stepper.SMALLEST_STEP", np.radians(40.0))
+    stepper, crossed = _swing("substep")
     assert crossed == 0
     assert {event.action for event in stepper.collect()[1]} == {"held_back", "angle_flag"}
 

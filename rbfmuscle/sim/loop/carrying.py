@@ -7,7 +7,6 @@ touches counts where it comes near: then the muscle is solved as ever.
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -63,8 +62,6 @@ class OwnBones:
     ----------
     names : list of str
         Bones that hold the muscle; the first holds most of it, and carries it.
-    still : float
-        A muscle whose bones have turned by no more than this since it was solved is not solved again [radian].
     """
 
     def __init__(self, muscle: Muscle, scene: Scene) -> None:
@@ -76,7 +73,6 @@ class OwnBones:
         parts = {name: np.concatenate(found) for name, found in held.items()}
         self.names = sorted(parts, key=lambda name: -len(parts[name]))
         self._corners = {name: frame.corners(parts[name]) for name in self.names}
-        self.still = math.radians(scene.contact.still_angle)
 
     def apart(self, before: Mapping[str, Floats], after: Mapping[str, Floats]) -> tuple[float, str]:
         """How far the bones turned and moved against the first, from one set of poses to another.
@@ -99,11 +95,6 @@ class OwnBones:
         """The rigid motion (4, 4) of the bone that carries the muscle."""
         root = self.names[0]
         return after[root] @ np.linalg.inv(before[root])
-
-    def lagging(self, poses: Mapping[str, Floats], solved: Mapping[str, Floats]) -> dict[str, Floats]:
-        """Where a muscle that was carried takes its bones to be: as they lay to the first when it was solved."""
-        carried = self.carriage(solved, poses)
-        return {**poses, **{name: carried @ solved[name] for name in self.names[1:]}}
 
 
 def relative_motion(
@@ -156,7 +147,7 @@ class Carrier:
         if self.solved is None:
             self.solved = before
         angle, bone = self.own.apart(self.solved, after)
-        if angle > max(self.own.still, STILL):
+        if angle > STILL:
             self.reason = f"{bone} against {self.own.names[0]}"
             return False
         near = [b for b in self.others if self._moves(b, before, after)]
@@ -195,12 +186,6 @@ class Carrier:
     def _moves(self, b: int, before: Mapping[str, Floats], after: Mapping[str, Floats]) -> bool:
         name, corners = self.stepper.contacts.names[b], self.own._corners[self.own.names[0]]
         return relative_motion(before, after, name, self.own.names[0], corners, self.own.size) > STILL
-
-    def begin(self, before: Mapping[str, Floats]) -> Mapping[str, Floats]:
-        """Poses that a solve begins from: where the muscle takes its bones to be."""
-        if self.solved is None or self.own.still == 0.0:
-            return before
-        return self.own.lagging(before, self.solved)
 
     def collect(self, substeps: int) -> Work:
         """What was done since the last call."""

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 TOUCH = 0.1
 # Rounds in which what still crosses at the smallest step is fenced off, together with what crosses then.
 FENCES = 4
+# A step that points pass through in is not halved below this turn [radian].
+SMALLEST_STEP = math.radians(0.1)
 
 
 class TimedDrawing:
@@ -159,10 +161,7 @@ class MuscleStepper:
 
     def begin(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
         """First half of a sub-step: the bones move, the muscle goes along."""
-        start = self.poses(before)
-        if self.carrier is not None:
-            start = self.carrier.begin(start)
-        self.path, poses = (before, after), (start, self.poses(after))
+        self.path, poses = (before, after), (self.poses(before), self.poses(after))
         self.saved, self._shown = None, None
         if self.detect is not None:
             self.saved = self.model.snapshot(), self.model.contact_points().copy(), poses
@@ -178,7 +177,6 @@ class MuscleStepper:
             crossings = self._crossings(start, poses)
             if crossings:
                 self._correct(state, start, poses, before, after, crossings)
-        # Last: a step that is halved begins again from where the muscle was solved before.
         if self.carrier is not None:
             self.carrier.solved = self.poses(after)
 
@@ -260,7 +258,7 @@ class MuscleStepper:
             self._report_all(crossings, "rotated")
             return
         angle = step_angle(self.scene, before, after)
-        if self.detect.action == "rotate" or angle <= 2.0 * math.radians(self.detect.smallest_step):
+        if self.detect.action == "rotate" or angle <= 2.0 * SMALLEST_STEP:
             for crossing in self._held_back(state, start, poses, after, remaining):
                 name = self.contacts.names[crossing.bone]
                 paths, ends = (start, self.model.contact_points()), (poses[0][name], poses[1][name])

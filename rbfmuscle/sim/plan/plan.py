@@ -60,7 +60,7 @@ def _work(muscle: Muscle, scene: Scene, bones: Sequence[str], poses: PoseMemo) -
         steps, moved = 0, False
         for before, after in itertools.pairwise([here, *cut.split(here, there)]):
             angle, bone = own.apart(solved, poses(after))
-            if never or angle > max(own.still, STILL):
+            if never or angle > STILL:
                 steps, solved = steps + 1, poses(after)
                 reasons[never or f"{bone} against {own.names[0]}"] += 1
             else:

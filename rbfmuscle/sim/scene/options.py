@@ -32,6 +32,12 @@ LARGEST_INTEGER = 2**53
 REMOVED_KEYS: dict[str, str] = {
     "contact.from_rest": "delete the key: solve_pose(scene, models, coordinates) in Python solves a pose from rest",
     "contact.detector": "delete the key; for other fields call simulate(scene, fields={bone: field}) in Python",
+    "contact.still_angle": "delete the key: a muscle is solved wherever its bones move against each other",
+    "detect.tunnelling.smallest_step": "delete the key: steps are halved down to 0.1 degrees",
+    "sliding.strip": "delete the key: a linked point is free to 0.5 mm beyond its gap at rest",
+    "sliding.release": "delete the key: a point 5 mm beyond that is let go",
+    "sliding.join": "delete the key: points that come near a neighbour are linked",
+    "sliding.cut": "delete the key: overlaps that remain are cut midway in the surfaces",
     "model.across": "delete the key: the muscle is an elastic solid, set its model.nodes",
     "model.across_weight": "delete the key: the muscle is an elastic solid, set its model.nodes",
     "model.acceleration": "delete the key: each solve combines five iterations",
@@ -179,28 +185,15 @@ class ContactOptions(Table):
     initial: Literal["resolve", "keep", "error"] = "resolve"
     tolerance: Positive | None = None
     substep_angle: Annotated[float, Field(gt=0, le=90)] = 2.0
-    still_angle: Annotated[float, Field(ge=0, le=90)] = 0.0
     margin: NotNegative = 0.0
-
-    @model_validator(mode="after")
-    def _check_still(self):
-        if self.still_angle > self.substep_angle:
-            raise ValueError(
-                f"still_angle must not exceed substep_angle ({self.substep_angle:g}), got {self.still_angle:g}"
-            )
-        return self
 
 
 class SlidingOptions(Table):
     """``[sliding]``: neighbouring muscles that keep their distance and slide."""
 
     threshold: Positive | None = None
-    strip: NotNegative | None = None
-    release: Positive | None = None
     bones: bool = False
     pairs: list[Annotated[list[str], Field(min_length=2, max_length=2)]] | None = None
-    join: bool = True
-    cut: bool = True
 
 
 class TunnellingOptions(Table):
@@ -209,8 +202,6 @@ class TunnellingOptions(Table):
     angle: Annotated[float, Field(gt=0, lt=180)] = 135.0
     action: Literal["report", "rotate", "substep"] = "substep"
     swept: bool = True
-    # Each halving doubles the steps: a thousandth of a degree is already 2,000 for one of two degrees.
-    smallest_step: Annotated[float, Field(ge=0.001, allow_inf_nan=False)] = 0.1
 
 
 class DetectOptions(Table):

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from rbfmuscle.sim.scene.scene import Scene
 
 
-# Defaults [mm]: nearer than THRESHOLD at rest is linked; STRIP beyond its gap there is free; RELEASE beyond lets go.
+# [mm]: nearer than THRESHOLD (default) at rest is linked; STRIP beyond its gap there is free; RELEASE beyond lets go.
 THRESHOLD, STRIP, RELEASE = 2.0, 0.5, 5.0
 # At rest points this share of a mean edge farther are linked too: a patch where two muscles touch may lie between them.
 BETWEEN = 0.5
@@ -120,8 +120,7 @@ class Link:
         far = np.ones(len(points), dtype=bool)
         far[index] = distance > self.hold[index] + limits.release
         self.linked &= ~far
-        if limits.join:
-            self.linked[index[distance < limits.threshold]] = True
+        self.linked[index[distance < limits.threshold]] = True
         share = np.where(self.other.fixed[nearest], 1.0, 0.5)
         self._push_out((index, np.maximum(share * distance, -limits.most), normal))
         held = self.linked[index]
@@ -193,7 +192,7 @@ class Link:
         """Cut (n,) and its gradient (n, 3): the surface midway between two overlapping muscles."""
         value, gradient = np.full(len(points), np.inf), np.zeros((len(points), 3))
         zone, depth = self.meeting(), self.limits.cut_depth
-        if zone is None or not self.limits.cut:
+        if zone is None:
             return value, gradient
         inside = np.all((points > zone[0]) & (points < zone[1]), axis=1)
         if self.own.field is not None and self.other.field is not None:
@@ -216,7 +215,7 @@ class Link:
     def points(self) -> Floats:
         """Points (k, 3) of the neighbour where the two meet, which the faces of a surface have to leave outside."""
         zone = self.meeting()
-        if zone is None or not self.limits.cut:
+        if zone is None:
             return np.zeros((0, 3))
         found, (low, high) = self.other.vertices, zone
         return found[np.all((found > low) & (found < high), axis=1)]
@@ -265,21 +264,17 @@ class BoneLink:
 
 
 class SlidingLimits:
-    """The distances of ``[sliding]`` in the scene's unit, with their defaults."""
+    """The distances of sliding in the scene's unit."""
 
     def __init__(self, options: Any, scene: Scene) -> None:
-        def length(value, default):
-            return scene.length(default) if value is None else float(value)
-
-        self.threshold = length(options.threshold, THRESHOLD)
-        self.strip = length(options.strip, STRIP)
+        self.threshold = scene.length(THRESHOLD) if options.threshold is None else float(options.threshold)
+        self.strip = scene.length(STRIP)
         self.hold = self.threshold + self.strip
-        self.release = length(options.release, RELEASE)
+        self.release = scene.length(RELEASE)
         self.search = max(scene.length(SEARCH), self.threshold)
         self.reach = max(self.search, self.hold + self.release)
         self.cut_from, self.cut_depth = scene.length(CUT_FROM), scene.length(CUT_DEPTH)
         self.most = scene.length(MOST)
-        self.join, self.cut = options.join, options.cut
 
 
 def _box(points, pad):
