@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.model.muscle import RBFMuscle
 from rbfmuscle.model.options import RBFOptions
-from rbfmuscle.models import MODEL_NAMES
+from rbfmuscle.models import COMPARED
 from rbfmuscle.run import simulate
 from rbfmuscle.sim.distance.sdf import BoneSDF
 from rbfmuscle.sim.scene.attachments import signed_distances
@@ -244,7 +244,7 @@ def compare(path):
     print(f"{'model':18}{columns}\n{'':18}" + "    rms   worst  volume  " * len(volumes))
     own = "".join(f"      -       - {100 * (v / volumes[0] - 1):+6.2f} %  " for v in volumes)
     print(f"{'finite elements':18}{own}")
-    for model in MODEL_NAMES:
+    for model in COMPARED:
         cells = "".join(f"{r:7.2f} {w:7.2f} {100 * v:+6.2f} %  " for _, r, w, v in distances(model, kept))
         print(f"{model:18}{cells}", flush=True)
 

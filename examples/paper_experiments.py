@@ -30,14 +30,7 @@ from rbfmuscle.sim.scene.phantom import phantom_scene
 from rbfmuscle.sim.scene.scene import Scene
 from rbfmuscle.study.measure.penetration import BoneProbe, bone_depth, surface_depth
 
-AS_PRINTED = {
-    "method": "pbd",
-    "prediction": "velocity",
-    "soft_length": 0.0,
-    "limits": [0.01, 100.0],
-    "response": "nearest",
-}
-MODELS = {"as printed": AS_PRINTED} | {
+MODELS = {"as printed": {"method": "pbd-paper"}} | {
     name: {"method": name} for name in ("pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
 }
 # Coordinate, end and step [degree].

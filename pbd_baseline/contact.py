@@ -24,15 +24,17 @@ class ContactConstraint:
         Vertices and shares of each contact point; a vertex alone is (i, i, i) and (1, 0, 0).
     reach : float
         Distance within which contacts are looked for [scene unit].
-    response : {"sum", "nearest"}
-        A vertex in several bones moves by the sum of its ways out, or by the longest alone: the response of
-        the authors' earlier papers.
+    nearest_only : bool
+        A vertex in several bones moves by the longest of its ways out alone, as in the authors' papers, not by
+        their sum.
     """
 
-    def __init__(self, columns: Integers, shares: Floats, *, reach: float, response: str = "sum") -> None:
+    def __init__(
+        self, columns: Integers, shares: Floats, *, reach: float, nearest_only: bool = False
+    ) -> None:
         self.columns, self.shares = columns, shares
         self.reach = float(reach)
-        self.nearest_only = response == "nearest"
+        self.nearest_only = nearest_only
         self.index, self.gap = np.zeros(0, dtype=np.int64), np.zeros(0)
         self.normal = self.anchor = np.zeros((0, 3))
         self.source = np.zeros(0, dtype=np.int64)

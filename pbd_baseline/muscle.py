@@ -30,6 +30,8 @@ DEPTH = 0.05
 SETTLING_ROUNDS = 8
 # Of a muscle kept sound: what faces away from a bone keeps this share of an edge from it.
 SKIN = 0.2
+# Share of its velocity that a vertex of `pbd-paper` keeps.
+DAMPING = 0.99
 # Motion that makes the time of one XPBD step [radian].
 STEP_ANGLE = math.radians(2.0)
 
@@ -59,8 +61,9 @@ class PBDMuscle:
         self.rest = Rest.from_muscle(muscle, scene, self.options)
         self.fibres: Any = MeshFibres(muscle, self.rest) if muscle.contraction is not None else None
         stiffer = 1.0 if self.fibres is None else np.where(self.fibres.tendon, TENDON_WEIGHT, 1.0)
-        kind: Any = METHODS[self.options.method].shape
-        self.shape = kind(self.rest, self.options, stiffer)
+        method = METHODS[self.options.method]
+        kind: Any = method.shape
+        self.shape, self.printed = kind(self.rest, self.options, stiffer), method.printed
         self.sweeps = sweeps(self.options)
         numbers = _bone_numbers(self.rest, scene)
         self.contact = _contact(self.rest, scene, self.options, numbers)
@@ -81,12 +84,12 @@ class PBDMuscle:
         """Go along with the bones; held vertices arrive exactly."""
         motions = np.array([_relative(before[bone], after[bone]) for bone in self.rest.bones])
         self.time = max(1.0, _largest_angle(motions) / STEP_ANGLE)
-        if self.options.prediction == "carried":
-            carry(self.points, self.rest.weights, motions)
-        elif self.options.prediction == "velocity":
+        if self.printed:
             velocity = self.points - self.before
             self.before = self.points.copy()
-            self.points += self.options.damping * velocity
+            self.points += DAMPING * velocity
+        else:
+            carry(self.points, self.rest.weights, motions)
         for b, bone in enumerate(self.rest.bones):
             held = self.rest.holder == b
             self.points[held] = self.rest.vertices[held] @ after[bone][:3, :3].T + after[bone][:3, 3]
@@ -198,7 +201,7 @@ def _bone_numbers(rest, scene):
 def _contact(rest, scene, options, numbers):
     """The contact that the options ask for."""
     columns, shares = _contact_carriers(rest, faces_too=options.contact == "faces")
-    usual = {"reach": scene.length(REACH), "response": options.response}
+    usual = {"reach": scene.length(REACH), "nearest_only": METHODS[options.method].printed}
     if not options.sound:
         return ContactConstraint(columns, shares, **usual)
     faces, edge = rest.topology.faces, rest.edge()

@@ -25,6 +25,9 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rotations import turned_quaternions
 from rbfmuscle.jit import compiled
 
+# Edges shorter or longer than these multiples of their rest length are hard in any case.
+LIMITS = 0.6, 2.2
+
 
 class Shape:
     """What all ways have in common: how the volume comes back, and what a snapshot holds.
@@ -78,14 +81,16 @@ class PBDShape(Shape):
 
     # Three sweeps change the volume too little for PBD to feel it before the last of them.
     volume_in_sweeps = False
+    # Edges longer than so many medians are softer in inverse proportion.
+    soft_length = 0.3
+    limits = LIMITS
 
     def __init__(self, rest: Rest, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
         super().__init__(rest)
         stiffness = edge_stiffness(rest.vertices, rest.topology.edges, rest.fibres, options.fibre_exponent)
-        if options.soft_length > 0.0:
-            stiffness = stiffness * np.minimum(1.0, options.soft_length / rest.relative_lengths())
+        stiffness = stiffness * np.minimum(1.0, self.soft_length / rest.relative_lengths())
         self.edges = EdgeConstraint(
-            rest.vertices, rest.topology.edges, stiffness=options.edge * stiffness, limits=options.limits
+            rest.vertices, rest.topology.edges, stiffness=options.edge * stiffness, limits=self.limits
         )
         self.passive, self.stiffest = self.edges.stiffness, options.edge
         self.bending = BendingConstraint(
@@ -104,6 +109,13 @@ class PBDShape(Shape):
         self.edges.project(points, self.inverse_mass)
 
 
+class PaperShape(PBDShape):
+    """The same as the paper of 2023 has it: all edges alike, none hard."""
+
+    soft_length = np.inf
+    limits = 0.01, 100.0
+
+
 class XPBDShape(Shape):
     """The same constraints with compliances, one iteration in each of many small steps (Macklin 2019).
 
@@ -115,7 +127,7 @@ class XPBDShape(Shape):
     def __init__(self, rest: Rest, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
         super().__init__(rest)
         softness = edge_stiffness(rest.vertices, rest.topology.edges, rest.fibres, options.fibre_exponent)
-        self.edges = EdgeConstraint(rest.vertices, rest.topology.edges, limits=options.limits)
+        self.edges = EdgeConstraint(rest.vertices, rest.topology.edges, limits=LIMITS)
         self.bending = BendingConstraint(rest.vertices, rest.topology.edges, rest.topology.wings)
         across = options.edge_compliance * rest.relative_lengths()
         self.edge_compliance = (across / np.maximum(softness, 1e-3))[self.edges.order]
@@ -233,14 +245,18 @@ class Method(NamedTuple):
     shape : type of Shape
     sweeps : int
         The authors' three for PBD; sub-steps of one sweep for XPBD.
+    printed : bool
+        As the paper prints it: vertices keep their velocity and answer to the deepest bone alone.
     """
 
     shape: type[Shape]
     sweeps: int
+    printed: bool = False
 
 
 METHODS = {
     "pbd": Method(PBDShape, 3),
+    "pbd-paper": Method(PaperShape, 3, printed=True),
     "xpbd": Method(XPBDShape, 10),
     "arap-pbd": Method(ARAPShape, 10),
     "arap-volume": Method(GlobalARAPShape, 6),

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rbfmuscle.models import MODEL_NAMES, build_models, check_model_name, configure_scene
+from rbfmuscle.models import COMPARED, build_models, check_model_name, configure_scene
 from rbfmuscle.progress import stage
 from rbfmuscle.run import stream_run
 from rbfmuscle.sim.loop.simulate import simulate_frames
@@ -36,7 +36,7 @@ COARSER = 5
 def compare_models(
     scene: Scene,
     directory: str | Path,
-    models: Sequence[str] = MODEL_NAMES,
+    models: Sequence[str] = COMPARED,
     *,
     frames: Any = None,
     settings: dict[str, Any] | None = None,

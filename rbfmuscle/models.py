@@ -26,11 +26,13 @@ _HOME = {
     "rbf": _Home(*_RBF, {}),
     **{
         name: _Home(*_PBD, {"method": name})
-        for name in ("pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
+        for name in ("pbd", "pbd-paper", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
     },
 }
 
 MODEL_NAMES = tuple(_HOME)
+# What is compared where no models are named: all but the historical one.
+COMPARED = tuple(name for name in MODEL_NAMES if name != "pbd-paper")
 
 
 def build_model(muscle: Muscle, scene: Scene, name: str | None = None) -> MuscleModel:

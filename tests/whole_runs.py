@@ -23,14 +23,6 @@ FOLDER = Path(__file__).resolve().parent / "data" / "references"
 # A few points of each muscle say where all are: they hang together through one matrix.
 POINTS = 12
 RBF = {"name": "rbf", "centres": 80, "samples": 300, "resolution": 20}
-# PBD as its paper prints it: velocities are kept, all edges are alike, one bone answers.
-PAPER = {
-    "name": "pbd",
-    "prediction": "velocity",
-    "soft_length": 0.0,
-    "limits": [0.01, 100.0],
-    "response": "nearest",
-}
 QUANTITIES = ("volume_error", "penetration_max", "length", "moment_arm", "edge_strain_rms", "rest_error_rms")
 
 
@@ -108,7 +100,7 @@ SCENES = {
     "contact_pbd": lambda: _bent("pbd"),
     "contact_pbd_serendipity": lambda: _bent("pbd"),
     "contact_pbd_voxel": lambda: _bent("pbd"),
-    "contact_pbd_paper": lambda: _bent(PAPER),
+    "contact_pbd_paper": lambda: _bent("pbd-paper"),
     "contact_xpbd": lambda: _bent("xpbd"),
     "contact_arap_pbd": lambda: _bent("arap-pbd"),
     "contact_arap_volume": lambda: _bent("arap-volume"),

@@ -59,11 +59,11 @@ def compare(
     """
     from rbfmuscle import interruption
     from rbfmuscle.compare import compare_models
-    from rbfmuscle.models import MODEL_NAMES
+    from rbfmuscle.models import COMPARED
     from rbfmuscle.sim.scene.settings import parse_settings
     from rbfmuscle.study.files.writer import json_text
 
-    names = [name.strip() for name in models.split(",") if name.strip()] if models else list(MODEL_NAMES)
+    names = [name.strip() for name in models.split(",") if name.strip()] if models else list(COMPARED)
     changes = parse_settings(settings)
     with Progress("compare") as progress, interruption.keeping(lambda: output.exists()):
 

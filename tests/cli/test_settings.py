@@ -60,9 +60,9 @@ MODELS = {
     "pbd": (
         PBDOptions,
         {
-            "iterations": 2, "prediction": "velocity", "damping": 0.9, "fibre_exponent": 1.0, "limits": [0.7, 2.0],
-            "soft_length": 0.2, "edge": 0.9, "bending": 0.8, "edge_compliance": 0.1, "bending_compliance": 0.1,
-            "arap_compliance": 0.5, "arap_reach": 0.05, "swelling_reach": 0.05, "response": "nearest",
+            "iterations": 2, "fibre_exponent": 1.0, "edge": 0.9, "bending": 0.8,
+            "edge_compliance": 0.1, "bending_compliance": 0.1,
+            "arap_compliance": 0.5, "arap_reach": 0.05, "swelling_reach": 0.05,
             "contact": "faces", "sound": True,
         },
     ),

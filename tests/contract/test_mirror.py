@@ -90,7 +90,7 @@ def test_what_is_known_at_rest_has_the_same_names_and_types():
         for package in PACKAGES
     ]
     shared = fields[0].keys() & fields[1].keys()
-    assert shared >= {"bones", "weights", "holder"}
+    assert shared >= {"bones", "holder"}
     assert [name for name in shared if fields[0][name] != fields[1][name]] == []
 
 

@@ -15,7 +15,8 @@ MODELS = ("rbf", "pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
 
 
 def test_every_name_is_tested():
-    assert set(MODELS) == set(MODEL_NAMES)
+    # As printed in the paper, `pbd-paper` keeps none of these laws; `test_whole_runs` and its experiments run it.
+    assert {*MODELS, "pbd-paper"} == set(MODEL_NAMES)
 
 
 def _spindle(length, radius):

@@ -157,7 +157,7 @@ def _attach(scene, rng):
 OPTIONS = (
     "centres", "samples", "iterations", "nodes", "slack", "fibre_ratio", "epsilon",
     "placement", "seed", "kernel", "edge", "bending",
-    "arap_compliance", "limits", "damping", "prediction", "response", "contact", "soft_length", "fibre_exponent",
+    "arap_compliance", "contact", "fibre_exponent",
 )  # fmt: skip
 # What an option may be set to: out of its range, or in it and quick. What is allowed and slow is not an error.
 SETTINGS = (

@@ -228,10 +228,15 @@ def test_arap_rotations_of_a_turned_mesh_cost_nothing():
     assert arap.energy(points) < 1e-20
 
 
-@pytest.mark.parametrize("prediction", ["velocity", "none"])
-def test_other_predictions_run(prediction):
-    points = Rig(prediction=prediction).go(*range(2, 22, 2))
-    assert np.isfinite(points).all()
+def test_vertices_of_the_papers_model_keep_their_velocity():
+    """Carried vertices stay where the bones rest; those with a velocity go on."""
+    for method, goes_on in (("pbd", False), ("pbd-paper", True)):
+        rig = Rig(method=method)
+        rig.go(*range(2, 22, 2))
+        before = rig.model.points.copy()
+        rig.model.predict(rig.at, rig.at)
+        free = rig.model.rest.holder < 0
+        assert (np.abs(rig.model.points - before)[free].max() > 0.01) == goes_on
 
 
 def test_sum_of_ways_out_leaves_two_bones_where_one_does_not():
@@ -244,10 +249,10 @@ def test_sum_of_ways_out_leaves_two_bones_where_one_does_not():
             gap = np.array([points[0, 0], points[0, 1]])
             return HalfSpaces(np.zeros(2, dtype=np.int64), gap, np.eye(3)[:2].copy(), np.arange(2))
 
-    for response, expected in (("sum", [0.0, 0.0, 0.0]), ("nearest", [0.0, -1.0, 0.0])):
+    for nearest_only, expected in ((False, [0.0, 0.0, 0.0]), (True, [0.0, -1.0, 0.0])):
         point = np.array([[-2.0, -1.0, 0.0]])
         collision = ContactConstraint(
-            np.zeros((1, 3), dtype=int), np.array([[1.0, 0.0, 0.0]]), reach=5.0, response=response
+            np.zeros((1, 3), dtype=int), np.array([[1.0, 0.0, 0.0]]), reach=5.0, nearest_only=nearest_only
         )
         collision.find(Corner(), point)
         collision.project(point)
