@@ -63,7 +63,7 @@ class PBDMuscle:
         stiffer = 1.0 if self.fibres is None else np.where(self.fibres.tendon, TENDON_WEIGHT, 1.0)
         method = METHODS[self.options.method]
         kind: Any = method.shape
-        self.shape, self.printed = kind(self.rest, self.options, stiffer), method.printed
+        self.shape, self.as_printed = kind(self.rest, self.options, stiffer), method.as_printed
         self.sweeps = sweeps(self.options)
         numbers = _bone_numbers(self.rest, scene)
         self.contact = _contact(self.rest, scene, self.options, numbers)
@@ -84,7 +84,7 @@ class PBDMuscle:
         """Go along with the bones; held vertices arrive exactly."""
         motions = np.array([_relative(before[bone], after[bone]) for bone in self.rest.bones])
         self.time = max(1.0, _largest_angle(motions) / STEP_ANGLE)
-        if self.printed:
+        if self.as_printed:
             velocity = self.points - self.before
             self.before = self.points.copy()
             self.points += DAMPING * velocity
@@ -201,7 +201,7 @@ def _bone_numbers(rest, scene):
 def _contact(rest, scene, options, numbers):
     """The contact that the options ask for."""
     columns, shares = _contact_carriers(rest, faces_too=options.contact == "faces")
-    usual = {"reach": scene.length(REACH), "nearest_only": METHODS[options.method].printed}
+    usual = {"reach": scene.length(REACH), "nearest_only": METHODS[options.method].as_printed}
     if not options.sound:
         return ContactConstraint(columns, shares, **usual)
     faces, edge = rest.topology.faces, rest.edge()

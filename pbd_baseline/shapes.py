@@ -110,7 +110,7 @@ class PBDShape(Shape):
 
 
 class PaperShape(PBDShape):
-    """The same as the paper of 2023 has it: all edges alike, none hard."""
+    """PBD as Cervenka et al. print it (GRAPP 2023): stiffness does not fall with an edge's length, limits are wide."""
 
     soft_length = np.inf
     limits = 0.01, 100.0
@@ -245,18 +245,18 @@ class Method(NamedTuple):
     shape : type of Shape
     sweeps : int
         The authors' three for PBD; sub-steps of one sweep for XPBD.
-    printed : bool
+    as_printed : bool
         As the paper prints it: vertices keep their velocity and answer to the deepest bone alone.
     """
 
     shape: type[Shape]
     sweeps: int
-    printed: bool = False
+    as_printed: bool = False
 
 
 METHODS = {
     "pbd": Method(PBDShape, 3),
-    "pbd-paper": Method(PaperShape, 3, printed=True),
+    "pbd-paper": Method(PaperShape, 3, as_printed=True),
     "xpbd": Method(XPBDShape, 10),
     "arap-pbd": Method(ARAPShape, 10),
     "arap-volume": Method(GlobalARAPShape, 6),

@@ -28,7 +28,7 @@ NEAR = 0.03  # contact points nearer to an obstacle than this take part in a sol
 BATCH, ROUNDS, SWEEPS = 24, 10, 400  # contacts that join the working set in one round, rounds, sweeps in each
 # How far a contact yields under a pressure of 2 μ, of the muscle's size, and the greatest pressure that it takes, over
 # 2 μ: a muscle that bones squeeze from two sides would otherwise be turned inside out.
-YIELDING, MOST_FORCE = 1e-4, 5.0
+YIELDING, MOST_CONTACT_PRESSURE = 1e-4, 5.0
 # Edge of the cells that a bone is rounded over, relative to the spacing of the samples. With 0.7 to 1.0 one pose of the
 # phantom's extensor has shapes 0.6 to 1.6 mm RMS apart, from 1.5 to 2 at most 0.06.
 ROUNDING = 1.7
@@ -88,16 +88,16 @@ class SolidContact:
         self.bones = bones
         self.solid, self.reach = solid, NEAR * solid.scale
         self.tolerance, self.margin = TOLERANCE * solid.scale, REACH_MARGIN * solid.scale
-        self.yielding, self.most = YIELDING * solid.scale / area, MOST_FORCE * area
+        self.yielding, self.most = YIELDING * solid.scale / area, MOST_CONTACT_PRESSURE * area
         self.edge = ROUNDING * float(np.sqrt(area))
         self._round: dict[int, RoundedField] = {}
-        self._push = np.zeros_like(solid.rest)
+        self._last_push = np.zeros_like(solid.rest)
 
     def near(self, contacts: BoneContacts, before: NearPoints | None) -> NearPoints:
         """The contact points near an obstacle, with the forces on them until now."""
         solid = self.solid
         if before is None:
-            self._push = np.zeros_like(solid.y)
+            self._last_push = np.zeros_like(solid.y)
         else:
             solid.forces[:] = 0.0
             solid.forces[before.which] = before.forces
@@ -145,10 +145,10 @@ class SolidContact:
         here = near.carry(y)
         motion = near.carry(step) - here
         # Contacts that push now push in the next iteration too: where the points will then go decides what they meet.
-        ahead = near.carry(step + self._push) - here
+        ahead = near.carry(step + self._last_push) - here
         spaces = near.contacts.half_spaces(here, 1.5 * np.sqrt((ahead**2).sum(axis=1)) + self.margin)
         push, taken = self._touch(near, spaces, motion, near.forces, self.yielding / part, self.most * part)
-        self._push = push
+        self._last_push = push
         return push, taken
 
     def lifted(self, near: NearPoints) -> Floats:

@@ -192,7 +192,7 @@ def _tables(scene, rng):
             (
                 "detect",
                 "tunnelling",
-                [{}, {"angle": 1e-300}, {"angle": 1e-9}, {"action": "rotate"}, 1],
+                [{}, {"angle": 1e-300}, {"action": "rotate"}, 1],
             ),
             ("output", "surfaces", [False, True, {"format": "stl"}, {"format": "glb"}, {"format": "x"}]),
             ("motion", "max_substeps", [0, 1, 10**15, -1]),

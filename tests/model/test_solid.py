@@ -8,7 +8,7 @@ import trimesh
 from conftest import benchmark_script
 from elastic_bar import NO_BONES, bar, settle, shift, with_fibres
 
-from rbfmuscle.implicit.placement.lattice import Lattice
+from rbfmuscle.implicit.placement.lattice import LEAST_REGION, Lattice
 from rbfmuscle.model.muscle import RBFMuscle
 from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.model.solid import BULK, TONE
@@ -31,6 +31,22 @@ def test_quadrature_gives_volume_middle_and_moments():
     assert np.abs(w @ p / w.sum()).max() < 0.01
     wanted = np.array([3.0, 1.0, 0.6]) ** 2 / 5
     assert np.einsum("q,qa,qa->a", w, p, p) / w.sum() == pytest.approx(wanted, rel=0.03)
+
+
+@pytest.mark.parametrize("count", [1, 5, 18, 10_000])
+def test_no_region_is_a_sliver_and_none_divides_a_cell(count):
+    # Cells across are cut by the surface into parts of any size.
+    mesh = trimesh.creation.icosphere(subdivisions=3).apply_scale([6.0, 1.3, 1.0])
+    lattice = Lattice(mesh.vertices, np.asarray(mesh.faces), 150)
+    region = lattice.regions(count)
+    cells = np.bincount(lattice.cell, lattice.weights)
+    volumes = np.bincount(region, lattice.weights)
+    assert len(volumes) <= count and volumes.min() >= min(
+        LEAST_REGION * lattice.weights.sum() / count, cells.min()
+    )
+    assert all(len(set(region[lattice.cell == cell])) == 1 for cell in np.unique(lattice.cell))
+    if count <= 18:
+        assert len(volumes) == count and volumes.min() >= LEAST_REGION * volumes.mean()
 
 
 def test_shape_functions_reproduce_linear_maps():

@@ -11,7 +11,7 @@ from rbfmuscle.models import build_model
 from rbfmuscle.sim.loop.simulate import simulate_frames
 from rbfmuscle.sim.scene.phantom import phantom_scene
 
-METHODS = ["pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved"]
+METHODS = ["pbd", "pbd-paper", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved"]
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "paper_experiments.py"
 
 

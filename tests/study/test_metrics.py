@@ -131,7 +131,7 @@ class TestMeshDistance:
         # A flap folded flat onto the outside: the layers above it look like the inside from one face.
         box = trimesh.creation.box((2, 2, 2))
         vertices, faces = arrays(box)
-        top = np.flatnonzero((vertices[faces][:, :, 2] == 1).all(axis=1))[0]
+        top = np.flatnonzero((vertices[faces][:, :, 2] > 0).all(axis=1))[0]
         a, b, c = faces[top]
         extra = np.array([[0.3, 0.3, 1.0], [-0.3, 0.3, 1.0]]) + vertices[[a, b, c]].mean(axis=0) * [1, 1, 0]
         vertices = np.vstack([vertices, extra])

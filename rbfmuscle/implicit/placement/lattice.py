@@ -166,7 +166,8 @@ class Lattice:
         """
         volume = np.bincount(self.cell, self.weights, minlength=len(self.cells))
         least = LEAST_REGION * volume.sum() / count
-        open_groups, whole = [np.arange(len(self.cells))], []
+        open_groups = [np.arange(len(self.cells))]
+        whole: list[Integers] = []
         while open_groups and len(open_groups) + len(whole) < count:
             group = open_groups.pop(int(np.argmax([volume[g].sum() for g in open_groups])))
             middle = self.cells[group] * self.spacing
@@ -196,8 +197,9 @@ class Lattice:
         for place, k in known.items():
             for axis in range(3):
                 step = np.eye(3, dtype=int)[axis]
-                row = [known.get(tuple(place - step)), k, known.get(tuple(place + step))]
-                if None not in row:
+                before, after = known.get(tuple(place - step)), known.get(tuple(place + step))
+                if before is not None and after is not None:
+                    row = [before, k, after]
                     out[np.ix_(row, row)] += stencil
         return out
 

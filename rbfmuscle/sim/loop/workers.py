@@ -15,22 +15,16 @@ class Workers:
     ----------
     muscles : int
 
-    Attributes
-    ----------
-    threads : int
-        How many there are for all.
     """
 
     def __init__(self, muscles: int) -> None:
         from threadpoolctl import ThreadpoolController
 
         self._blas = ThreadpoolController()
-        self.threads = numba.get_num_threads()
+        threads = min(muscles, numba.get_num_threads())
         self._pool: ThreadPoolExecutor | None = None
-        if min(muscles, self.threads) > 1:
-            self._pool = ThreadPoolExecutor(
-                min(muscles, self.threads), initializer=numba.set_num_threads, initargs=(1,)
-            )
+        if threads > 1:
+            self._pool = ThreadPoolExecutor(threads, initializer=numba.set_num_threads, initargs=(1,))
 
     @property
     def parallel(self) -> bool:

@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     from rbfmuscle.sim.scene.scene import Scene
 
 
-# [mm]: nearer than THRESHOLD (default) at rest is linked; STRIP beyond its gap there is free; RELEASE beyond lets go.
+# Distances [mm]. Points nearer than THRESHOLD (the default) at rest are linked. A linked point is free to STRIP beyond
+# its gap at rest, and is let go RELEASE beyond that.
 THRESHOLD, STRIP, RELEASE = 2.0, 0.5, 5.0
 # At rest points this share of a mean edge farther are linked too: a patch where two muscles touch may lie between them.
 BETWEEN = 0.5
