@@ -32,7 +32,7 @@ LARGEST_INTEGER = 2**53
 REMOVED_KEYS: dict[str, str] = {
     "contact.from_rest": "delete the key: solve_pose(scene, models, coordinates) in Python solves a pose from rest",
     "contact.detector": "delete the key; for other fields call simulate(scene, fields={bone: field}) in Python",
-    "contact.still_angle": "delete the key: a muscle is solved wherever its bones move against each other",
+    "contact.still_angle": "delete the key: a muscle is solved whenever its bones move against each other",
     "detect.tunnelling.smallest_step": "delete the key: steps are halved down to 0.1 degrees",
     "sliding.strip": "delete the key: a linked point is free to 0.5 mm beyond its gap at rest",
     "sliding.release": "delete the key: a point 5 mm beyond that is let go",
