@@ -33,15 +33,15 @@ test-fast: $(STAMP)
 test-nojit: $(STAMP)
 	NUMBA_DISABLE_JIT=1 $(PYTEST) -q $$(grep -v '^#' tests/nojit.txt)
 
-ROOMS := $(patsubst %/,%,$(sort $(dir $(wildcard rbfmuscle/*/__init__.py)))) pbd_baseline
+PACKAGES := $(patsubst %/,%,$(sort $(dir $(wildcard rbfmuscle/*/__init__.py)))) pbd_baseline
 # Loops count as covered where they run as Python: without compiler; the rest by all tests, child processes included.
 coverage: $(STAMP)
 	NUMBA_DISABLE_JIT=1 $(PYTEST) -q --cov --cov-report= $$(grep -v '^#' tests/nojit.txt)
 	$(PYTEST) -q --cov --cov-append --cov-report=term:skip-covered
-	@for room in $(ROOMS); do echo "$$room $$($(BIN)/python -m coverage report --include="$$room/*" --format=total) %"; done
+	@for package in $(PACKAGES); do echo "$$package $$($(BIN)/python -m coverage report --include="$$package/*" --format=total) %"; done
 
 # The tests under other BLAS kernels, processor features, threads, versions, and with vertices moved by last digits.
-# Hours for all; a part by TESTS="tests/implicit tests/model" ONLY="haswell oldest".
+# Hours for all; a part by TESTS="tests/implicit tests/muscle" ONLY="haswell oldest".
 TESTS ?= tests
 portability: $(STAMP)
 	$(BIN)/python benchmarks/portability.py $(TESTS) $(if $(ONLY),--only $(ONLY))

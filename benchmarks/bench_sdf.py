@@ -20,8 +20,8 @@ from peers.detectors import TreeDetector, VoxelDetector
 from peers.serendipity import SerendipityField
 from peers.spline import SplineField
 
-from rbfmuscle.sim.distance.errors import points_near
-from rbfmuscle.sim.distance.sdf import BoneSDF
+from rbfmuscle.bones.errors import points_near
+from rbfmuscle.bones.sdf import BoneSDF
 
 PSEUDONORMAL = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
 # Points for accuracy, for speed, and for the slow exact tools.

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 import rbfmuscle as rm
-from rbfmuscle.sim.scene.phantom import AXES, phantom_scene
-from rbfmuscle.sim.scene.settings import parse_settings
-from rbfmuscle.study.measure.mesh_distance import MeshDistance
+from rbfmuscle.metrics.mesh_distance import MeshDistance
+from rbfmuscle.scene.phantom import AXES, phantom_scene
+from rbfmuscle.scene.settings import parse_settings
 
 # Degrees from rest to the end of each coordinate, all together, or angles of stops on a way.
 RAMPS = {

@@ -16,16 +16,16 @@ from peers.fibre_material import PassiveFibres
 from peers.finite_element import HexSolid, brick_grid, follow, nearest_bone
 from scipy.spatial import cKDTree
 
+from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.model.muscle import RBFMuscle
-from rbfmuscle.model.options import RBFOptions
+from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.models import COMPARED
+from rbfmuscle.muscle.muscle import RBFMuscle
+from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.run import simulate
-from rbfmuscle.sim.distance.sdf import BoneSDF
-from rbfmuscle.sim.scene.attachments import signed_distances
-from rbfmuscle.sim.scene.motion import bone_poses
-from rbfmuscle.sim.scene.phantom import ATTACHED_ENDS, ATTACHED_WITHIN, MUSCLES, phantom_scene
-from rbfmuscle.study.measure.metrics import surface_distance
+from rbfmuscle.scene.attachments import signed_distances
+from rbfmuscle.scene.motion import bone_poses
+from rbfmuscle.scene.phantom import ATTACHED_ENDS, ATTACHED_WITHIN, MUSCLES, phantom_scene
 
 MUSCLE = "extensor"
 COORDINATE = "hip.flexion"

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.models import build_models
-from rbfmuscle.sim.loop.simulate import simulate_frames
-from rbfmuscle.sim.scene.scene import Scene
-from rbfmuscle.sim.scene.settings import parse_setting
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.settings import parse_setting
+from rbfmuscle.simulation.frame_loop import simulate_frames
 
 
 def frames_of(scene):

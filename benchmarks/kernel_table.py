@@ -14,16 +14,16 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from rbfmuscle.experiments.kernel_judge import ReferenceSurface
+from rbfmuscle.experiments.kernel_row import VOLUME_BOUND, measure_row
+from rbfmuscle.experiments.workers import threads_limited
 from rbfmuscle.implicit.extraction.sheets import count_sheets
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.kernels.table import KERNELS
 from rbfmuscle.implicit.placement.sampling import sample_surface
-from rbfmuscle.implicit.selection import SPAN, spacing, surface_miss
-from rbfmuscle.sim.scene.meshes import read_mesh
-from rbfmuscle.sim.scene.phantom import phantom_scene
-from rbfmuscle.study.experiment.kernel_judge import SurfaceJudge
-from rbfmuscle.study.experiment.kernel_row import VOLUME_BOUND, measure_row
-from rbfmuscle.study.experiment.workers import threads_limited
+from rbfmuscle.implicit.selection import SPAN, spacing, surface_error
+from rbfmuscle.scene.meshes.read import read_mesh
+from rbfmuscle.scene.phantom import phantom_scene
 
 SCANNED, LIMIT = 40, 1.05
 
@@ -60,7 +60,7 @@ def best_of_scan(judge, found, own):
     for epsilon in np.geomspace(*SPAN, SCANNED) / h:
         fit = replace(found.fit, epsilon=float(epsilon))
         try:
-            missed = surface_miss(fit.fit(sample.points, sample.normals), judge.points[::4], h)
+            missed = surface_error(fit.fit(sample.points, sample.normals), judge.points[::4], h)
         except np.linalg.LinAlgError:
             continue
         if missed < np.sqrt(2.0) * best:
@@ -79,7 +79,7 @@ def main():
     ratios, unfit = [], []
     for name, mesh in surfaces(options.data):
         vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
-        judge = SurfaceJudge(vertices, faces)
+        judge = ReferenceSurface(vertices, faces)
         for count in map(int, options.centres.split(",")):
             sample = sample_surface(vertices, faces, count, placement="greedy")
             for placement in options.placements.split(","):

@@ -34,10 +34,10 @@ from peers.known_scenes import (
     wrapped_strip,
 )
 
+from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.models import build_model
-from rbfmuscle.sim.loop.simulate import simulate_frames
-from rbfmuscle.sim.scene.phantom import phantom_scene
-from rbfmuscle.study.measure.metrics import surface_distance
+from rbfmuscle.scene.phantom import phantom_scene
+from rbfmuscle.simulation.frame_loop import simulate_frames
 
 CENTRES = (150, 300, 600, 1200)
 RBF = {"name": "rbf"}
@@ -73,7 +73,7 @@ class Played:
 def play(scene, *, surfaces=True):
     """Run a scene with one muscle to its last frame."""
     model = build_model(scene.muscles[0], scene)
-    rest = model.carried_mesh()
+    rest = model.material_mesh()
     last = len(scene.motion) - 1
     (frame,) = simulate_frames(scene, [model], surfaces=surfaces, written=[last])
     return Played(scene, rest, frame)
@@ -219,7 +219,7 @@ def flexed(model, *, spacing=3.0, substep=2.0):
     scene.muscles = [scene.muscle(MUSCLE)]
     scene = scene.with_options({"contact.substep_angle": substep})
     built = build_model(scene.muscles[0], scene)
-    rest, found, lengths = built.carried_mesh(), [], []
+    rest, found, lengths = built.material_mesh(), [], []
     for frame in simulate_frames(scene, [built]):
         mesh = frame.carried[MUSCLE]
         lengths.append(path_length(centreline(scene.muscles[0], scene, rest, mesh, frame.poses)))

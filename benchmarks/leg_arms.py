@@ -15,8 +15,8 @@ import numpy as np
 from evidence import data_folder
 
 from rbfmuscle.run import simulate
-from rbfmuscle.sim.scene.motion import Motion
-from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.scene.motion import Motion
+from rbfmuscle.scene.scene import Scene
 
 # Leading coordinate; those that go along (those of the squat, to its end); range of clinical angles that is compared.
 JOINTS = {

@@ -21,11 +21,11 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.surfaces import vertex_normals
+from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.models import build_models
-from rbfmuscle.sim.loop.simulate import FrameLoop
-from rbfmuscle.sim.plan.reach import build_fields, reached_bones
-from rbfmuscle.sim.scene.scene import Scene
-from rbfmuscle.study.measure.mesh_distance import MeshDistance
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.frame_loop import FrameLoop
+from rbfmuscle.simulation.plan.contact_pairs import build_fields, find_contact_pairs
 
 THRESHOLD = 2.0  # mm: nearer at rest is touching, as `[sliding]` has it
 FACING = 0.5  # cosine between a vertex's normal and the way to its neighbour, from which on it faces that
@@ -48,7 +48,7 @@ class Bench:
             one.muscles = [muscle for muscle in one.muscles if muscle.name in named]
         self.models = build_models(self.scenes[True])
         self.rest = [model.snapshot() for model in self.models]
-        self.fields = build_fields(self.scenes[True], reached_bones(self.scenes[True]))
+        self.fields = build_fields(self.scenes[True], find_contact_pairs(self.scenes[True]))
 
     def loop(self, *, sliding=True):
         """A loop at rest, to be closed."""
@@ -77,8 +77,8 @@ class Touching:
         Bones that hold vertices, empty where none does.
     """
 
-    def __init__(self, surfaces, holder):
-        self.held, self.found = {name: bones != "" for name, bones in holder.items()}, {}
+    def __init__(self, surfaces, attached_bone):
+        self.held, self.found = {name: bones != "" for name, bones in attached_bone.items()}, {}
         for one, other in itertools.permutations(surfaces, 2):
             near = _near(surfaces[one], surfaces[other], THRESHOLD)
             if len(near):

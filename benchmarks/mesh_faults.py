@@ -15,13 +15,13 @@ import time
 import numpy as np
 
 from rbfmuscle.geometry.surfaces import mesh_volume
+from rbfmuscle.metrics.mesh_distance import MeshDistance
+from rbfmuscle.metrics.penetration import BoneProbe, bone_depth, surface_depth
+from rbfmuscle.metrics.topology import SurfaceForm
 from rbfmuscle.models import build_model, configure_scene
-from rbfmuscle.sim.loop.simulate import simulate_frames
-from rbfmuscle.sim.scene.scene import Scene
-from rbfmuscle.sim.scene.settings import parse_settings
-from rbfmuscle.study.measure.mesh_distance import MeshDistance
-from rbfmuscle.study.measure.penetration import BoneProbe, bone_depth, surface_depth
-from rbfmuscle.study.measure.topology import SurfaceForm
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.settings import parse_settings
+from rbfmuscle.simulation.frame_loop import simulate_frames
 
 COLUMNS = (
     "held in bone",

@@ -15,12 +15,12 @@ import time
 
 import numpy as np
 
-from rbfmuscle.model.muscle import RBFMuscle
-from rbfmuscle.model.options import RBFOptions
-from rbfmuscle.sim.loop.simulate import simulate_frames
-from rbfmuscle.sim.scene.motion import Motion
-from rbfmuscle.sim.scene.phantom import phantom_scene
-from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.muscle.muscle import RBFMuscle
+from rbfmuscle.muscle.options import RBFOptions
+from rbfmuscle.scene.motion import Motion
+from rbfmuscle.scene.phantom import phantom_scene
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.frame_loop import simulate_frames
 
 STEP = 2.0  # degrees
 WALK, SEED = 5, 0

@@ -22,11 +22,11 @@ from evidence import commit, machine
 from peers.finite_element import TetSolid, follow, nearest_bone
 from scipy.spatial import cKDTree
 
+from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.run import simulate
-from rbfmuscle.sim.plan.reach import build_fields, reached_bones
-from rbfmuscle.sim.scene.motion import bone_poses, interpolate
-from rbfmuscle.sim.scene.scene import Scene
-from rbfmuscle.study.measure.metrics import surface_distance
+from rbfmuscle.scene.motion import bone_poses, interpolate
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.plan.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.validation import MissingPartError, SolveError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -91,7 +91,7 @@ class Course:
     def __init__(self, scene, edge):
         self.scene, self.muscle = scene, scene.muscles[0]
         self.solid = TetSolid(*tetrahedra(self.muscle.mesh, edge))
-        self.fields = build_fields(scene, reached_bones(scene))
+        self.fields = build_fields(scene, find_contact_pairs(scene))
         self.names = [attachment.bone for attachment in self.muscle.attachments]
         self.owner = self._attach()
         self.poses = bone_poses(scene, scene.motion.frames[0])

@@ -130,8 +130,8 @@ def write_scene_reference(root):
     root : pathlib.Path
     """
     from pbd_baseline.options import PBDOptions
-    from rbfmuscle.model.options import RBFOptions
-    from rbfmuscle.sim.scene.file import SceneFile
+    from rbfmuscle.muscle.options import RBFOptions
+    from rbfmuscle.scene.file import SceneFile
 
     schema = SceneFile.model_json_schema()
     models = [(options.__name__, options.model_json_schema()) for options in (RBFOptions, PBDOptions)]

@@ -16,7 +16,7 @@ from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.kernels.table import KERNELS
 from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import spacing
-from rbfmuscle.study.measure.metrics import surface_distance
+from rbfmuscle.metrics.metrics import surface_distance
 
 out = folder("choosing_a_kernel")
 mesh = rm.phantom_scene().muscle("abductor").mesh

@@ -16,10 +16,10 @@ from PIL import Image
 
 import rbfmuscle as rm
 from rbfmuscle.models import build_model
-from rbfmuscle.sim.loop.contact import BoneContacts
-from rbfmuscle.sim.loop.stepper import MuscleStepper
-from rbfmuscle.sim.scene.motion import bone_poses
-from rbfmuscle.sim.scene.options import ContactOptions, DetectOptions, SlidingOptions, TunnellingOptions
+from rbfmuscle.scene.motion import bone_poses
+from rbfmuscle.scene.options import ContactOptions, DetectOptions, SlidingOptions, TunnellingOptions
+from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.stepper import MuscleStepper
 
 out = folder("contact_pictures")
 pyvista.OFF_SCREEN = True
@@ -100,7 +100,7 @@ for action, title in (("report", "tunnelled"), ("substep", "corrected")):
     stepper = MuscleStepper(model, BoneContacts(names, fields, contact_bone=model.contact_bone), scene)
     stepper.step(rest, turned)
     remaining[action] = {event.action for event in stepper.collect()[1]}
-    panels.append((title, [(*model.carried_mesh(), "#a63d38", 0.75), *bones(scene, turned)]))
+    panels.append((title, [(*model.material_mesh(), "#a63d38", 0.75), *bones(scene, turned)]))
 picture("tunnelling", panels, view=(0.55, -0.8, 0.1), zoom=1.3)
 
 # Overlapping and resolved: a muscle from another source, two fifths too thick for these bones.

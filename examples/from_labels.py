@@ -20,7 +20,7 @@ from pictures import folder
 
 import rbfmuscle as rm
 from rbfmuscle.cli import main
-from rbfmuscle.study.files.saved import SavedRun
+from rbfmuscle.output.saved import SavedRun
 
 out = folder("from_labels")
 VOXEL = 1.5

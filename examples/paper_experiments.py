@@ -20,15 +20,15 @@ import numpy as np
 
 from pbd_baseline.muscle import PBDMuscle
 from pbd_baseline.options import PBDOptions
-from rbfmuscle.sim.loop.contact import BoneContacts
-from rbfmuscle.sim.loop.substeps import SubSteps
-from rbfmuscle.sim.loop.tunnelling import find_crossings
-from rbfmuscle.sim.plan.reach import build_fields, reached_bones
-from rbfmuscle.sim.scene.motion import bone_poses
-from rbfmuscle.sim.scene.options import TunnellingOptions
-from rbfmuscle.sim.scene.phantom import phantom_scene
-from rbfmuscle.sim.scene.scene import Scene
-from rbfmuscle.study.measure.penetration import BoneProbe, bone_depth, surface_depth
+from rbfmuscle.metrics.penetration import BoneProbe, bone_depth, surface_depth
+from rbfmuscle.scene.motion import bone_poses
+from rbfmuscle.scene.options import TunnellingOptions
+from rbfmuscle.scene.phantom import phantom_scene
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.plan.contact_pairs import build_fields, find_contact_pairs
+from rbfmuscle.simulation.substeps import SubSteps
+from rbfmuscle.simulation.tunnelling import find_crossings
 
 MODELS = ("pbd-paper", "pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
 # Coordinate, end and step [degree].
@@ -75,7 +75,7 @@ class Experiment:
             return
         self.coordinate = coordinate
         self.scene.set_motion(ramp={coordinate: {"from": 0, "to": end, "step": step}})
-        regions = reached_bones(self.scene)
+        regions = find_contact_pairs(self.scene)
         fields = build_fields(self.scene, regions)
         self.names = [bone.name for bone in scene.bones]
         self.sub_steps = SubSteps(self.scene)
@@ -142,7 +142,7 @@ class Record:
         # the muscle starts with an overlap; the first frame resolves it
         if self.frames > 1:
             self.depth = max(self.depth, depth)
-        self.bone_depth = max(self.bone_depth, bone_depth(*self.model.carried_mesh(), self.probes, poses))
+        self.bone_depth = max(self.bone_depth, bone_depth(*self.model.material_mesh(), self.probes, poses))
         self.volume = max(self.volume, abs(self.model.volume() / self.model.rest.volume.rest - 1.0))
         low, high = np.quantile(self.edge_lengths(points) / self.lengths, [0.01, 0.99])
         self.ratio = [min(self.ratio[0], low), max(self.ratio[1], high)]

@@ -6,7 +6,7 @@ Not an example itself.
 import sys
 from pathlib import Path
 
-from rbfmuscle.study.show.render import render_run
+from rbfmuscle.report.render import render_run
 from rbfmuscle.validation import MissingPartError
 
 _SAVED = {}  # runs that were drawn already, and their folders

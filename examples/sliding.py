@@ -8,8 +8,8 @@ import numpy as np
 from pictures import draw, folder, plot
 
 import rbfmuscle as rm
-from rbfmuscle.sim.scene.options import SlidingOptions
-from rbfmuscle.study.measure.mesh_distance import MeshDistance
+from rbfmuscle.metrics.mesh_distance import MeshDistance
+from rbfmuscle.scene.options import SlidingOptions
 
 out = folder("sliding")
 scene = rm.phantom_scene()

@@ -12,9 +12,9 @@ from pictures import folder, plot
 
 import rbfmuscle as rm
 from rbfmuscle.models import build_model
-from rbfmuscle.sim.loop.contact import BoneContacts
-from rbfmuscle.sim.loop.stepper import MuscleStepper
-from rbfmuscle.sim.scene.options import DetectOptions, TunnellingOptions
+from rbfmuscle.scene.options import DetectOptions, TunnellingOptions
+from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.stepper import MuscleStepper
 
 out = folder("tunnelling")
 scene = rm.phantom_scene()

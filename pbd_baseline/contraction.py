@@ -8,8 +8,8 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.jit import compiled
-from rbfmuscle.sim.contraction.law import FibreLaw
-from rbfmuscle.sim.contraction.resolve import resolve_contraction
+from rbfmuscle.scene.activation.law import FibreLaw
+from rbfmuscle.scene.activation.resolve import resolve_contraction
 
 # Weight of tendon edges in the ARAP energy. Beside a belly that shortens by a fifth tendon keeps its length within
 # 0.6 %; at 100 it takes up so little in an iteration that a belly between fixed bones ends 8 % too long.

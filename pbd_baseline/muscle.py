@@ -10,15 +10,15 @@ from pbd_baseline.contact import ContactConstraint
 from pbd_baseline.contraction import TENDON_WEIGHT, MeshFibres
 from pbd_baseline.motion import carry
 from pbd_baseline.options import PBDOptions
-from pbd_baseline.rest import Rest
+from pbd_baseline.rest import RestState
+from pbd_baseline.self_collision.contact import SoundContact
+from pbd_baseline.self_collision.ridges import Ridges
+from pbd_baseline.self_collision.untangling import Untangling
 from pbd_baseline.shapes import METHODS, sweeps
-from pbd_baseline.sound.contact import SoundContact
-from pbd_baseline.sound.ridges import Ridges
-from pbd_baseline.sound.untangling import Untangling
-from rbfmuscle.sim.loop.contact import BoneContacts
-from rbfmuscle.sim.loop.frame import FinishedDrawing, ModelSurface
-from rbfmuscle.sim.scene.objects import Muscle
-from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.frame import FinishedDrawing, ModelSurface
 
 # Bones are looked for within this distance [mm] of the vertices as predicted, and as swept.
 REACH = 6.0
@@ -37,7 +37,7 @@ STEP_ANGLE = math.radians(2.0)
 
 
 class PBDMuscle:
-    """A mesh muscle of any of the paper's kinds; implements ``rbfmuscle.sim.loop.frame.MuscleModel``.
+    """A mesh muscle of any of the paper's kinds; implements ``rbfmuscle.simulation.frame.MuscleModel``.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class PBDMuscle:
     def __init__(self, muscle: Muscle, scene: Scene, options: PBDOptions | None = None) -> None:
         self.name = muscle.name
         self.options = options or PBDOptions()
-        self.rest = Rest.from_muscle(muscle, scene, self.options)
+        self.rest = RestState.from_muscle(muscle, scene, self.options)
         self.fibres: Any = MeshFibres(muscle, self.rest) if muscle.contraction is not None else None
         stiffer = 1.0 if self.fibres is None else np.where(self.fibres.tendon, TENDON_WEIGHT, 1.0)
         method = METHODS[self.options.method]
@@ -91,7 +91,7 @@ class PBDMuscle:
         else:
             carry(self.points, self.rest.weights, motions)
         for b, bone in enumerate(self.rest.bones):
-            held = self.rest.holder == b
+            held = self.rest.attached_bone == b
             self.points[held] = self.rest.vertices[held] @ after[bone][:3, :3].T + after[bone][:3, 3]
 
     def solve(self, contacts: BoneContacts) -> None:
@@ -125,7 +125,7 @@ class PBDMuscle:
 
     def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
         """Move the vertices marked in a bool mask (n,) by a (4, 4) transform; held ones stay."""
-        which = self._vertices_of(which) & (self.rest.holder < 0)
+        which = self._vertices_of(which) & (self.rest.attached_bone < 0)
         self.points[which] = self.points[which] @ transform[:3, :3].T + transform[:3, 3]
 
     def _vertices_of(self, which):
@@ -149,7 +149,7 @@ class PBDMuscle:
         self.points[:], self.before = points, before.copy()
         self.shape.restore(shape)
 
-    def carried_mesh(self) -> tuple[np.ndarray, np.ndarray]:
+    def material_mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and faces, numbered as in the muscle's mesh but for the order of the faces."""
         vertices = np.empty_like(self.points)
         vertices[self.rest.order] = self.points
@@ -158,7 +158,7 @@ class PBDMuscle:
     def drawing(self, contacts: BoneContacts) -> FinishedDrawing:
         """What gives the mesh as it is now."""
         return FinishedDrawing(
-            ModelSurface(*self.carried_mesh(), {"solver_penetration_max": self.penetration})
+            ModelSurface(*self.material_mesh(), {"solver_penetration_max": self.penetration})
         )
 
     def volume(self) -> float:
@@ -195,7 +195,7 @@ def _bone_numbers(rest, scene):
     """Number in the scene of the bone that holds each vertex, -1 where it is free."""
     names = [bone.name for bone in scene.bones]
     numbers = np.array([names.index(bone) for bone in rest.bones])
-    return np.where(rest.holder < 0, -1, numbers[rest.holder])
+    return np.where(rest.attached_bone < 0, -1, numbers[rest.attached_bone])
 
 
 def _contact(rest, scene, options, numbers):
@@ -212,7 +212,7 @@ def _contact(rest, scene, options, numbers):
         shares,
         faces=faces,
         held=held,
-        holder=numbers[held],
+        attached_bone=numbers[held],
         skin=SKIN * edge,
         ridges=ridges,
         **usual,

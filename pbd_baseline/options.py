@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from rbfmuscle.sim.scene.options import NotNegative, Positive, Share, Table
+from rbfmuscle.scene.options import Fraction, NotNegative, Positive, Table
 
 
 class PBDOptions(Table):
@@ -23,8 +23,8 @@ class PBDOptions(Table):
     method: Literal["pbd", "pbd-paper", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved"] = "pbd"
     iterations: Annotated[int, Field(ge=0, le=10_000)] = 0
     fibre_exponent: NotNegative = 0.5
-    edge: Share = 1.0
-    bending: Share = 0.9
+    edge: Fraction = 1.0
+    bending: Fraction = 0.9
     edge_compliance: NotNegative = 0.2
     bending_compliance: NotNegative = 0.2
     arap_compliance: Positive = 1.0

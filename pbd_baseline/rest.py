@@ -11,11 +11,11 @@ from pbd_baseline.fibres import fibre_directions, swelling_room
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.topology import Topology, cache_order
 from pbd_baseline.weights import even_weights
+from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.harmonic import surface_gradient
-from rbfmuscle.sim.cache import content_key, load_arrays, store_arrays
-from rbfmuscle.sim.scene.objects import Muscle
-from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import SceneError
 
 # Raise it when weights or room are computed in another way: entries of the cache are then not found.
@@ -23,7 +23,7 @@ VERSION = 2
 
 
 @dataclass(frozen=True)
-class Rest:
+class RestState:
     """A muscle at rest, its vertices renumbered for the cache.
 
     Attributes
@@ -52,14 +52,14 @@ class Rest:
     topology: Topology
     bones: list[str]
     weights: np.ndarray
-    holder: np.ndarray
+    attached_bone: np.ndarray
     inverse_mass: np.ndarray
     fibres: np.ndarray
     room: np.ndarray
     volume: VolumeConstraint
 
     @classmethod
-    def from_muscle(cls, muscle: Muscle, scene: Scene, options: PBDOptions) -> Rest:
+    def from_muscle(cls, muscle: Muscle, scene: Scene, options: PBDOptions) -> RestState:
         """Measure a muscle of a scene.
 
         Parameters
@@ -77,15 +77,17 @@ class Rest:
         """
         if not muscle.attachments:
             raise SceneError(f"muscle {muscle.name!r} has no attachment, give attach a place on two bones")
-        order, vertices, faces, bones, holder = _renumbered(muscle)
+        order, vertices, faces, bones, attached_bone = _renumbered(muscle)
         topology = Topology.from_mesh(vertices, faces)
         volume = VolumeConstraint(vertices, faces)
-        inverse_mass = np.where(holder < 0, 1.0, 0.0)
-        weights, room = _weights_and_room(vertices, faces, holder, len(bones), volume, options.swelling_reach)
+        inverse_mass = np.where(attached_bone < 0, 1.0, 0.0)
+        weights, room = _weights_and_room(
+            vertices, faces, attached_bone, len(bones), volume, options.swelling_reach
+        )
         along = surface_gradient(vertices, faces, weights[:, -1])
         fibres = fibre_directions(vertices, along, muscle.fibres)
         return cls(
-            order, vertices, topology, bones, weights, holder, inverse_mass, fibres, room, volume
+            order, vertices, topology, bones, weights, attached_bone, inverse_mass, fibres, room, volume
         )  # fmt: skip
 
     def edge(self) -> float:
@@ -112,26 +114,28 @@ def _renumbered(muscle):
     vertices = np.ascontiguousarray(muscle.mesh.vertices, dtype=np.float64)[order]
     faces = _sorted_faces(place[np.asarray(muscle.mesh.faces)])
     bones = list(dict.fromkeys(attachment.bone for attachment in muscle.attachments))
-    holder = np.full(len(vertices), -1)
+    attached_bone = np.full(len(vertices), -1)
     for attachment in muscle.attachments:
-        holder[place[attachment.vertices]] = bones.index(attachment.bone)
-    return order, vertices, faces, bones, holder
+        attached_bone[place[attachment.vertices]] = bones.index(attachment.bone)
+    return order, vertices, faces, bones, attached_bone
 
 
-def _weights_key(vertices, faces, holder, swelling_reach):
-    return content_key(vertices, faces, ("mesh muscle", VERSION, swelling_reach, holder.tolist()))
+def _weights_key(vertices, faces, attached_bone, swelling_reach):
+    return content_key(vertices, faces, ("mesh muscle", VERSION, swelling_reach, attached_bone.tolist()))
 
 
-def _weights_and_room(vertices, faces, holder, bones, volume, swelling_reach):
+def _weights_and_room(vertices, faces, attached_bone, bones, volume, swelling_reach):
     """What takes nearly all the time of the build, from the cache on disk where it is known."""
-    key = _weights_key(vertices, faces, holder, swelling_reach)
+    key = _weights_key(vertices, faces, attached_bone, swelling_reach)
     known = load_arrays(key)
     if known is None or not {"weights", "room"} <= known.keys():
         normals = volume.gradient(vertices)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
         known = {
-            "weights": even_weights(vertices, faces, [np.flatnonzero(holder == b) for b in range(bones)]),
-            "room": swelling_room(vertices, faces, normals, holder >= 0, swelling_reach),
+            "weights": even_weights(
+                vertices, faces, [np.flatnonzero(attached_bone == b) for b in range(bones)]
+            ),
+            "room": swelling_room(vertices, faces, normals, attached_bone >= 0, swelling_reach),
         }
         store_arrays(key, known)
     return known["weights"], known["room"]

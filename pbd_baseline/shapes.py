@@ -20,7 +20,7 @@ from pbd_baseline.contraction import TENDON_WEIGHT, MeshFibres
 from pbd_baseline.factor import SymmetricFactor
 from pbd_baseline.fibres import edge_stiffness, vertex_areas
 from pbd_baseline.options import PBDOptions
-from pbd_baseline.rest import Rest
+from pbd_baseline.rest import RestState
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rotations import turned_quaternions
 from rbfmuscle.jit import compiled
@@ -44,7 +44,7 @@ class Shape:
 
     volume_in_sweeps = True
 
-    def __init__(self, rest: Rest) -> None:
+    def __init__(self, rest: RestState) -> None:
         self.volume, self.room, self.inverse_mass = rest.volume, rest.room, rest.inverse_mass
 
     def sweep(self, points: np.ndarray, time: float) -> None:
@@ -85,7 +85,7 @@ class PBDShape(Shape):
     soft_length = 0.3
     limits = LIMITS
 
-    def __init__(self, rest: Rest, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
+    def __init__(self, rest: RestState, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
         super().__init__(rest)
         stiffness = edge_stiffness(rest.vertices, rest.topology.edges, rest.fibres, options.fibre_exponent)
         stiffness = stiffness * np.minimum(1.0, self.soft_length / rest.relative_lengths())
@@ -124,7 +124,7 @@ class XPBDShape(Shape):
     the same place.
     """
 
-    def __init__(self, rest: Rest, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
+    def __init__(self, rest: RestState, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
         super().__init__(rest)
         softness = edge_stiffness(rest.vertices, rest.topology.edges, rest.fibres, options.fibre_exponent)
         self.edges = EdgeConstraint(rest.vertices, rest.topology.edges, limits=LIMITS)
@@ -156,7 +156,7 @@ class XPBDShape(Shape):
 class RotatingShape(Shape):
     """A shape whose neighbourhoods have rotations (`ARAP`), which it remembers from sweep to sweep."""
 
-    def __init__(self, rest: Rest, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
+    def __init__(self, rest: RestState, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
         super().__init__(rest)
         self.arap = ARAP(rest.vertices, rest.topology, stiffer=stiffer)
 
@@ -176,7 +176,7 @@ class RotatingShape(Shape):
 class ARAPShape(RotatingShape):
     """The ARAP energy as PBD constraints: the paper's section 6.2, first option."""
 
-    def __init__(self, rest: Rest, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
+    def __init__(self, rest: RestState, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
         super().__init__(rest, options, stiffer)
         self.constraint = ARAPConstraint(self.arap, compliance=options.arap_compliance)
 
@@ -200,7 +200,7 @@ class GlobalARAPShape(RotatingShape):
     muscle is pulled through the bone that it wraps. A free fixed point is the same for any l.
     """
 
-    def __init__(self, rest: Rest, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
+    def __init__(self, rest: RestState, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
         super().__init__(rest, options, stiffer)
         self.free = np.flatnonzero(rest.inverse_mass > 0.0)
         self.held = np.flatnonzero(rest.inverse_mass == 0.0)

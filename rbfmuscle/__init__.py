@@ -12,23 +12,23 @@ from typing import Any
 __version__ = "0.1.0"
 
 _HOME = {
-    "BoneSDF": "rbfmuscle.sim.distance.sdf",
+    "BoneSDF": "rbfmuscle.bones.sdf",
     "LimitExceededError": "rbfmuscle.validation",
     "MeshError": "rbfmuscle.validation",
     "MissingPartError": "rbfmuscle.validation",
     "NumericalWarning": "rbfmuscle.validation",
     "RBFField": "rbfmuscle.implicit.field",
-    "RBFMuscle": "rbfmuscle.model.muscle",
+    "RBFMuscle": "rbfmuscle.muscle.muscle",
     "RBFMuscleError": "rbfmuscle.validation",
     "Run": "rbfmuscle.run",
-    "Scene": "rbfmuscle.sim.scene.scene",
+    "Scene": "rbfmuscle.scene.scene",
     "SceneError": "rbfmuscle.validation",
     "SolveError": "rbfmuscle.validation",
     "compare_models": "rbfmuscle.compare",
-    "phantom_scene": "rbfmuscle.sim.scene.phantom",
-    "reach_error": "rbfmuscle.study.experiment.wanted_error",
+    "phantom_scene": "rbfmuscle.scene.phantom",
+    "reach_error": "rbfmuscle.experiments.wanted_error",
     "simulate": "rbfmuscle.run",
-    "study_kernels": "rbfmuscle.study.experiment.kernel_study",
+    "study_kernels": "rbfmuscle.experiments.kernel_study",
 }
 
 __all__ = [*_HOME, "__version__"]

@@ -7,26 +7,26 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rbfmuscle.models import COMPARED, build_models, check_model_name, configure_scene
-from rbfmuscle.progress import stage
-from rbfmuscle.run import stream_run
-from rbfmuscle.sim.loop.simulate import simulate_frames
-from rbfmuscle.sim.scene.motion import Motion
-from rbfmuscle.sim.scene.options import OutputOptions
-from rbfmuscle.sim.scene.settings import chooses_model
-from rbfmuscle.study.experiment.comparison import (
+from rbfmuscle.experiments.comparison import (
     ModelProbe,
     add_distances,
     chosen_poses,
     measure_run,
     write_tables,
 )
-from rbfmuscle.study.files.saved import SavedRun
-from rbfmuscle.study.files.writer import check_writable
+from rbfmuscle.models import COMPARED, build_models, check_model_name, configure_scene
+from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.output.writer import check_writable
+from rbfmuscle.progress import stage
+from rbfmuscle.run import stream_run
+from rbfmuscle.scene.motion import Motion
+from rbfmuscle.scene.options import OutputOptions
+from rbfmuscle.scene.settings import chooses_model
+from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.validation import SolveError, UsageError
 
 if TYPE_CHECKING:
-    from rbfmuscle.sim.scene.scene import Scene
+    from rbfmuscle.scene.scene import Scene
 
 
 # The motion is repeated with steps this many times as long.
@@ -103,7 +103,7 @@ def compare_models(
         matrix = add_distances(results, folder, poses)
     table = write_tables(folder, next(iter(variants.values())), results, failed, matrix, poses)
 
-    from rbfmuscle.study.show.comparison_page import write_page
+    from rbfmuscle.report.comparison_page import write_page
 
     with stage("drawing pictures" if pictures else "writing the report"):
         missing = write_page(folder, table, pictures=pictures)

@@ -4,10 +4,10 @@ import importlib
 from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
-from rbfmuscle.sim.loop.frame import MuscleModel
-from rbfmuscle.sim.scene.objects import Muscle
-from rbfmuscle.sim.scene.options import Table
-from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.options import Table
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.frame import MuscleModel
 from rbfmuscle.validation import SceneError, UsageError, did_you_mean, shown
 
 
@@ -20,7 +20,7 @@ class _Home(NamedTuple):
     implied: dict
 
 
-_RBF = "rbfmuscle.model", "RBFMuscle", "RBFOptions"
+_RBF = "rbfmuscle.muscle", "RBFMuscle", "RBFOptions"
 _PBD = "pbd_baseline", "PBDMuscle", "PBDOptions"
 _HOME = {
     "rbf": _Home(*_RBF, {}),
@@ -75,7 +75,7 @@ def solved_points(muscle: Muscle, scene: Scene) -> str:
 
 def build_models(scene: Scene, names: Collection[str] | None = None) -> list[MuscleModel]:
     """Return the models of a scene's muscles, all or those named, in the scene's order, built side by side."""
-    from rbfmuscle.sim.loop.workers import Workers
+    from rbfmuscle.simulation.workers import Workers
 
     muscles = [muscle for muscle in scene.muscles if names is None or muscle.name in names]
     workers = Workers(len(muscles))

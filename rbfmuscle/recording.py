@@ -11,18 +11,18 @@ from datetime import UTC, datetime
 import numba
 
 from rbfmuscle.geometry.fields import BoneField
+from rbfmuscle.metrics.quantities import Row
+from rbfmuscle.metrics.recorder import MetricsRecorder
+from rbfmuscle.metrics.summary import LIMITS, Summary, default_limit
+from rbfmuscle.output.runinfo import Clock, Stages, build_info, frame_facts
+from rbfmuscle.output.sinks import Sink
 from rbfmuscle.progress import stage
-from rbfmuscle.sharing.crew import Crew
-from rbfmuscle.sharing.share import Share, timed
-from rbfmuscle.sim.loop.frame import Event, Frame
-from rbfmuscle.sim.plan.processes import helpers_for
-from rbfmuscle.sim.scene.check import bone_collisions, bone_findings, check_initial
-from rbfmuscle.sim.scene.scene import Scene
-from rbfmuscle.study.files.runinfo import Clock, Stages, build_info, frame_facts
-from rbfmuscle.study.files.sinks import Sink
-from rbfmuscle.study.measure.quantities import Row
-from rbfmuscle.study.measure.recorder import MetricsRecorder
-from rbfmuscle.study.measure.summary import LIMITS, Summary, default_limit
+from rbfmuscle.scene.check import bone_collisions, bone_findings, check_initial
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.sharing.crew import WorkerPool
+from rbfmuscle.sharing.share import MuscleGroup, timed
+from rbfmuscle.simulation.frame import Event, Frame
+from rbfmuscle.simulation.plan.processes import helpers_for
 from rbfmuscle.validation import RBFMuscleError, SceneWarning, SolveError
 
 
@@ -67,8 +67,8 @@ class Recording:
         """All muscles, here or in helpers' hands, and the events of bones; a scene that is refused ends the helpers."""
         if helpers < 2:
             check_initial(self.scene)
-            return Share(self.scene, fields=fields), _bones_driven_together(self.scene)
-        crew = Crew(self.scene, helpers)
+            return MuscleGroup(self.scene, fields=fields), _bones_driven_together(self.scene)
+        crew = WorkerPool(self.scene, helpers)
         try:
             check_initial(self.scene)
             driven = _bones_driven_together(self.scene)

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.fields import BoneField
+from rbfmuscle.metrics.quantities import Row
+from rbfmuscle.metrics.summary import parse_limits, require_limits
 from rbfmuscle.models import configure_scene
+from rbfmuscle.output.sinks import MemorySink
+from rbfmuscle.output.writer import RunWriter, check_writable
 from rbfmuscle.progress import Progress, stage
 from rbfmuscle.recording import Recording
-from rbfmuscle.sim.loop.frame import Event, Frame
-from rbfmuscle.sim.scene.scene import Scene
-from rbfmuscle.study.files.sinks import MemorySink
-from rbfmuscle.study.files.writer import RunWriter, check_writable
-from rbfmuscle.study.measure.quantities import Row
-from rbfmuscle.study.measure.summary import parse_limits, require_limits
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.frame import Event, Frame
 from rbfmuscle.validation import SolveError, UsageError
 
 
@@ -108,7 +108,7 @@ def stream_run(
     model, settings, frames, progress
         As for `simulate`.
     fail_on : str, list of str or dict, optional
-        Limits, see `rbfmuscle.study.measure.summary.parse_limits`.
+        Limits, see `rbfmuscle.metrics.summary.parse_limits`.
     pictures : bool
         Draw pictures for the report and the preview.
     watch : callable, optional
@@ -151,7 +151,7 @@ def _finish(recording, writer, limits, pictures):
     missing = None
     with recording.timed("report"), stage("drawing pictures"):
         if output.report or output.preview:
-            from rbfmuscle.study.show.report import write_report
+            from rbfmuscle.report.report import write_report
 
             missing = write_report(
                 writer.directory, report=output.report, preview=output.preview and pictures, pictures=pictures

@@ -6,9 +6,9 @@ import numpy as np
 import trimesh
 
 from rbfmuscle.geometry.harmonic import harmonic_weights
-from rbfmuscle.sim.loop.frame import FinishedDrawing, ModelSurface
-from rbfmuscle.sim.scene.options import OutputOptions
-from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.scene.options import OutputOptions
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.frame import FinishedDrawing, ModelSurface
 from rbfmuscle.validation import SolveError
 
 
@@ -57,7 +57,7 @@ class BlendMuscle:
     def settle(self, contacts):
         pass
 
-    def carried_mesh(self):
+    def material_mesh(self):
         return self.x.copy(), self.faces
 
     def drawing(self, contacts):

@@ -33,7 +33,7 @@ def _move_vertices():
     import numpy as np
     import trimesh
 
-    from rbfmuscle.sim.scene import meshes
+    from rbfmuscle.scene.meshes import read as meshes
 
     def prepared(vertices, faces, prepare=meshes.prepare_mesh, **named):
         sound = np.ndim(vertices) == 2 and np.size(vertices) and (np.abs(vertices) < 1e30).all()
@@ -72,7 +72,7 @@ def hip_data():
 @pytest.fixture(scope="session")
 def hip_scene(hip_data):
     """The flexion scene of the real hip, loaded once; copy before changing it."""
-    from rbfmuscle.sim.scene.scene import Scene
+    from rbfmuscle.scene.scene import Scene
 
     return Scene.load(hip_data / "flexion.toml")
 

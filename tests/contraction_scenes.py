@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from peers.known_scenes import FAR, Bar, _block
 
-from rbfmuscle.sim.scene.attachments import Attachment
-from rbfmuscle.sim.scene.phantom_shapes import stitch
-from rbfmuscle.sim.scene.scene import Scene
-from rbfmuscle.study.measure.contraction import belly_measures
-from rbfmuscle.study.measure.mesh_distance import MeshDistance
+from rbfmuscle.metrics.contraction import belly_measures
+from rbfmuscle.metrics.mesh_distance import MeshDistance
+from rbfmuscle.scene.attachments import Attachment
+from rbfmuscle.scene.phantom_shapes import stitch
+from rbfmuscle.scene.scene import Scene
 
 MUSCLE = "muscle"
 # Long against its radius: the ends keep theirs, over about one radius each, and that volume goes to the middle.
@@ -124,7 +124,7 @@ def bar_scene(*, bar=FREE_BAR, spacing=2.5, model="rbf", **contraction):
 
 def with_frames(scene, pulls, length):
     """The scene with one frame for each pull of the slider [mm, positive shortens]."""
-    from rbfmuscle.sim.scene.motion import Motion
+    from rbfmuscle.scene.motion import Motion
 
     far = FAR * length
     moved = scene.copy()

@@ -5,8 +5,8 @@ import trimesh
 
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.implicit.placement.lattice import Lattice
-from rbfmuscle.model.solid import EmbeddedSolid
-from rbfmuscle.sim.loop.contact import BoneContacts
+from rbfmuscle.muscle.solid import EmbeddedSolid
+from rbfmuscle.simulation.contact import BoneContacts
 
 NO_BONES = [], []
 

@@ -3,7 +3,7 @@
 import numpy as np
 import trimesh
 
-from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.scene.scene import Scene
 
 CENTRE = np.array([0.0, -22.0, 0.0])
 

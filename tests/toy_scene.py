@@ -6,10 +6,10 @@ import numpy as np
 import trimesh
 
 from rbfmuscle.jit import compiled
-from rbfmuscle.sim.loop.frame import FinishedDrawing, ModelSurface
-from rbfmuscle.sim.scene.joint_tables import JointTable
-from rbfmuscle.sim.scene.motion import Motion
-from rbfmuscle.sim.scene.options import ContactOptions, DetectOptions
+from rbfmuscle.scene.joints.tables import JointTable
+from rbfmuscle.scene.motion import Motion
+from rbfmuscle.scene.options import ContactOptions, DetectOptions
+from rbfmuscle.simulation.frame import FinishedDrawing, ModelSurface
 
 
 class AnalyticBone:
@@ -162,7 +162,7 @@ class ToyMuscle:
     def settle(self, contacts):
         pass
 
-    def carried_mesh(self):
+    def material_mesh(self):
         return self.x.copy(), self.faces
 
     def drawing(self, contacts):

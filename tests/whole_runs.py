@@ -17,7 +17,7 @@ from peers.serendipity import SerendipityField
 from spindle_scene import CENTRE, build_scene
 
 import rbfmuscle as rm
-from rbfmuscle.sim.scene.options import ContactOptions, DetectOptions, SlidingOptions, TunnellingOptions
+from rbfmuscle.scene.options import ContactOptions, DetectOptions, SlidingOptions, TunnellingOptions
 
 FOLDER = Path(__file__).resolve().parent / "data" / "references"
 # A few points of each muscle say where all are: they hang together through one matrix.

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from rbfmuscle.bones.mesh import prepare_bone, winding_test
 from rbfmuscle.geometry.arrays import Booleans, Floats, MeshLike
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.sim.distance.mesh import prepare_bone, winding_test
 from rbfmuscle.validation import check_mesh, check_points
 
 # Share of the longest side that a baseline's grid reaches beyond the mesh.

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.study.measure.centreline import Centreline, MuscleAtRest
+from rbfmuscle.metrics.centreline import Centreline, MuscleAtRest
 
 # Points of a centreline: their chords fall short of an arc of 90 degrees by 0.01 %.
 SLICES = 64
@@ -134,7 +134,7 @@ def stretched_bar_errors(stretch, bar, rest, frame):
     bar : peers.known_scenes.Bar
     rest : (vertices, faces)
         The model's material surface at rest.
-    frame : rbfmuscle.sim.loop.simulate.Frame
+    frame : rbfmuscle.simulation.frame_loop.Frame
         With a surface.
 
     Returns

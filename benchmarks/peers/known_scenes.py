@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rbfmuscle.sim.scene.attachments import Attachment
-from rbfmuscle.sim.scene.phantom_shapes import stitch
-from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.scene.attachments import Attachment
+from rbfmuscle.scene.phantom_shapes import stitch
+from rbfmuscle.scene.scene import Scene
 
 # The centre of the joint that pulls lies this many bar lengths away: the path of the end is straight to half of
 # its inverse (5e-5 of the pull) and turns by 1e-4 radian at most.

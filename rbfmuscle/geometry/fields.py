@@ -15,7 +15,7 @@ class Field(Protocol):
         """Values (n,) and gradients (n, 3) at points (n, 3)."""
 
 
-class Cut(Protocol):
+class ClipDistance(Protocol):
     """What cuts a surface: a signed distance, negative inside, that need not be exact far away.
 
     Attributes

@@ -93,7 +93,7 @@ def spacing(points: ArrayLike) -> Floats:
     return np.asarray(distance)
 
 
-def surface_miss(fitted: RBFField, points: Floats, reach: float) -> float:
+def surface_error(fitted: RBFField, points: Floats, reach: float) -> float:
     """Root mean square distance of a field's surface from points that should lie on it, to first order.
 
     |f| / |grad f|, at most ``reach``. Where the field is flat it knows no surface, though it may be 0: beyond a few
@@ -191,7 +191,7 @@ class _Search:
             warnings.simplefilter("ignore", NumericalWarning)
             try:
                 field = replace(self.fit, epsilon=epsilon).fit(self.points, self.normals)
-                trial = epsilon, surface_miss(field, self.held_out, self.reach), field.condition
+                trial = epsilon, surface_error(field, self.held_out, self.reach), field.condition
                 self.fields[epsilon] = field
             except np.linalg.LinAlgError:
                 pass

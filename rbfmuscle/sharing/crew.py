@@ -20,15 +20,15 @@ import numba
 
 from rbfmuscle.child import gone, how_it_ended, send, start_child
 from rbfmuscle.progress import stage
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.sharing.share import Solved
-from rbfmuscle.sim.scene.scene import Scene
 
 # Frames that a helper may be ahead of what is written: memory is bounded, and nobody waits for the disk.
 AHEAD = 1
 
 
-class Crew:
-    """Stands in for a `Share` of all muscles: same frames, to the last digit.
+class WorkerPool:
+    """Stands in for a `MuscleGroup` of all muscles: same frames, to the last digit.
 
     Parameters
     ----------
@@ -46,10 +46,10 @@ class Crew:
         self.scene = scene
         threads = max(1, numba.get_num_threads() // helpers)
         self._told: set[str] = set()
-        self._helpers: list[_Helper] = []
+        self._helpers: list[_Worker] = []
         try:
             for names in _dealt([muscle.name for muscle in scene.muscles], helpers):
-                self._helpers.append(_Helper((scene, names), threads))
+                self._helpers.append(_Worker((scene, names), threads))
         except BaseException:
             self.close()
             raise
@@ -66,7 +66,7 @@ class Crew:
             self._next(helper)
 
     def frames(self) -> Iterator[Solved]:
-        """As of a `Share`."""
+        """As of a `MuscleGroup`."""
         for helper in self._helpers:
             helper.begin()
         with stage("solving the first frame"):
@@ -100,7 +100,7 @@ class Crew:
                 logging.getLogger(what[0]).log(*what[1:])
 
 
-class _Helper:
+class _Worker:
     """One process, seen from here: its messages are taken by a thread, so that it need not wait for ours."""
 
     def __init__(self, job: Any, threads: int) -> None:

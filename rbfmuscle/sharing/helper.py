@@ -1,4 +1,4 @@
-"""The life of a process that takes a share of a run's muscles: ``python -m rbfmuscle.sharing.helper``, by `Crew` alone.
+"""A process that takes some of a run's muscles: ``python -m rbfmuscle.sharing.helper``, started by `WorkerPool`.
 
 It is given a scene and the names of its muscles on standard input, and gives pairs of a kind and what it is about on
 standard output, each with its clock. It ends with the process that started it.
@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rbfmuscle.child import Outbox, listen
-from rbfmuscle.sharing.share import Share
+from rbfmuscle.sharing.share import MuscleGroup
 from rbfmuscle.validation import RBFMuscleError
 
 
@@ -50,7 +50,7 @@ def main() -> None:
     warnings.showwarning = lambda message, *_: outbox.say("warned", message)
     logging.getLogger("rbfmuscle").addHandler(_Forward(outbox))
     try:
-        _work(outbox, words, Share(scene, names))
+        _work(outbox, words, MuscleGroup(scene, names))
     except (RBFMuscleError, MemoryError, OSError) as error:  # what the command line tells in one line
         outbox.say("failed", error)
     except Exception:  # noqa: BLE001 - whatever it is, it is told where the run was asked for

@@ -8,12 +8,12 @@ from contextlib import contextmanager
 from typing import NamedTuple
 
 from rbfmuscle.geometry.fields import BoneField
+from rbfmuscle.metrics.metrics import Measured, MuscleMeasures
 from rbfmuscle.models import build_models
 from rbfmuscle.progress import stage
-from rbfmuscle.sim.loop.frame import Frame
-from rbfmuscle.sim.loop.simulate import simulate_frames
-from rbfmuscle.sim.scene.scene import Scene
-from rbfmuscle.study.measure.metrics import Measured, MuscleMeasures
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.frame import Frame
+from rbfmuscle.simulation.frame_loop import simulate_frames
 
 
 class Solved(NamedTuple):
@@ -30,7 +30,7 @@ class Solved(NamedTuple):
     measured: dict[str, Measured]
 
 
-class Share:
+class MuscleGroup:
     """Some muscles of a scene, or all.
 
     Parameters
@@ -64,7 +64,7 @@ class Share:
         self.scene, self._fields = scene, fields
         self.times: dict[str, float] = {}
         self.models = build_models(scene, names)
-        carried = {model.name: model.carried_mesh() for model in self.models}
+        carried = {model.name: model.material_mesh() for model in self.models}
         self._measures = MuscleMeasures(scene, carried) if scene.output.metrics else None
 
     def frames(self) -> Iterator[Solved]:

@@ -13,8 +13,8 @@ import pytest
 import trimesh
 from command_line import call
 
-from rbfmuscle.app import app
-from rbfmuscle.sim.scene.phantom import phantom_scene
+from rbfmuscle.cli.app import app
+from rbfmuscle.scene.phantom import phantom_scene
 
 
 @pytest.fixture(scope="module")
@@ -138,9 +138,9 @@ class TestRun:
         [
             (("run",), "rbfmuscle.run.Recording"),
             (("compare",), "rbfmuscle.compare._measure"),
-            (("kernels",), "rbfmuscle.study.experiment.kernel_study.study_kernels"),
-            (("kernels", "--error", "1"), "rbfmuscle.study.experiment.wanted_error.reach_error"),
-            (("paths",), "rbfmuscle.commands.opensim.sampling.sample_muscles"),
+            (("kernels",), "rbfmuscle.experiments.kernel_study.study_kernels"),
+            (("kernels", "--error", "1"), "rbfmuscle.experiments.wanted_error.reach_error"),
+            (("paths",), "rbfmuscle.cli.sampling.sample_muscles"),
         ],
     )
     def test_output_that_cannot_be_written_is_told_before_any_work(
@@ -155,7 +155,7 @@ class TestRun:
     def test_full_disk_is_one_line(self, phantom_folder, tmp_path, capsys, monkeypatch):
         import errno
 
-        from rbfmuscle.study.files import vtp, writer
+        from rbfmuscle.output import vtp, writer
 
         real, count = vtp.write_vtp, [0]
 
@@ -168,7 +168,7 @@ class TestRun:
         for module in (vtp, writer):
             if hasattr(module, "write_vtp"):
                 monkeypatch.setattr(module, "write_vtp", full)
-        monkeypatch.setattr("rbfmuscle.study.files.meshfiles.write_vtp", full, raising=False)
+        monkeypatch.setattr("rbfmuscle.output.meshfiles.write_vtp", full, raising=False)
         code, _, err = call(capsys, "run", phantom_folder / "hip.toml", "-o", tmp_path / "o")
         assert code == 5 and "No space left" in err and "Traceback" not in err
         info = json.loads((tmp_path / "o" / "run.json").read_text())
@@ -288,7 +288,7 @@ class TestErrors:
 
     def test_bug_is_one_line(self, phantom_folder):
         code = (
-            "import rbfmuscle.sim.scene.scene as s, sys\n"
+            "import rbfmuscle.scene.scene as s, sys\n"
             "def load(path, **options): raise ZeroDivisionError('planted')\n"
             "s.Scene.load = load\n"
             "from rbfmuscle.cli import main\nmain(['check', 'x.toml'])"
@@ -323,7 +323,7 @@ class TestOtherCommands:
     def test_new_on_the_real_hip_finds_the_joint(self, hip_data, tmp_path, capsys):
         import shutil
 
-        from rbfmuscle.sim.scene.scene import Scene
+        from rbfmuscle.scene.scene import Scene
 
         for name in ("pelvis", "sacrum", "femur", "gluteus_maximus", "iliacus"):
             shutil.copy(hip_data / f"{name}.ply", tmp_path)

@@ -16,9 +16,9 @@ import trimesh
 from blend_model import arm_scene, use_blend_model
 from command_line import call
 
+from rbfmuscle.output.export import export_run
+from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.run import stream_run
-from rbfmuscle.study.files.export import export_run
-from rbfmuscle.study.files.saved import SavedRun
 from rbfmuscle.validation import UsageError
 
 PROGRAM = [sys.executable, "-m", "rbfmuscle"]
@@ -66,9 +66,9 @@ class TestInterrupts:
         scene = write_scene(tmp_path, end=60)
         place = {
             "import": "import cyclopts",
-            "load": "from rbfmuscle.sim.scene import mesh_repair as m; name = 'repair'",
+            "load": "from rbfmuscle.scene import mesh_repair as m; name = 'repair'",
             "build": "import pbd_baseline.muscle as m; name = '_contact_carriers'",
-            "run": "import rbfmuscle.study.files.writer as m; name = 'write_mesh'",
+            "run": "import rbfmuscle.output.writer as m; name = 'write_mesh'",
         }[moment]
         code = (
             "import os, sys, builtins\n"
@@ -106,7 +106,7 @@ class TestInterrupts:
     def test_interrupt_that_is_lost_in_a_callback_is_heeded_at_the_next_frame(self, tmp_path):
         scene = write_scene(tmp_path, end=60)
         code = (
-            "import os, signal, sys\nimport rbfmuscle.cli as cli, rbfmuscle.study.files.writer as m\n"
+            "import os, signal, sys\nimport rbfmuscle.cli as cli, rbfmuscle.output.writer as m\n"
             "inner, count = m.write_mesh, [0]\n"
             "def struck(*a, **k):\n"
             "    count[0] += 1\n"
@@ -151,7 +151,7 @@ class TestInterrupts:
     def test_json_is_told_of_an_interrupt(self, tmp_path):
         code = (
             "import os, signal, sys, rbfmuscle.cli as cli\n"
-            "import rbfmuscle.sim.scene.file as m\n"
+            "import rbfmuscle.scene.file as m\n"
             "m.read_scene_file = lambda path: os.kill(os.getpid(), signal.SIGINT)\n"
             "sys.argv = ['rbfmuscle', 'check', 'a.toml', '--json']\ncli.main()\n"
         )
@@ -196,7 +196,7 @@ class TestOutputs:
     def test_full_disk_for_kernels_names_the_folder(self, tmp_path, capsys, monkeypatch):
         import errno
 
-        from rbfmuscle.study.show import kernel_page
+        from rbfmuscle.report import kernel_page
 
         trimesh.creation.icosphere(subdivisions=2, radius=20).export(tmp_path / "ball.ply")
 
@@ -255,7 +255,7 @@ class TestKilledRuns:
         assert (killed / "last.png").read_bytes().startswith(b"\x89PNG")
 
     def test_it_is_scrubbed_in_the_viewer(self, killed):
-        from rbfmuscle.study.show.view.saved import SavedViewer
+        from rbfmuscle.report.viewer.saved import SavedViewer
 
         viewer = SavedViewer(SavedRun(killed))
         viewer.scrub(5)

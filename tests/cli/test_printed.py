@@ -7,7 +7,7 @@ import pytest
 from blend_model import arm_files, use_blend_model
 from command_line import call
 
-from rbfmuscle.commands.run import SHOWN
+from rbfmuscle.cli.run import SHOWN
 
 TWO = (("biceps", 0.0), ("long_head", 60.0))
 

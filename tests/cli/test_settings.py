@@ -13,9 +13,9 @@ from cyclopts import Parameter
 
 from pbd_baseline.options import PBDOptions
 from rbfmuscle import commands
-from rbfmuscle.model.options import RBFOptions
 from rbfmuscle.models import MODEL_NAMES
-from rbfmuscle.sim.scene import options
+from rbfmuscle.muscle.options import RBFOptions
+from rbfmuscle.scene import options
 
 # A value for every key, other than its default; model settings of quick muscles.
 TABLES = {

@@ -16,15 +16,15 @@ from blend_model import arm_files, arm_scene, use_blend_model
 from command_line import call
 
 import rbfmuscle as rm
-from rbfmuscle.commands.plan import _lines as plan_lines
-from rbfmuscle.sim.scene.check import check_centre, check_extents, check_scene
-from rbfmuscle.study.measure.summary import require_limits
-from rbfmuscle.study.show.comparison_page import cell
-from rbfmuscle.study.show.kernel_page import COLUMNS
-from rbfmuscle.study.show.kernel_page import _row as kernel_row
-from rbfmuscle.study.show.report import _cell as report_cell
-from rbfmuscle.study.show.report import _facts, _stages, _summary, _verdict
-from rbfmuscle.study.show.sweep_page import _cell as sweep_cell
+from rbfmuscle.cli.plan import _lines as plan_lines
+from rbfmuscle.metrics.summary import require_limits
+from rbfmuscle.report.comparison_page import cell
+from rbfmuscle.report.kernel_page import COLUMNS
+from rbfmuscle.report.kernel_page import _row as kernel_row
+from rbfmuscle.report.report import _cell as report_cell
+from rbfmuscle.report.report import _facts, _stages, _summary, _verdict
+from rbfmuscle.report.sweep_page import _cell as sweep_cell
+from rbfmuscle.scene.check import check_centre, check_extents, check_scene
 from rbfmuscle.validation import LimitExceededError, MeshError, SceneError
 
 

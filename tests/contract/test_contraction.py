@@ -18,7 +18,7 @@ from contraction_scenes import (
 from peers.known_scenes import Bar
 
 import rbfmuscle as rm
-from rbfmuscle.sim.contraction.keys import ContractionTable
+from rbfmuscle.scene.activation.keys import ContractionTable
 
 MODELS = ("rbf", "pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
 SETTLED = ("rbf", "arap-volume", "arap-interleaved")
@@ -94,13 +94,13 @@ def test_spindle_lies_near_finite_elements():
 
 @pytest.mark.parametrize("model", ("rbf", "arap-volume"))
 def test_pennate_panel_turns_its_fibres_as_its_volume_says(model):
+    from rbfmuscle.metrics.centreline import MuscleAtRest
+    from rbfmuscle.metrics.contraction import ContractionStudy, pennation
     from rbfmuscle.models import build_model
-    from rbfmuscle.study.measure.centreline import MuscleAtRest
-    from rbfmuscle.study.measure.contraction import ContractionStudy, pennation
 
     scene = panel_scene(0.8, model=model, spacing=6.0)
     run = rm.simulate(scene, settings={"output.surfaces": False})
-    rest = build_model(scene.muscles[0], scene).carried_mesh()
+    rest = build_model(scene.muscles[0], scene).material_mesh()
     study = ContractionStudy(MuscleAtRest(scene.muscles[0], scene.joints, *rest))
     lines = study.lines(carried(run, -1))
     assert pennation(lines, study.belly, np.eye(3)[0]) == pytest.approx(panel_pennation(0.8), abs=1.0)

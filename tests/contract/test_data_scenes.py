@@ -4,9 +4,9 @@ import pytest
 
 from rbfmuscle.models import check_models
 from rbfmuscle.run import simulate
-from rbfmuscle.sim.plan.plan import plan_scene
-from rbfmuscle.sim.scene.check import check_initial
-from rbfmuscle.sim.scene.scene import Scene
+from rbfmuscle.scene.check import check_initial
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.plan.plan import plan_scene
 
 # Muscles and bones of each scene.
 SCENES = {

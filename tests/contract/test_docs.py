@@ -35,7 +35,7 @@ def test_links_and_pictures_lead_to_files(page):
 
 
 def test_scene_reference_holds_every_key_with_its_default(tmp_path):
-    from rbfmuscle.sim.scene.file import SceneFile
+    from rbfmuscle.scene.file import SceneFile
 
     (tmp_path / "docs" / "gallery").mkdir(parents=True)
     gallery.write_scene_reference(tmp_path)

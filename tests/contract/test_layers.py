@@ -1,4 +1,4 @@
-"""The import rules between the rooms, checked on the source."""
+"""The import rules between the packages, checked on the source."""
 
 import ast
 import shutil
@@ -10,45 +10,53 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 
 LEAVES = tuple(
-    f"rbfmuscle.{name}" for name in ("child", "geometry", "interruption", "jit", "progress", "validation")
+    f"rbfmuscle.{name}"
+    for name in ("cache", "child", "geometry", "interruption", "jit", "progress", "validation")
 )
-ABOVE = (*LEAVES, "rbfmuscle.implicit", "rbfmuscle.sim", "rbfmuscle.study", "rbfmuscle.__version__")
-# Which of our own modules (by prefix) a room may import; the first matching room counts.
+CORE = (*LEAVES, "rbfmuscle.bones", "rbfmuscle.scene", "rbfmuscle.simulation")
+MEASURED = (*CORE, "rbfmuscle.implicit", "rbfmuscle.metrics", "rbfmuscle.output", "rbfmuscle.experiments")
+ABOVE = (*MEASURED, "rbfmuscle.report", "rbfmuscle.__version__")
+# Which of our own modules (by prefix) a package may import; the first matching package counts.
 ALLOWED = {
     "rbfmuscle.validation": (),
     "rbfmuscle.jit": (),
     "rbfmuscle.progress": (),
+    "rbfmuscle.cache": ("rbfmuscle.geometry",),
     "rbfmuscle.child": ("rbfmuscle.child", "rbfmuscle.validation"),
     "rbfmuscle.geometry": ("rbfmuscle.geometry", "rbfmuscle.jit"),
     "rbfmuscle.implicit": (*LEAVES, "rbfmuscle.implicit"),
-    "rbfmuscle.sim": (*LEAVES, "rbfmuscle.sim"),
-    "rbfmuscle.opensim": (*LEAVES, "rbfmuscle.sim", "rbfmuscle.opensim"),
-    "rbfmuscle.study": (
-        *LEAVES,
-        "rbfmuscle.implicit",
-        "rbfmuscle.sim",
-        "rbfmuscle.study",
+    "rbfmuscle.bones": (*LEAVES, "rbfmuscle.bones"),
+    "rbfmuscle.scene": CORE,
+    "rbfmuscle.simulation": CORE,
+    "rbfmuscle.importers": (*LEAVES, "rbfmuscle.scene", "rbfmuscle.importers"),
+    "rbfmuscle.muscle": (*CORE, "rbfmuscle.implicit", "rbfmuscle.muscle"),
+    "pbd_baseline": (*CORE, "pbd_baseline"),
+    "rbfmuscle.metrics": (*CORE, "rbfmuscle.implicit", "rbfmuscle.metrics"),
+    "rbfmuscle.output": (
+        *CORE,
+        "rbfmuscle.metrics",
+        "rbfmuscle.output",
+        "rbfmuscle.report.appearance",
+        "rbfmuscle.report.labels",
     ),
-    "rbfmuscle.model": (*LEAVES, "rbfmuscle.implicit", "rbfmuscle.sim", "rbfmuscle.model"),
-    "pbd_baseline": (*LEAVES, "rbfmuscle.sim", "pbd_baseline"),
+    "rbfmuscle.experiments": MEASURED,
+    "rbfmuscle.report": ABOVE,
     "rbfmuscle.sharing": (*ABOVE, "rbfmuscle.models", "rbfmuscle.sharing"),
     "rbfmuscle.recording": (*ABOVE, "rbfmuscle.sharing"),
     "rbfmuscle.run": (*ABOVE, "rbfmuscle.models", "rbfmuscle.recording"),
     "rbfmuscle.compare": (*ABOVE, "rbfmuscle.models", "rbfmuscle.run"),
-    "rbfmuscle.commands": (
+    "rbfmuscle.cli": (
         *ABOVE,
-        "rbfmuscle.opensim",
+        "rbfmuscle.importers",
         "rbfmuscle.models",
         "rbfmuscle.run",
         "rbfmuscle.compare",
-        "rbfmuscle.commands",
+        "rbfmuscle.cli",
     ),
 }
-ALLOWED["rbfmuscle.app"] = ALLOWED["rbfmuscle.commands"]
-ALLOWED["rbfmuscle.cli"] = (*LEAVES, "rbfmuscle.app")
 ALLOWED["rbfmuscle.__main__"] = ("rbfmuscle.cli",)
 NAMES_BOTH = "rbfmuscle.models"
-FULLEST_ROOM = 15
+LARGEST_PACKAGE = 15
 
 
 def module_name(path, root=ROOT):
@@ -83,8 +91,8 @@ def starts_with(name, prefix):
 def wrong_arrows(module, source, *, is_package=False):
     if module in (NAMES_BOTH, "rbfmuscle"):
         return []
-    room = next((room for room in ALLOWED if starts_with(module, room)), None)
-    allowed = ALLOWED[room] if room else ()
+    package = next((package for package in ALLOWED if starts_with(module, package)), None)
+    allowed = ALLOWED[package] if package else ()
     names = imported_modules(source, module, is_package=is_package)
     names = {name for name in names if name != "rbfmuscle"}  # `from rbfmuscle import x` names x itself too
     return sorted(name for name in names if not any(starts_with(name, prefix) for prefix in allowed))
@@ -100,34 +108,35 @@ def wrong_arrows_of_file(path, root=ROOT):
 
 
 @pytest.mark.parametrize("path", sources(ROOT), ids=lambda path: module_name(path))
-def test_imports_only_what_its_room_may(path):
+def test_imports_only_what_its_package_may(path):
     assert wrong_arrows_of_file(path) == []
 
 
 @pytest.mark.parametrize(
     ("module", "source"),
     [
-        ("rbfmuscle.implicit.field", "from rbfmuscle.sim.scene.scene import Scene"),
+        ("rbfmuscle.implicit.field", "from rbfmuscle.scene.scene import Scene"),
         ("rbfmuscle.implicit.field", "from ..sim import scene"),
-        ("rbfmuscle.sim.distance.sdf", "def f():\n    import rbfmuscle.implicit.kernels.table"),
-        ("rbfmuscle.sim.loop.simulate", "from rbfmuscle import models"),
+        ("rbfmuscle.bones.sdf", "def f():\n    import rbfmuscle.implicit.kernels.table"),
+        ("rbfmuscle.simulation.frame_loop", "from rbfmuscle import models"),
         (
-            "rbfmuscle.sim.loop.simulate",
-            "import importlib\nimportlib.import_module('rbfmuscle.model.muscle')",
+            "rbfmuscle.simulation.frame_loop",
+            "import importlib\nimportlib.import_module('rbfmuscle.muscle.muscle')",
         ),
-        ("rbfmuscle.study.measure.metrics", "from rbfmuscle.model.muscle import RBFMuscle"),
-        ("rbfmuscle.study.measure.metrics", "import pbd_baseline.muscle"),
-        ("rbfmuscle.study.measure.metrics", "from rbfmuscle.run import simulate"),
+        ("rbfmuscle.metrics.metrics", "from rbfmuscle.muscle.muscle import RBFMuscle"),
+        ("rbfmuscle.metrics.metrics", "import pbd_baseline.muscle"),
+        ("rbfmuscle.metrics.metrics", "from rbfmuscle.run import simulate"),
         ("pbd_baseline.muscle", "from rbfmuscle.implicit.field import RBFField"),
-        ("pbd_baseline.muscle", "from rbfmuscle.model.muscle import RBFMuscle"),
-        ("rbfmuscle.model.muscle", "from pbd_baseline.muscle import PBDMuscle"),
-        ("rbfmuscle.validation", "from rbfmuscle.sim.scene.scene import Scene"),
-        ("rbfmuscle.cli", "from rbfmuscle.model.muscle import RBFMuscle"),
-        ("rbfmuscle.run", "from rbfmuscle.commands.run import run"),
+        ("pbd_baseline.muscle", "from rbfmuscle.muscle.muscle import RBFMuscle"),
+        ("rbfmuscle.muscle.muscle", "from pbd_baseline.muscle import PBDMuscle"),
+        ("rbfmuscle.validation", "from rbfmuscle.scene.scene import Scene"),
+        ("rbfmuscle.cli", "from rbfmuscle.muscle.muscle import RBFMuscle"),
+        ("rbfmuscle.bones.sdf", "from rbfmuscle.scene.scene import Scene"),
+        ("rbfmuscle.run", "from rbfmuscle.cli.run import run"),
         ("rbfmuscle.geometry.triangles", "from rbfmuscle.implicit.field import RBFField"),
         ("rbfmuscle.jit", "from rbfmuscle.geometry.triangles import vertex_faces"),
         ("rbfmuscle.geometry.triangles", "from rbfmuscle.validation import check_points"),
-        ("rbfmuscle.commands.run", "import pbd_baseline"),
+        ("rbfmuscle.cli.run", "import pbd_baseline"),
     ],
 )
 def test_planted_wrong_arrow_is_found(module, source):
@@ -139,8 +148,8 @@ def test_wrong_arrow_planted_in_a_copy_of_the_tree_is_found(tmp_path):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
     assert len(sources(tmp_path)) == len(sources(ROOT))
     planted = {
-        "rbfmuscle/sim/loop/simulate.py": "\n\ndef late():\n    from ...implicit.field import RBFField\n",
-        "pbd_baseline/__init__.py": "\nimport rbfmuscle.model.muscle\n",
+        "rbfmuscle/simulation/frame_loop.py": "\n\ndef late():\n    from ..implicit.field import RBFField\n",
+        "pbd_baseline/__init__.py": "\nimport rbfmuscle.muscle.muscle\n",
     }
     for name, text in planted.items():
         with (tmp_path / name).open("a", encoding="utf-8") as file:
@@ -149,7 +158,7 @@ def test_wrong_arrow_planted_in_a_copy_of_the_tree_is_found(tmp_path):
     assert found == {tmp_path / name for name in planted}
 
 
-def rooms(root=ROOT):
+def packages(root=ROOT):
     """Folder -> its modules, without ``__init__``."""
     found = {}
     for path in sources(root):
@@ -158,9 +167,9 @@ def rooms(root=ROOT):
     return found
 
 
-@pytest.mark.parametrize(("room", "files"), rooms().items(), ids=lambda value: str(value)[:40])
-def test_no_room_is_too_full(room, files):
-    assert len(files) <= FULLEST_ROOM
+@pytest.mark.parametrize(("package", "files"), packages().items(), ids=lambda value: str(value)[:40])
+def test_no_package_is_too_full(package, files):
+    assert len(files) <= LARGEST_PACKAGE
 
 
 def cycles(arrows):
@@ -198,10 +207,10 @@ def test_planted_cycle_is_found():
 
 
 def test_right_arrows_pass():
-    assert wrong_arrows("rbfmuscle.study.show.report", "from rbfmuscle.sim.scene.scene import Scene") == []
-    assert wrong_arrows("rbfmuscle.model.muscle", "from rbfmuscle.implicit.field import RBFField") == []
+    assert wrong_arrows("rbfmuscle.report.report", "from rbfmuscle.scene.scene import Scene") == []
+    assert wrong_arrows("rbfmuscle.muscle.muscle", "from rbfmuscle.implicit.field import RBFField") == []
     assert (
-        wrong_arrows("rbfmuscle.sim.scene.scene", "from . import motion\nfrom rbfmuscle.validation import x")
+        wrong_arrows("rbfmuscle.scene.scene", "from . import motion\nfrom rbfmuscle.validation import x")
         == []
     )
 

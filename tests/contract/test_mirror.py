@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = {"rbfmuscle.model": ROOT / "rbfmuscle" / "model", "pbd_baseline": ROOT / "pbd_baseline"}
+PACKAGES = {"rbfmuscle.muscle": ROOT / "rbfmuscle" / "muscle", "pbd_baseline": ROOT / "pbd_baseline"}
 # What a reader who knows one model finds in the other. A class is named after its model where both are imported.
 SHARED = {
     "muscle": {"RBFMuscle": "PBDMuscle"},
     "options": {"RBFOptions": "PBDOptions"},
-    "rest": {"Rest": "Rest", "solved_points": "solved_points"},
+    "rest": {"RestState": "RestState", "solved_points": "solved_points"},
     "fibres": {"fibre_directions": "fibre_directions"},
 }
 
@@ -66,7 +66,7 @@ def differences(one, other):
 
 
 def test_every_file_that_both_have_is_compared():
-    assert files(PACKAGES["rbfmuscle.model"]) & files(PACKAGES["pbd_baseline"]) == set(SHARED)
+    assert files(PACKAGES["rbfmuscle.muscle"]) & files(PACKAGES["pbd_baseline"]) == set(SHARED)
 
 
 @pytest.mark.parametrize("file", SHARED)
@@ -79,25 +79,25 @@ def test_every_name_that_both_have_is_compared(file):
     ("file", "name", "twin"), [(file, *pair) for file, pairs in SHARED.items() for pair in pairs.items()]
 )
 def test_the_same_names_have_the_same_signatures(file, name, twin):
-    one = getattr(importlib.import_module(f"rbfmuscle.model.{file}"), name)
+    one = getattr(importlib.import_module(f"rbfmuscle.muscle.{file}"), name)
     other = getattr(importlib.import_module(f"pbd_baseline.{file}"), twin)
     assert differences(one, other) == []
 
 
 def test_what_is_known_at_rest_has_the_same_names_and_types():
     fields = [
-        {f.name: f.type for f in dataclasses.fields(importlib.import_module(f"{package}.rest").Rest)}
+        {f.name: f.type for f in dataclasses.fields(importlib.import_module(f"{package}.rest").RestState)}
         for package in PACKAGES
     ]
     shared = fields[0].keys() & fields[1].keys()
-    assert shared >= {"bones", "holder"}
+    assert shared >= {"bones", "attached_bone"}
     assert [name for name in shared if fields[0][name] != fields[1][name]] == []
 
 
 def test_both_muscles_are_the_model_that_the_loop_asks_for():
     from pbd_baseline.muscle import PBDMuscle
-    from rbfmuscle.model.muscle import RBFMuscle
-    from rbfmuscle.sim.loop.frame import MuscleModel
+    from rbfmuscle.muscle.muscle import RBFMuscle
+    from rbfmuscle.simulation.frame import MuscleModel
 
     asked = methods(MuscleModel)
     asked.pop("__init__")

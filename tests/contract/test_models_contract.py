@@ -6,10 +6,10 @@ import trimesh
 
 import rbfmuscle as rm
 from rbfmuscle.models import MODEL_NAMES, build_model
-from rbfmuscle.sim.loop.contact import BoneContacts
-from rbfmuscle.sim.loop.simulate import simulate_frames
-from rbfmuscle.sim.scene.motion import Motion, bone_poses, rotation_about
-from rbfmuscle.sim.scene.options import DetectOptions, SlidingOptions, TunnellingOptions
+from rbfmuscle.scene.motion import Motion, bone_poses, rotation_about
+from rbfmuscle.scene.options import DetectOptions, SlidingOptions, TunnellingOptions
+from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.frame_loop import simulate_frames
 
 MODELS = ("rbf", "pbd", "pbd-paper", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
 
@@ -127,7 +127,7 @@ def test_turn_moves_free_points_and_leaves_held_ones(name):
     assert moved[free, 1].mean() > 0.5
     # A model's own points come first; those that a bone holds stay, whoever asks.
     own = slice(len(part.points))
-    attached = which[own] & (part.rest.holder[own] >= 0)
+    attached = which[own] & (part.rest.attached_bone[own] >= 0)
     assert attached.any() and np.abs(moved[own][attached]).max() == 0.0
     # Samples between held and free centres of an RBF muscle go a part of the way.
     assert np.abs(moved[held]).mean() < 0.1

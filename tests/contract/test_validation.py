@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from pbd_baseline.options import PBDOptions
 from rbfmuscle import validation
-from rbfmuscle.model.options import RBFOptions
-from rbfmuscle.sim.scene.options import Table
+from rbfmuscle.muscle.options import RBFOptions
+from rbfmuscle.scene.options import Table
 from rbfmuscle.validation import (
     MeshError,
     NotFiniteError,

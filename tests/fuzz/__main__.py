@@ -82,8 +82,8 @@ class Cases:
 def load(path: Path) -> int:
     """Read a scene with all that belongs to it, look it over, and prove its meshes."""
     from rbfmuscle.models import check_models
-    from rbfmuscle.sim.loop.substeps import check_substeps
-    from rbfmuscle.sim.scene.scene import Scene
+    from rbfmuscle.scene.scene import Scene
+    from rbfmuscle.simulation.substeps import check_substeps
     from rbfmuscle.validation import RBFMuscleError
 
     try:
@@ -99,7 +99,7 @@ def load(path: Path) -> int:
 
 def read(path: Path, *, may_be_open: bool) -> int:
     """Read a mesh as a muscle's or, where it may be open, a bone's."""
-    from rbfmuscle.sim.scene.meshes import read_mesh
+    from rbfmuscle.scene.meshes.read import read_mesh
     from rbfmuscle.validation import MeshError
 
     try:
@@ -115,7 +115,7 @@ def read(path: Path, *, may_be_open: bool) -> int:
 
 def run(path: Path, output: Path, model: str | None) -> int:
     """Three frames by the command line itself, and a look at what it left."""
-    from rbfmuscle.app import run_command
+    from rbfmuscle.cli.app import run_command
 
     words = ["run", str(path), "-o", str(output), "--frames", "0:3", "--json"]
     shown = os.dup(1)
@@ -131,7 +131,7 @@ def run(path: Path, output: Path, model: str | None) -> int:
 
 def check_run(output: Path) -> None:
     """Raise WrongResult for numbers that are not finite, or a volume that was not kept."""
-    from rbfmuscle.study.files.saved import SavedRun
+    from rbfmuscle.output.saved import SavedRun
 
     saved = SavedRun(output)
     for frame in saved.frames if saved.has_surfaces() else []:

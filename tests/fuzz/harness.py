@@ -104,7 +104,7 @@ def _judge(status, usage, text):
 
 def tell(error: Exception) -> int:
     """Print an error meant for users as the command line does; its exit code."""
-    from rbfmuscle.app import one_line
+    from rbfmuscle.cli.app import one_line
 
     print(f"rbfmuscle: {one_line(error)}", file=sys.stderr)
     return error.exit_code

@@ -10,7 +10,7 @@ from rbfmuscle.implicit.fit.fitting import solve_bounded
 from rbfmuscle.implicit.fit.systems import hermite_system
 from rbfmuscle.implicit.kernels.table import KERNELS
 from rbfmuscle.implicit.placement.sampling import sample_surface
-from rbfmuscle.implicit.selection import spacing, surface_miss
+from rbfmuscle.implicit.selection import spacing, surface_error
 from rbfmuscle.validation import UsageError
 
 
@@ -77,7 +77,7 @@ def test_a_bound_costs_septic_little_of_its_error(plate):
     plain = RBFField.fit_hermite(points, normals, kernel="septic")
     bounded = RBFField.fit_hermite(points, normals, kernel="septic", condition=1e10)
     assert bounded.condition <= 1e10 < plain.condition
-    assert surface_miss(bounded, others, reach) < 1.02 * surface_miss(plain, others, reach)
+    assert surface_error(bounded, others, reach) < 1.02 * surface_error(plain, others, reach)
 
 
 def test_bounds_beyond_floating_point_are_refused(plate):

@@ -10,7 +10,7 @@ from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels.table import KERNELS
 from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import spacing
-from rbfmuscle.sim.scene.phantom import phantom_scene
+from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.validation import NumericalWarning
 
 WITH_EPSILON = [name for name, kernel in KERNELS.items() if kernel.has_epsilon]

@@ -6,7 +6,7 @@ import trimesh
 
 from rbfmuscle.geometry.crossing import FaceTree, creased_faces, crossing_faces
 from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.implicit.extraction.material import _Fitting, carry_material, fit_material
+from rbfmuscle.implicit.extraction.material import _Fitting, carry_material, project_to_level_set
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh, _edges_loop
 from rbfmuscle.implicit.extraction.obstacles import ObstaclePoints
 from rbfmuscle.implicit.extraction.projection import Projector
@@ -65,14 +65,14 @@ def mesh_of(ball=BALL):
 def test_vertices_come_to_lie_on_the_sphere():
     rng = np.random.default_rng(1)
     carried = BALL.vertices * (1.0 + 0.05 * rng.normal(size=(len(BALL.vertices), 1)))
-    found = fit_material(mesh_of(), carried, Sphere())
+    found = project_to_level_set(mesh_of(), carried, Sphere())
     np.testing.assert_allclose(np.linalg.norm(found.vertices, axis=1), 1.0, atol=1e-8)
     np.testing.assert_array_equal(found.faces, BALL.faces)
     assert (found.left, found.crossing) == (0, 0)
 
 
 def test_the_level_gives_the_volume():
-    found = fit_material(mesh_of(), np.asarray(BALL.vertices), Sphere(), volume=1.5 * VOLUME)
+    found = project_to_level_set(mesh_of(), np.asarray(BALL.vertices), Sphere(), volume=1.5 * VOLUME)
     assert mesh_volume(found.vertices, found.faces) == pytest.approx(1.5 * VOLUME, rel=1e-12)
     radius = np.linalg.norm(found.vertices, axis=1)
     assert np.ptp(radius) < 1e-8
@@ -82,7 +82,7 @@ def test_the_level_gives_the_volume():
 
 def test_what_the_cut_takes_away_lies_on_it():
     cut = Bone(5.0, (5.5, 0.0, 0.0))
-    found = fit_material(mesh_of(), np.asarray(BALL.vertices), Sphere(), cut=cut)
+    found = project_to_level_set(mesh_of(), np.asarray(BALL.vertices), Sphere(), cut=cut)
     assert cut(found.vertices).min() > -1e-5
     on_cut = np.abs(cut(found.vertices)) < 1e-4
     assert on_cut.sum() > 50
@@ -105,7 +105,7 @@ def test_bone_vertices_end_up_outside():
     edge = mesh_of().edge(np.asarray(BALL.vertices))
     middle = BALL.triangles_center[0] * 0.97 ** (1 / 3)
     spike = (middle - 0.1 * edge * BALL.face_normals[0])[None]
-    found = fit_material(
+    found = project_to_level_set(
         mesh_of(), np.asarray(BALL.vertices), Sphere(), volume=0.97 * VOLUME,
         obstacles=[(ObstaclePoints(spike), np.eye(4))],
     )  # fmt: skip
@@ -121,7 +121,7 @@ def test_sheets_that_met_do_not_pull_vertices_off_the_material():
     mesh.slope = np.ones(len(BALL.vertices))
     x = np.asarray(BALL.vertices)
     carried = np.column_stack([1.9 * x[:, 0], x[:, 1] * (0.4 + x[:, 0] ** 2), x[:, 2] * (0.4 + x[:, 0] ** 2)])
-    found = fit_material(mesh, carried, Two(0.9))
+    found = project_to_level_set(mesh, carried, Two(0.9))
     away = np.linalg.norm(found.vertices - carried, axis=1)
     assert away.max() <= 1.0 * mesh.edge(carried) + 1e-12
     assert found.left > 0 and found.crossing == 0
@@ -131,7 +131,7 @@ def test_tangled_triangles_are_smoothed_until_none_cross():
     rng = np.random.default_rng(5)
     carried = BALL.vertices + 0.06 * rng.normal(size=BALL.vertices.shape)
     assert crossing_faces(carried, BALL.faces).sum() > 50
-    found = fit_material(mesh_of(), carried, Sphere(), volume=VOLUME)
+    found = project_to_level_set(mesh_of(), carried, Sphere(), volume=VOLUME)
     assert not crossing_faces(found.vertices, found.faces).any()
     assert found.smoothed > 0 and found.crossing == 0
     assert mesh_volume(found.vertices, found.faces) == pytest.approx(VOLUME, rel=1e-12)
@@ -143,7 +143,7 @@ def test_the_way_back_to_the_volume_leaves_nothing_that_crosses(radius, seed):
     rng = np.random.default_rng(seed)
     cut = Bone(radius, (0.9, 0.1 * seed, 0.0))
     carried = BALL.vertices + 0.06 * rng.normal(size=BALL.vertices.shape)
-    found = fit_material(mesh_of(), carried, Sphere(), volume=0.8 * VOLUME, cut=cut)
+    found = project_to_level_set(mesh_of(), carried, Sphere(), volume=0.8 * VOLUME, cut=cut)
     assert not crossing_faces(found.vertices, found.faces).any()
     assert found.crossing == 0
     assert cut(found.vertices).min() > -1e-3
@@ -189,7 +189,7 @@ def test_a_volume_that_no_level_reaches_is_an_error():
     flat = Sphere()
     flat.value_and_gradient = lambda p: (np.tanh(Sphere()(p)), Sphere().value_and_gradient(p)[1])
     with pytest.raises(ValueError, match="no level gives a volume"):
-        fit_material(mesh_of(), np.asarray(BALL.vertices), flat, volume=1e4)
+        project_to_level_set(mesh_of(), np.asarray(BALL.vertices), flat, volume=1e4)
 
 
 def test_a_tree_made_at_rest_finds_crossings_later():
@@ -284,7 +284,7 @@ def test_what_is_known_of_the_cut_changes_nothing(shift):
     spike = np.array([[0.6 + 1e-3, 0.0, 0.0], [0.62, 0.02, 0.01]])
     bones = [(ObstaclePoints(spike), np.eye(4))]
     found = [
-        fit_material(mesh_of(), carried, Sphere(), volume=VOLUME, cut=each, obstacles=bones)
+        project_to_level_set(mesh_of(), carried, Sphere(), volume=VOLUME, cut=each, obstacles=bones)
         for each in (cut, asked)
     ]
     np.testing.assert_allclose(found[0].vertices, found[1].vertices, rtol=0, atol=1e-12)

@@ -13,8 +13,8 @@ from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.field_fit import FieldFit
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.placement.sampling import sample_surface
-from rbfmuscle.implicit.selection import BOUND, SPAN, _Looks, choose_epsilon, spacing, surface_miss
-from rbfmuscle.study.measure.mesh_distance import MeshDistance
+from rbfmuscle.implicit.selection import BOUND, SPAN, _Looks, choose_epsilon, spacing, surface_error
+from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.validation import NumericalWarning, UsageError
 
 
@@ -109,11 +109,11 @@ def test_miss_is_the_distance_to_first_order_and_a_flat_field_misses(plate):
     field = RBFField.fit_hermite(centres.points, centres.normals)
     found = extract_surface(field, points=centres.points, resolution=96)
     exact = MeshDistance(found.vertices, found.faces).unsigned(held_out)
-    assert surface_miss(field, held_out, h) == pytest.approx(np.sqrt((exact**2).mean()), rel=0.1)
+    assert surface_error(field, held_out, h) == pytest.approx(np.sqrt((exact**2).mean()), rel=0.1)
     with pytest.warns(NumericalWarning, match="does not reach"):
         narrow = RBFField.fit_hermite(centres.points, centres.normals, kernel="wendland_c4", epsilon=8.0 / h)
     assert np.sqrt((narrow(held_out) ** 2).mean()) < 0.1 * h  # 0 where it knows nothing
-    assert surface_miss(narrow, held_out, h) > 0.5 * h
+    assert surface_error(narrow, held_out, h) > 0.5 * h
 
 
 class Shape:

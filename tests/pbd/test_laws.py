@@ -19,8 +19,8 @@ from pbd_baseline.topology import Topology
 from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.geometry.rotations import quaternion_matrix
 from rbfmuscle.geometry.surfaces import vertex_normals
-from rbfmuscle.sim.loop.contact import HalfSpaces
-from rbfmuscle.sim.scene.motion import rotation_about
+from rbfmuscle.scene.motion import rotation_about
+from rbfmuscle.simulation.contact import HalfSpaces
 
 
 @pytest.fixture

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from rbfmuscle.models import build_model
-from rbfmuscle.sim.loop.simulate import simulate_frames
-from rbfmuscle.sim.scene.phantom import phantom_scene
+from rbfmuscle.scene.phantom import phantom_scene
+from rbfmuscle.simulation.frame_loop import simulate_frames
 
 METHODS = ["pbd", "pbd-paper", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved"]
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "paper_experiments.py"
@@ -52,7 +52,7 @@ def test_hip_flexes_within_the_promised_figures(hip_scene):
 
 @pytest.mark.parametrize("name", ["pbd", "xpbd"])
 def test_hip_stays_finite_at_thirty_degrees_a_step_without_substeps(hip_data, name):
-    from rbfmuscle.sim.scene.scene import Scene
+    from rbfmuscle.scene.scene import Scene
 
     scene = Scene.load(hip_data / "extension.toml")
     scene = scene.with_options({"motion.step": 30.0, "contact.substep_angle": 30.0})

@@ -9,14 +9,14 @@ from spindle_scene import build_scene
 
 from pbd_baseline.muscle import PBDMuscle
 from pbd_baseline.options import PBDOptions
-from pbd_baseline.sound.contact import SoundContact
-from pbd_baseline.sound.ridges import NOTHING, Ridges
-from pbd_baseline.sound.untangling import Untangling
+from pbd_baseline.self_collision.contact import SoundContact
+from pbd_baseline.self_collision.ridges import NOTHING, Ridges
+from pbd_baseline.self_collision.untangling import Untangling
 from rbfmuscle.geometry.crossing import crossing_faces
-from rbfmuscle.sim.loop.contact import HalfSpaces
-from rbfmuscle.sim.loop.simulate import simulate_frames
-from rbfmuscle.sim.scene.motion import rotation_about
-from rbfmuscle.study.measure.penetration import BoneProbe, bone_depth, surface_depth
+from rbfmuscle.metrics.penetration import BoneProbe, bone_depth, surface_depth
+from rbfmuscle.scene.motion import rotation_about
+from rbfmuscle.simulation.contact import HalfSpaces
+from rbfmuscle.simulation.frame_loop import simulate_frames
 
 
 class Poses:
@@ -108,7 +108,7 @@ def test_what_smoothing_does_not_untangle_is_calmed():
     assert not crossing_faces(points, model.rest.topology.faces).any()
     turn = rotation_about([0.3, 1.0, -0.2], 0.7, np.array([5.0, 1.0, -9.0]))
     moved = rest @ turn[:3, :3].T + turn[:3, 3]
-    np.testing.assert_allclose(untangling.calmed(moved, 40), moved, atol=1e-9)
+    np.testing.assert_allclose(untangling.smooth_displacement(moved, 40), moved, atol=1e-9)
 
 
 def test_a_sound_surface_is_left_as_it_is():
@@ -165,7 +165,7 @@ def test_a_skin_is_kept_from_bones_and_not_from_the_planes_of_neighbours():
     )
     contact = SoundContact(
         np.arange(count)[:, None].repeat(3, axis=1), np.tile([1.0, 0.0, 0.0], (count, 1)), reach=1.0, faces=faces,
-        held=np.zeros(0, np.int64), holder=np.zeros(0, np.int64), skin=0.1,
+        held=np.zeros(0, np.int64), attached_bone=np.zeros(0, np.int64), skin=0.1,
         ridges=SimpleNamespace(find=lambda *_: NOTHING),
     )  # fmt: skip
     contact._held_in = lambda *_: nothing

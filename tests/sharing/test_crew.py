@@ -19,14 +19,14 @@ from blend_model import files_in
 from run_folders import timeless
 
 from rbfmuscle import recording
+from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.run import simulate, stream_run
+from rbfmuscle.scene.motion import Motion
+from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.sharing import crew as sharing
-from rbfmuscle.sharing.crew import Crew
-from rbfmuscle.sharing.share import Share
-from rbfmuscle.sim.plan.processes import helpers_for
-from rbfmuscle.sim.scene.motion import Motion
-from rbfmuscle.sim.scene.phantom import phantom_scene
-from rbfmuscle.study.files.saved import SavedRun
+from rbfmuscle.sharing.crew import WorkerPool
+from rbfmuscle.sharing.share import MuscleGroup
+from rbfmuscle.simulation.plan.processes import helpers_for
 from rbfmuscle.validation import MeshError, SceneWarning, SolveError
 
 
@@ -40,12 +40,12 @@ def crews(monkeypatch):
     """The crews that a test starts."""
     made = []
 
-    class Watched(Crew):
+    class Watched(WorkerPool):
         def __init__(self, *given, **options):
             super().__init__(*given, **options)
             made.append(self)
 
-    monkeypatch.setattr(recording, "Crew", Watched)
+    monkeypatch.setattr(recording, "WorkerPool", Watched)
     return made
 
 
@@ -90,7 +90,7 @@ def test_frames_in_memory_have_all_muscles_in_the_scenes_order(two_helpers, crew
         for found in (frame.surfaces, frame.carried, frame.times, frame.work):
             assert list(found) == names
     assert [r.muscle for r in run.metrics if r.frame == 1 and r.quantity == "length"] == names
-    alone = Share(scene, names[1:2])
+    alone = MuscleGroup(scene, names[1:2])
     for frame, solved in zip(run.frames, alone.frames()):
         surface = solved.frame.surfaces[names[1]]
         np.testing.assert_array_equal(surface.vertices, frame.surfaces[names[1]].vertices)
@@ -200,7 +200,7 @@ def test_what_helpers_say_is_said_once(caplog):
         found = iter(messages)
         return SimpleNamespace(take=lambda: next(found))
 
-    crew = Crew.__new__(Crew)
+    crew = WorkerPool.__new__(WorkerPool)
     crew._told = set()
     warning, line = SceneWarning("bones meet"), ("rbfmuscle.bones", logging.WARNING, "bone: is open")
     one = helper(("warned", warning), ("logged", line), ("done", 1))
@@ -243,7 +243,7 @@ class TooLarge:
 
 
 def test_a_message_that_does_not_fit_is_told_and_not_waited_for():
-    helper = sharing._Helper.__new__(sharing._Helper)
+    helper = sharing._Worker.__new__(sharing._Worker)
     message = io.BytesIO(pickle.dumps(("done", TooLarge(), {})))
     helper.process = SimpleNamespace(stdin=io.BytesIO(), stdout=message)
     helper._inbox, helper._room, helper._closed = queue.Queue(), threading.Semaphore(1), False

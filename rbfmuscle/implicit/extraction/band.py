@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.fields import Cut, Field
+from rbfmuscle.geometry.fields import ClipDistance, Field
 from rbfmuscle.implicit.extraction.marching import (
     FACE_CORNERS,
     Made,
@@ -128,7 +128,7 @@ class Band:
         ``(n, 3) -> (n,)``; ``cut`` may be None.
     """
 
-    def __init__(self, grid: BandGrid, field: Field, cut: Cut | None = None) -> None:
+    def __init__(self, grid: BandGrid, field: Field, cut: ClipDistance | None = None) -> None:
         total = int(np.prod(grid.shape))
         self.grid, self.field, self.cut = grid, field, cut
         self.index = np.full(total, -1, dtype=np.int32)

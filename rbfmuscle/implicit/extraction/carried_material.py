@@ -3,7 +3,7 @@
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Array, Booleans, Floats, Integers
-from rbfmuscle.geometry.fields import Cut, Field
+from rbfmuscle.geometry.fields import ClipDistance, Field
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.implicit.extraction.band import BandGrid
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
@@ -50,7 +50,7 @@ class CarriedMaterial:
         mesh: MaterialMesh,
         vertices: Floats,
         field: Field | None,
-        cut: Cut | None,
+        cut: ClipDistance | None,
         level: float,
     ) -> None:
         self.mesh, self.carried, self.level = mesh, np.ascontiguousarray(vertices, dtype=np.float64), level
@@ -60,7 +60,7 @@ class CarriedMaterial:
         self.outside = np.ones(len(vertices), dtype=np.bool_)
         self._start(cut)
 
-    def _start(self, cut: Cut | None) -> None:
+    def _start(self, cut: ClipDistance | None) -> None:
         """A projector of the vertices where the material takes them, that knows how far the bones are there."""
         near, vertices = np.zeros(len(self.carried), dtype=np.bool_), self.carried.copy()
         if cut is None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.fields import Cut, Field
+from rbfmuscle.geometry.fields import ClipDistance, Field
 from rbfmuscle.geometry.surfaces import mesh_volume, vertex_normals
 from rbfmuscle.implicit.extraction.carried_material import CarriedMaterial
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
@@ -54,14 +54,14 @@ class FittedMesh(ExtractedSurface):
     crossing: int = 0
 
 
-def fit_material(
+def project_to_level_set(
     mesh: MaterialMesh,
     vertices: Floats,
     field: Field,
     *,
     volume: float | None = None,
     level: float = 0.0,
-    cut: Cut | None = None,
+    cut: ClipDistance | None = None,
     obstacles: list[tuple[ObstaclePoints, Floats]] | None = None,
     axes: Floats | None = None,
 ) -> FittedMesh:
@@ -97,7 +97,7 @@ def carry_material(
     vertices: Floats,
     *,
     volume: float | None = None,
-    cut: Cut | None = None,
+    cut: ClipDistance | None = None,
     obstacles: list[tuple[ObstaclePoints, Floats]] | None = None,
     axes: Floats | None = None,
 ) -> FittedMesh:
@@ -106,7 +106,7 @@ def carry_material(
     Parameters
     ----------
     mesh, vertices, volume, cut, obstacles, axes
-        As for `fit_material`.
+        As for `project_to_level_set`.
 
     Returns
     -------
@@ -131,7 +131,7 @@ class _Fitting(CarriedMaterial):
         mesh: MaterialMesh,
         vertices: Floats,
         field: Field | None,
-        cut: Cut | None,
+        cut: ClipDistance | None,
         level: float,
     ) -> None:
         super().__init__(mesh, vertices, field, cut, level)

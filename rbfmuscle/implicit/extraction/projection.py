@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.fields import Cut, Field
+from rbfmuscle.geometry.fields import ClipDistance, Field
 from rbfmuscle.geometry.surfaces import volume_cubic
 from rbfmuscle.implicit.extraction.obstacles import push_off_points
 from rbfmuscle.jit import compiled
@@ -68,7 +68,7 @@ class Projector:
     def __init__(
         self,
         field: Field | None,
-        cut: Cut | None,
+        cut: ClipDistance | None,
         vertices: Floats,
         spacing: float,
         near_cut: Booleans,

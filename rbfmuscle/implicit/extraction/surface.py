@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.fields import Cut, Field
+from rbfmuscle.geometry.fields import ClipDistance, Field
 from rbfmuscle.geometry.surfaces import corner_from, mesh_volume, six_volumes
 from rbfmuscle.implicit.extraction.band import Band, BandGrid
 from rbfmuscle.implicit.extraction.obstacles import CHORD, points_near_cells
@@ -67,7 +67,7 @@ def extract_surface(
     *,
     points: ArrayLike,
     resolution: int = 48,
-    cut: Cut | None = None,
+    cut: ClipDistance | None = None,
     volume: float | None = None,
     level: float = 0.0,
     axes: ArrayLike | None = None,

@@ -23,7 +23,7 @@ from rbfmuscle.implicit.fit import assembly
 from rbfmuscle.implicit.fit.fitting import bounding_ridge
 from rbfmuscle.implicit.fit.systems import hermite_system
 from rbfmuscle.implicit.placement.sampling import spread_points
-from rbfmuscle.implicit.selection import spacing, surface_miss
+from rbfmuscle.implicit.selection import spacing, surface_error
 from rbfmuscle.validation import UsageError, check_points, check_vectors
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def fit_centres(
 
     def fitted(where: Floats, direction: Floats) -> tuple[Floats, float]:
         field = fit.fit(where, direction)
-        return field(samples), surface_miss(field, samples, reach)
+        return field(samples), surface_error(field, samples, reach)
 
     value, least = fitted(points, normals)
     best, problem = (points, normals), _problem(points, normals, samples, fit, reach)

@@ -1,0 +1,1 @@
+"""Self-collision of mesh muscles."""

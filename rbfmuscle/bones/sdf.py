@@ -1,0 +1,375 @@
+"""BoneSDF: signed distance and gradient of a rigid bone, in any pose.
+
+The field stays in bone coordinates and is never rebuilt; queries carry points there inside their loop.
+Distances are negative inside. What a query reads, and how, is in ``sdf_query.py``; how it is built, in
+``sdf_build.py``.
+"""
+
+from __future__ import annotations
+
+import logging
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbfmuscle.bones.build import build_cells, grid_shape
+from rbfmuscle.bones.cells import BLOCK
+from rbfmuscle.bones.mesh import prepare_bone, winding_test
+from rbfmuscle.bones.query import FieldData, query_loop
+from rbfmuscle.cache import content_key, load_arrays, store_arrays
+from rbfmuscle.geometry.arrays import Floats, MeshLike
+from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.rest_frame import BoneFrame, on_one_line
+from rbfmuscle.geometry.threads import in_chunks
+from rbfmuscle.geometry.triangles import FIRST
+from rbfmuscle.validation import MeshError, check_mesh, check_points, check_positive
+
+if TYPE_CHECKING:
+    from rbfmuscle.bones.build import Cells
+
+
+log = logging.getLogger(__name__)
+
+IDENTITY = np.eye(4)
+NO_GRADIENT = np.empty((0, 3))
+# Fine cells against the mean edge of the mesh, and at least this many along its longest side.
+CELL_SHARE, LEAST_CELLS = 0.6, 40
+# Fine cells cover points nearer than this many of their edges.
+BAND = 1.2
+# Default tolerance as a share of the mean edge: facets are flat, so errors scale with them.
+TOLERANCE_SHARE = 0.004
+# Points at which a field measures itself, and how often it may be refined.
+PROBES, ATTEMPTS = 4000, 5
+# Bytes that a field may take unless told otherwise.
+MEMORY_LIMIT = 2**28
+
+
+class BoneSDF:
+    """Distance field of one bone; build it with :meth:`from_mesh`.
+
+    Attributes
+    ----------
+    vertices, faces : (n, 3) and (m, 3) ndarray
+        The mesh as used: degenerate and duplicate faces left out.
+    bounds : (2, 3) ndarray
+        Box of the mesh, bone coordinates.
+    spacing : float
+        Edge of a fine cell [unit of the mesh].
+    band : float
+        Distance up to which fine cells answer.
+    error : float
+        RMS error within the band, measured when it was built.
+    closed : bool
+        Whether the sign comes from the mesh itself (else from winding numbers).
+    notes : tuple of str
+        What was found about the mesh.
+    data : FieldData
+        What queries read, in a frame of the bone's own: a scene that is moved, turned or written in another unit
+        gives the same field.
+
+    Examples
+    --------
+    >>> import trimesh
+    >>> ball = trimesh.creation.icosphere(4, 10.0)
+    >>> field = BoneSDF.from_mesh(ball, cache=False)
+    >>> field.distance([[0.0, 0.0, 12.0], [0.0, 0.0, 9.0]]).round(1).tolist()
+    [2.0, -1.0]
+    """
+
+    def __init__(self, vertices: Floats, frame: BoneFrame, parts: Any) -> None:
+        self.vertices, self.faces, self.notes = vertices, parts.faces, tuple(parts.notes)
+        used = self.vertices[np.unique(self.faces)]
+        self.bounds = np.array([used.min(axis=0), used.max(axis=0)])
+        self.data, self.closed = parts.data, parts.closed
+        self.spacing, self.error = parts.spacing * frame.size, parts.error * frame.size
+        self.band = BAND * self.spacing
+        self._frame = frame
+
+    @property
+    def memory(self) -> int:
+        """Bytes that queries read."""
+        return sum(array.nbytes for array in self.data)
+
+    @property
+    def fine_cells(self) -> int:
+        """Number of fine cells."""
+        return self.data.cells.size
+
+    @cached_property
+    def exact(self) -> ExactDistance:
+        """The exact distance to the mesh (:class:`ExactDistance`), built when first asked for."""
+        return ExactDistance(self.vertices, self.faces)
+
+    @classmethod
+    def from_mesh(
+        cls,
+        mesh: MeshLike,
+        *,
+        tolerance: float | None = None,
+        region: ArrayLike | None = None,
+        cache: bool = True,
+        memory_limit: int = MEMORY_LIMIT,
+        name: str = "bone",
+    ) -> BoneSDF:
+        """Build the field of a bone, or take it from the cache.
+
+        Parameters
+        ----------
+        mesh : trimesh.Trimesh or pair of (n, 3) vertices and (m, 3) faces
+            Rest (bone) coordinates. Closed and outward for exact signs; others are signed by winding
+            numbers, and the log says so.
+        tolerance : float, optional
+            RMS error near the surface [unit of the mesh]. By default 0.4 % of the mean edge, or what the
+            memory allows.
+        region : (2, 3) array_like, optional
+            Box, bone coordinates, that points come from. Outside of it the field is coarse, but still right.
+        cache : bool
+            Look the field up on disk, and keep it there.
+        memory_limit : int
+            Bytes the field may take.
+        name : str
+            What messages call the bone.
+
+        Raises
+        ------
+        MeshError
+            If the mesh is unusable, or the tolerance needs more memory than allowed.
+        """
+        vertices, faces = (mesh.vertices, mesh.faces) if hasattr(mesh, "faces") else mesh
+        vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
+        tolerance = None if tolerance is None else check_positive(tolerance, name="tolerance")
+        region = None if region is None else check_points(region, name="region")
+        if region is not None and (region.shape != (2, 3) or np.any(region[0] > region[1])):
+            raise ValueError(f"region must be (2, 3), least corner first, got {region.tolist()}")
+        key = _key(vertices, faces, tolerance, region, memory_limit) if cache else None
+        arrays = None if key is None else load_arrays(key)
+        parts = None if arrays is None else _from_arrays(arrays)
+        vertices, faces = check_mesh(vertices, faces, name=name)
+        if parts is None and on_one_line(vertices):
+            raise MeshError(f"{name} has no face with an area")
+        frame = BoneFrame(vertices)
+        if parts is None:
+            parts = _build(
+                prepare_bone(frame.local, faces, name=name), frame, tolerance, region, memory_limit, name
+            )
+            if key is not None:
+                store_arrays(key, _to_arrays(parts))
+        for note in parts.notes:
+            log.warning("%s: %s", name, note)
+        return cls(vertices, frame, parts)
+
+    def distance(
+        self, points: ArrayLike, pose: ArrayLike | None = None, *, reach: ArrayLike = np.inf
+    ) -> Floats:
+        """Signed distance of points, (n,) [unit of the mesh], negative inside the bone.
+
+        Parameters
+        ----------
+        points : (n, 3) array_like
+            World coordinates if ``pose`` is given, else bone coordinates.
+        pose : (4, 4) array_like, optional
+            Bone to world, rigid.
+        reach : float or (n,) array_like
+            Points further away than this may get any lower bound of their distance that is above it: much
+            faster.
+        """
+        points, pose = check_points(points), _check_pose(pose)
+        out = np.empty(len(points))
+        placed, size = self._frame.placed(pose), self._frame.size
+        reach = _local_reach(reach, len(points), size)
+
+        def work(a, b):
+            query_loop(points[a:b], placed, reach[a:b], out[a:b], NO_GRADIENT, self.data)
+
+        in_chunks(len(points), work, least=4096)
+        out *= size
+        return out
+
+    def gradient(self, points: Floats, pose: Floats | None = None) -> Floats:
+        """Gradient of the distance, (n, 3) unit vectors in the axes of ``points``."""
+        return self.distance_and_gradient(points, pose)[1]
+
+    def distance_and_gradient(
+        self, points: Floats, pose: Floats | None = None, reach: Floats | float = np.inf
+    ) -> tuple[Floats, Floats]:
+        """Signed distance (n,) and its gradient (n, 3), which is a unit vector; parameters as for `distance`.
+
+        On the surface the gradient is the normal of the triangle. It is zero where only a lower bound is
+        given.
+        """
+        points, pose = check_points(points), _check_pose(pose)
+        distance, gradient = np.empty(len(points)), np.empty((len(points), 3))
+        placed, size = self._frame.placed(pose), self._frame.size
+        reach = _local_reach(reach, len(points), size)
+
+        def work(a, b):
+            query_loop(points[a:b], placed, reach[a:b], distance[a:b], gradient[a:b], self.data)
+
+        in_chunks(len(points), work, least=4096)
+        distance *= size
+        gradient *= size
+        return distance, gradient
+
+    def direction(self, points: Floats, pose: Floats | None = None) -> Floats:
+        """Unit direction (n, 3) in which the distance grows: out of the bone, also from inside."""
+        return self.gradient(points, pose)
+
+    def closest_point(self, points: Floats, pose: Floats | None = None) -> Floats:
+        """Nearest point (n, 3) of the bone's mesh, exact."""
+        points, pose = check_points(points), _check_pose(pose)
+        local = (points - pose[:3, 3]) @ pose[:3, :3]
+        return self.exact.closest_point(local) @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _key(vertices, faces, tolerance, region, memory_limit):
+    box = None if region is None else np.asarray(region).tolist()
+    return content_key(vertices, faces, (tolerance, box, memory_limit))
+
+
+def _check_pose(pose):
+    if pose is None:
+        return IDENTITY
+    pose = np.ascontiguousarray(pose, dtype=np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise ValueError(f"pose must be a finite (4, 4) transform, got shape {pose.shape}")
+    return pose
+
+
+def _local_reach(reach, count, size):
+    """Reach of each point in local units; not below zero, as cells inside the bone have zero for a bound."""
+    if np.ndim(reach) == 0:
+        return np.full(count, max(reach, 0.0) / size)
+    return np.maximum(reach, 0.0) / size
+
+
+class _Parts(NamedTuple):
+    """A field in local units, as it is kept on disk."""
+
+    faces: np.ndarray
+    notes: list
+    data: FieldData
+    spacing: float
+    error: float
+    closed: bool
+
+
+def _build(mesh, frame, tolerance, region, memory_limit, name):
+    """Refine until the field errs by no more than the tolerance."""
+    exact = ExactDistance(mesh.vertices, mesh.faces)
+    edge = _mean_edge(mesh)
+    used = mesh.vertices[np.unique(mesh.faces)]
+    extent = float(np.ptp(used, axis=0).max())
+    spacing = min(CELL_SHARE * edge, extent / LEAST_CELLS)
+    box = None if region is None else frame.box(region)
+    wanted = TOLERANCE_SHARE * edge if tolerance is None else tolerance / frame.size
+    inside = None if mesh.closed else winding_test(mesh)
+    error = np.inf
+    for _ in range(ATTEMPTS):
+        spacing = _check_memory(mesh, exact, spacing, tolerance, memory_limit, name)
+        cells = build_cells(exact, spacing, BAND * spacing, inside=inside, region=box, doubtful=mesh.doubtful)
+        if inside is None and not cells.sound:
+            mesh.notes.append("intersects itself: the sign comes from winding numbers")
+            inside = winding_test(mesh)
+            continue
+        data = pack_field(exact, cells)
+        error = _measure(mesh, data, exact, BAND * spacing, box)
+        reached = _Parts(mesh.faces, mesh.notes, data, spacing, error, inside is None)
+        if error <= wanted:
+            return reached
+        spacing *= max(0.5, 0.9 * (wanted / error) ** (1 / 3))
+    mesh.notes.append(
+        f"errs by {error * frame.size:.3g} RMS near the surface, {wanted * frame.size:.3g} was asked for"
+    )
+    return reached
+
+
+def _mean_edge(mesh):
+    corners = mesh.vertices[mesh.faces]
+    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
+
+
+def _check_memory(mesh, exact, spacing, tolerance, limit, name):
+    """Spacing that fits in the memory: larger if the caller asked for no tolerance, else an error."""
+    low, high = exact.vertices.min(axis=0), exact.vertices.max(axis=0)
+    corners = mesh.vertices[mesh.faces]
+    area = 0.5 * np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+
+    def need(h):
+        table = 4.0 * np.prod(BLOCK * grid_shape(low, high, h, BAND * h).astype(np.float64))
+        return table + 25.0 * (2 * BAND + 6) * float(area.sum()) / h**2 + 160.0 * len(mesh.faces)
+
+    if need(spacing) <= limit:
+        return spacing
+    if tolerance is not None:
+        raise MeshError(
+            f"{name}: a tolerance of {tolerance:g} needs about {need(spacing) / 2**20:.0f} MB, "
+            f"{limit / 2**20:.0f} MB are allowed; raise the tolerance or the memory limit"
+        )
+    start = spacing
+    while need(spacing) > limit and spacing < 1e3 * start:
+        spacing *= 1.25
+    if need(spacing) > limit:
+        raise MeshError(f"{name}: its {len(mesh.faces)} faces do not fit in {limit / 2**20:.0f} MB")
+    return spacing
+
+
+def _measure(mesh, data, exact, band, region):
+    """RMS error at points spread over the band, in the region."""
+    rng = np.random.default_rng(0)
+    corners = mesh.vertices[mesh.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    if region is not None:
+        area = area * np.all((corners.min(axis=1) <= region[1]) & (corners.max(axis=1) >= region[0]), axis=1)
+    if area.sum() == 0.0:
+        return 0.0
+    which = rng.choice(len(area), PROBES, p=area / area.sum())
+    weight = rng.dirichlet(np.ones(3), PROBES)
+    points = np.einsum("nk,nkj->nj", weight, corners[which])
+    unit = normal[which] / np.linalg.norm(normal[which], axis=1, keepdims=True)
+    points += unit * rng.uniform(-band, band, (PROBES, 1))
+    distance = np.empty(len(points))
+    query_loop(points, IDENTITY, np.full(PROBES, np.inf), distance, NO_GRADIENT, data)
+    difference = np.abs(distance) - np.abs(exact.signed_distance(points))
+    return float(np.sqrt(np.mean(difference**2)))
+
+
+def pack_field(exact: ExactDistance, cells: Cells) -> FieldData:
+    """Arrays for queries, single precision and relative to the grid's origin, where that loses nothing."""
+    records = np.empty((len(exact.records), 16), dtype=np.float32)
+    records[:, :3] = exact.records[:, :3] - cells.origin
+    records[:, 3:] = exact.records[:, 3:16]
+    turn = (exact.records[:, FIRST].astype(np.int64)[:, None] + np.arange(3)) % 3
+    rows = exact.order[:, None]
+    return FieldData(
+        grid=np.array([*cells.origin, 1.0 / cells.block, cells.unit]),
+        blocks=cells.blocks,
+        cells=cells.cells,
+        lists=cells.lists,
+        corners=cells.corners,
+        far=cells.far,
+        records=records,
+        edge_normals=exact.edge_normals[rows, turn].astype(np.float32),
+        vertex_normals=exact.vertex_normals.astype(np.float32),
+        vertices=exact.faces[rows, turn].astype(np.int32),
+        across=cells.across,
+    )
+
+
+def _to_arrays(parts):
+    arrays = {"data_" + name: array for name, array in parts.data._asdict().items()}
+    numbers = np.array([parts.spacing, parts.error, float(parts.closed)])
+    return {**arrays, "faces": parts.faces, "numbers": numbers, "notes": np.array("\n".join(parts.notes))}
+
+
+def _from_arrays(arrays):
+    if not {"numbers", "notes", "faces"} <= arrays.keys():
+        return None
+    notes = [note for note in str(arrays["notes"]).split("\n") if note]
+    data = FieldData(**{name: arrays["data_" + name] for name in FieldData._fields})
+    spacing, error, closed = arrays["numbers"]
+    return _Parts(arrays["faces"], notes, data, float(spacing), float(error), bool(closed))

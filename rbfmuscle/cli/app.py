@@ -1,0 +1,149 @@
+"""The commands as one: reads the arguments, runs a command, turns errors into one line and an exit code.
+
+0 done; 2 wrong usage; 3 bad scene; 4 unusable mesh; 5 solve failed, frames so far kept; 6 a ``--fail-on``
+limit exceeded; 7 an optional part missing; 130 interrupted, frames so far kept.
+"""
+
+import contextlib
+import json
+import logging
+import os
+import sys
+import warnings
+
+from cyclopts import App, CycloptsError
+
+from rbfmuscle import __version__
+from rbfmuscle.cli.check import check
+from rbfmuscle.cli.compare import compare
+from rbfmuscle.cli.import_model import import_
+from rbfmuscle.cli.kernels import kernels
+from rbfmuscle.cli.new import new
+from rbfmuscle.cli.paths import paths
+from rbfmuscle.cli.plan import plan
+from rbfmuscle.cli.run import demo, run
+from rbfmuscle.cli.show import export, render
+from rbfmuscle.cli.sweep import sweep
+from rbfmuscle.cli.view import view
+from rbfmuscle.interruption import INTERRUPTED
+from rbfmuscle.validation import RBFMuscleError, SolveError, UsageError
+
+LONGEST_LINE = 1000  # characters of a message: what a hostile file holds is not all shown
+
+app = App(
+    name="rbfmuscle", help="Muscles as implicit RBF surfaces that move with the bones.", version=__version__
+)
+for command in (
+    demo,
+    check,
+    plan,
+    run,
+    compare,
+    sweep,
+    export,
+    render,
+    new,
+    view,
+    kernels,
+):
+    app.command(command)
+app.command(import_, name="import")
+app.command(paths)
+
+
+def run_command(arguments: list[str]) -> int:
+    """Run one command; the process's exit code, all errors told in one line."""
+    sys.excepthook = _report_bug
+    warnings.showwarning = _show_warning
+    logging.lastResort = _LogLines(logging.WARNING)
+    as_json = "--json" in arguments
+    if sys.stdout is None:
+        return _fail(
+            "standard output is closed; send it to a file, or to /dev/null", UsageError.exit_code, False
+        )
+    try:
+        code = _run(arguments, as_json)
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader of our output went away, as `| head` does
+        _drop_output()
+        return 0
+    except OSError as error:
+        _drop_output()
+        return _fail(_describe_os_error(error), UsageError.exit_code, False)
+    return code
+
+
+def _run(arguments, as_json):
+    if not arguments:
+        app.help_print([])
+        return 2
+    try:
+        action, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False)
+    except CycloptsError as error:
+        return _fail(one_line(error), 2, as_json, hint=f"try 'rbfmuscle {_command_of(arguments)}--help'")
+    try:
+        code = action(*bound.args, **bound.kwargs)
+    except KeyboardInterrupt as error:
+        return _fail(str(error) or "interrupted", INTERRUPTED, as_json)
+    except RBFMuscleError as error:
+        return _fail(one_line(error), error.exit_code, as_json)
+    except MemoryError as error:
+        asked = f" ({one_line(error)})" if str(error) else ""
+        message = f"not enough memory{asked}; take fewer centres, coarser cells or smaller meshes"
+        return _fail(message, SolveError.exit_code, as_json)
+    return code if isinstance(code, int) else 0
+
+
+def _describe_os_error(error):
+    """What the system refused; that of a stream without a name is standard output."""
+    what = f"{error.filename}" if error.filename else "standard output or a file of the command"
+    return f"cannot read or write {what}: {error.strerror or one_line(error)}; free or choose another place"
+
+
+def _drop_output():
+    """Nothing more can be written: what is still held back goes nowhere, so that leaving raises no second error."""
+    with contextlib.suppress(OSError):  # of a caller in Python, whose stream has no file
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _fail(message, code, as_json, *, hint=""):
+    print(f"rbfmuscle: {message}{'; ' + hint if hint else ''}", file=sys.stderr)
+    if as_json:
+        print(json.dumps({"error": message, "exit_code": code}))
+    return code
+
+
+def one_line(error: object) -> str:
+    """Return a message without line breaks, cut where it is longer than any that is meant."""
+    text = " ".join(str(error).split())
+    return text if len(text) <= LONGEST_LINE else f"{text[: LONGEST_LINE - 60]} ... {text[-50:]}"
+
+
+def _command_of(arguments):
+    return f"{arguments[0]} " if arguments[0] in app else ""
+
+
+def _show_warning(message, category, filename, lineno, file=None, line=None):
+    print(f"rbfmuscle: warning: {one_line(message)}", file=sys.stderr)
+
+
+class _LogLines(logging.Handler):
+    """What the library logs, where nobody has set up logging, as the warnings are told."""
+
+    def emit(self, record):
+        print(f"rbfmuscle: warning: {one_line(record.getMessage())}", file=sys.stderr)
+
+
+def _report_bug(kind, error, trace):
+    """What is left is a bug: say where, without a traceback unless one is asked for."""
+    if os.environ.get("RBFMUSCLE_TRACEBACK"):
+        sys.__excepthook__(kind, error, trace)
+        return
+    while trace.tb_next:
+        trace = trace.tb_next
+    place = f"{os.path.basename(trace.tb_frame.f_code.co_filename)}:{trace.tb_lineno}"
+    print(
+        f"rbfmuscle: a bug: {kind.__name__}: {one_line(error)} (at {place}); "
+        "set RBFMUSCLE_TRACEBACK=1 for the whole trace and report it",
+        file=sys.stderr,
+    )

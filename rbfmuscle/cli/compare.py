@@ -1,0 +1,106 @@
+"""``rbfmuscle compare``: models on one scene, beside each other."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from rbfmuscle.cli.run import Json, Output
+from rbfmuscle.cli.scenes import load_scene
+from rbfmuscle.progress import Progress
+from rbfmuscle.validation import SolveError
+
+# What the table on the terminal holds.
+SHOWN = (
+    "volume_error",
+    "penetration_max",
+    "bone_penetration_max",
+    "euler",
+    "self_crossing",
+    "flicker_max",
+    "rest_error_rms",
+    "step_rms",
+    "return_rms",
+    "strain_rms",
+    "distance_rms",
+    "time_frame",
+)
+
+
+def compare(
+    scene: str,
+    *,
+    output: Output,
+    models: str | None = None,
+    settings: Annotated[list[str] | None, Parameter(name="--set", negative="")] = None,
+    frames: str | None = None,
+    pictures: bool = True,
+    as_json: Json = False,
+) -> None:
+    """Run models on one scene: the same motion, contacts and measures; tables, report, pictures.
+
+    Parameters
+    ----------
+    scene
+        Scene file (TOML), or "phantom" for the embedded hip.
+    output
+        Folder for the results; each model's run is in a folder of its own there.
+    models
+        Names with commas between; distances are measured to the first. All models by default.
+    settings
+        KEY=VALUE as for run, for all models; MODEL:KEY=VALUE for one. May be repeated.
+    frames
+        Frames of the motion, as A:B:S (B not included).
+    pictures
+        Draw pictures and the animation.
+    as_json
+        Print JSON and nothing else.
+    """
+    from rbfmuscle import interruption
+    from rbfmuscle.compare import compare_models
+    from rbfmuscle.models import COMPARED
+    from rbfmuscle.output.writer import json_text
+    from rbfmuscle.scene.settings import parse_settings
+
+    names = [name.strip() for name in models.split(",") if name.strip()] if models else list(COMPARED)
+    changes = parse_settings(settings)
+    with Progress("compare") as progress, interruption.keeping(lambda: output.exists()):
+
+        def advance(model, done, total):
+            if done == 0:
+                progress.show(model, done, total)
+            progress(done, total)
+            interruption.check()
+
+        try:
+            table = compare_models(
+                load_scene(scene),
+                output,
+                names,
+                frames=frames,
+                settings=changes,
+                pictures=pictures,
+                progress=advance,
+            )
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"interrupted; finished runs are kept in {output}") from None
+    if as_json:
+        print(json_text({"directory": str(output), **table}))
+    else:
+        _print_table(table, output)
+    if table["failed"]:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in table["failed"].items())
+        raise SolveError(f"{reasons}; the other models are in {output}")
+
+
+def _print_table(table, output):
+    width = max(len(name) for name in (*table["models"], *SHOWN)) + 2
+    print(" " * width + "".join(f"{name:>18}" for name in table["models"]))
+    for quantity in SHOWN:
+        cells = [table["results"][name]["all"].get(quantity) for name in table["models"]]
+        if any(value is not None for value in cells):
+            texts = ("-" if value is None else f"{value:.3g}" for value in cells)
+            unit = table["measures"][quantity]["unit"]
+            print(f"{quantity:{width}}" + "".join(f"{text:>18}" for text in texts) + f"  {unit}")
+    print(f"{table['frames']} frames, in {output}, open {output / 'report.html'}")

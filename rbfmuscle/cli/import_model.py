@@ -1,0 +1,58 @@
+"""``rbfmuscle import``: a scene from an OpenSim model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from rbfmuscle.validation import UsageError
+
+
+def import_(
+    model: Path,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    units: Literal["m", "cm", "mm"] = "m",
+    geometry: Annotated[list[Path] | None, Parameter(negative="")] = None,
+    bodies: Annotated[list[str] | None, Parameter(negative="")] = None,
+    motion: Path | None = None,
+    force: Annotated[bool, Parameter(negative="")] = False,
+) -> None:
+    """Write a scene file and its meshes from an OpenSim model (.osim).
+
+    Parameters
+    ----------
+    model
+        The model, of version 2 to 4; OpenSim itself is not needed.
+    output
+        Folder for scene.toml and the bones.
+    units
+        Unit of the scene's lengths.
+    geometry
+        Folder with meshes, besides the model's own and its Geometry; repeatable.
+    bodies
+        Take this body and what lies between it and the ground; repeatable, all by default.
+    motion
+        A .mot or .sto file for the scene's motion.
+    force
+        Replace a scene file that exists.
+    """
+    from rbfmuscle.importers.opensim.scene import import_osim
+    from rbfmuscle.importers.opensim.write import write_scene
+
+    target = output / "scene.toml"
+    if target.exists() and not force:
+        raise UsageError(f"{target} exists; give another --output, or --force to replace it")
+    for folder in geometry or []:
+        if not folder.is_dir():
+            raise UsageError(f"--geometry {folder}: no such folder")
+    found = import_osim(model, units=units, geometry=geometry, bodies=bodies)
+    written = write_scene(found, output, motion=motion)
+    for note in found.notes:
+        print(f"note: {note}")
+    scene = found.scene
+    counts = f"{len(scene.bones)} bones, {len(scene.links)} without a mesh, {len(scene.joints)} joints"
+    print(f"{written}: {counts}, {len(scene.couplings)} couplings")
+    print(f"next: add a [[muscle]] for each muscle (docs/scene_file.md), then rbfmuscle check {written}")

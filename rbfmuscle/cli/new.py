@@ -1,0 +1,107 @@
+"""``rbfmuscle new``: a commented scene file to start from, guessed from meshes or from a volume of labels."""
+
+import re
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from rbfmuscle.validation import UsageError
+
+
+def new(
+    source: Path,
+    *,
+    units: Literal["mm", "cm", "m"] | None = None,
+    labels: Path | None = None,
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    force: Annotated[bool, Parameter(negative="")] = False,
+) -> None:
+    """Write a commented scene file for a folder of meshes or a volume of labels.
+
+    Parameters
+    ----------
+    source
+        Folder with STL, OBJ, PLY, VTK or VTP files, one bone or muscle each (or in folders bones and muscles);
+        or a segmentation: .nii, .nii.gz, .nrrd, or a folder with one mask a file.
+    units
+        Unit of the meshes; label volumes say theirs and become millimetres.
+    labels
+        Names of a segmentation's labels: JSON, CSV, TSV or ITK-SNAP's descriptions.
+    output
+        Scene file to write, scene.toml beside the meshes by default.
+    force
+        Replace a file that exists.
+    """
+    from rbfmuscle.importers.guess.guess import guess_scene, write_scene
+
+    volume = _is_segmentation(source)
+    if volume and units not in (None, "mm"):
+        raise UsageError(f"{source}: a segmentation says its unit, its scene is in mm; leave --units out")
+    if not volume and units is None:
+        raise UsageError("--units is missing: give the unit of the meshes, mm, cm or m")
+    if labels is not None and not volume:
+        raise UsageError(f"--labels names the labels of a segmentation, {source} is a folder of meshes")
+    folder = _beside(source, output) if volume else source
+    output = output or folder / "scene.toml"
+    if output.exists() and not force:
+        raise UsageError(f"{output} exists; give another --output, or --force to replace it")
+    if volume:
+        folder = _write_surfaces(source, labels, folder)
+    guess = guess_scene(folder, units or "mm", output.parent)
+    scene = write_scene(guess, output)
+    print(f"{output} written; every guess in it is marked, look them over")
+    for doubt in guess.doubts():
+        print(f"doubtful: {doubt}")
+    for finding in scene.check():
+        print(finding)
+    print(f"next: rbfmuscle check {output}, then rbfmuscle run {output} -o out")
+
+
+def _is_segmentation(source):
+    from rbfmuscle.importers.labels.read import is_volume
+    from rbfmuscle.scene.meshes.read import MESH_SUFFIXES
+
+    if not source.is_dir():
+        return is_volume(source)
+    files = [path for path in source.iterdir() if path.is_file()]
+    meshes = any(path.suffix.lower() in MESH_SUFFIXES for path in files)
+    return not meshes and any(is_volume(path) for path in files)
+
+
+def _beside(source, output):
+    """Folder of the scene of a segmentation."""
+    if output is not None:
+        return output.parent
+    name = source.name.split(".")[0] or "scene"
+    return source / "scene" if source.is_dir() else source.parent / f"{name}_scene"
+
+
+def _write_surfaces(source, labels, folder):
+    """Surfaces of all labels as PLY beside the scene; their folder."""
+    from rbfmuscle.importers.guess.anatomy import bone_class, says_muscle
+    from rbfmuscle.importers.labels.read import read_labels
+    from rbfmuscle.importers.labels.surfaces import label_surface
+    from rbfmuscle.progress import Progress
+
+    volume = read_labels(source, names=labels)
+    meshes = folder / "meshes"
+    try:
+        meshes.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"cannot write to {folder}: {error.strerror}; choose another --output") from None
+    values, files = volume.values(), set()
+    with Progress("surfaces", "label") as progress:
+        for done, label in enumerate(values, start=1):
+            name = volume.name(label)
+            several = bool(bone_class(name)) and not says_muscle(name)
+            surface = label_surface(volume, int(label), pieces=several)
+            file = re.sub(r"[^A-Za-z0-9_-]+", "_", surface.name)
+            if file.lower() in files:  # two labels of one name are two parts
+                file = f"{file}_{int(label)}"
+            files.add(file.lower())
+            surface.mesh.export(meshes / f"{file}.ply")
+            for note in surface.notes:
+                print(f"{surface.name}: {note}")
+            progress(done, len(values))
+    return meshes

@@ -1,0 +1,85 @@
+"""``rbfmuscle plan``: what a scene will build and do, before it is run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from rbfmuscle.cli.scenes import load_scene
+from rbfmuscle.progress import Progress, stage
+
+if TYPE_CHECKING:
+    from rbfmuscle.scene.scene import Scene
+
+
+def plan(
+    scene: Path,
+    *,
+    time: Annotated[bool, Parameter(negative="")] = False,
+    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+) -> None:
+    """List what a run of the scene would build, without building it.
+
+    Parameters
+    ----------
+    scene
+        Scene file (TOML), or "phantom" for the embedded hip.
+    time
+        Also build the muscles, solve two frames after the first, and extrapolate to the whole motion.
+    as_json
+        Print JSON and nothing else.
+    """
+    from rbfmuscle.models import check_models, solved_points
+    from rbfmuscle.simulation.plan.plan import plan_scene
+
+    with Progress(f"plan {scene.name}"):
+        loaded = load_scene(scene)
+        check_models(loaded)
+        made = plan_scene(loaded)
+        for muscle, facts in zip(loaded.muscles, made["muscles"]):
+            facts["points"] = solved_points(muscle, loaded)
+        if time:
+            with stage("solving two frames"):
+                made["time"] = measure_time(loaded)
+    print(json.dumps(made, indent=1) if as_json else "\n".join(_lines(made)))
+
+
+def measure_time(scene: Scene) -> dict[str, Any]:
+    """Wall time of a run [s], from its first three frames: ``build`` (with the first frame), ``frame``, ``total``.
+
+    Report, pictures and files are not in it.
+    """
+    from time import perf_counter
+
+    from rbfmuscle.run import simulate
+
+    start = perf_counter()
+    frames = simulate(scene, frames=slice(0, 3), settings={"output.report": False}).frames
+    spent, count = perf_counter() - start, len(scene.motion)
+    frame = spent / count if len(frames) < 2 else sum(f.wall for f in frames[1:]) / (len(frames) - 1)
+    build = max(0.0, spent - frame * (len(frames) - 1))
+    return {"build": build, "frame": frame, "total": build + frame * (count - 1)}
+
+
+def _lines(made):
+    lines = [f"{made['frames']} frames in {made['substeps']} sub-steps"]
+    for muscle in made["muscles"]:
+        work = ", ".join(f"{s} in {muscle[s]}" for s in ("solved", "carried", "skipped") if muscle[s])
+        lines.append(
+            f"muscle {muscle['name']}: {muscle['model']}, {muscle['points']}, can meet "
+            f"{', '.join(muscle['bones']) or 'no bone'}; {work or 'solved in 0'} frames ({muscle['reason']})"
+        )
+    for field in made["fields"]:
+        lines.append(
+            f"field of {field['bone']}: {field['share']:.0%} of its box, {field['triangles']} triangles"
+        )
+    if "time" in made:
+        spent = made["time"]
+        lines.append(
+            f"expected time: {spent['total']:.3g} s without report, pictures and files; build and first frame "
+            f"{spent['build']:.2g} s, {1e3 * spent['frame']:.3g} ms per frame"
+        )
+    return lines

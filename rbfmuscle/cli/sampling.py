@@ -1,0 +1,266 @@
+"""What ``rbfmuscle paths`` does: sample muscles over their coordinates, fit, and say how well the fits hold."""
+
+import csv
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rbfmuscle.importers.opensim.fitted import MOST_COORDINATES, FittedPath, fit_path, write_paths
+from rbfmuscle.metrics.centreline import Centreline, MuscleAtRest
+from rbfmuscle.models import build_models
+from rbfmuscle.scene.joints.skeleton import all_coordinates
+from rbfmuscle.scene.joints.tables import full_name
+from rbfmuscle.scene.motion import Motion, bone_poses, inner_value
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.frame_loop import FrameLoop
+from rbfmuscle.simulation.plan.contact_pairs import build_fields, find_contact_pairs
+from rbfmuscle.validation import SceneError, SolveError, UsageError
+
+# Every fifth sample is held out of the fit.
+HELD_OUT = 5
+# Of the central differences, to either side [degree, or mm of a shift].
+STEP = 1.0
+# A muscle has settled where no contact point moves by more than this share of its size in a solve.
+MOST_SOLVES, SETTLED = 60, 3e-7
+
+Ranges = dict[str, tuple[float, float]]
+
+
+@dataclass
+class Samples:
+    """A muscle's lengths and moment arms at some poses; a pose that could not be solved has NaN.
+
+    Attributes
+    ----------
+    coordinates : tuple of str
+        Those that the muscle depends on, full names.
+    values, arms : (n, d) ndarray
+        [radian or scene unit], [scene unit].
+    lengths : (n,) ndarray
+    """
+
+    muscle: str
+    coordinates: tuple[str, ...]
+    values: np.ndarray
+    lengths: np.ndarray
+    arms: np.ndarray
+
+
+def parse_ranges(scene: Scene, texts: list[str]) -> Ranges:
+    """Return the ranges that --range asks for, by full name [radian or scene unit]."""
+    known, found = list(all_coordinates(scene.joints)), {}
+    for text in texts:
+        name, _, ends = text.partition("=")
+        try:
+            low, high = (float(end) for end in ends.split(":"))
+        except ValueError:
+            raise UsageError(
+                f"--range {text!r} is not COORDINATE=LOW:HIGH, for instance hip.flexion=0:60"
+            ) from None
+        full = full_name(name, known, place="--range")
+        if not -np.inf < low < high < np.inf:
+            raise UsageError(f"--range {text!r}: the range must go upwards between two numbers")
+        found[full] = (inner_value(scene, full, low), inner_value(scene, full, high))
+    return found
+
+
+def sample_muscles(
+    scene: Scene, given: Ranges, *, samples: int, progress: Callable[[int, int], None] | None = None
+) -> list[Samples]:
+    """Return lengths and moment arms of every muscle at quasi-random poses of the coordinates that it depends on.
+
+    Each pose is reached from rest in a straight line and the muscle settles there. A moment arm is minus the central
+    difference of the length over `STEP` to both sides, the muscle settling there too.
+
+    Parameters
+    ----------
+    scene : Scene
+    given : dict of str to (float, float)
+        Ranges instead of the coordinates' own.
+    samples : int
+        Poses for each muscle.
+    progress : callable, optional
+        Told how many poses are done, and of how many.
+    """
+    if not scene.muscles:
+        raise SceneError(f"scene {scene.name!r} has no muscles, add a [[muscle]]")
+    scene = scene.validate().copy()
+    scene.sliding = None
+    groups = _groups(scene, given)
+    found, done = [], 0
+    for ranges, muscles in groups:
+        part = scene.copy()
+        part.muscles = [muscle for muscle in scene.muscles if muscle.name in muscles]
+        poses = _poses(ranges, samples)
+        rows = []
+        for row in _measured(part, poses):
+            rows.append(row)
+            done += 1
+            if progress is not None:
+                progress(done, samples * len(groups))
+        values = np.array([[pose[name] for name in ranges] for pose in poses])
+        for k, muscle in enumerate(part.muscles):
+            table = np.array([row[k] for row in rows])
+            found.append(Samples(muscle.name, tuple(ranges), values, table[:, 0], table[:, 1:]))
+    return found
+
+
+def _measured(scene, poses):
+    """For each pose a row for each muscle: its length, then its moment arm about each coordinate of the poses."""
+    scene.motion = Motion(poses[:40])  # what bones a muscle may meet is sought along it
+    models = build_models(scene)
+    rest = [model.snapshot() for model in models]
+    lines = {
+        m.name: Centreline(MuscleAtRest(scene.muscle(m.name), scene.joints, *m.material_mesh()))
+        for m in models
+    }
+    fields = build_fields(scene, find_contact_pairs(scene))
+    for pose in poses:
+        for model, state in zip(models, rest):
+            model.restore(state)
+        try:
+            with FrameLoop(scene, models, fields=fields, surfaces=False) as loop:
+                yield _row(loop, lines, pose)
+        except SolveError:
+            yield np.full((len(models), 1 + len(pose)), np.nan)
+
+
+def _row(loop, lines, pose):
+    """Length and moment arms (n, 1 + d) of the muscles at a pose."""
+    here, arms = _settled(loop, lines, pose), []
+    facts = all_coordinates(loop.scene.joints)
+    for name, value in pose.items():
+        turns = facts[name].motion != "translation"
+        step = math.radians(STEP) if turns else loop.scene.length(STEP)
+        ends = [facts[name].honoured(value + side * step) for side in (-1.0, 1.0)]
+        below, above = (_settled(loop, lines, {**pose, name: end}) for end in ends)
+        arms.append(-(above - below) / (ends[1] - ends[0]))
+    return np.stack([here, *arms], axis=1)
+
+
+def _settled(loop, lines, pose):
+    """Lengths (n,) of the muscles when they have come to rest at a pose, or have had `MOST_SOLVES`."""
+    loop.skip(pose)
+    with loop.workers.one_thread_each():
+        loop.workers.each(lambda stepper: _settle(stepper, loop.here), loop.steppers)
+    poses = bone_poses(loop.scene, loop.here)
+    return np.array([lines[s.name].length(s.model.material_mesh()[0], poses) for s in loop.steppers])
+
+
+def _settle(stepper, here):
+    points = stepper.model.contact_points().copy()
+    small = SETTLED * float(np.linalg.norm(np.ptp(points, axis=0)))
+    for _ in range(MOST_SOLVES):
+        stepper.solve(dict(here))
+        before, points = points, stepper.model.contact_points().copy()
+        if np.abs(points - before).max() <= small:
+            return
+
+
+def _poses(ranges, samples):
+    from scipy.stats import qmc
+
+    # A power of two of them, as Sobol's points are balanced.
+    points = qmc.Sobol(len(ranges), scramble=True, seed=0).random(1 << (samples - 1).bit_length())
+    low, high = np.array(list(ranges.values())).T
+    return [dict(zip(ranges, row)) for row in (low + points[:samples] * (high - low)).tolist()]
+
+
+def _groups(scene, given):
+    """Ranges of the coordinates that muscles depend on, with the names of these muscles, which are sampled together."""
+    facts, followers = all_coordinates(scene.joints), {coupling.coordinate for coupling in scene.couplings}
+    free = [name for name, fact in facts.items() if name not in followers and not fact.locked]
+    groups = {}
+    for muscle in scene.muscles:
+        bones = sorted({attachment.bone for attachment in muscle.attachments})
+        needed = tuple(name for name in free if _moves(scene, bones, name))
+        if not 1 <= len(needed) <= MOST_COORDINATES:
+            raise SceneError(
+                f"muscle {muscle.name!r} depends on {len(needed)} coordinates ({', '.join(needed)}); OpenSim takes "
+                f"1 to {MOST_COORDINATES}: lock some in the scene"
+            )
+        groups.setdefault(needed, []).append(muscle.name)
+    return [
+        ({name: _range(scene, name, given) for name in needed}, names) for needed, names in groups.items()
+    ]
+
+
+def _moves(scene, bones, name):
+    """Whether a coordinate moves some bones against each other, from where all others rest."""
+    fact, places = all_coordinates(scene.joints)[name], []
+    for value in (fact.rest, fact.rest + 0.1, fact.rest - 0.1):
+        poses = bone_poses(scene, {name: fact.honoured(value)})
+        back = np.linalg.inv(poses[bones[0]])
+        places.append([back @ poses[bone] for bone in bones])
+    return np.ptp(np.array(places), axis=0).max() > 1e-6
+
+
+def _range(scene, name, given):
+    """The range of a coordinate: as given, its own, or what the motion covers."""
+    moved = [frame[name] for frame in scene.motion.frames if name in frame]
+    own = all_coordinates(scene.joints)[name].range
+    for ends in (given.get(name), own, (min(moved, default=0.0), max(moved, default=0.0))):
+        if ends is not None and ends[0] < ends[1]:
+            return ends
+    raise UsageError(f"coordinate {name!r} has no range; give --range {name}=LOW:HIGH")
+
+
+def report_fits(scene: Scene, sampled: list[Samples], directory: Path, order: int) -> list[str]:
+    """Fit every muscle, write the files, and return lines that say how well the fits hold where they were not made."""
+    fitted, lines, errors, unit = [], [], [], scene.units
+    for found in sampled:
+        solved = np.isfinite(found.lengths)
+        held = np.arange(len(solved)) % HELD_OUT == HELD_OUT - 1
+        use, out = solved & ~held, solved & held
+        failed = int((~solved).sum())
+        if use.sum() < 2 * (len(found.coordinates) + 1) or not out.any():
+            raise SolveError(
+                f"muscle {found.muscle!r}: {failed} of {len(solved)} poses failed, too few are left to fit"
+            )
+        parts = (found.values[use], found.lengths[use], found.arms[use])
+        path = fit_path(found.muscle, found.coordinates, *parts, most=order)
+        row = held_out_errors(path, found.values[out], found.lengths[out], found.arms[out])
+        fitted.append(path)
+        head = {"muscle": path.muscle, "order": path.order, "fitted": int(use.sum()), "failed": failed}
+        errors.append({**head, **row})
+        lines.append(
+            f"{path.muscle}: order {path.order} in {', '.join(path.coordinates)}; {int(out.sum())} poses held out: "
+            f"length {row['length_rms']:.3g} {unit} RMS, {row['length_max']:.3g} at most; "
+            f"arms {row['arm_rms']:.3g} {unit} RMS, {row['arm_max']:.3g} at most"
+            + (f"; {failed} poses could not be solved" if failed else "")
+        )
+    turning = {name: f.motion != "translation" for name, f in all_coordinates(scene.joints).items()}
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        write_paths(directory / "paths.xml", fitted, scene.length(1000.0), turning)
+        _write_csv(directory / "errors.csv", errors)
+    except OSError as error:
+        raise UsageError(f"cannot write to {directory}: {error.strerror}; choose another folder") from None
+    lines.append(
+        f"{directory / 'paths.xml'}: {len(fitted)} paths; OpenSim puts them in by their names, /forceset/MUSCLE"
+    )
+    return lines
+
+
+def held_out_errors(
+    path: FittedPath, values: np.ndarray, lengths: np.ndarray, arms: np.ndarray
+) -> dict[str, float]:
+    """Return root mean square and greatest errors of length and arms at poses that the fit has not seen."""
+    length, arm = path.length(values) - lengths, path.arms(values) - arms
+    return {
+        "held_out": len(values),
+        "length_rms": float(np.sqrt(np.mean(length**2))),
+        "length_max": float(np.abs(length).max()),
+        "arm_rms": float(np.sqrt(np.mean(arm**2))),
+        "arm_max": float(np.abs(arm).max()),
+    }
+
+
+def _write_csv(file, rows):
+    with file.open("w", encoding="utf-8", newline="") as out:
+        writer = csv.DictWriter(out, fieldnames=list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)

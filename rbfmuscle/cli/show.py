@@ -1,0 +1,81 @@
+"""``rbfmuscle export`` and ``rbfmuscle render``: what a run left, in other forms."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from rbfmuscle.progress import Progress, stage
+
+
+def export(
+    directory: Path,
+    *,
+    formats: Annotated[list[str], Parameter(name="--format", negative="", consume_multiple=True)],
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    units: str | None = None,
+    frames: str | None = None,
+    up: str = "z",
+) -> None:
+    """Write the surfaces of a run in other formats and units.
+
+    Parameters
+    ----------
+    directory
+        Folder of the run.
+    formats
+        pvd, vtp, ply, stl, obj or glb: files for each frame; usd or animated-glb: all frames as an animation;
+        html: a page that turns and scrubs it. Several may be given.
+    output
+        Folder to write to, DIR/export by default.
+    units
+        m, cm or mm; the scene's by default (glb, animated-glb, html: m).
+    frames
+        Of the written frames, as A:B:S.
+    up
+        z or y: the scene's axis that points up, for usd, glb, animated-glb and html.
+    """
+    with Progress(f"export {directory}"):
+        from rbfmuscle.output.export import export_run
+        from rbfmuscle.scene.settings import parse_slice
+
+        chosen = parse_slice(frames) if frames is not None else None
+        written = export_run(directory, formats, output=output, units=units, frames=chosen, up=up)
+    folders = sorted({str(path.parent) for path in written})
+    print(f"{len(written)} file{'s'[: len(written) != 1]} in {', '.join(folders)}")
+
+
+def render(
+    directory: Path,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    frame: int | None = None,
+    view: Annotated[list[str] | None, Parameter(negative="")] = None,
+    seconds: float = 5.0,
+    colour: Literal["muscle", "activation"] = "muscle",
+) -> None:
+    """Draw a run: a picture (.png) or an animation (.gif, .webp).
+
+    Parameters
+    ----------
+    directory
+        Folder of the run.
+    output
+        File to draw.
+    frame
+        Of a picture; the last one by default.
+    view
+        front, side, back or far (the other side); may be repeated; the first three by default.
+    seconds
+        Length of an animation.
+    colour
+        What muscles are coloured by: themselves, or their activation.
+    """
+    with Progress(f"render {directory}"):
+        from rbfmuscle.report.render import render_run
+
+        with stage("drawing pictures"):
+            render_run(directory, output, frame=frame, views=view, seconds=seconds, colour=colour)
+    print(output)

@@ -1,1 +1,0 @@
-"""Commands that read from and write for OpenSim."""

@@ -1,0 +1,1 @@
+"""Kernel studies, comparisons and sweeps."""

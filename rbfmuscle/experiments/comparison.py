@@ -1,0 +1,358 @@
+"""Models on one scene, measured alike: what each keeps, how far apart they are, what each costs."""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from rbfmuscle.metrics.comparison_measures import MaterialProbe, array_bytes, curvature_variation
+from rbfmuscle.metrics.metrics import surface_distance
+from rbfmuscle.metrics.quantities import ALL, unit_text
+from rbfmuscle.output.runinfo import machine, versions
+from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.output.writer import write_json
+from rbfmuscle.scene.scene import MM_PER_UNIT
+
+if TYPE_CHECKING:
+    from rbfmuscle.scene.scene import Scene
+    from rbfmuscle.simulation.frame import Frame, MuscleModel
+
+
+FORMAT = 1
+LAW, MESH, OWN, FIRST, COST = "law", "input mesh", "own run", "first model", "cost"
+
+
+class Measure(NamedTuple):
+    """A row of the table.
+
+    ``against`` says what a value is an error of or against; a value is better the smaller its magnitude, and
+    differences of less than ``floor`` (millimetres for lengths) do not count. ``ideal`` is the perfect value.
+    """
+
+    title: str
+    kind: str
+    against: str
+    floor: float
+    meaning: str
+    ideal: float = 0.0
+
+
+MEASURES = {
+    "volume_error": Measure("volume error", "1", LAW, 1e-5, "worst frame, relative to the input mesh"),
+    "penetration_max": Measure(
+        "surface in a bone", "length", LAW, 0.02, "deepest surface vertex in a bone, worst frame"
+    ),
+    "bone_penetration_max": Measure(
+        "bone in the muscle", "length", LAW, 0.02, "deepest bone vertex in the muscle, worst frame"
+    ),
+    "solver_penetration_max": Measure(
+        "model in a bone before the cut",
+        "length",
+        LAW,
+        0.02,
+        "deepest point of the model, before bones are cut away",
+    ),
+    "components": Measure("pieces", "1", LAW, 0.0, "connected pieces of the surface, most in any frame"),
+    "euler": Measure(
+        "Euler characteristic", "1", LAW, 0.0, "2 for a sphere, two less for a handle; worst frame", 2.0
+    ),
+    "self_crossing": Measure(
+        "self-crossing", "1", LAW, 0.0, "triangles that cross others of the surface, worst frame"
+    ),
+    "flicker_rms": Measure(
+        "flicker (RMS)", "length", LAW, 0.01, "surface against carried mesh, frame to frame"
+    ),
+    "flicker_max": Measure("flicker (greatest)", "length", LAW, 0.05, "the same, greatest"),
+    "tunnelled": Measure("tunnelled points", "1", LAW, 0.0, "points beyond a bone, worst frame"),
+    "return_rms": Measure(
+        "return error (RMS)", "length", LAW, 0.02, "first pose before and after the motion there and back"
+    ),
+    "return_max": Measure("return error (greatest)", "length", LAW, 0.1, "the same, greatest distance"),
+    "step_rms": Measure(
+        "step dependence (RMS)",
+        "length",
+        LAW,
+        0.02,
+        "last pose by the scene's steps and by five times coarser",
+    ),
+    "step_max": Measure("step dependence (greatest)", "length", LAW, 0.1, "the same, greatest distance"),
+    "rest_error_rms": Measure("rest error (RMS)", "length", MESH, 0.02, "surface to input mesh at rest"),
+    "rest_error_max": Measure("rest error (greatest)", "length", MESH, 0.1, "the same, greatest distance"),
+    "strain_rms": Measure(
+        "strain", "1", OWN, 0.002, "edges between the same 1200 material points for all models, worst frame"
+    ),
+    "curvature_variation": Measure(
+        "curvature variation",
+        "1/length",
+        OWN,
+        0.0,
+        "unevenness of mean curvature among neighbours, worst pose",
+    ),
+    "distance_rms": Measure(
+        "distance (RMS)", "length", FIRST, 0.0, "to the first model's surface, worst pose"
+    ),
+    "distance_max": Measure("distance (greatest)", "length", FIRST, 0.0, "the same, greatest distance"),
+    "time_frame": Measure(
+        "time a frame (median)", "s", COST, 0.0, "wall time, all muscles, surfaces included"
+    ),
+    "time_frame_p95": Measure("time a frame (95 %)", "s", COST, 0.0, "the same, exceeded by one frame in 20"),
+    "time_solve": Measure(
+        "solution", "s", COST, 0.0, "prediction, solution, contacts; median, summed over muscles"
+    ),
+    "time_surface": Measure("surface", "s", COST, 0.0, "fit and extraction; median, summed over muscles"),
+    "time_build": Measure("build", "s", COST, 0.0, "models of all muscles, once, with filled caches"),
+    "memory": Measure("memory", "MB", COST, 0.0, "arrays held by the models after the motion, summed"),
+}
+_FROM_METRICS = [name for name, m in MEASURES.items() if m.against in (LAW, MESH)]
+_SUMMED = ("time_solve", "time_surface", "memory")
+_TIE = 1.05
+
+
+class ModelProbe:
+    """Measures one model during its run, beside the metrics; given to `stream_run` as ``watch``.
+
+    Parameters
+    ----------
+    scene : Scene
+    poses : collection of int
+        Frames in which curvature is measured.
+    """
+
+    def __init__(self, scene: Scene, poses: list[int]) -> None:
+        self.scene, self.poses = scene, set(poses)
+        self.found = {muscle.name: {} for muscle in scene.muscles}
+        self._material = {}
+
+    def __call__(self, models: list[MuscleModel], frame: Frame | None) -> None:
+        """Take what is kept of a frame; the rest states where ``frame`` is None."""
+        if frame is None:
+            for model in models:
+                vertices, faces = model.material_mesh()
+                probe = MaterialProbe(self.scene.muscle(model.name).mesh, vertices, faces)
+                self._material[model.name] = probe, probe.points(vertices)
+            return
+        for name, (probe, start) in self._material.items():
+            self._worst(name, "strain_rms", probe.strain(probe.points(frame.carried[name][0]), start))
+        if frame.index in self.poses:
+            for name, surface in frame.surfaces.items():
+                variation = curvature_variation(surface.vertices, surface.faces)
+                self._worst(name, "curvature_variation", variation)
+        if frame.index == len(self.scene.motion) - 1:
+            for model in models:
+                self.found[model.name]["memory"] = array_bytes(model, without=[self.scene]) / 1e6
+
+    def _worst(self, muscle, quantity, value):
+        known = self.found[muscle]
+        known[quantity] = max(known.get(quantity, 0.0), value)
+
+
+def chosen_poses(scene: Scene) -> list[int]:
+    """First, middle and last frame of the motion, each once."""
+    last = len(scene.motion) - 1
+    return sorted({0, last // 2, last})
+
+
+def measure_run(saved: SavedRun, probe: ModelProbe, extra: dict[str, Any]) -> dict[str, Any]:
+    """Values of every measure but the distances for one model.
+
+    Parameters
+    ----------
+    saved : SavedRun
+    probe : ModelProbe
+        Which has watched the run.
+    extra : dict
+        ``build`` [s], and where the motion has more than one frame ``turn`` and ``end``: surfaces by muscle
+        (vertices, faces) at the last pose and back at the first, by coarser steps.
+
+    Returns
+    -------
+    dict
+        muscle -> quantity -> value, and under ``"all"`` the worst over muscles, the sum, or the wall time.
+    """
+    found = {}
+    for muscle in saved.muscles:
+        facts = saved.info["muscles"].get(muscle, {})
+        values = {q: facts[q]["worst"] for q in _FROM_METRICS if q in facts}
+        values.update(probe.found[muscle])
+        values.update(_times(saved, muscle))
+        for name, frame, part in (("return", 0, "end"), ("step", -1, "turn")):
+            if part in extra:
+                pair = surface_distance(*saved.surface(muscle, saved.frames[frame]), *extra[part][muscle])
+                values[f"{name}_rms"], values[f"{name}_max"] = pair
+        found[muscle] = values
+    together = {name: _over_muscles(name, found.values()) for name in MEASURES}
+    wall = saved.series(ALL, "time_frame")[1][1:]
+    if len(wall):
+        together.update(time_frame=float(np.median(wall)), time_frame_p95=float(np.percentile(wall, 95)))
+    together["time_build"] = extra["build"]
+    found[ALL] = {name: value for name, value in together.items() if value is not None}
+    return found
+
+
+def _times(saved, muscle):
+    """Median times of a muscle after its first frame, which loads and compiles."""
+    found = {}
+    for name in ("time_frame", "time_solve"):
+        values = saved.series(muscle, name)[1][1:]
+        if len(values):
+            found[name] = float(np.median(values))
+    stages = saved.info["stages"].get(muscle, {})
+    if "time_surface" in stages:
+        found["time_surface"] = stages["time_surface"]["median"]
+    return found
+
+
+def _over_muscles(quantity, muscles):
+    values = [values[quantity] for values in muscles if values.get(quantity) is not None]
+    if not values:
+        return None
+    return (
+        float(sum(values))
+        if quantity in _SUMMED
+        else float(max(values, key=lambda v: abs(v - MEASURES[quantity].ideal)))
+    )
+
+
+def add_distances(results: dict[str, Any], folder: Path, poses: list[int]) -> list[list[float]]:
+    """Distances between the models' surfaces.
+
+    Parameters
+    ----------
+    results : dict of str to dict
+        Model -> what `measure_run` found; takes ``distance_rms`` and ``distance_max`` to the first model.
+    folder : pathlib.Path
+        With a run of each model.
+    poses : list of int
+
+    Returns
+    -------
+    list of list of float
+        Root mean square distance of each pair of models in the last pose, over all muscles.
+    """
+    runs = {name: SavedRun(folder / name) for name in results}
+    first = next(iter(runs))
+    matrix = np.zeros((len(runs), len(runs)))
+    for i, (a, mine) in enumerate(runs.items()):
+        for j, (b, other) in enumerate(runs.items()):
+            if j <= i:
+                continue
+            for pose in poses if a == first else poses[-1:]:
+                pairs = {
+                    m: surface_distance(*mine.surface(m, pose), *other.surface(m, pose)) for m in mine.muscles
+                }
+                if a == first:
+                    _take_worst(results[b], pairs)
+            matrix[i, j] = matrix[j, i] = math.sqrt(np.mean([rms**2 for rms, _ in pairs.values()]))
+    return matrix.tolist()
+
+
+def _take_worst(found, pairs):
+    pairs = {**pairs, ALL: tuple(np.max(list(pairs.values()), axis=0).tolist())}
+    for muscle, pair in pairs.items():
+        for name, value in zip(("distance_rms", "distance_max"), pair):
+            found[muscle][name] = max(found[muscle].get(name, 0.0), value)
+
+
+def write_tables(
+    folder: Path,
+    scene: Scene,
+    results: dict[str, Any],
+    failed: dict[str, Any],
+    matrix: list[list[float]],
+    poses: list[int],
+) -> dict[str, Any]:
+    """Write ``comparison.json`` and ``comparison.csv``.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+    scene : Scene
+    results : dict of str to dict
+        Model -> muscle or "all" -> quantity -> value.
+    failed : dict of str to str
+        Models that did not finish, and why.
+    matrix : list of list of float
+    poses : list of int
+
+    Returns
+    -------
+    dict
+        What the JSON file holds.
+    """
+    units = {name: measure_unit(m.kind, scene.units) for name, m in MEASURES.items()}
+    table = {
+        "format": FORMAT,
+        "scene": scene.name,
+        "units": scene.units,
+        "frames": len(scene.motion),
+        "poses": poses,
+        "models": list(results),
+        "failed": failed,
+        "measures": {
+            name: {"title": m.title, "unit": units[name], "against": m.against, "meaning": m.meaning}
+            for name, m in MEASURES.items()
+        },
+        "results": results,
+        "distances": matrix,
+        "verdicts": {name: verdict(results, name, scene.units) for name in results},
+        "machine": machine(),
+        "versions": versions(),
+    }
+    write_json(folder / "comparison.json", table)
+    with open(folder / "comparison.csv", "w", encoding="utf-8", newline="") as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(("model", "muscle", "quantity", "value", "unit", "against"))
+        for model, muscles in results.items():
+            for muscle, values in muscles.items():
+                for name in MEASURES:
+                    if name in values:
+                        rows.writerow(
+                            (model, muscle, name, values[name], units[name], MEASURES[name].against)
+                        )
+    return table
+
+
+def measure_unit(kind: str, units: str) -> str:
+    """Unit of a measure in a scene of these units."""
+    return f"1/{units}" if kind == "1/length" else unit_text(kind, units)
+
+
+def best_models(results: dict[str, Any], quantity: str, units: str) -> list[Any]:
+    """Models that are as good as the best in a measure: within 5 %, or within what does not count."""
+    measure = MEASURES[quantity]
+    values = {
+        name: abs(found[ALL][quantity] - measure.ideal)
+        for name, found in results.items()
+        if quantity in found[ALL]
+    }
+    if measure.against == FIRST or len(values) < 2:
+        return []
+    scale = 1.0 / MM_PER_UNIT[units] if measure.kind == "length" else 1.0
+    limit = _TIE * min(values.values()) + measure.floor * scale
+    return [name for name, value in values.items() if value <= limit]
+
+
+def verdict(results: dict[str, Any], model: str, units: str) -> dict[str, Any]:
+    """In what a model is best alone, and in what another is better.
+
+    Returns
+    -------
+    dict
+        ``best``: quantities; ``loses``: dicts of quantity, value, other and its value.
+    """
+    best, loses = [], []
+    for quantity in MEASURES:
+        good = best_models(results, quantity, units)
+        if not good or quantity not in results[model][ALL]:
+            continue
+        if good == [model]:
+            best.append(quantity)
+        elif model not in good:
+            other = min(good, key=lambda name: abs(results[name][ALL][quantity]))
+            value, theirs = (results[name][ALL][quantity] for name in (model, other))
+            loses.append({"quantity": quantity, "value": value, "other": other, "other_value": theirs})
+    return {"best": best, "loses": loses}

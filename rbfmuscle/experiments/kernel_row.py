@@ -1,0 +1,168 @@
+"""One row of a kernel study: a kernel, its shape parameter chosen, its centres fitted, its surface measured."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from rbfmuscle.experiments.kernel_judge import ReferenceSurface
+from rbfmuscle.experiments.workers import threads_limited
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.implicit.extraction.sheets import FINER, count_sheets
+from rbfmuscle.implicit.extraction.surface import ExtractedSurface, extract_surface
+from rbfmuscle.implicit.field import RBFField
+from rbfmuscle.implicit.field_fit import FieldFit, wanted_derivatives
+from rbfmuscle.implicit.kernels.table import Kernel
+from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
+from rbfmuscle.implicit.placement.sampling import SurfaceSample
+from rbfmuscle.implicit.selection import BOUND, EpsilonChoice, choose_epsilon, spacing
+from rbfmuscle.validation import NumericalWarning
+
+# Points of one timed evaluation, and the processor time after which enough of them, or of fits, are made [s].
+TIMED, MEASURED = 20_000, 0.05
+# A level zero that encloses so much more or less than the mesh has lost or gained a part of it.
+VOLUME_BOUND = 0.1
+
+
+class Measured(NamedTuple):
+    """What one row found.
+
+    Attributes
+    ----------
+    row : dict
+        As in `KernelStudy.rows`, without times.
+    sample : SurfaceSample
+        The centres that were fitted.
+    fit : FieldFit
+    surface : (vertices, faces) or None
+    """
+
+    row: dict
+    sample: SurfaceSample
+    fit: FieldFit
+    surface: tuple[Floats, Integers] | None
+
+
+def measure_row(
+    judge: ReferenceSurface,
+    sample: SurfaceSample,
+    kernel: Kernel,
+    placement: str,
+    *,
+    confirm: ReferenceSurface | None = None,
+) -> Measured:
+    """One row of the table, its times left open, and its surface.
+
+    Parameters
+    ----------
+    judge : ReferenceSurface
+    sample : SurfaceSample
+        Greedy centres.
+    kernel : Kernel
+    placement : {"greedy", "fitted"}
+    confirm : ReferenceSurface, optional
+        Measures the row in place of the judge, which then only chooses.
+    """
+    placement = placement if kernel.hermite else "greedy"
+    derivatives = wanted_derivatives(len(sample.points), fitted=placement == FITTED)
+    fit = FieldFit(kernel, 1.0, derivatives, BOUND if kernel.has_epsilon else np.inf)
+    row = {
+        "kernel": kernel.name, "centres": len(sample.points), "placement": placement, "epsilon": 0.0, "shape": None,
+        "condition": None, "bound": 0.0, "rms": None, "hausdorff": None, "normal_error": None, "volume_error": None,
+        "components": None, "fit_time": None, "evaluation_time": None, "unfit": "",
+        "note": "" if kernel.hermite else "values on and off the surface, the kernel is not C2",
+    }  # fmt: skip
+    surface = None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NumericalWarning)
+        try:
+            if placement == FITTED:
+                if kernel.has_epsilon:
+                    fit = replace(fit, epsilon=_choose(judge, sample, fit, look=False).epsilon)
+                sample = fit_sample(sample, judge.vertices, judge.faces, fit=fit)
+            if kernel.has_epsilon:  # what was best for the greedy centres need not be so for these
+                choice = _choose(judge, sample, fit, look=judge.sheets == 1)
+                fit = replace(fit, epsilon=choice.epsilon)
+                row["epsilon"], row["shape"] = fit.epsilon, fit.epsilon * float(spacing(sample.points).mean())
+                if choice.broken:
+                    raise ValueError(choice.broken)
+            elif fit.fit(sample.points, sample.normals).condition > BOUND:
+                fit, row["bound"] = replace(fit, condition=BOUND), BOUND
+            surface = _measure(row, confirm or judge, sample, fit.fit(sample.points, sample.normals))
+        except (ValueError, np.linalg.LinAlgError) as error:
+            row["unfit"] = " ".join(str(error).split())
+    return Measured(row, sample, fit, surface)
+
+
+def _choose(judge: ReferenceSurface, sample: SurfaceSample, fit: FieldFit, *, look: bool) -> EpsilonChoice:
+    distance = judge.distance.unsigned if look else None
+    return choose_epsilon(sample.points, sample.normals, fit, held_out=judge.held_out, distance=distance)
+
+
+def _measure(
+    row: dict, judge: ReferenceSurface, sample: SurfaceSample, field: RBFField
+) -> tuple[Floats, Integers]:
+    """Write what is measured of a field into the row; its surface."""
+    row["condition"] = float(field.condition)
+    gradient = field.gradient(judge.points[::5])
+    cosine = np.einsum("ij,ij->i", gradient, judge.normals[::5])
+    cosine /= np.maximum(np.linalg.norm(gradient, axis=1), np.finfo(float).tiny)
+    row["normal_error"] = float(np.degrees(np.sqrt((np.arccos(np.clip(cosine, -1.0, 1.0)) ** 2).mean())))
+    found, sheets = _surface_and_sheets(field, judge, sample)
+    row["components"], row["volume_error"] = sheets, found.volume / judge.volume - 1.0
+    if sheets > judge.sheets:
+        row["unfit"] = f"{sheets} sheets where the mesh has {judge.sheets}"
+    elif abs(row["volume_error"]) > VOLUME_BOUND:
+        row["unfit"] = f"{100 * row['volume_error']:+.3g} % of volume, beyond {100 * VOLUME_BOUND:g}"
+    row["rms"], row["hausdorff"] = judge.apart(found.vertices, found.faces)
+    return found.vertices, found.faces
+
+
+def _surface_and_sheets(
+    field: RBFField, judge: ReferenceSurface, sample: SurfaceSample
+) -> tuple[ExtractedSurface, int]:
+    """The extracted surface, and how many sheets the field has."""
+    look = partial(count_sheets, field, sample.points, judge.distance.unsigned, wanted=judge.sheets)
+    seen = look()
+    if seen.is_open and seen.number <= judge.sheets:
+        raise ValueError("the level set is open: it leaves the box of the muscle; take more centres")
+    if seen.number > judge.sheets:
+        raise ValueError(f"{seen.number} sheets where the mesh has {judge.sheets}")
+    found = extract_surface(field, points=sample.points, resolution=judge.resolution)
+    number = judge.sheets
+    if found.components > number:  # these cells alone show them: sheets of its own, or pieces of a thin rim
+        number = max(number, look(boxes=(FINER,)).number)
+    return found, number
+
+
+def time_row(found: Measured, points: Floats) -> None:
+    """Write what a fit, and the values at 20,000 points, cost into a row [s of processor time, one thread].
+
+    Parameters
+    ----------
+    found : Measured
+    points : (n, 3) ndarray
+        Of the mesh [length].
+    """
+    row, sample = found.row, found.sample
+    with warnings.catch_warnings(), threads_limited(1):
+        warnings.simplefilter("ignore", NumericalWarning)  # it stands in the row's condition
+        field = found.fit.fit(sample.points, sample.normals)
+        row["fit_time"] = _spent(lambda: found.fit.fit(sample.points, sample.normals))
+        field(points[:TIMED])
+        row["evaluation_time"] = _spent(lambda: field(points[:TIMED]))
+
+
+def _spent(work: Callable[[], object]) -> float:
+    """Processor time of some work, done as often as a coarse clock needs [s]."""
+    start, runs = time.process_time(), 0
+    while runs == 0 or time.process_time() - start < MEASURED:
+        work()
+        runs += 1
+    return (time.process_time() - start) / runs

@@ -1,0 +1,253 @@
+"""Running the points of a sweep side by side by joblib, in processes or on a Dask cluster."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rbfmuscle.experiments.sweep import SweepPoint
+from rbfmuscle.experiments.workers import available_cores, connect_cluster, threads_limited
+from rbfmuscle.metrics.metrics import surface_distance
+from rbfmuscle.metrics.quantities import ALL
+from rbfmuscle.output.writer import write_json
+from rbfmuscle.validation import RBFMuscleError, SolveError, UsageError
+
+if TYPE_CHECKING:
+    from rbfmuscle.scene.scene import Scene
+
+Runner = Callable[["Scene", dict[str, Any], str | None], Any]
+# What a point may fail with and leave the others standing.
+POINT_ERRORS = (RBFMuscleError, ArithmeticError, LookupError, MemoryError, OSError, RuntimeError, ValueError)
+# Worst over muscles and frames, by magnitude.
+WORST = (
+    "volume_error",
+    "penetration_max",
+    "bone_penetration_max",
+    "solver_penetration_max",
+    "rest_error_rms",
+    "edge_strain_rms",
+    "components",
+)
+TIMES = ("time_frame", "time_frame_p95", "time_extract")
+VALUES = ("error_rms", "error_max", *WORST, *TIMES)
+
+
+class SweepFolder:
+    """``points/KEY.json`` (a result each) and ``references/KEY.npz`` (surfaces that errors are measured against).
+
+    Parameters
+    ----------
+    directory : path
+        Made where it is missing; raises UsageError where it cannot be written to.
+    """
+
+    def __init__(self, directory: str | Path) -> None:
+        self.directory = Path(os.path.abspath(directory))
+        self.points, self.references = self.directory / "points", self.directory / "references"
+        try:
+            for folder in (self.points, self.references):
+                folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(
+                f"cannot write to {directory}: {error.strerror}; choose another folder"
+            ) from None
+
+    def read(self, key: str) -> dict[str, Any]:
+        """A point's result, empty where there is none."""
+        try:
+            return json.loads((self.points / f"{key}.json").read_text(encoding="utf-8"))
+        except (FileNotFoundError, ValueError):
+            return {}
+
+    def write(self, result: dict[str, Any]) -> None:
+        """Keep a point's result: whole or not at all."""
+        write_json(self.points / f"{result['key']}.json", result)
+        self.marker(result["key"]).unlink(missing_ok=True)
+
+    def marker(self, key: str) -> Path:
+        """A file that is there while a point is run."""
+        return self.points / f"{key}.running"
+
+    def surfaces(self, key: str) -> Path:
+        """Surfaces of a reference."""
+        return self.references / f"{key}.npz"
+
+
+def run_sweep(
+    runner: Runner,
+    scenes: Mapping[str, Scene],
+    points: Sequence[SweepPoint],
+    directory: str | Path,
+    *,
+    frames: str | None = None,
+    jobs: int | None = None,
+    cluster: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> int:
+    """Run the points that the folder does not hold done: the references first, then all others.
+
+    Parameters
+    ----------
+    runner : callable
+        ``runner(scene, settings, frames)`` gives a finished `Run`; module-level, so that it can be sent away.
+    scenes, points, frames
+        As for `plan_sweep`.
+    directory : path
+    jobs : int, optional
+        Points beside each other, each with cores / jobs threads; all cores by default.
+    cluster : str, optional
+        Address of a Dask scheduler whose workers see the folder.
+    progress : callable, optional
+        ``progress(done, total)``.
+
+    Returns
+    -------
+    int
+        How many points were run.
+    """
+    from joblib import parallel_config
+
+    folder = SweepFolder(directory)
+    left = [point for point in points if not _is_done(folder, point)]
+    for point in left:
+        (folder.points / f"{point.key}.json").unlink(missing_ok=True)
+    jobs = jobs or available_cores()
+    threads = 1 if cluster else max(1, available_cores() // jobs)
+    calls = [(runner, scenes[p.scene], p, folder, frames, threads) for p in left]
+
+    def advance():
+        if progress is not None:
+            progress(sum(bool(folder.read(point.key)) for point in left), len(left))
+
+    with ExitStack() as stack:
+        if cluster:
+            client = stack.enter_context(connect_cluster(cluster))
+            stack.enter_context(parallel_config(backend="dask", client=client))
+        elif jobs > 1:
+            stack.enter_context(parallel_config(backend="loky", inner_max_num_threads=threads))
+        for first in (True, False):
+            stage = [call for call in calls if (call[2].role == "reference") == first]
+            _side_by_side(stage, folder, -1 if cluster else jobs, advance)
+    return len(left)
+
+
+def _is_done(folder, point):
+    done = folder.read(point.key).get("status") == "done"
+    return done and (point.role != "reference" or folder.surfaces(point.key).exists())
+
+
+def _side_by_side(calls, folder, jobs, advance):
+    """Run calls; a process that dies takes only its own point along."""
+    from joblib import Parallel, delayed
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    calls = [call for call in calls if not folder.read(call[2].key)]
+    if not calls:
+        return
+    try:
+        tasks = (delayed(measure_point)(*call) for call in calls)
+        for _ in Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1)(tasks):
+            advance()
+    except TerminatedWorkerError:
+        left = [call for call in calls if not folder.read(call[2].key)]
+        for call in [call for call in left if folder.marker(call[2].key).exists()] or left:
+            _alone(call, folder)
+            advance()
+        _side_by_side(left, folder, jobs, advance)
+    except RuntimeError as error:  # of Dask, where worker after worker dies of a point
+        raise SolveError(f"a point ended its workers ({error}); finished points are kept") from None
+
+
+def _alone(call, folder):
+    """A point that was under way when a process died: in a process of its own, so that it shows which."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        try:
+            pool.submit(measure_point, *call).result()
+        except BrokenProcessPool:
+            error = "the process ended without a word (out of memory, or a crash)"
+            folder.write({"key": call[2].key, "status": "failed", "error": error})
+
+
+def measure_point(
+    runner: Runner, scene: Scene, point: SweepPoint, folder: SweepFolder, frames: str | None, threads: int
+) -> None:
+    """Run one point, measure it and keep the result; an error becomes the result of a failed point."""
+    start = time.perf_counter()
+    result: dict[str, Any] = {"key": point.key, "settings": point.settings, "status": "done", "error": ""}
+    folder.marker(point.key).touch()
+    try:
+        with threads_limited(threads):
+            run = runner(scene, point.settings, frames)
+            values = _values(run)
+            shown = {_pose(f): {n: (s.vertices, s.faces) for n, s in f.surfaces.items()} for f in run.frames}
+            if point.role == "reference":
+                _keep_surfaces(shown, folder.surfaces(point.key))
+            elif point.reference:
+                values |= _errors(shown, folder.surfaces(point.reference))
+            result |= {"values": values, "muscles": run.summary}
+    except POINT_ERRORS as error:
+        result |= {"status": "failed", "error": f"{type(error).__name__}: {' '.join(str(error).split())}"}
+    result |= {"threads": threads, "machine": platform.node(), "process": os.getpid()}
+    folder.write({**result, "seconds": time.perf_counter() - start})
+
+
+def _values(run):
+    values: dict[str, float] = {}
+    for muscle, quantities in run.summary.items():
+        for name in WORST:
+            worst = abs(quantities.get(name, {}).get("worst", math.nan))
+            if muscle != ALL and not math.isnan(worst):
+                values[name] = max(values.get(name, 0.0), worst)
+    # The first frame loads and compiles, and settles what overlaps at rest.
+    shown = run.frames[1:] or run.frames
+    walls = np.array([frame.wall for frame in shown])
+    extract = [sum(s.quantities.get("time_extract", 0.0) for s in f.surfaces.values()) for f in shown]
+    times = np.median(walls), np.percentile(walls, 95), np.median(extract)
+    return values | {name: float(value) for name, value in zip(TIMES, times)}
+
+
+def _pose(frame):
+    return " ".join(f"{name}={angle:.9f}" for name, angle in sorted(frame.coordinates.items())) or "rest"
+
+
+def _keep_surfaces(shown, path):
+    """Surfaces of every pose in one file, written in one move."""
+    arrays = {}
+    for pose, surfaces in shown.items():
+        for name, (vertices, faces) in surfaces.items():
+            arrays[f"{pose}|{name}|v"] = np.asarray(vertices)
+            arrays[f"{pose}|{name}|f"] = np.asarray(faces, dtype=np.int32)
+    fresh = path.with_name(f".{os.getpid()}.{path.name}")
+    np.savez_compressed(fresh, **arrays)
+    os.replace(fresh, path)
+
+
+def _errors(shown, path):
+    """Surface distance to the reference, root mean square over frames and muscles, and greatest."""
+    if not path.exists():
+        raise UsageError("its reference is missing: that point failed, or the folder is not shared")
+    squares, worst = [], 0.0
+    with np.load(path) as kept:
+        for pose, surfaces in shown.items():
+            for name, (vertices, faces) in surfaces.items():
+                if f"{pose}|{name}|v" not in kept:
+                    continue
+                other = kept[f"{pose}|{name}|v"], kept[f"{pose}|{name}|f"].astype(np.int64)
+                rms, most = surface_distance(vertices, faces, *other)
+                squares.append(rms**2)
+                worst = max(worst, most)
+    if not squares:
+        raise UsageError("no frame of this point is at a pose of the reference")
+    return {"error_rms": math.sqrt(float(np.mean(squares))), "error_max": worst}

@@ -1,0 +1,1 @@
+"""Scenes from OpenSim models, meshes and label volumes."""

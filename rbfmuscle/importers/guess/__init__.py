@@ -1,0 +1,1 @@
+"""A scene guessed from meshes."""

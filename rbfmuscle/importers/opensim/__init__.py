@@ -1,0 +1,1 @@
+"""OpenSim models and muscle paths."""

@@ -1,0 +1,212 @@
+"""Length of a muscle: a line through the slices of a harmonic field between its origin and its insertion."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse as sparse
+from scipy.spatial import cKDTree
+
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.harmonic import harmonic_weights
+from rbfmuscle.geometry.surfaces import vertex_areas
+from rbfmuscle.scene.joints.skeleton import all_coordinates
+
+_FINE, _SLICES = 120, 16
+
+
+class MuscleAtRest(NamedTuple):
+    """What measures that follow a muscle are bound to.
+
+    Attributes
+    ----------
+    muscle : Muscle
+        Input mesh and attachments.
+    joints : list of Joint
+        Bones that no joint separates count as one.
+    vertices, faces : (n, 3) and (m, 3) ndarray
+        The model's carried mesh at rest [scene unit].
+    moving : collection of str, optional
+        Names of the joints that move; all where not given.
+    """
+
+    muscle: Any
+    joints: list[Any]
+    vertices: Floats
+    faces: Integers
+    moving: Collection[str] | None = None
+
+
+class Centreline:
+    """The centreline of one muscle on a mesh of constant topology.
+
+    The harmonic field is 0 on the origin and 1 on the insertion. Slices are taken at levels whose centroids
+    lie evenly along the muscle at rest. Each centroid is a fixed linear combination of the vertices, so
+    the line costs one sparse product a frame. Its ends are the centroids of the attached patches of the
+    input mesh, by area, carried by their bones.
+
+    Parameters
+    ----------
+    rest : MuscleAtRest
+    slices : int
+        Points of the line between its ends.
+    """
+
+    def __init__(self, rest: MuscleAtRest, *, slices: int = _SLICES) -> None:
+        vertices, faces = rest.vertices, rest.faces
+        self.ends = end_groups(rest.muscle, rest.joints, rest.moving)
+        sides = _sides(rest.muscle, self.ends, vertices)
+        field = harmonic_weights(vertices, faces, sides)[:, 1]
+        levels = np.linspace(0.0, 1.0, _FINE + 2)[1:-1]
+        fine = slice_operator(vertices, faces, field, levels)
+        line = fine @ vertices
+        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+        even = np.interp(np.linspace(0.0, along[-1], slices), along, levels)
+        self.operator = slice_operator(vertices, faces, field, even)
+
+    def points(self, vertices: Floats, poses: dict[str, Floats]) -> Floats:
+        """The line now.
+
+        Parameters
+        ----------
+        vertices : (n, 3) ndarray
+            The carried mesh.
+        poses : dict of str to (4, 4) ndarray
+
+        Returns
+        -------
+        (k, 3) ndarray
+        """
+        first, last = (carried_middle(end, poses) for end in self.ends)
+        return np.vstack([first, self.operator @ vertices, last])
+
+    def length(self, vertices: Floats, poses: dict[str, Floats]) -> float:
+        """Length of the line now [scene unit]."""
+        return float(np.linalg.norm(np.diff(self.points(vertices, poses), axis=0), axis=1).sum())
+
+
+def end_groups(
+    muscle: Any, joints: list[Any], moving: Collection[str] | None = None
+) -> list[list[tuple[Any, ...]]]:
+    """Split the attachments into origin and insertion.
+
+    The origin is every attachment on the same rigid body as the first one; the rest is the insertion. Bones whose
+    joint does not move are one body with its parent. Where all are on one body, the first attachment is the origin.
+
+    Returns
+    -------
+    list of two lists of (bone, points, areas)
+        ``points`` (k, 3) are the attached vertices at rest, ``areas`` (k,) what each stands for: where triangles are
+        small there are more of them, which must not draw the end of a line there.
+    """
+    vertices = np.asarray(muscle.mesh.vertices, dtype=float)
+    areas = vertex_areas(vertices, np.asarray(muscle.mesh.faces))
+    return [
+        [(a.bone, vertices[np.asarray(a.vertices)], areas[np.asarray(a.vertices)]) for a in group]
+        for group in split_ends(muscle, joints, moving)
+    ]
+
+
+def split_ends(muscle: Any, joints: list[Any], moving: Collection[str] | None = None) -> list[Any]:
+    """The attachments of the origin and those of the insertion, as `end_groups` tells them apart."""
+    joint_of = {joint.child: joint for joint in joints}
+
+    def body(bone):
+        while moving is not None and bone in joint_of and joint_of[bone].name not in moving:
+            bone = joint_of[bone].parent
+        return bone if bone in joint_of else None
+
+    bodies = [body(a.bone) for a in muscle.attachments]
+    origin = [a for a, owner in zip(muscle.attachments, bodies) if owner == bodies[0]]
+    insertion = [a for a, owner in zip(muscle.attachments, bodies) if owner != bodies[0]]
+    if insertion:
+        return [origin, insertion]
+    if moving is not None:
+        return split_ends(muscle, joints)
+    return [muscle.attachments[:1], muscle.attachments[1:]]
+
+
+def moving_joints(scene: Any) -> set[str]:
+    """Names of the joints that a scene's motion moves, those that follow others among them."""
+    facts = all_coordinates(scene.joints)
+    names = {
+        name for frame in scene.motion.frames for name, value in frame.items() if value != facts[name].rest
+    }
+    for coupling in scene.couplings:  # in an order in which what they follow is known
+        if names & set(coupling.of):
+            names.add(coupling.coordinate)
+    return {name.rpartition(".")[0] for name in names}
+
+
+def slice_operator(vertices: Floats, faces: Integers, field: Floats, levels: Floats) -> Any:
+    """Sparse matrix that maps vertices to the centroids of the field's isolines.
+
+    Parameters
+    ----------
+    vertices : (n, 3) ndarray
+        Positions whose isoline lengths weigh the centroids.
+    faces : (m, 3) ndarray of int
+    field : (n,) ndarray
+    levels : (k,) array_like
+        Each strictly between the least and the greatest value of the field.
+
+    Returns
+    -------
+    (k, n) scipy.sparse.csr_matrix
+        Rows sum to one.
+    """
+    levels = np.asarray(levels, dtype=float)
+    at_corner = field[faces]
+    face, row = _crossings(at_corner, levels)
+    level = levels[row]
+    crossed, above = faces[face], at_corner[face] > level[:, None]
+    # The corner that is alone on its side: both crossing points lie on its edges.
+    lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
+    each = np.arange(len(crossed))
+    a, b, c = (crossed[each, (lone + k) % 3] for k in range(3))
+    s, t = (level - field[a]) / (field[b] - field[a]), (level - field[a]) / (field[c] - field[a])
+    p = vertices[a] + s[:, None] * (vertices[b] - vertices[a])
+    q = vertices[a] + t[:, None] * (vertices[c] - vertices[a])
+    share = np.linalg.norm(p - q, axis=1)
+    share = share / np.bincount(row, share, minlength=len(levels))[row] / 2
+    values = np.concatenate([share * (2 - s - t), share * s, share * t])
+    where = np.tile(row, 3), np.concatenate([a, b, c])
+    return sparse.csr_matrix((values, where), shape=(len(levels), len(vertices)))
+
+
+def _crossings(at_corner, levels):
+    """Face and level of every isoline in every face: levels not below a face's least value and below its greatest."""
+    order = np.argsort(levels, kind="stable")
+    first, last = (
+        np.searchsorted(levels[order], end) for end in (at_corner.min(axis=1), at_corner.max(axis=1))
+    )
+    count = last - first
+    face = np.repeat(np.arange(len(at_corner)), count)
+    place = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count) + first[face]
+    return face, order[place]
+
+
+def _sides(muscle, ends, vertices):
+    """Carried vertices of origin and insertion: those whose nearest input vertex is attached there."""
+    mesh = np.asarray(muscle.mesh.vertices, dtype=float)
+    nearest = cKDTree(mesh).query(vertices)[1]
+    sides = []
+    for end in ends:
+        attached = np.concatenate([points for _, points, _ in end])
+        on_end = cKDTree(attached).query(mesh[nearest])[0] == 0.0
+        if not on_end.any():
+            on_end[cKDTree(vertices).query(attached.mean(axis=0))[1]] = True
+        sides.append(np.flatnonzero(on_end))
+    return [np.setdiff1d(sides[0], sides[1]), sides[1]]
+
+
+def carried_middle(end: list[tuple[Any, ...]], poses: dict[str, Floats]) -> Any:
+    """Middle (3,) of an end's patches where its bones (their poses (4, 4)) carry them."""
+    total = sum(areas.sum() for _, _, areas in end)
+    moved = [
+        poses[bone][:3, :3] @ (areas @ points) + areas.sum() * poses[bone][:3, 3]
+        for bone, points, areas in end
+    ]
+    return np.sum(moved, axis=0) / total

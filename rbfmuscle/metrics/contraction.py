@@ -1,0 +1,200 @@
+"""What is measured of muscles that contract: fibres of the scene, thickness and greatest section."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.mean_value import mean_value_weights
+from rbfmuscle.geometry.surfaces import vertex_normals
+from rbfmuscle.metrics.centreline import MuscleAtRest, carried_middle, end_groups
+from rbfmuscle.scene.activation.resolve import resolve_contraction
+from rbfmuscle.validation import SolveError
+
+SEGMENTS = 16  # of each fibre
+STATIONS = 48  # sections along the line of action
+SKIN = 0.004  # of the muscle's diagonal: how deep below the surface a fibre is kept
+CALIPERS = 36  # directions in which a section's width is taken
+
+
+class ContractionStudy:
+    """Measures one muscle that contracts, frame by frame, whatever model moves it.
+
+    Parameters
+    ----------
+    rest : MuscleAtRest
+        Its muscle has keys of contraction. Fibres are followed where the scene gives them; without any there is
+        nothing to tell of them.
+    """
+
+    def __init__(self, rest: MuscleAtRest) -> None:
+        muscle, vertices, faces = rest.muscle, rest.vertices, rest.faces
+        self.name = muscle.name
+        self.ends = end_groups(muscle, rest.joints, rest.moving)
+        self.weights = None
+        if not muscle.fibres:
+            return
+        lines = np.array([resampled(np.asarray(line, dtype=float), SEGMENTS) for line in muscle.fibres])
+        lines = _kept_inside(lines, vertices, faces)
+        self.shape = lines.shape
+        self.weights = mean_value_weights(lines.reshape(-1, 3), vertices, faces)
+        nearest = cKDTree(np.asarray(muscle.mesh.vertices, dtype=float)).query(lines)[1]
+        tendon = resolve_contraction(muscle).tendon[nearest]
+        # A segment is belly where neither end is tendon; a line of tendon alone counts for nothing.
+        self.belly = ~(tendon[:, 1:] | tendon[:, :-1])
+        self.rest_lengths = _segments(self.lines(vertices))
+
+    def lines(self, vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The fibres (n, k, 3) that a carried mesh with these vertices holds; there must be some."""
+        middle = vertices.mean(axis=0)
+        return (self.weights @ (vertices - middle) + middle).reshape(self.shape)
+
+    def measure(self, vertices: Floats, poses: dict[str, Any], surface: Any = None) -> dict[str, float]:
+        """Quantities of a frame.
+
+        Parameters
+        ----------
+        vertices : (n, 3) ndarray
+            The carried mesh.
+        poses : dict of str to (4, 4) ndarray
+        surface : ModelSurface, optional
+            Sections are of this surface; without one there are none.
+
+        Returns
+        -------
+        dict of str to float
+            Lengths in scene units, ``pennation`` in degrees, ``csa_place`` as a share of the line of action.
+        """
+        first, last = (carried_middle(end, poses) for end in self.ends)
+        found = {}
+        if self.weights is not None:
+            lines = self.lines(vertices)
+            lengths = _segments(lines)
+            counted = self.belly.any(axis=1)
+            found = {
+                "fibre_length": float((lengths * self.belly).sum(axis=1)[counted].mean()),
+                "fibre_stretch": float((lengths / self.rest_lengths)[self.belly].mean()),
+                "pennation": pennation(lines, self.belly, (last - first) / np.linalg.norm(last - first)),
+            }
+        if surface is not None:
+            found.update(belly_measures(surface.vertices, np.asarray(surface.faces), first, last))
+        return found
+
+
+def pennation(lines: Any, counted: Any, axis: Any) -> float:
+    """Mean angle [degree] between the segments (n, k) of lines (n, k + 1, 3) that count and an axis (3,)."""
+    along = np.diff(lines, axis=1)[counted]
+    cosine = np.abs(along @ axis) / np.linalg.norm(along, axis=1)
+    return float(np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0))).mean())
+
+
+def belly_measures(vertices: Floats, faces: Integers, first: Floats, last: Floats) -> dict[str, float]:
+    """Greatest section of a closed surface across a line, where it lies, and how thick it is.
+
+    Parameters
+    ----------
+    vertices, faces : (n, 3) and (m, 3) ndarray
+    first, last : (3,) ndarray
+        Ends of the line of action.
+
+    Returns
+    -------
+    dict
+        ``csa_max`` [unit²], ``csa_place`` (0 at ``first``, 1 at ``last``), ``belly_thickness``: the least width of
+        that section.
+    """
+    length = float(np.linalg.norm(last - first))
+    axis = (last - first) / length
+    height = (vertices - first) @ axis
+    low, high = height.min(), height.max()
+    places = low + (high - low) * (np.arange(STATIONS) + 0.5) / STATIONS
+    areas = np.array([section_area(vertices, faces, axis, height, place) for place in places])
+    best = int(np.argmax(areas))
+    area, place = areas[best], places[best]
+    if 0 < best < STATIONS - 1:
+        before, after = areas[best - 1], areas[best + 1]
+        bend = before - 2.0 * area + after
+        shift = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
+        place += shift * (places[1] - places[0])
+        area -= 0.25 * (before - after) * shift
+    return {
+        "csa_max": float(area),
+        "csa_place": float(place / length),
+        "belly_thickness": _thickness(_section(vertices, faces, height, places[best]), axis),
+    }
+
+
+def section_area(vertices: Floats, faces: Integers, axis: Any, height: Any, place: Any) -> float:
+    """Area of a closed surface's section where ``height`` (n,), along ``axis``, is ``place``."""
+    start, end = _section(vertices, faces, height, place)
+    if len(start) == 0:
+        return 0.0
+    middle = start.mean(axis=0)
+    return float(abs(0.5 * (np.cross(start - middle, end - middle) @ axis).sum()))
+
+
+def _section(vertices, faces, height, place):
+    """Segments in which the surface meets a plane, from (s, 3) to (s, 3), all one way round."""
+    above = height[faces] > place
+    crossed = above.any(axis=1) & ~above.all(axis=1)
+    corners, above = faces[crossed], above[crossed]
+    lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
+    row = np.arange(len(corners))
+    a, b, c = (corners[row, (lone + k) % 3] for k in range(3))
+    p = _crossing(vertices, height, a, b, place)
+    q = _crossing(vertices, height, a, c, place)
+    flipped = ~above[row, lone]
+    p[flipped], q[flipped] = q[flipped].copy(), p[flipped].copy()
+    return p, q
+
+
+def _crossing(vertices, height, one, other, place):
+    share = ((place - height[one]) / (height[other] - height[one]))[:, None]
+    return vertices[one] + share * (vertices[other] - vertices[one])
+
+
+def _thickness(section, axis):
+    """Least width of a section over all directions across the axis."""
+    points = section[0]
+    if len(points) == 0:
+        return 0.0
+    helper = np.eye(3)[np.argmin(np.abs(axis))]
+    u = np.cross(axis, helper)
+    u /= np.linalg.norm(u)
+    v = np.cross(axis, u)
+    angle = np.pi * np.arange(CALIPERS) / CALIPERS
+    ways = np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v
+    return float(np.ptp(points @ ways.T, axis=0).min())
+
+
+def _kept_inside(lines, vertices, faces):
+    """Lines whose points on or beyond the surface are put just below it, as only inner points can be carried.
+
+    Lines with a point for which there is no room, at a thin rim, are left out, unless that is all of them.
+    """
+    tree = ExactDistance(vertices, faces)
+    points = lines.reshape(-1, 3).copy()
+    skin = SKIN * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    out = tree.signed_distance(points) > -skin
+    normals = vertex_normals(vertices, faces)[cKDTree(vertices).query(points[out])[1]]
+    points[out] = tree.closest_point(points[out]) - skin * normals
+    good = (tree.signed_distance(points) < -0.1 * skin).reshape(lines.shape[:2]).all(axis=1)
+    if not good.any():
+        raise SolveError("no fibre lies inside the muscle's mesh, so none can be followed; check fibres")
+    return points.reshape(lines.shape)[good]
+
+
+def resampled(line: Floats, segments: int) -> Floats:
+    """Points (segments + 1, 3) at even distances along a polyline."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    even = np.linspace(0.0, along[-1], segments + 1)
+    return np.stack([np.interp(even, along, line[:, k]) for k in range(3)], axis=1)
+
+
+def _segments(lines):
+    return np.linalg.norm(np.diff(lines, axis=1), axis=2)

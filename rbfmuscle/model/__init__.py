@@ -1,1 +1,0 @@
-"""The RBF muscle: joins a field to the simulation."""

@@ -1,0 +1,318 @@
+"""How an RBF muscle is shown: its field refitted, the bones cut away, the closed surface brought onto the level set."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple, TypedDict
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.fields import BoneField, ClipDistance, LevelField
+from rbfmuscle.implicit.extraction.band import box_along
+from rbfmuscle.implicit.extraction.material import FittedMesh, carry_material, project_to_level_set
+from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
+from rbfmuscle.implicit.extraction.obstacles import ObstaclePoints
+from rbfmuscle.implicit.extraction.surface import ExtractedSurface, extract_surface
+from rbfmuscle.implicit.field import RBFField
+from rbfmuscle.muscle.display_mesh import DisplayMesh
+from rbfmuscle.muscle.options import RBFOptions
+from rbfmuscle.muscle.rest import RestState
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.frame import ModelSurface
+from rbfmuscle.validation import SolveError
+
+# Cells along the longest side where marching cubes is asked for and no resolution.
+MARCHING_CELLS = 48
+# Bones are asked for exact distances within so many mean edges of the mesh.
+REACH = 3.0
+# A tenth of the edges this much longer than at rest is the cause of what cannot be fitted.
+STRETCHED = 1.6
+# Bones' vertices, sorted, by the bone's distance field.
+_BONE_POINTS: WeakKeyDictionary[BoneField, ObstaclePoints] = WeakKeyDictionary()
+
+# Where the material is no sound surface, what it does beside a rigid motion is smoothed so often, until it is one;
+# how deep in a bone a vertex of a sound one may be, in mean edges, and how much volume may be lacking.
+CALM, SUNKEN, LOST = (30, 120, 500, 2000, 10_000), 0.01, 1e-10
+
+
+class Configuration(NamedTuple):
+    """Where a muscle's points are at one moment.
+
+    Attributes
+    ----------
+    centres, normals : (K, 3) ndarray
+    points : (K + S, 3) ndarray
+        Contact points.
+    carried : (n, 3) ndarray or None
+        Vertices of the shown mesh where the material takes them.
+    """
+
+    centres: np.ndarray
+    normals: np.ndarray
+    points: np.ndarray
+    carried: np.ndarray | None
+
+
+class _Neighbours(NamedTuple):
+    """Whether points of sliding neighbours push faces off, and whether neighbours cut the surface at all."""
+
+    points: bool
+    cut: bool
+
+
+class _Surroundings(TypedDict):
+    """Cut, obstacles and axes, as `project_to_level_set` takes them."""
+
+    cut: ClipDistance | None
+    obstacles: list[tuple[ObstaclePoints, Floats]]
+    axes: Floats
+
+
+class SurfaceBuilder:
+    """Draws the surface of one muscle, from frame to frame.
+
+    Parameters
+    ----------
+    muscle : Muscle
+    scene : Scene
+    rest : Rest
+    options : RBFOptions
+
+    Attributes
+    ----------
+    level : float
+        Of the field that met the rest volume last: where the next search for it begins.
+    shown : DisplayMesh or None
+        The material's mesh, where it is not marching cubes that show the surface.
+    """
+
+    def __init__(self, muscle: Muscle, scene: Scene, rest: RestState, options: RBFOptions) -> None:
+        self.name, self.rest, self.options = muscle.name, rest, options
+        self._bones = [bone.mesh for bone in scene.bones]
+        self.level = 0.0
+        self.shown = DisplayMesh(muscle, rest, options) if options.surface == "material" else None
+
+    def draw(self, fit: Callable[[], RBFField], now: Configuration, contacts: BoneContacts) -> ModelSurface:
+        """The closed surface at the rest volume.
+
+        Parameters
+        ----------
+        fit : callable
+            Gives the field.
+        now : Moment
+        contacts : BoneContacts
+            What cuts the surface.
+
+        Raises
+        ------
+        SolveError
+            If marching cubes find no closed surface.
+        """
+        notes: list[tuple[str, int, str]] = []
+        if self.shown is None or now.carried is None:
+            result: ExtractedSurface = self._march(fit, now, contacts)
+            left = 0.0
+        else:
+            result, notes = self._of_material(fit, now.carried, contacts)
+            left = result.left / len(now.carried)
+            if left == 1.0:
+                bone, cause = self._cause(now, contacts)
+                notes.append((bone, len(now.carried), f"carried_{cause}"))
+        quantities = {"components": result.components, "level": self.level, "unfitted_fraction": left}
+        return ModelSurface(result.vertices, result.faces, quantities, notes)
+
+    def _of_material(
+        self, fit: Callable[[], RBFField], carried: np.ndarray, contacts: BoneContacts
+    ) -> tuple[FittedMesh, list[tuple[str, int, str]]]:
+        """The material's mesh on the level set, or where the material is if there is no fit; notes for events."""
+        mesh = self.shown.mesh
+        volume, notes = self.rest.mesh_volume, []
+        for neighbours in self._neighbours_met(contacts):
+            where = self._surroundings(mesh, carried, contacts, neighbours)
+            try:
+                result = project_to_level_set(mesh, carried, fit(), volume=volume, level=self.level, **where)
+            except (ValueError, np.linalg.LinAlgError):
+                continue
+            self.level = result.level
+            if result.crossing:
+                result = self._sounder(result, mesh, carried, volume, where)
+            break
+        else:
+            result = self._carry(mesh, carried, volume, where)
+        if contacts.cuts and not neighbours.cut:
+            notes.append(("", len(carried), "neighbours_let_in"))
+        return result, notes
+
+    def _neighbours_met(self, contacts: BoneContacts) -> list[_Neighbours]:
+        """What sliding neighbours do to the surface, the first that leaves one: on all sides they may leave nothing."""
+        less = [_Neighbours(points=False, cut=True), _Neighbours(points=False, cut=False)]
+        if not contacts.cuts:
+            return less[1:]
+        return [_Neighbours(points=True, cut=True), *less] if len(contacts.neighbour_points()) else less
+
+    def _surroundings(
+        self, mesh: MaterialMesh, carried: Floats, contacts: BoneContacts, neighbours: _Neighbours
+    ) -> _Surroundings:
+        reach = REACH * mesh.edge(carried)
+        return {
+            "cut": _BoneCut(contacts, reach, neighbours=neighbours.cut) if contacts.names else None,
+            "obstacles": self._obstacles(contacts, neighbours=neighbours.points),
+            "axes": self._axes(contacts),
+        }
+
+    def _sounder(
+        self, fitted: FittedMesh, mesh: MaterialMesh, carried: Floats, volume: float, where: _Surroundings
+    ) -> FittedMesh:
+        """What was fitted and crosses itself, or the surface without a fit where that has fewer faults."""
+        try:
+            other = self._carry(mesh, carried, volume, where)
+        except SolveError:
+            return fitted
+        return min(fitted, other, key=lambda result: _faults(result, where["cut"], volume))
+
+    def _carry(self, mesh: MaterialMesh, carried: Floats, volume: float, where: _Surroundings) -> FittedMesh:
+        """The mesh where the material is; where no sound surface comes of that, where the material is on the whole."""
+        found: list[tuple[float, FittedMesh]] = []
+        reason: ValueError | None = None
+        for sweeps in (0, *CALM):
+            start = carried if sweeps == 0 else self.shown.smooth_displacement(carried, sweeps)
+            try:
+                result = carry_material(mesh, start, volume=volume, **where)
+            except ValueError as error:
+                reason = error
+                continue
+            faults = _faults(result, where["cut"], volume)
+            if faults == 0.0:
+                return result
+            found.append((faults, result))
+        if found:
+            return min(found, key=lambda pair: pair[0])[1]
+        raise SolveError(
+            f"muscle {self.name!r}: no surface outside the bones holds its volume of {volume:.6g} ({reason}); "
+            "check where its attachments lie and what the motion drives into it"
+        ) from reason
+
+    def _march(
+        self, fit: Callable[[], RBFField], now: Configuration, contacts: BoneContacts
+    ) -> ExtractedSurface:
+        axes, resolution = self._axes(contacts), self.options.resolution or MARCHING_CELLS
+        # Farther than a cell from the bones a lower bound will do: no vertex gets there.
+        reach = 1.25 * float(np.diff(box_along(now.points, axes), axis=0).max()) / resolution
+        try:
+            result = extract_surface(
+                fit(), points=now.points, resolution=resolution,
+                cut=_BoneCut(contacts, reach) if contacts.names else None,
+                volume=self.rest.mesh_volume, level=self.level, axes=axes, obstacles=self._obstacles(contacts),
+            )  # fmt: skip
+        except (ValueError, np.linalg.LinAlgError) as error:
+            raise SolveError(
+                f"muscle {self.name!r}: no closed surface by marching cubes with kernel "
+                f"{self.options.kernel!r} and {len(now.centres)} centres: {error}; surface = 'material' shows one"
+            ) from error
+        self.level = result.level
+        return result
+
+    def _axes(self, contacts: BoneContacts) -> np.ndarray:
+        """Axes that turn with the scene: what is sorted by them then falls out alike."""
+        return self.rest.axes @ contacts.poses[self.rest.bones[0]][:3, :3].T
+
+    def _obstacles(
+        self, contacts: BoneContacts, *, neighbours: bool = True
+    ) -> list[tuple[ObstaclePoints, np.ndarray]]:
+        """Points that faces have to leave outside: those of bones, and of sliding neighbours where they meet."""
+        found = [(self._points_of(contacts, b), contacts.poses[contacts.names[b]]) for b in contacts.reached]
+        points = contacts.neighbour_points() if neighbours else np.zeros((0, 3))
+        # A neighbour thinner than the surface's edges would stick through its faces: their corners alone are cut.
+        return [*found, (ObstaclePoints(points), np.eye(4))] if len(points) else found
+
+    def _points_of(self, contacts: BoneContacts, bone: int) -> ObstaclePoints:
+        """A bone's vertices, sorted once for all muscles that share its field."""
+        field = contacts.fields[bone]
+        if field not in _BONE_POINTS:
+            _BONE_POINTS[field] = ObstaclePoints(self._bones[bone].vertices)
+        return _BONE_POINTS[field]
+
+    def _cause(self, now: Configuration, contacts: BoneContacts) -> tuple[str, str]:
+        """Bone and cause of a surface that cannot be fitted: a held end in a bone, stretch, or sheets that met."""
+        depth, found = self.shown.mesh.edge(now.carried), ""
+        attached_bone = self.rest.attached_bone[: len(now.centres)]
+        for b in contacts.reached:
+            name = contacts.names[b]
+            own = self.rest.bones.index(name) if name in self.rest.bones else -1
+            held = (attached_bone >= 0) & (attached_bone != own)
+            deepest = -contacts.distance_and_direction(now.centres[held], b)[0].min(initial=0.0)
+            if deepest > depth:
+                depth, found = deepest, name
+        if found:
+            return found, "held_end"
+        return "", "stretched" if self.shown.stretch(now.carried) > STRETCHED else "sheets"
+
+
+def _faults(result: FittedMesh, cut: ClipDistance | None, volume: float) -> float:
+    """Triangles that cross others, mean edges of depth in a bone, thousandths of volume lost; 0 where it is sound."""
+    deep = 0.0 if cut is None else -float(cut(result.vertices).min()) / result.spacing
+    lost = abs(result.volume / volume - 1.0)
+    # Asked the other way round: NaN is no sound surface.
+    return result.crossing + (0.0 if deep <= SUNKEN else deep) + (0.0 if lost <= LOST else 1e3 * lost)
+
+
+class RBFDrawing:
+    """An RBF muscle as it was at one moment; its field is fitted when it is first asked for.
+
+    Parameters
+    ----------
+    drawer : SurfaceBuilder
+    now : Moment
+    contacts : BoneContacts
+        As they stand.
+    """
+
+    def __init__(self, drawer: SurfaceBuilder, now: Configuration, contacts: BoneContacts) -> None:
+        self._drawer, self._now = drawer, now
+        self._depth, self._contacts = contacts.depth(now.points), contacts.frozen()
+        self._fitted: RBFField | None = None
+        self._time_fit = 0.0
+
+    def field(self) -> LevelField:
+        """The field that the surface is drawn by, less the level that the frame before came to."""
+        return LevelField(self._fit(), self._drawer.level)
+
+    def surface(self) -> ModelSurface:
+        """The closed surface at the rest volume, cut by what lay in the way."""
+        started = time.perf_counter()
+        before = self._time_fit
+        surface = self._drawer.draw(self._fit, self._now, self._contacts)
+        surface.quantities.update(
+            condition=np.inf if self._fitted is None else self._fitted.condition,
+            time_fit=self._time_fit,
+            time_extract=time.perf_counter() - started - (self._time_fit - before),
+            solver_penetration_max=self._depth,
+        )
+        return surface
+
+    def _fit(self) -> RBFField:
+        if self._fitted is None:
+            started = time.perf_counter()
+            self._fitted = self._drawer.rest.fit.fit(self._now.centres, self._now.normals)
+            self._time_fit = time.perf_counter() - started
+        return self._fitted
+
+
+class _BoneCut:
+    """What the bones cut away: their smallest distance, a lower bound where it is beyond ``reach``."""
+
+    def __init__(self, contacts: BoneContacts, reach: float, *, neighbours: bool = True) -> None:
+        self.contacts, self.reach, self.neighbours = contacts, reach, neighbours
+        # Distances to bones change as fast as one walks; half the difference of two muscles' fields is no distance.
+        self.steepest = np.inf if contacts.cuts and neighbours else 1.0
+
+    def __call__(self, points: Floats) -> Floats:
+        return self.contacts.nearest(points, self.reach, neighbours=self.neighbours)
+
+    def value_and_gradient_below(self, points: Floats, limit: Floats) -> tuple[Floats, Floats]:
+        return self.contacts.nearest_with_gradient(points, limit, neighbours=self.neighbours)

@@ -1,0 +1,138 @@
+"""RBFMuscle: an implicit RBF surface whose centres move with an elastic solid."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from rbfmuscle.implicit.field import RBFField
+from rbfmuscle.muscle.build import build_solid
+from rbfmuscle.muscle.drawing import Configuration, RBFDrawing, SurfaceBuilder
+from rbfmuscle.muscle.options import RBFOptions
+from rbfmuscle.muscle.rest import RestState
+from rbfmuscle.muscle.solid import SolidState
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.contact import BoneContacts
+
+
+class RBFMuscle:
+    """A muscle as the zero level set of an RBF field with moving centres.
+
+    Implements ``rbfmuscle.simulation.frame.MuscleModel``.
+
+    Parameters
+    ----------
+    muscle : Muscle
+        Mesh, attachments and fibres, from a scene.
+    scene : Scene
+    options : RBFOptions
+
+    Attributes
+    ----------
+    points : (K, 3) ndarray
+        The centres now.
+    rest : Rest
+    solid : EmbeddedSolid
+        The elastic solid that carries the free centres.
+    law : FibrePull or None
+        Of a muscle that contracts.
+
+    Raises
+    ------
+    SceneError
+        If the placement cannot be had or no centre is left free to move.
+
+    Examples
+    --------
+    >>> from rbfmuscle import phantom_scene
+    >>> scene = phantom_scene(end=0.0)
+    >>> muscle = RBFMuscle(scene.muscles[0], scene)
+    >>> muscle.contact_points().shape[1]
+    3
+    """
+
+    def __init__(self, muscle: Muscle, scene: Scene, options: RBFOptions | None = None) -> None:
+        self.name = muscle.name
+        self.options = options or RBFOptions()
+        self.rest = RestState.from_muscle(muscle, scene, self.options)
+        self.solid, self.law = build_solid(muscle, scene, self.rest, self.options)
+        self.drawer = SurfaceBuilder(muscle, scene, self.rest, self.options)
+        names = [bone.name for bone in scene.bones]
+        numbers = np.array([names.index(bone) for bone in self.rest.bones])
+        self.contact_bone = np.where(self.solid.owner < 0, -1, numbers[self.solid.owner])
+        self.points = self.rest.centres.copy()
+
+    def contact_points(self) -> np.ndarray:
+        """Centres, then surface samples, (K + S, 3)."""
+        points = self.solid.carry()
+        points[: len(self.points)] = self.points
+        return points
+
+    def material_mesh(self) -> tuple[np.ndarray, np.ndarray]:
+        """The samples and their triangulation: a material surface of constant topology."""
+        return self.contact_points()[len(self.points) :], self.rest.sample_faces
+
+    def predict(self, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> None:
+        """Go along with the bones; held centres arrive exactly."""
+        rest = self.rest
+        motions = np.array([after[bone] @ np.linalg.inv(before[bone]) for bone in rest.bones])
+        points = self.points.copy()
+        for b, bone in enumerate(rest.bones):
+            held = rest.held[rest.attached_bone[rest.held] == b]
+            points[held] = rest.centres[held] @ after[bone][:3, :3].T + after[bone][:3, 3]
+        self.solid.move(motions, [after[bone] for bone in rest.bones])
+        self.points = self.solid.centres(points)
+
+    def solve(self, contacts: BoneContacts) -> None:
+        """Solve for the equilibrium under elasticity, volume and contact at the bones' present poses."""
+        self.solid.settle(contacts)
+        self.points = self.solid.centres(self.points)
+
+    def activate(self, activation: float) -> None:
+        """Take an activation, 0 to 1, that the next `solve` settles under."""
+        if self.law is not None:
+            self.law.activate(activation)
+
+    def settle(self, contacts: BoneContacts) -> None:
+        """Nothing: the surface is cut along the bones."""
+
+    def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
+        """Move the centres that carry contact points marked in a bool mask by a (4, 4) transform; held ones stay."""
+        self.solid.turn(which, transform)
+        self.points = self.solid.centres(self.points)
+
+    def transform(self, motion: np.ndarray) -> None:
+        """Go along with a rigid motion (4, 4), as the muscle is."""
+        self.points = self.points @ motion[:3, :3].T + motion[:3, 3]
+        self.solid.transform(motion)
+
+    def snapshot(self) -> tuple[np.ndarray, SolidState]:
+        """Everything that :meth:`restore` needs."""
+        return self.points.copy(), self.solid.snapshot()
+
+    def restore(self, state: tuple[np.ndarray, SolidState]) -> None:
+        """Go back to a snapshot."""
+        points, solid = state
+        self.points = points.copy()
+        self.solid.restore(solid)
+
+    def normals(self) -> np.ndarray:
+        """Unit normals at the centres, turned with the local deformation by its cofactor, (K, 3)."""
+        f = self.solid.deformation()
+        n = self.rest.normals
+        helper = np.where(np.abs(n[:, :1]) < 0.6, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+        u = np.cross(n, helper)
+        v = np.cross(n, u)
+        turned = np.cross(np.einsum("kab,kb->ka", f, u), np.einsum("kab,kb->ka", f, v))
+        return turned / np.linalg.norm(turned, axis=1, keepdims=True)
+
+    def field(self) -> RBFField:
+        """The RBF field through the present centres."""
+        return self.rest.fit.fit(self.points, self.normals())
+
+    def drawing(self, contacts: BoneContacts) -> RBFDrawing:
+        """The muscle as it is now, for its surface."""
+        shown = self.drawer.shown
+        carried = None if shown is None else self.solid.follow(shown.rest)
+        now = Configuration(self.points.copy(), self.normals(), self.contact_points(), carried)
+        return RBFDrawing(self.drawer, now, contacts)

@@ -1,0 +1,56 @@
+"""Settings of an RBF muscle, and what they may be."""
+
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
+
+from rbfmuscle.implicit.kernels.table import get_kernel
+from rbfmuscle.scene.options import NotNegative, Table
+from rbfmuscle.validation import UsageError
+
+
+def _known_bound(condition: float) -> float:
+    if 0.0 < condition < 1.0:
+        raise ValueError("condition must be at least 1, or 0 for no bound")
+    return condition
+
+
+def _known_kernel(name: str) -> str:
+    try:
+        get_kernel(name)
+    except UsageError as error:
+        raise PydanticCustomError("unknown_key", "{reason}", {"reason": str(error)}) from None
+    return name
+
+
+class RBFOptions(Table):
+    """``[muscle.model]`` of an RBF muscle.
+
+    ``centres``, where none are given, follow from the muscle's area, and are more where the surface at rest would
+    err by more than ``rest_error`` (RMS; 0 for 0.5 mm, or a tenth of the muscle's thickness where that is less), and
+    ``epsilon`` (a kernel's shape parameter) from the error at rest. A ridge keeps the ``condition`` of every fit below
+    a bound, 0 for 1e10 where the kernel has a shape parameter and none where not. ``samples`` of the surface meet the
+    bones. ``nodes`` of the elastic solid that carries the centres, and the greatest number of ``iterations`` of a
+    solve. Fibres shorten without resistance from their length in the scan to 1 / ``slack`` of it (1: no slack);
+    beyond, the solid is stiffer along them than across by ``fibre_ratio``, a ratio of Young's moduli.
+    ``surface`` is shown by a mesh of the ``material`` that is brought onto the level set, or by ``marching`` cubes;
+    ``resolution`` is the number of edges or cells along the longest side, 0 for as many as the muscle's thickness
+    wants. ``placement`` of the centres: ``greedy`` where a fit misses the surface, or ``fitted`` beside it so that all
+    of it is met, for slower fits; ``seed`` of the random numbers.
+    """
+
+    centres: Annotated[int, Field(ge=0, le=20_000)] = 0
+    rest_error: NotNegative = 0.0
+    samples: Annotated[int, Field(ge=50, le=200_000)] = 2000
+    nodes: Annotated[int, Field(ge=30, le=3000)] = 150
+    iterations: Annotated[int, Field(ge=1, le=1000)] = 24
+    slack: Annotated[float, Field(ge=1.0, le=5.0)] = 1.6
+    surface: Literal["material", "marching"] = "material"
+    resolution: Annotated[int, Field(ge=0, le=1000)] = 0
+    kernel: Annotated[str, AfterValidator(_known_kernel)] = "cubic"
+    epsilon: NotNegative = 0.0
+    condition: Annotated[NotNegative, AfterValidator(_known_bound)] = 0.0
+    placement: Literal["greedy", "fitted"] = "greedy"
+    fibre_ratio: Annotated[float, Field(ge=1.0, le=1e4)] = 1.0
+    seed: int = 0

@@ -1,0 +1,264 @@
+"""Where the centres and samples of an RBF muscle lie, and the fit that its field is made by."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import asdict, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from rbfmuscle.cache import content_key, load_arrays, store_arrays
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.geometry.surfaces import mesh_volume
+from rbfmuscle.implicit.extraction.surface import extract_surface
+from rbfmuscle.implicit.field_fit import FieldFit, wanted_derivatives
+from rbfmuscle.implicit.kernels.table import get_kernel
+from rbfmuscle.implicit.placement.density import GREEDY_LARGEST
+from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
+from rbfmuscle.implicit.placement.sampling import SurfaceSample, sample_surface
+from rbfmuscle.implicit.selection import BOUND, choose_epsilon, spacing, surface_error
+from rbfmuscle.muscle.options import RBFOptions
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.validation import NumericalWarning, SceneError
+
+# Area for each centre [mm²], from which their number follows where the scene names none, and the least number.
+AREA_FOR_EACH = 212.0
+LEAST_CENTRES = 150
+# A field at rest that is looked at before it is used: cells along its longest side, and the share of the mesh's volume
+# by which its level zero may be off.
+CELLS, VOLUME_BOUND = 48, 0.2
+# What the surface at rest may err by where the scene says nothing: a length [mm], or a share of the muscle's thickness.
+REST_ERROR, REST_SHARE = 0.5, 0.1
+# How fast the error falls with the centres, taken low; trials of their number, and the most, in the usual number.
+FALL, TRIALS, MOST_CENTRES = 1.2, 5, 4.0
+# What is aimed at, in what is wanted: the shown mesh adds its own.
+AIM = 0.97
+# Part of the name under which samples are cached: raise it when they are made in another way.
+SAMPLING = 1
+
+
+def default_centres(area: float, scene: Scene) -> int:
+    """Number of centres of a muscle of this area [scene unit squared]."""
+    return max(LEAST_CENTRES, int(round(area / (AREA_FOR_EACH * scene.length(1.0) ** 2), -1)))
+
+
+def wanted_error(muscle: Muscle, scene: Scene, options: RBFOptions) -> float:
+    """What a muscle's surface at rest may err by, RMS [scene unit]: as asked for, or by its size."""
+    if options.rest_error:
+        return options.rest_error
+    thickness = 2.0 * float(muscle.mesh.volume) / float(muscle.mesh.area)
+    return min(scene.length(REST_ERROR), REST_SHARE * thickness)
+
+
+class Chosen(NamedTuple):
+    """Number of centres of a muscle, and why.
+
+    Attributes
+    ----------
+    centres : int
+    error : float
+        Of the surface at rest with them, RMS [scene unit]; not a number where nothing was fitted.
+    reason : str
+    """
+
+    centres: int
+    error: float
+    reason: str
+
+
+def choose_centres(muscle: Muscle, scene: Scene, options: RBFOptions, *, known_only: bool = False) -> Chosen:
+    """How many centres a muscle has.
+
+    As many as the scene says; else those that its area asks for, and more until the surface at rest errs by no more
+    than is wanted. The number is kept on disk.
+
+    Parameters
+    ----------
+    muscle : Muscle
+    scene : Scene
+    options : RBFOptions
+    known_only : bool
+        Fit nothing: where the number is not on disk, the least that it can be.
+    """
+    if options.centres:
+        return Chosen(options.centres, np.nan, "as given")
+    usual, wanted = default_centres(muscle.mesh.area, scene), wanted_error(muscle, scene, options)
+    frame, faces = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)), np.asarray(muscle.mesh.faces)
+    fit = (options.kernel, options.epsilon, options.condition, options.placement, options.seed)
+    key = content_key(frame.local, faces, ("centres", SAMPLING, usual, round(wanted / frame.size, 9), *fit))
+    found = load_arrays(key)
+    if found is None and known_only:
+        return Chosen(usual, np.nan, "by its area; more where the rest error asks for them")
+    if found is None:
+        count, error = _search_centres(muscle, frame, options, usual, wanted)
+        found = {"count": np.array(count), "error": np.array(error / frame.size)}
+        store_arrays(key, found)
+    count, error = int(found["count"]), float(found["error"]) * frame.size
+    how = "by its area" if count == usual else f"more than the {usual} of its area"
+    met = "met" if error <= wanted else "not met"
+    return Chosen(count, error, f"{how}, rest error {error:.2g}, {wanted:.2g} {scene.units} wanted: {met}")
+
+
+def _search_centres(
+    muscle: Muscle, frame: RestFrame, options: RBFOptions, usual: int, wanted: float
+) -> tuple[int, float]:
+    """The number of centres that errs little enough, or the best within reach, and its error."""
+    most, count, tried = min(int(MOST_CENTRES * usual), GREEDY_LARGEST), usual, []
+    for _ in range(TRIALS):
+        centres, _, fit = place_points(muscle, frame, options, count)
+        error = _rest_miss(frame, centres, fit)
+        tried.append((error > wanted, count if error <= wanted else error, count, error))
+        if error <= AIM * wanted or count >= most:
+            break
+        # Infinite where no fit is to be had, or next to nothing is wanted.
+        grown = min(count * (error / (AIM * wanted)) ** (1.0 / FALL), float(most))
+        count = min(most, max(count + 20, 10 * int(np.ceil(grown / 10))))
+    return min(tried)[2:]
+
+
+def _rest_miss(frame: RestFrame, centres: SurfaceSample, fit: FieldFit) -> float:
+    """How far the mesh's vertices lie from the field's surface, RMS [scene unit]."""
+    points = frame.points(centres.points)
+    try:
+        field = fit.fit(points, frame.directions(centres.normals))
+    except (ValueError, np.linalg.LinAlgError):
+        return np.inf
+    return surface_error(field, frame.points(frame.local), float(spacing(points).mean()))
+
+
+def place_points(
+    muscle: Muscle, frame: RestFrame, options: RBFOptions, count: int
+) -> tuple[SurfaceSample, SurfaceSample, FieldFit]:
+    """Centres, samples and fit of a muscle, in its own frame.
+
+    Parameters
+    ----------
+    muscle : Muscle
+    frame : RestFrame
+        Of its vertices.
+    options : RBFOptions
+    count : int
+        Of centres.
+
+    Returns
+    -------
+    centres, samples : SurfaceSample
+        In the frame's coordinates.
+    fit : FieldFit
+        In the scene's.
+
+    Raises
+    ------
+    SceneError
+        If the placement cannot be had with this kernel.
+    """
+    fitted = options.placement == FITTED
+    faces = np.asarray(muscle.mesh.faces)
+    centres = cached_sample(frame.local, faces, count, seed=options.seed, placement="greedy")
+    samples = cached_sample(frame.local, faces, options.samples, seed=options.seed, placement="even")
+    surface = frame, faces
+    fit = _choose_fit(muscle.name, surface, options, centres, samples)
+    if fitted:
+        centres = _fit_centres(muscle.name, surface, options, centres, fit)
+        # what was best for the greedy centres need not be so for these
+        fit = _choose_fit(muscle.name, surface, options, centres, samples)
+    if options.condition or (fit.kernel.has_epsilon and not options.epsilon):
+        _refuse_broken(muscle.name, surface, fit, centres)
+    return centres, samples, fit
+
+
+def _choose_fit(
+    name: str,
+    mesh: tuple[RestFrame, Integers],
+    options: RBFOptions,
+    centres: SurfaceSample,
+    samples: SurfaceSample,
+) -> FieldFit:
+    """The kernel, and its shape parameter where the scene leaves it open: by the error at the samples at rest."""
+    frame, faces = mesh
+    kernel = get_kernel(options.kernel)
+    fit = FieldFit(
+        kernel,
+        options.epsilon or 1.0,
+        wanted_derivatives(len(centres.points), fitted=options.placement == FITTED),
+        options.condition or (BOUND if kernel.has_epsilon else np.inf),
+    )
+    if not kernel.hermite:
+        warnings.warn(
+            f"muscle {name!r}: kernel {kernel.name!r} is C{kernel.smoothness} only; the field is "
+            "fitted to values on and off the surface, with three centres a point, in place of normals",
+            NumericalWarning,
+            stacklevel=6,
+        )
+    if not kernel.has_epsilon or options.epsilon:
+        return fit
+    try:
+        # In the muscle's own frame, so that a scene that is turned chooses the same.
+        chosen = choose_epsilon(
+            centres.points,
+            centres.normals,
+            fit,
+            held_out=samples.points,
+            distance=ExactDistance(frame.local, faces).signed_distance,
+        )
+    except np.linalg.LinAlgError as error:
+        raise SceneError(f"muscle {name!r}: {error}") from None
+    return replace(fit, epsilon=chosen.epsilon / frame.size)
+
+
+def _refuse_broken(
+    name: str, mesh: tuple[RestFrame, Integers], fit: FieldFit, centres: SurfaceSample
+) -> None:
+    """Raise where the level zero at rest is open, in more sheets than one, or of another volume."""
+    frame, faces = mesh
+    local = replace(fit, epsilon=fit.epsilon * frame.size)
+    shape = f" and epsilon {fit.epsilon:.3g}" if fit.kernel.has_epsilon else ""
+    said = f"muscle {name!r}: kernel {fit.kernel.name!r} with {len(centres.points)} centres{shape}"
+    bound = ", a greater condition" if np.isfinite(fit.condition) else ""
+    remedy = f"take kernel 'cubic', more centres{bound}, or another epsilon (rbfmuscle kernels ranks them)"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NumericalWarning)
+        try:
+            field = local.fit(centres.points, centres.normals)
+            found = extract_surface(field, points=centres.points, resolution=CELLS)
+        except (ValueError, np.linalg.LinAlgError) as error:
+            raise SceneError(f"{said} gives no surface at rest ({error}); {remedy}") from None
+    off = found.volume / mesh_volume(frame.local, faces) - 1.0
+    if found.components > 1 or abs(off) > VOLUME_BOUND:
+        raise SceneError(
+            f"{said} breaks at rest: {found.components} sheets, {100 * off:+.3g} % of volume; {remedy}"
+        )
+
+
+def _fit_centres(
+    name: str, mesh: tuple[RestFrame, Integers], options: RBFOptions, centres: SurfaceSample, fit: FieldFit
+) -> SurfaceSample:
+    """Centres beside the surface, whose field lies nearer to all of it."""
+    frame, faces = mesh
+    if not fit.kernel.hermite:
+        raise SceneError(
+            f"muscle {name!r}: placement {FITTED!r} needs a C2 kernel, got {fit.kernel.name!r}; take placement 'greedy'"
+        )
+    local = replace(fit, epsilon=fit.epsilon * frame.size)
+    return fit_sample(centres, frame.local, faces, fit=local, seed=options.seed)
+
+
+def cached_sample(
+    vertices: np.ndarray, faces: np.ndarray, count: int, *, seed: int, placement: str
+) -> SurfaceSample:
+    """`sample_surface` of a muscle's mesh, from the cache on disk by content: greedy placement takes a second."""
+    key = _sample_key(vertices, faces, count, seed, placement)
+    arrays = load_arrays(key)
+    if arrays is not None:
+        return SurfaceSample(**arrays)
+    sample = sample_surface(vertices, faces, count, seed=seed, placement=placement)
+    store_arrays(key, asdict(sample))
+    return sample
+
+
+def _sample_key(vertices: Floats, faces: Integers, count: int, seed: int, placement: str) -> str:
+    return content_key(vertices, faces, ("surface sample", SAMPLING, count, seed, placement))

@@ -1,0 +1,141 @@
+"""What is known of an RBF muscle at rest, found once: where its points lie and what holds them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.implicit.field_fit import FieldFit
+from rbfmuscle.muscle.options import RBFOptions
+from rbfmuscle.muscle.placement import choose_centres, place_points
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.validation import SceneError
+
+# A patch smaller than the spacing of the centres still has to hold the muscle against turning.
+LEAST_ATTACHED = 4
+
+
+@dataclass(frozen=True)
+class RestState:
+    """An RBF muscle at rest: K centres, whose field is its surface, and S samples of the surface.
+
+    Attributes
+    ----------
+    centres, normals : (K, 3) ndarray
+    samples : (S, 3) ndarray
+    sample_faces : (m, 3) ndarray of int
+        A closed outward triangulation of the samples.
+    fit : FieldFit
+        How the field through the centres is fitted.
+    bones : list of str
+        Bones that hold the muscle, in the order of the scene.
+    holder : (K + S,) ndarray of int
+        Position in ``bones`` of the bone that holds a contact point (centres, then samples), -1 where it is free.
+    free, held : ndarray of int
+        Centres that move, and those that their bones carry.
+    mesh_volume : float
+        Of the muscle's mesh [scene unit cubed].
+    axes : (3, 3) ndarray
+        The muscle's principal axes as rows.
+    """
+
+    centres: np.ndarray
+    normals: np.ndarray
+    samples: np.ndarray
+    sample_faces: np.ndarray
+    fit: FieldFit
+    bones: list[str]
+    attached_bone: np.ndarray
+    free: np.ndarray
+    held: np.ndarray
+    mesh_volume: float
+    axes: np.ndarray
+
+    @classmethod
+    def from_muscle(cls, muscle: Muscle, scene: Scene, options: RBFOptions) -> RestState:
+        """Measure a muscle of a scene.
+
+        Parameters
+        ----------
+        muscle : Muscle
+        scene : Scene
+        options : RBFOptions
+
+        Raises
+        ------
+        SceneError
+            If the placement cannot be had or no centre is left free to move.
+        """
+        frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
+        count = choose_centres(muscle, scene, options).centres
+        centres, samples, fit = place_points(muscle, frame, options, count)
+        points = frame.points(centres.points)
+        held_by = _Attachment(muscle, scene, frame, centres.points, samples.points)
+        free, held = np.flatnonzero(held_by.centres < 0), np.flatnonzero(held_by.centres >= 0)
+        if len(free) == 0:
+            raise SceneError(
+                f"muscle {muscle.name!r}: every centre lies on an attachment; nothing is free to move"
+            )
+        attached_bone = np.concatenate([held_by.centres, held_by.samples])
+        return cls(
+            points,
+            frame.directions(centres.normals),
+            frame.points(samples.points),
+            samples.control_faces,
+            fit,
+            held_by.bones,
+            attached_bone,
+            free,
+            held,
+            float(muscle.mesh.volume),
+            # Cells along the muscle's own axes are smaller than along the scene's, and turn with the scene.
+            frame.directions(_principal_axes(samples.points)),
+        )
+
+    def contact_points(self) -> np.ndarray:
+        """Centres, then samples, (K + S, 3)."""
+        return np.concatenate([self.centres, self.samples])
+
+
+class _Attachment:
+    """Which bone holds each centre and each sample, as a position in ``bones``; -1 where none does."""
+
+    def __init__(
+        self, muscle: Muscle, scene: Scene, frame: RestFrame, centres: np.ndarray, samples: np.ndarray
+    ) -> None:
+        names = [bone.name for bone in scene.bones]
+        patches = [np.asarray(attachment.vertices) for attachment in muscle.attachments]
+        numbers = np.array([names.index(attachment.bone) for attachment in muscle.attachments])
+        owner = np.full(len(frame.local), -1)
+        for number, patch in zip(numbers, patches):
+            owner[patch] = number
+        used = np.unique(owner[owner >= 0])
+        self.bones = [names[b] for b in used]
+        place = np.full(len(names) + 1, -1)
+        place[used] = np.arange(len(used))
+        owner, numbers = place[owner], place[numbers]
+        tree = cKDTree(frame.local)
+        nearest = tree.query(centres)[1]
+        self.centres, self.samples = owner[nearest], owner[tree.query(samples)[1]]
+        for number, patch in zip(numbers, patches):
+            if number >= 0 and np.isin(nearest, patch).sum() < LEAST_ATTACHED:
+                distance = cKDTree(frame.local[patch]).query(centres)[0]
+                self.centres[np.argsort(distance, kind="stable")[:LEAST_ATTACHED]] = number
+
+
+def _principal_axes(points: Floats) -> Floats:
+    """Right-handed principal axes as rows."""
+    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    axes[2] *= np.sign(np.linalg.det(axes))
+    return axes
+
+
+def solved_points(muscle: Muscle, scene: Scene, options: RBFOptions) -> str:
+    """How many centres a muscle will have, and why."""
+    chosen = choose_centres(muscle, scene, options, known_only=True)
+    return f"{chosen.centres} centres ({chosen.reason})"

@@ -1,0 +1,429 @@
+"""The elastic solid that carries the centres of an RBF muscle.
+
+With y the nodes of a `Lattice` and F = Σ y_k ∇N_k the deformation gradient at its quadrature points q, the nodes
+minimise
+
+    E(y) = μ Σ_q w_q min over R, t of (|F_q - R D(t)|² - b (1 - t)² + c (|F_q a| - t)²),
+    D(t) = t aaᵀ + t^(-1/2) (I - aaᵀ),    1 / slack <= t <= 1,
+
+subject to the volumes of the regions r of the lattice, V_r(y) = Σ_{q in r} w_q det F_q, and to the contacts. R is a
+rotation and a the fibre direction. Between 1 / slack and 1 a fibre shortens without resistance while
+the section thickens, and bears a small tension, 2 μ b (1 - t), which keeps a slack muscle straight;
+c = 3/2 (fibre_ratio - 1) stiffens fibres that are longer or shorter than that.
+For small stretches beyond the slack band and more and more nodes this is the incompressible solid of shear modulus μ,
+Young's modulus 3 μ across and 3 μ · fibre_ratio along the fibres.
+
+Each iteration minimises over R and t at each point, then over y with the matrix of E for these, which never changes
+(Bouaziz et al. 2014, "Projective dynamics"), and corrects the regions' volumes and the contacts in its metric. The
+pressures are kept from iteration to iteration, so that the fixed point of the iteration is the equilibrium.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.harmonic import blended_motion
+from rbfmuscle.geometry.rest_frame import RestFrame, diameter
+from rbfmuscle.geometry.rotations import turned_quaternions
+from rbfmuscle.implicit.placement.lattice import Lattice
+from rbfmuscle.muscle.anderson import Anderson
+from rbfmuscle.muscle.solid_contact import NearPoints, SolidContact
+from rbfmuscle.muscle.solid_loops import (
+    Fibres,
+    carry_loop,
+    mobility_loop,
+    press_loop,
+    respond_loop,
+    stress_loop,
+    swell_loop,
+    target_loop,
+)
+from rbfmuscle.simulation.contact import BoneContacts
+
+MEMORY = 5  # steps that Anderson acceleration combines
+HOLD = 25.0  # stiffness of the spring at a held point, relative to that of a cell
+GHOST = 1e-3  # stiffness of second differences, relative to a cell: for nodes that hold hardly any material
+# b: the tension of a slack fibre grows to 0.23 μ at a slack of 1.6; at full activation it is 30 μ. Without it a muscle
+# is bent where its ends turn while they approach each other; with 0.6 it does not return to its shape at rest.
+TONE = 0.3
+# Bulk modulus and greatest pressure of a region, over 2 μ: a muscle that bones squeeze yields in volume. The surface
+# is drawn at the volume at rest in any case.
+BULK, MOST_PRESSURE = 50.0, 3.0
+MOST_TREND = 1.5  # greatest multiple of the last sub-step's correction that the next one starts with
+MOBILE = 0.02  # points that move by less than this fraction of the median for a unit force count as attached
+SETTLED = 2e-5  # of the size: an iteration that moves no node farther was the last one
+# The same where the bones stand still and only the activation changes, and how many times the iterations it may take.
+SETTLED_STILL, ROUNDS_STILL = 1e-7, 10
+LONGEST = 0.2  # of the size: a longer step is shortened to it
+# Over 2 μ: at higher pressures det F bends the energy more than the iteration's matrix does, and steps are shortened.
+CALM_PRESSURE = 0.5
+GROWTH = 2.0  # a motion beyond this multiple of the least so far restarts the acceleration
+NODES_PER_REGION = 8
+
+
+class SolidState(NamedTuple):
+    """What an `EmbeddedSolid` carries from one sub-step to the next."""
+
+    nodes: Floats
+    shown: Floats
+    quaternion: Floats
+    stretch: Floats
+    pressure: Floats
+    forces: Floats
+    anchor: Floats
+    trend: tuple[Floats, Floats, Floats] | None
+
+
+class EmbeddedSolid:
+    """An elastic solid on a lattice, with volume and contact solved inside the iteration.
+
+    Parameters
+    ----------
+    lattice : Lattice
+        In the units of ``frame``.
+    frame : RestFrame
+    points : (n, 3) ndarray
+        Contact points at rest [scene unit]: K centres, then samples of the surface.
+    owner : (n,) ndarray of int
+        Bone that each contact point is attached to, -1 where it is free.
+    held : (h,) ndarray of int
+        Contact points by which the bones hold the muscle.
+    free : (f,) ndarray of int
+        Centres that are free to move.
+    count : int
+        K.
+    area : float
+        Area of the surface per sample [scene unit squared].
+    iterations : int
+        Greatest number of iterations in a solve.
+    bones : mapping of str to (vertices, faces)
+        Meshes of the bones that are obstacles.
+
+    Attributes
+    ----------
+    y : (N, 3) ndarray
+        Nodes in equilibrium with contacts that yield a little.
+    shown : (N, 3) ndarray
+        The same nodes, with what is left in a bone moved out.
+    pressure : (M,) ndarray
+        Of the regions, over 2 μ.
+    history : list of float
+        Greatest motion of a node in each iteration of the last solve [scene unit].
+    """
+
+    def __init__(
+        self,
+        lattice: Lattice,
+        frame: RestFrame,
+        points: Floats,
+        owner: Integers,
+        held: Integers,
+        *,
+        free: Integers,
+        count: int,
+        area: float,
+        iterations: int,
+        bones: Mapping[str, tuple[Floats, Integers]],
+    ) -> None:
+        self.lattice, self.frame, self.iterations = lattice, frame, iterations
+        self.points, self.owner, self.held, self.free, self.count = points, owner, held, free, count
+        self.scale, self.side = diameter(points), float(np.prod(lattice.spacing)) ** (1 / 3) * frame.size
+        self.rest = frame.points(lattice.rest)
+        self.columns, self.shares, self.slopes_at = self._embed(points)
+        self.quad_columns = lattice.quadrature.columns
+        self.slopes = np.ascontiguousarray(lattice.quadrature.slopes @ frame.axes / frame.size)
+        self.weights = lattice.weights * frame.size**3
+        self.quad_points = frame.points(lattice.points)
+        one = np.ones(len(self.weights))
+        axis = np.tile([1.0, 0.0, 0.0], (len(one), 1))
+        self.fibres = Fibres(axis, 0.0 * one, 0.0 * one, one, one, one)
+        self.quaternion, self.stretch = np.tile([1.0, 0.0, 0.0, 0.0], (len(one), 1)), one.copy()
+        self.f, self.target = np.empty((2, len(one), 3, 3))
+        self._number_regions(lattice.regions(max(1, len(lattice.rest) // NODES_PER_REGION)))
+        self._assemble(lattice)
+        self.contact = SolidContact(self, area, bones)
+        self.y, self.pressure = self.rest.copy(), np.zeros(len(self.rest_volumes))
+        self.shown, self.forces = self.y, np.zeros((len(points), 1))
+        self.anchor, self.history, self.still = points[held], [0.0], False
+        self.trend: tuple[Floats, Floats, Floats] | None = None
+        self.begun: tuple[Floats, Floats, Floats] | None = None
+        self._followed: tuple[Floats, Integers, Floats] | None = None
+
+    def _embed(self, points: Floats) -> tuple[Integers, Floats, Floats]:
+        """Nodes (n, 27), shape functions (n, 27) and their slopes (n, 27, 3) at points of the muscle at rest."""
+        frame = self.frame
+        found = self.lattice.embed((points - frame.origin) @ frame.axes.T / frame.size)
+        return found.columns, found.shares, found.slopes @ frame.axes / frame.size
+
+    def _assemble(self, lattice: Lattice) -> None:
+        """Matrix of the energy for frozen targets, with its springs; its inverse; the weights of the bones."""
+        size, rows = len(self.rest), np.arange(len(self.weights))[:, None]
+        matrix = GHOST * self.side * lattice.second_differences()
+        for axis in range(3):
+            full = np.zeros((len(self.weights), size))
+            np.add.at(full, (rows, self.quad_columns), self.slopes[:, :, axis])
+            matrix += (full * self.weights[:, None]).T @ full
+        hangs = np.zeros((size, len(self.held)))
+        np.add.at(hangs, (self.columns[self.held].T, np.arange(len(self.held))), self.shares[self.held].T)
+        self.spring = HOLD * self.side * hangs
+        self.without_springs, self.without_fibres = matrix, matrix + self.spring @ hangs.T
+        self._invert(self.without_fibres)
+        own = self.owner[self.held]
+        self.bones = sorted(set(own.tolist()))
+        weights = np.stack([self.inverse @ self.spring[:, own == bone].sum(axis=1) for bone in self.bones], 1)
+        self.motion_weights = weights / weights.sum(axis=1, keepdims=True)
+
+    def _invert(self, matrix: Floats) -> None:
+        inverse = np.linalg.inv(matrix)
+        self.inverse = np.ascontiguousarray(0.5 * (inverse + inverse.T))
+
+    def _number_regions(self, region: Integers) -> None:
+        self.region, size = region, len(self.rest)
+        count = int(region.max()) + 1
+        pair = region[:, None] * size + self.quad_columns
+        known, slot = np.unique(pair, return_inverse=True)
+        self.slot = slot.reshape(pair.shape).astype(np.int64)
+        self.touched = (known % size).astype(np.int64)
+        self.start = np.searchsorted(known // size, np.arange(count + 1)).astype(np.int64)
+        self.gradient = np.empty((len(known), 3))
+        self.volumes = np.empty(count)
+        self.rest_volumes = np.bincount(region, self.weights, minlength=count)
+
+    # --- fibres -----------------------------------------------------------------------------------------------
+
+    def rise(self) -> Floats:
+        """Unit directions at the quadrature points from the muscle's first bone to its last, (Q, 3)."""
+        height = self.motion_weights @ np.arange(len(self.bones))
+        slope = np.einsum("qk,qka->qa", height[self.quad_columns], self.slopes)
+        return slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-300)
+
+    def flux(self) -> Floats:
+        """Gradient (Q, 3) of a potential whose flux from the first bone's held points to the others' is one."""
+        first = self.owner[self.held] == self.bones[0]
+        source = np.where(first, -1.0 / max(first.sum(), 1), 1.0 / max((~first).sum(), 1))
+        right = self.spring @ source / (HOLD * self.side)
+        height = np.linalg.lstsq(self.without_springs, right, rcond=None)[0]
+        return np.einsum("qk,qka->qa", height[self.quad_columns], self.slopes)
+
+    def take_fibres(self, fibres: Fibres) -> None:
+        """Take springs along the fibres; their stiffness becomes part of the matrix."""
+        self.fibres, stiff = fibres, fibres.passive + fibres.active
+        if not stiff.any():
+            self._invert(self.without_fibres)
+            return
+        along = np.zeros((len(self.weights), len(self.rest)))
+        slopes = np.einsum("qka,qa->qk", self.slopes, fibres.direction)
+        np.add.at(along, (np.arange(len(self.weights))[:, None], self.quad_columns), slopes)
+        self._invert(self.without_fibres + (along * (stiff * self.weights)[:, None]).T @ along)
+
+    def attach_immobile(self) -> None:
+        """Count free contact points that a force hardly moves to the bone of the nearest attached one."""
+        mobility = np.empty(len(self.points))
+        mobility_loop(self.columns, self.shares, self.inverse, mobility)
+        free, fixed = self.owner < 0, np.flatnonzero(self.owner >= 0)
+        stuck = np.flatnonzero(free & (mobility < MOBILE * np.median(mobility[free])))
+        for point in stuck:
+            away = ((self.points[fixed] - self.points[point]) ** 2).sum(axis=1)
+            self.owner[point] = self.owner[fixed[np.argmin(away)]]
+
+    # --- what the nodes carry ---------------------------------------------------------------------------------
+
+    def carry(self) -> Floats:
+        """Contact points now, (n, 3)."""
+        out = np.empty_like(self.points)
+        carry_loop(self.shown, self.columns, self.shares, out)
+        return out
+
+    def follow(self, points: Floats) -> Floats:
+        """Present positions of points (n, 3) of the muscle at rest; the embedding of the last array is kept."""
+        if self._followed is None or self._followed[0] is not points:
+            self._followed = points, *self._embed(points)[:2]
+        out = np.empty_like(points)
+        carry_loop(self.shown, *self._followed[1:], out)
+        return out
+
+    def centres(self, before: Floats) -> Floats:
+        """Centres (K, 3): the free ones where the nodes carry them, the held ones as in ``before``."""
+        out, free = before.copy(), np.empty((len(self.free), 3))
+        carry_loop(self.shown, self.columns[self.free], self.shares[self.free], free)
+        out[self.free] = free
+        return out
+
+    def deformation(self) -> Floats:
+        """Deformation gradient (K, 3, 3) at the centres."""
+        at = slice(0, self.count)
+        return np.einsum("nka,nkb->nab", self.shown[self.columns[at]], self.slopes_at[at])
+
+    # --- motion -----------------------------------------------------------------------------------------------
+
+    def move(self, motions: Floats, poses: Sequence[Floats]) -> None:
+        """Predict the nodes.
+
+        They take a weighted mean of the motions of the bones (b, 4, 4); held points follow the ``poses`` (4, 4) from
+        rest, a list by bone. Where the motion goes on as before, so does the last correction.
+        """
+        self.y = blended_motion(self.y, self.motion_weights, motions)
+        anchor, own = np.empty_like(self.anchor), self.owner[self.held]
+        for bone in self.bones:
+            here, pose = own == bone, poses[bone]
+            anchor[here] = self.points[self.held[here]] @ pose[:3, :3].T + pose[:3, 3]
+        step = (anchor - self.anchor).ravel()
+        self.still = bool(np.abs(step).max() <= SETTLED_STILL * self.scale)
+        self.anchor, self.begun = anchor, (step, self.y, self.pressure.copy())
+        if self.trend is not None:
+            last, correction, pressed = self.trend
+            share = float(step @ last) / max(float(last @ last), 1e-30)
+            share = float(np.clip(share, -MOST_TREND, MOST_TREND))
+            self.y = self.y + share * correction
+            self.pressure = self.pressure + share * pressed
+        self.shown = self.y
+
+    def turn(self, which: Integers, transform: Floats) -> None:
+        """Move the nodes by a rigid transform as far as they carry free contact points of the mask ``which``."""
+        hit, every = np.zeros((2, len(self.y)))
+        marked = np.asarray(which) & (self.owner < 0)
+        np.add.at(hit, self.columns[marked], self.shares[marked])
+        np.add.at(every, self.columns, self.shares)
+        share = (hit / np.maximum(every, 1e-12))[:, None]
+        self.y = self.y + share * (self.y @ transform[:3, :3].T + transform[:3, 3] - self.y)
+        self.shown = self.y
+
+    def transform(self, motion: Floats) -> None:
+        """Apply a rigid motion (4, 4) to the whole solid."""
+        turn, shift = motion[:3, :3].T, motion[:3, 3]
+        self.y, self.shown, self.anchor = (at @ turn + shift for at in (self.y, self.shown, self.anchor))
+        self.quaternion = turned_quaternions(self.quaternion, motion[:3, :3])
+        self.begun = None
+        if self.trend is not None:
+            last, correction, pressed = self.trend
+            self.trend = (last.reshape(-1, 3) @ turn).ravel(), correction @ turn, pressed
+
+    def snapshot(self) -> SolidState:
+        """State that ``restore`` brings back."""
+        return SolidState(
+            self.y.copy(), self.shown.copy(), self.quaternion.copy(), self.stretch.copy(), self.pressure.copy(),
+            self.forces.copy(), self.anchor.copy(), self.trend,
+        )  # fmt: skip
+
+    def restore(self, state: SolidState) -> None:
+        """Return to an earlier ``snapshot``."""
+        self.y, self.shown, self.quaternion, self.stretch, self.pressure, self.forces, self.anchor = (
+            part.copy() for part in state[:7]
+        )
+        self.trend, self.begun = state.trend, None
+
+    # --- equilibrium ------------------------------------------------------------------------------------------
+
+    def settle(self, contacts: BoneContacts) -> None:
+        """Bring the nodes to equilibrium under pressures and contacts.
+
+        Raises
+        ------
+        FloatingPointError
+            If the iteration diverges.
+        """
+        self.history, self._pull = [], self.spring @ self.anchor
+        self.localise()
+        self._find_responses()
+        near = self.contact.near(contacts, None)
+        rounds, settled = (ROUNDS_STILL, SETTLED_STILL) if self.still else (1, SETTLED)
+        mixer, least = Anderson(MEMORY, self.y.size), np.inf
+        while True:
+            new, pressure = self._iterate(near)
+            moved = float(np.sqrt(((new - self.y) ** 2).sum(axis=1).max()))
+            if not np.isfinite(moved):
+                raise FloatingPointError("the solid does not settle")
+            self.history.append(moved)
+            if moved > GROWTH * least:
+                mixer.restart()
+                least = np.inf
+            least = min(least, moved)
+            if moved > LONGEST * self.scale:
+                part = LONGEST * self.scale / moved
+                new, pressure = (
+                    self.y + part * (new - self.y),
+                    self.pressure + part * (pressure - self.pressure),
+                )
+                mixer.restart()
+            if moved < settled * self.scale or len(self.history) == self.iterations * rounds:
+                break
+            self.y, self.pressure = self._mixed(mixer, new, pressure)
+            self.localise()
+            if np.abs(self.y - near.y).max() > 0.4 * near.reach:
+                near = self.contact.near(contacts, near)
+        self.y, self.pressure = new, pressure
+        self.forces[:] = 0.0
+        self.forces[near.which] = near.forces
+        self.shown = self.contact.lifted(near)
+        self._note_trend()
+
+    def _mixed(self, mixer: Anderson, new: Floats, pressure: Floats) -> tuple[Floats, Floats]:
+        """Nodes and pressures to go on from, after an iteration has brought the present ones to ``new``."""
+        size = self.y.size
+        state, image = (np.concatenate([y.ravel(), p]) for y, p in ((self.y, self.pressure), (new, pressure)))
+        mixed = mixer.mix(state, image)
+        return mixed[:size].reshape(-1, 3).copy(), mixed[size:].copy()
+
+    def _note_trend(self) -> None:
+        if self.begun is not None:
+            motion, start, pressure = self.begun
+            if np.abs(motion).max() > SETTLED * self.scale:
+                self.trend = motion, self.y - start, self.pressure - pressure
+            self.begun = None
+
+    def energy(self) -> float:
+        """Elastic energy over 2 μ at the present nodes, springs at held points apart."""
+        self.localise()
+        given, gap = self.fibres, self.f - self.target
+        along = np.linalg.norm(np.einsum("qab,qb->qa", self.f, given.direction), axis=1)
+        beyond = along - np.clip(along, given.lower, given.upper)
+        springs = given.passive * beyond**2 + given.active * (along - given.content) ** 2
+        tone = -TONE * (self.stretch - 1.0) ** 2
+        return 0.5 * float(self.weights @ ((gap**2).sum(axis=(1, 2)) + springs + tone))
+
+    def localise(self) -> None:
+        """Find deformation gradients, targets, volumes and forces for the present nodes."""
+        target_loop(
+            self.y, self.quad_columns, self.slopes, self.fibres.direction, self.fibres.lower, TONE,
+            self.quaternion, self.stretch, self.f, self.target,
+        )  # fmt: skip
+        self.right = np.empty_like(self.y)
+        stress_loop(
+            self.f, self.target, self.fibres, self.weights, self.quad_columns, self.slopes, self.region,
+            self.slot, self.right, self.gradient, self.volumes,
+        )  # fmt: skip
+
+    def _find_responses(self) -> None:
+        """Motion of the nodes for a unit pressure of each region: the metric of this solve's corrections."""
+        count = len(self.pressure)
+        response, gram = np.empty((count, 3, len(self.y))), np.empty((count, count))
+        respond_loop(self.start, self.touched, self.gradient, self.inverse, response, gram)
+        gram[np.diag_indices(count)] += 1e-9 * gram[np.diag_indices(count)] + self.rest_volumes / BULK
+        self.factor = np.linalg.cholesky(gram)
+        white = solve_triangular(self.factor, response.reshape(count, -1), lower=True, check_finite=False)
+        self.response = np.ascontiguousarray(white.reshape(response.shape))
+
+    def _iterate(self, near: NearPoints) -> tuple[Floats, Floats]:
+        """One global step with volumes and contacts: nodes (N, 3) and pressures (M,)."""
+        right = self.right
+        press_loop(self.pressure, self.start, self.touched, self.gradient, right)
+        free = self.inverse @ (right + self._pull)
+        part = 1.0 / max(1.0, float(np.abs(self.pressure).max(initial=0.0)) / CALM_PRESSURE)
+        free = self.y + part * (free - self.y)
+        swollen = np.empty(len(self.pressure))
+        swell_loop(free - self.y, self.start, self.touched, self.gradient, swollen)
+        excess = self.volumes - self.rest_volumes * (1.0 - self.pressure / BULK) + swollen
+        change = -solve_triangular(self.factor, excess, lower=True, check_finite=False)
+        step = free + np.tensordot(change, self.response, 1).T
+        push, taken = self.contact.push(near, self.y, step, part)
+        change -= taken
+        pressure = (
+            self.pressure
+            + solve_triangular(self.factor, change, lower=True, trans=1, check_finite=False) / part
+        )
+        return step + push, np.clip(pressure, -MOST_PRESSURE, MOST_PRESSURE)

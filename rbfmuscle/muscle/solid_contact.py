@@ -1,0 +1,181 @@
+"""How the elastic solid of a muscle meets bones and neighbours: yielding while it settles, exactly in the end.
+
+A surface of points on a bone of flat facets has many equilibria, because each point has to be lifted over each edge. A
+muscle on a bone has not. So the solid settles with contacts that yield a little, on bones whose facets are rounded
+(`RoundedField`): one shape for each pose. What is then left in a bone is lifted out of it in the metric of the energy,
+volumes kept. The next sub-step starts from the settled shape, not from the lifted one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.fields import BoneField
+from rbfmuscle.muscle.rounded_bones import RoundedField, bone_thickness
+from rbfmuscle.muscle.solid_loops import carry_loop, contact_loop
+from rbfmuscle.simulation.contact import BoneContacts, HalfSpaces
+
+if TYPE_CHECKING:
+    from rbfmuscle.muscle.solid import EmbeddedSolid
+
+TOLERANCE = 2e-5  # violation of a contact that is left, of the muscle's size
+REACH_MARGIN = 0.003  # of the muscle's size
+NEAR = 0.03  # contact points nearer to an obstacle than this take part in a solve, of the muscle's size
+BATCH, ROUNDS, SWEEPS = 24, 10, 400  # contacts that join the working set in one round, rounds, sweeps in each
+# How far a contact yields under a pressure of 2 μ, of the muscle's size, and the greatest pressure that it takes, over
+# 2 μ: a muscle that bones squeeze from two sides would otherwise be turned inside out.
+YIELDING, MOST_CONTACT_PRESSURE = 1e-4, 5.0
+# Edge of the cells that a bone is rounded over, relative to the spacing of the samples. With 0.7 to 1.0 one pose of the
+# phantom's extensor has shapes 0.6 to 1.6 mm RMS apart, from 1.5 to 2 at most 0.06.
+ROUNDING = 1.7
+LEAST_ROUNDING = 0.1  # of that
+LIFTS = 3  # linear steps, at most, that lift what is left in a bone out of it
+
+
+class NearPoints(NamedTuple):
+    """Contact points near an obstacle, and what they meet.
+
+    Attributes
+    ----------
+    which : (m,) ndarray of int
+    columns, shares : (m, w) ndarray
+        Their nodes and shape functions.
+    forces : (m, sources) ndarray
+        Changed in place.
+    contacts, exact : BoneContacts
+        Obstacles with rounded bones, and as they are.
+    y : (N, 3) ndarray
+        Nodes when the points were chosen.
+    reach : float
+        Distance within which points were chosen [scene unit].
+    """
+
+    which: Integers
+    columns: Integers
+    shares: Floats
+    forces: Floats
+    contacts: BoneContacts
+    exact: BoneContacts
+    y: Floats
+    reach: float
+
+    def carry(self, y: Floats) -> Floats:
+        """Positions (m, 3) for nodes (N, 3)."""
+        out = np.empty((len(self.which), 3))
+        carry_loop(y, self.columns, self.shares, out)
+        return out
+
+
+class SolidContact:
+    """Contact of an `EmbeddedSolid`: forces of a linear complementarity problem through the inverse of its matrix.
+
+    Parameters
+    ----------
+    solid : EmbeddedSolid
+    area : float
+        Area of the surface per sample [scene unit squared].
+    bones : mapping of str to (vertices, faces)
+        Meshes of the bones.
+    """
+
+    def __init__(
+        self, solid: EmbeddedSolid, area: float, bones: Mapping[str, tuple[Floats, Integers]]
+    ) -> None:
+        self.bones = bones
+        self.solid, self.reach = solid, NEAR * solid.scale
+        self.tolerance, self.margin = TOLERANCE * solid.scale, REACH_MARGIN * solid.scale
+        self.yielding, self.most = YIELDING * solid.scale / area, MOST_CONTACT_PRESSURE * area
+        self.edge = ROUNDING * float(np.sqrt(area))
+        self._round: dict[int, RoundedField] = {}
+        self._last_push = np.zeros_like(solid.rest)
+
+    def near(self, contacts: BoneContacts, before: NearPoints | None) -> NearPoints:
+        """The contact points near an obstacle, with the forces on them until now."""
+        solid = self.solid
+        if before is None:
+            self._last_push = np.zeros_like(solid.y)
+        else:
+            solid.forces[:] = 0.0
+            solid.forces[before.which] = before.forces
+        sources = max(1, len(contacts.names) + len(contacts.neighbours))
+        if solid.forces.shape[1] != sources:
+            solid.forces = np.zeros((len(solid.points), sources))
+        index = np.arange(len(solid.points))
+        if not contacts.neighbours:
+            here = np.empty_like(solid.points)
+            carry_loop(solid.y, solid.columns, solid.shares, here)
+            index = np.unique(contacts.half_spaces(here, self.reach).index)
+            contacts = contacts.only(index)
+        return NearPoints(
+            index, solid.columns[index], solid.shares[index], solid.forces[index], self._rounded(contacts),
+            contacts, solid.y.copy(), self.reach,
+        )  # fmt: skip
+
+    def _rounded(self, contacts: BoneContacts) -> BoneContacts:
+        """The same obstacles with rounded bones."""
+        other = contacts.frozen()
+        other.fields = list(contacts.fields)
+        for b in contacts.reached:
+            field = contacts.fields[b]
+            if b not in self._round or self._round[b].field is not field:
+                self._round[b] = RoundedField(field, self.solid.frame, self._edge(field, contacts.names[b]))
+            other.fields[b] = self._round[b]
+        return other
+
+    def _edge(self, field: BoneField, bone: str) -> float:
+        """Cells over which a bone is rounded: no larger than it is thick, or a thin plate would vanish."""
+        if bone not in self.bones:
+            return self.edge
+        thickness = bone_thickness(field, *self.bones[bone], self.edge)
+        return max(thickness, LEAST_ROUNDING * self.edge)
+
+    def push(self, near: NearPoints, y: Floats, step: Floats, part: float) -> tuple[Floats, Floats]:
+        """Contact correction of a step of the nodes from ``y`` to ``step`` (N, 3), ``part`` of the way of a full one.
+
+        Returns
+        -------
+        push : (N, 3) ndarray
+        taken : (M,) ndarray
+            What the contacts take from the whitened pressures.
+        """
+        here = near.carry(y)
+        motion = near.carry(step) - here
+        # Contacts that push now push in the next iteration too: where the points will then go decides what they meet.
+        ahead = near.carry(step + self._last_push) - here
+        spaces = near.contacts.half_spaces(here, 1.5 * np.sqrt((ahead**2).sum(axis=1)) + self.margin)
+        push, taken = self._touch(near, spaces, motion, near.forces, self.yielding / part, self.most * part)
+        self._last_push = push
+        return push, taken
+
+    def lifted(self, near: NearPoints) -> Floats:
+        """The settled nodes (N, 3), moved so far that no contact point is left in an obstacle."""
+        y = self.solid.y
+        for _ in range(LIFTS):
+            here = near.carry(y)
+            spaces = near.exact.half_spaces(here, self.margin)
+            if spaces.gap.min(initial=0.0) > -self.tolerance:
+                break
+            y = y + self._touch(near, spaces, np.zeros_like(here), np.zeros_like(near.forces), 0.0, np.inf)[0]
+        return y
+
+    def _touch(
+        self,
+        near: NearPoints,
+        spaces: HalfSpaces,
+        motion: Floats,
+        forces: Floats,
+        yielding: float,
+        most: float,
+    ) -> tuple[Floats, Floats]:
+        solid = self.solid
+        push, taken = np.empty_like(solid.y), np.empty(len(solid.pressure))
+        contact_loop(
+            spaces.index, spaces.gap, spaces.normal, spaces.source % forces.shape[1], motion, solid.inverse,
+            near.columns, near.shares, solid.response, forces,
+            (BATCH, ROUNDS, SWEEPS, self.tolerance), (yielding, most), push, taken,
+        )  # fmt: skip
+        return push, taken

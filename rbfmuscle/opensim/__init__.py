@@ -1,1 +1,0 @@
-"""What is read from and written for OpenSim: models in, muscle paths out."""

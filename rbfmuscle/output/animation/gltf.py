@@ -1,0 +1,173 @@
+"""A moving run as one animated binary glTF file: bones are nodes that turn, muscles are meshes with morph targets.
+
+glTF is in metres with y up, and knows no other animation of vertices than morph targets: one a frame, whose weights
+go from 0 to 1 and back one after the other.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.surfaces import vertex_normals
+from rbfmuscle.output.animation.moving import MovingBone, MovingMuscle, MovingRun, linear_rgb
+from rbfmuscle.validation import UsageError
+
+_FLOAT, _INT = 5126, 5125
+_VERTICES, _INDICES = 34962, 34963  # what a view is bound as
+_TURN_Z_UP = [-np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]  # quaternion (x, y, z, w) that brings z up to y up
+
+
+def animated_glb(run: MovingRun, name: str = "animated-glb") -> bytes:
+    """The content of an animated ``.glb``; ``name`` is what messages call the format.
+
+    Raises
+    ------
+    UsageError
+        If a muscle's surface has other vertices in other frames.
+    """
+    changing = [muscle.name for muscle in run.muscles if not muscle.keeps_vertices]
+    if changing:
+        raise UsageError(
+            f"{name} needs surfaces that keep their vertices, those of {changing[0]!r} do not; "
+            "run with surface = 'material', or export to usd, pvd or glb"
+        )
+    file = _File()
+    if len(run.times) > 1:
+        file.times = file.add(run.times[:, None] - run.times[0], "SCALAR", bounds=True)
+    children = [_add_bone(file, bone) for bone in run.bones] + [_add_muscle(file, m) for m in run.muscles]
+    root: dict[str, Any] = {"name": run.name, "children": children}
+    if run.up == "z":
+        root["rotation"] = [float(x) for x in _TURN_Z_UP]
+    return file.content({"name": run.name, "nodes": [file.append("nodes", root)]})
+
+
+def _add_bone(file: _File, bone: MovingBone) -> int:
+    turns, shifts = _quaternions(bone.poses[:, :3, :3]), bone.poses[:, :3, 3]
+    node = file.append(
+        "nodes",
+        {
+            "name": bone.name,
+            "mesh": file.mesh(bone.name, bone.colour, bone.vertices, bone.faces),
+            "rotation": turns[0].tolist(),
+            "translation": shifts[0].tolist(),
+        },
+    )
+    if bone.moves:
+        file.animate(node, "rotation", file.add(turns, "VEC4"))
+        file.animate(node, "translation", file.add(shifts, "VEC3"))
+    return node
+
+
+def _add_muscle(file: _File, muscle: MovingMuscle) -> int:
+    base, faces = muscle.mesh(0)
+    normals, targets = vertex_normals(base, faces), []
+    for vertices in muscle.vertices[1:]:
+        moved, turned = vertices - base, vertex_normals(vertices, faces) - normals
+        position = file.add(moved, "VEC3", target=_VERTICES, bounds=True)
+        targets.append({"POSITION": position, "NORMAL": file.add(turned, "VEC3", target=_VERTICES)})
+    mesh = file.mesh(muscle.name, muscle.colour, base, faces, targets=targets)
+    node = file.append("nodes", {"name": muscle.name, "mesh": mesh})
+    if targets:
+        weights = np.eye(len(muscle.vertices))[:, 1:]
+        file.animate(node, "weights", file.add(weights.reshape(-1, 1), "SCALAR"))
+    return node
+
+
+def _quaternions(rotations):
+    """Quaternions (T, 4), scalar last, none more than half a turn from the one before."""
+    from scipy.spatial.transform import Rotation
+
+    found = Rotation.from_matrix(rotations).as_quat()
+    for k in range(1, len(found)):
+        if found[k] @ found[k - 1] < 0.0:
+            found[k] = -found[k]
+    return found
+
+
+class _File:
+    """A glTF file on its way: the binary part and the lists that describe it."""
+
+    def __init__(self) -> None:
+        self.parts: list[bytes] = []
+        self.size, self.times = 0, 0
+        self.lists: dict[str, list[Any]] = {
+            key: [] for key in ("bufferViews", "accessors", "meshes", "materials", "nodes")
+        }
+        self.samplers: list[Any] = []
+        self.channels: list[Any] = []
+
+    def append(self, key: str, entry: dict[str, Any]) -> int:
+        """Number of a new entry of a list."""
+        self.lists[key].append(entry)
+        return len(self.lists[key]) - 1
+
+    def add(
+        self, values: Floats | Integers, shape: str, *, target: int | None = None, bounds: bool = False
+    ) -> int:
+        """Number of a new accessor of these rows: whole numbers as indices, others in single precision."""
+        whole = np.issubdtype(values.dtype, np.integer)
+        rows = np.ascontiguousarray(values, dtype="<u4" if whole else "<f4")
+        view = {"buffer": 0, "byteOffset": self.size, "byteLength": rows.nbytes}
+        view |= {} if target is None else {"target": target}
+        self.parts.append(rows.tobytes())
+        self.size += rows.nbytes
+        entry = {
+            "bufferView": self.append("bufferViews", view),
+            "componentType": _INT if whole else _FLOAT,
+            "count": len(rows),
+            "type": shape,
+        }
+        if bounds:
+            entry |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
+        return self.append("accessors", entry)
+
+    def mesh(
+        self, name: str, colour: Floats, vertices: Floats, faces: Integers, *, targets: Sequence[Any] = ()
+    ) -> int:
+        """Number of a new mesh with a material of its own."""
+        look = {
+            "baseColorFactor": [*linear_rgb(colour).tolist(), 1.0],
+            "metallicFactor": 0.0,
+            "roughnessFactor": 0.6,
+        }
+        primitive = {
+            "attributes": {
+                "POSITION": self.add(vertices, "VEC3", target=_VERTICES, bounds=True),
+                "NORMAL": self.add(vertex_normals(vertices, faces), "VEC3", target=_VERTICES),
+            },
+            "indices": self.add(faces.reshape(-1, 1), "SCALAR", target=_INDICES),
+            "material": self.append("materials", {"name": name, "pbrMetallicRoughness": look}),
+        }
+        entry: dict[str, Any] = {"name": name, "primitives": [primitive]}
+        if targets:
+            primitive["targets"] = list(targets)
+            entry["weights"] = [0.0] * len(targets)
+            entry["extras"] = {"targetNames": [f"frame {k}" for k in range(1, len(targets) + 1)]}
+        return self.append("meshes", entry)
+
+    def animate(self, node: int, path: str, values: int) -> None:
+        """Let an accessor move a node's ``path`` over the times."""
+        self.samplers.append({"input": self.times, "output": values, "interpolation": "LINEAR"})
+        self.channels.append({"sampler": len(self.samplers) - 1, "target": {"node": node, "path": path}})
+
+    def content(self, scene: dict[str, Any]) -> bytes:
+        """The whole file."""
+        tree: dict[str, Any] = {
+            "asset": {"version": "2.0", "generator": "rbfmuscle"},
+            "scene": 0,
+            "scenes": [scene],
+            "buffers": [{"byteLength": self.size}],
+            **self.lists,
+        }
+        if self.channels:
+            tree["animations"] = [{"name": "motion", "samplers": self.samplers, "channels": self.channels}]
+        text = json.dumps(tree, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + self.size, len(text), b"JSON")
+        return b"".join([head, text, struct.pack("<I4s", self.size, b"BIN\0"), *self.parts])

@@ -1,0 +1,142 @@
+"""A moving run as one USD file (.usdc): meshes whose points are sampled over time, bones that move as rigid bodies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.surfaces import vertex_normals
+from rbfmuscle.output.animation.moving import (
+    FRAMES_A_SECOND,
+    MovingBone,
+    MovingMuscle,
+    MovingRun,
+    linear_rgb,
+)
+from rbfmuscle.scene.scene import MM_PER_UNIT
+from rbfmuscle.validation import MissingPartError
+
+
+def check_usd() -> None:
+    """Raise MissingPartError where the package that writes USD is absent."""
+    try:
+        import pxr.Usd  # noqa: F401
+    except ImportError:
+        raise MissingPartError(
+            "export to usd needs usd-core: pip install -e '.[usd]' in rbfmuscle's folder"
+        ) from None
+
+
+def write_usd(path: Path, run: MovingRun) -> None:
+    """Write a run as one ``.usdc`` file.
+
+    Raises
+    ------
+    MissingPartError
+        Where usd-core is absent.
+
+    Notes
+    -----
+    Time codes count 24 a second. A surface that keeps its vertices has its topology once and its points at every
+    time; another one has both at every time. Lengths stay in the run's unit, which ``metersPerUnit`` tells.
+    """
+    check_usd()
+    from pxr import Usd, UsdGeom
+
+    codes = (run.times * FRAMES_A_SECOND).tolist()
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, run.up.upper())
+    UsdGeom.SetStageMetersPerUnit(stage, MM_PER_UNIT[run.unit] / 1000.0)
+    stage.SetTimeCodesPerSecond(FRAMES_A_SECOND)
+    stage.SetFramesPerSecond(FRAMES_A_SECOND)
+    stage.SetStartTimeCode(codes[0])
+    stage.SetEndTimeCode(codes[-1])
+    place = f"/{identifier(run.name, set())}"
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, place).GetPrim())
+    used: set[str] = set()
+    parts: list[MovingBone | MovingMuscle] = [*run.bones, *run.muscles]
+    for part in parts:
+        mesh = UsdGeom.Mesh.Define(stage, f"{place}/{identifier(part.name, used)}")
+        mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
+        if isinstance(part, MovingBone):
+            _fill_bone(mesh, part, codes)
+        else:
+            _fill_muscle(mesh, part, codes)
+        _paint(stage, mesh, part, place)
+    stage.GetRootLayer().Export(str(path))
+
+
+def _fill_bone(mesh: Any, bone: MovingBone, codes: list[float]) -> None:
+    from pxr import Gf, UsdGeom, Vt
+
+    _set_faces(mesh, bone.faces, ())
+    _set_points(mesh, bone.vertices, ())
+    # Without normals a surface that is no subdivision surface is drawn facet by facet.
+    normals = np.ascontiguousarray(vertex_normals(bone.vertices, bone.faces), dtype=np.float32)
+    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals))
+    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    place = mesh.AddTransformOp()
+    for code, pose in zip(codes, bone.poses):
+        place.Set(Gf.Matrix4d(pose.T), *((code,) if bone.moves else ()))
+
+
+def _fill_muscle(mesh: Any, muscle: MovingMuscle, codes: list[float]) -> None:
+    if muscle.keeps_vertices:
+        _set_faces(mesh, muscle.faces[0], ())
+    for k, code in enumerate(codes):
+        if not muscle.keeps_vertices:
+            _set_faces(mesh, muscle.faces[k], (code,))
+        _set_points(mesh, muscle.vertices[k], (code,))
+
+
+def _set_faces(mesh: Any, faces: Integers, at: tuple[float, ...]) -> None:
+    """Set triangles, at a time code or for all times."""
+    from pxr import Vt
+
+    mesh.CreateFaceVertexCountsAttr().Set(Vt.IntArray(len(faces), 3), *at)
+    numbers = np.ascontiguousarray(faces, dtype=np.int32).ravel()
+    mesh.CreateFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(numbers), *at)
+
+
+def _set_points(mesh: Any, vertices: Floats, at: tuple[float, ...]) -> None:
+    from pxr import Vt
+
+    points = np.ascontiguousarray(vertices, dtype=np.float32)
+    extent = np.stack([points.min(axis=0), points.max(axis=0)])
+    mesh.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(points), *at)
+    mesh.CreateExtentAttr().Set(Vt.Vec3fArray.FromNumpy(extent), *at)
+
+
+def _paint(stage: Any, mesh: Any, part: MovingBone | MovingMuscle, place: str) -> None:
+    """The colour of a mesh, for those who draw materials and for those who draw none."""
+    from pxr import Gf, Sdf, UsdShade
+
+    colour = Gf.Vec3f(*linear_rgb(part.colour).tolist())
+    mesh.CreateDisplayColorAttr([colour])
+    mesh.GetPrim().SetDisplayName(part.name)
+    at = f"{place}/materials/{mesh.GetPrim().GetName()}"
+    material = UsdShade.Material.Define(stage, at)
+    shader: Any = UsdShade.Shader.Define(stage, f"{at}/surface")
+    shader.CreateIdAttr("UsdPreviewSurface")
+    shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(colour)
+    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.6)
+    output = shader.CreateOutput("surface", Sdf.ValueTypeNames.Token)
+    material.CreateSurfaceOutput().ConnectToSource(output)
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
+
+
+def identifier(name: str, used: set[str]) -> str:
+    """A name as USD allows it, unlike those used before."""
+    from pxr import Tf
+
+    base = Tf.MakeValidIdentifier(name)
+    found, count = base, 1
+    while found in used or found == "materials":
+        count += 1
+        found = f"{base}_{count}"
+    used.add(found)
+    return found

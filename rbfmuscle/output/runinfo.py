@@ -1,0 +1,204 @@
+"""The facts in ``run.json``: what was run, with what, on what, how long it took and how it went."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import os
+import platform
+from collections import Counter, defaultdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import rbfmuscle
+from rbfmuscle.scene.motion import shown_value
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.frame import Frame
+
+FORMAT = 1
+_PACKAGES = ("numpy", "scipy", "numba", "scikit-image", "trimesh", "pyvista", "vtk", "libigl")
+
+
+class Clock(NamedTuple):
+    """When a run started, and what its time went into.
+
+    Attributes
+    ----------
+    started : datetime
+    times : dict of str to float
+        Wall time of the parts of the run [s].
+    stages : Stages
+    """
+
+    started: datetime
+    times: dict[str, float]
+    stages: Stages
+
+
+def build_info(
+    scene: Scene,
+    *,
+    ending: tuple[str, str],
+    clock: Clock,
+    frames: list[Any],
+    summary: dict[str, Any],
+    limits: dict[str, float],
+    options: dict[str, Any],
+) -> dict[str, Any]:
+    """Assemble ``run.json``.
+
+    Parameters
+    ----------
+    scene : Scene
+    ending : pair of str
+        "running", "complete", "interrupted" or "failed", and why it ended, where it was not complete.
+    clock : Clock
+    frames : list of dict
+        Frame number, coordinates [degree] and wall time of each written frame.
+    summary : dict
+        From `Summary.table`.
+    limits : dict
+        Quantity -> limit in the unit of ``metrics.csv``.
+    options : dict
+        What the caller asked for.
+
+    Returns
+    -------
+    dict
+    """
+    status, message = ending
+    return {
+        "format": FORMAT,
+        "status": status,
+        "message": message,
+        "started": clock.started.isoformat(timespec="seconds"),
+        "written": datetime.now(UTC).isoformat(timespec="seconds"),
+        "scene": scene.resolved(),
+        "options": options,
+        "versions": versions(),
+        "machine": machine(),
+        "inputs": input_hashes(scene),
+        "times": clock.times,
+        "stages": clock.stages.table(),
+        "work": clock.stages.work(),
+        **({"neighbours": clock.stages.neighbours()} if clock.stages.pairs else {}),
+        "limits": limits,
+        "muscles": {name: facts for name, facts in summary.items() if name != "all"},
+        "frame_time": summary.get("all", {}).get("time_frame"),
+        "frames": frames,
+    }
+
+
+def frame_facts(scene: Scene, frame: Frame) -> dict:
+    """What ``run.json`` says of a written frame; coordinates in degrees, those of shifts in scene units."""
+    times = scene.motion.times
+    return {
+        "frame": frame.index,
+        **({} if times is None else {"time": times[frame.index]}),
+        "coordinates": {name: shown_value(scene, name, value) for name, value in frame.coordinates.items()},
+        "wall": frame.wall,
+    }
+
+
+class Stages:
+    """Time of each stage of each muscle over the frames, and what each frame took of it."""
+
+    def __init__(self) -> None:
+        self._values = defaultdict(lambda: defaultdict(list))
+        self._work = defaultdict(Counter)
+        self._reasons = defaultdict(Counter)
+        #: Pairs of neighbours: worst overlap and its frame, worst gap and its frame.
+        self.pairs: dict[tuple[str, str], tuple[float, int, float, int]] = {}
+
+    def add(self, frame: Frame) -> None:
+        """Take in a frame's times and those that its surfaces report."""
+        for pair, (overlap, gap) in frame.neighbours.items():
+            deepest, at, widest, there = self.pairs.get(pair, (-1.0, 0, -1.0, 0))
+            deepest, at = max((deepest, at), (overlap, frame.index), key=lambda found: found[0])
+            widest, there = max((widest, there), (gap, frame.index), key=lambda found: found[0])
+            self.pairs[pair] = deepest, at, widest, there
+        for name, work in frame.work.items():
+            self._work[name].update({work.state: 1, "substeps": work.substeps})
+            self._reasons[name, work.state][work.reason] += 1
+        for name, times in frame.times.items():
+            surface = frame.surfaces.get(name)
+            inner = surface.quantities if surface is not None else {}
+            for source in (times, inner):
+                for key, value in source.items():
+                    if key.startswith("time_"):
+                        self._values[name][key].append(float(value))
+
+    def neighbours(self) -> list[dict[str, Any]]:
+        """Pairs of neighbours, the deepest overlap first [scene unit]."""
+        names = ("overlap_max", "overlap_frame", "gap_rms", "gap_frame")
+        found = [{"muscles": list(pair), **dict(zip(names, worst))} for pair, worst in self.pairs.items()]
+        return sorted(found, key=lambda row: -row["overlap_max"])
+
+    def work(self) -> dict[str, Any]:
+        """Nested dict: muscle -> frames ``solved``, ``carried``, ``skipped``; ``substeps``; commonest ``reasons``."""
+        return {
+            name: {
+                **{key: count[key] for key in ("solved", "carried", "skipped", "substeps")},
+                "reasons": {
+                    state: self._reasons[name, state].most_common(1)[0][0]
+                    for state in ("solved", "carried", "skipped")
+                    if count[state]
+                },
+            }
+            for name, count in self._work.items()
+        }
+
+    def table(self) -> dict[str, Any]:
+        """Nested dict: muscle -> stage -> total, median, 95th percentile and first [s]."""
+        return {
+            name: {
+                key: {
+                    "total": float(np.sum(values)),
+                    "median": float(np.median(values)),
+                    "p95": float(np.percentile(values, 95)),
+                    "first": values[0],
+                }
+                for key, values in stages.items()
+            }
+            for name, stages in self._values.items()
+        }
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, this library and what it computes with."""
+    found = {"python": platform.python_version(), "rbfmuscle": rbfmuscle.__version__}
+    for name in _PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def machine() -> dict[str, Any]:
+    """What the times belong to."""
+    import numba
+
+    return {
+        "system": platform.platform(),
+        "processor": platform.processor() or platform.machine(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "threads": numba.get_num_threads(),
+    }
+
+
+def input_hashes(scene: Scene) -> dict[str, Any]:
+    """SHA-256 of the scene file and of the meshes and motion that it names; files that are gone are left out."""
+    motion = scene.motion.options.file
+    if motion is not None:
+        motion = (Path(scene.path).parent if scene.path else Path()) / motion
+    sources = [scene.path, motion, *(item.source for item in [*scene.bones, *scene.muscles])]
+    found = {}
+    for source in dict.fromkeys(str(s) for s in sources if s):
+        path = Path(source)
+        if path.is_file():
+            found[source] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return found

@@ -1,0 +1,161 @@
+"""Reading back what a run left in a folder."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.metrics.quantities import Row
+from rbfmuscle.output.meshfiles import SUFFIXES, read_mesh
+from rbfmuscle.validation import UsageError
+
+
+class SavedRun:
+    """A run in a folder; surfaces are read when asked for.
+
+    Of a run that was killed, or still goes on, the frames up to the last whole one are found on the disk.
+
+    Parameters
+    ----------
+    directory : path
+
+    Raises
+    ------
+    UsageError
+        If the folder holds no run.
+
+    Attributes
+    ----------
+    info : dict
+        ``run.json``.
+    frames : list of int
+        Frames that were written.
+    muscles, bones : list of str
+    units : str
+    """
+
+    def __init__(self, directory: str | Path) -> None:
+        self.directory = Path(directory)
+        path = self.directory / "run.json"
+        try:
+            self.info = json.loads(path.read_text(encoding="utf-8"))
+            self.units = self.info["scene"]["units"]
+            self.muscles = [muscle["name"] for muscle in self.info["scene"]["muscles"]]
+            self.bones = [bone["name"] for bone in self.info["scene"]["bones"]]
+            surfaces = self.info["scene"]["output"]["surfaces"]
+            self.frames = [frame["frame"] for frame in self.info["frames"]]
+        except OSError:
+            raise UsageError(
+                f"{self.directory} holds no run (no run.json); give the folder of 'run -o'"
+            ) from None
+        except (ValueError, KeyError, TypeError) as error:
+            raise UsageError(
+                f"{path} is not the run.json of a run ({error!r}); run the scene again"
+            ) from None
+        self.suffix = SUFFIXES[surfaces["format"]] if surfaces else None
+        if self.info.get("status") == "running":
+            self.info["frames"] = self._whole_frames()
+            self.frames = [frame["frame"] for frame in self.info["frames"]]
+
+    @cached_property
+    def path_bounds(self) -> np.ndarray:
+        """Box (2, 3) around all muscles in the first, middle and last frame [scene unit]."""
+        chosen = {self.frames[0], self.frames[len(self.frames) // 2], self.frames[-1]}
+        points = [self.surface(muscle, frame)[0] for frame in sorted(chosen) for muscle in self.muscles]
+        low, high = (np.array([end(p, axis=0) for p in points]) for end in (np.min, np.max))
+        return np.array([low.min(axis=0), high.max(axis=0)])
+
+    @cached_property
+    def metrics(self) -> list[Row]:
+        """Rows of ``metrics.csv``."""
+        return [
+            Row(int(r[0]), r[1], float(r[2]), r[3], r[4], float(r[5]), r[6])
+            for r in self._table("metrics.csv")
+        ]
+
+    @cached_property
+    def events(self) -> list[Any]:
+        """Rows of ``events.csv``: frame, muscle, bone, count, action."""
+        return [(int(r[0]), r[1], r[2], int(r[3]), r[4]) for r in self._table("events.csv")]
+
+    @cached_property
+    def poses(self) -> dict[int, dict[str, Floats]]:
+        """Dict of frame to dict of bone to (4, 4) ndarray."""
+        found = {}
+        for row in self._table("poses.csv"):
+            found.setdefault(int(row[0]), {})[row[1]] = np.array(row[2:], dtype=float).reshape(4, 4)
+        return found
+
+    @cached_property
+    def times(self) -> dict[int, float] | None:
+        """Time of each frame [s], None where the motion has none."""
+        found = self.info["scene"].get("motion", {}).get("times")
+        return None if found is None else dict(enumerate(map(float, found)))
+
+    def surface(self, muscle: str, frame: int) -> tuple[Floats, Integers]:
+        """Vertices and faces of a muscle in a frame."""
+        return read_mesh(self._file("surfaces", muscle, frame))
+
+    def bone(self, name: str) -> tuple[Floats, Integers]:
+        """Vertices and faces of a bone at rest."""
+        first = self.frames[0]
+        vertices, faces = read_mesh(self._file("bones", name, first))
+        pose = self.poses[first][name]
+        return (vertices - pose[:3, 3]) @ pose[:3, :3], faces
+
+    def series(self, muscle: str, quantity: str, coordinate: str | None = None) -> tuple[Integers, Floats]:
+        """Frames and values of a quantity of a muscle, of moment arms those of a coordinate, as two arrays."""
+        found = [r for r in self._rows.get((muscle, quantity), []) if coordinate in (None, r.coordinate)]
+        return np.array([r.frame for r in found]), np.array([r.value for r in found], dtype=float)
+
+    @cached_property
+    def _rows(self) -> dict[tuple[str, str], list[Row]]:
+        """Rows of ``metrics.csv`` by muscle and quantity: of dozens of muscles there are tens of thousands."""
+        found: dict[tuple[str, str], list[Row]] = {}
+        for row in self.metrics:
+            found.setdefault((row.muscle, row.quantity), []).append(row)
+        return found
+
+    def arm_coordinates(self, muscle: str | None = None) -> list[str]:
+        """The coordinates that a muscle, or any, has moment arms about, in their order in ``metrics.csv``."""
+        rows = (r for r in self.metrics if r.quantity == "moment_arm" and muscle in (None, r.muscle))
+        return list(dict.fromkeys(r.coordinate for r in rows))
+
+    def has_surfaces(self) -> bool:
+        """Whether there is something to draw."""
+        return self.suffix is not None and bool(self.frames)
+
+    def _whole_frames(self):
+        """Entries of ``run.json`` for the frames of which every file is there.
+
+        A frame's surfaces are on the disk before its poses.
+        """
+        planned = self.info.get("planned", [])
+        return [
+            {"frame": frame, "coordinates": planned[frame] if frame < len(planned) else {}, "wall": None}
+            for frame, poses in self.poses.items()
+            if set(poses) >= set(self.bones) and self._has_files(frame)
+        ]
+
+    def _has_files(self, frame):
+        return self.suffix is None or all(self._file("surfaces", m, frame).is_file() for m in self.muscles)
+
+    def _file(self, folder, name, frame):
+        if self.suffix is None:
+            raise UsageError(f"{self.directory} has no surfaces: the run's scene had output.surfaces = false")
+        return self.directory / folder / f"{name}_{frame:04d}{self.suffix}"
+
+    def _table(self, name):
+        path = self.directory / name
+        if not path.is_file():
+            return []
+        text = path.read_text(encoding="utf-8")
+        whole = text[: text.rfind("\n") + 1]  # the last line of a run that was killed may be cut
+        return list(csv.reader(io.StringIO(whole, newline="")))[1:]

@@ -1,0 +1,278 @@
+"""Writes a run to a folder while it goes on: whatever ends it, the frames so far can be read."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.threads import each
+from rbfmuscle.output.meshfiles import SUFFIXES, write_mesh
+from rbfmuscle.output.vtp import Collection
+from rbfmuscle.validation import SolveError, UsageError
+
+if TYPE_CHECKING:
+    from rbfmuscle.scene.scene import Scene
+    from rbfmuscle.simulation.frame import Frame
+
+
+METRICS_COLUMNS = ("frame", "coordinate", "angle", "muscle", "quantity", "value", "unit")
+EVENTS_COLUMNS = ("frame", "muscle", "bone", "count", "action")
+POSES_COLUMNS = ("frame", "bone", *(f"m{i}{j}" for i in range(4) for j in range(4)))
+
+# Of an earlier run in the same folder.
+_OLD_FILES = (
+    "run.json",
+    "surfaces.pvd",
+    "bones.pvd",
+    "metrics.csv",
+    "report.html",
+    "preview.webp",
+)
+
+
+def check_writable(directory: str | Path) -> None:
+    """Write to a folder, or to the one that it would be made in, before what takes time is begun.
+
+    Raises
+    ------
+    UsageError
+        If the folder cannot be written to.
+    """
+    path = Path(directory).absolute()
+    there = next(place for place in (path, *path.parents) if place.exists())
+    try:
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        raise UsageError(f"cannot write to {directory}: {error.strerror}; choose another folder") from None
+
+
+class RunWriter:
+    """Streams frames to a folder; nothing of a frame is kept in memory.
+
+    Parameters
+    ----------
+    directory : path
+        Made where it is missing. A run that lies there already is replaced.
+    scene : Scene
+        Its ``output`` table says which parts are written.
+
+    Raises
+    ------
+    UsageError
+        If the folder cannot be written to.
+    """
+
+    def __init__(self, directory: str | Path, scene: Scene) -> None:
+        self.directory = Path(directory)
+        self.scene = scene
+        output = scene.output
+        self.format = output.surfaces.format if output.surfaces else None
+        self.count, self._failed = 0, False
+        self._bone_files: dict[str, tuple[Floats, str]] = {}
+        try:
+            self._clear()
+            self._tables = {name: self._table(name, columns) for name, columns in _tables(output)}
+            names = ("surfaces", "bones") if self.format == "pvd" else ()
+            self._collections = {name: Collection(self.directory / f"{name}.pvd") for name in names}
+        except OSError as error:
+            raise UsageError(
+                f"cannot write to {self.directory}: {error.strerror}; choose another folder"
+            ) from None
+        self._good = self._sizes()
+
+    def write(self, frame: Frame, rows: Sequence[Any] = ()) -> None:
+        """Write one frame and the rows of metrics that are complete by now.
+
+        Parameters
+        ----------
+        frame : Frame
+        rows : list of Row
+
+        Raises
+        ------
+        SolveError
+            If the disk refuses; the frames before stand.
+        """
+        try:
+            self._write(frame, rows)
+        except OSError as error:
+            self._roll_back(frame.index)
+            kept = f"{self.count} frames are kept in {self.directory}"
+            raise SolveError(f"cannot write frame {frame.index}: {error.strerror}; {kept}") from None
+        self.count += 1
+        self._good = self._sizes()
+
+    def close(self, rows: Sequence[Any] = ()) -> None:
+        """Write the last rows of metrics and close all files; after a frame that could not be written, nothing."""
+        if self._failed:
+            return
+        try:
+            self._add_rows(rows)
+            for _, file in self._tables.values():
+                file.close()
+            for collection in self._collections.values():
+                collection.close()
+        except OSError as error:
+            raise SolveError(f"cannot finish the tables in {self.directory}: {error.strerror}") from None
+
+    def _sizes(self):
+        """Bytes of the tables and of the collections as they stand."""
+        return {
+            "sizes": {name: os.fstat(file.fileno()).st_size for name, (_, file) in self._tables.items()},
+            "ends": {name: collection.end for name, collection in self._collections.items()},
+        }
+
+    def write_info(self, info: dict[str, Any]) -> None:
+        """Write ``run.json`` in one piece: a reader finds the old one or the new one, never half of it.
+
+        While the run goes on it holds the coordinates of all frames to come, for readers of a run that was killed.
+        """
+        if info.get("status") == "running":
+            planned = [_degrees(coordinates) for coordinates in self.scene.motion.frames]
+            info = {**info, "planned": planned}
+        write_json(self.directory / "run.json", info)
+
+    def _write(self, frame, rows):
+        surfaces = self._write_surfaces(frame) if self.format is not None else []
+        bones = self._write_bones(frame) if self.format is not None else []
+        if "bones" in self._collections:
+            times = self.scene.motion.times
+            step = frame.index if times is None else times[frame.index]
+            self._collections["bones"].add(step, bones)
+            self._collections["surfaces"].add(step, surfaces)
+        (poses, poses_file), (events, events_file) = self._tables["poses.csv"], self._tables["events.csv"]
+        poses.writerows(
+            [frame.index, bone, *(repr(float(x)) for x in pose.ravel())] for bone, pose in frame.poses.items()
+        )
+        events.writerows([e.frame, e.muscle, e.bone, e.count, e.action] for e in frame.events)
+        poses_file.flush()
+        events_file.flush()
+        self._add_rows(rows)
+
+    def _add_rows(self, rows):
+        if self.scene.output.metrics:
+            metrics, file = self._tables["metrics.csv"]
+            metrics.writerows(rows)
+            file.flush()
+
+    def _write_surfaces(self, frame):
+        """Surfaces of a frame, side by side: most of the time goes into packing them."""
+        entries = [
+            (name, f"surfaces/{name}_{frame.index:04d}{SUFFIXES[self.format]}") for name in frame.surfaces
+        ]
+
+        def write(entry):
+            surface = frame.surfaces[entry[0]]
+            write_mesh(self.directory / entry[1], surface.vertices, surface.faces)
+
+        each(write, entries)
+        return entries
+
+    def _write_bones(self, frame):
+        """Bones of a frame; one that stands where it stood is not written again."""
+        entries = []
+        for bone in self.scene.bones:
+            pose = frame.poses[bone.name]
+            known = self._bone_files.get(bone.name)
+            if known is None or np.abs(known[0] - pose).max() > 0.0:
+                file = f"bones/{bone.name}_{frame.index:04d}{SUFFIXES[self.format]}"
+                vertices = np.asarray(bone.mesh.vertices) @ pose[:3, :3].T + pose[:3, 3]
+                write_mesh(self.directory / file, vertices, bone.mesh.faces)
+                known = self._bone_files[bone.name] = (pose.copy(), file)
+            entries.append((bone.name, known[1]))
+        return entries
+
+    def _roll_back(self, frame):
+        """Leave the folder as it was before a frame that could not be written.
+
+        What the disk still allows: nothing here can be told better than the first refusal.
+        """
+        self._failed = True
+        for name, (_, file) in self._tables.items():
+            with suppress(OSError):
+                file.close()
+            with suppress(OSError):
+                os.truncate(self.directory / name, self._good["sizes"][name])
+        for name, collection in self._collections.items():
+            with suppress(OSError):
+                collection.roll_back(self._good["ends"][name])
+                collection.close()
+        self._remove(frame - 1)
+
+    def _remove(self, last):
+        """Take the meshes of all frames after ``last`` away."""
+        for folder in ("surfaces", "bones"):
+            for file in (self.directory / folder).glob("*_[0-9][0-9][0-9][0-9]*.*"):
+                if int(file.stem.rpartition("_")[2]) > last:
+                    file.unlink(missing_ok=True)
+
+    def _clear(self):
+        """Make the folders, without the files of a run that was here before."""
+        self.directory.mkdir(parents=True, exist_ok=True)
+        for old in _OLD_FILES:
+            (self.directory / old).unlink(missing_ok=True)
+        self._remove(-1)
+        for folder in ("surfaces", "bones") if self.format is not None else ():
+            (self.directory / folder).mkdir(exist_ok=True)
+
+    def _table(self, name, columns):
+        file = open(self.directory / name, "w", encoding="utf-8", newline="")  # noqa: SIM115
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        file.flush()
+        return writer, file
+
+
+def _tables(output):
+    """Name and columns of each table that a run writes."""
+    found = [("poses.csv", POSES_COLUMNS), ("events.csv", EVENTS_COLUMNS)]
+    if output.metrics:
+        found.append(("metrics.csv", METRICS_COLUMNS))
+    return found
+
+
+def _degrees(coordinates):
+    return {name: math.degrees(value) for name, value in coordinates.items()}
+
+
+def write_json(path: Path, data: dict[str, Any]) -> None:
+    """Write JSON in one move, so that whoever reads it finds the old or the new; NaN and infinity become null."""
+    path = Path(path)
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        part.write_text(json_text(data) + "\n", encoding="utf-8")
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise SolveError(f"cannot write {path}: {error.strerror}") from None
+
+
+def json_text(data: Any) -> str:
+    """JSON that every reader takes: NaN and infinity become null."""
+    return json.dumps(plain(data), indent=1, allow_nan=False)
+
+
+def plain(value: Any) -> Any:
+    """A tree as JSON can hold it: NaN and infinity become null, what is no plain value its text."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    elif isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if isinstance(value, (str, int, float, bool, type(None))) else str(value)

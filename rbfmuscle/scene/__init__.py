@@ -1,0 +1,1 @@
+"""Scenes: bones, joints, muscles, motions and their files."""

@@ -1,0 +1,1 @@
+"""Muscles that contract: keys, activation curves and the law of fibres."""

@@ -1,0 +1,297 @@
+"""The scene file: its tables, and the scene that they describe."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from pydantic import Field, ValidationError, field_validator
+
+from rbfmuscle.scene.activation.keys import KEYS
+from rbfmuscle.scene.attachments import AttachTable
+from rbfmuscle.scene.check import check_centre, check_place, check_size
+from rbfmuscle.scene.joints.tables import (
+    CouplingTable,
+    JointTable,
+    coupling_row,
+    joint_row,
+    make_coupling,
+)
+from rbfmuscle.scene.meshes.read import read_mesh
+from rbfmuscle.scene.motion import coordinate_names, unit_sign
+from rbfmuscle.scene.options import (
+    ContactOptions,
+    DetectOptions,
+    MotionOptions,
+    OutputOptions,
+    Positive,
+    SlidingOptions,
+    Table,
+    check_plain,
+    check_removed,
+    describe_error,
+)
+from rbfmuscle.validation import MeshError, SceneError, is_file, shown, shown_path
+
+if TYPE_CHECKING:
+    from rbfmuscle.scene.scene import Scene
+
+
+# A scene file is a page or two; long lists of vertices belong into files of their own.
+LARGEST_FILE = 4_000_000
+
+
+class SceneTable(Table):
+    """``[scene]``."""
+
+    format: Literal[1]
+    name: str | None = None
+    units: Literal["m", "cm", "mm"]
+
+
+class BoneTable(Table):
+    """``[[bone]]``."""
+
+    name: str
+    mesh: str | None = None
+    scale: Positive = 1.0
+
+
+class DefaultsTable(Table):
+    """``[defaults]``: any key of a muscle, for all that do not give it themselves."""
+
+    model: Any = "rbf"
+    scale: Positive = 1.0
+    attach: list[AttachTable] = Field(default_factory=list)
+    fibres: str | None = None
+    activation: Any = None
+    fibre_stretch_at_rest: Any = None
+    optimal_fibre_length: Any = None
+    shortening: Any = None
+    tendon: Any = None
+
+    @field_validator("model")
+    @classmethod
+    def _check_model(cls, model):
+        if not isinstance(model, (str, dict)):
+            raise ValueError("model must be a name or a table with a name")
+        return model
+
+
+class MuscleTable(DefaultsTable):
+    """``[[muscle]]``."""
+
+    name: str
+    mesh: str
+
+
+class SceneFile(Table):
+    """A whole scene file."""
+
+    scene: SceneTable
+    defaults: DefaultsTable = DefaultsTable()
+    bone: list[BoneTable] = Field(default_factory=list)
+    joint: list[JointTable] = Field(default_factory=list)
+    coupling: list[CouplingTable] = Field(default_factory=list)
+    motion: MotionOptions = MotionOptions()
+    muscle: list[MuscleTable] = Field(default_factory=list)
+    contact: ContactOptions = ContactOptions()
+    sliding: SlidingOptions | None = None
+    detect: DetectOptions | None = None
+    output: OutputOptions = OutputOptions()
+
+
+def read_scene_file(path: Path) -> SceneFile:
+    """Return the checked SceneFile of a TOML file, paths as written.
+
+    Raises
+    ------
+    SceneError
+        Naming the file, the table, the key, the value and what is right.
+    """
+    data = _read_toml(path)
+    check_plain(data, place=f"{path}: ")
+    check_removed(data, place=f"{path}: ")
+    try:
+        return SceneFile.model_validate(data)
+    except ValidationError as error:
+        raise SceneError(
+            describe_error(error, root=str(path), name_row=lambda at: _place(at, data))
+        ) from None
+
+
+def _read_toml(path):
+    if path.is_dir():
+        raise SceneError(f"{path}: is a folder, give a scene file (.toml)")
+    if not is_file(path):
+        raise SceneError(f"{shown_path(path)}: no such scene file")
+    size = os.path.getsize(path)
+    if size > LARGEST_FILE:
+        raise SceneError(
+            f"{path}: has {size} bytes, a scene file at most {LARGEST_FILE}; put long lists of vertices into "
+            "files of their own"
+        )
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SceneError(f"{path}: cannot read the scene file: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise SceneError(f"{path}: not a text file in UTF-8, give a scene file (.toml)") from None
+    except tomllib.TOMLDecodeError as error:
+        quotes = "; text stands in quotes" if str(error).startswith("Invalid value") else ""
+        raise SceneError(f"{path}: not valid TOML: {shown(str(error))}{quotes}") from None
+    except (ValueError, RecursionError) as error:  # integers of thousands of digits; nesting without end
+        what = (
+            "tables or lists are nested too deep" if isinstance(error, RecursionError) else shown(str(error))
+        )
+        raise SceneError(f"{path}: not valid TOML: {what}") from None
+
+
+def load_scene(cls: Any, path: Path, *, skeleton: bool = False) -> Scene:
+    """Return the scene (of class ``cls``) of a TOML file, its meshes read and checked; see `Scene.load`."""
+    tables = read_scene_file(path)
+    folder = path.parent
+    try:
+        return _build(
+            cls(tables.scene.name or path.stem, units=tables.scene.units), tables, folder, path, skeleton
+        )
+    except (SceneError, MeshError) as error:
+        raise type(error)(f"{path}: {error}") from None
+
+
+def _build(scene, tables, folder, path, skeleton):
+    scene.path = path
+    for bone in tables.bone:
+        if bone.mesh is None:
+            scene.add_link(bone.name)
+            continue
+        read = read_mesh(folder / bone.mesh, name=bone.name, scale=bone.scale, may_be_open=True)
+        check_size(scene, "bone", bone.name, read.mesh, read.source)
+        scene.add_bone(bone.name, read)
+    for joint in tables.joint:
+        scene.place_joint(joint.joint())
+        check_centre(scene, joint.name, scene.joints[-1].centre)
+    for coupling in tables.coupling:
+        scene.place_coupling(make_coupling(coupling, scene.joints))
+    for muscle in tables.muscle:
+        _add_muscle(scene, muscle, tables.defaults, folder)
+    scene.motion = scene.motion_from(tables.motion, folder=folder)
+    scene.contact = tables.contact
+    scene.sliding = tables.sliding
+    scene.detect = tables.detect
+    scene.output = tables.output
+    return scene if skeleton and not tables.muscle else scene.validate()
+
+
+def _add_muscle(scene, muscle, defaults, folder):
+    given = {key: getattr(muscle, key) for key in muscle.model_fields_set}
+    for key in defaults.model_fields_set:
+        given.setdefault(key, getattr(defaults, key))
+    scale = given.get("scale", 1.0)
+    fibres = given.get("fibres")
+    read = read_mesh(folder / muscle.mesh, name=muscle.name, scale=scale)
+    check_size(scene, "muscle", muscle.name, read.mesh, read.source)
+    check_place(scene, muscle.name, read.mesh, read.source)
+    scene.add_muscle(
+        muscle.name,
+        read,
+        attach=[_from_folder(entry, folder) for entry in given.get("attach", [])],
+        model=_merge_model(given.get("model", "rbf"), defaults.model),
+        fibres=str(folder / fibres) if fibres is not None else None,
+        scale=scale,
+        folder=folder,
+        **{key: given[key] for key in KEYS if key in given},
+    )
+
+
+def _merge_model(model, default):
+    """A model table without a name changes some options of the default model."""
+    if isinstance(model, dict) and "name" not in model:
+        return {**({"name": default} if isinstance(default, str) else default), **model}
+    return model
+
+
+def _from_folder(entry, folder):
+    if isinstance(entry.vertices, str):
+        return entry.model_copy(update={"vertices": str(folder / entry.vertices)})
+    return entry
+
+
+def _place(location, data):
+    """Words for a pydantic location: ("muscle", 1, "attach", 0) -> [[muscle]] 'iliacus' attach 1."""
+    words = []
+    here = data
+    for depth, part in enumerate(location):
+        known = isinstance(here, list) or (isinstance(here, dict) and part in here)
+        missing = depth == len(location) - 1 and isinstance(here, dict) and str(part).islower()
+        if isinstance(part, str) and not known and not missing:
+            continue  # the name of one of several types that pydantic tried
+        here = here[part] if known and not (isinstance(here, list) and not isinstance(part, int)) else None
+        if isinstance(part, int):
+            name = here.get("name") if isinstance(here, dict) else None
+            words.append(repr(name) if name else str(part + 1))
+        elif depth == 0:
+            words.append(f"[[{part}]]" if isinstance(here, list) else f"[{part}]")
+        else:
+            words.append(part)
+    return " ".join(words)
+
+
+def describe_scene(scene: Scene) -> dict[str, Any]:
+    """Return the scene as plain data for ``run.json``: names, counts, options, sources and hashes."""
+    return {
+        "name": scene.name,
+        "units": scene.units,
+        "file": str(scene.path) if scene.path else None,
+        "bones": [{"name": b.name, **_mesh_facts(b)} for b in scene.bones],
+        "links": list(scene.links),
+        "joints": [joint_row(joint) for joint in scene.joints],
+        "couplings": [coupling_row(coupling, scene.joints) for coupling in scene.couplings],
+        "coordinate_units": {
+            name: unit_sign(scene, name)
+            for name in coordinate_names(scene.joints)
+            if unit_sign(scene, name) != "°"
+        },
+        "motion": {
+            **scene.motion.options.model_dump(by_alias=True, exclude_none=True),
+            "frames": len(scene.motion.frames),
+            **({} if scene.motion.times is None else {"times": scene.motion.times}),
+        },
+        "muscles": [_describe_muscle(muscle) for muscle in scene.muscles],
+        "contact": scene.contact.model_dump(),
+        "sliding": scene.sliding.model_dump() if scene.sliding else None,
+        "detect": scene.detect.model_dump() if scene.detect else None,
+        "output": scene.output.model_dump(),
+    }
+
+
+def _describe_muscle(muscle):
+    return {
+        "name": muscle.name,
+        "model": {"name": muscle.model, **muscle.options},
+        "attach": [{"bone": a.bone, "vertices": len(a.vertices)} for a in muscle.attachments],
+        "fibres": len(muscle.fibres) if muscle.fibres else 0,
+        **_describe_contraction(muscle.contraction),
+        **_mesh_facts(muscle),
+    }
+
+
+def _describe_contraction(keys):
+    return {} if keys is None else keys.model_dump(by_alias=True, exclude_none=True)
+
+
+def _mesh_facts(item):
+    vertices = np.ascontiguousarray(item.mesh.vertices, dtype=np.float64)
+    faces = np.ascontiguousarray(item.mesh.faces, dtype=np.int64)
+    return {
+        "mesh": item.source,
+        "vertices": len(vertices),
+        "triangles": len(faces),
+        "volume": float(item.mesh.volume),
+        "sha256": hashlib.sha256(vertices.tobytes() + faces.tobytes()).hexdigest(),
+        "mended": list(item.notes),
+    }

@@ -1,0 +1,1 @@
+"""Joints: their kinds, functions and poses."""

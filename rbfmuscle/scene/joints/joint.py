@@ -1,0 +1,217 @@
+"""A joint: coordinates that move one bone against another, and the table of the kinds of joint.
+
+Every kind is rotations about axes that are carried along by those before them, and a shift along the joint's own
+axes, which is not turned by them (Seth et al. 2010, the custom joint of Simbody); what a kind fixes is how many
+there are, and that each follows one coordinate.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from rbfmuscle.scene.joints.functions import Function, Linear
+
+X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+
+
+class Kind(NamedTuple):
+    """What a kind of joint fixes: the axes of its coordinates, turning ones first.
+
+    ``most`` says how many there may be where their number is free.
+    """
+
+    rotations: tuple = ()
+    translations: tuple = ()
+    least: int = 0
+    most: int = 0
+
+
+# All that is known of a kind stands here; files, code, messages and tests read this table.
+KINDS = {
+    "fixed": Kind(),
+    "hinge": Kind((Z,), (), 1, 1),
+    "slider": Kind((), (X,), 1, 1),
+    "universal": Kind((X, Y), (), 2, 2),
+    "ball": Kind((X, Y, Z), (), 1, 6),
+    "planar": Kind((Z,), (X, Y), 3, 3),
+    "free": Kind((X, Y, Z), (X, Y, Z), 6, 6),
+    "custom": Kind((), (), 0, 6),
+}
+
+IDENTITY = Linear((1.0,))
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """One number that moves a joint: an angle [radian], a length [scene unit], or one with no unit.
+
+    Attributes
+    ----------
+    motion : {"rotation", "translation", "coupled"}
+        What the number is; a coupled one drives several axes by functions and has no unit of its own.
+    rest : float
+        Its value in the pose in which the meshes are.
+    default : float, optional
+        Its value in a motion that does not mention it; ``rest`` where not given.
+    range : (float, float), optional
+    clamped : bool
+        Cut to the range; others may leave it, which is reported.
+    locked : bool
+        Stays at ``rest`` whatever is asked of it.
+    """
+
+    motion: Literal["rotation", "translation", "coupled"] = "rotation"
+    rest: float = 0.0
+    default: float | None = None
+    range: tuple[float, float] | None = None
+    clamped: bool = False
+    locked: bool = False
+
+    @property
+    def resting(self) -> float:
+        """Value in a motion that does not mention it."""
+        return self.rest if self.default is None or self.locked else self.default
+
+    def honoured(self, value: float) -> float:
+        """Return what the coordinate becomes when ``value`` is asked of it."""
+        if self.locked:
+            return self.rest
+        if self.clamped and self.range is not None:
+            return min(max(value, self.range[0]), self.range[1])
+        return value
+
+
+@dataclass(frozen=True)
+class TransformAxis:
+    """A direction (3,) in the joint's frame, and the function of coordinates that turns about or shifts along it."""
+
+    direction: tuple[float, float, float]
+    coordinates: tuple[str, ...] = ()
+    function: Function = IDENTITY
+
+
+@dataclass
+class Joint:
+    """Moves ``child`` (and all that hangs on it) against ``parent``.
+
+    Attributes
+    ----------
+    frame : (4, 4) ndarray
+        The joint's frame on the parent, in the scene's coordinates at rest.
+    coordinates : dict of str to Coordinate
+    rotations, translations : tuple of TransformAxis
+        In order; the first rotation is the outermost.
+    kind : str
+        A key of `KINDS`.
+    backward : bool
+        The joint was written from ``child`` to ``parent``: its motion is inverted.
+    """
+
+    name: str
+    parent: str
+    child: str
+    frame: np.ndarray
+    coordinates: dict[str, Coordinate]
+    rotations: tuple[TransformAxis, ...] = ()
+    translations: tuple[TransformAxis, ...] = ()
+    kind: str = "ball"
+    backward: bool = False
+    _rest: tuple = field(default=(None, None), repr=False, compare=False)
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Origin (3,) of the frame [scene unit]: what a ball turns about."""
+        return self.frame[:3, 3]
+
+    @property
+    def axes(self) -> dict[str, np.ndarray]:
+        """Axis (3,) in the scene of each coordinate that alone turns or shifts as much as its value says."""
+        found = {}
+        for axis in (*self.rotations, *self.translations):
+            if axis.function == IDENTITY:
+                found[axis.coordinates[0]] = self._turned(axis.direction)
+        return found
+
+    def motion(self, values: dict[str, float], rest: dict[str, float]) -> np.ndarray:
+        """Return the (4, 4) motion of the child against the parent, scene coordinates, the identity at rest.
+
+        Parameters
+        ----------
+        values, rest : dict of str to float
+            Every coordinate of the joint by its bare name, now and in the rest pose.
+        """
+        transform = self.displacement(values)
+        if self._rest[0] != rest:
+            start = self.displacement(rest)
+            self._rest = (dict(rest), None if start is None else np.linalg.inv(start))
+        if self._rest[1] is not None:
+            if values == rest:
+                return np.eye(4)
+            transform = self._rest[1] if transform is None else transform @ self._rest[1]
+        if transform is None:
+            return np.eye(4)
+        return np.linalg.inv(transform) if self.backward else transform
+
+    def displacement(self, values: dict[str, float]) -> np.ndarray | None:
+        """Return the (4, 4) motion from where every function is zero, in scene coordinates; None for none.
+
+        Parameters
+        ----------
+        values : dict of str to float
+            Every coordinate of the joint by its bare name.
+        """
+        transform = None
+        for axis in self.translations:
+            amount = axis.function(*(values[name] for name in axis.coordinates))
+            if amount:
+                transform = np.eye(4) if transform is None else transform
+                transform[:3, 3] += amount * self._turned(axis.direction)
+        for axis in self.rotations:
+            angle = axis.function(*(values[name] for name in axis.coordinates))
+            if angle:
+                turn = rotation_about(self._turned(axis.direction), angle, self.frame[:3, 3])
+                transform = turn if transform is None else transform @ turn
+        return transform
+
+    def _turned(self, direction):
+        return self.frame[:3, :3] @ np.asarray(direction)
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """A coordinate that follows others: ``coordinate = function(*of)``, full names, radian and scene units."""
+
+    coordinate: str
+    of: tuple[str, ...]
+    function: Function
+
+
+def rotation_about(axis: np.ndarray, angle: float, centre: np.ndarray) -> np.ndarray:
+    """Return the (4, 4) rotation by ``angle`` [radian] about an axis through ``centre`` (Rodrigues)."""
+    x, y, z = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    pose = np.eye(4)
+    pose[:3, :3] += math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    pose[:3, 3] = centre - pose[:3, :3] @ centre
+    return pose
+
+
+def frame_at(origin: np.ndarray, orientation: Sequence[float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+    """Return the (4, 4) frame at ``origin`` (3,), turned about its own x, then y, then z [radian]."""
+    frame = np.eye(4)
+    for axis, angle in zip((X, Y, Z), orientation):
+        if angle:
+            frame = frame @ rotation_about(np.array(axis), angle, np.zeros(3))
+    frame[:3, 3] = origin
+    return frame
+
+
+def frame_angles(rotation: np.ndarray) -> tuple[float, float, float]:
+    """Return the angles [radian] about its own x, y, z that make a (3, 3) rotation, as `frame_at` takes them."""
+    y = math.atan2(rotation[0, 2], math.hypot(rotation[0, 0], rotation[0, 1]))
+    if math.hypot(rotation[0, 0], rotation[0, 1]) < 1e-12:  # x and z turn about the same line
+        return math.atan2(rotation[2, 1], rotation[1, 1]), y, 0.0
+    return math.atan2(-rotation[1, 2], rotation[2, 2]), y, math.atan2(-rotation[0, 1], rotation[0, 0])

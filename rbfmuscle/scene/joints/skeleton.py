@@ -1,0 +1,107 @@
+"""Poses of bones from coordinates: couplings, locks and ranges first, then joint after joint from the root."""
+
+import numpy as np
+
+from rbfmuscle.scene.joints.joint import Coordinate, Coupling, Joint
+from rbfmuscle.validation import SceneError
+
+# Share of a turn [radian] or of a length that rounding may take a coordinate beyond its range.
+RANGE_TOLERANCE = 1e-6
+
+
+def all_coordinates(joints: list[Joint]) -> dict[str, Coordinate]:
+    """Return every coordinate by its full name "joint.coordinate", in order."""
+    return {f"{joint.name}.{name}": facts for joint in joints for name, facts in joint.coordinates.items()}
+
+
+def rest_values(joints: list[Joint], couplings: list[Coupling]) -> dict[str, float]:
+    """Return the value of every coordinate in the rest pose, those that follow others included."""
+    return resolve({}, joints, couplings)
+
+
+def resolve(
+    coordinates: dict[str, float], joints: list[Joint], couplings: list[Coupling]
+) -> dict[str, float]:
+    """Return the value that every coordinate takes when some are asked for.
+
+    Locked ones stay, clamped ones are cut to their range, those that follow others follow.
+
+    Parameters
+    ----------
+    coordinates : dict of str to float
+        Full names, radian or scene unit; absent ones are at rest.
+    """
+    values = {}
+    for name, facts in all_coordinates(joints).items():
+        values[name] = facts.honoured(coordinates[name]) if name in coordinates else facts.rest
+    for coupling in couplings:  # in an order in which what they follow is known
+        values[coupling.coordinate] = coupling.function(*(values[name] for name in coupling.of))
+    return values
+
+
+def ordered(couplings: list[Coupling]) -> list[Coupling]:
+    """Return the couplings in an order in which each follows what is known by then.
+
+    Raises
+    ------
+    SceneError
+        If a coordinate follows itself, or is given twice.
+    """
+    targets = [coupling.coordinate for coupling in couplings]
+    for name in targets:
+        if targets.count(name) > 1:
+            raise SceneError(f"coupling of {name!r} is given twice")
+    found, waiting = [], list(couplings)
+    while waiting:
+        open_names = {coupling.coordinate for coupling in waiting}
+        ready = [c for c in waiting if not open_names & set(c.of)]
+        if not ready:
+            raise SceneError(
+                f"coupling of {waiting[0].coordinate!r} follows itself; leave one of the ring out"
+            )
+        found += ready
+        waiting = [c for c in waiting if c not in ready]
+    return found
+
+
+def joint_poses(
+    bones: list[str], joints: list[Joint], couplings: list[Coupling], coordinates: dict[str, float]
+) -> dict[str, np.ndarray]:
+    """Return the (4, 4) pose of every bone, rest coordinates to world; a bone without a joint is fixed."""
+    now = joint_values(joints, couplings, coordinates)
+    rest = joint_values(joints, couplings, {})
+    joint_of = {joint.child: joint for joint in joints}
+    poses = {}
+    for bone in bones:
+        chain, name = [], bone
+        while name in joint_of and name not in poses:
+            chain.append(joint_of[name])
+            name = chain[-1].parent
+        pose = poses.setdefault(name, np.eye(4))
+        for joint in reversed(chain):
+            pose = pose @ joint.motion(now[joint.name], rest[joint.name])
+            poses[joint.child] = pose
+    return {bone: poses[bone] for bone in bones}
+
+
+def joint_values(
+    joints: list[Joint], couplings: list[Coupling], coordinates: dict[str, float]
+) -> dict[str, dict[str, float]]:
+    """Return the values that `resolve` gives, by joint and bare name."""
+    values = resolve(coordinates, joints, couplings)
+    return {
+        joint.name: {name: values[f"{joint.name}.{name}"] for name in joint.coordinates} for joint in joints
+    }
+
+
+def beyond_range(coordinates: dict[str, float], joints: list[Joint]) -> dict[str, float]:
+    """Return how far coordinates lie outside their ranges; those inside are left out."""
+    found = {}
+    for name, facts in all_coordinates(joints).items():
+        if name not in coordinates or facts.range is None or facts.locked:
+            continue
+        low, high = facts.range
+        excess = max(low - coordinates[name], coordinates[name] - high)
+        if excess > RANGE_TOLERANCE * max(1.0, abs(low), abs(high)):
+            found[name] = excess
+    return found

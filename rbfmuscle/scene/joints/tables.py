@@ -1,0 +1,360 @@
+"""``[[joint]]`` and ``[[coupling]]``: from the tables of a scene to joints, and back.
+
+Files and calls speak in degrees and scene units; inside are radians and scene units.
+"""
+
+import math
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from rbfmuscle.scene.joints.functions import (
+    Constant,
+    Function,
+    Linear,
+    PiecewiseLinear,
+    Polynomial,
+    Scaled,
+    Spline,
+)
+from rbfmuscle.scene.joints.joint import (
+    IDENTITY,
+    KINDS,
+    Coordinate,
+    Coupling,
+    Joint,
+    TransformAxis,
+    frame_angles,
+    frame_at,
+)
+from rbfmuscle.scene.joints.skeleton import all_coordinates
+from rbfmuscle.scene.options import Axis, Finite, Table, Vector
+from rbfmuscle.validation import SceneError, did_you_mean
+
+# What a number in a file is multiplied by.
+FACTORS = {"rotation": math.pi / 180.0, "translation": 1.0, "coupled": 1.0}
+FUNCTIONS = ("constant", "linear", "polynomial", "piecewise", "spline", "natural_spline")
+
+
+class PointsTable(Table):
+    """Points of a function of one coordinate."""
+
+    x: list[Finite] = Field(min_length=1)
+    y: list[Finite] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _check_order(self):
+        if len(self.x) != len(self.y):
+            raise ValueError(f"x has {len(self.x)} values and y {len(self.y)}")
+        if any(b <= a for a, b in zip(self.x, self.x[1:])):
+            raise ValueError("x must increase")
+        return self
+
+
+class FunctionTable(Table):
+    """One function; without any it is the coordinate's own value."""
+
+    constant: Finite | None = None
+    linear: list[Finite] | None = Field(default=None, min_length=1)
+    polynomial: list[Finite] | None = Field(default=None, min_length=1)
+    piecewise: PointsTable | None = None
+    spline: PointsTable | None = None
+    natural_spline: PointsTable | None = None
+    scale: Finite = 1.0
+
+    def function(self, inputs: list[str], output: str, *, place: str) -> Function:
+        """Return the function in inner units; ``inputs`` and ``output`` are kinds of motion, keys of `FACTORS`."""
+        given = [name for name in FUNCTIONS if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise SceneError(f"{place}: give one function, not {' and '.join(given)}")
+        kind = given[0] if given else "linear"
+        found = self._plain(kind, len(inputs), place)
+        if found == IDENTITY and inputs == [output]:
+            return found if self.scale == 1.0 else Scaled(self.scale, found)
+        found = found.rescaled([FACTORS[motion] for motion in inputs], FACTORS[output])
+        return found if self.scale == 1.0 else Scaled(self.scale, found)
+
+    def _plain(self, kind, count, place):
+        needed = {"constant": 0, "linear": count}.get(kind, 1)
+        if kind != "constant" and (count == 0 or count != needed):
+            raise SceneError(f"{place}: {kind} is of {needed or 1} coordinate, {count} are given")
+        if kind == "constant":
+            return Constant(self.constant)
+        if kind == "linear":
+            values = self.linear or [1.0, 0.0]
+            if len(values) != count + 1:
+                raise SceneError(
+                    f"{place}: linear needs a slope for each of {count} coordinates and a constant, got {values}"
+                )
+            return Linear(tuple(values[:-1]), values[-1])
+        if kind == "polynomial":
+            return Polynomial(tuple(self.polynomial))
+        points = getattr(self, kind)
+        if kind == "piecewise":
+            return PiecewiseLinear(tuple(points.x), tuple(points.y))
+        return Spline(tuple(points.x), tuple(points.y), natural=kind == "natural_spline")
+
+
+class AxisTable(FunctionTable):
+    """One axis of a custom joint."""
+
+    axis: Axis
+    coordinates: list[str] = Field(default_factory=list)
+
+
+class CoordinateTable(Table):
+    """``joint.coordinates.NAME`` [degree or scene unit]."""
+
+    motion: Literal["rotation", "translation", "coupled"] | None = None
+    rest: Finite = 0.0
+    default: Finite | None = None
+    range: list[Finite] | None = Field(default=None, min_length=2, max_length=2)
+    clamped: bool = False
+    locked: bool = False
+
+    @model_validator(mode="after")
+    def _check_values(self):
+        if self.range is not None and self.range[0] > self.range[1]:
+            raise ValueError(f"range must go upwards, got {self.range}")
+        if self.clamped and self.range is None:
+            raise ValueError("clamped needs a range")
+        if self.locked and self.default not in (None, self.rest):
+            raise ValueError("a locked coordinate stays at rest, it has no other default")
+        return self
+
+    def coordinate(self, motion: str) -> Coordinate:
+        """Return it in inner units."""
+        kind: Any = self.motion or motion
+        factor = FACTORS[kind]
+        return Coordinate(
+            kind,
+            self.rest * factor,
+            None if self.default is None else self.default * factor,
+            None if self.range is None else (self.range[0] * factor, self.range[1] * factor),
+            self.clamped,
+            self.locked,
+        )
+
+
+class JointTable(Table):
+    """``[[joint]]``."""
+
+    name: str
+    parent: str
+    child: str
+    type: Literal["fixed", "hinge", "slider", "universal", "ball", "planar", "free", "custom"] = "ball"
+    centre: Vector | None = None
+    orientation: Vector | None = None
+    axes: dict[str, Axis] | None = None
+    coordinates: dict[str, CoordinateTable] = Field(default_factory=dict)
+    rotations: list[AxisTable] = Field(default_factory=list, max_length=3)
+    translations: list[AxisTable] = Field(default_factory=list, max_length=3)
+    backward: bool = False
+
+    def joint(self) -> Joint:
+        """Return the joint that the table describes, or raise SceneError naming it."""
+        place = f"joint {self.name!r}"
+        if self.centre is None and self.type != "fixed":
+            raise SceneError(f"{place}: centre is missing, give the joint's place at rest")
+        angles = tuple(math.radians(angle) for angle in self.orientation or (0.0, 0.0, 0.0))
+        frame = frame_at(np.array(self.centre or (0.0, 0.0, 0.0)), angles)
+        if self.type == "custom":
+            parts: Any = self._custom(place)
+        else:
+            parts = self._of_kind(place)
+        rest: Any = {"kind": self.type, "backward": self.backward}
+        return Joint(self.name, self.parent, self.child, frame, *parts, **rest)
+
+    def _of_kind(self, place):
+        kind = KINDS[self.type]
+        if self.rotations or self.translations:
+            raise SceneError(f"{place}: rotations and translations belong to type 'custom', give axes")
+        directions = [*kind.rotations, *kind.translations]
+        if self.axes:
+            axes = self.axes
+        else:
+            axes = dict(zip(self.coordinates, directions))
+        count = len(axes) or len(self.coordinates)
+        if not kind.least <= count <= kind.most:
+            words = f"{kind.least}" if kind.least == kind.most else f"{kind.least} to {kind.most}"
+            if count == 0:
+                raise SceneError(
+                    f"{place}: axes needs at least one coordinate"
+                    if self.type == "ball"
+                    else f"{place}: a {self.type} joint has {words} coordinates, name them in axes"
+                )
+            raise SceneError(f"{place}: a {self.type} joint has {words} coordinates, {count} are given")
+        self._check_known(axes, place)
+        turning = len(kind.rotations) if self.type != "ball" else count
+        made, coordinates = [], {}
+        for k, (name, axis) in enumerate(axes.items()):
+            motion = "rotation" if k < turning else "translation"
+            table = self.coordinates.get(name, CoordinateTable())
+            if table.motion not in (None, motion):
+                raise SceneError(f"{place}: {name!r} is a {motion} here, not a {table.motion}")
+            coordinates[name] = table.coordinate(motion)
+            made.append(TransformAxis(unit(axis, f"{place}: axis {name!r}"), (name,)))
+        return coordinates, tuple(made[:turning]), tuple(made[turning:])
+
+    def _custom(self, place):
+        if self.axes:
+            raise SceneError(f"{place}: a custom joint has rotations and translations instead of axes")
+        tables = [
+            *(("rotation", t) for t in self.rotations),
+            *(("translation", t) for t in self.translations),
+        ]
+        named = dict.fromkeys(name for _, table in tables for name in table.coordinates)
+        self._check_known(named, place)
+        kinds = {name: self._motion_of(name, tables) for name in named}
+        order = [*self.coordinates, *(name for name in named if name not in self.coordinates)]
+        coordinates = {
+            name: self.coordinates.get(name, CoordinateTable()).coordinate(kinds[name]) for name in order
+        }
+        made = {"rotation": [], "translation": []}
+        for k, (motion, table) in enumerate(tables):
+            at = f"{place}: {motion} {k + 1 - (len(self.rotations) if motion == 'translation' else 0)}"
+            function = table.function([coordinates[n].motion for n in table.coordinates], motion, place=at)
+            axis = unit(table.axis, f"{at}: axis")
+            made[motion].append(TransformAxis(axis, tuple(table.coordinates), function))
+        return coordinates, tuple(made["rotation"]), tuple(made["translation"])
+
+    def _motion_of(self, name, tables):
+        """A coordinate that is itself an angle or a shift along some axis is a rotation or a translation."""
+        declared = self.coordinates.get(name)
+        if declared is not None and declared.motion is not None:
+            return declared.motion
+        found = "coupled"
+        for motion, table in tables:
+            plain = not any(getattr(table, key) is not None for key in FUNCTIONS)
+            slope = 1.0 if plain else (table.linear or [0.0])[0]
+            if table.coordinates == [name] and abs(slope * table.scale) == 1.0:
+                found = motion
+        return found
+
+    def _check_known(self, used, place):
+        for name in self.coordinates:
+            if name not in used:
+                raise SceneError(
+                    f"{place}: coordinate {name!r} moves nothing, {did_you_mean(name, list(used))}"
+                )
+
+
+class CouplingTable(FunctionTable):
+    """``[[coupling]]``."""
+
+    coordinate: str
+    of: list[str] = Field(min_length=1)
+
+
+def unit(values: list[float], name: str) -> tuple[float, float, float]:
+    """Return a direction (3,) at length one, or raise SceneError naming it."""
+    vector = np.asarray(values, dtype=float)
+    size = np.linalg.norm(vector)
+    if vector.shape != (3,) or not np.isfinite(size):
+        raise SceneError(f"{name} must be three numbers, got {values!r}")
+    if size == 0:
+        raise SceneError(f"{name} must not be the zero vector")
+    return tuple((vector / size).tolist())
+
+
+def full_name(name: str, known: list[str], *, place: str) -> str:
+    """Return "joint.coordinate"; a bare coordinate may stand for the only joint that has it."""
+    if name in known:
+        return name
+    owners = [full for full in known if full.split(".", 1)[1] == name]
+    if len(owners) == 1:
+        return owners[0]
+    raise SceneError(f"{place}: unknown coordinate {name!r}, {did_you_mean(name, known)}")
+
+
+def make_coupling(table: CouplingTable, joints: list[Joint]) -> Coupling:
+    """Return the coupling that a table describes, names in full."""
+    coordinates = all_coordinates(joints)
+    known = list(coordinates)
+    target = full_name(table.coordinate, known, place="coupling")
+    place = f"coupling of {target!r}"
+    of = tuple(full_name(name, known, place=place) for name in table.of)
+    motions: list[Any] = [coordinates[name].motion for name in of]
+    return Coupling(target, of, table.function(motions, coordinates[target].motion, place=place))
+
+
+def joint_row(joint: Joint) -> dict:
+    """Return a joint as the plain table that makes it again [degree, scene unit]."""
+    row: dict[str, Any] = {"name": joint.name, "parent": joint.parent, "child": joint.child}
+    if joint.kind != "ball":
+        row["type"] = joint.kind
+    if joint.kind != "fixed":
+        row["centre"] = joint.centre.tolist()
+    turned = joint.frame[:3, :3]
+    if not np.array_equal(turned, np.eye(3)):
+        row["orientation"] = [math.degrees(angle) for angle in frame_angles(turned)]
+    if joint.kind == "custom":
+        motions = {name: facts.motion for name, facts in joint.coordinates.items()}
+        for key, axes in (("rotations", joint.rotations), ("translations", joint.translations)):
+            if axes:
+                row[key] = [_axis_row(axis, motions, key[:-1]) for axis in axes]
+    elif joint.coordinates:
+        axes = zip(joint.coordinates, (*joint.rotations, *joint.translations))
+        row["axes"] = {name: list(axis.direction) for name, axis in axes}
+    tables = {name: _coordinate_row(facts, joint.kind) for name, facts in joint.coordinates.items()}
+    if joint.kind == "custom" or any(tables.values()):
+        row["coordinates"] = tables
+    if joint.backward:
+        row["backward"] = True
+    return row
+
+
+def coupling_row(coupling: Coupling, joints: list[Joint]) -> dict:
+    """Return a coupling as the plain table that makes it again."""
+    motions = {name: facts.motion for name, facts in all_coordinates(joints).items()}
+    inputs = [motions[name] for name in coupling.of]
+    function = _function_row(coupling.function, inputs, motions[coupling.coordinate])
+    return {"coordinate": coupling.coordinate, "of": list(coupling.of), **function}
+
+
+def _coordinate_row(facts, kind):
+    factor = FACTORS[facts.motion]
+    row: dict[str, Any] = {"motion": facts.motion} if kind == "custom" else {}
+    if facts.rest:
+        row["rest"] = facts.rest / factor
+    if facts.default is not None:
+        row["default"] = facts.default / factor
+    if facts.range is not None:
+        row["range"] = [end / factor for end in facts.range]
+    row.update({key: True for key in ("clamped", "locked") if getattr(facts, key)})
+    return row
+
+
+def _axis_row(axis, motions, output):
+    inputs = [motions[name] for name in axis.coordinates]
+    row: dict[str, Any] = {"axis": list(axis.direction)}
+    if axis.coordinates:
+        row["coordinates"] = list(axis.coordinates)
+    return {**row, **_function_row(axis.function, inputs, output)}
+
+
+def _function_row(function, inputs, output):
+    scale = 1.0
+    while isinstance(function, Scaled):
+        scale, function = scale * function.factor, function.inner
+    if function == IDENTITY and inputs == [output]:
+        row = {}
+    else:
+        row = _plain_row(
+            function.rescaled([1.0 / FACTORS[motion] for motion in inputs], 1.0 / FACTORS[output])
+        )
+    return row if scale == 1.0 else {**row, "scale": scale}
+
+
+def _plain_row(function):
+    if isinstance(function, Constant):
+        return {"constant": function.value}
+    if isinstance(function, Linear):
+        return {"linear": [*function.slopes, function.constant]}
+    if isinstance(function, Polynomial):
+        return {"polynomial": list(function.coefficients)}
+    points = {"x": list(function.x), "y": list(function.y)}
+    if isinstance(function, PiecewiseLinear):
+        return {"piecewise": points}
+    return {"natural_spline" if function.natural else "spline": points}

@@ -1,0 +1,1 @@
+"""Meshes as files have them, read and mended."""

@@ -1,0 +1,262 @@
+"""The tables of a scene that hold settings: contact, sliding, detection, output, motion.
+
+They check themselves, so the same rules hold for a file, for code and for ``--set``.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
+
+from rbfmuscle.validation import SceneError, did_you_mean, shown
+
+# How deep tables and lists of a scene file may lie in each other, and how large a whole number may be: beyond
+# 2^53 it is no longer the number that was written once it meets a float.
+DEEPEST = 20
+LARGEST_INTEGER = 2**53
+
+# Keys that were removed, and what to do instead; a key of a muscle or of its model (`model.KEY`) without the muscle.
+# The table is deleted at 1.0.
+REMOVED_KEYS: dict[str, str] = {
+    "contact.from_rest": "delete the key: solve_pose(scene, models, coordinates) in Python solves a pose from rest",
+    "contact.detector": "delete the key; for other fields call simulate(scene, fields={bone: field}) in Python",
+    "contact.still_angle": "delete the key: a muscle is solved whenever its bones move against each other",
+    "detect.tunnelling.smallest_step": "delete the key: steps are halved down to 0.1 degrees",
+    "sliding.strip": "delete the key: a linked point is free to 0.5 mm beyond its gap at rest",
+    "sliding.release": "delete the key: a point 5 mm beyond that is let go",
+    "sliding.join": "delete the key: points that come near a neighbour are linked",
+    "sliding.cut": "delete the key: overlaps that remain are cut midway in the surfaces",
+    "model.across": "delete the key: the muscle is an elastic solid, set its model.nodes",
+    "model.across_weight": "delete the key: the muscle is an elastic solid, set its model.nodes",
+    "model.acceleration": "delete the key: each solve combines five iterations",
+    "model.contacts": "delete the key: all contacts near a bone are solved together",
+    "model.inside": "use model.nodes: every RBF muscle is carried by an elastic solid",
+    "model.stretch_high": "delete the key: use model.fibre_ratio, the stiffness along the fibres",
+    "model.stretch_hold": "use model.fibre_ratio, the stiffness along the fibres",
+    "model.stretch_low": "use model.slack: fibres shorten freely to 1 / slack of their length in the scan",
+    "model.prediction": 'use model = "pbd-paper", or delete the key: vertices are carried along by the bones',
+    "model.damping": 'use model = "pbd-paper", or delete the key',
+    "model.limits": 'use model = "pbd-paper", or delete the key: edges beyond 0.6 or 2.2 times their length are hard',
+    "model.soft_length": 'use model = "pbd-paper", or delete the key: long edges are softer',
+    "model.response": 'use model = "pbd-paper", or delete the key: ways out of several bones are added up',
+    "model.derivatives": "delete the key: up to 200 centres, and fitted ones, meet all derivatives",
+    "output.fibres": "delete the key: fibres of a run are no longer followed; those of a scene still steer its muscles",
+    "output.moment_arms": "delete the key: moment arms are measured along every motion, about what moves alone",
+    "opensim": "delete the table: runs are no longer compared with the muscle paths of an OpenSim model",
+}
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
+
+
+def _check_length(vector):
+    if not any(vector):
+        raise ValueError("must not be the zero vector")
+    return vector
+
+
+Axis = Annotated[Vector, AfterValidator(_check_length)]
+
+
+def check_plain(value: object, *, place: str) -> None:
+    """Raise SceneError where TOML holds what no key can mean: endless nesting, vast integers, nan or inf.
+
+    Parameters
+    ----------
+    value : object
+        What a TOML reader returned: tables, lists, numbers, texts.
+    place : str
+        Begins the message.
+    """
+    open_parts = [(value, place, 0)]
+    while open_parts:
+        part, where, depth = open_parts.pop()
+        if isinstance(part, (dict, list)):
+            if depth >= DEEPEST:
+                raise SceneError(f"{shown(where)}: tables or lists are nested more than {DEEPEST} deep")
+            items = part.items() if isinstance(part, dict) else enumerate(part, 1)
+            open_parts += [
+                (item, f"{where}{'' if depth == 0 else '.'}{shown(str(key))}", depth + 1)
+                for key, item in items
+                if not (isinstance(item, int) and abs(item) <= LARGEST_INTEGER) and not isinstance(item, str)
+            ]
+        elif isinstance(part, int) and not isinstance(part, bool) and abs(part) > LARGEST_INTEGER:
+            raise SceneError(f"{where}: a whole number must be at most 2^53 in size, got {shown(part)}")
+        elif isinstance(part, float) and not math.isfinite(part):
+            raise SceneError(f"{where}: must be a finite number, got {part}")
+
+
+def check_removed(values: object, *, place: str, prefix: str = "") -> None:
+    """Raise SceneError where a table holds a key that was removed, naming what to do instead.
+
+    Parameters
+    ----------
+    values : object
+        A table, or a list of tables, as a TOML reader returned it.
+    place : str
+        Begins the message.
+    prefix : str
+        Dotted name of the table, with a full stop at its end.
+    """
+    for row in values if isinstance(values, list) else [values]:
+        for key, value in row.items() if isinstance(row, dict) else ():
+            name = f"{prefix}{key}".removeprefix("muscle.").removeprefix("defaults.")
+            if name in REMOVED_KEYS:
+                raise SceneError(f"{place}{name} was removed: {REMOVED_KEYS[name]}")
+            check_removed(value, place=place, prefix=f"{name}.")
+
+
+class Table(BaseModel):
+    """A table whose unknown keys are errors that name the nearest right one."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, populate_by_name=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name_unknown_keys(cls, data):
+        if not isinstance(data, dict):
+            return data
+        known = [field.alias or name for name, field in cls.model_fields.items()]
+        for key in data:
+            if key not in known and key not in cls.model_fields:
+                raise PydanticCustomError(
+                    "unknown_key",
+                    "unknown key '{key}', {hint}",
+                    {"key": shown(str(key)), "hint": did_you_mean(key, known)},
+                )
+        return data
+
+    @classmethod
+    def build(cls, values: dict[str, Any], *, place: str) -> Any:
+        """Return the table made from a dict, or raise SceneError that begins with ``place``."""
+        try:
+            return cls.model_validate(values)
+        except ValidationError as error:
+            raise SceneError(f"{place}{describe_error(error)}") from None
+
+    def changed(self, key: str, value: Any, *, place: str) -> ContactOptions | DetectOptions | OutputOptions:
+        """Return a copy with the dotted ``key`` set to ``value``, checked again."""
+        values = self.model_dump(by_alias=True, exclude_unset=True)
+        table = values
+        *parents, last = key.split(".")
+        for parent in parents:
+            table = table.setdefault(parent, {})
+            if not isinstance(table, dict):
+                raise SceneError(f"{place}{key}: {parent!r} is not a table")
+        table[last] = value
+        return type(self).build(values, place=place)
+
+
+def describe_error(error: Any, *, root: str = "", name_row: Callable[..., Any] | None = None) -> str:
+    """Return the first problem of a pydantic error as "where: what, given value".
+
+    Parameters
+    ----------
+    error : pydantic.ValidationError
+    root : str
+        Prefix of the location.
+    name_row : callable, optional
+        Turns the location (a tuple) into the words that a user knows the place by.
+    """
+    first = error.errors(include_url=False)[0]
+    where = name_row(first["loc"]) if name_row else ".".join(str(part) for part in first["loc"])
+    message = first["msg"].removeprefix("Value error, ")
+    message = re.sub(r"a valid dictionary( or instance of \w+)?", "a table", message[0].lower() + message[1:])
+    given = first.get("input")
+    value = ""
+    if first["type"] not in ("unknown_key", "missing") and not isinstance(given, dict):
+        value = f", got {shown(repr(given) if isinstance(given, str) else given)}"
+    return ": ".join(part for part in (root, where, message + value) if part)
+
+
+class ContactOptions(Table):
+    """``[contact]``: how muscles meet bones."""
+
+    initial: Literal["resolve", "keep", "error"] = "resolve"
+    tolerance: Positive | None = None
+    substep_angle: Annotated[float, Field(gt=0, le=90)] = 2.0
+    margin: NotNegative = 0.0
+
+
+class SlidingOptions(Table):
+    """``[sliding]``: neighbouring muscles that keep their distance and slide."""
+
+    threshold: Positive | None = None
+    bones: bool = False
+    pairs: list[Annotated[list[str], Field(min_length=2, max_length=2)]] | None = None
+
+
+class TunnellingOptions(Table):
+    """``detect.tunnelling``: points that pass through a bone in one step."""
+
+    angle: Annotated[float, Field(gt=0, lt=180)] = 135.0
+    action: Literal["report", "rotate", "substep"] = "substep"
+    swept: bool = True
+
+
+class DetectOptions(Table):
+    """``[detect]``: what is looked for while a motion runs."""
+
+    tunnelling: TunnellingOptions | None = None
+
+
+class SurfaceOptions(Table):
+    """``output.surfaces``: the surfaces written for every frame."""
+
+    format: Literal["pvd", "vtp", "ply", "stl", "obj", "glb"] = "pvd"
+
+
+class OutputOptions(Table):
+    """``[output]``: what a run leaves behind."""
+
+    surfaces: SurfaceOptions | Literal[False] = SurfaceOptions()
+    metrics: bool = True
+    report: bool = True
+    preview: bool = True
+
+
+class RampOptions(Table):
+    """One coordinate from one value to another [degree or scene unit]."""
+
+    start: Finite | None = Field(alias="from", default=None)
+    end: Finite = Field(alias="to")
+    step: Positive
+
+
+class MotionOptions(Table):
+    """``[motion]``: a ramp, waypoints or an OpenSim file; without any, the rest pose alone."""
+
+    ramp: dict[str, RampOptions] | None = None
+    waypoints: Annotated[list[dict[str, Finite]], Field(min_length=1)] | None = None
+    step: Positive | None = None
+    file: str | None = None
+    degrees: bool | None = None
+    max_substeps: Annotated[int, Field(ge=1)] = 100_000
+
+    @model_validator(mode="after")
+    def _check_one_source(self):
+        given = [key for key in ("ramp", "waypoints", "file") if getattr(self, key) is not None]
+        if len(given) > 1:
+            raise ValueError(f"give one of ramp, waypoints and file, not {' and '.join(given)}")
+        if self.waypoints is not None and len(self.waypoints) > 1 and self.step is None:
+            raise ValueError("waypoints need a step (degrees between frames)")
+        if self.step is not None and self.waypoints is None:
+            raise ValueError("step belongs to waypoints; a ramp has its own step")
+        if self.degrees is not None and self.file is None:
+            raise ValueError("degrees belongs to a file; ramps and waypoints are in degrees")
+        return self

@@ -1,0 +1,219 @@
+"""Changing a scene by dotted keys: ``--set KEY=VALUE``, grids of a sweep, ``Scene.with_options``."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rbfmuscle.scene.activation.keys import KEYS
+from rbfmuscle.scene.objects import split_model
+from rbfmuscle.scene.options import DetectOptions, SlidingOptions, check_plain, check_removed
+from rbfmuscle.validation import SceneError, UsageError, did_you_mean
+
+if TYPE_CHECKING:
+    from rbfmuscle.scene.scene import Scene
+
+TABLES = ("contact", "sliding", "detect", "output", "motion")
+
+
+def apply_model(scene: Scene, model: dict[str, Any] | str, *, muscles: Any = None) -> None:
+    """Give muscles (all by default) another model; options of a different model are dropped."""
+    name, options = split_model(model, place="model")
+    for muscle in scene.muscles if muscles is None else muscles:
+        if muscle.model != name:
+            muscle.options = {}
+        muscle.model = name
+        muscle.options.update(options)
+
+
+def apply_settings(scene: Scene, settings: Mapping[str, Any]) -> None:
+    """Set dotted keys of a scene, in place.
+
+    ``model`` or ``model.KEY`` change every muscle, ``muscle.NAME.model`` or ``muscle.NAME.model.KEY`` one;
+    ``contact.KEY``, ``sliding.KEY``, ``detect.KEY`` and ``output.KEY`` change a table (one that the scene
+    lacks is switched on); ``activation`` and the other keys of contraction change every muscle,
+    ``muscle.NAME.activation`` one; ``motion.step`` changes the step of every ramp and
+    ``motion.ramp.NAME.COORDINATE.KEY`` one key of one. Whole models come first, whatever the order, as another
+    model drops the settings of the one before.
+
+    Parameters
+    ----------
+    scene : Scene
+    settings : mapping of str to value
+
+    Raises
+    ------
+    UsageError
+        If a key is unknown, with the nearest right one, or a value is not allowed.
+    """
+    for key in sorted(settings, key=lambda key: not chooses_model(key)):
+        value = settings[key]
+        try:
+            _apply(scene, key, value.item() if isinstance(value, np.generic) else value)
+        except SceneError as error:
+            raise UsageError(str(error)) from None
+
+
+def chooses_model(key: str) -> bool:
+    """Whether a dotted key gives muscles another model as a whole."""
+    return key == "model" or (key.startswith("muscle.") and key.endswith(".model"))
+
+
+def choose_frames(scene: Scene, frames: slice | str) -> None:
+    """Keep some frames of a scene's motion, in place: a slice or "A:B:S".
+
+    Raises
+    ------
+    UsageError
+        If there is none of them.
+    """
+    try:
+        scene.motion = scene.motion.sliced(parse_slice(frames) if isinstance(frames, str) else frames)
+    except SceneError as error:
+        raise UsageError(str(error)) from None
+
+
+def _apply(scene, key, value):
+    head, _, rest = key.partition(".")
+    check_removed({key: value}, place="")
+    if head == "model":
+        _set_model(scene.muscles, scene, rest, value, key)
+    elif head == "muscle":
+        name, _, rest = rest.partition(".")
+        check_removed({rest: value}, place=f"{key}: ")
+        head, _, rest = rest.partition(".")
+        muscle = scene.muscle(name)
+        if head in KEYS:
+            _set_contraction([muscle], scene, head, rest, value)
+            return
+        if head != "model":
+            raise SceneError(
+                f"{key}: of a muscle its model (muscle.{name}.model.KEY) and {', '.join(KEYS)} can be set"
+            )
+        _set_model([muscle], scene, rest, value, key)
+    elif head in KEYS:
+        _set_contraction(scene.muscles, scene, head, rest, value)
+    elif head == "motion":
+        _set_motion(scene, rest, value, key)
+    elif head in TABLES and rest:
+        table = getattr(scene, head)
+        if table is None:
+            table = {"sliding": SlidingOptions, "detect": DetectOptions}[head]()
+        setattr(scene, head, table.changed(rest, value, place=f"{key}: "))
+    elif head in TABLES:
+        raise SceneError(f"{key}: name a key of the table, for instance {head}.KEY=VALUE")
+    else:
+        raise SceneError(f"{key}: unknown setting, {did_you_mean(head, ['model', 'muscle', *KEYS, *TABLES])}")
+
+
+def parse_setting(text: str) -> tuple[Any, ...]:
+    """Return (key, value) of "KEY=VALUE"; the value is read as TOML, else taken as text.
+
+    Raises
+    ------
+    UsageError
+        If there is no "=", or the value is a number or a nesting that nothing takes.
+    """
+    key, found, value = text.partition("=")
+    if not found or not key.strip():
+        raise UsageError(f"{text!r} is not KEY=VALUE, for instance model.centres=200")
+    return key.strip(), parse_value(value.strip(), place=key.strip())
+
+
+def parse_settings(texts: list[str] | None) -> dict[str, Any]:
+    """Return the settings of several "KEY=VALUE", of which the last of a key counts."""
+    return dict(parse_setting(text) for text in texts or [])
+
+
+def parse_value(text: str, *, place: str) -> dict[str, Any] | int | str:
+    """Return the value of a TOML literal (number, true, list, table), or the text itself.
+
+    Raises
+    ------
+    UsageError
+        For NaN, infinity, numbers beyond 2^53 and deep nesting; ``place`` begins the message.
+    """
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except (ValueError, RecursionError):
+        return text
+    try:
+        check_plain(value, place=place)
+    except SceneError as error:
+        raise UsageError(str(error)) from None
+    return value
+
+
+def parse_slice(text: str) -> slice:
+    """Return the slice of "A:B:S" (each part may be empty), or of a single frame "A".
+
+    Raises
+    ------
+    UsageError
+        If a part is no whole number or S is zero.
+    """
+    parts = text.split(":")
+    try:
+        numbers = [int(part) if part.strip() else None for part in parts]
+    except ValueError:
+        numbers = []
+    if not 1 <= len(numbers) <= 3 or (len(numbers) == 1 and numbers[0] is None) or numbers[2:] == [0]:
+        raise UsageError(
+            f"frames {text!r} must look like A:B:S (whole numbers, S not 0), for instance 0:46:5"
+        )
+    first = numbers[0]
+    if len(numbers) == 1 and first is not None:
+        return slice(first, first + 1 or None)
+    return slice(*numbers)
+
+
+def _set_model(muscles, scene, rest, value, key):
+    if not rest:
+        apply_model(scene, value, muscles=muscles)
+        return
+    for muscle in muscles:
+        options = muscle.options = dict(muscle.options)
+        *parents, last = rest.split(".")
+        for parent in parents:
+            inner = options.get(parent, {})
+            if not isinstance(inner, dict):
+                raise SceneError(f"{key}: {parent!r} is not a table")
+            options[parent] = dict(inner)
+            options = options[parent]
+        options[last] = value
+
+
+def _set_contraction(muscles, scene, key, rest, value):
+    from rbfmuscle.scene.activation.resolve import contraction_keys
+
+    folder = scene.path.parent if scene.path else None
+    for muscle in muscles:
+        table = muscle.contraction
+        given = {} if table is None else table.model_dump(by_alias=True, exclude_unset=True)
+        if rest:
+            inner = given.get(key)
+            given[key] = {**(inner if isinstance(inner, dict) else {}), rest: value}
+        else:
+            given[key] = value
+        muscle.contraction = contraction_keys(given, muscle=muscle.name, folder=folder)
+
+
+def _set_motion(scene, rest, value, key):
+    options = scene.motion.options
+    values = options.model_dump(by_alias=True, exclude_unset=True)
+    if rest == "step" and options.ramp is not None:
+        for ramp in values["ramp"].values():
+            ramp["step"] = value
+    elif rest.startswith("ramp.") and rest.count(".") >= 2:
+        name, _, last = rest.removeprefix("ramp.").rpartition(".")
+        ramps = values.setdefault("ramp", {})
+        if name not in ramps:
+            raise SceneError(f"{key}: the motion has no ramp {name!r}, {did_you_mean(name, ramps)}")
+        ramps[name][last] = value
+    else:
+        values[rest] = value
+    table = type(options).build(values, place=f"{key}: motion ")
+    scene.motion = scene.motion_from(table, folder=scene.path.parent if scene.path else None)

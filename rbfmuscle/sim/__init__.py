@@ -1,1 +1,0 @@
-"""Any muscle against bones: scene, motion, distance fields, contact and the frame loop. Knows no model."""

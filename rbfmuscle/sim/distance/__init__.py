@@ -1,1 +1,0 @@
-"""Signed distance to a bone, in any pose."""

@@ -1,1 +1,0 @@
-"""The frame loop: contacts, tunnelling, overlap, sliding."""

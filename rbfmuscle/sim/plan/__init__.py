@@ -1,1 +1,0 @@
-"""What a scene will build, reach and cost, found without building it."""

@@ -1,0 +1,1 @@
+"""The frame loop: sub-steps, contact, tunnelling, sliding."""

@@ -1,0 +1,292 @@
+"""Which points touch which obstacles, and the way out: contacts as half-spaces, several bones at once.
+
+Obstacles are the bones' distance fields, which stay in bone coordinates and are never rebuilt, and, where a
+scene asks for sliding, the surfaces of neighbouring muscles. Nothing here knows how a muscle is represented.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.simulation.broad_phase import apart_loop, closer_loop, direction_loop, near_loop, remember_loop
+from rbfmuscle.validation import check_points
+
+
+@dataclass(frozen=True)
+class HalfSpaces:
+    """Linearised contacts: moving point ``index`` by ``dp`` is admissible where ``gap + normal . dp >= 0``.
+
+    Attributes
+    ----------
+    index : (c,) ndarray of int
+        Contact point.
+    gap : (c,) ndarray
+        Signed distance now [scene unit]; negative is violated.
+    normal : (c, 3) ndarray
+        Unit direction of growing distance, world axes.
+    source : (c,) ndarray of int
+        Index of the bone, or ``-1 - k`` for virtual edges of family k.
+    give : (c,) ndarray or None
+        How far a contact gives way to the force on it, as a share of how far that force alone would move its point;
+        None where all are rigid.
+    """
+
+    index: np.ndarray
+    gap: np.ndarray
+    normal: np.ndarray
+    source: np.ndarray
+    give: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+class BoneContacts:
+    """The obstacles of one muscle, in one pose.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Names of all bones of the scene.
+    fields : sequence of BoneSDF or None
+        One for each name; None where the muscle cannot reach the bone. Fields may be shared between muscles.
+    contact_bone : (n,) array_like of int, optional
+        Bone that contact point i is attached to, -1 where free. Attached points take no contact.
+    margin : float
+        Gap that contact points keep from bones [scene unit].
+    """
+
+    def __init__(
+        self,
+        names: list[str],
+        fields: list[Any],
+        *,
+        contact_bone: ArrayLike | None = None,
+        margin: float = 0.0,
+    ) -> None:
+        if len(names) != len(fields):
+            raise ValueError(f"one field a bone is needed, got {len(fields)} for {len(names)} bones")
+        self.names = list(names)
+        self.fields = list(fields)
+        self.reached = [b for b, field in enumerate(self.fields) if field is not None]
+        self._row = {b: row for row, b in enumerate(self.reached)}
+        boxes = [self.fields[b].bounds for b in self.reached]
+        self.boxes = np.array(boxes, dtype=np.float64).reshape(-1, 2, 3)
+        self.contact_bone = None if contact_bone is None else np.asarray(contact_bone, dtype=np.int64)
+        self._take({name: np.eye(4) for name in self.names})
+        self.margin = float(margin)
+        self.allowed = {}
+        self.neighbours, self.cuts = [], []
+        self._known: tuple[Floats, ...] = (
+            np.zeros((len(self.reached), 0, 3)),
+            np.zeros((len(self.reached), 0)),
+        )
+
+    def move(self, poses: dict[str, Floats]) -> None:
+        """Take the bones' poses, a dict of bone name to (4, 4) rest-to-world transform."""
+        missing = [self.names[b] for b in self.reached if self.names[b] not in poses]
+        if missing:
+            raise ValueError(f"poses lack the bone {missing[0]!r}")
+        self._take(poses)
+
+    def stacked(self, poses: dict[str, Floats]) -> Floats:
+        """Poses (r, 4, 4) of the bones that the muscle can reach, in their order."""
+        return np.array([poses[self.names[b]] for b in self.reached]).reshape(-1, 4, 4)
+
+    def _take(self, poses: dict[str, Floats]) -> None:
+        self.poses, self._placed = poses, self.stacked(poses)
+
+    def frozen(self) -> BoneContacts:
+        """These obstacles as they stand, for questions from another thread while the bones move on."""
+        other = copy.copy(self)
+        other.cuts, other._known = list(self.cuts), tuple(part[:, :0] for part in self._known)
+        return other
+
+    def only(self, index: Any) -> BoneContacts:
+        """These obstacles for some of the contact points, which are then counted in the order of ``index``."""
+        other = self.frozen()
+        if self.contact_bone is not None:
+            other.contact_bone = self.contact_bone[index]
+        other.allowed = {bone: depth[index] for bone, depth in self.allowed.items()}
+        return other
+
+    def allow(self, bone_index: Any, depth: Any) -> None:
+        """Let each contact point be up to ``depth`` (n,) inside a bone, [scene unit]; zeros take it back."""
+        if np.any(depth > 0.0):
+            self.allowed[bone_index] = np.array(depth, dtype=np.float64)
+        else:
+            self.allowed.pop(bone_index, None)
+
+    def distance_and_direction(self, points: Floats, bone_index: int) -> tuple[Floats, Floats]:
+        """Signed distance (n,) to one bone and the unit direction (n, 3) in which it grows, world axes."""
+        points = check_points(points)
+        return self._query(points, bone_index)
+
+    def nearest(self, points: ArrayLike, reach: float = np.inf, *, neighbours: bool = True) -> Floats:
+        """Smallest distance over all bones and neighbours at any points: what an extracted surface is cut by.
+
+        Parameters
+        ----------
+        points : (n, 3) array_like
+        reach : float
+            Where a bone is farther than this, a lower bound beyond ``reach`` suffices [scene unit].
+        neighbours : bool
+            Count sliding neighbours.
+
+        Returns
+        -------
+        (n,) ndarray
+            [scene unit], negative inside a bone; infinity where no bone is in reach. Against a sliding
+            neighbour it is half the difference of the two muscles' distances, so that both are cut alike.
+        """
+        points = check_points(points)
+        near, beyond = self._within(points, reach)
+        smallest = np.full(len(points), beyond)
+        for b in near:
+            pose = self.poses[self.names[b]]
+            distance = self.fields[b].distance(points, pose=pose, reach=reach)
+            np.minimum(smallest, distance, out=smallest)
+        for neighbour in self.cuts if neighbours else ():
+            np.minimum(smallest, neighbour.cut(points), out=smallest)
+        return smallest
+
+    def nearest_with_gradient(
+        self, points: Floats, limit: Floats | float = np.inf, *, neighbours: bool = True
+    ) -> tuple[Floats, Floats]:
+        """Smallest distance (n,) over bones and, where wanted, neighbours, exact, and its gradient (n, 3), world axes.
+
+        Where the smallest distance is beyond ``limit``, a number or (n,), any value beyond it may stand, without
+        a gradient.
+        """
+        points = check_points(points)
+        near, beyond = self._within(points, limit)
+        smallest, gradient = np.full(len(points), beyond), np.zeros((len(points), 3))
+        answers = [self._query(points, b, limit) for b in near]
+        answers += [neighbour.cut_with_gradient(points) for neighbour in self.cuts if neighbours]
+        for distance, direction in answers:
+            closer_loop(distance, direction, smallest, gradient)
+        return smallest, gradient
+
+    def neighbour_points(self) -> Floats:
+        """Points (k, 3) of sliding neighbours where these meet the muscle [scene unit]."""
+        return np.concatenate([np.zeros((0, 3)), *(neighbour.points() for neighbour in self.cuts)])
+
+    def depth(self, points: Floats) -> float:
+        """How deep the deepest free contact point is in a bone, 0 where none is [scene unit]."""
+        return max([0.0, *(-float(distance.min()) for _, _, distance in self._inside(points))])
+
+    def depths(self, points: Floats) -> dict[int, Floats]:
+        """How deep each free contact point is in each bone, by the bone's index, (n,) [scene unit]; 0 outside."""
+        found = {b: np.zeros(len(points)) for b in self.reached}
+        for b, near, distance in self._inside(points):
+            found[b][near] = np.maximum(-distance, 0.0)
+        return found
+
+    def comes_near(self, points: Floats, bone_index: int, reach: float) -> bool:
+        """Whether a bone is nearer than ``reach`` to any free contact point."""
+        asked = self._near(points, np.full(len(points), reach), [bone_index])
+        return any(self._ask(points, near, b, reach)[0].min() < reach for b, near in asked)
+
+    def _of_bones(self, points: Floats, reach: ArrayLike) -> list[tuple[Integers, Floats, Floats, int]]:
+        """Contacts of bones, ``(index, distance, direction, bone)`` of each that has any."""
+        found = []
+        reach = np.full(len(points), reach) if np.ndim(reach) == 0 else np.asarray(reach, dtype=np.float64)
+        for b, near in self._near(points, reach + self.margin, self.reached):
+            limit = reach[near]
+            distance, direction = self._ask(points, near, b, limit + self.margin)
+            distance = distance - self.margin
+            if b in self.allowed and len(self.allowed[b]) == len(points):
+                distance = distance + self.allowed[b][near]
+            keep = distance < limit
+            if keep.any():
+                found.append((near[keep], distance[keep], direction[keep], b))
+        return found
+
+    def half_spaces(self, points: ArrayLike, reach: ArrayLike) -> HalfSpaces:
+        """All pairs of contact point and obstacle nearer than ``reach``, as :class:`HalfSpaces`.
+
+        Parameters
+        ----------
+        points : (n, 3) array_like
+            The model's contact points, in their order.
+        reach : float or (n,) array_like
+            For all, or for each point [scene unit].
+        """
+        points = check_points(points)
+        parts = [(*found, 0.0) for found in self._of_bones(points, reach)]
+        for k, neighbour in enumerate(self.neighbours):
+            found = neighbour.contacts(points, float(np.asarray(reach).max()))
+            if len(found[0]):
+                parts.append((*found, -1 - k, neighbour.give))
+        if not parts:
+            return HalfSpaces(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64))
+        index, gap, normal = (np.concatenate([part[k] for part in parts]) for k in range(3))
+        source = np.concatenate([np.full(len(part[0]), part[3], dtype=np.int64) for part in parts])
+        give = np.concatenate([np.full(len(part[0]), part[4]) for part in parts]) if self.neighbours else None
+        return HalfSpaces(index, gap, normal, source, give)
+
+    def known(self, count: int) -> tuple[Floats, ...]:
+        """Earlier places (r, count, 3) of the contact points in the coordinates of each bone that the muscle can reach,
+        and distances (r, count) there.
+
+        The distances are lower bounds, -infinity where nothing is known; they hold wherever the bone goes.
+        """
+        if self._known[1].shape[1] != count:
+            rows = len(self.reached)
+            self._known = np.zeros((rows, count, 3)), np.full((rows, count), -np.inf)
+        return self._known
+
+    def free(self, count: int) -> Booleans:
+        """Mask (n,) of the contact points that are attached to no bone."""
+        if self.contact_bone is None:
+            return np.ones(count, dtype=np.bool_)
+        if len(self.contact_bone) != count:
+            raise ValueError(f"half-spaces need all {len(self.contact_bone)} contact points, got {count}")
+        return self.contact_bone < 0
+
+    def _query(self, points, b, reach=np.inf):
+        pose = self.poses[self.names[b]]
+        distance, gradient = self.fields[b].distance_and_gradient(points, pose=pose, reach=reach)
+        # On the medial surface the field has no direction; away from the bone's middle is as good as any.
+        direction = np.empty_like(gradient)
+        direction_loop(points, gradient, pose, self.boxes[self._row[b]], direction)
+        return distance, direction
+
+    def _within(self, points, limit):
+        """Bones whose box is within the greatest limit of the points' box, and how near the nearest other one is."""
+        apart = np.empty(len(self.reached))
+        apart_loop(points, self._placed, self.boxes, apart)
+        far = apart > np.max(limit, initial=0.0)
+        return [b for b, left in zip(self.reached, far) if not left], apart[far].min(initial=np.inf)
+
+    def _near(self, points, reach, bones):
+        """Bones, each with the free contact points that may be nearer to it than their ``reach``: by boxes and by
+        earlier answers.
+        """
+        rows = np.array([self._row[b] for b in bones], dtype=np.int64)
+        found, counts = (
+            np.empty((len(rows), len(points)), dtype=np.int64),
+            np.zeros(len(rows), dtype=np.int64),
+        )
+        free, known = self.free(len(points)), self.known(len(points))
+        near_loop(points, free, reach, rows, (self._placed, self.boxes), known, found, counts)
+        return [(b, near[:count]) for b, near, count in zip(bones, found, counts.tolist()) if count]
+
+    def _inside(self, points):
+        """Bones that free contact points may be in, each with these points and their distances."""
+        points = check_points(points)
+        for b, near in self._near(points, np.zeros(len(points)), self.reached):
+            yield b, near, self._ask(points, near, b, 0.0)[0]
+
+    def _ask(self, points, near, b, reach):
+        """Distance to bone b and direction of some of the contact points; what is learnt is remembered."""
+        distance, direction = self._query(points[near], b, reach)
+        known = (part[self._row[b]] for part in self.known(len(points)))
+        remember_loop(points, self.poses[self.names[b]], near, distance, *known)
+        return distance, direction

@@ -1,0 +1,1 @@
+"""Sliding of neighbouring muscles."""

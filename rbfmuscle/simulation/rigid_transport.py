@@ -1,0 +1,201 @@
+"""What a step asks of one muscle: to be solved, to be carried along as it is, or nothing at all.
+
+Bones that hold a muscle and do not move against each other leave it the shape that it has: it goes with them, rigidly.
+What counts is how these bones lie to each other now and lay when the muscle was solved last. A bone that it only
+touches counts where it comes near: then the muscle is solved as ever.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.rest_frame import RestFrame, diameter
+from rbfmuscle.scene.motion import turned_angle
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from rbfmuscle.scene.objects import Muscle
+    from rbfmuscle.scene.scene import Scene
+
+
+# Bones farther than this [mm] from a muscle do not act on it: its samples are some millimetres apart.
+CLEAR = 2.0
+# Turns [radian] and ways (of the muscle's size) that are rounding.
+STILL = 1e-9
+# The way of an attachment that counts as much as a turn by one radian, in sizes of its muscle: an arc of half of it.
+ARC = 0.5
+
+SOLVED, CARRIED, SKIPPED = "solved", "carried", "skipped"
+
+
+class MuscleStatus(NamedTuple):
+    """What a frame took of one muscle.
+
+    Attributes
+    ----------
+    state : {"solved", "carried", "skipped"}
+        Carried: moved as it is, with its bones. Skipped: nothing moved it at all.
+    substeps : int
+        In how many sub-steps it was solved.
+    reason : str
+        Why it was solved, or why it was not.
+    """
+
+    state: str
+    substeps: int
+    reason: str
+
+
+class OwnBones:
+    """How the bones that hold one muscle move against each other.
+
+    Parameters
+    ----------
+    muscle : Muscle
+    scene : Scene
+
+    Attributes
+    ----------
+    names : list of str
+        Bones that hold the muscle; the first holds most of it, and carries it.
+    """
+
+    def __init__(self, muscle: Muscle, scene: Scene) -> None:
+        vertices = np.asarray(muscle.mesh.vertices, dtype=float)
+        frame, self.size = RestFrame(vertices), diameter(vertices)
+        held: dict[str, list[np.ndarray]] = {}
+        for attachment in muscle.attachments:
+            held.setdefault(attachment.bone, []).append(attachment.vertices)
+        parts = {name: np.concatenate(found) for name, found in held.items()}
+        self.names = sorted(parts, key=lambda name: -len(parts[name]))
+        self._corners = {name: frame.corners(parts[name]) for name in self.names}
+
+    def apart(self, before: Mapping[str, Floats], after: Mapping[str, Floats]) -> tuple[float, str]:
+        """How far the bones turned and moved against the first, from one set of poses to another.
+
+        Returns
+        -------
+        angle : float
+            The largest turn [radian]; a way of an attachment counts as an arc of half the muscle's size.
+        bone : str
+            Which did.
+        """
+        root, worst, which = self.names[0], 0.0, ""
+        for name in self.names[1:]:
+            angle = relative_motion(before, after, root, name, self._corners[name], self.size)
+            if angle > worst:
+                worst, which = angle, name
+        return worst, which
+
+    def carriage(self, before: Mapping[str, Floats], after: Mapping[str, Floats]) -> Floats:
+        """The rigid motion (4, 4) of the bone that carries the muscle."""
+        root = self.names[0]
+        return after[root] @ np.linalg.inv(before[root])
+
+
+def relative_motion(
+    before: Mapping[str, Floats],
+    after: Mapping[str, Floats],
+    root: str,
+    bone: str,
+    corners: Floats,
+    size: float,
+) -> float:
+    """How far a bone turned [radian] or places on it moved (over half a size) against another bone."""
+    old, new = (np.linalg.inv(poses[root]) @ poses[bone] for poses in (before, after))
+    if np.array_equal(old, new):
+        return 0.0
+    turn = float(turned_angle(new[:3, :3] @ old[:3, :3].T))
+    way = corners @ (new - old)[:3, :3].T + (new - old)[:3, 3]
+    return max(turn, float(np.sqrt((way**2).sum(axis=1)).max()) / (ARC * size))
+
+
+def why_never(muscle: Muscle, scene: Scene) -> str:
+    """Why a muscle is never carried as it is: what acts on it where its bones rest; empty where it may be."""
+    if scene.sliding is not None:
+        return "slides on neighbours"
+    return "contracts" if muscle.contraction is not None else ""
+
+
+class RigidTransport:
+    """Carries one muscle along as it is, where that is what a step asks.
+
+    Parameters
+    ----------
+    stepper : MuscleStepper
+    scene : Scene
+    """
+
+    def __init__(self, stepper: Any, scene: Scene) -> None:
+        muscle = next(muscle for muscle in scene.muscles if muscle.name == stepper.name)
+        self.own, self.stepper = OwnBones(muscle, scene), stepper
+        self.muscle, self.never = muscle, why_never(muscle, scene)
+        self.clear = scene.length(CLEAR) + scene.contact.margin
+        contacts = stepper.contacts
+        self.others = [b for b in contacts.reached if contacts.names[b] not in self.own.names]
+        self.solved: Mapping[str, Floats] | None = None
+        self.moved, self.reason = False, ""
+
+    def try_carry(self, before: Mapping[str, Floats], after: Mapping[str, Floats]) -> bool:
+        """Bring the muscle from one set of poses to the next if it need not be solved; say whether it was."""
+        if self.never:
+            return False
+        if self.solved is None:
+            self.solved = before
+        angle, bone = self.own.apart(self.solved, after)
+        if angle > STILL:
+            self.reason = f"{bone} against {self.own.names[0]}"
+            return False
+        near = [b for b in self.others if self._moves(b, before, after)]
+        if self._touched(near):
+            return False
+        return self._carry(before, after, near)
+
+    def _carry(self, before, after, near):
+        """Carry the muscle; undone, and False, where that brings it to another bone."""
+        motion, model = self.own.carriage(before, after), self.stepper.model
+        saved = model.snapshot() if near else None
+        moves = np.abs(motion - np.eye(4)).max() > STILL
+        if moves:
+            model.transform(motion)
+        self.stepper.contacts.move(after)
+        if self._touched(near):
+            model.restore(saved)
+            self.stepper.contacts.move(before)
+            return False
+        if moves:
+            self.stepper.carried(motion)
+            self.moved = True
+        return True
+
+    def _touched(self, bones: Sequence[int]) -> bool:
+        """Whether one of these bones comes near the muscle where both are now."""
+        if not bones:
+            return False
+        contacts, points = self.stepper.contacts, self.stepper.model.contact_points()
+        for b in bones:
+            if contacts.comes_near(points, b, self.clear):
+                self.reason = f"{contacts.names[b]} comes near"
+                return True
+        return False
+
+    def _moves(self, b: int, before: Mapping[str, Floats], after: Mapping[str, Floats]) -> bool:
+        name, corners = self.stepper.contacts.names[b], self.own._corners[self.own.names[0]]
+        return relative_motion(before, after, name, self.own.names[0], corners, self.own.size) > STILL
+
+    def collect(self, substeps: int) -> MuscleStatus:
+        """What was done since the last call."""
+        moved, reason = self.moved, self.reason
+        self.moved, self.reason = False, ""
+        if substeps:
+            return MuscleStatus(SOLVED, substeps, reason or self.never)
+        if moved:
+            names = self.own.names
+            return MuscleStatus(
+                CARRIED, 0, f"moves with {names[0]}" if len(names) == 1 else f"{', '.join(names)} as one"
+            )
+        return MuscleStatus(SKIPPED, 0, "its bones rest")

@@ -1,0 +1,303 @@
+"""One muscle on its way through sub-steps: its model, its obstacles, its clock and its events."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.scene.motion import bone_poses, interpolate, shown_value, step_angle, unit_sign
+from rbfmuscle.simulation.frame import Drawing, Event, ModelSurface
+from rbfmuscle.simulation.rigid_transport import SOLVED, MuscleStatus, RigidTransport
+from rbfmuscle.simulation.tunnelling import find_crossings, one_sided_planes, only_grazed, rotate_with_bone
+from rbfmuscle.validation import NotFiniteError, SolveError
+
+if TYPE_CHECKING:
+    from rbfmuscle.scene.scene import Scene
+    from rbfmuscle.simulation.contact import BoneContacts
+    from rbfmuscle.simulation.frame import MuscleModel
+
+
+# Depth [mm] below which a path through a bone counts as touching it; above the error of a bone's field.
+TOUCH = 0.1
+# Rounds in which what still crosses at the smallest step is fenced off, together with what crosses then.
+FENCES = 4
+# A step that points pass through in is not halved below this turn [radian].
+SMALLEST_STEP = math.radians(0.1)
+
+
+class TimedDrawing:
+    """A muscle's drawing with what was measured beside it.
+
+    Parameters
+    ----------
+    stepper : MuscleStepper
+    drawing : Drawing
+    measured : dict of str to float
+    """
+
+    def __init__(self, stepper: MuscleStepper, drawing: Drawing, measured: dict) -> None:
+        self.stepper, self.drawing, self.measured = stepper, drawing, measured
+        self._finished: ModelSurface | None = None
+
+    def surface(self) -> ModelSurface:
+        """The surface with what was measured; drawn once."""
+        if self._finished is None:
+            self._finished = self.drawing.surface()
+            self._finished.quantities.update(self.measured)
+        return self._finished
+
+    def draw(self) -> tuple[ModelSurface, float]:
+        """The surface, and the time that it took [s]; from any thread."""
+        start = time.perf_counter()
+        return self.surface(), time.perf_counter() - start
+
+
+class CarriedDrawing(TimedDrawing):
+    """A muscle that was carried along as it was when it was drawn.
+
+    Parameters
+    ----------
+    before : TimedDrawing
+    motion : (4, 4) ndarray
+        Since then.
+    """
+
+    def __init__(self, before: TimedDrawing, motion: Floats) -> None:
+        super().__init__(before.stepper, before.drawing, before.measured)
+        self._before, self._motion = before, motion
+
+    def surface(self) -> ModelSurface:
+        """The surface that was drawn then, moved."""
+        if self._finished is None:
+            then, motion = self._before.surface(), self._motion
+            vertices = then.vertices @ motion[:3, :3].T + motion[:3, 3]
+            taken = {name: 0.0 if name.startswith("time_") else v for name, v in then.quantities.items()}
+            self._finished = ModelSurface(vertices, then.faces, taken, list(then.notes), (then, motion))
+        return self._finished
+
+
+class MuscleStepper:
+    """Drives one model through sub-steps.
+
+    Parameters
+    ----------
+    model : MuscleModel
+    contacts : BoneContacts
+        Of this muscle alone.
+    scene : Scene
+    poses : callable, optional
+        Poses of the bones for coordinates; those of the scene where not given.
+
+    Attributes
+    ----------
+    carrier : Carrier or None
+        What carries the muscle along where it need not be solved; none unless a loop gives one.
+    work : Work
+        What the frame that was collected last took.
+    """
+
+    def __init__(
+        self, model: MuscleModel, contacts: BoneContacts, scene: Scene, *, poses: Any = None
+    ) -> None:
+        self.model, self.contacts, self.scene = model, contacts, scene
+        self.name = model.name
+        self.detect = scene.detect.tunnelling if scene.detect is not None else None
+        self.tolerance = scene.length(TOUCH)
+        self.times, self.events = {}, {}
+        self.frame = 0
+        self.path: Any = None
+        self.saved: Any = None
+        self.measured = {}
+        self.poses = poses or (lambda coordinates: bone_poses(scene, coordinates))
+        self.carrier: RigidTransport | None = None
+        self.solves, self.work = 0, MuscleStatus(SOLVED, 0, "")
+        self._shown: TimedDrawing | None = None
+        self._since = np.eye(4)
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[Any]:
+        """Add the time spent inside to ``time_<stage>``."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            key = f"time_{stage}"
+            self.times[key] = self.times.get(key, 0.0) + time.perf_counter() - start
+
+    def advance(self, stops: list[dict[str, float]], activations: Any = ()) -> None:
+        """Go through sub-steps: a list of coordinates, the first of which is where the muscle is.
+
+        ``activations`` holds, for muscles that contract, the activation by muscle at the end of each.
+        """
+        for before, after, activation in itertools.zip_longest(stops[:-1], stops[1:], activations):
+            self.excite(activation)
+            if not self._carries(before, after):
+                self.step(before, after)
+
+    def _carries(self, before: Mapping[str, float], after: Mapping[str, float]) -> bool:
+        """Whether a step asks no more of the muscle than to be carried along, which is then done."""
+        return self.carrier is not None and self.carrier.try_carry(self.poses(before), self.poses(after))
+
+    def carried(self, motion: Floats) -> None:
+        """Note that the muscle was moved as it is, by a rigid motion (4, 4)."""
+        self._since = motion @ self._since
+
+    def excite(self, activation: Any) -> None:
+        """Give the model its activation, where it is among those (by muscle; None for no muscle at all)."""
+        if activation is not None and self.name in activation:
+            self.model.activate(activation[self.name])
+
+    def step(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
+        """One sub-step, watched for tunnelling where the scene asks for it."""
+        self.begin(before, after)
+        self.finish()
+
+    def begin(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
+        """First half of a sub-step: the bones move, the muscle goes along."""
+        self.path, poses = (before, after), (self.poses(before), self.poses(after))
+        self.saved, self._shown = None, None
+        if self.detect is not None:
+            self.saved = self.model.snapshot(), self.model.contact_points().copy(), poses
+        self._predict(poses)
+
+    def finish(self) -> None:
+        """Second half: the muscle settles, and what passed through a bone is brought back."""
+        before, after = self.path
+        self.solve(after)
+        self.solves += 1
+        if self.saved is not None:
+            state, start, poses = self.saved
+            crossings = self._crossings(start, poses)
+            if crossings:
+                self._correct(state, start, poses, before, after, crossings)
+        if self.carrier is not None:
+            self.carrier.solved = self.poses(after)
+
+    def solve(self, coordinates: dict[str, float]) -> None:
+        """Solve, and refuse what is not finite.
+
+        Raises
+        ------
+        SolveError
+            Naming muscle, frame and coordinates.
+        """
+        with self.timed("solve"):
+            try:
+                self.model.solve(self.contacts)
+            except (np.linalg.LinAlgError, FloatingPointError, NotFiniteError) as error:
+                raise SolveError(f"{self._place(coordinates)}: {error}") from error
+        bad = ~np.isfinite(self.model.contact_points()).all(axis=1)
+        if bad.any():
+            raise SolveError(
+                f"{self._place(coordinates)}: {int(bad.sum())} of {len(bad)} positions are not finite; "
+                "try a smaller substep_angle in [contact]"
+            )
+
+    def go(self, stops: list[dict], activations: Sequence[dict] = ()) -> TimedDrawing:
+        """Go through sub-steps; what draws the muscle there."""
+        self.advance(stops, activations)
+        return self.drawing()
+
+    def drawing(self) -> TimedDrawing:
+        """What draws the muscle as it is now, while it goes on."""
+        if self._shown is not None:
+            return CarriedDrawing(self._shown, self._since)
+        with self.timed("surface"):
+            shown = TimedDrawing(self, self.model.drawing(self.contacts), self.measured)
+        if self.carrier is not None and not self.carrier.never:
+            self._shown, self._since = shown, np.eye(4)
+        return shown
+
+    def report(self, bone: Any, count: int, action: Any) -> None:
+        """Note an event of the present frame; of one kind the most points at one time are kept."""
+        key = (self.frame, bone, action)
+        self.events[key] = max(int(count), self.events.get(key, 0))
+
+    def collect(self) -> tuple[Any, ...]:
+        """Times and events since the last call."""
+        times = self.times
+        events = [Event(k, self.name, bone, n, action) for (k, bone, action), n in self.events.items()]
+        times["time_frame"] = sum(times.values())
+        if self.carrier is not None:
+            self.work = self.carrier.collect(self.solves)
+        self.times, self.events, self.solves = {}, {}, 0
+        return times, events
+
+    def _predict(self, poses):
+        self.contacts.move(poses[1])
+        with self.timed("predict"):
+            self.model.predict(*poses)
+
+    def _crossings(self, start, poses, *, flag=True):
+        with self.timed("tunnelling"):
+            end = self.model.contact_points()
+            found = find_crossings(self.contacts, start, end, *poses, self.detect, tolerance=self.tolerance)
+        for crossing in found:
+            if flag and crossing.flagged:
+                self.report(self.contacts.names[crossing.bone], crossing.flagged, "angle_flag")
+        return [crossing for crossing in found if len(crossing.index)]
+
+    def _correct(self, state, start, poses, before, after, crossings):
+        """Turn what crossed with the bone and solve again; then halve the step, down to the smallest."""
+        if self.detect.action == "report":
+            self._report_all(crossings, "reported")
+            return
+        self.model.restore(state)
+        self._predict(poses)
+        rotate_with_bone(self.model, crossings, start, *poses, self.contacts.names)
+        self.solve(after)
+        remaining = self._crossings(start, poses, flag=False)
+        if not remaining:
+            self._report_all(crossings, "rotated")
+            return
+        angle = step_angle(self.scene, before, after)
+        if self.detect.action == "rotate" or angle <= 2.0 * SMALLEST_STEP:
+            for crossing in self._held_back(state, start, poses, after, remaining):
+                name = self.contacts.names[crossing.bone]
+                paths, ends = (start, self.model.contact_points()), (poses[0][name], poses[1][name])
+                touched = only_grazed(crossing, self.scene.bone(name).mesh, paths, *ends, self.tolerance)
+                self.report(name, len(crossing.index), "grazed" if touched else "unresolved")
+            return
+        self._report_all(remaining, "halved")
+        self.model.restore(state)
+        middle = interpolate(before, after, 0.5)
+        self.step(before, middle)
+        self.step(middle, after)
+
+    def _held_back(self, state, start, poses, after, crossings):
+        """Solve with what crosses kept on its side of a plane; return what crosses all the same."""
+        neighbours = self.contacts.neighbours
+        fenced = [*neighbours]
+        try:
+            for _ in range(FENCES):
+                fenced += [one_sided_planes(self.contacts, crossing, start, *poses) for crossing in crossings]
+                self.contacts.neighbours = fenced
+                self.model.restore(state)
+                self._predict(poses)
+                self.solve(after)
+                held, crossings = crossings, self._crossings(start, poses, flag=False)
+                self._report_all(held, "held_back")
+                if not crossings:
+                    break
+        finally:
+            self.contacts.neighbours = neighbours
+        return crossings
+
+    def _report_all(self, crossings, action):
+        for crossing in crossings:
+            self.report(self.contacts.names[crossing.bone], len(crossing.index), action)
+
+    def _place(self, coordinates):
+        scene = self.scene
+        where = ", ".join(
+            f"{name} = {shown_value(scene, name, value):.6g}{unit_sign(scene, name).replace('°', ' deg')}"
+            for name, value in coordinates.items()
+        )
+        return f"muscle {self.name!r}, frame {self.frame} ({where or 'rest'})"

@@ -1,0 +1,266 @@
+"""How the way from one frame to the next is cut into sub-steps."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rbfmuscle.geometry.rest_frame import RestFrame, diameter
+from rbfmuscle.scene.joints.skeleton import all_coordinates
+from rbfmuscle.scene.motion import (
+    bone_poses,
+    completed,
+    interpolate,
+    rest_coordinates,
+    step_angle,
+    turned_angle,
+)
+from rbfmuscle.validation import SceneError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rbfmuscle.scene.scene import Scene
+
+
+# No attached point moves farther against a bone in one sub-step than this share of its muscle's diameter.
+TRAVEL = 1.0 / 27.0
+# Pieces in which a path is followed to see how far it turns the bones.
+PIECES = 8
+
+
+__all__ = ["PoseCache", "SubSteps", "path_angle", "turned_angle"]
+
+
+class SubSteps:
+    """How a scene's motion is cut into sub-steps.
+
+    No bone turns by more than the scene's ``substep_angle`` in one, and no attached point moves far against a
+    bone. Where one coordinate moves alone, sub-steps end at multiples of that angle, however the frames are
+    spaced: a muscle that can settle in several ways then comes to a pose by the same path.
+
+    Parameters
+    ----------
+    scene : Scene
+    muscle : Muscle, optional
+        Cut as this muscle's own bones move against each other; as the whole scene does where not given.
+    bones : sequence of str
+        Other bones that it can meet.
+    poses : callable, optional
+        Poses of the bones for coordinates; those of the scene where not given.
+    """
+
+    def __init__(
+        self, scene: Scene, muscle: Any = None, *, bones: Sequence[str] = (), poses: Any = None
+    ) -> None:
+        self.scene = scene
+        self._poses = poses or (lambda coordinates: bone_poses(scene, coordinates))
+        muscles = scene.muscles if muscle is None else [muscle]
+        own = [attachment.bone for part in muscles for attachment in part.attachments]
+        self._facts = all_coordinates(scene.joints)
+        #: The bones that count, and the coordinates that move them against each other. A muscle's are seen from the
+        #: first that holds it, a whole scene's from the world.
+        if muscle is None:
+            self._root, self.bones = None, [bone.name for bone in scene.bones]
+            self.relevant = set(self._facts)
+        else:
+            self._root, self.bones = own[0], [*dict.fromkeys([*own, *bones])]
+            self.relevant = _moving_apart(scene, self.bones)
+        self.limit = math.radians(scene.contact.substep_angle)
+        self.most = scene.motion.options.max_substeps
+        names = self.bones
+        owner, corners, size = [], [], []
+        for part in muscles:
+            vertices = np.asarray(part.mesh.vertices)
+            frame = RestFrame(vertices)
+            for attachment in part.attachments:
+                owner.append(names.index(attachment.bone))
+                corners.append(frame.corners(attachment.vertices))
+                size.append(diameter(vertices))
+        # Of each attachment: its bone, a box about it, and how far that may move in one sub-step.
+        self._owner, self._travel = np.array(owner, dtype=int), TRAVEL * np.array(size)
+        self._corners = np.array(corners).reshape(-1, 8, 3)
+
+    def split(self, before: dict[str, Any], after: dict[str, float]) -> list[Any]:
+        """Coordinates of the sub-steps from one frame to the next, ``before`` left out and ``after`` last.
+
+        Returns
+        -------
+        list of dict
+            Empty where nothing moves.
+        """
+        before, after = completed(self.scene, before), completed(self.scene, after)
+        moving = [k for k in {*before, *after} if before.get(k, 0.0) != after.get(k, 0.0)]
+        if not moving:
+            return []
+        moving = [k for k in moving if k in self.relevant]
+        if not moving:
+            return [dict(after)]
+        if len(moving) == 1 and self._facts[moving[0]].motion == "rotation":
+            return [*self._stops_on_grid(before, after, moving[0]), dict(after)]
+        return self._even_stops(before, after)
+
+    def _even_stops(self, before, after):
+        """The fewest equal sub-steps that are short enough."""
+        # What does not move these bones against each other does not count.
+        start = {**before, **{k: value for k, value in after.items() if k not in self.relevant}}
+        count = max(1, math.ceil(path_angle(self.scene, start, after) / self.limit - 1e-9))
+        while True:
+            if count > self.most:
+                raise SceneError(
+                    f"[motion]: one frame takes more than {self.most} sub-steps; make its step or the angles smaller, "
+                    "or raise motion.max_substeps"
+                )
+            stops = [interpolate(before, after, k / count) for k in range(count + 1)]
+            poses = [self._matrices(stop) for stop in stops]
+            excess = max(self._excess(a, b) for a, b in itertools.pairwise(poses))
+            if excess <= 1.0 + 1e-9:
+                return stops[1:]
+            count = max(count + 1, math.ceil(count * min(excess, 4.0)))
+
+    def rate_of(self, name: str) -> float:
+        """About how many sub-steps a change of one coordinate takes, a radian or a scene unit of it."""
+        turns = self._facts[name].motion == "rotation"
+        probe = self.limit if turns else self.scene.length(1.0)
+        rest = rest_coordinates(self.scene)
+        moved = {**rest, name: rest.get(name, 0.0) + probe}
+        excess = self._excess(self._matrices(rest), self._matrices(moved))
+        if not math.isfinite(excess):
+            return math.inf
+        return max(1.0 if turns else 0.0, excess) / probe
+
+    def _stops_on_grid(self, before, after, name):
+        """Stops strictly between two values of the coordinate ``name``, in order."""
+        start, end = before.get(name, 0.0), after.get(name, 0.0)
+        low, high = min(start, end), max(start, end)
+        found = []
+        for cell in range(math.floor(low / self.limit + 1e-9), math.ceil(high / self.limit - 1e-9)):
+            # The whole cell decides how it is split, also where the path takes only a part of it.
+            ends = [{**before, name: self.limit * (cell + k)} for k in range(2)]
+            found.append(ends[0][name])
+            found += [stop[name] for stop in self._even_stops(*ends)]
+        margin = 1e-6 * self.limit
+        inner = []
+        for value in sorted(found):
+            # Ends of neighbouring cells may differ by rounding.
+            if (inner[-1] if inner else low) + margin < value < high - margin:
+                inner.append(value)
+        ordered = inner if end > start else inner[::-1]
+        return [
+            {**interpolate(before, after, (value - start) / (end - start)), name: value} for value in ordered
+        ]
+
+    def _matrices(self, coordinates):
+        poses = self._poses(coordinates)
+        found = np.array([poses[name] for name in self.bones])
+        return found if self._root is None else np.linalg.inv(poses[self._root]) @ found
+
+    def _excess(self, old, new):
+        """How far a step between poses (b, 4, 4) goes beyond what one sub-step may do: 1 is just allowed."""
+        turns = new[:, :3, :3] @ old[:, :3, :3].transpose(0, 2, 1)
+        excess = float(turned_angle(turns).max()) / self.limit
+        # How the bones that carry the corners move, seen from every bone.
+        change = (
+            np.linalg.inv(new)[:, None] @ new[self._owner] - np.linalg.inv(old)[:, None] @ old[self._owner]
+        )
+        moved = np.einsum("bkij,kcj->bkci", change[..., :3, :3], self._corners) + change[..., None, :3, 3]
+        length = np.sqrt((moved**2).sum(axis=-1)).max(axis=(0, 2))
+        return max(excess, float((length / self._travel).max(initial=0.0)))
+
+
+class PoseCache:
+    """Poses of a scene's bones by coordinates, found once for all muscles that ask.
+
+    Parameters
+    ----------
+    scene : Scene
+    """
+
+    MOST = 256
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self._known: dict[Any, dict[str, Any]] = {}
+
+    def __call__(self, coordinates: dict[str, float]) -> dict[str, Any]:
+        """Poses (4, 4) by bone, as `bone_poses` gives them; shared, so not to be changed."""
+        key = tuple(sorted(coordinates.items()))
+        found = self._known.get(key)
+        if found is None:
+            if len(self._known) >= self.MOST:
+                self._known = {}
+            found = self._known[key] = bone_poses(self.scene, coordinates)
+        return found
+
+
+def _moving_apart(scene: Scene, bones: Sequence[str]) -> set[str]:
+    """Coordinates that move some of these bones against others: those of the joints not common to all their chains."""
+    joint_of = {joint.child: joint for joint in scene.joints}
+    chains = []
+    for bone in bones:
+        chain, name = set(), bone
+        while name in joint_of and joint_of[name].name not in chain:
+            chain.add(joint_of[name].name)
+            name = joint_of[name].parent
+        chains.append(chain)
+    apart = set.union(*chains) - set.intersection(*chains)
+    found = {f"{j.name}.{name}" for j in scene.joints if j.name in apart for name in j.coordinates}
+    for coupling in reversed(scene.couplings):
+        if coupling.coordinate in found:
+            found.update(coupling.of)
+    return found
+
+
+def check_substeps(scene: Any) -> None:
+    """Refuse a motion of more sub-steps than ``motion.max_substeps``, before anything grows with their number.
+
+    Raises
+    ------
+    SceneError
+        With the number, the coordinate that takes most of it, and the key that raises the limit.
+    """
+    by_name = estimate_substeps(scene)
+    name = max(by_name, key=lambda name: by_name[name], default="")
+    limit = scene.motion.options.max_substeps
+    if by_name and not by_name[name] <= limit:
+        raise SceneError(
+            f"[motion]: {name!r} takes about {by_name[name]:.3g} sub-steps, more than {limit} (its way is long, "
+            f"contact.substep_angle = {scene.contact.substep_angle:g} is small, or muscles lie far from the joint's "
+            "centre); correct these, or raise motion.max_substeps"
+        )
+
+
+def estimate_substeps(scene: Any) -> dict[str, float]:
+    """Return about how many sub-steps each coordinate of a motion takes by itself, from rest on.
+
+    Found from one probe a coordinate: how far a small change of it, from rest, moves what is attached.
+    """
+    cut, frames, rest = SubSteps(scene), scene.motion.frames, rest_coordinates(scene)
+    found = {}
+    for name in sorted({name for frame in frames for name in frame}):
+        start = rest.get(name, 0.0)
+        path = np.array([start, *(frame.get(name, start) for frame in frames)])
+        with np.errstate(all="ignore"):
+            change = np.abs(np.diff(path))
+            steps = np.ceil(change * cut.rate_of(name) - 1e-9)
+            total = float(steps[change > 0].sum())
+        # Not a number, where numbers overflow, is more than any limit.
+        found[name] = total if math.isfinite(total) else math.inf
+    return found
+
+
+def path_angle(scene: Scene, before: Any, after: Any) -> Any:
+    """How far the bones turn from one set of coordinates to another [radian].
+
+    Angles count as they are given; where other coordinates move too, the path is followed in a few pieces.
+    """
+    facts = all_coordinates(scene.joints)
+    changes = {k: abs(after.get(k, 0.0) - before.get(k, 0.0)) for k in {*before, *after}}
+    angle = max((change for k, change in changes.items() if facts[k].motion == "rotation"), default=0.0)
+    if not any(change for k, change in changes.items() if facts[k].motion != "rotation"):
+        return angle
+    stops = [interpolate(before, after, k / PIECES) for k in range(PIECES + 1)]
+    return max(angle, sum(step_angle(scene, a, b, shifts=False) for a, b in itertools.pairwise(stops)))

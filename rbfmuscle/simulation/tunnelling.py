@@ -1,0 +1,381 @@
+"""Points that pass through a bone within one step: the angle test, the swept test, and the way back.
+
+Both tests look at a point's path relative to the bone, that is in bone coordinates. The angle test compares
+the directions to the bone at the two ends (Cervenka et al. 2023, equation 1, with the bound on d . d' stated
+as the text means it: below cos 135 degrees); it misses most short crossings. The swept test follows the path
+by sphere tracing (Hart 1996) in the bone's distance field and cannot miss what is thicker than its tolerance.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.rigid import rigid_fit
+from rbfmuscle.jit import compiled
+from rbfmuscle.simulation.broad_phase import box_loop, boxes_apart
+from rbfmuscle.simulation.neighbours.pairs import Planes
+
+if TYPE_CHECKING:
+    from rbfmuscle.bones.sdf import BoneSDF
+    from rbfmuscle.scene.options import TunnellingOptions
+    from rbfmuscle.simulation.contact import BoneContacts
+
+
+# 135 degrees, the bound of the angle test.
+RIGHT_ANGLE_AND_HALF = 0.75 * math.pi
+# The field's interpolation may change a little faster than the distance does.
+STEP_SHARE = 0.9
+# A path that leaves a bone facing within 90 degrees of where it went in has slid along, not passed through.
+SLIDING_COSINE = 0.0
+# Times that a path is halved to show that it stays clear, before it is traced.
+HALVINGS = 5
+# Rounds of tracing after which what is still under way counts as traced to where it is.
+MAX_ROUNDS = 10_000
+# Share of the tolerance between places of a path that are held against a bone's triangles.
+GRAZE_STRIDE = 0.2
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What the paths of some points did at one bone.
+
+    Attributes
+    ----------
+    index : (c,) ndarray of int
+        Points whose paths may have touched the bone; all others stayed clear of it.
+    lowest : (c,) ndarray
+        Smallest distance found along the path [scene unit]; negative inside.
+    through : (c,) ndarray of bool
+        Went in deeper than the tolerance, and came out (or ended) facing another way than it went in.
+    flagged : (c,) ndarray of bool
+        The angle test's answer: directions at the two ends differ by more than its angle.
+    """
+
+    index: np.ndarray
+    lowest: np.ndarray
+    through: np.ndarray
+    flagged: np.ndarray
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """Points that passed through one bone in a step, and how deep they were by its field."""
+
+    bone: int
+    index: np.ndarray
+    depth: float
+    flagged: int
+
+
+def sweep_paths(
+    field: BoneSDF, start: Floats, end: Floats, *, tolerance: float, angle: float = RIGHT_ANGLE_AND_HALF
+) -> Sweep:
+    """Follow straight paths through a bone's distance field.
+
+    Parameters
+    ----------
+    field : BoneSDF
+    start, end : (n, 3) ndarray
+        Ends of each path in bone coordinates.
+    tolerance : float
+        Depth below which nothing counts, the field's own error [scene unit].
+    angle : float
+        Bound of the angle test [radian].
+
+    Returns
+    -------
+    Sweep
+    """
+    length = np.linalg.norm(end - start, axis=1)
+    distance = field.distance(start, reach=float(length.max(initial=0.0)))
+    index = np.flatnonzero(distance < length)
+    last = field.distance(end[index])
+    near = distance[index] + last <= length[index] + tolerance
+    index, last = index[near], last[near]
+    if len(index) == 0:
+        nothing = np.zeros(0, dtype=bool)
+        return Sweep(index, np.zeros(0), nothing, nothing)
+    start, end = start[index], end[index]
+    lowest = _halve(field, start, end, distance[index], last, tolerance)
+    through = np.zeros(len(index), dtype=bool)
+    # What halving leaves open.
+    deep = np.flatnonzero(lowest < -tolerance)
+    if len(deep):
+        lowest[deep], first, last = _trace(field, start[deep], end[deep], tolerance)
+        way = end[deep] - start[deep]
+        entry = _directions(field, start[deep] + first[:, None] * way)
+        leave = _directions(field, start[deep] + last[:, None] * way)
+        turned = np.einsum("ij,ij->i", entry, leave) < SLIDING_COSINE
+        through[deep] = turned & (lowest[deep] < -tolerance)
+    cosine = np.einsum("ij,ij->i", _directions(field, start), _directions(field, end))
+    return Sweep(index, lowest, through, cosine < math.cos(angle))
+
+
+def find_crossings(
+    contacts: BoneContacts,
+    start: Floats,
+    end: Floats,
+    before: dict[str, Floats],
+    after: dict[str, Floats],
+    options: TunnellingOptions,
+    *,
+    tolerance: float,
+) -> list[Any]:
+    """Points that passed through bones while the bones went from one set of poses to another.
+
+    Parameters
+    ----------
+    contacts : BoneContacts
+        In the poses ``after``.
+    start, end : (n, 3) ndarray
+        Contact points before and after the step, world coordinates.
+    before, after : dict of str to (4, 4) ndarray
+    options : TunnellingOptions
+        ``angle`` in degrees; with ``swept`` false the angle test alone decides.
+    tolerance : float
+        [scene unit].
+
+    Returns
+    -------
+    list of Crossing
+        One for each bone that was crossed or flagged.
+    """
+    crossings = []
+    for b, index in _candidates(contacts, start, end, before, after):
+        name = contacts.names[b]
+        first, second = _local(start[index], before[name]), _local(end[index], after[name])
+        sweep = sweep_paths(
+            contacts.fields[b], first, second, tolerance=tolerance, angle=math.radians(options.angle)
+        )
+        crossed = sweep.through if options.swept else sweep.flagged
+        if crossed.any() or sweep.flagged.any():
+            depth = float(max(0.0, -sweep.lowest[crossed].min())) if crossed.any() else 0.0
+            crossings.append(Crossing(b, index[sweep.index[crossed]], depth, int(sweep.flagged.sum())))
+    return crossings
+
+
+def rotate_with_bone(model: Any, crossings: Any, start: Any, before: Any, after: Any, names: Any) -> None:
+    """Put points that crossed back where they were relative to the bone: turned with it about its joint.
+
+    The bone's own motion from ``before`` to ``after`` is the rotation about the joint centre by the step's
+    angle, so a point that is moved by it keeps its place at the bone. The model has predicted already; it is
+    handed the rigid transform from where it predicted the points to where they belong.
+    """
+    for crossing in crossings:
+        motion = after[names[crossing.bone]] @ np.linalg.inv(before[names[crossing.bone]])
+        wanted = start[crossing.index] @ motion[:3, :3].T + motion[:3, 3]
+        which = np.zeros(len(start), dtype=bool)
+        which[crossing.index] = True
+        model.turn(which, rigid_fit(model.contact_points()[crossing.index], wanted))
+
+
+def one_sided_planes(contacts: Any, crossing: Crossing, start: Any, before: Any, after: Any) -> Planes:
+    """Planes that keep points which crossed on the side of the bone where they were, a half-space for each.
+
+    The plane lies between the point and the bone, square to the way out, and goes along with the bone.
+    """
+    name = contacts.names[crossing.bone]
+    back, motion = np.linalg.inv(before[name]), after[name] @ np.linalg.inv(before[name])
+    points = start[crossing.index]
+    local = points @ back[:3, :3].T + back[:3, 3]
+    distance = contacts.fields[crossing.bone].distance(local)
+    way = _directions(contacts.fields[crossing.bone], local) @ after[name][:3, :3].T
+    planes = Planes()
+    planes.set(crossing.index, distance, way, points @ motion[:3, :3].T + motion[:3, 3])
+    return planes
+
+
+def only_grazed(
+    crossing: Crossing,
+    mesh: Any,
+    paths: tuple[Floats, Floats],
+    before: Floats,
+    after: Floats,
+    tolerance: float,
+) -> bool:
+    """Whether the bone's own triangles say that no path was deeper in it than the tolerance; its field said more.
+
+    Parameters
+    ----------
+    crossing : Crossing
+    mesh : trimesh.Trimesh
+        Of the bone, in its coordinates.
+    paths : pair of (n, 3) ndarray
+        Contact points before and after the step, world coordinates.
+    before, after : (4, 4) ndarray
+        Poses of the bone.
+    tolerance : float
+        [scene unit].
+    """
+    exact = ExactDistance(mesh.vertices, mesh.faces)
+    if not exact.closed:
+        return False
+    for n in crossing.index:
+        first, last = (
+            np.linalg.solve(pose, np.append(points[n], 1.0))[:3]
+            for points, pose in zip(paths, (before, after))
+        )
+        count = int(np.linalg.norm(last - first) / (GRAZE_STRIDE * tolerance)) + 2
+        if count > MAX_ROUNDS:
+            return False
+        places = first + np.linspace(0.0, 1.0, count)[:, None] * (last - first)
+        # Between two places no depth is greater than there by more than half their distance.
+        if exact.signed_distance(places).min() < -(1.0 - 0.5 * GRAZE_STRIDE) * tolerance:
+            return False
+    return True
+
+
+def _halve(field, start, end, distance, last, tolerance):
+    """Smallest distance found along each path by halving it; -infinity where that does not show it clear.
+
+    Between two places s apart, at distances d and d' from the bone, nothing is deeper than (s - d - d') / 2.
+    """
+    length = np.linalg.norm(end - start, axis=1) / STEP_SHARE
+    lowest = np.minimum(distance, last)
+    # Pieces: which path, where they begin (fraction), the distances at their ends.
+    path, at, near, far, size = np.arange(len(start)), np.zeros(len(start)), distance, last, 1.0
+    for halvings in range(HALVINGS + 1):
+        left = near + far - size * length[path] < -2.0 * tolerance
+        path, at, near, far = path[left], at[left], near[left], far[left]
+        if len(path) == 0 or halvings == HALVINGS:
+            break
+        size *= 0.5
+        middle = at + size
+        between = field.distance(start[path] + middle[:, None] * (end[path] - start[path]))
+        np.minimum.at(lowest, path, between)
+        path, at = np.concatenate([path, path]), np.concatenate([at, middle])
+        near, far = np.concatenate([near, between]), np.concatenate([between, far])
+        clear = lowest[path] >= -tolerance
+        path, at, near, far = path[clear], at[clear], near[clear], far[clear]
+    lowest[path] = -np.inf
+    lowest[lowest < -tolerance] = -np.inf
+    return lowest
+
+
+def _trace(field, start, end, tolerance):
+    """Smallest distance along each path, and the places (fraction) right before it first went in and after it came out.
+
+    Directions to the bone are told apart outside of it: within a crest, near its middle, they are either side's.
+    """
+    length = np.linalg.norm(end - start, axis=1)
+    lowest = np.full(len(start), np.inf)
+    entry, leave, at, before = (np.zeros(len(start)) for _ in range(4))
+    entered, within = np.zeros(len(start), dtype=bool), np.zeros(len(start), dtype=bool)
+    under_way = np.arange(len(start))
+    for _ in range(MAX_ROUNDS):
+        t = at[under_way]
+        distance = field.distance(start[under_way] + t[:, None] * (end[under_way] - start[under_way]))
+        lowest[under_way] = np.minimum(lowest[under_way], distance)
+        inside = distance < 0.0
+        first = under_way[inside & ~entered[under_way]]
+        entry[first] = before[first]
+        entered[first] = True
+        crossed = under_way[inside | within[under_way]]
+        leave[crossed] = at[crossed]
+        within[under_way], before[under_way] = inside, t
+        # Between two places outside, d and d' from the bone and s apart, no place is deeper than (s - d - d') / 2:
+        # with s = d + tolerance that is less than the tolerance where the second place is not itself that deep.
+        outside = STEP_SHARE * distance + 0.9 * tolerance
+        stride = np.where(inside, np.maximum(-0.5 * distance, 0.5 * tolerance), outside)
+        at[under_way] = np.minimum(t + stride / np.maximum(length[under_way], 1e-300), 1.0)
+        under_way = under_way[t < 1.0]
+        if len(under_way) == 0:
+            break
+    return lowest, entry, leave
+
+
+def _directions(field, points):
+    gradient = field.distance_and_gradient(points)[1]
+    return gradient / np.maximum(np.linalg.norm(gradient, axis=1), 1e-12)[:, None]
+
+
+def _local(points, pose):
+    """Points in the coordinates of a bone in a rigid pose."""
+    return (points - pose[:3, 3]) @ pose[:3, :3]
+
+
+def _candidates(contacts, start, end, before, after):
+    """Bones, each with the free points whose paths may touch it."""
+    poses = contacts.stacked(before), contacts.stacked(after)
+    found = np.empty((len(contacts.reached), len(start)), dtype=np.int64)
+    counts = np.zeros(len(found), dtype=np.int64)
+    free, known = contacts.free(len(end)), contacts.known(len(end))
+    _candidates_loop((start, end), free, poses, contacts.boxes, known, found, counts)
+    return [(b, index[:count]) for b, index, count in zip(contacts.reached, found, counts.tolist()) if count]
+
+
+@compiled(error_model="numpy")
+def _candidates_loop(paths, free, poses, boxes, known, found, counts):
+    """Leave out paths that are shorter than what is known of their end's distance to the bone.
+
+    That is the distance to the bone's box, and an earlier answer less the way since, (x + y)^2 <= 2 x^2 + 2 y^2.
+    """
+    start, end = paths
+    before, after = poses
+    anchor, answer = known
+    ends, starts, longest = np.empty((2, 3)), np.empty((2, 3)), 0.0
+    box_loop(start, free, starts)
+    box_loop(end, free, ends)
+    for i in range(len(start)):
+        if free[i]:
+            way = 0.0
+            for k in range(3):
+                way += (end[i, k] - start[i, k]) ** 2
+            longest = max(longest, way)
+    longest = np.sqrt(longest)
+    for b in range(len(boxes)):
+        count = 0
+        if boxes_apart(ends, after[b], boxes[b]) > longest + _carried_way(starts, before[b], after[b]):
+            continue
+        for i in range(len(start)):
+            if free[i] and _may_touch(
+                start[i], end[i], before[b], after[b], boxes[b], anchor[b, i], answer[b, i]
+            ):
+                found[b, count] = i
+                count += 1
+        counts[b] = count
+
+
+@compiled(error_model="numpy")
+def _may_touch(start, end, before, after, bounds, anchor, known):
+    """Whether a path is long enough to reach a bone from where it ends."""
+    way, moved, outside = 0.0, 0.0, 0.0
+    for k in range(3):
+        a, b = 0.0, 0.0
+        for j in range(3):
+            a += before[j, k] * (start[j] - before[j, 3])
+            b += after[j, k] * (end[j] - after[j, 3])
+        way += (b - a) ** 2
+        moved += (b - anchor[k]) ** 2
+        beyond = max(bounds[0, k] - b, b - bounds[1, k], 0.0)
+        outside += beyond * beyond
+    if way < outside:
+        return False
+    if known <= 0.0:
+        return True
+    square = known * known
+    return not (2.0 * (way + moved) < square or np.sqrt(way) + np.sqrt(moved) < known)
+
+
+@compiled(error_model="numpy")
+def _carried_way(box, before, after):
+    """How far the farthest point of a box goes from one pose to another: one of its corners, as the way is convex."""
+    farthest = 0.0
+    for corner in range(8):
+        square = 0.0
+        for k in range(3):
+            there = after[k, 3]
+            for j in range(3):
+                local = 0.0
+                for m in range(3):
+                    local += before[m, j] * (box[corner >> m & 1, m] - before[m, 3])
+                there += after[k, j] * local
+            square += (there - box[corner >> k & 1, k]) ** 2
+        farthest = max(farthest, square)
+    return np.sqrt(farthest)

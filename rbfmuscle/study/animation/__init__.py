@@ -1,1 +1,0 @@
-"""A run as one moving thing: USD, animated glTF and VTKHDF."""

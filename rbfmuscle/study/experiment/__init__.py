@@ -1,1 +1,0 @@
-"""Many runs or fits side by side: comparisons, sweeps, kernels."""

@@ -1,1 +1,0 @@
-"""A scene before it runs."""

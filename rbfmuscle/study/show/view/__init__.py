@@ -1,1 +1,0 @@
-"""The window: what it shows of a live scene or a saved run, and its switches."""

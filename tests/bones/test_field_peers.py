@@ -1,0 +1,185 @@
+"""Other fields of bones, with the interface of BoneSDF: their accuracy, and a whole run by each."""
+
+import numpy as np
+import pytest
+import trimesh
+from peers.detectors import TreeDetector, VoxelDetector
+from peers.serendipity import SerendipityField
+from peers.spline import SplineField
+
+import rbfmuscle as rm
+from rbfmuscle.bones.errors import measure_field
+from rbfmuscle.bones.sdf import BoneSDF
+from rbfmuscle.validation import UsageError
+
+RADIUS = 0.7
+FIELDS = {
+    "sdf": lambda mesh: BoneSDF.from_mesh(mesh, cache=False),
+    "bvh": TreeDetector.from_mesh,
+    "spline": lambda mesh: SplineField.from_mesh(mesh, nodes=60_000),
+    "serendipity": lambda mesh: SerendipityField.from_mesh(mesh, cells=20),
+    "voxel": lambda mesh: VoxelDetector.from_mesh(mesh, resolution=40),
+}
+# Largest error at 3 from a ball of 20 and least cosine of the direction; a voxel's edge is 1.2.
+EXPECTED = {
+    "sdf": (0.03, 0.99),
+    "bvh": (0.03, 0.99),
+    "spline": (0.05, 0.95),
+    "serendipity": (0.05, 0.95),
+    "voxel": (1.3, 0.3),
+}
+
+
+def _sphere(points):
+    return np.linalg.norm(points, axis=1) - RADIUS
+
+
+def _directions(count, seed=0):
+    unit = np.random.default_rng(seed).normal(size=(count, 3))
+    return unit / np.linalg.norm(unit, axis=1, keepdims=True)
+
+
+def _band(count=100_000):
+    offset = np.random.default_rng(1).uniform(-0.1, 0.1, (count, 1))
+    return _directions(count) * (RADIUS + offset)
+
+
+# Largest errors within 0.1 of a sphere of 0.7 in [-1, 1]^3, from docs/sdf.md; fourth order.
+@pytest.mark.parametrize(("cells", "error"), [(8, 5.9e-4), (16, 4.3e-5), (32, 3.2e-6), (64, 2.0e-7)])
+def test_serendipity_cells_are_of_fourth_order_on_a_sphere(cells, error):
+    field = SerendipityField(_sphere, [-1.0] * 3, [1.0] * 3, cells)
+    points = _band()
+    found = np.abs(field.distance(points) - _sphere(points)).max()
+    assert error / 3 < found <= error
+
+
+def test_spline_is_of_fourth_order_on_a_sphere():
+    points = _band()
+    errors = [
+        np.abs(SplineField(_sphere, [-1.0] * 3, [1.0] * 3, 2.0 / n).distance(points) - _sphere(points)).max()
+        for n in (16, 32, 64)
+    ]
+    assert errors[0] / errors[1] > 12
+    assert errors[1] / errors[2] > 12
+
+
+def cubic(points):
+    x, y, z = points.T
+    return x**3 - 2 * y**3 + z**3 + x * y * z + x * x * y - z * z * x + y - 0.3
+
+
+def cubic_gradient(points):
+    x, y, z = points.T
+    return np.column_stack(
+        [3 * x**2 + y * z + 2 * x * y - z * z, -6 * y**2 + x * z + x * x + 1, 3 * z**2 + x * y - 2 * z * x]
+    )
+
+
+def test_serendipity_cells_hold_cubics_and_their_gradients():
+    """Cells of different edges along each axis, so that no axis stands for another."""
+    field = SerendipityField(cubic, [-1.0, -0.8, -0.5], [1.0, 0.7, 0.9], (2, 3, 1))
+    points = np.random.default_rng(0).uniform([-1, -0.8, -0.5], [1, 0.7, 0.9], (40, 3))
+    distance, gradient = field.distance_and_gradient(points)
+    np.testing.assert_allclose(distance, cubic(points), atol=1e-12)
+    np.testing.assert_allclose(gradient, cubic_gradient(points), atol=1e-11)
+
+
+def test_spline_meets_its_nodes_and_its_gradient_is_that_of_its_values():
+    field = SplineField(cubic, [-1.0] * 3, [1.0, 0.9, 0.8], 0.25)
+    nodes = np.stack(np.meshgrid(*[np.arange(-0.5, 0.6, 0.25)] * 3), axis=-1).reshape(-1, 3)
+    np.testing.assert_allclose(field.distance(nodes), cubic(nodes), atol=1e-12)
+    points = np.random.default_rng(1).uniform(-0.6, 0.6, (30, 3))
+    distance, gradient = field.distance_and_gradient(points)
+    # Natural ends leave an error of their own, which falls by a quarter with each node inward.
+    np.testing.assert_allclose(distance, cubic(points), atol=2e-2)
+    step = 6e-6
+    for k in range(3):
+        way = step * np.eye(3)[k]
+        slope = (field.distance(points + way) - field.distance(points - way)) / (2 * step)
+        np.testing.assert_allclose(gradient[:, k], slope, atol=1e-8)
+    assert np.ptp(field.distance(points + [1e-9, 0, 0]) - distance) < 1e-7
+
+
+@pytest.mark.parametrize("kind", ["serendipity", "spline"])
+def test_gradients_are_those_of_the_values(kind):
+    field = {
+        "serendipity": lambda: SerendipityField(_sphere, [-1.0] * 3, [1.0] * 3, (9, 10, 11)),
+        "spline": lambda: SplineField(_sphere, [-1.0] * 3, [1.0] * 3, 0.21),
+    }[kind]()
+    points, step = _band(500), 6e-6
+    slope = np.stack(
+        [field.distance(points + step * e) - field.distance(points - step * e) for e in np.eye(3)], 1
+    )
+    np.testing.assert_allclose(field.gradient(points), slope / (2 * step), atol=1e-7)
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_detectors_agree_on_a_ball_in_any_pose(name):
+    ball = trimesh.creation.icosphere(4, 20.0)
+    detector = FIELDS[name](ball)
+    pose = trimesh.transformations.rotation_matrix(0.7, [1.0, 2.0, 3.0])
+    pose[:3, 3] = [30.0, -10.0, 5.0]
+    unit = _directions(3000)
+    offset = np.random.default_rng(2).uniform(-3.0, 3.0, len(unit))
+    points = unit * (20.0 + offset)[:, None]
+    distance, gradient = detector.distance_and_gradient(trimesh.transform_points(points, pose), pose)
+    error, cosine = EXPECTED[name]
+    assert np.abs(distance - offset).max() < error
+    assert np.einsum("ni,ni->n", gradient @ pose[:3, :3], unit).min() > cosine
+    np.testing.assert_array_equal(distance, detector.distance(trimesh.transform_points(points, pose), pose))
+    assert detector.memory > 1000
+    assert np.abs(np.linalg.norm(detector.closest_point(points), axis=1) - 20.0).max() < 2 * error
+
+
+@pytest.mark.parametrize("name", ["voxel", "bvh"])
+def test_detectors_are_right_far_away(name):
+    detector = FIELDS[name](trimesh.creation.icosphere(3, 20.0))
+    assert detector.distance(np.array([[320.0, 0.0, 0.0]]))[0] == pytest.approx(300.0, rel=0.01)
+
+
+def test_errors_of_a_ring_are_small():
+    found = measure_field(BoneSDF.from_mesh(trimesh.creation.torus(20.0, 5.0), cache=False))
+    assert found["error_rms"] < 0.01 and found["sign_wrong"] < 1e-3 and found["angle_median"] < 0.5
+
+
+def test_measure_sees_a_wrong_field():
+    field = BoneSDF.from_mesh(trimesh.creation.icosphere(3, 20.0), cache=False)
+
+    class Shifted:
+        vertices, faces, closed = field.vertices, field.faces, True
+
+        def distance_and_gradient(self, points):
+            distance, gradient = field.distance_and_gradient(points)
+            return distance + 0.1, -gradient
+
+        def distance(self, points):
+            return field.distance(points) + 0.1
+
+    found = measure_field(Shifted(), count=5000)
+    assert found["error_rms"] == pytest.approx(0.1, rel=0.01)
+    assert found["sign_wrong"] > 0.01
+    assert found["angle_median"] > 179.0
+
+
+def test_run_takes_any_fields_of_the_bones_and_all_of_them():
+    scene = rm.phantom_scene(model="pbd", end=20.0, step=20.0, spacing=6.0)
+    fields = {bone.name: TreeDetector.from_mesh(bone.mesh) for bone in scene.bones}
+    asked = []
+
+    class Watched(TreeDetector):
+        def distance_and_gradient(self, points, pose=None, reach=np.inf):
+            asked.append(len(points))
+            return super().distance_and_gradient(points, pose, reach)
+
+    name, first = next(iter(fields.items()))
+    run = rm.simulate(
+        scene, fields={**fields, name: Watched(first.exact)}, settings={"output.surfaces": False}
+    )
+    plain = rm.simulate(scene, settings={"output.surfaces": False})
+    assert asked, "the field that was given is not asked"
+    for one, other in zip(run.frames, plain.frames, strict=True):
+        for muscle, (vertices, _) in one.carried.items():
+            # A field of nearest triangles errs by hundredths of a millimetre against the exact tree.
+            assert np.abs(vertices - other.carried[muscle][0]).max() < 0.5
+    with pytest.raises(UsageError, match="fields must name each bone"):
+        rm.simulate(scene, fields={name: first})

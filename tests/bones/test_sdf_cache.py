@@ -1,0 +1,157 @@
+"""The cache of distance fields on disk."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+
+from rbfmuscle.bones import sdf
+from rbfmuscle.bones.sdf import BoneSDF
+from rbfmuscle.cache import SUFFIX, cache_path, load_arrays, store_arrays
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("RBFMUSCLE_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def ball():
+    return trimesh.creation.icosphere(3, 20.0)
+
+
+@pytest.fixture
+def builds(monkeypatch):
+    """Number of fields built from their meshes, as a list that grows."""
+    found = []
+    build = sdf.build_cells
+
+    def counted(*arguments, **options):
+        found.append(1)
+        return build(*arguments, **options)
+
+    monkeypatch.setattr(sdf, "build_cells", counted)
+    return found
+
+
+POINTS = np.random.default_rng(0).uniform(-25.0, 25.0, (2000, 3))
+
+
+def test_second_field_comes_from_the_cache_and_is_the_same(ball, builds, folder):
+    first, second = BoneSDF.from_mesh(ball), BoneSDF.from_mesh(ball)
+    assert len(builds) == 1
+    assert cache_path() == folder
+    np.testing.assert_array_equal(first.distance(POINTS), second.distance(POINTS))
+    np.testing.assert_array_equal(first.closest_point(POINTS), second.closest_point(POINTS))
+    for name in ("spacing", "error", "closed", "notes", "memory"):
+        assert getattr(first, name) == getattr(second, name)
+
+
+def test_other_mesh_or_options_are_other_entries(ball, builds, folder):
+    BoneSDF.from_mesh(ball)
+    BoneSDF.from_mesh(ball, tolerance=0.005)
+    BoneSDF.from_mesh(ball, region=[[0.0, 0, 0], [25, 25, 25]])
+    ball.vertices[0, 0] += 1e-9
+    BoneSDF.from_mesh(ball)
+    assert len(builds) >= 4
+    assert len(list(folder.glob("*" + SUFFIX))) == 4
+
+
+def test_notes_survive_the_cache(ball, caplog):
+    inward = (ball.vertices, ball.faces[:, ::-1])
+    first = BoneSDF.from_mesh(inward)
+    caplog.clear()
+    assert BoneSDF.from_mesh(inward).notes == first.notes != ()
+    assert "turned" in caplog.text
+
+
+@pytest.mark.parametrize("damage", ["cut", "flip", "text", "empty"])
+def test_corrupt_entry_is_rebuilt(ball, builds, folder, damage):
+    expected = BoneSDF.from_mesh(ball).distance(POINTS)
+    (entry,) = folder.glob("*.npz")
+    content = bytearray(entry.read_bytes())
+    if damage == "cut":
+        entry.write_bytes(content[: len(content) // 2])
+    elif damage == "flip":
+        content[len(content) // 2] ^= 0xFF
+        entry.write_bytes(content)
+    else:
+        entry.write_bytes(b"" if damage == "empty" else b"not an archive")
+    np.testing.assert_array_equal(BoneSDF.from_mesh(ball).distance(POINTS), expected)
+    assert len(builds) == 2
+    BoneSDF.from_mesh(ball)
+    assert len(builds) == 2
+
+
+def test_entry_of_another_mesh_is_not_believed(ball, builds, folder):
+    BoneSDF.from_mesh(ball)
+    (entry,) = folder.glob("*.npz")
+    other = trimesh.creation.box((10.0, 10.0, 10.0))
+    BoneSDF.from_mesh(other)
+    (second,) = set(folder.glob("*.npz")) - {entry}
+    second.write_bytes(entry.read_bytes())
+    assert BoneSDF.from_mesh(other).distance(np.zeros((1, 3)))[0] == pytest.approx(-5.0, abs=0.1)
+    assert len(builds) == 3
+
+
+def test_cache_that_cannot_be_written_does_no_harm(ball, folder, caplog):
+    folder.write_text("a file where the folder should be")
+    field = BoneSDF.from_mesh(ball)
+    assert field.distance(np.zeros((1, 3)))[0] < -19.0
+    assert "cannot be written" in caplog.text
+
+
+def test_nothing_is_kept_when_the_cache_is_off(ball, folder):
+    BoneSDF.from_mesh(ball, cache=False)
+    assert not folder.exists()
+
+
+def test_several_processes_may_build_the_same_field(folder):
+    code = (
+        "import trimesh, numpy as np\n"
+        "from rbfmuscle.bones.sdf import BoneSDF\n"
+        "f = BoneSDF.from_mesh(trimesh.creation.icosphere(3, 20.0))\n"
+        "print(f.distance(np.array([[1.0, 2.0, 3.0]]))[0])"
+    )
+    running = [subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) for _ in range(3)]
+    answers = {process.communicate(timeout=300)[0] for process in running}
+    assert [process.returncode for process in running] == [0, 0, 0]
+    assert len(answers) == 1
+    assert len(list(folder.glob("*" + SUFFIX))) == 1
+    assert not list(folder.glob("*.part"))
+
+
+def test_arrays_are_used_where_they_lie_and_what_is_written_to_them_stays_here(folder):
+    rng = np.random.default_rng(3)
+    arrays = {
+        "rows": rng.random((100, 3)),
+        "columns": np.asfortranarray(rng.random((4, 5))),
+        "none": np.zeros((0, 3)),
+        "one": np.float64(3.0),
+        "flags": np.array([True, False, True]),
+        "numbers": np.arange(7, dtype=np.int32),
+    }
+    store_arrays("some", arrays)
+    found = load_arrays("some")
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(found[name], array)
+        assert found[name].dtype == np.asarray(array).dtype
+        # As loops are compiled for them: aligned, and not for reading alone.
+        assert found[name].flags.aligned and found[name].flags.writeable
+        assert not found[name].flags.owndata
+    found["rows"][:] = 0.0
+    np.testing.assert_array_equal(load_arrays("some")["rows"], arrays["rows"])
+    with np.load(cache_path() / f"some{SUFFIX}") as archive:
+        np.testing.assert_array_equal(archive["columns"], arrays["columns"])
+
+
+def test_entries_that_numpy_wrote_are_read(folder):
+    array = np.asfortranarray(np.random.default_rng(3).random((4, 5)))
+    folder.mkdir(exist_ok=True)
+    np.savez(folder / f"other{SUFFIX}", key=np.array("other"), array=array)
+    found = load_arrays("other")
+    np.testing.assert_array_equal(found["array"], array)
+    assert found["array"].flags.aligned

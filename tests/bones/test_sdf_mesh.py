@@ -1,0 +1,108 @@
+"""Distance fields of bones whose meshes are open, crossed, split or degenerate."""
+
+import logging
+
+import numpy as np
+import pytest
+import trimesh
+
+from rbfmuscle.bones.sdf import BoneSDF
+from rbfmuscle.validation import MeshError
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return trimesh.creation.icosphere(4, 20.0)
+
+
+def _random(count=20000, width=26.0):
+    return np.random.default_rng(0).uniform(-width, width, (count, 3))
+
+
+def _sides_right(field, points, radius=20.0, faceting=0.1):
+    depth = np.linalg.norm(points, axis=1) - radius
+    clear = np.abs(depth + 0.5 * faceting) > faceting
+    return np.mean(field.distance(points[clear]) * depth[clear] > 0.0)
+
+
+def test_open_bone_keeps_its_signs_away_from_the_hole(ball, caplog):
+    centres = ball.triangles_center
+    order = np.argsort(np.linalg.norm(centres - centres[7], axis=1))
+    removed = order[: len(order) // 100]
+    faces = np.delete(ball.faces, removed, axis=0)
+    with caplog.at_level(logging.WARNING):
+        field = BoneSDF.from_mesh((ball.vertices, faces), cache=False, name="hip")
+    assert not field.closed
+    assert "hip: not closed" in caplog.text
+    assert "winding numbers" in caplog.text
+    radius = np.linalg.norm(centres[removed] - centres[7], axis=1).max()
+    points = _random()
+    away = np.linalg.norm(points - centres[7], axis=1) > 2.0 * radius
+    assert _sides_right(field, points[away]) >= 0.999
+
+
+def test_soup_is_merged(ball):
+    soup = ball.vertices[ball.faces].reshape(-1, 3)
+    field = BoneSDF.from_mesh((soup, np.arange(len(soup)).reshape(-1, 3)), cache=False)
+    assert field.closed
+    assert any("merged" in note for note in field.notes)
+    assert _sides_right(field, _random()) == 1.0
+
+
+def test_faces_of_mixed_orientation_are_oriented_alike(ball):
+    faces = ball.faces.copy()
+    faces[::7] = faces[::7, ::-1]
+    field = BoneSDF.from_mesh((ball.vertices, faces), cache=False)
+    assert field.closed
+    assert _sides_right(field, _random()) == 1.0
+
+
+def test_inward_bone_is_turned(ball):
+    field = BoneSDF.from_mesh((ball.vertices, ball.faces[:, ::-1]), cache=False)
+    assert field.notes == ("faces pointed inward and were turned",)
+    assert _sides_right(field, _random()) == 1.0
+
+
+def test_bone_that_intersects_itself_is_signed_by_winding_numbers(ball):
+    other = ball.copy().apply_translation([15.0, 0.0, 0.0])
+    field = BoneSDF.from_mesh(trimesh.util.concatenate([ball, other]), cache=False)
+    assert not field.closed
+    points = _random() + [7.5, 0.0, 0.0]
+    depth = (
+        np.minimum(np.linalg.norm(points, axis=1), np.linalg.norm(points - [15.0, 0.0, 0.0], axis=1)) - 20.0
+    )
+    clear = np.abs(depth + 0.05) > 0.1
+    wrong = field.distance(points) * depth < 0.0
+    # Cells that both surfaces cross take their sign from their corners.
+    assert wrong[clear].mean() < 1e-3
+
+
+def test_duplicate_and_degenerate_faces_are_left_out(ball):
+    faces = np.vstack([ball.faces, ball.faces[:5], [[0, 0, 1], [3, 3, 3]]])
+    field = BoneSDF.from_mesh((ball.vertices, faces), cache=False)
+    clean = BoneSDF.from_mesh(ball, cache=False)
+    assert field.closed
+    assert "5 duplicate faces left out" in field.notes
+    assert "2 faces without area left out" in field.notes
+    np.testing.assert_array_equal(field.distance(_random(2000)), clean.distance(_random(2000)))
+
+
+def test_one_triangle_is_outside_everywhere():
+    field = BoneSDF.from_mesh(([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]), cache=False)
+    assert not field.closed
+    points = np.array([[0.2, 0.2, 0.5], [0.2, 0.2, -0.5], [5.0, 0.0, 0.0]])
+    np.testing.assert_allclose(field.distance(points), [0.5, 0.5, 4.0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "message"),
+    [
+        ([[0, 0, np.nan], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], "vertices of shin must be finite"),
+        ([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 0, 1]], "shin has no face with an area"),
+        ([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 3]], "outside its 3 vertices"),
+        (np.zeros((0, 3)), np.zeros((0, 3), dtype=int), "shin is empty"),
+    ],
+)
+def test_unusable_meshes_are_refused(vertices, faces, message):
+    with pytest.raises(MeshError, match=message):
+        BoneSDF.from_mesh((vertices, faces), cache=False, name="shin")

@@ -1,0 +1,212 @@
+"""Comparing models: what is measured alike, what lands in tables and report, and how it fails."""
+
+import csv
+import json
+import math
+
+import numpy as np
+import pytest
+import trimesh
+from blend_model import BlendMuscle, arm_scene
+
+from rbfmuscle import compare
+from rbfmuscle.compare import compare_models
+from rbfmuscle.experiments.comparison import MEASURES, best_models, verdict
+from rbfmuscle.metrics.comparison_measures import MaterialProbe, array_bytes, curvature_variation
+from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.report.comparison_page import map_limit
+from rbfmuscle.scene.phantom import phantom_scene
+from rbfmuscle.validation import SolveError, UsageError
+
+
+class TestMaterialProbe:
+    def ball(self, subdivisions=3):
+        return trimesh.creation.icosphere(subdivisions=subdivisions, radius=10.0)
+
+    def test_stretch_has_the_strain_of_its_closed_form(self):
+        """Along x by 1 + e: an edge at angle t to x changes by sqrt(1 + (2 e + e^2) cos^2 t) - 1."""
+        mesh = self.ball()
+        probe = MaterialProbe(mesh, np.array(mesh.vertices), np.array(mesh.faces))
+        rest = probe.points(np.array(mesh.vertices))
+        stretched = probe.points(np.array(mesh.vertices) * [1.1, 1, 1])
+        way = rest[probe.edges[:, 0]] - rest[probe.edges[:, 1]]
+        cosine = way[:, 0] / np.linalg.norm(way, axis=1)
+        exact = np.sqrt(1 + 0.21 * cosine**2) - 1
+        assert probe.strain(stretched, rest) == pytest.approx(np.sqrt(np.mean(exact**2)), rel=1e-9)
+        assert probe.strain(rest, rest) == 0.0
+
+    def test_is_the_same_on_another_mesh_of_the_surface(self):
+        fine = self.ball(4)
+        found = []
+        for mesh in (self.ball(3), fine):
+            probe = MaterialProbe(fine, np.array(mesh.vertices), np.array(mesh.faces))
+            rest, moved = (probe.points(np.array(mesh.vertices) * f) for f in ([1, 1, 1], [1.3, 0.9, 0.9]))
+            found.append(probe.strain(moved, rest))
+        assert found[0] == pytest.approx(found[1], rel=5e-3)
+
+
+class TestCurvatureVariation:
+    def test_bumps_count_and_size_scales(self):
+        mesh = trimesh.creation.icosphere(subdivisions=5)
+        smooth = curvature_variation(mesh.vertices, mesh.faces)
+        assert smooth < 0.01  # of 1, the sphere's own curvature
+        assert curvature_variation(10 * mesh.vertices, mesh.faces) == pytest.approx(smooth / 10, rel=1e-6)
+        bumpy = mesh.vertices * (1 + 0.02 * np.sin(8 * mesh.vertices[:, :1]))
+        assert curvature_variation(bumpy, mesh.faces) > 10 * smooth
+
+    def test_thin_plates_are_measured_without_warnings(self):
+        plate = trimesh.creation.box((40.0, 30.0, 0.01)).subdivide().subdivide()
+        assert np.isfinite(curvature_variation(plate.vertices, plate.faces))
+
+
+class TestMemory:
+    def test_buffers_count_once_and_what_is_shared_not(self):
+        class Holder:
+            pass
+
+        attached_bone, shared = Holder(), np.zeros(1000)
+        attached_bone.a, attached_bone.views, attached_bone.shared = np.zeros(100), [], shared
+        attached_bone.views.append(attached_bone.a[:50])
+        attached_bone.me = attached_bone
+        assert array_bytes(attached_bone) == 8 * 1100
+        assert array_bytes(attached_bone, without=[shared]) == 800
+
+
+def results(**models):
+    return {name: {"all": values} for name, values in models.items()}
+
+
+class TestVerdict:
+    def test_losing_is_said(self):
+        found = results(
+            a={"volume_error": 1e-3, "time_frame": 0.02, "strain_rms": 0.1},
+            b={"volume_error": -1e-9, "time_frame": 0.03, "strain_rms": 0.1},
+        )
+        mine = verdict(found, "a", "mm")
+        assert mine["best"] == ["time_frame"]
+        assert mine["loses"] == [
+            {"quantity": "volume_error", "value": 1e-3, "other": "b", "other_value": -1e-9}
+        ]
+
+    def test_what_does_not_count_is_a_tie(self):
+        found = results(a={"rest_error_rms": 0.0}, b={"rest_error_rms": 0.01}, c={"rest_error_rms": 0.5})
+        assert best_models(found, "rest_error_rms", "mm") == ["a", "b"]
+        assert best_models(found, "rest_error_rms", "m") == ["a"]
+
+    def test_colours_of_maps_end_at_round_numbers(self):
+        table = {"results": results(a={}, b={"distance_max": 15.9})}
+        assert map_limit(table) == 5.0
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    """Two models on the phantom, four poses to 18 degrees."""
+    folder = tmp_path_factory.mktemp("compare")
+    scene = phantom_scene(step=6.0).with_options(frames="0:4")
+    table = compare_models(scene, folder, ["rbf", "pbd"], settings={"rbf:model.centres": 100}, pictures=False)
+    return folder, table
+
+
+class TestComparison:
+    def test_values_are_those_of_the_runs(self, compared):
+        folder, table = compared
+        assert (table["models"], table["frames"], table["poses"]) == (["rbf", "pbd"], 4, [0, 1, 3])
+        for model in table["models"]:
+            saved, found = SavedRun(folder / model), table["results"][model]
+            assert len(saved.frames) == 4
+            for quantity in ("volume_error", "bone_penetration_max", "rest_error_rms"):
+                each = [saved.series(muscle, quantity)[1] for muscle in saved.muscles]
+                assert abs(found["all"][quantity]) == max(abs(values).max() for values in each)
+            wall = saved.series("all", "time_frame")[1][1:]
+            assert found["all"]["time_frame"] == np.median(wall)
+            missing = set(MEASURES) - set(found["all"]) - {"distance_rms", "distance_max"}
+            assert not missing
+        assert SavedRun(folder / "rbf").info["scene"]["muscles"][0]["model"]["centres"] == 100
+
+    def test_laws(self, compared):
+        found = compared[1]["results"]
+        for model in found:
+            assert abs(found[model]["all"]["volume_error"]) < 1e-6
+            assert found[model]["all"]["components"] == 1
+            assert 0 <= found[model]["all"]["return_rms"] < 1.5
+        assert found["pbd"]["all"]["rest_error_rms"] < 1e-9 < found["rbf"]["all"]["rest_error_rms"]
+
+    def test_distances_are_symmetric_and_belong_to_the_first(self, compared):
+        table = compared[1]
+        matrix = np.array(table["distances"])
+        np.testing.assert_array_equal(matrix, matrix.T)
+        assert "distance_rms" not in table["results"]["rbf"]["all"]
+        pbd = table["results"]["pbd"]
+        assert pbd["all"]["distance_rms"] == max(v["distance_rms"] for k, v in pbd.items() if k != "all")
+        assert 0 < matrix[0, 1] <= pbd["all"]["distance_rms"] <= pbd["all"]["distance_max"]
+
+    def test_tables_agree(self, compared):
+        folder, table = compared
+        with open(folder / "comparison.json", encoding="utf-8") as file:
+            assert json.load(file) == json.loads(json.dumps(table))
+        with open(folder / "comparison.csv", encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+        for row in rows:
+            assert float(row["value"]) == table["results"][row["model"]][row["muscle"]][row["quantity"]]
+        assert {row["unit"] for row in rows if row["quantity"] == "curvature_variation"} == {"1/mm"}
+
+    def test_report_says_where_each_loses(self, compared):
+        folder, table = compared
+        text = (folder / "report.html").read_text(encoding="utf-8")
+        assert "There are no pictures" in text and "<b>pbd</b> alone is best in" in text
+        lost = {entry["quantity"] for entry in table["verdicts"]["rbf"]["loses"]}
+        assert "rest_error_rms" in lost
+        assert all(MEASURES[quantity].title in text for quantity in lost)
+
+
+def test_pictures_show_every_model(tmp_path, graphics):
+    from PIL import Image
+
+    compare_models(arm_scene(), tmp_path, ["pbd", "arap-volume"])
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert text.count("data:image/png") == 3 + 2
+    with Image.open(tmp_path / "models.webp") as moving:
+        assert moving.n_frames == 3
+        assert moving.width == 2 * 420
+
+
+class TestFailure:
+    def test_names_and_keys_are_checked_before_anything_runs(self, tmp_path):
+        for models, settings, words in (
+            (["rbf", "pdb"], {}, "did you mean 'pbd'"),
+            (["rbf"], {}, "two or more"),
+            (["rbf", "rbf"], {}, "two or more"),
+            (["rbf", "pbd"], {"xpbd:model.sweeps": 2}, "not compared"),
+        ):
+            with pytest.raises(UsageError, match=words):
+                compare_models(arm_scene(), tmp_path, models, settings=settings)
+        assert not list(tmp_path.iterdir())
+
+    def test_a_model_that_fails_leaves_the_others(self, tmp_path, monkeypatch):
+        """The third model of three gives up in its run; it is named, and the others are compared."""
+        from rbfmuscle.models import build_model
+
+        class GivesUp(BlendMuscle):
+            def solve(self, contacts):
+                raise SolveError("planted failure")
+
+        def build(muscle, scene):
+            return GivesUp(muscle, scene) if muscle.model == "xpbd" else build_model(muscle, scene)
+
+        monkeypatch.setattr("rbfmuscle.models.build_model", build)
+        table = compare_models(arm_scene(), tmp_path, ["pbd", "arap-pbd", "xpbd"], pictures=False)
+        assert table["models"] == ["pbd", "arap-pbd"] and "planted" in table["failed"]["xpbd"]
+        assert "xpbd did not finish" in (tmp_path / "report.html").read_text(encoding="utf-8")
+        assert not math.isnan(table["results"]["pbd"]["all"]["volume_error"])
+
+
+def test_the_way_back_is_the_way_there_from_the_last_pose(monkeypatch):
+    scene, asked = arm_scene(end=60, step=5), []
+    monkeypatch.setattr(
+        compare, "_surfaces", lambda scene, at: (0.0, asked.append((scene.motion.frames, at)) or "ab")
+    )
+    found = compare._there_and_back(scene)
+    ((path, (turn, end)),) = asked
+    assert path == path[::-1] and path[0] == scene.motion.frames[0] == path[end] and end == len(path) - 1
+    assert path[turn] == scene.motion.frames[-1] and turn > 1
+    assert found == {"build": 0.0, "turn": "a", "end": "b"}

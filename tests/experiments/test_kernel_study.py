@@ -1,0 +1,191 @@
+"""The kernel study on a mesh of known shape, and its command."""
+
+import html
+import json
+import tomllib
+import warnings
+from dataclasses import replace
+
+import numba
+import numpy as np
+import pytest
+import trimesh
+from command_line import call
+
+import rbfmuscle as rm
+from rbfmuscle.experiments import kernel_study
+from rbfmuscle.experiments.kernel_judge import ReferenceSurface
+from rbfmuscle.experiments.kernel_study import recommend, row_name, row_toml
+from rbfmuscle.metrics.mesh_distance import MeshDistance
+from rbfmuscle.report.kernel_page import write_study
+from rbfmuscle.validation import MeshError, UsageError
+
+
+@pytest.fixture(scope="module")
+def ellipsoid():
+    return trimesh.creation.icosphere(subdivisions=4).apply_scale([40.0, 18.0, 12.0])
+
+
+@pytest.fixture(scope="module")
+def study(ellipsoid):
+    kernels = ["linear", "cubic", "quintic", "gaussian", "wendland_c2", "matern_52"]
+    return rm.study_kernels(ellipsoid, kernels=kernels, centres=[40, 80], resolution=32, units="mm")
+
+
+def test_rows_are_ranked_and_more_centres_err_less(study):
+    good = [row["rms"] for row in study.rows if not row["unfit"]]
+    assert good == sorted(good) and len(study.rows) == 12
+    assert all(row["unfit"] for row in study.rows[len(good) :])
+    error = {(row["kernel"], row["centres"]): row["rms"] for row in study.rows}
+    for kernel in ("linear", "cubic", "quintic", "wendland_c2", "matern_52"):
+        assert error[kernel, 80] < error[kernel, 40]
+    assert error["cubic", 80] < 0.6 * error["linear", 80]
+
+
+def test_numbers_are_those_of_the_surface(study, ellipsoid):
+    for row, surface in zip(study.rows, study.surfaces, strict=True):
+        if surface is None:
+            assert row["unfit"]
+            continue
+        vertices, faces = surface
+        assert row["components"] >= 1 and 0 < row["rms"] <= row["hausdorff"]
+        volume = trimesh.Trimesh(vertices, faces, process=False).volume
+        assert row["volume_error"] == pytest.approx(volume / ellipsoid.volume - 1.0, abs=1e-9)
+        # The implicit form x^2/a^2 + ... = 1 is met where the row says so.
+        radius = np.sqrt(((vertices / [40.0, 18.0, 12.0]) ** 2).sum(axis=1))
+        assert np.abs(radius - 1.0).max() * 12.0 <= row["hausdorff"] + 0.2
+
+
+def test_front_holds_what_nothing_beats(study):
+    good = [row for row in study.rows if not row["unfit"]]
+    assert good[0]["front"] and all(row["condition"] <= 1e10 for row in good if row["epsilon"])
+    for row in good:
+        beaten = any(
+            o["rms"] < row["rms"]
+            and o["fit_time"] + o["evaluation_time"] <= row["fit_time"] + row["evaluation_time"]
+            for o in good
+        )
+        assert not (row["front"] and beaten)
+
+
+def test_lines_to_paste_give_the_row(study):
+    row = next(row for row in study.rows if row["kernel"] == "matern_52")
+    table = tomllib.loads(row_toml(row))["muscle"]["model"]
+    assert table["kernel"] == "matern_52" and table["centres"] == row["centres"]
+    assert table["epsilon"] == pytest.approx(row["epsilon"], rel=1e-5) and table["placement"] == "fitted"
+    row = next(row for row in study.rows if row["kernel"] == "linear")
+    assert 'placement = "greedy"' in row_toml(row)  # not C2: no Hermite fit to be fitted
+    assert "condition = 1e+10" in row_toml(row | {"bound": 1e10})
+
+
+def test_a_study_on_several_threads_is_that_of_one():
+    ball = trimesh.creation.icosphere(3, 10.0).apply_scale([2.0, 1.0, 1.0])
+    asked = {"kernels": ["cubic", "quintic", "gaussian"], "centres": [30, 50], "resolution": 24}
+    rows, threads, filters = {}, numba.get_num_threads(), list(warnings.filters)
+    for count in (1, threads):
+        numba.set_num_threads(count)
+        rows[count] = {(row["kernel"], row["centres"]): row for row in rm.study_kernels(ball, **asked).rows}
+    assert warnings.filters == filters
+    for key, row in rows[1].items():
+        same = rows[threads][key]
+        assert row["unfit"] == same["unfit"] and row["epsilon"] == pytest.approx(same["epsilon"], rel=1e-9)
+        if not row["unfit"]:
+            assert row["rms"] == pytest.approx(same["rms"], rel=1e-6)
+            assert same["fit_time"] > 0.0 and same["evaluation_time"] > 0.0
+
+
+def test_fitted_centres_halve_the_error_of_greedy_ones(ellipsoid):
+    """Bumps that 80 centres cannot follow are met on average."""
+    vertices, faces = np.array(ellipsoid.vertices), np.asarray(ellipsoid.faces)
+    vertices[:, 2] += 0.8 * np.sin(vertices[:, 0] / 2.5) * np.sin(vertices[:, 1] / 2.5)
+    settings = {"kernels": ["cubic"], "centres": [80], "resolution": 48}
+    greedy, fitted = (
+        rm.study_kernels((vertices, faces), placement=placement, **settings).rows[0]
+        for placement in ("greedy", "fitted")
+    )
+    assert fitted["rms"] < 0.8 * greedy["rms"]
+
+
+def test_slender_muscles_are_looked_at_with_finer_cells(ellipsoid):
+    """With 128 cells along it a spindle of 40 times its width is three cells thick."""
+    rod = trimesh.creation.icosphere(subdivisions=4).apply_scale([200.0, 5.0, 5.0])
+    assert ReferenceSurface(np.array(rod.vertices), np.asarray(rod.faces)).resolution == 320
+    assert ReferenceSurface(ellipsoid.vertices, ellipsoid.faces).resolution == 128
+
+
+def row(kernel, rms, milliseconds, *, condition=1e6, epsilon=0.0, unfit=""):
+    return {
+        "kernel": kernel, "rms": rms, "fit_time": milliseconds * 1e-3, "evaluation_time": 0.0, "condition": condition,
+        "epsilon": epsilon, "unfit": unfit,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("rows", "wanted"),
+    [
+        ([row("multiquadric", 0.1407, 20.0), row("cubic", 0.143, 2.0), row("linear", 0.4, 1.0)], "cubic"),
+        ([row("quintic", 0.10, 20.0), row("cubic", 0.14, 2.0)], "quintic"),  # really better
+        ([row("a", 0.14, 2.0, epsilon=0.2), row("b", 0.14, 2.2)], "b"),  # no parameter to choose
+        ([row("a", 0.14, 2.0, epsilon=0.2), row("b", 0.14, 2.4)], "a"),  # quicker
+        ([row("a", 0.14, 2.0, condition=1e8), row("b", 0.14, 2.0)], "b"),  # better conditioned
+        ([row("a", 0.14, 1.0, condition=1e12), row("b", 0.14, 2.0)], "b"),  # sound
+        ([row("gaussian", 0.05, 1.0, unfit="9 sheets"), row("cubic", 0.15, 2.0)], "cubic"),
+        ([row("gaussian", 0.05, 1.0, unfit="9 sheets")], None),
+    ],
+)
+def test_the_quickest_of_those_alike_is_recommended(rows, wanted):
+    found = recommend(rows)
+    assert (found and found["kernel"]) == wanted
+
+
+def test_rows_that_err_more_than_the_coarsest_kernel_are_unfit():
+    rows = [row("linear", 0.4, 1.0), row("buhmann", 0.9, 1.0), row("cubic", 0.1, 1.0)]
+    kernel_study._refuse_coarse([one | {"centres": 80} for one in rows])
+    rows = [one | {"centres": 80} for one in rows]
+    kernel_study._refuse_coarse(rows)
+    assert [one["unfit"] for one in rows] == ["", "an error of 0.9, beyond that of linear, 0.4", ""]
+
+
+def test_files_hold_the_table(study, ellipsoid, tmp_path):
+    write_study(study, tmp_path, title="An ellipsoid", mesh=MeshDistance(ellipsoid.vertices, ellipsoid.faces))
+    kept = json.loads((tmp_path / "kernels.json").read_text())
+    assert [row["kernel"] for row in kept["rows"]] == [row["kernel"] for row in study.rows]
+    assert (tmp_path / "kernels.csv").read_text().count("\n") == len(study.rows) + 1
+    assert (tmp_path / "recommended.vtp").stat().st_size > 1000
+    page = (tmp_path / "kernels.html").read_text()
+    assert "An ellipsoid" in page and "http" not in page.replace("http-equiv", "")
+    best = study.recommended
+    text = html.unescape(page.split("<h2>To paste</h2><pre>")[1].split("</pre>")[0])
+    assert tomllib.loads(text)["muscle"]["model"]["kernel"] == best["kernel"]
+    assert f"Recommended: <b>{html.escape(row_name(best))}</b>" in page
+
+
+@pytest.mark.parametrize("left", [0, 1])
+def test_page_of_few_fit_rows_is_written(study, tmp_path, left):
+    rows = [{**row, "unfit": "" if k < left else "too few centres"} for k, row in enumerate(study.rows)]
+    write_study(replace(study, rows=rows, recommended=recommend(rows)), tmp_path)
+    page = (tmp_path / "kernels.html").read_text()
+    assert page.count("too few centres") == len(rows) - left
+    assert ("every field is unfit" in page) is (left == 0)
+
+
+def test_wrong_requests_are_answered(ellipsoid):
+    with pytest.raises(UsageError, match="at least 8"):
+        rm.study_kernels(ellipsoid, centres=[4])
+    with pytest.raises(UsageError, match="unknown kernel"):
+        rm.study_kernels(ellipsoid, kernels=["cubics"])
+    with pytest.raises(UsageError, match="placement must be one of greedy, fitted"):
+        rm.study_kernels(ellipsoid, placement="even")
+    with pytest.raises(MeshError):
+        rm.study_kernels((np.full((3, 3), np.nan), np.array([[0, 1, 2]])))
+
+
+def test_command_ranks_and_prints(tmp_path, capsys):
+    words = ["phantom", "--muscle", "adductor_posterior", "--kernels", "cubic,quintic", "--centres", "60"]
+    code, out, _ = call(capsys, "kernels", *words, "--resolution", "24", "-o", tmp_path / "k", "--json")
+    assert code == 0 and {row["kernel"] for row in json.loads(out)["rows"]} == {"cubic", "quintic"}
+    assert (tmp_path / "k" / "kernels.html").exists()
+    code, out, _ = call(capsys, "kernels", *words, "--resolution", "24", "-o", tmp_path / "k")
+    assert code == 0 and "recommended: " in out and "[muscle.model]" in out
+    code, _, err = call(capsys, "kernels", "phantom", "--centres", "150,some", "-o", tmp_path)
+    assert code == 2 and "--centres must be whole numbers of 8 and more, got '150 some'" in err

@@ -1,0 +1,306 @@
+"""Sweeps: the grid, the front, scenes apart, failures, and the same table however the points were run."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from blend_model import arm_files, arm_scene, use_blend_model
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rbfmuscle.cli.app import run_command as command
+from rbfmuscle.cli.sweep import run_point
+from rbfmuscle.experiments.sweep import SweepPoint, parse_grid, plan_sweep, point_key
+from rbfmuscle.experiments.sweep_run import SweepFolder, run_sweep
+from rbfmuscle.experiments.sweep_table import (
+    mark_front,
+    outliers,
+    pareto_front,
+    sweep_rows,
+    write_table,
+)
+from rbfmuscle.report.sweep_page import draw_front, write_page
+from rbfmuscle.validation import UsageError
+
+GRID = ["model.centres=40,60", "model.resolution=16,24"]
+FRAMES = "0:3"
+POINTS = 5  # four combinations and the scene's own settings
+# Of a clock, a machine and a process.
+CLOCKED = ("time_frame", "time_frame_p95", "time_extract", "seconds", "threads", "machine", "front")
+
+
+def plan_of(texts=GRID, **options):
+    scenes = {"arm": arm_scene(end=10, step=5)}
+    return scenes, plan_sweep(scenes, parse_grid(texts), frames=FRAMES, **options)
+
+
+def sweep(folder, texts=GRID, runner=run_point, **options):
+    scenes, points = plan_of(texts)
+    count = run_sweep(runner, scenes, points, folder, frames=FRAMES, **{"jobs": 1, **options})
+    return points, count
+
+
+def rows_of(points, folder):
+    """Lines of the table without what differs from run to run."""
+    write_table(points, folder, {"arm": "mm"})
+    with open(folder / "sweep.csv", encoding="utf-8", newline="") as file:
+        return [{k: v for k, v in row.items() if k not in CLOCKED} for row in csv.DictReader(file)]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A sweep run in this process: (points, folder)."""
+    folder = tmp_path_factory.mktemp("sweep")
+    points, count = sweep(folder)
+    assert count == len(points) == POINTS
+    return points, folder
+
+
+class TestGrid:
+    def test_values_are_read_as_toml_or_text(self):
+        grid = parse_grid(
+            ["model.centres=100,200", "contact.substep_angle=0.5,2", "model.kernel=cubic,wendland_c2"]
+        )
+        assert [values for _, _, values in grid] == [[100, 200], [0.5, 2], ["cubic", "wendland_c2"]]
+
+    def test_keys_of_one_model(self):
+        _, points = plan_of(["model=rbf,pbd", "rbf:model.centres=40,60", "pbd:model.iterations=2,4,8"])
+        assert [sum(p.model == name for p in points) for name in ("rbf", "pbd")] == [3, 4]
+        assert {p.settings["model"] for p in points if p.role == "reference"} == {"rbf", "pbd"}
+        assert all(next(iter(p.settings)) == "model" for p in points)
+
+    def test_one_reference_for_all_models_where_one_is_named(self):
+        _, points = plan_of(["model=rbf,pbd", "rbf:model.centres=40,60"], reference={"model": "rbf"})
+        (reference,) = [p for p in points if p.role == "reference"]
+        assert reference.settings == {"model": "rbf", "model.centres": 60}
+        assert {p.reference for p in points} == {reference.key}
+
+    def test_reference_is_the_finest_of_the_grid(self):
+        texts = ["model.centres=80,40", "contact.substep_angle=2,1", "model.kernel=cubic,quintic"]
+        assert plan_of(texts)[1][0].settings == {"model.centres": 80, "contact.substep_angle": 1}
+        given = plan_of(texts, reference={"model.centres": 200})[1][0]
+        assert given.role == "reference" and given.settings["model.centres"] == 200
+
+    def test_scenes_without_a_grid_are_a_point_each(self):
+        scenes = {"a": arm_scene(end=10), "b": arm_scene(end=20)}
+        points = plan_sweep(scenes, [])
+        assert [(p.scene, p.role, p.reference) for p in points] == [
+            ("a", "default", ""),
+            ("b", "default", ""),
+        ]
+        assert points[0].key != points[1].key
+
+    @pytest.mark.parametrize(
+        "texts", [["centres"], ["=1,2"], ["a="], ["model.centres=1", "model.centres=2"], ["pbd:a=1"]]
+    )
+    def test_wrong_grid(self, texts):
+        with pytest.raises(UsageError):
+            parse_grid(texts)
+
+    def test_wrong_key_fails_before_anything_runs(self):
+        with pytest.raises(UsageError, match="substep_angle"):
+            plan_of(["contact.substep_angel=1,2"])
+
+    def test_key_depends_on_scene_and_settings_not_on_their_order(self):
+        assert point_key("a", {"x": 1, "y": 2}) == point_key("a", {"y": 2, "x": 1})
+        assert len({point_key("a", {"x": 1}), point_key("b", {"x": 1}), point_key("a", {"x": 2})}) == 3
+
+
+def row(error, time, role=""):
+    facts = {"scene": "s", "status": "done", "role": role, "reference": "r", "model": ""}
+    label = role or f"{error:g} {time:g}"
+    return {**facts, "label": label, "error_rms": error, "time_frame": time, "front": False}
+
+
+class TestFront:
+    def test_known_front(self):
+        errors, times = [5, 3, 4, 1, 1, np.nan], [1, 2, 3, 4, 5, 0.1]
+        assert pareto_front(errors, times) == [0, 1, 3]
+
+    @pytest.mark.parametrize(
+        ("error", "time", "factor", "near"),
+        [(1.0, 1.0, 1.0, True), (1.05, 1.08, 1.05, True), (2.0, 3.0, 2.0, False)],
+    )
+    def test_default_is_judged_by_the_factor_to_the_front(self, error, time, factor, near):
+        rows = [row(1.0, 1.0), row(5.0, 0.5), row(error, time, "default"), row(np.nan, 0.1, "reference")]
+        (verdict,) = mark_front(rows)
+        assert verdict["factor"] == pytest.approx(factor)
+        assert verdict["near"] is near
+        assert ("lies on the front" in verdict["text"]) is rows[2]["front"]
+
+    @settings(deadline=None, derandomize=True)
+    @given(st.lists(st.tuples(st.integers(0, 4), st.integers(1, 5)), min_size=2, max_size=8))
+    def test_advice_names_what_is_better_and_no_worse(self, pairs):
+        rows = [row(float(e), float(t), "" if k else "default") for k, (e, t) in enumerate(pairs)]
+        (verdict,) = mark_front(rows)
+        (error, time), others = pairs[0], pairs[1:]
+        better = [e for e, t in others if e < error and t <= time]
+        faster = [t for e, t in others if t < time and e <= error]
+        assert (verdict["better"] and float(verdict["better"].split()[0])) == (
+            min(better) if better else None
+        )
+        assert (verdict["faster"] and float(verdict["faster"].split()[1])) == (
+            min(faster) if faster else None
+        )
+        assert ("Quicker" in verdict["text"], "Better" in verdict["text"]) == (bool(faster), bool(better))
+
+    def test_picture_is_drawn_for_a_front(self):
+        rows = [row(0.5, 0.02), row(0.3, 0.03, "default"), row(np.nan, 0.5, "reference")]
+        assert draw_front(rows, "error_rms").startswith(b"\x89PNG")
+
+
+def test_rows_are_those_of_their_points_in_order():
+    points = [
+        SweepPoint(f"k{n}", "s", {"a": n} if n else {}, "", "" if n else "default", "r") for n in range(3)
+    ]
+    results = {
+        "k0": {"status": "done", "values": {"error_rms": 0.25}},
+        "k1": {"status": "failed", "error": "no"},
+    }
+    rows = sweep_rows(points, SimpleNamespace(read=lambda key: results.get(key, {})), {"s": "cm"})
+    assert [r["status"] for r in rows] == ["done", "failed", "missing"]
+    assert [r["label"] for r in rows] == ["default", "a=1", "a=2"]
+    assert [r["error"] for r in rows] == ["", "no", ""] and rows[0]["units"] == "cm"
+    np.testing.assert_array_equal([r["error_rms"] for r in rows], [0.25, np.nan, np.nan])
+
+
+def test_a_scene_apart_is_found_where_there_are_enough_others():
+    values = [(f"s{k}", "m", "length", 100.0 + k) for k in range(6)] + [("far", "m", "length", 160.0)]
+    values += [("few", "other", "length", 1.0), ("few2", "other", "length", 9.0)]
+    (found,) = outliers(values)
+    assert (found["scene"], found["median"]) == ("far", 103.0) and found["apart"] > 10
+    assert outliers(values[:6]) == []
+
+
+class TestRun:
+    def test_error_falls_with_refinement_and_the_reference_has_none(self, finished):
+        points, folder = finished
+        rows = {r["label"]: r for r in write_table(points, folder, {"arm": "mm"})["rows"]}
+        assert all(r["status"] == "done" for r in rows.values())
+        coarse, fine = (rows[f"model.centres=40 model.resolution={n}"] for n in (16, 24))
+        assert 0 < fine["error_rms"] < coarse["error_rms"] < 1
+        (reference,) = [r for r in rows.values() if r["role"] == "reference"]
+        assert np.isnan(reference["error_rms"]) and not reference["front"]
+
+    def test_what_is_done_is_not_done_twice(self, finished):
+        before = {path: path.stat().st_mtime_ns for path in (finished[1] / "points").iterdir()}
+        assert sweep(finished[1])[1] == 0 and len(before) == POINTS
+        assert {path: path.stat().st_mtime_ns for path in before} == before
+
+    def test_processes_give_the_same_table(self, finished, tmp_path):
+        points, count = sweep(tmp_path, jobs=2)
+        assert count == POINTS and rows_of(points, tmp_path) == rows_of(*finished)
+        assert os.getpid() not in {SweepFolder(tmp_path).read(p.key)["process"] for p in points}
+
+    def test_failed_points_leave_the_others_and_are_tried_again(self, tmp_path):
+        points, _ = sweep(tmp_path, ["model.centres=40,-3", "model.resolution=16,24"])
+        rows = write_table(points, tmp_path, {"arm": "mm"})["rows"]
+        failed = [r for r in rows if r["status"] == "failed"]
+        assert {r["settings"]["model.centres"] for r in failed} == {-3} and all(r["error"] for r in failed)
+        assert sweep(tmp_path, ["model.centres=40,-3", "model.resolution=16,24"])[1] == len(failed)
+
+    def test_page_stands_alone(self, finished):
+        points, folder = finished
+        write_page(write_table(points, folder, {"arm": "mm"}), folder)
+        page = (folder / "sweep.html").read_text()
+        assert "data:image/png;base64," in page and "http" not in page
+
+
+def crash_or_run(scene, settings, frames):
+    """A runner whose process ends without a word for one setting."""
+    if settings.get("model.centres") == 60:
+        os._exit(1)
+    return run_point(scene, settings, frames)
+
+
+@pytest.mark.filterwarnings("ignore:A worker stopped:UserWarning")
+def test_a_process_that_dies_takes_only_its_own_point(tmp_path):
+    points, _ = sweep(tmp_path, ["model.centres=40,60,80"], crash_or_run, jobs=2)
+    rows = {r["label"]: r for r in write_table(points, tmp_path, {"arm": "mm"})["rows"]}
+    assert {label for label, r in rows.items() if r["status"] != "done"} == {"model.centres=60"}
+    assert "process ended" in rows["model.centres=60"]["error"]
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """Address of a Dask scheduler on loopback, and its two workers, which nobody replaces."""
+    pytest.importorskip("distributed")
+    file = tmp_path / "scheduler.json"
+    home = ["--scheduler-file", str(file), "--no-dashboard"]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    python = [sys.executable, "-m"]
+    words = [*python, "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", *home]
+    started = [subprocess.Popen(words, **quiet)]
+    deadline = time.monotonic() + 60
+    while not file.exists() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    words = [*python, "distributed.cli.dask_worker", *home, "--nthreads", "1", "--no-nanny"]
+    started += [
+        subprocess.Popen([*words, "--local-directory", str(tmp_path / str(k))], **quiet) for k in (0, 1)
+    ]
+    try:
+        yield json.loads(file.read_text())["address"], started[1:]
+    finally:
+        for process in reversed(started):
+            process.terminate()
+        for process in started:
+            process.wait(timeout=30)
+
+
+def test_a_cluster_that_loses_one_of_two_workers_gives_the_same_table(finished, cluster, tmp_path):
+    address, workers = cluster
+
+    def kill(done, total):
+        if done == 2:
+            workers[0].send_signal(signal.SIGKILL)
+
+    points, count = sweep(tmp_path / "out", cluster=address, progress=kill)
+    assert count == POINTS and workers[0].wait(timeout=30) != 0
+    assert rows_of(points, tmp_path / "out") == rows_of(*finished)
+
+
+def test_no_scheduler_is_said(tmp_path, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("rbfmuscle.experiments.workers.CONNECT_WITHIN", 2)
+    with pytest.raises(UsageError, match="no Dask scheduler"):
+        sweep(tmp_path, cluster="tcp://127.0.0.1:1")
+
+
+class TestCommand:
+    @pytest.fixture
+    def scene_file(self, tmp_path):
+        return arm_files(tmp_path)
+
+    def test_several_scenes_and_a_grid(self, scene_file, tmp_path, monkeypatch, capsys):
+        use_blend_model(monkeypatch)
+        other = scene_file.with_name("other.toml")
+        other.write_text(scene_file.read_text())
+        words = ["sweep", str(scene_file), str(other), "-o", str(tmp_path / "out"), "--jobs", "1", "--json"]
+        assert command([*words, "--grid", "contact.substep_angle=1,2"]) == 0
+        table = json.loads(capsys.readouterr().out)
+        assert {r["scene"] for r in table["rows"]} == {scene_file.stem, "other"}
+        assert table["done"] == len(table["rows"])
+        long = (tmp_path / "out" / "quantities.csv").read_text().splitlines()
+        assert long[0].startswith("scene,point,muscle,quantity,unit,count")
+        assert any(",volume_error," in line for line in long)
+
+    def test_failed_points_end_with_five_and_are_run_again(self, scene_file, tmp_path, monkeypatch, capsys):
+        base = ["sweep", str(scene_file), "-o", str(tmp_path / "out"), "--jobs", "1"]
+        base += ["--grid", "contact.substep_angle=1,2"]
+        use_blend_model(monkeypatch, fail_at=6)  # half steps need more solves than whole ones
+        assert command(base) == 5
+        assert "planted failure" in capsys.readouterr().err
+        use_blend_model(monkeypatch)
+        assert command(base) == 0
+
+    @pytest.mark.parametrize("words", [[], ["--error", "rms"], ["--jobs", "0"]], ids=str)
+    def test_wrong_usage(self, scene_file, tmp_path, words):
+        grid = ["--grid", "contact.substep_angle=1,2"] if words else []
+        assert command(["sweep", str(scene_file), "-o", str(tmp_path / "out"), *grid, *words]) == 2

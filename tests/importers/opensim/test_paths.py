@@ -1,0 +1,158 @@
+"""Fitted paths: the fit itself, the file that OpenSim takes, and the command."""
+
+import subprocess
+import sys
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from rbfmuscle.cli.sampling import Samples, parse_ranges, report_fits, sample_muscles
+from rbfmuscle.importers.opensim.fitted import FittedPath, exponents, fit_path, write_paths
+from rbfmuscle.scene.phantom import phantom_scene
+from rbfmuscle.validation import SolveError, UsageError
+
+
+def smooth(q):
+    """A length over two coordinates, and its arms."""
+    x, y = q.T
+    length = 100 + 20 * np.sin(x) - 8 * np.cos(0.7 * y) + 5 * x * y
+    return length, np.stack([-(20 * np.cos(x) + 5 * y), -(5.6 * np.sin(0.7 * y) + 5 * x)], axis=1)
+
+
+def made(count=60):
+    values = np.random.default_rng(3).uniform([-0.5, 0.2], [1.2, 0.9], (count, 2))
+    return values, *smooth(values)
+
+
+def test_fit_holds_at_poses_that_it_has_not_seen():
+    path = fit_path("m", ("a.x", "b.y"), *made())
+    held = np.random.default_rng(4).uniform([-0.5, 0.2], [1.2, 0.9], (200, 2))
+    length, arms = smooth(held)
+    assert np.sqrt(np.mean((path.length(held) - length) ** 2)) < 1e-3
+    assert np.sqrt(np.mean((path.arms(held) - arms) ** 2)) < 1e-2
+
+
+def test_arms_are_minus_the_derivative_of_the_length():
+    path, q, h = fit_path("m", ("a.x", "b.y"), *made()), np.array([[0.3, 0.5]]), 1e-6
+    for k, step in enumerate(np.eye(2) * h):
+        slope = (path.length(q + step) - path.length(q - step)) / (2 * h)
+        assert path.arms(q)[0, k] == pytest.approx(-slope[0], rel=1e-6)
+
+
+def test_order_is_no_higher_than_the_data_bear():
+    values, length, arms = made(40)
+    noise = np.random.default_rng(5)
+    noisy = fit_path(
+        "m", ("a.x", "b.y"), values, length + noise.normal(0, 1, 40), arms + noise.normal(0, 3, (40, 2))
+    )
+    assert noisy.order < fit_path("m", ("a.x", "b.y"), values, length, arms).order
+
+
+def test_terms_are_in_the_order_of_opensim():
+    assert exponents(2, 2).tolist() == [[0, 0], [0, 1], [0, 2], [1, 0], [1, 1], [2, 0]]
+
+
+def test_file_is_in_metres(tmp_path):
+    path = FittedPath("soleus", ("ankle.angle", "rail.s"), 1, np.array([300.0, 2.0, -40.0]))
+    write_paths(tmp_path / "p.xml", [path], 1000.0, {"ankle.angle": True, "rail.s": False})
+    root = ElementTree.parse(tmp_path / "p.xml").getroot()
+    item = root.find(".//FunctionBasedPath")
+    assert item.get("name") == "/forceset/soleus"
+    assert item.find("coordinate_paths").text.split() == ["/jointset/ankle/angle", "/jointset/rail/s"]
+    assert [float(x) for x in root.find(".//coefficients").text.split()] == pytest.approx([0.3, 2.0, -0.04])
+
+
+def test_opensim_loads_the_file_and_gives_the_same_numbers(tmp_path):
+    # By a module of the package: this folder alone would pass for a namespace package of its name.
+    pytest.importorskip("opensim.simulation")
+    osim = pytest.importorskip("opensim")
+    path = fit_path("m", ("a.x", "b.y"), *made())
+    write_paths(tmp_path / "p.xml", [path], 1000.0, {"a.x": True, "b.y": True})
+    model = osim.Model()
+    parent = model.getGround()
+    coordinates = []
+    for joint, name in (("a", "x"), ("b", "y")):
+        body = osim.Body(f"body_{name}", 1.0, osim.Vec3(0), osim.Inertia(1))
+        pin = osim.PinJoint(joint, parent, body)
+        pin.updCoordinate().setName(name)
+        model.addBody(body)
+        model.addJoint(pin)
+        parent = body
+    muscle = osim.Millard2012EquilibriumMuscle("m", 100.0, 0.05, 0.1, 0.0)
+    muscle.addNewPathPoint("p", model.getGround(), osim.Vec3(0))
+    muscle.addNewPathPoint("q", parent, osim.Vec3(0.1))
+    model.addForce(muscle)
+    model.finalizeConnections()
+    processor = osim.ModelProcessor(model)
+    processor.append(osim.ModOpReplacePathsWithFunctionBasedPaths(str(tmp_path / "p.xml")))
+    model = processor.process()
+    state = model.initSystem()
+    muscle = osim.Muscle.safeDownCast(model.getForceSet().get("m"))
+    coordinates = [model.getCoordinateSet().get(name) for name in "xy"]
+    for values in ([0.0, 0.5], [0.9, 0.3]):
+        for coordinate, value in zip(coordinates, values):
+            coordinate.setValue(state, value)
+        model.realizePosition(state)
+        q = np.array([values])
+        assert muscle.getLength(state) == pytest.approx(path.length(q)[0] / 1000, rel=1e-12)
+        arms = [muscle.computeMomentArm(state, coordinate) for coordinate in coordinates]
+        assert arms == pytest.approx(path.arms(q)[0] / 1000, rel=1e-6)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    found = phantom_scene()
+    found.muscles = [muscle for muscle in found.muscles if muscle.name == "abductor"]
+    return found
+
+
+RANGES = {"hip.flexion": (0.0, 0.4), "hip.adduction": (-0.1, 0.1), "hip.internal_rotation": (-0.1, 0.1)}
+
+
+def test_muscle_is_sampled_over_what_moves_it_and_fitted(scene, tmp_path):
+    told = []
+    (found,) = sample_muscles(scene, RANGES, samples=15, progress=lambda *done: told.append(done))
+    assert found.coordinates == tuple(RANGES) and told[-1] == (15, 15)
+    assert found.values.shape == (15, 3) == found.arms.shape and np.ptp(found.lengths) > 0
+    low, high = np.array(list(RANGES.values())).T
+    assert (found.values >= low).all() and (found.values <= high).all()
+    assert (np.ptp(found.values, axis=0) > 0.8 * (high - low)).all()
+    lines = report_fits(scene, [found], tmp_path, 3)
+    assert "3 poses held out" in lines[0] and (tmp_path / "errors.csv").is_file()
+    assert ElementTree.parse(tmp_path / "paths.xml").getroot().find(".//order").text in "123"
+
+
+def test_a_pose_is_sampled_from_rest_whatever_was_sampled_before(scene):
+    (four,) = sample_muscles(scene, RANGES, samples=4)
+    (two,) = sample_muscles(scene, RANGES, samples=2)
+    # Sobol's sequence is scrambled for its whole length: the same points first, whatever the count.
+    np.testing.assert_allclose(two.values, four.values[:2], rtol=1e-12)
+    np.testing.assert_allclose(two.lengths, four.lengths[:2], rtol=1e-12)
+    np.testing.assert_allclose(two.arms, four.arms[:2], rtol=1e-9)
+
+
+def test_poses_that_fail_are_left_out_and_too_many_are_refused(tmp_path, scene):
+    values, lengths, arms = made(20)
+    lengths[3] = np.nan
+    found = Samples("m", ("hip.flexion", "hip.adduction"), values, lengths, arms)
+    assert "1 poses could not be solved" in report_fits(scene, [found], tmp_path, 2)[0]
+    lengths[:15] = np.nan
+    with pytest.raises(SolveError, match="15 of 20 poses failed"):
+        report_fits(scene, [found], tmp_path, 2)
+
+
+def test_ranges_are_checked(scene):
+    assert parse_ranges(scene, ["flexion=0:90"])["hip.flexion"] == pytest.approx((0.0, np.pi / 2))
+    for text in ("flexion", "flexion=1", "flexion=9:1", "flexion=a:b", "flexion=0:inf"):
+        with pytest.raises(UsageError, match="--range"):
+            parse_ranges(scene, [text])
+
+
+def test_command_refuses_too_few_samples(tmp_path):
+    code = "from rbfmuscle.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "paths", str(tmp_path / "no.toml"), "-o", str(tmp_path), "--samples", "3"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2 and "too few" in done.stderr and len(done.stderr.splitlines()) == 1

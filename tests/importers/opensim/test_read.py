@@ -1,0 +1,219 @@
+"""Models as OpenSim reads them: reference transforms of every model given, and a small one with known answers."""
+
+import json
+
+import numpy as np
+import pytest
+
+import rbfmuscle as rm
+from rbfmuscle.importers.opensim.model import motion_kinds
+from rbfmuscle.importers.opensim.read import read_osim
+from rbfmuscle.importers.opensim.scene import import_osim
+from rbfmuscle.importers.opensim.write import write_scene
+from rbfmuscle.scene.joints.joint import TransformAxis, frame_at, rotation_about
+from rbfmuscle.scene.joints.skeleton import all_coordinates
+from rbfmuscle.scene.motion import bone_poses
+from rbfmuscle.validation import SceneError
+
+MODELS = [
+    "arm26",
+    "arm26_v20303",
+    "bouncing_block",
+    "gait10dof18musc",
+    "gait10dof18musc_v30000",
+    "gait2392_thelen2003muscle",
+    "leg6dof9musc",
+    "subject01",
+    "subject01_simbody_adjusted",
+    "synthetic",
+    "Tug_of_War",
+]
+KINDS = {"rotational": "rotation", "translational": "translation", "coupled": "coupled"}
+
+
+def reference(data, name):
+    found = json.loads((data / "reference" / f"{name}.json").read_text())
+    return next(data.rglob(f"{name}.osim")), found
+
+
+def poses_of(found):
+    """Every recorded pose: coordinates by name and body transforms."""
+    names = [row["name"] for row in found["coordinates"]]
+    sets = [found["default"], *({k: found["poses"][k][i] for k in found["poses"] if k != "moment_arms"}
+                                for i in range(len(found["poses"]["q"])))]  # fmt: skip
+    for entry in sets:
+        matrices = [np.array(row).reshape(3, 4) for row in entry["transforms"]]
+        yield dict(zip(names, entry["q"])), dict(zip(found["bodies"], matrices))
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_body_transforms_are_opensims(osim_data, name):
+    path, found = reference(osim_data, name)
+    model = read_osim(path)
+    kinds = {coordinate: facts.motion for coordinate, facts in model.coordinates().items()}
+    assert kinds == {row["name"]: KINDS[row["motion"]] for row in found["coordinates"]}
+    for values, bodies in poses_of(found):
+        got = model.transforms(values)
+        for body, wanted in bodies.items():
+            assert np.abs(got[body][:3, 3] - wanted[:, 3]).max() <= 1e-8
+            assert np.abs(got[body][:3, :3] - wanted[:, :3]).max() <= 1e-7
+        # Assembly meets couplers to 1e-10.
+        assert all(abs(value - values[n]) < 2e-10 for n, value in model.resolve(values).items())
+
+
+@pytest.mark.parametrize(
+    ("name", "units"), [("leg6dof9musc", "mm"), ("synthetic", "cm"), ("gait10dof18musc", "m")]
+)
+def test_poses_of_the_written_scene_are_opensims(osim_data, tmp_path, name, units):
+    path, found = reference(osim_data, name)
+    imported = import_osim(path, units=units)
+    scene = rm.Scene.load(write_scene(imported, tmp_path), skeleton=True)
+    metre = scene.length(1000.0)
+    facts = all_coordinates(scene.joints)
+    full = {coordinate.split(".")[1]: coordinate for coordinate in facts}
+    for values, bodies in list(poses_of(found))[:20]:
+        asked = {
+            full[n]: v * (metre if facts[full[n]].motion == "translation" else 1.0) for n, v in values.items()
+        }
+        poses = bone_poses(scene, asked)
+        for body, wanted in bodies.items():
+            if imported.names[body] in poses:
+                got = poses[imported.names[body]] @ imported.places[body]
+                assert np.abs(got[:3, 3] / metre - wanted[:, 3]).max() <= 1e-8
+                assert np.abs(got[:3, :3] - wanted[:, :3]).max() <= 1e-7
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_placed_meshes_are_where_opensim_has_them(osim_data, name):
+    path, found = reference(osim_data, name)
+    model = read_osim(path)
+    wanted = {}
+    for row in found.get("meshes", []):
+        key = (row["file"].lower(), row["body"].lower())
+        wanted.setdefault(key, []).append((row["scale"], np.array(row["transform"]).reshape(3, 4)))
+    for mesh in model.meshes:
+        entries = wanted[mesh.file.lower(), mesh.body.lower()]
+        assert any(
+            np.allclose(mesh.scale, scale, atol=1e-9) and np.allclose(mesh.transform[:3], place, atol=1e-9)
+            for scale, place in entries
+        )
+
+
+class TestSmall:
+    def test_known_pose(self, small):
+        model = read_osim(small)
+        got = model.transforms({"hip_angle": 0.3, "knee_angle": -1.0, "slide": 5.0})
+        thigh = rotation_about((0, 0, 1), 0.3, np.zeros(3))
+        assert got["thigh"] == pytest.approx(thigh, abs=1e-15)
+        knee = frame_at((0, -0.4, 0)) @ frame_at((0.03, 0, 0)) @ rotation_about((0, 0, 1), -1.0, np.zeros(3))
+        assert got["shank"] == pytest.approx(thigh @ knee, abs=1e-15)
+        assert got["cap"] == pytest.approx(thigh @ frame_at((-0.08, 0, 0)), abs=1e-15)
+
+    def test_joint_that_closes_a_loop_is_left_out_and_named(self, small):
+        joint = """<PinJoint name="strut"><socket_parent_frame>/ground</socket_parent_frame>
+            <socket_child_frame>shank</socket_child_frame>
+            <coordinates><Coordinate name="strut_angle"><range>-1 1</range></Coordinate></coordinates></PinJoint>"""
+        assert not any("closes a loop" in note for note in read_osim(small).notes)
+        small.write_text(small.read_text().replace("<SliderJoint", joint + "<SliderJoint"))
+        (note,) = [note for note in read_osim(small).notes if "closes a loop" in note]
+        assert "joint 'strut' (ground to shank)" in note
+
+    def test_axis_that_follows_no_coordinate_of_its_joint_is_refused(self, small):
+        old = '<TransformAxis name="translation1"><coordinates>knee_angle<'
+        assert old in small.read_text()
+        small.write_text(small.read_text().replace(old, old.replace("knee_angle", "hip_angle")))
+        with pytest.raises(
+            SceneError, match=r"joint 'knee' .*: an axis follows 'hip_angle', which is no coordinate"
+        ):
+            read_osim(small)
+
+    def test_what_is_not_taken_is_named(self, small):
+        notes = "\n".join(import_osim(small).notes)
+        for text in ("'rail' (PointOnLineConstraint)", "'wedge.obj' is hidden", "'nowhere.vtp' is not there"):
+            assert text in notes
+
+    def test_scene_stands_in_the_default_pose(self, small):
+        found = import_osim(small, units="mm")
+        scene = found.scene
+        assert [bone.name for bone in scene.bones] == ["thigh", "shank"] and scene.links == ["ground", "cap"]
+        knee = scene.joints[1]
+        assert knee.name == "knee" and knee.coordinates["knee_angle"].rest == -0.5
+        shank = scene.bone("shank").mesh
+        place = read_osim(small).transforms()["shank"]
+        wedge = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]]) @ place[:3, :3].T + place[:3, 3]
+        assert np.asarray(shank.vertices).min(axis=0) == pytest.approx(1000 * wedge.min(axis=0))
+        assert all(np.array_equal(pose, np.eye(4)) for pose in bone_poses(scene, {}).values())
+
+    def test_mirrored_mesh_is_outward_and_scaled(self, small):
+        mesh = import_osim(small).scene.bone("thigh").mesh
+        assert mesh.volume == pytest.approx(2 * 0.1**3 / 6)
+        assert mesh.bounds[0][2] == pytest.approx(-0.2)
+
+    def test_only_some_bodies(self, small):
+        scene = import_osim(small, bodies=["thigh"]).scene
+        assert [bone.name for bone in scene.bones] == ["thigh"] and len(scene.joints) == 1
+        with pytest.raises(SceneError, match=r"no body 'thig', did you mean 'thigh'"):
+            import_osim(small, bodies=["thig"])
+
+    @pytest.mark.parametrize(
+        ("old", "new", "message"),
+        [
+            (
+                "<PinJoint",
+                "<EllipsoidJoint",
+                r"joint 'hip' \(ground to thigh\): a EllipsoidJoint is not in the table",
+            ),
+            ("PolynomialFunction", "GCVSpline", "axis 'translation1': .*GCVSpline"),
+            ("/bodyset/shank", "/bodyset/shnk", "no frame '/bodyset/shnk'"),
+            ("0 -0.4 0", "0 x 0", "is no list of numbers"),
+            ("0 -0.4 0", "0 nan 0", "is not finite"),
+            ("<range>-2 0.2</range>", "<range>2 0.2</range>", "goes downwards"),
+            ('<Body name="cap"/>', '<Body name="cap"/><Body name="cap"/>', "two bodies are named 'cap'"),
+            (">knee_angle</independent", ">nobody</independent", "names coordinate 'nobody'"),
+            ("<OpenSimDocument", "<OtherDocument", "no OpenSim model"),
+        ],
+    )
+    def test_what_cannot_be_taken_is_one_line(self, small, old, new, message):
+        text = small.read_text()
+        text = text.replace(old, new).replace(old.replace("<", "</"), new.replace("<", "</"))
+        small.write_text(text)
+        with pytest.raises(SceneError, match=message) as error:
+            read_osim(small)
+        assert "\n" not in str(error.value) and str(small) in str(error.value)
+
+
+def test_ground_may_be_the_child(small):
+    text = small.read_text().replace(
+        "<socket_parent_frame>/ground</socket_parent_frame><socket_child_frame>thigh</socket_child_frame>",
+        "<socket_parent_frame>/bodyset/thigh</socket_parent_frame><socket_child_frame>/ground</socket_child_frame>",
+    )
+    forth = read_osim(small).transforms({"hip_angle": -0.3})
+    small.write_text(text)
+    back = read_osim(small)
+    assert back.transforms({"hip_angle": 0.3})["shank"] == pytest.approx(forth["shank"], abs=1e-15)
+    imported = import_osim(small)
+    pose = bone_poses(imported.scene, {"hip.hip_angle": 0.3})["shank"] @ imported.places["shank"]
+    assert pose == pytest.approx(forth["shank"], abs=1e-14)
+
+
+def test_a_body_keeps_the_meshes_that_can_be_read_beside_one_that_cannot(small):
+    both = '<Mesh name="bad"><mesh_file>bad.obj</mesh_file></Mesh><Mesh name="n">'
+    small.write_text(small.read_text().replace('<Mesh name="n">', both))
+    torn = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 99\n"
+    (small.parent / "bad.obj").write_text(torn)
+    found = import_osim(small)
+    assert [bone.name for bone in found.scene.bones] == ["thigh", "shank"]
+    assert sum("body 'thigh': mesh 'bad.obj' is not taken" in note for note in found.notes) == 1
+    (small.parent / "wedge.obj").write_text(torn)
+    assert not import_osim(small).scene.bones
+
+
+@pytest.mark.parametrize("slot", ["rotation", "translation"])
+@pytest.mark.parametrize("place", [1, 2, 3])
+def test_a_coordinate_is_what_it_drives_alone_with_a_slope_of_one_on_any_axis(slot, place):
+    key = f"{slot}{place}"
+    axes = {key: TransformAxis((0.0, 0.0, 1.0), ("q",))}
+    assert motion_kinds("custom", ["q", "p"], axes, {key: -1.0}) == [slot, "coupled"]
+    assert motion_kinds("custom", ["q", "p"], axes, {key: 0.5}) == ["coupled", "coupled"]
+    shared = {key: TransformAxis((0.0, 0.0, 1.0), ("q", "p"))}
+    assert motion_kinds("custom", ["q", "p"], shared, {key: 1.0}) == ["coupled", "coupled"]

@@ -1,0 +1,215 @@
+"""What a model says wrongly is refused in one line that names it; what is left out is noted."""
+
+import re
+
+import numpy as np
+import pytest
+
+from rbfmuscle.importers.opensim.read import read_osim
+from rbfmuscle.validation import SceneError
+
+
+def changed(path, *pairs):
+    text = path.read_text()
+    for before, after in pairs:
+        assert text.count(before) >= 1, before
+        text = text.replace(before, after, 1)
+    path.write_text(text)
+    return path
+
+
+KNEE_FRAME = "<socket_parent_frame>offset</socket_parent_frame>"
+HIP_CHILD = "<socket_child_frame>thigh</socket_child_frame>"
+POLYNOMIAL = "<PolynomialFunction><coefficients>0.01 0 0</coefficients></PolynomialFunction>"
+COUPLER = "<LinearFunction><coefficients>0.1 0.02</coefficients></LinearFunction>"
+WRONG = {
+    "version": ('Version="40000"', 'Version="four"', "version 'four' is no number"),
+    "no parent": (KNEE_FRAME, "", "joint 'knee': names no parent frame"),
+    "no child": (HIP_CHILD, "", "joint 'hip': names no child frame"),
+    "ring": (
+        "<socket_parent>/bodyset/thigh</socket_parent>",
+        "<socket_parent>../offset</socket_parent>",
+        "frame '/jointset/knee/offset' hangs on itself",
+    ),
+    "axis of another joint": (
+        "<coordinates>knee_angle</coordinates><axis>0 0 2</axis>",
+        "<coordinates>slide</coordinates><axis>0 0 2</axis>",
+        "an axis follows 'slide', which is no coordinate of this joint",
+    ),
+    "axis without direction": (
+        "<axis>0 0 2</axis>",
+        "<axis>0 0 0</axis>",
+        "axis 'rotation1': its direction is zero",
+    ),
+    "axis without function": (
+        '<LinearFunction name="function"><coefficients>1 0</coefficients></LinearFunction>',
+        "",
+        "axis 'rotation1': follows knee_angle by no function",
+    ),
+    "too many slopes": (
+        "<coefficients>1 0</coefficients>",
+        "<coefficients>1 2 0</coefficients>",
+        "a linear function of 2 coordinates, 1 are named",
+    ),
+    "function of nothing": (
+        "<coordinates>knee_angle</coordinates><axis>1 0 0</axis>",
+        "<coordinates/><axis>1 0 0</axis>",
+        "axis 'translation1': a function of a coordinate, and none is named",
+    ),
+    "empty multiplier": (
+        f"<MultiplierFunction><function>{POLYNOMIAL}\n      </function>",
+        "<MultiplierFunction>",
+        "a MultiplierFunction without a function",
+    ),
+    "too few coordinates": (
+        '<Coordinate name="hip_angle"><range>-1 1</range></Coordinate>',
+        "",
+        "a PinJoint has 1 coordinates, 0 are given",
+    ),
+    "half a range": ("<range>-1 1</range>", "<range>-1</range>", "coordinate 'hip_angle': range"),
+    "no number": (
+        "<default_value>-0.5</default_value>",
+        "<default_value>half</default_value>",
+        "coordinate 'knee_angle': default_value",
+    ),
+    "scale of a mesh": (
+        "<scale_factors>1 1 -2</scale_factors>",
+        "<scale_factors>1 1</scale_factors>",
+        "body 'thigh': mesh 'm': scale_factors",
+    ),
+    "coupler without function": (COUPLER, "", "coupler 'follow': has no function"),
+    "coupler of nothing": (
+        "<independent_coordinate_names>knee_angle</independent_coordinate_names>",
+        "",
+        "coupler 'follow': names no coordinates",
+    ),
+    "coupler to nothing": (
+        "<dependent_coordinate_name>slide</dependent_coordinate_name>",
+        "",
+        "coupler 'follow': names no coordinates",
+    ),
+    "spline": (
+        COUPLER,
+        "<SimmSpline><x>0 1</x><y>0</y></SimmSpline>",
+        "SimmSpline needs as many y as x, and x that increase, got 2 and 1",
+    ),
+    "spline downwards": (
+        COUPLER,
+        "<SimmSpline><x>0 0</x><y>0 1</y></SimmSpline>",
+        "x that increase, got 2 and 2",
+    ),
+    "first version": ("<SpatialTransform>", "<TransformAxisSet/><Other>", "is written as OpenSim 1 did"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_wrong_model_is_refused_in_one_line(small, what):
+    before, after, words = WRONG[what]
+    pairs = [(before, after)]
+    if what == "first version":
+        pairs.append(("</SpatialTransform>", "</Other>"))
+    with pytest.raises(SceneError) as error:
+        read_osim(changed(small, *pairs))
+    message = str(error.value)
+    assert words in message
+    assert message.startswith(str(small)) and "\n" not in message
+
+
+def noted(path):
+    return " | ".join(read_osim(path).notes)
+
+
+def test_what_is_not_taken_is_noted_once(small):
+    assert "is scaled to nothing" not in noted(small) and "follows others" not in noted(small)
+    text = noted(
+        changed(
+            small,
+            ("<scale_factors>1 1 -2</scale_factors>", "<scale_factors>1 0 1</scale_factors>"),
+            ("<length_units>meters", "<length_units>furlongs"),
+            ('<Coordinate name="slide"/>', '<Coordinate name="slide"><locked>true</locked></Coordinate>'),
+            ("<range>-1 1</range>", "<prescribed>true</prescribed><default_value>0.25</default_value>"),
+            ('<Mesh name="n">', '<Sphere name="ball"/><Mesh name="n">'),
+        )
+    )
+    for words in (
+        "body 'thigh': mesh 'wedge.obj' is scaled to nothing", "<length_units> says 'furlongs'",
+        "coordinate 'slide' is locked and follows others: it follows",
+        "coordinate 'hip_angle' is prescribed by a function of time: not taken, it stays at 0.25",
+        "body 'thigh': geometry 'ball' is a Sphere, no mesh: not taken",
+        "mesh 'wedge.obj' is hidden", "constraint 'rail' (PointOnLineConstraint) is not taken",
+    ):  # fmt: skip
+        assert text.count(words) == 1, words
+
+
+@pytest.mark.parametrize("switch", ["<isEnforced>false</isEnforced>", "<isDisabled>true</isDisabled>"])
+def test_coupler_that_is_switched_off_couples_nothing(small, switch):
+    assert [c.coordinate for c in read_osim(small).couplings] == ["slide"]
+    assert not read_osim(
+        changed(small, ("<coupled_coordinates_function>", switch + "<coupled_coordinates_function>"))
+    ).couplings
+
+
+def test_scale_of_a_coupler_multiplies_its_function(small):
+    one = read_osim(small).couplings[0]
+    three = read_osim(
+        changed(
+            small,
+            (
+                "<coupled_coordinates_function>",
+                "<scale_factor>3</scale_factor><coupled_coordinates_function>",
+            ),
+        )
+    ).couplings[0]
+    assert three.function(0.7) == pytest.approx(3.0 * one.function(0.7))
+    assert one.function(0.7) == pytest.approx(0.1 * 0.7 + 0.02)
+
+
+def test_a_limit_holds_only_where_it_is_given_and_clamped(small):
+    facts = read_osim(small).coordinates()
+    assert facts["knee_angle"].range == (-2.0, 0.2) and facts["knee_angle"].clamped
+    assert facts["hip_angle"].range == (-1.0, 1.0) and not facts["hip_angle"].clamped
+    assert facts["slide"].range is None and not facts["slide"].clamped
+    facts = read_osim(
+        changed(
+            small,
+            ('<Coordinate name="slide"/>', '<Coordinate name="slide"><clamped>true</clamped></Coordinate>'),
+        )
+    ).coordinates()
+    assert not facts["slide"].clamped
+
+
+@pytest.mark.parametrize("where", ["component set", "component", "within the thigh", "by its path"])
+def test_a_frame_is_the_same_wherever_it_stands(small, where):
+    """The knee's parent frame, moved out of the joint, places the shank where it was."""
+    before = read_osim(small).joints
+    text = small.read_text()
+    frame = re.search(r"<PhysicalOffsetFrame.*?</PhysicalOffsetFrame>", text, flags=re.S)[0]
+    text = text.replace(frame, "")
+    name = "offset"
+    if where == "component set":
+        text = text.replace("<BodySet", f"<ComponentSet><objects>{frame}</objects></ComponentSet><BodySet")
+    elif where == "component":
+        text = text.replace("<BodySet", f"<components>{frame}</components><BodySet", 1)
+    else:
+        inner = frame.replace(
+            "<socket_parent>/bodyset/thigh</socket_parent>", "<socket_parent>..</socket_parent>"
+        )
+        text = text.replace('<Body name="thigh">', f'<Body name="thigh"><components>{inner}</components>')
+        name = "/bodyset/thigh/offset" if where == "within the thigh" else "../../bodyset/thigh/offset"
+    small.write_text(text.replace(KNEE_FRAME, KNEE_FRAME.replace("offset", name)))
+    after = read_osim(small).joints
+    for one, other in zip(before, after, strict=True):
+        assert (one.name, one.parent, one.child) == (other.name, other.parent, other.child)
+        for place in ("parent_frame", "child_frame"):
+            np.testing.assert_allclose(getattr(one, place), getattr(other, place), atol=1e-15)
+
+
+def test_meshes_of_the_ground_are_the_grounds_and_come_once(small):
+    before = [(mesh.body, mesh.file) for mesh in read_osim(small).meshes]
+    geometry = '<attached_geometry><Mesh name="g"><mesh_file>floor.obj</mesh_file></Mesh></attached_geometry>'
+    found = read_osim(
+        changed(small, ('<Ground name="ground"/>', f'<Ground name="ground">{geometry}</Ground>'))
+    )
+    assert sorted((mesh.body, mesh.file) for mesh in found.meshes) == sorted(
+        [*before, ("ground", "floor.obj")]
+    )

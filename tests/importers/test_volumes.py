@@ -1,0 +1,239 @@
+"""Label volumes: positions, names, surfaces without steps, neighbours that share a face, and files that are broken."""
+
+import gzip
+import json
+import sys
+
+import numpy as np
+import pytest
+from command_line import call
+
+from rbfmuscle.geometry.crossing import crossing_faces
+from rbfmuscle.importers.labels import surfaces
+from rbfmuscle.importers.labels.read import LabelVolume, read_labels, read_names
+from rbfmuscle.importers.labels.surfaces import label_surface, smooth_mask
+from rbfmuscle.validation import MeshError, UsageError
+
+nibabel = pytest.importorskip("nibabel")
+nrrd = pytest.importorskip("nrrd")
+
+RADIUS = 20.0
+
+
+def ball_labels(spacing=(1.0, 1.0, 1.0), centre=(24.3, 25.1, 24.7), split=None):
+    """Voxels of a ball of 20 mm; with a plane, its two halves are two labels."""
+    counts = [round(50 / s) for s in spacing]
+    grid = np.stack(np.meshgrid(*[np.arange(n) * s for n, s in zip(counts, spacing)], indexing="ij"), axis=-1)
+    inside = np.linalg.norm(grid - centre, axis=-1) < RADIUS
+    labels = inside.astype(np.int32)
+    if split is not None:
+        labels[inside & ((grid - centre) @ split > 0)] = 2
+    return labels
+
+
+def write_nifti(path, data, affine, unit="mm"):
+    image = nibabel.Nifti1Image(data, affine)
+    image.header.set_xyzt_units(unit)
+    nibabel.save(image, path)
+    return path
+
+
+@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.8, 0.8, 1.5)])
+def test_surface_of_a_ball_is_the_ball(spacing):
+    labels = ball_labels(spacing)
+    volume = LabelVolume(labels, np.diag([*spacing, 1.0]), {1: "ball"}, "ball.nii")
+    surface = label_surface(volume, 1)
+    mesh = surface.mesh
+    radius = np.linalg.norm(mesh.vertices - (24.3, 25.1, 24.7), axis=1)
+    # A quarter of a millimetre is wanted of the leg at voxels of 1; the voxels themselves are 0.3 RMS off.
+    assert np.sqrt(np.mean((radius - RADIUS) ** 2)) < 0.2
+    assert mesh.is_watertight and mesh.euler_number == 2 and mesh.volume > 0
+    assert mesh.volume == pytest.approx(surface.volume, rel=5e-3)
+    outward = mesh.triangles_center - (24.3, 25.1, 24.7)
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    off = np.degrees(np.arccos(np.clip((mesh.face_normals * outward).sum(axis=1), -1, 1)))
+    # Without steps: those of voxels are 31 degrees off RMS and up to 55.
+    assert np.sqrt(np.average(off**2, weights=mesh.area_faces)) < 7.0 and np.percentile(off, 99) < 22.0
+
+
+def test_neighbours_that_share_a_face_neither_overlap_nor_gape():
+    direction = np.array([0.6, 0.64, 0.48])
+    volume = LabelVolume(ball_labels(split=direction), np.eye(4), {}, "halves.nii")
+    centre = np.array([24.3, 25.1, 24.7])
+    heights = []
+    for label in (1, 2):
+        mesh = label_surface(volume, label).mesh
+        place = mesh.vertices - centre
+        inner = np.linalg.norm(place - np.outer(place @ direction, direction), axis=1) < 0.7 * RADIUS
+        flat = inner & (np.abs(place @ direction) < 3.0)
+        assert flat.sum() > 50
+        heights.append(place[flat] @ direction)
+    assert np.abs(np.concatenate(heights)).max() < 1.0 / 3.0  # of a voxel, on either side of the plane
+
+
+@pytest.mark.parametrize(
+    "turn", [np.eye(3), np.diag([-1.0, 1, 1]), np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]]), "oblique"]
+)
+def test_directions_and_units_are_honoured(tmp_path, turn):
+    if isinstance(turn, str):
+        from scipy.spatial.transform import Rotation
+
+        turn = Rotation.from_rotvec([0.3, -0.5, 0.4]).as_matrix()
+    labels = ball_labels(split=np.array([0.0, 0.0, 1.0])).astype(np.int16)
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = turn, [100.0, -50.0, 7.0]
+    centre = affine[:3, :3] @ [24.3, 25.1, 24.7] + affine[:3, 3]
+    files = [write_nifti(tmp_path / "a.nii.gz", labels, affine)]
+    metres = affine.copy()
+    metres[:3] *= 1e-3
+    files.append(write_nifti(tmp_path / "b.nii", labels, metres, unit="meter"))
+    lps = np.diag([-1.0, -1.0, 1.0]) @ affine[:3]
+    header = {"space": "left-posterior-superior", "space directions": lps[:, :3].T, "space origin": lps[:, 3]}
+    nrrd.write(str(tmp_path / "c.nrrd"), labels, header)
+    for file in [*files, tmp_path / "c.nrrd"]:
+        volume = read_labels(file)
+        meshes = [label_surface(volume, label).mesh for label in (1, 2)]
+        assert all(mesh.volume > 0 for mesh in meshes)
+        both = sum(mesh.center_mass * mesh.volume for mesh in meshes) / sum(mesh.volume for mesh in meshes)
+        assert both == pytest.approx(centre, abs=0.05)  # voxels of a ball are not quite symmetric
+        above = (meshes[1].center_mass - meshes[0].center_mass) @ affine[:3, 2]
+        assert above > 10.0
+
+
+def cup_labels(thickness):
+    """Voxels of a part of a hollow ball, as thin as the wing of a pelvis."""
+    grid = np.stack(np.meshgrid(*[np.arange(40.0)] * 3, indexing="ij"), axis=-1) - 19.7
+    wall = np.abs(np.linalg.norm(grid, axis=-1) - 15.2) < thickness / 2
+    return (wall & (grid @ [0.5, 0.6, 0.62] > -8.0)).astype(np.int32)
+
+
+def test_thin_walls_do_not_go_through_themselves(monkeypatch):
+    """Two voxels thick: triangles cross where edges collapsed, and are drawn apart; thinner ones are full of holes."""
+
+    def crossings(thickness):
+        mesh = label_surface(LabelVolume(cup_labels(thickness), np.eye(4), {}, "cup.nii"), 1).mesh
+        return crossing_faces(mesh.vertices, mesh.faces).sum(), mesh
+
+    mended, mesh = crossings(2.0)
+    hopeless, _ = crossings(1.2)
+    assert mended == 0 and mesh.is_watertight and mesh.euler_number == 2
+    assert mesh.volume == pytest.approx(cup_labels(2.0).sum(), rel=5e-3)
+    monkeypatch.setattr(surfaces, "UNTANGLE", 1)
+    assert crossings(2.0)[0] > 0 and hopeless <= crossings(1.2)[0]
+
+
+def test_islands_and_holes_are_told():
+    labels = ball_labels()
+    labels[1:3, 1:3, 1:3] = 1
+    labels[22:26, 22:26, 22:26] = 0
+    surface = label_surface(LabelVolume(labels, np.eye(4), {}, "x.nii"), 1)
+    assert (
+        len(surface.notes) == 2
+        and "1 islands of 8 voxels" in surface.notes[0]
+        and "64 voxels" in surface.notes[1]
+    )
+    assert surface.mesh.euler_number == 2
+
+
+def test_names_from_header_and_tables(tmp_path):
+    labels = ball_labels(split=np.array([1.0, 0, 0])).astype(np.int16)
+    header = {"space": "left-posterior-superior", "space directions": np.eye(3), "space origin": np.zeros(3)}
+    header |= {
+        "Segment0_Name": "femur",
+        "Segment0_LabelValue": "2",
+        "Segment1_Name": "soleus",
+        "Segment1_LabelValue": "1",
+    }
+    nrrd.write(str(tmp_path / "s.seg.nrrd"), labels, header)
+    assert read_labels(tmp_path / "s.seg.nrrd").names == {2: "femur", 1: "soleus"}
+    (tmp_path / "n.json").write_text(json.dumps({"1": "soleus", "2": "tibia"}))
+    (tmp_path / "n.csv").write_text("1,soleus\n2,tibia\n")
+    (tmp_path / "n.txt").write_text('# snap\n1 255 0 0 1 1 1 "soleus"\n2 0 255 0 1 1 1 "tibia"\n')
+    for name in ("n.json", "n.csv", "n.txt"):
+        assert read_names(tmp_path / name) == {1: "soleus", 2: "tibia"}
+    (tmp_path / "none.csv").write_text("nothing\n")
+    with pytest.raises(UsageError, match="names no label"):
+        read_names(tmp_path / "none.csv")
+
+
+def test_folder_of_masks_is_a_volume(tmp_path):
+    labels = ball_labels(split=np.array([1.0, 0, 0])).astype(np.uint8)
+    for value, name in ((1, "soleus"), (2, "tibia")):
+        write_nifti(tmp_path / f"{name}.nii.gz", (labels == value).astype(np.uint8), np.eye(4))
+    volume = read_labels(tmp_path)
+    assert sorted(volume.names.values()) == ["soleus", "tibia"] and len(volume.values()) == 2
+
+
+def test_two_labels_of_one_name_are_two_meshes(tmp_path):
+    from rbfmuscle.cli.new import _write_surfaces
+
+    labels = ball_labels(split=np.array([1.0, 0, 0])).astype(np.int16)
+    source = write_nifti(tmp_path / "a.nii", labels, np.eye(4))
+    (tmp_path / "names.csv").write_text("1,Soleus\n2,soleus\n")
+    folder = _write_surfaces(source, tmp_path / "names.csv", tmp_path / "out")
+    assert sorted(path.name for path in folder.iterdir()) == ["Soleus.ply", "soleus_2.ply"]
+
+
+def _hostile(tmp_path):
+    good = ball_labels(split=np.array([1.0, 0, 0])).astype(np.int16)
+    eye = np.eye(4)
+    yield write_nifti(tmp_path / "nan.nii", np.where(good > 0, np.nan, 0.0), eye), "not finite"
+    yield write_nifti(tmp_path / "one.nii", (good > 0).astype(np.int16), eye), "only one label"
+    yield write_nifti(tmp_path / "empty.nii", np.zeros_like(good), eye), "no voxel has a label"
+    yield write_nifti(tmp_path / "four.nii", np.stack([good, good], axis=-1), eye), "three axes"
+    data = bytearray(write_nifti(tmp_path / "zero.nii", good, eye).read_bytes())
+    data[280:296] = bytes(16)  # the first row of the affine
+    (tmp_path / "zero.nii").write_bytes(data)
+    yield tmp_path / "zero.nii", "voxel"
+    yield write_nifti(tmp_path / "metres.nii", good, np.diag([1e-3, 1e-3, 1e-3, 1])), "metres"
+    yield write_nifti(tmp_path / "image.nii", good + 0.5, eye), "between whole numbers"
+    many = np.arange(13**3, dtype=np.int16).reshape(13, 13, 13)
+    yield write_nifti(tmp_path / "many.nii", many, eye), "at most 512"
+    write_nifti(tmp_path / "whole.nii.gz", good, eye)
+    data = (tmp_path / "whole.nii.gz").read_bytes()
+    (tmp_path / "cut.nii.gz").write_bytes(data[: len(data) // 2])
+    yield tmp_path / "cut.nii.gz", "no readable NIfTI"
+    (tmp_path / "garbage.nii").write_bytes(b"\x01" * 400)
+    yield tmp_path / "garbage.nii", "no readable NIfTI"
+    (tmp_path / "garbage.nrrd").write_bytes(b"NRRD0004\n\n" + gzip.compress(b"x"))
+    yield tmp_path / "garbage.nrrd", "no readable NRRD"
+    write_nifti(tmp_path / "swapped.nii", good.astype(">i2").view("<i2"), eye)
+    yield tmp_path / "swapped.nii", "swapped"
+
+
+def test_hostile_volumes_end_in_one_line_and_code_4(tmp_path, capsys):
+    for path, words in _hostile(tmp_path):
+        code, out, err = call(capsys, "new", path, "-o", tmp_path / "out" / "scene.toml")
+        assert code == 4 and out == "", (path.name, err)
+        assert len(err.strip().splitlines()) == 1 and path.name in err and words in err, (path.name, err)
+
+
+def test_a_volume_larger_than_the_limit_is_refused_unread(tmp_path):
+    header = nibabel.Nifti1Header()
+    header.set_data_dtype(np.int32)
+    header.set_data_shape((4000, 4000, 4000))
+    with (tmp_path / "huge.nii").open("wb") as file:
+        header.write_to(file)
+    with pytest.raises(MeshError, match="bytes unpacked, at most"):
+        read_labels(tmp_path / "huge.nii")
+
+
+def test_without_the_reader_the_message_names_the_extra(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "nibabel", None)
+    (tmp_path / "a.nii").write_bytes(b"")
+    code, _, err = call(capsys, "new", tmp_path / "a.nii")
+    assert code == 7 and "'.[labels]'" in err
+
+
+def test_smoothing_treats_inside_and_outside_alike():
+    """The field of what is left out is the field with the other sign; a plane stays half-way between voxels."""
+    mask = np.zeros((12, 10, 9), dtype=bool)
+    mask[3:9, 2:7, 3:6] = True
+    mask[5, 4, 6] = True
+    np.testing.assert_allclose(smooth_mask(~mask), -smooth_mask(mask), atol=1e-6)
+    half = np.zeros((12, 4, 4), dtype=bool)
+    half[:6] = True
+    field = smooth_mask(half)
+    np.testing.assert_allclose(field[5], -field[6], atol=1e-6)
+    assert (field[:6] > 0).all() and (field[6:] < 0).all()
+    np.testing.assert_allclose(field, field[:, :1, :1] * np.ones_like(field), atol=1e-6)

@@ -1,0 +1,459 @@
+"""Metrics against known answers: spheres, boxes, cylinders, a string over a pulley."""
+
+import math
+from types import SimpleNamespace
+
+import igl
+import numpy as np
+import pytest
+import trimesh
+
+from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
+from rbfmuscle.metrics.centreline import Centreline, MuscleAtRest, slice_operator, split_ends
+from rbfmuscle.metrics.mesh_distance import MeshDistance
+from rbfmuscle.metrics.metrics import MuscleMeasures, edge_strain, surface_distance
+from rbfmuscle.metrics.moment_arms import moment_arms
+from rbfmuscle.metrics.occupancy import OccupancyGrid
+from rbfmuscle.metrics.penetration import (
+    BoneProbe,
+    bone_depth,
+    bones_about,
+    surface_depth,
+)
+from rbfmuscle.metrics.recorder import MetricsRecorder
+from rbfmuscle.metrics.topology import SurfaceForm, count_components
+from rbfmuscle.scene.joints.joint import Coordinate
+from rbfmuscle.scene.motion import Motion
+from rbfmuscle.simulation.frame_loop import Event, Frame, ModelSurface
+
+EYE = np.eye(4)
+
+
+def arrays(mesh):
+    return np.array(mesh.vertices), np.array(mesh.faces)
+
+
+def turned(angle, axis, centre=(0, 0, 0)):
+    return trimesh.transformations.rotation_matrix(angle, axis, centre)
+
+
+@pytest.fixture(scope="module")
+def blob():
+    """A bumpy closed surface, so that nothing is symmetric by chance."""
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=10.0)
+    v = np.array(mesh.vertices)
+    bump = 1 + 0.2 * np.sin(0.7 * v[:, 0]) * np.cos(0.5 * v[:, 1] + 0.3) + 0.1 * np.sin(0.9 * v[:, 2])
+    return trimesh.Trimesh(v * bump[:, None] * [1.6, 1.0, 0.7], mesh.faces, process=False)
+
+
+class TestVolume:
+    def test_box_is_exact_far_from_the_origin(self):
+        vertices, faces = arrays(trimesh.creation.box((2, 3, 5)))
+        assert mesh_volume(vertices + 1e6, faces) == pytest.approx(30, rel=1e-9)
+
+    def test_ellipsoid_comes_near_the_formula_from_below(self):
+        vertices, faces = arrays(trimesh.creation.icosphere(subdivisions=5))
+        volume = mesh_volume(vertices * [4, 2, 1], faces)
+        exact = 4 / 3 * math.pi * 8
+        # An inscribed icosphere of 20480 faces lacks 0.07 %.
+        assert 0.999 * exact < volume < exact
+
+    def test_inward_faces_are_negative(self):
+        vertices, faces = arrays(trimesh.creation.box((1, 1, 1)))
+        assert mesh_volume(vertices, faces[:, ::-1]) == pytest.approx(-1)
+
+
+class TestOccupancy:
+    @pytest.mark.parametrize("cells", [5, 20, 64])
+    def test_no_inner_point_is_left_out(self, blob, cells):
+        points = np.random.default_rng(1).uniform(*blob.bounds, size=(4000, 3))
+        inside = np.flatnonzero(igl.signed_distance(points, *arrays(blob))[0] < 0)
+        assert np.isin(inside, OccupancyGrid(*arrays(blob), cells=cells).candidates(points)).all()
+
+    def test_most_outer_points_are_left_out(self, blob):
+        points = np.random.default_rng(2).uniform(*blob.bounds, size=(4000, 3))
+        outside = igl.signed_distance(points, *arrays(blob))[0] > 0
+        candidates = OccupancyGrid(*arrays(blob), cells=64).candidates(points)
+        assert outside[candidates].sum() < 0.2 * outside.sum()
+
+    @pytest.mark.parametrize("axis", [0, 1, 2])
+    def test_nothing_beyond_the_grid_is_a_candidate_however_near(self, blob, axis):
+        grid = OccupancyGrid(*arrays(blob), cells=16)
+        ends = grid.origin, grid.origin + np.array(grid.state.shape) * grid.spacing
+        middle = 0.5 * (ends[0] + ends[1])
+        points = np.tile(middle, (6, 1))
+        for k, beyond in enumerate((1e-9, 0.3, 5.0)):
+            points[k, axis] = ends[0][axis] - beyond * grid.spacing
+            points[3 + k, axis] = ends[1][axis] + beyond * grid.spacing
+        assert len(grid.candidates(points)) == 0 and len(grid.candidates(middle[None])) == 1
+
+    @pytest.mark.parametrize("scale", [2.0**-10, 1.0, 2.0**10])
+    def test_slanted_triangles_mark_only_cells_that_they_meet(self, scale):
+        corners = scale * np.vstack([np.eye(3), -np.eye(3)])
+        octahedron = trimesh.convex.convex_hull(corners)
+        grid = OccupancyGrid(*arrays(octahedron), cells=32)
+        points = scale * np.random.default_rng(9).uniform(-1.0, 1.0, (3000, 3))
+        above = np.abs(points).sum(axis=1) - scale
+        found = np.isin(np.arange(3000), grid.candidates(points))
+        assert found[above < 0.0].all() and not found[above > 4.0 * grid.spacing].any()
+
+    @pytest.mark.parametrize("scale", [2.0**-10, 2.0**10])
+    def test_candidates_are_the_same_in_any_unit(self, blob, scale):
+        vertices, faces = arrays(blob)
+        points = np.random.default_rng(6).uniform(*(1.2 * blob.bounds), size=(2000, 3))
+        found = OccupancyGrid(vertices, faces, cells=24).candidates(points)
+        same = OccupancyGrid(scale * vertices, faces, cells=24).candidates(scale * points)
+        np.testing.assert_array_equal(same, found)
+
+    def test_large_triangles_mark_only_cells_that_they_meet(self):
+        grid = OccupancyGrid(*arrays(trimesh.creation.box((1, 1, 1))), cells=16)
+        far = np.array([[0.7, 0.7, 0.7], [0.0, 0.0, 0.66]])
+        assert len(grid.candidates(far)) == 0
+        assert len(grid.candidates(np.zeros((1, 3)))) == 1
+
+
+class TestMeshDistance:
+    @pytest.mark.parametrize("spread", [1e-6, 0.1, 3.0])
+    def test_equals_libigl(self, blob, spread):
+        rng = np.random.default_rng(3)
+        points = np.array(blob.vertices) + rng.normal(scale=spread, size=blob.vertices.shape)
+        expected = igl.signed_distance(points, *arrays(blob))[0]
+        # Near zero both round a squared distance.
+        np.testing.assert_allclose(MeshDistance(*arrays(blob)).signed(points), expected, atol=1e-9)
+
+    def test_box_feature_by_feature(self):
+        distance = MeshDistance(*arrays(trimesh.creation.box((2, 2, 2))))
+        points = np.array([[1.5, 0.1, 0.2], [2, 2, 0], [2, 2, 2], [0.9, 0, 0.05], [0.9, 0.9, 0.9]])
+        expected = [0.5, math.sqrt(2), math.sqrt(3), -0.1, -0.1]
+        np.testing.assert_allclose(distance.signed(points), expected, atol=1e-12)
+
+    def test_deepest_point_is_not_believed_at_a_fold(self):
+        # A flap folded flat onto the outside: the layers above it look like the inside from one face.
+        box = trimesh.creation.box((2, 2, 2))
+        vertices, faces = arrays(box)
+        top = np.flatnonzero((vertices[faces][:, :, 2] > 0).all(axis=1))[0]
+        a, b, c = faces[top]
+        extra = np.array([[0.3, 0.3, 1.0], [-0.3, 0.3, 1.0]]) + vertices[[a, b, c]].mean(axis=0) * [1, 1, 0]
+        vertices = np.vstack([vertices, extra])
+        p, q = len(vertices) - 2, len(vertices) - 1
+        folded = [[a, b, p], [b, q, p], [b, c, q], [c, p, q], [c, a, p]]
+        faces = np.vstack([np.delete(faces, top, axis=0), folded])
+        above = np.random.default_rng(4).uniform([-1, -1, 1.01], [1, 1, 1.6], size=(300, 3))
+        assert MeshDistance(vertices, faces).depth(above).max() == 0.0
+
+    def test_open_bone_is_judged_by_winding_number(self):
+        sphere = trimesh.creation.icosphere(subdivisions=4)
+        hole = sphere.triangles_center[:, 2] > 0.97
+        vertices, faces = np.array(sphere.vertices), np.array(sphere.faces)[~hole]
+        distance = MeshDistance(vertices, faces, closed=False)
+        assert distance.signed([[0, 0, -0.5]])[0] == pytest.approx(-0.5, abs=5e-3)  # polyhedron, not sphere
+        assert distance.signed([[0, 0, -1.5]])[0] == pytest.approx(0.5, abs=5e-3)
+
+
+class TestPenetration:
+    def test_sphere_into_a_moved_box(self):
+        sphere = trimesh.creation.icosphere(subdivisions=4, radius=5.0)
+        probe = BoneProbe("bone", trimesh.creation.box((20, 20, 20)))
+        pose = turned(0.3, (0, 0, 1))
+        pose[:3, 3] = [0, 0, -13.8]  # the top of the box at z = -3.8: the pole is 1.2 deep
+        depth = surface_depth(np.array(sphere.vertices), [probe], {"bone": pose})
+        assert depth.max() == pytest.approx(1.2, abs=1e-9)
+        assert np.count_nonzero(depth) == np.count_nonzero(sphere.vertices[:, 2] < -3.8)
+
+    def test_bone_corner_in_a_muscle_that_no_muscle_vertex_shows(self):
+        block = trimesh.creation.box((40, 40, 10))
+        spike = trimesh.creation.cone(radius=1.0, height=6.0)  # apex at z = 6
+        pose = np.eye(4)
+        pose[:3, 3] = [3.3, 4.1, -9.0]  # apex at z = -3, that is 2 above the block's lower face
+        probes = [BoneProbe("spike", spike)]
+        assert surface_depth(np.array(block.vertices), probes, {"spike": pose}).max() == 0
+        assert bone_depth(*arrays(block), probes, {"spike": pose}) == pytest.approx(2.0, abs=1e-9)
+
+    def test_equals_the_plain_way(self, blob):
+        bone = trimesh.creation.icosphere(subdivisions=4, radius=6.0)
+        pose = turned(0.4, (1, 2, 3))
+        pose[:3, 3] = [9, 4, 3]
+        moved = bone.copy().apply_transform(pose)
+        probes = [BoneProbe("bone", bone)]
+        v, f = arrays(blob)
+        expected = max(0, -igl.signed_distance(np.array(moved.vertices), v, f)[0].min())
+        assert bone_depth(v, f, probes, {"bone": pose}) == pytest.approx(expected, rel=1e-9)
+        known = MeshDistance(v, f)
+        assert bone_depth(v, f, probes, {"bone": pose}, distance=known) == pytest.approx(expected, rel=1e-9)
+        expected = np.maximum(0, -igl.signed_distance(v, *arrays(moved))[0])
+        np.testing.assert_allclose(surface_depth(v, probes, {"bone": pose}), expected, atol=1e-9)
+
+    def test_bones_elsewhere_are_not_asked(self):
+        rng = np.random.default_rng(8)
+        probes = [BoneProbe(f"bone {k}", trimesh.creation.box((30, 4, 8))) for k in range(40)]
+        poses = {}
+        for probe in probes:
+            poses[probe.name] = turned(rng.uniform(0, 3), rng.normal(size=3))
+            poses[probe.name][:3, 3] = rng.uniform(-25, 25, 3)
+        ball = trimesh.creation.icosphere(subdivisions=3, radius=7.0)
+        near = bones_about(*ball.bounds, probes, poses)
+        assert 0 < len(near) < len(probes)
+        for probe in probes:
+            moved = trimesh.Trimesh(probe.vertices, probe.faces).apply_transform(poses[probe.name])
+            inside = moved.contains(np.array(ball.vertices)).any()
+            assert probe in near or not inside
+
+    def test_deep_points_are_as_deep_as_they_are(self):
+        ball = trimesh.creation.icosphere(subdivisions=5, radius=50.0)
+        probes = [BoneProbe("bone", trimesh.creation.icosphere(subdivisions=1, radius=1.0))]
+        depth = bone_depth(*arrays(ball), probes, {"bone": EYE})
+        assert 48.9 < depth < 49.0  # facets lie just within the sphere
+
+
+class TestMeshMeasures:
+    def test_components_ignore_unused_vertices(self):
+        vertices, faces = arrays(trimesh.creation.icosphere(subdivisions=1))
+        two = np.vstack([faces, faces + len(vertices)])
+        assert count_components(len(vertices), faces) == 1
+        assert count_components(2 * len(vertices) + 3, two) == 2
+
+    def test_form_is_looked_for_again_where_it_can_have_changed(self):
+        ball = trimesh.creation.icosphere(subdivisions=2)
+        one = ModelSurface(np.array(ball.vertices), np.array(ball.faces))
+        folded = ModelSurface(one.vertices * np.where(one.vertices[:, :1] > 0.3, -1.0, 1.0), one.faces)
+        torus = trimesh.creation.torus(3.0, 1.0)
+        other = ModelSurface(np.array(torus.vertices), np.array(torus.faces))
+        moved = ModelSurface(folded.vertices + 5.0, one.faces, origin=(folded, np.eye(4)))
+        form = SurfaceForm()
+        found = [form.measure(surface) for surface in (one, folded, moved, other)]
+        assert [m["euler"] for m in found] == [2, 2, 2, 0]
+        assert found[0]["self_crossing"] == 0 < found[1]["self_crossing"]
+        assert found[2] == found[1]
+        assert found[3]["self_crossing"] == 0
+
+    @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+    def test_strain_knows_no_unit(self, scale):
+        vertices, faces = arrays(trimesh.creation.icosphere(subdivisions=1))
+        edges = unique_edges(faces)
+        rest, moved = scale * vertices, scale * vertices * [1.1, 0.9, 1.0]
+        found = edge_strain(moved, edges, edge_lengths(rest, edges))
+        assert found == pytest.approx(
+            edge_strain(moved / scale, edges, edge_lengths(vertices, edges)), rel=1e-12
+        )
+        assert 0.01 < found < 0.1
+
+    def test_strain_of_a_stretch(self):
+        vertices, faces = arrays(trimesh.creation.icosphere(subdivisions=2))
+        edges = unique_edges(faces)
+        assert len(edges) == len(faces) * 3 // 2
+        assert edge_strain(1.25 * vertices, edges, edge_lengths(vertices, edges)) == pytest.approx(0.25)
+
+    def test_distance_of_concentric_spheres(self):
+        small = trimesh.creation.icosphere(subdivisions=4, radius=10.0)
+        large = trimesh.creation.icosphere(subdivisions=4, radius=10.5)
+        rms, worst = surface_distance(*arrays(small), *arrays(large))
+        assert rms == pytest.approx(0.5, abs=0.02)  # sagitta of the triangles
+        assert worst == pytest.approx(0.5, abs=0.02)
+
+
+def rod(length=100.0, radius=8.0, rings=60, around=24):
+    """A closed cylinder along x from 0 to ``length``, with many rings, and its Trimesh."""
+    x = np.linspace(0, length, rings)
+    angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
+    ring = np.stack([np.zeros(around), radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    vertices = np.concatenate([ring + [place, 0, 0] for place in x] + [[[0, 0, 0], [length, 0, 0]]])
+    k, j = np.meshgrid(np.arange(rings - 1), np.arange(around), indexing="ij")
+    a, b = k * around + j, k * around + (j + 1) % around
+    sides = np.concatenate([np.stack([a, b, b + around], -1), np.stack([a, b + around, a + around], -1)])
+    first, last = np.arange(around), (rings - 1) * around + np.arange(around)
+    caps = [
+        np.stack([np.full(around, len(vertices) - 2), np.roll(first, -1), first], -1),
+        np.stack([np.full(around, len(vertices) - 1), last, np.roll(last, -1)], -1),
+    ]
+    return trimesh.Trimesh(vertices, np.concatenate([sides.reshape(-1, 3), *caps]), process=False)
+
+
+def rod_muscle(mesh, length=100.0):
+    ends = [("trunk", mesh.vertices[:, 0] == 0), ("limb", mesh.vertices[:, 0] == length)]
+    attachments = [SimpleNamespace(bone=bone, vertices=np.flatnonzero(where)) for bone, where in ends]
+    return SimpleNamespace(name="rod", mesh=mesh, attachments=attachments, contraction=None)
+
+
+BEND = {"bend": Coordinate()}
+JOINTS = [SimpleNamespace(name="joint", parent="trunk", child="limb", coordinates=BEND)]
+
+
+class TestLength:
+    def test_straight_cylinder(self):
+        mesh = rod()
+        assert mesh.volume > 0
+        line = Centreline(MuscleAtRest(rod_muscle(mesh), JOINTS, *arrays(mesh)))
+        assert line.length(np.array(mesh.vertices), {"trunk": EYE, "limb": EYE}) == pytest.approx(
+            100, abs=1e-6
+        )
+
+    def test_ends_do_not_follow_small_triangles(self):
+        """One side of the end's cap has sixteen times as many triangles; the line ends in the middle all the same."""
+        mesh = rod()
+        vertices, faces = arrays(mesh)
+        for _ in range(2):
+            middle = vertices[faces].mean(axis=1)
+            cap = np.flatnonzero((middle[:, 0] == 100) & (middle[:, 1] > 0))
+            vertices, faces = trimesh.remesh.subdivide(vertices, faces, face_index=cap)
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        held = vertices[vertices[:, 0] == 100, 1]
+        assert held.mean() > 2  # where there are more
+        line = Centreline(MuscleAtRest(rod_muscle(mesh), JOINTS, *arrays(mesh)))
+        last = line.points(vertices, {"trunk": EYE, "limb": EYE})[-1]
+        assert last == pytest.approx([100, 0, 0], abs=0.6)  # the new ones on the rim have no side faces
+
+    def test_stretch_is_followed(self):
+        mesh = rod()
+        line = Centreline(MuscleAtRest(rod_muscle(mesh), JOINTS, *arrays(mesh)))
+        pose = np.eye(4)
+        pose[0, 3] = 30.0
+        stretched = np.array(mesh.vertices) * [1.3, 0.9, 0.9]
+        assert line.length(stretched, {"trunk": EYE, "limb": pose}) == pytest.approx(130, abs=1e-6)
+
+    def test_bent_cylinder_has_its_arc(self):
+        mesh, radius = rod(), 60.0
+        line = Centreline(MuscleAtRest(rod_muscle(mesh), JOINTS, *arrays(mesh)))
+        v = np.array(mesh.vertices)
+        angle = v[:, 0] / radius
+        bent = np.stack([(radius + v[:, 1]) * np.sin(angle), (radius + v[:, 1]) * np.cos(angle), v[:, 2]], 1)
+        pose = turned(-100 / radius, (0, 0, 1))
+        pose[:3, 3] = [radius * np.sin(100 / radius), radius * np.cos(100 / radius), 0]
+        pose[:3, 3] -= pose[:3, :3] @ [100, 0, 0]
+        start = np.eye(4)
+        start[1, 3] = radius
+        # 17 chords of an arc of 95 degrees are 0.04 % short.
+        assert line.length(bent, {"trunk": start, "limb": pose}) == pytest.approx(100, rel=3e-3)
+
+    def test_bones_whose_joint_rests_are_one_end(self):
+        rows = [("tibiofibular", "tibia", "fibula"), ("ankle", "tibia", "talus"), ("knee", "femur", "tibia")]
+        joints = [SimpleNamespace(name=n, parent=p, child=c, coordinates=BEND) for n, p, c in rows]
+        soleus = SimpleNamespace(attachments=[SimpleNamespace(bone=b) for b in ("fibula", "tibia", "talus")])
+
+        def ends(moving):
+            return [[a.bone for a in group] for group in split_ends(soleus, joints, moving)]
+
+        assert ends({"ankle"}) == ends({"ankle", "knee"}) == [["fibula", "tibia"], ["talus"]]
+        # Where nothing moves its ends against each other, they are those of joints that all might move.
+        assert ends({"knee"}) == ends(None) == [["fibula"], ["tibia", "talus"]]
+
+    def test_slice_rows_sum_to_one_and_hit_the_level(self):
+        mesh = rod()
+        v, f = arrays(mesh)
+        operator = slice_operator(v, f, v[:, 0], [12.3, 50.0001, 99.0])
+        np.testing.assert_allclose(np.asarray(operator.sum(axis=1)).ravel(), 1)
+        np.testing.assert_allclose((operator @ v)[:, 0], [12.3, 50.0001, 99.0])
+        np.testing.assert_allclose((operator @ v)[:, 1:], 0, atol=1e-9)
+
+
+class TestMomentArm:
+    def arms(self, angles, lengths, name="joint.bend"):
+        return [found.get(name) for found in moment_arms([{name: a} for a in angles], lengths)]
+
+    def test_string_over_a_pulley_has_the_pulleys_radius(self):
+        angles = np.radians([0, 5, 10, 20, 40])
+        assert self.arms(angles, 200 + 23.5 * angles) == pytest.approx([-23.5] * 5)
+
+    def test_parabola_has_its_slope_however_the_steps_are(self):
+        angles = np.array([0.1, 0.2, 0.5])
+        assert self.arms(angles, 3 * angles**2 - angles)[1] == pytest.approx(-(6 * 0.2 - 1))
+        angles = np.cumsum(np.radians([0.0, 1.0, 0.3, 2.0, 0.7, 1.1, 0.2, 3.0, 1.0]))
+        assert self.arms(angles, 3 * angles**2 - angles) == pytest.approx(-(6 * angles - 1), rel=1e-6)
+
+    def test_ripple_of_lengths_is_smoothed_where_frames_are_near(self):
+        angles = np.radians(np.arange(41.0))
+        ripple = 0.05 * np.random.default_rng(2).normal(size=len(angles))
+        arms = np.array(self.arms(angles, 40.0 * np.cos(angles) + ripple))
+        plain = -np.gradient(40.0 * np.cos(angles) + ripple, angles)
+        away, before = arms - 40.0 * np.sin(angles), plain - 40.0 * np.sin(angles)
+        assert np.abs(away[8:-8]).max() < 0.2 * np.abs(before[8:-8]).max()
+
+    def test_turning_point_takes_the_way_there(self):
+        assert self.arms([0.2, 0.3, 0.2], [10, 11, 10.4])[1] == pytest.approx(-10)
+
+    def test_two_coordinates_at_once_give_none(self):
+        assert moment_arms([{"a": 0.0, "b": 0.0}, {"a": 0.1, "b": 0.1}], [1.0, 1.2]) == [{}, {}]
+
+    def test_each_leg_of_a_path_has_its_coordinate(self):
+        found = moment_arms([{"a": 0.0}, {"a": 0.1}, {"a": 0.1, "b": 0.2}], [1.0, 1.1, 1.5])
+        assert found[1] == {"a": pytest.approx(-1.0), "b": pytest.approx(-2.0)}
+
+    def test_unknown_lengths_and_rest_give_none(self):
+        assert self.arms([0.0, 0.1, 0.2, 0.2], [1.0, np.nan, 2.0, 2.0]) == [None] * 4
+
+
+class TestRecorder:
+    @pytest.fixture
+    def scene(self):
+        mesh = rod()
+        block = trimesh.creation.box((10, 10, 10))
+        block.apply_translation([50, 0, -12])
+        bones = [SimpleNamespace(name="trunk", mesh=block), SimpleNamespace(name="limb", mesh=block.copy())]
+        bones[1].mesh.apply_translation([500, 0, 0])
+        frames = [{"joint.bend": a} for a in (0.0, 0.1, 0.2)]
+        return SimpleNamespace(
+            units="cm",
+            motion=Motion(frames),
+            bones=bones,
+            couplings=[],
+            joints=JOINTS,
+            muscles=[rod_muscle(mesh)],
+        )
+
+    def frame(self, scene, index):
+        """The rod stretched by 10 cm a radian, the limb going with it."""
+        angle = 0.1 * index
+        pose = np.eye(4)
+        pose[0, 3] = 10 * angle
+        mesh = scene.muscles[0].mesh
+        vertices = np.array(mesh.vertices) * [1 + 0.1 * angle, 1, 1]
+        surface = ModelSurface(vertices, np.array(mesh.faces), {"condition": 7.0, "time_fit": 0.25})
+        events = [Event(index, "rod", "trunk", 3, "unresolved"), Event(index, "rod", "trunk", 5, "rotated")]
+        poses = {"trunk": EYE, "limb": pose}
+        times = {"rod": {"time_predict": 0.5, "time_solve": 1.0, "time_frame": 2.0}}
+        carried = {"rod": (vertices, np.array(mesh.faces))}
+        return Frame(index, {"joint.bend": angle}, poses, {"rod": surface}, carried, events, times, 3.0)
+
+    def rows(self, scene):
+        measures, recorder = (
+            MuscleMeasures(scene, {"rod": arrays(scene.muscles[0].mesh)}),
+            MetricsRecorder(scene),
+        )
+        frames = [self.frame(scene, k) for k in range(3)]
+        return [row for f in frames for row in recorder.add(f, measures.measure(f))] + recorder.finish()
+
+    def test_values_units_and_order(self, scene):
+        rows = self.rows(scene)
+        for arms in (False, True):  # those of all frames come last
+            frames = [r.frame for r in rows if (r.quantity == "moment_arm") == arms]
+            assert frames == sorted(frames)
+        assert {r.coordinate for r in rows} == {"joint.bend"}
+        at = {(r.frame, r.muscle, r.quantity): r for r in rows}
+        assert at[2, "rod", "volume_error"].value == pytest.approx(0.02)
+        assert at[2, "rod", "volume"].unit == "cm^3"
+        # A face of the rod's 24-sided section reaches 8 cm down, the block's top stands at -7.
+        assert at[0, "rod", "penetration_max"].value == pytest.approx(1.0)
+        assert at[1, "rod", "length"].value == pytest.approx(101.0)
+        assert [at[k, "rod", "moment_arm"].value for k in range(3)] == pytest.approx([-10.0] * 3)
+        assert at[1, "rod", "moment_arm"].unit == "cm"
+        assert at[1, "rod", "tunnelled"].value == 3
+        assert at[1, "rod", "time_solve"].value == 1.5
+        assert at[1, "all", "time_frame"].value == 3.0
+        assert at[1, "rod", "tunnelled"].angle == pytest.approx(math.degrees(0.1))
+
+    def test_rest_error_is_of_the_first_frame_at_rest_only(self, scene):
+        rows = [r for r in self.rows(scene) if r.quantity.startswith("rest_error")]
+        assert [(r.frame, r.value) for r in rows] == [(0, 0.0), (0, 0.0)]
+
+    def test_rigid_motion_changes_nothing(self, scene):
+        measures = MuscleMeasures(scene, {"rod": arrays(scene.muscles[0].mesh)})
+        move = turned(1.1, (1, -2, 0.5), (3, 1, 4))
+        move[:3, 3] += [1000, -2000, 500]
+        frame = self.frame(scene, 0)
+        moved = self.frame(scene, 0)
+        moved.poses = {name: move @ pose for name, pose in moved.poses.items()}
+        vertices = trimesh.transform_points(frame.surfaces["rod"].vertices, move)
+        moved.surfaces = {"rod": ModelSurface(vertices, frame.surfaces["rod"].faces, {})}
+        moved.carried = {"rod": (vertices, frame.carried["rod"][1])}
+        before, after = (measures.measure(each)["rod"].values for each in (frame, moved))
+        for name in ("volume", "penetration_max", "penetration_fraction", "length", "components"):
+            assert after[name] == pytest.approx(before[name], rel=1e-8)

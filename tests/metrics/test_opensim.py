@@ -1,0 +1,63 @@
+"""Motions from OpenSim; moment arms and the sum rule."""
+
+import math
+
+import numpy as np
+import pytest
+from blend_model import arm_scene, use_blend_model
+
+from rbfmuscle.run import simulate
+from rbfmuscle.scene.motion import Motion
+from rbfmuscle.scene.options import MotionOptions
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A saved run: the run in memory and its folder."""
+    folder = tmp_path_factory.mktemp("run")
+    with pytest.MonkeyPatch.context() as patch:
+        use_blend_model(patch)
+        made = simulate(arm_scene(end=60, step=2))
+    made.save(folder, pictures=False)
+    return made, folder
+
+
+def test_arms_sum_to_the_change_of_length(run):
+    """l(q) = l(0) - integral r dq, trapezoidal; 1 % of the greatest change, as one-sided ends err."""
+    made, _ = run
+    for muscle in made.scene.muscles:
+        length, arm = made.values(muscle.name, "length"), made.values(muscle.name, "moment_arm")
+        name = made.scene.motion.coordinates[0]
+        angle = np.array([frame.coordinates.get(name, 0.0) for frame in made.frames])
+        change = -np.cumsum(0.5 * (arm[1:] + arm[:-1]) * np.diff(angle))
+        worst = np.abs(length[1:] - length[0] - change).max()
+        assert worst <= 0.01 * np.abs(length - length[0]).max()
+
+
+@pytest.mark.parametrize(("degrees", "factor"), [("yes", math.pi / 180), ("no", 1.0)])
+def test_motion_file_honours_in_degrees(tmp_path, degrees, factor):
+    scene = arm_scene()
+    joint = scene.joints[0]
+    name = next(iter(joint.axes))
+    text = f"m\nversion=1\nnRows=2\nnColumns=2\ninDegrees={degrees}\nendheader\ntime\t{name}\n0\t0\n1\t0.75\n"
+    (tmp_path / "a.mot").write_text(text)
+    motion = Motion.from_options(MotionOptions(file="a.mot"), scene.joints, folder=tmp_path)
+    assert [frame[f"{joint.name}.{name}"] for frame in motion.frames] == pytest.approx([0.0, 0.75 * factor])
+
+
+def test_arms_of_the_real_hip_have_the_right_signs_and_sum(hip_scene):
+    """Gluteus maximus and medius extend, the iliacus flexes; the adductor brevis flexes first, then extends."""
+    wanted = {
+        "gluteus_maximus": (-1, -1),
+        "gluteus_medius": (-1, -1),
+        "iliacus": (1, 1),
+        "adductor_brevis": (1, -1),
+    }
+    made = simulate(hip_scene, settings={"output.surfaces": False}, frames="0:46:3")
+    angle = np.array([frame.coordinates["hip.flexion"] for frame in made.frames])
+    for muscle, signs in wanted.items():
+        length, arm = made.values(muscle, "length"), made.values(muscle, "moment_arm")
+        assert tuple(np.sign([arm[0], arm[-1]])) == signs
+        change = -np.cumsum(0.5 * (arm[1:] + arm[:-1]) * np.diff(angle))
+        # 6 degrees a frame: the one-sided arms at both ends err by half a step's change.
+        assert np.abs(length[1:] - length[0] - change).max() <= 0.01 * length[0]

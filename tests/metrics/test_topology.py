@@ -1,0 +1,77 @@
+"""Handles, surfaces that cross themselves, and what comes and goes between frames."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from rbfmuscle.geometry.crossing import crossing_faces
+from rbfmuscle.metrics.quantities import Row
+from rbfmuscle.metrics.summary import Summary, exceeded
+from rbfmuscle.metrics.topology import euler_characteristic, self_crossing
+
+
+def test_euler_of_sphere_torus_and_two_spheres():
+    sphere = trimesh.creation.icosphere(2)
+    torus = trimesh.creation.torus(3.0, 1.0)
+    two = trimesh.util.concatenate([sphere, sphere.copy().apply_translation([5, 0, 0])])
+    assert euler_characteristic(sphere.faces) == 2
+    assert euler_characteristic(torus.faces) == 0
+    assert euler_characteristic(two.faces) == 4
+
+
+def test_vertices_that_no_triangle_uses_do_not_count():
+    sphere = trimesh.creation.icosphere(1)
+    assert euler_characteristic(np.asarray(sphere.faces) + 7) == 2
+
+
+def literal_crossings(vertices, faces):
+    """Every edge against every triangle, one by one."""
+    marked = np.zeros(len(faces), dtype=bool)
+    volume = lambda a, b, c, d: np.linalg.det([b - a, c - a, d - a])  # noqa: E731
+    for f, face in enumerate(faces):
+        for g, other in enumerate(faces):
+            if f == g or len({*face, *other}) < 5:
+                continue
+            for k in range(3):
+                p, q = face[k], face[(k + 1) % 3]
+                if p in other or q in other:
+                    continue
+                a, b, c, p, q = (vertices[i] for i in (*other, p, q))
+                if volume(a, b, c, p) * volume(a, b, c, q) >= 0:
+                    continue
+                sides = {np.sign(volume(p, q, *pair)) for pair in ((a, b), (b, c), (c, a))}
+                if sides in ({1.0}, {-1.0}):
+                    marked[f] = marked[g] = True
+    return marked
+
+
+def test_crossings_are_those_of_a_literal_search():
+    mesh = trimesh.creation.icosphere(1)
+    rng = np.random.default_rng(3)
+    vertices = mesh.vertices + 0.35 * rng.normal(size=mesh.vertices.shape)
+    expected = literal_crossings(vertices, mesh.faces)
+    assert 0 < expected.sum() < len(expected)
+    np.testing.assert_array_equal(crossing_faces(vertices, mesh.faces), expected)
+
+
+def test_sound_surfaces_do_not_cross_and_two_balls_cross_in_a_ring():
+    ball = trimesh.creation.icosphere(3)
+    assert self_crossing(ball.vertices, ball.faces) == (0, 0.0)
+    both = trimesh.util.concatenate([ball, ball.copy().apply_translation([1.0, 0.1, 0.2])])
+    found = self_crossing(both.vertices, both.faces)
+    inner = np.linalg.norm(np.asarray(ball.triangles_center), axis=1)
+    assert inner.min() > 0.9
+    # The ring has a radius of 0.86; its triangles have edges of 0.15 to 0.17.
+    assert 60 < found.count < 300
+    assert 0.01 < found.area < 0.2
+    moved = self_crossing(both.vertices * 1e3 + 7.0, both.faces)
+    assert moved.count == found.count and moved.area == pytest.approx(found.area)
+
+
+def test_a_limit_on_the_euler_characteristic_is_the_least_allowed():
+    summary = Summary()
+    summary.add([Row(i, "", 0.0, "m", "euler", value, "1") for i, value in enumerate([2.0, 0.0, 2.0])])
+    table = summary.table()
+    assert table["m"]["euler"]["worst"] == 0.0 and table["m"]["euler"]["worst_frame"] == 1
+    assert [row[:2] for row in exceeded(table, {"euler": 2.0})] == [("m", "euler")]
+    assert exceeded(table, {"euler": 0.0}) == []

@@ -1,0 +1,60 @@
+"""A material that is no sound surface is shown as it is on the whole."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from spindle_scene import build_scene
+
+from rbfmuscle.bones.sdf import BoneSDF
+from rbfmuscle.geometry.crossing import crossing_faces
+from rbfmuscle.geometry.surfaces import mesh_volume
+from rbfmuscle.implicit.extraction.material import carry_material
+from rbfmuscle.muscle.drawing import Configuration
+from rbfmuscle.muscle.muscle import RBFMuscle
+from rbfmuscle.simulation.contact import BoneContacts
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """A spindle's model and what it meets."""
+    scene = build_scene()
+    model = RBFMuscle(scene.muscles[0], scene)
+    names = [bone.name for bone in scene.bones]
+    fields = [BoneSDF.from_mesh(bone.mesh, cache=False) for bone in scene.bones]
+    return model, BoneContacts(names, fields, contact_bone=model.contact_bone)
+
+
+def no_fit():
+    raise ValueError("no field")
+
+
+def test_a_tangle_of_the_material_is_shown_as_a_sound_surface(drawn):
+    model, contacts = drawn
+    shown, volume = model.drawer.shown, model.rest.mesh_volume
+    tangled = shown.rest.copy()
+    # The lower half inside out.
+    tangled[tangled[:, 2] < 0.0] *= [-1.0, 1.0, 1.0]
+    alone = carry_material(shown.mesh, tangled, volume=volume)
+    assert crossing_faces(alone.vertices, alone.faces).sum() > 20
+    now = Configuration(model.points, model.normals(), model.contact_points(), tangled)
+    surface = model.drawer.draw(no_fit, now, contacts)
+    assert not crossing_faces(surface.vertices, np.asarray(surface.faces)).any()
+    assert mesh_volume(surface.vertices, np.asarray(surface.faces)) == pytest.approx(volume, rel=1e-10)
+    assert contacts.nearest(surface.vertices).min() > -0.05
+    assert surface.quantities["unfitted_fraction"] == 1.0
+    # Far from the tangle it is where the material is.
+    far = shown.rest[:, 2] > 15.0
+    assert np.linalg.norm(surface.vertices - tangled, axis=1)[far].max() < 6.0
+
+
+def test_what_moves_rigidly_is_calm_already_and_a_bump_sinks_with_the_sweeps(drawn):
+    shown = drawn[0].drawer.shown
+    moved = shown.rest @ Rotation.from_rotvec([0.3, -1.0, 0.4]).as_matrix().T + [5.0, 80.0, -3.0]
+    np.testing.assert_allclose(shown.smooth_displacement(moved, 50), moved, atol=1e-9)
+    top = int(np.argmax(shown.rest[:, 0]))
+    bumped = moved.copy()
+    bumped[top] += [0.0, 10.0, 0.0]
+    left = [
+        np.linalg.norm(shown.smooth_displacement(bumped, sweeps)[top] - moved[top]) for sweeps in (0, 5, 50)
+    ]
+    assert left[0] == pytest.approx(10.0, abs=0.1) and left[1] < 3.0 and left[2] < 1.0

@@ -1,0 +1,87 @@
+"""Bones with rounded facets, on which the solid of a muscle settles, and contact points outside of the bones."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from rbfmuscle.bones.sdf import BoneSDF
+from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.models import build_models
+from rbfmuscle.scene.motion import rotation_about
+from rbfmuscle.scene.phantom import phantom_scene
+from rbfmuscle.simulation.frame_loop import FrameLoop
+
+RADIUS, EDGE = 20.0, 2.0
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """A ball of flat facets, rounded over a cell, at a pose."""
+    from rbfmuscle.muscle.rounded_bones import RoundedField
+
+    mesh = trimesh.creation.icosphere(2, RADIUS)
+    field = BoneSDF.from_mesh(mesh, cache=False)
+    pose = rotation_about([1, 2, 3], 0.7, np.array([5.0, -2.0, 1.0]))
+    return field, RoundedField(field, RestFrame(np.asarray(mesh.vertices)), EDGE), pose
+
+
+def around(pose, count=400, away=RADIUS):
+    """World points about a ball at a pose, and their directions from its middle."""
+    way = np.random.default_rng(0).normal(size=(count, 3))
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    return (away * way) @ pose[:3, :3].T + pose[:3, 3], way @ pose[:3, :3].T
+
+
+def test_rounded_distance_is_near_the_exact_one_and_its_direction_nearer_to_the_ball(ball):
+    field, rounded, pose = ball
+    points, way = around(pose)
+    exact, normal = field.distance_and_gradient(points, pose)
+    distance, direction = rounded.distance_and_gradient(points, pose)
+    assert np.abs(distance - exact).max() < 0.3  # facets stand off the ball by 0.5
+    assert np.linalg.norm(direction, axis=1) == pytest.approx(np.ones(len(points)))
+    turned = [np.degrees(np.arccos(np.clip((n * way).sum(axis=1), -1, 1))) for n in (normal, direction)]
+    assert np.sqrt((turned[1] ** 2).mean()) < 0.6 * np.sqrt((turned[0] ** 2).mean())
+
+
+def test_direction_turns_steadily_where_the_exact_one_jumps(ball):
+    field, rounded, pose = ball
+    one, way = around(pose)
+    side = np.cross(way, [0.3, 0.5, 0.8])
+    two = one + 0.05 * side / np.linalg.norm(side, axis=1, keepdims=True)
+    jumps = []
+    for asked in (field, rounded):
+        normals = [asked.distance_and_gradient(points, pose)[1] for points in (one, two)]
+        jumps.append(np.linalg.norm(normals[1] - normals[0], axis=1).max())
+    assert jumps[0] > 0.1  # radian, from facet to facet
+    assert jumps[1] < 0.02
+
+
+def test_direction_is_the_slope_of_the_distance(ball):
+    _, rounded, pose = ball
+    points, _ = around(pose)
+    # On the rounded surface itself.
+    for _ in range(5):
+        distance, direction = rounded.distance_and_gradient(points, pose)
+        points = points - distance[:, None] * direction
+    step = np.random.default_rng(1).normal(size=points.shape) * 1e-4
+    there, back = (rounded.distance_and_gradient(points + sign * step, pose)[0] for sign in (1, -1))
+    assert np.abs((there - back) / 2 - (direction * step).sum(axis=1)).max() < 1e-3 * 1e-4 * 4
+
+
+def test_beyond_reach_the_exact_field_answers(ball):
+    field, rounded, pose = ball
+    points, _ = around(pose, away=30.0)
+    assert np.array_equal(
+        rounded.distance_and_gradient(points, pose, 5.0)[0], field.distance_and_gradient(points, pose, 5.0)[0]
+    )
+
+
+def test_no_contact_point_stays_in_a_bone():
+    scene = phantom_scene()
+    scene.muscles = [scene.muscle("extensor")]
+    scene.set_motion(ramp={"hip.flexion": {"from": 0, "to": 60, "step": 10}})
+    (model,) = build_models(scene)
+    with FrameLoop(scene, [model], surfaces=False) as loop:
+        for coordinates in scene.motion.frames:
+            loop.skip(coordinates)
+            assert loop.steppers[0].contacts.depth(model.contact_points()) < 0.02  # mm

@@ -1,0 +1,266 @@
+"""Laws of the solid's loops on systems of a few nodes: contact, transposes, volumes, acceleration."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rbfmuscle.geometry.rotations import quaternion_matrix, rotation_loop
+from rbfmuscle.muscle.anderson import Anderson
+from rbfmuscle.muscle.solid_loops import (
+    Fibres,
+    carry_loop,
+    contact_loop,
+    mobility_loop,
+    press_loop,
+    respond_loop,
+    solve_contact_forces,
+    stress_loop,
+    swell_loop,
+    target_loop,
+)
+from rbfmuscle.simulation.contact import HalfSpaces
+
+CENTRES, POINTS = 7, 9
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(5)
+
+
+class System:
+    """An elastic matrix of a few centres, points that hang on them, and half-spaces that some violate."""
+
+    def __init__(self, rng):
+        root = rng.normal(size=(CENTRES, CENTRES))
+        self.matrix = root @ root.T + CENTRES * np.eye(CENTRES)
+        self.inverse = np.linalg.inv(self.matrix)
+        self.columns = np.array([rng.choice(CENTRES, 3, replace=False) for _ in range(POINTS)])
+        self.shares = rng.dirichlet(np.ones(3), POINTS)
+        self.weights = np.zeros((POINTS, CENTRES))
+        np.put_along_axis(self.weights, self.columns, self.shares, axis=1)
+        self.pull = rng.normal(size=(CENTRES, 3))
+        self.answer = self.inverse @ self.pull  # of the centres to a unit pressure
+        self.stiffness = float(np.vdot(self.pull, self.answer))
+        self.motion = 0.1 * rng.normal(size=(POINTS, 3))
+        index = np.array([0, 1, 2, 3, 3, 5, 8])
+        normal = rng.normal(size=(len(index), 3))
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        source = np.array([0, 0, 0, 0, 1, 1, 0])
+        self.spaces = HalfSpaces(index, rng.uniform(-0.4, 0.3, len(index)), normal, source)
+
+    def gaps(self, motion, spaces=None):
+        """Gaps after a motion of the centres on top of that of the points."""
+        s = spaces or self.spaces
+        way = (self.motion + self.weights @ motion)[s.index]
+        return s.gap + np.einsum("ij,ij->i", s.normal, way)
+
+
+@pytest.fixture
+def system(rng):
+    return System(rng)
+
+
+def test_one_contact_takes_its_share_up_to_the_greatest_force():
+    for need, expected in ((2.0, 1.0), (-3.0, 0.0), (3.0, 1.2)):
+        force = np.zeros(1)
+        solve_contact_forces(np.array([[2.0]]), np.array([need]), force, 60, 1e-12, 1.2)
+        assert force[0] == expected
+
+
+def test_complementarity_stops_early_only_when_it_is_done(rng):
+    root = rng.normal(size=(6, 6))
+    gram, need = root @ root.T + 3.0 * np.eye(6), rng.normal(size=6)
+    force = np.zeros(6)
+    solve_contact_forces(gram, need, force, 1000, 1e-12, np.inf)
+    slack = gram @ force - need
+    assert slack.min() > -1e-10 and force.min() >= 0.0 and abs(slack @ force) < 1e-10
+
+
+@pytest.mark.parametrize("measured", [12, 9])
+def test_acceleration_solves_a_linear_map_in_few_steps(rng, measured):
+    """x -> M x + b with four different eigenvalues: four differences are enough (Walker & Ni 2011)."""
+    basis = np.linalg.qr(rng.normal(size=(12, 12)))[0]
+    m = basis @ np.diag(np.repeat([0.9, 0.5, -0.4, 0.1], 3)) @ basis.T
+    b = rng.normal(size=12)
+    x, mixer = np.zeros(12), Anderson(4, measured)
+    for _ in range(7):
+        x = mixer.mix(x, m @ x + b)
+    # The normal equations carry 1e-8 of their diagonal.
+    np.testing.assert_allclose(x, np.linalg.solve(np.eye(12) - m, b), atol=1e-4)
+
+
+def test_without_memory_and_after_a_restart_steps_are_plain(rng):
+    image, mixer = np.arange(12.0), Anderson(3, 12)
+    np.testing.assert_array_equal(Anderson(0, 12).mix(np.ones(12), image), image)
+    for _ in range(3):
+        mixer.mix(rng.normal(size=12), rng.normal(size=12))
+    mixer.restart()
+    np.testing.assert_array_equal(mixer.mix(np.ones(12), image), image)
+
+
+def test_turning_towards_a_deformation_ends_at_its_polar_rotation(rng):
+    for _ in range(20):
+        turn = Rotation.random(random_state=rng).as_matrix()
+        stretch = np.eye(3) + 0.2 * rng.normal(size=(3, 3))
+        f, q = turn @ (stretch @ stretch.T), np.array([1.0, 0.0, 0.0, 0.0])
+        for _ in range(50):
+            rotation_loop(f, q)
+        u, _, vt = np.linalg.svd(f)
+        np.testing.assert_allclose(np.array(quaternion_matrix(q)), u @ vt, atol=1e-6)
+
+
+class Cells:
+    """Two tetrahedra on five nodes, a point in each, two regions."""
+
+    columns = np.array([[0, 1, 2, 3], [1, 2, 3, 4]])
+    region = np.array([0, 1])
+    weights = np.array([0.7, 0.4])
+
+    def __init__(self, rng):
+        self.rest = np.array([[0, 0, 0], [1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [0.9, 0.8, 1.1]])
+        self.slopes = np.empty((2, 4, 3))
+        for q, nodes in enumerate(self.columns):
+            self.slopes[q] = np.linalg.inv(np.column_stack([self.rest[nodes], np.ones(4)]))[:3].T
+        self.fibre = rng.normal(size=(2, 3))
+        self.fibre /= np.linalg.norm(self.fibre, axis=1, keepdims=True)
+        self.start = np.array([0, 4, 8])
+        self.node = self.columns.ravel()
+        self.slot = np.arange(8).reshape(2, 4)
+
+    def turn(self, y):
+        q, f, target = np.tile([1.0, 0, 0, 0], (2, 1)), np.empty((2, 3, 3)), np.empty((2, 3, 3))
+        one = np.ones(2)
+        for _ in range(20):
+            target_loop(y, self.columns, self.slopes, self.fibre, one, 0.05, q, one.copy(), f, target)
+        return q, f, target
+
+    def stress(self, y, passive=0.0, active=0.0, content=1.0, slack=(1.0, 1.0)):
+        _, f, target = self.turn(y)
+        one = np.ones(2)
+        fibres = Fibres(
+            self.fibre, passive * one, active * one, slack[0] * one, slack[1] * one, content * one
+        )
+        out, gradient, volume = np.empty((5, 3)), np.empty((8, 3)), np.empty(2)
+        stress_loop(
+            f, target, fibres, self.weights, self.columns, self.slopes, self.region, self.slot, out,
+            gradient, volume,
+        )  # fmt: skip
+        return out, gradient, volume
+
+
+@pytest.fixture
+def cells(rng):
+    return Cells(rng)
+
+
+def test_deformation_of_an_affine_map_is_its_matrix_and_the_target_its_rotation(rng, cells):
+    turn = Rotation.from_rotvec([0.4, 0.2, -0.5]).as_matrix()
+    stretch = np.diag([1.2, 0.9, 0.95])
+    q, f, target = cells.turn(cells.rest @ (turn @ stretch).T + 3.0)
+    for i in range(2):
+        np.testing.assert_allclose(f[i], turn @ stretch, atol=1e-12)
+        np.testing.assert_allclose(target[i], turn, atol=1e-9)
+        np.testing.assert_allclose(np.array(quaternion_matrix(q[i])), turn, atol=1e-9)
+
+
+def test_a_slack_fibre_asks_for_the_length_it_has_and_a_taut_one_for_the_nearest_end(cells):
+    # Both cells at rest: the fibres' length is 1.
+    def asked(slack):
+        return cells.stress(cells.rest, passive=2.0, slack=slack)[0] - cells.stress(cells.rest)[0]
+
+    taut = asked((1.0, 1.0))
+    np.testing.assert_allclose(asked((0.9, 1.2)), taut, atol=1e-12)
+    np.testing.assert_allclose(asked((0.7, 0.8)), 0.8 * taut, atol=1e-12)
+    np.testing.assert_allclose(asked((1.1, 1.2)), 1.1 * taut, atol=1e-12)
+
+
+def test_volumes_are_determinants_and_their_gradients_differences(rng, cells):
+    y = cells.rest + 0.1 * rng.normal(size=(5, 3))
+    _, gradient, volume = cells.stress(y)
+    _, f, _ = cells.turn(y)
+    np.testing.assert_allclose(volume, cells.weights * np.linalg.det(f), rtol=1e-12)
+    step, direction = 6e-6, rng.normal(size=(5, 3))
+    ahead, behind = (cells.stress(y + s * step * direction)[2] for s in (1, -1))
+    swollen = np.empty(2)
+    swell_loop(direction, cells.start, cells.node, gradient, swollen)
+    np.testing.assert_allclose(swollen, (ahead - behind) / (2 * step), rtol=1e-8)
+
+
+def test_pressing_and_swelling_are_transposes(rng, cells):
+    gradient, motion, pressure = rng.normal(size=(8, 3)), rng.normal(size=(5, 3)), rng.normal(size=2)
+    force, swollen = np.zeros((5, 3)), np.empty(2)
+    press_loop(pressure, cells.start, cells.node, gradient, force)
+    swell_loop(motion, cells.start, cells.node, gradient, swollen)
+    assert np.vdot(force, motion) == pytest.approx(swollen @ pressure)
+
+
+def test_right_side_balances_the_laplacian_at_rest_and_carries_the_fibres(rng, cells):
+    """With F = T at rest, Σ w T ∇N is Σ w F ∇N: no force is left; a fibre adds its own stress along itself."""
+    out, _, _ = cells.stress(cells.rest)
+    laplacian = np.zeros((5, 5))
+    for q, nodes in enumerate(cells.columns):
+        laplacian[np.ix_(nodes, nodes)] += cells.weights[q] * cells.slopes[q] @ cells.slopes[q].T
+    np.testing.assert_allclose(out, laplacian @ cells.rest, atol=1e-12)
+    y = cells.rest + 0.1 * rng.normal(size=(5, 3))
+    given = {"passive": 2.5, "active": 1.5, "content": 0.6}
+    fibres = cells.stress(y, **given)[0] - cells.stress(y)[0]
+    _, f, _ = cells.turn(y)
+    expected = np.zeros((5, 3))
+    for q, nodes in enumerate(cells.columns):
+        along = f[q] @ cells.fibre[q]
+        pull = cells.weights[q] * (2.5 + 1.5 * 0.6) * along / np.linalg.norm(along)
+        expected[nodes] += np.outer(cells.slopes[q] @ cells.fibre[q], pull)
+    np.testing.assert_allclose(fibres, expected, atol=1e-11)
+
+
+def test_responses_are_those_of_the_inverse_and_their_gram_is_symmetric(rng, cells):
+    root = rng.normal(size=(5, 5))
+    inverse, gradient = np.linalg.inv(root @ root.T + np.eye(5)), rng.normal(size=(8, 3))
+    response, gram = np.empty((2, 3, 5)), np.empty((2, 2))
+    respond_loop(cells.start, cells.node, gradient, inverse, response, gram)
+    for r in range(2):
+        force, swollen = np.zeros((5, 3)), np.empty(2)
+        press_loop(np.eye(2)[r], cells.start, cells.node, gradient, force)
+        np.testing.assert_allclose(response[r].T, inverse @ force, atol=1e-12)
+        swell_loop(np.ascontiguousarray(response[r].T), cells.start, cells.node, gradient, swollen)
+        np.testing.assert_allclose(gram[r], swollen, atol=1e-12)
+    np.testing.assert_allclose(gram, gram.T, atol=1e-12)
+
+
+def test_embedded_points_and_their_mobility(rng, system):
+    y, out = rng.normal(size=(CENTRES, 3)), np.empty((POINTS, 3))
+    carry_loop(y, system.columns, system.shares, out)
+    np.testing.assert_allclose(out, system.weights @ y, atol=1e-14)
+    mobility = np.empty(POINTS)
+    mobility_loop(system.columns, system.shares, system.inverse, mobility)
+    np.testing.assert_allclose(
+        mobility, np.diag(system.weights @ system.inverse @ system.weights.T), rtol=1e-12
+    )
+
+
+@pytest.mark.parametrize("yielding", [0.0, 0.03])
+@pytest.mark.parametrize("batch", [1, 10])
+def test_contact_meets_the_laws_and_keeps_every_region(rng, system, batch, yielding):
+    """Complementarity of gaps and forces, two regions, pressures whitened: responses have the identity as gram."""
+    pulls = rng.normal(size=(2, CENTRES, 3))
+    answers = np.einsum("ij,rja->ria", system.inverse, pulls)
+    gram = np.einsum("ria,sia->rs", pulls, answers)
+    whiten = np.linalg.inv(np.linalg.cholesky(gram))
+    response = np.ascontiguousarray(np.einsum("rs,sia->rai", whiten, answers))
+    s, table = system.spaces, np.zeros((POINTS, 2))
+    push, taken = np.empty((CENTRES, 3)), np.empty(2)
+    for _ in range(2):  # from nothing, and from the forces of the first time
+        contact_loop(
+            s.index, s.gap, s.normal, s.source, system.motion, system.inverse, system.columns, system.shares,
+            response, table, (batch, 12, 400, 1e-10), (yielding, np.inf), push, taken,
+        )  # fmt: skip
+        force = table[s.index, s.source]
+        # A contact gives way by its force; the matrix carries 1e-7 of its diagonal.
+        gaps = system.gaps(push) + yielding * force
+        assert force.min() >= 0.0 and np.count_nonzero(force) >= 2
+        assert gaps.min() > -1e-6 and np.abs(gaps[force > 0.0]).max() < 1e-6
+        np.testing.assert_allclose(np.einsum("ria,ia->r", pulls, push), 0.0, atol=1e-11)
+        load = system.weights[s.index].T @ (force[:, None] * s.normal)
+        whitened = np.einsum("rai,ia->r", response, load)
+        np.testing.assert_allclose(taken, whitened, atol=1e-11)

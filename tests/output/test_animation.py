@@ -1,0 +1,311 @@
+"""Animations of a run, by readers that are not ours: usd-core, trimesh, Blender, glTF to the letter."""
+
+import json
+import os
+import struct
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from blend_model import arm_scene, use_blend_model
+
+from rbfmuscle.output.export import export_run
+from rbfmuscle.output.meshfiles import write_mesh
+from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.run import simulate
+from rbfmuscle.validation import MissingPartError, UsageError
+
+TOLERANCE = 1e-6  # [m]: what single precision holds at a metre, with room
+NAMES = ("biceps", "upper", "fore")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A saved run of three frames, in mm."""
+    made = tmp_path_factory.mktemp("run")
+    with pytest.MonkeyPatch.context() as patch:
+        use_blend_model(patch)
+        simulate(arm_scene()).save(made)
+    return made
+
+
+@pytest.fixture(scope="module")
+def truth(folder):
+    """Vertices of everything in each frame [m], by (name, frame)."""
+    saved, found = SavedRun(folder), {}
+    for frame in saved.frames:
+        found["biceps", frame] = saved.surface("biceps", frame)[0] * 1e-3
+        for bone in saved.bones:
+            pose = saved.poses[frame][bone]
+            found[bone, frame] = (saved.bone(bone)[0] @ pose[:3, :3].T + pose[:3, 3]) * 1e-3
+    return found
+
+
+@pytest.fixture
+def changing(folder, tmp_path):
+    """The same run, but with another mesh in its last frame."""
+    import shutil
+
+    copy = shutil.copytree(folder, tmp_path / "changing")
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=9.0)
+    write_mesh(copy / "surfaces" / "biceps_0002.vtp", ball.vertices, ball.faces)
+    return copy, np.array(ball.vertices), np.array(ball.faces)
+
+
+class TestUsd:
+    @pytest.fixture(autouse=True)
+    def _needs_usd(self):
+        pytest.importorskip("pxr.UsdGeom")
+
+    def read(self, path):
+        from pxr import Usd
+
+        stage = Usd.Stage.Open(str(path))
+        return stage, {prim.GetName(): prim for prim in stage.Traverse() if prim.GetTypeName() == "Mesh"}
+
+    def world(self, stage, prim, code):
+        from pxr import UsdGeom
+
+        points = np.array(UsdGeom.Mesh(prim).GetPointsAttr().Get(code), dtype=float)
+        place = np.array(UsdGeom.XformCache(code).GetLocalToWorldTransform(prim))
+        world = np.column_stack([points, np.ones(len(points))]) @ place
+        return world[:, :3] * UsdGeom.GetStageMetersPerUnit(stage)
+
+    def test_every_vertex_of_every_frame(self, folder, truth, tmp_path):
+        (path,) = export_run(folder, "usd", output=tmp_path)
+        stage, meshes = self.read(path)
+        assert path.suffix == ".usdc"
+        assert set(meshes) == set(NAMES)
+        for (name, frame), expected in truth.items():
+            np.testing.assert_allclose(
+                self.world(stage, meshes[name], frame), expected, rtol=0, atol=TOLERANCE
+            )
+
+    def test_topology_once_bones_rigid_units_and_axis_told(self, folder, tmp_path):
+        from pxr import UsdGeom
+
+        (path,) = export_run(folder, "usd", output=tmp_path, units="cm", up="y")
+        stage, meshes = self.read(path)
+        assert UsdGeom.GetStageMetersPerUnit(stage) == pytest.approx(0.01)
+        assert UsdGeom.GetStageUpAxis(stage) == "Y"
+        assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0.0, 2.0)
+        muscle, bone = UsdGeom.Mesh(meshes["biceps"]), UsdGeom.Mesh(meshes["fore"])
+        assert muscle.GetFaceVertexIndicesAttr().GetNumTimeSamples() == 0
+        assert muscle.GetPointsAttr().GetNumTimeSamples() == 3
+        assert bone.GetPointsAttr().GetNumTimeSamples() == 0
+        assert bone.GetOrderedXformOps()[0].GetNumTimeSamples() == 3
+        assert UsdGeom.Mesh(meshes["upper"]).GetOrderedXformOps()[0].GetNumTimeSamples() == 0
+
+    def test_bones_have_their_normals_once(self, folder, tmp_path):
+        from pxr import UsdGeom
+
+        (path,) = export_run(folder, "usd", output=tmp_path)
+        stage, meshes = self.read(path)
+        assert stage and not UsdGeom.Mesh(meshes["biceps"]).GetNormalsAttr().HasAuthoredValue()
+        mesh = UsdGeom.Mesh(meshes["fore"])
+        assert mesh.GetNormalsInterpolation() == UsdGeom.Tokens.vertex
+        faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+        ours = trimesh.Trimesh(np.array(mesh.GetPointsAttr().Get()), faces, process=False)
+        normals = np.array(mesh.GetNormalsAttr().Get())
+        # Weighted by area here, by angle there.
+        assert np.einsum("nd,nd->n", normals, ours.vertex_normals).min() > 0.8
+
+    def test_changing_surface_has_its_topology_at_every_time(self, changing, tmp_path):
+        from pxr import UsdGeom
+
+        directory, vertices, faces = changing
+        (path,) = export_run(directory, "usd", output=tmp_path)
+        stage, meshes = self.read(path)
+        np.testing.assert_allclose(self.world(stage, meshes["biceps"], 2), vertices * 1e-3, atol=TOLERANCE)
+        numbers = UsdGeom.Mesh(meshes["biceps"]).GetFaceVertexIndicesAttr()
+        np.testing.assert_array_equal(np.array(numbers.Get(2)).reshape(-1, 3), faces)
+        assert len(numbers.Get(1)) != len(numbers.Get(2))
+
+    def test_names_that_usd_does_not_know_stay_apart(self):
+        from rbfmuscle.output.animation.usd import identifier
+
+        used = set()
+        assert [identifier(name, used) for name in ("a-b", "a_b", "1x", "materials")] == [
+            "a_b", "a_b_2", "_x", "materials_2",
+        ]  # fmt: skip
+
+
+def test_usd_without_its_package_is_one_line(folder, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    monkeypatch.setitem(sys.modules, "pxr.Usd", None)
+    with pytest.raises(MissingPartError, match=r"usd-core: pip install -e '\.\[usd\]'") as told:
+        export_run(folder, ["ply", "usd"], output=tmp_path)
+    assert told.value.exit_code == 7
+    assert not list(tmp_path.iterdir())
+
+
+def read_glb(path):
+    """JSON tree of a binary glTF file, and a function that gives the numbers of an accessor, as its standard says."""
+    data = Path(path).read_bytes()
+    magic, version, size, length, kind = struct.unpack("<4sIII4s", data[:20])
+    assert (magic, version, size, kind) == (b"glTF", 2, len(data), b"JSON")
+    tree = json.loads(data[20 : 20 + length])
+    body = data[28 + length :]
+    assert len(body) == tree["buffers"][0]["byteLength"]
+    types = {5125: np.uint32, 5126: np.float32}
+    width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+
+    def raw(view, offset, dtype, count, columns):
+        entry = tree["bufferViews"][view]
+        item = np.dtype(dtype).itemsize
+        step = entry.get("byteStride", columns * item)
+        start = entry["byteOffset"] + offset
+        assert start % item == 0
+        assert (count - 1) * step + columns * item <= entry["byteLength"]
+        shape, strides = (count, columns), (step, item)
+        return np.ndarray(shape, dtype, buffer=body, offset=start, strides=strides).copy()
+
+    def numbers(index):
+        entry = tree["accessors"][index]
+        dtype, columns = types[entry["componentType"]], width[entry["type"]]
+        out = raw(entry["bufferView"], 0, dtype, entry["count"], columns)
+        if "max" in entry:
+            np.testing.assert_array_equal(out.max(axis=0), np.array(entry["max"], dtype))
+            np.testing.assert_array_equal(out.min(axis=0), np.array(entry["min"], dtype))
+        return out
+
+    return tree, numbers
+
+
+def morphed(tree, numbers, name, frame):
+    """Vertices and normals of a node in the world in a frame, with y up."""
+    from scipy.spatial.transform import Rotation
+
+    number = next(k for k, node in enumerate(tree["nodes"]) if node["name"] == name)
+    node, animation = tree["nodes"][number], tree["animations"][0]
+    primitive = tree["meshes"][node["mesh"]]["primitives"][0]
+    moved = {key: numbers(primitive["attributes"][key]).astype(float) for key in ("POSITION", "NORMAL")}
+    found = dict(node)
+    for channel in animation["channels"]:
+        if channel["target"]["node"] == number:
+            sampler = animation["samplers"][channel["sampler"]]
+            times = numbers(sampler["input"])[:, 0]
+            found[channel["target"]["path"]] = numbers(sampler["output"]).reshape(len(times), -1)[frame]
+    for target, weight in zip(primitive.get("targets", ()), found.get("weights", ())):
+        for key in moved:
+            moved[key] += weight * numbers(target[key])
+    turn = Rotation.from_quat(found.get("rotation", [0, 0, 0, 1]))
+    root = Rotation.from_quat(tree["nodes"][tree["scenes"][0]["nodes"][0]].get("rotation", [0, 0, 0, 1]))
+    vertices = root.apply(turn.apply(moved["POSITION"]) + found.get("translation", np.zeros(3)))
+    return vertices, root.apply(turn.apply(moved["NORMAL"])), numbers(primitive["indices"]).reshape(-1, 3)
+
+
+class TestAnimatedGlb:
+    def test_every_vertex_of_every_frame(self, folder, truth, tmp_path):
+        (path,) = export_run(folder, "animated-glb", output=tmp_path)
+        tree, numbers = read_glb(path)
+        for (name, frame), expected in truth.items():
+            vertices, _, _ = morphed(tree, numbers, name, frame)
+            up = np.column_stack([expected[:, 0], expected[:, 2], -expected[:, 1]])
+            np.testing.assert_allclose(vertices, up, rtol=0, atol=TOLERANCE)
+
+    def test_normals_turn_with_the_surface(self, folder, tmp_path):
+        (path,) = export_run(folder, "animated-glb", output=tmp_path, up="y")
+        tree, numbers = read_glb(path)
+        for frame in range(3):
+            vertices, normals, faces = morphed(tree, numbers, "biceps", frame)
+            expected = trimesh.Trimesh(vertices, faces, process=False)
+            assert expected.volume > 0
+            normals /= np.linalg.norm(normals, axis=1)[:, None]
+            # Vertex normals are area-weighted here and by angle there.
+            assert np.median(np.einsum("nd,nd->n", normals, expected.vertex_normals)) > 0.999
+
+    def test_trimesh_reads_names_and_the_first_frame(self, folder, truth, tmp_path):
+        (path,) = export_run(folder, "animated-glb", output=tmp_path)
+        scene = trimesh.load(path)
+        assert set(scene.geometry) == set(NAMES)
+        np.testing.assert_allclose(scene.geometry["biceps"].vertices, truth["biceps", 0], atol=TOLERANCE)
+
+    def test_bones_are_nodes_and_what_stands_still_is_not_animated(self, folder, tmp_path):
+        (path,) = export_run(folder, "animated-glb", output=tmp_path)
+        tree, _ = read_glb(path)
+        moving = {
+            (tree["nodes"][c["target"]["node"]]["name"], c["target"]["path"])
+            for c in tree["animations"][0]["channels"]
+        }
+        assert moving == {("fore", "rotation"), ("fore", "translation"), ("biceps", "weights")}
+
+    def test_changing_surface_is_refused_with_a_remedy(self, changing, tmp_path):
+        with pytest.raises(
+            UsageError, match=r"'biceps' do not; run with surface = 'material', or export to usd"
+        ):
+            export_run(changing[0], "animated-glb", output=tmp_path)
+
+    def test_other_units_are_refused(self, folder, tmp_path):
+        with pytest.raises(UsageError, match="in metres"):
+            export_run(folder, "animated-glb", output=tmp_path, units="mm")
+
+
+def test_a_page_of_a_run_says_frame_and_coordinates(folder, tmp_path):
+    (path,) = export_run(folder, "html", output=tmp_path)
+    text = path.read_text(encoding="utf-8")
+    assert path.suffix == ".html" and path.parent.name == "html" and '"frame 1: ' in text
+    with pytest.raises(UsageError, match="html is in metres by its standard"):
+        export_run(folder, "html", output=tmp_path, units="mm")
+
+
+def test_times_of_a_motion_are_those_of_the_files(folder, tmp_path):
+    import shutil
+
+    import pyvista
+
+    copy = shutil.copytree(folder, tmp_path / "run")
+    info = json.loads((copy / "run.json").read_text())
+    info["scene"]["motion"]["times"] = [1.0, 1.25, 2.0]
+    (copy / "run.json").write_text(json.dumps(info))
+    export_run(copy, ["pvd", "animated-glb"], output=tmp_path / "out")
+    assert list(pyvista.get_reader(tmp_path / "out" / "pvd" / "surfaces.pvd").time_values) == [1.0, 1.25, 2.0]
+    tree, numbers = read_glb(next((tmp_path / "out" / "animated-glb").iterdir()))
+    times = numbers(tree["animations"][0]["samplers"][0]["input"])[:, 0]
+    np.testing.assert_allclose(times, [0.0, 0.25, 1.0])
+
+
+BLENDER = """
+import sys, bpy, numpy as np
+usd, glb, truth = sys.argv[1:4]
+truth = np.load(truth)
+for load, path in ((bpy.ops.wm.usd_import, usd), (bpy.ops.import_scene.gltf, glb)):
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    load(filepath=path)
+    corners = {}
+    for key in truth.files:
+        name, frame = key.rsplit(" ", 1)
+        bpy.context.scene.frame_set(int(frame))
+        shown = bpy.data.objects[name].evaluated_get(bpy.context.evaluated_depsgraph_get())
+        mesh = shown.to_mesh()
+        points = np.empty(3 * len(mesh.vertices), np.float32)
+        mesh.vertices.foreach_get("co", points)
+        place = np.array(shown.matrix_world)
+        world = points.reshape(-1, 3) @ place[:3, :3].T + place[:3, 3]
+        numbers = np.empty(len(mesh.loops), np.int32)
+        mesh.loops.foreach_get("vertex_index", numbers)
+        assert np.abs(world - truth[key]).max() < 1e-6, (path, key)
+        assert (corners.setdefault(name, numbers) == numbers).all(), (path, key)
+    bones = [bpy.data.objects[name] for name in ("upper", "fore")]
+    assert not any(bone.modifiers or bone.data.shape_keys for bone in bones), path
+print("as ours")
+"""
+
+
+def test_blender_shows_every_vertex_where_it_is(folder, truth, tmp_path):
+    """In a Python that has bpy: this one, or the one named by RBFMUSCLE_BPY_PYTHON."""
+    python = os.environ.get("RBFMUSCLE_BPY_PYTHON") or (sys.executable if find_spec("bpy") else None)
+    if python is None:
+        pytest.skip("no bpy here; RBFMUSCLE_BPY_PYTHON may name a Python that has it")
+    pytest.importorskip("pxr.UsdGeom")
+    usd, glb = export_run(folder, ["usd", "animated-glb"], output=tmp_path)
+    np.savez(tmp_path / "truth.npz", **{f"{name} {frame}": points for (name, frame), points in truth.items()})
+    (tmp_path / "look.py").write_text(BLENDER)
+    command = [python, tmp_path / "look.py", usd, glb, tmp_path / "truth.npz"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.rstrip().endswith("as ours")

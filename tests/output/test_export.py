@@ -1,0 +1,179 @@
+"""Files against readers that are not ours: pyvista and trimesh."""
+
+import io
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from blend_model import arm_scene, use_blend_model
+
+from rbfmuscle.output.export import MESHES, export_run
+from rbfmuscle.output.meshfiles import SUFFIXES, read_mesh, write_mesh
+from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.output.vtp import Collection, write_vtp
+from rbfmuscle.output.writer import write_json
+from rbfmuscle.run import simulate
+from rbfmuscle.validation import MeshError, UsageError
+
+pyvista = pytest.importorskip("pyvista")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A saved run: the run in memory and its folder."""
+    folder = tmp_path_factory.mktemp("run")
+    with pytest.MonkeyPatch.context() as patch:
+        use_blend_model(patch)
+        made = simulate(arm_scene())
+    made.save(folder)
+    return made, folder
+
+
+@pytest.fixture
+def mesh():
+    sphere = trimesh.creation.icosphere(subdivisions=3, radius=7.3)
+    return np.array(sphere.vertices) + [1000 / 3, -20, 4], np.array(sphere.faces)
+
+
+class TestVtp:
+    def test_pyvista_reads_the_same_numbers(self, tmp_path, mesh):
+        path = tmp_path / "a.vtp"
+        write_vtp(path, *mesh)
+        data = pyvista.read(path)
+        np.testing.assert_array_equal(data.points, mesh[0])
+        np.testing.assert_array_equal(data.regular_faces, mesh[1])
+        assert data.n_open_edges == 0
+
+    def test_values_of_vertices_are_point_data(self, tmp_path, mesh):
+        values = {"distance": np.linspace(-1.0, 1.0, len(mesh[0]))}
+        write_vtp(tmp_path / "a.vtp", *mesh, values=values)
+        np.testing.assert_array_equal(pyvista.read(tmp_path / "a.vtp")["distance"], values["distance"])
+
+    def test_large_arrays_too(self, tmp_path):
+        rng = np.random.default_rng(0)
+        vertices = rng.normal(size=(120_000, 3))
+        faces = rng.integers(0, len(vertices), size=(100_000, 3))
+        write_vtp(tmp_path / "a.vtp", vertices, faces)
+        data = pyvista.read(tmp_path / "a.vtp")
+        np.testing.assert_array_equal(data.points, vertices)
+        np.testing.assert_array_equal(data.regular_faces, faces)
+
+
+class TestCollection:
+    def test_complete_after_every_frame(self, tmp_path, mesh):
+        write_vtp(tmp_path / "a.vtp", *mesh)
+        collection = Collection(tmp_path / "all.pvd")
+        for time in range(3):
+            collection.add(time, [("a<b", "a.vtp"), ("c", "a.vtp")])
+            reader = pyvista.get_reader(tmp_path / "all.pvd")
+            assert list(reader.time_values) == list(range(time + 1))
+        reader.set_active_time_value(2.0)
+        assert reader.read().n_blocks == 2
+        collection.close()
+
+
+class TestMeshFiles:
+    @pytest.mark.parametrize("suffix", sorted(set(SUFFIXES.values())))
+    def test_round_trip_and_independent_reader(self, tmp_path, mesh, suffix):
+        path = tmp_path / f"a{suffix}"
+        write_mesh(path, *mesh)
+        vertices, faces = read_mesh(path)
+        exact = trimesh.Trimesh(*mesh, process=False).volume
+        # PLY, STL and GLB hold single precision.
+        assert trimesh.Trimesh(vertices, faces).volume == pytest.approx(exact, rel=1e-6)
+        if suffix != ".vtp":
+            again = trimesh.load(path, force="mesh")
+            assert again.is_watertight
+            assert again.volume == pytest.approx(exact, rel=1e-6)
+        if suffix in (".ply", ".stl", ".obj"):
+            assert pyvista.read(path).n_cells == len(mesh[1])
+
+    def test_missing_file_is_named(self, tmp_path):
+        with pytest.raises(MeshError, match=r"none\.ply is missing"):
+            read_mesh(tmp_path / "none.ply")
+
+
+class TestSaved:
+    def test_surfaces_come_back_unchanged(self, run):
+        made, folder = run
+        vertices, faces = SavedRun(folder).surface("biceps", 1)
+        np.testing.assert_array_equal(vertices, made.frames[1].surfaces["biceps"].vertices)
+        np.testing.assert_array_equal(faces, made.frames[1].surfaces["biceps"].faces)
+
+    def test_paraview_collection_has_every_frame_and_muscle(self, run):
+        reader = pyvista.get_reader(run[1] / "surfaces.pvd")
+        assert list(reader.time_values) == [0, 1, 2]
+        assert reader.read()[0].is_manifold
+        bones = pyvista.get_reader(run[1] / "bones.pvd")
+        bones.set_active_time_value(2.0)
+        pose = run[0].frames[2].poses["fore"]
+        expected = np.array(run[0].scene.bones[1].mesh.vertices) @ pose[:3, :3].T + pose[:3, 3]
+        np.testing.assert_allclose(bones.read()[1].points, expected, atol=1e-5)  # single precision
+
+    def test_bones_at_rest_come_back(self, run):
+        vertices, _ = SavedRun(run[1]).bone("fore")
+        np.testing.assert_allclose(vertices, run[0].scene.bones[1].mesh.vertices, atol=1e-5)
+
+    def test_no_run_is_said(self, tmp_path):
+        with pytest.raises(UsageError, match="holds no run"):
+            SavedRun(tmp_path)
+        (tmp_path / "run.json").write_text("{}")
+        with pytest.raises(UsageError, match=r"not the run\.json"):
+            SavedRun(tmp_path)
+
+
+class TestExport:
+    @pytest.mark.parametrize("name", (*MESHES, "glb"))
+    def test_units_are_converted(self, run, tmp_path, name):
+        made, folder = run
+        written = export_run(folder, name, output=tmp_path, units="m", frames=slice(2, 3))
+        exact = made["biceps"].surface(2).volume * 1e-9
+        if name == "glb":
+            scene = trimesh.load(written[0])
+            assert set(scene.geometry) == {"biceps", "upper", "fore"}
+            assert scene.geometry["biceps"].volume == pytest.approx(exact, rel=1e-5)  # single precision
+        else:
+            vertices, faces = read_mesh(next(p for p in written if p.stem == "biceps_0002"))
+            volume = trimesh.Trimesh(vertices, faces).volume
+            assert volume == pytest.approx(exact, rel=1e-5)
+
+    @pytest.mark.parametrize("name", ["pvd", "vtp", "ply", "obj"])
+    def test_vertices_and_faces_come_back_in_their_order(self, run, tmp_path, name):
+        made, folder = run
+        written = [p for p in export_run(folder, name, output=tmp_path) if p.stem.startswith("biceps_")]
+        assert len(written) == len(made.frames)
+        for path, frame in zip(sorted(written), made.frames):
+            vertices, faces = read_mesh(path)
+            np.testing.assert_allclose(vertices, frame.surfaces["biceps"].vertices, rtol=1e-6, atol=1e-5)
+            np.testing.assert_array_equal(faces, frame.surfaces["biceps"].faces)
+
+    def test_exported_series_has_every_time_and_muscle(self, run, tmp_path):
+        export_run(run[1], "pvd", output=tmp_path, units="cm")
+        reader = pyvista.get_reader(next(tmp_path.rglob("*surfaces.pvd")))
+        assert list(reader.time_values) == [0, 1, 2]
+        for time, frame in enumerate(run[0].frames):
+            reader.set_active_time_value(float(time))
+            expected = frame.surfaces["biceps"].vertices / 10.0
+            np.testing.assert_allclose(reader.read()[0].points, expected, rtol=1e-6, atol=1e-6)
+
+    def test_posed_bones_are_exported(self, run, tmp_path):
+        made, folder = run
+        export_run(folder, ["stl", "obj"], output=tmp_path)
+        pose = made.frames[2].poses["fore"]
+        expected = made.scene.bones[1].mesh.copy().apply_transform(pose).bounds
+        for name in ("stl/fore_0002.stl", "obj/fore_0002.obj"):
+            np.testing.assert_allclose(trimesh.load(tmp_path / name).bounds, expected, atol=1e-4)
+
+    def test_wrong_words(self, run, tmp_path):
+        with pytest.raises(UsageError, match="unknown format 'fbx'"):
+            export_run(run[1], "fbx", output=tmp_path)
+        with pytest.raises(UsageError, match="units"):
+            export_run(run[1], "ply", output=tmp_path, units="inch")
+
+
+def test_json_has_no_nan_and_is_replaced_whole(tmp_path):
+    path = tmp_path / "a.json"
+    write_json(path, {"a": float("nan"), "b": np.float64(2.5), "c": np.arange(3), "d": (1, np.inf)})
+    assert json.load(io.StringIO(path.read_text())) == {"a": None, "b": 2.5, "c": [0, 1, 2], "d": [1, None]}
+    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]

@@ -1,0 +1,234 @@
+"""Runs in memory and to a folder: the same numbers, and what an interrupt, a failure or a limit leaves."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from blend_model import arm_scene, files_in, use_blend_model
+from run_folders import timeless
+
+from rbfmuscle.metrics.summary import LIMITS, parse_limits
+from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.run import simulate, stream_run
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.validation import LimitExceededError, SceneError, SceneWarning, SolveError, UsageError
+
+
+@pytest.fixture(autouse=True)
+def blend(monkeypatch):
+    use_blend_model(monkeypatch)
+
+
+def table(path):
+    with open(path, encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+class TestSimulate:
+    def test_surfaces_and_values(self):
+        scene = arm_scene()
+        run = simulate(scene)
+        assert [f.coordinates["elbow.flexion"] for f in run.frames] == pytest.approx(np.radians([0, 10, 20]))
+        first = run["biceps"].surface(frame=0)
+        assert first.is_watertight
+        assert first.volume == pytest.approx(scene.muscles[0].mesh.volume)
+        assert run["biceps"].surface().volume == pytest.approx(run["biceps"].values("volume")[-1])
+        assert len(run["biceps"].values("length")) == 3
+
+    def test_flexor_has_a_positive_moment_arm(self):
+        # The muscle runs 9.5 above the hinge and shortens as the forearm rises.
+        arms = simulate(arm_scene(step=5))["biceps"].values("moment_arm")
+        assert np.all(arms > 3)
+
+    def test_lengths_and_moment_arms_keep_the_sum_rule(self):
+        run = simulate(arm_scene(step=2, end=40))
+        lengths, arms = run["biceps"].values("length"), run["biceps"].values("moment_arm")
+        angles = np.radians(np.arange(0, 41, 2))
+        assert lengths[-1] == pytest.approx(lengths[0] - np.trapezoid(arms, angles), rel=1e-4)
+
+    def test_unknown_muscle_and_frame(self):
+        run = simulate(arm_scene())
+        with pytest.raises(SceneError, match="biceps"):
+            run["bicep"]
+        with pytest.raises(UsageError, match="3 frames"):
+            run["biceps"].surface(frame=3)
+
+    def test_failure_hands_over_the_frames_so_far(self, monkeypatch):
+        use_blend_model(monkeypatch, fail_at=8)
+        with pytest.raises(SolveError, match="planted") as caught:
+            simulate(arm_scene())
+        assert 0 < len(caught.value.run.frames) < 3
+
+    def test_progress_and_frames(self):
+        seen = []
+        run = simulate(arm_scene(), frames="::2", progress=lambda done, total: seen.append((done, total)))
+        assert seen == [(1, 2), (2, 2)]
+        assert len(run.frames) == 2
+
+    @pytest.mark.parametrize("report", [True, False])
+    @pytest.mark.parametrize("preview", [True, False])
+    def test_report_and_preview_are_asked_for_one_by_one(self, report, preview, tmp_path):
+        settings = {"output.report": report, "output.preview": preview}
+        stream_run(arm_scene(end=10), tmp_path, settings=settings, pictures=False)
+        assert (tmp_path / "report.html").exists() == report
+
+    def test_units_change_nothing_but_units(self):
+        big = simulate(arm_scene(units="mm"))
+        rows = simulate(arm_scene(units="m")).metrics
+        assert {r.unit for r in rows if r.quantity == "length"} == {"m"}
+        for a, b in zip(big.metrics, rows):
+            if not a.quantity.startswith("time"):
+                assert a.value == pytest.approx(b.value)
+
+
+class TestStream:
+    def test_leaves_what_is_promised(self, tmp_path):
+        info = stream_run(arm_scene(), tmp_path)
+        assert files_in(tmp_path) == [
+            "bones.pvd",
+            "bones/fore_0000.vtp",
+            "bones/fore_0001.vtp",
+            "bones/fore_0002.vtp",
+            "bones/upper_0000.vtp",
+            "events.csv",
+            "metrics.csv",
+            "poses.csv",
+            "run.json",
+            "surfaces.pvd",
+            *(f"surfaces/biceps_000{k}.vtp" for k in range(3)),
+        ]
+        on_disk = json.loads((tmp_path / "run.json").read_text())
+        assert on_disk["status"] == info["status"] == "complete"
+        assert on_disk["scene"]["muscles"][0]["sha256"]
+        assert {"python", "numpy", "rbfmuscle"} <= set(on_disk["versions"])
+        assert {"build", "simulate", "metrics", "write", "wall"} <= set(on_disk["times"])
+        assert on_disk["stages"]["biceps"]["time_solve"]["median"] >= 0
+        facts = on_disk["muscles"]["biceps"]["volume_error"]
+        assert facts["count"] == 3
+        assert abs(facts["worst"]) >= abs(facts["last"])
+        assert [f["coordinates"]["elbow.flexion"] for f in on_disk["frames"]] == pytest.approx([0, 10, 20])
+
+    def test_tables_equal_the_run_in_memory(self, tmp_path):
+        run = simulate(arm_scene())
+        stream_run(arm_scene(), tmp_path / "a")
+        run.save(tmp_path / "b")
+        assert files_in(tmp_path / "a") == files_in(tmp_path / "b")
+        lines = table(tmp_path / "a" / "metrics.csv")
+        assert list(lines[0]) == ["frame", "coordinate", "angle", "muscle", "quantity", "value", "unit"]
+        timeless = [line for line in lines if not line["quantity"].startswith("time")]
+        expected = [r for r in run.metrics if not r.quantity.startswith("time")]
+        assert [float(line["value"]) for line in timeless] == [r.value for r in expected]
+        for name in ("poses.csv", "surfaces/biceps_0002.vtp", "bones.pvd"):
+            assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+    def test_streamed_and_saved_folders_are_the_same_but_for_times(self, tmp_path):
+        made = arm_scene(end=170, step=34)
+        # Thinner than the upper bone, so that it is driven into it where the elbow closes.
+        thin = trimesh.creation.box((40, 4, 4))
+        thin.apply_translation([22, 0, 0])
+        made.bones[1].mesh = thin
+        settings = {"contact.initial": "keep", "detect.tunnelling.action": "report"}
+        with pytest.warns(SceneWarning, match="upper and fore"):
+            stream_run(made, tmp_path / "streamed", settings=settings, frames="1:")
+        with pytest.warns(SceneWarning, match="upper and fore"):
+            simulate(made, settings=settings, frames="1:").save(tmp_path / "saved")
+        names = files_in(tmp_path / "streamed")
+        assert names == files_in(tmp_path / "saved") and "surfaces.pvd" in names
+        for name in names:
+            assert timeless(tmp_path / "streamed" / name) == timeless(tmp_path / "saved" / name), name
+        events = table(tmp_path / "saved" / "events.csv")
+        assert {event["action"] for event in events} >= {"bones_overlap"}
+
+    def test_poses_are_row_by_row(self, tmp_path):
+        run = simulate(arm_scene())
+        run.save(tmp_path)
+        np.testing.assert_array_equal(SavedRun(tmp_path).poses[2]["fore"], run.frames[2].poses["fore"])
+
+    def test_interrupt_keeps_the_frames_so_far(self, tmp_path):
+        def stop(done, total):
+            if done == 2:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            stream_run(arm_scene(), tmp_path, progress=stop)
+        saved = SavedRun(tmp_path)
+        assert saved.info["status"] == "interrupted"
+        assert saved.frames == [0, 1]
+        assert {r.frame for r in saved.metrics} == {0, 1}
+        assert len(saved.surface("biceps", 1)[0]) > 0
+        assert (tmp_path / "surfaces.pvd").read_text().endswith("</VTKFile>\n")
+
+    def test_failure_is_written_down(self, tmp_path, monkeypatch):
+        use_blend_model(monkeypatch, fail_at=8)
+        with pytest.raises(SolveError, match="planted"):
+            stream_run(arm_scene(), tmp_path)
+        saved = SavedRun(tmp_path)
+        assert saved.info["status"] == "failed"
+        assert "planted" in saved.info["message"]
+        assert saved.frames
+
+    def test_limit_exceeded_after_everything_is_written(self, tmp_path):
+        with pytest.raises(LimitExceededError, match="biceps: length"):
+            stream_run(arm_scene(), tmp_path, fail_on="length=3")
+        assert SavedRun(tmp_path).info["status"] == "complete"
+        stream_run(arm_scene(), tmp_path, fail_on=["length=300", "components"])
+
+    def test_second_run_leaves_nothing_of_the_first(self, tmp_path):
+        stream_run(arm_scene(), tmp_path)
+        stream_run(arm_scene(), tmp_path, frames=":1", settings={"output.surfaces": {"format": "ply"}})
+        assert "surfaces/biceps_0000.ply" in files_in(tmp_path)
+        assert not [name for name in files_in(tmp_path) if name.endswith((".vtp", ".pvd"))]
+
+    def test_only_what_is_asked_for_is_written(self, tmp_path):
+        info = stream_run(arm_scene(surfaces=False, metrics=False), tmp_path)
+        assert files_in(tmp_path) == ["events.csv", "poses.csv", "run.json"]
+        assert info["muscles"] == {}
+        assert "metrics" not in info["times"]
+
+    def test_unwritable_folder_is_one_line(self, tmp_path):
+        (tmp_path / "file").write_text("")
+        with pytest.raises(UsageError, match="cannot write to"):
+            stream_run(arm_scene(), tmp_path / "file" / "out")
+
+    def test_disk_that_fills_up_keeps_the_frames(self, tmp_path, monkeypatch):
+        import rbfmuscle.output.writer as writer
+
+        real, count = writer.write_mesh, []
+
+        def full(path, *args, **kwargs):
+            count.append(path)
+            if len(count) > 5:
+                raise OSError(28, "No space left on device")
+            real(path, *args, **kwargs)
+
+        monkeypatch.setattr(writer, "write_mesh", full)
+        with pytest.raises(SolveError, match="frame 2: No space left"):
+            stream_run(arm_scene(), tmp_path)
+        assert SavedRun(tmp_path).frames == [0, 1]
+
+
+class TestLimits:
+    def test_defaults_follow_the_unit(self):
+        limits = parse_limits("all", arm_scene(units="m"))
+        assert limits["penetration_max"] == pytest.approx(0.0005)
+        assert limits["volume_error"] == LIMITS["volume_error"]
+
+    @pytest.mark.parametrize("text", ["penetration", "length", "volume_error=abc", "volume_error=-1"])
+    def test_wrong_ones_are_refused(self, text):
+        with pytest.raises(UsageError):
+            parse_limits(text, arm_scene())
+
+    def test_near_name_is_offered(self):
+        with pytest.raises(UsageError, match="penetration_max"):
+            parse_limits("penetration_mx", arm_scene())
+
+
+def test_bones_driven_into_each_other_are_reported(hip_data, tmp_path):
+    scene = Scene.load(hip_data / "adduction.toml")
+    scene.muscles = [scene.muscle("gluteus_medius")]
+    with pytest.warns(SceneWarning, match="pelvis and femur: the motion drives the bones into each other"):
+        stream_run(scene, tmp_path / "out", frames="0:22", pictures=False)
+    rows = (tmp_path / "out" / "events.csv").read_text().splitlines()
+    assert any(row.split(",")[1:] == ["", "pelvis and femur", "1", "bones_overlap"] for row in rows)

@@ -1,0 +1,214 @@
+"""Keys of contraction, activation along a motion, tendon, and the law of the fibres."""
+
+import numpy as np
+import pytest
+from contraction_scenes import MUSCLE, spindle_scene
+
+from rbfmuscle.scene.activation.curve import SETTLING, STEP, Activations, activation_curve
+from rbfmuscle.scene.activation.keys import Contraction
+from rbfmuscle.scene.activation.law import FibreLaw
+from rbfmuscle.scene.activation.resolve import resolve_contraction
+from rbfmuscle.validation import SceneError
+
+STO = "controls\nversion=1\nendheader\ntime\t{column}\tother\n0.0\t0.0\t1\n0.5\t0.8\t1\n1.0\t0.4\t1\n"
+
+
+def scene(**keys):
+    return spindle_scene(frames=4, spacing=6.0, **keys)
+
+
+def law(tendon=(False, True), *, hold=0.3, **keys):
+    given = {"stretch_at_rest": 1.0, "shortening": 0.5, "tendon_strain": 0.05, **keys}
+    return FibreLaw(np.array(tendon), Contraction(tendon=np.array(tendon), **given), hold=hold)
+
+
+def test_law_at_rest_is_that_of_a_passive_muscle_to_the_last_digit():
+    stretch = np.random.default_rng(0).uniform(0.5, 2.0, 200)
+    passive = FibreLaw(np.zeros(200, bool), None, hold=0.3)
+    active = law(np.zeros(200, bool))
+    active.activate(1.0)
+    active.activate(0.0)
+    old = 1.0 + (1.0 - 0.3) * (stretch - 1.0)
+    for made in (passive, active):
+        assert made.passive
+        along, across = made.goal(stretch)
+        assert np.array_equal(along, old)
+        assert np.array_equal(across, old**-0.5)
+
+
+def test_fully_active_fibre_pulls_to_its_shortening_and_not_outwards():
+    made = law(stretch_at_rest=1.25)
+    made.activate(1.0)
+    along, across = made.goal(np.array([0.8, 0.8]))
+    assert along[0] == pytest.approx(0.5 / 1.25)
+    assert across[0] == pytest.approx(0.8**-0.5)
+
+
+def test_stretched_fibre_is_slack_down_to_its_slack_length():
+    made = law((False,) * 3, stretch_at_rest=1.25)
+    along, _ = made.goal(np.array([0.9, 0.8, 0.7]))
+    assert along == pytest.approx([0.9, 0.8, 0.8 + 0.7 * (0.7 - 0.8)])
+
+
+def test_tendon_yields_by_its_strain_and_no_more():
+    made = law()
+    assert made.goal(np.array([1.1, 1.1]))[0][1] == 1.0
+    made.activate(1.0)
+    assert made.goal(np.array([1.1, 1.03]))[0][1] == pytest.approx(1.03)
+    assert made.goal(np.array([1.1, 1.1]))[0][1] == pytest.approx(1.05)
+
+
+@pytest.mark.parametrize(
+    ("given", "values"),
+    [
+        (0.4, [0.4] * 5),
+        ([0.2], [0.2] * 5),
+        ([0, 1, 0], [0, 0.5, 1, 0.5, 0]),
+        ({"to": 0.8}, [0, 0.2, 0.4, 0.6, 0.8]),
+        ({"from": 1.0, "to": 0.0}, [1, 0.75, 0.5, 0.25, 0]),
+    ],
+)
+def test_activation_along_the_motion(given, values):
+    made = scene(activation=given)
+    course = activation_curve(made.muscle(MUSCLE), made.motion)
+    assert course == pytest.approx(values)
+
+
+@pytest.mark.parametrize("column", [MUSCLE, f"/forceset/{MUSCLE}/activation", f"{MUSCLE}.excitation"])
+def test_activation_from_a_file_of_controls(tmp_path, column):
+    path = tmp_path / "controls.sto"
+    path.write_text(STO.format(column=column))
+    made = scene(activation={"file": str(path)})
+    course = activation_curve(made.muscle(MUSCLE), made.motion)
+    assert course == pytest.approx([0.0, 0.4, 0.8, 0.6, 0.4])
+
+
+def test_controls_follow_the_time_of_a_motion_file(tmp_path):
+    path = tmp_path / "controls.sto"
+    path.write_text(STO.format(column=MUSCLE))
+    made = scene(activation={"file": str(path)})
+    made.motion.times = [0.0, 0.25, 0.5, 2.0, 3.0]
+    assert activation_curve(made.muscle(MUSCLE), made.motion) == pytest.approx([0.0, 0.4, 0.8, 0.4, 0.4])
+
+
+def test_chosen_frames_keep_their_activation():
+    made = scene(activation=[0, 1]).with_options(frames="2:5:2")
+    assert activation_curve(made.muscle(MUSCLE), made.motion) == pytest.approx([0.5, 1.0])
+
+
+def test_setting_from_outside_changes_one_key():
+    made = scene(activation=0.2).with_options({"shortening": 0.6, f"muscle.{MUSCLE}.activation": 0.5})
+    keys = made.muscle(MUSCLE).contraction
+    assert (keys.activation, keys.shortening) == (0.5, 0.6)
+
+
+def test_sub_steps_follow_activation_and_settle_where_bones_stand_still():
+    made = scene(activation=[0.0, 0.55])
+    activations = Activations(made)
+    here = made.motion.frames[0]
+    assert activations.refine(0, [here]) == ([here], [])
+    stops, values = activations.refine(4, [here])
+    steps = [value[MUSCLE] for value in values]
+    assert len(stops) == len(values) + 1
+    assert max(np.diff([0.0, *steps])) <= STEP + 1e-12
+    assert steps[-SETTLING - 1 :] == pytest.approx([0.55] * (SETTLING + 1))
+
+
+def test_muscles_without_the_keys_cost_no_sub_step():
+    made = scene()
+    made.muscle(MUSCLE).contraction = None
+    stops = [{"slider.pull": 0.0}, {"slider.pull": 1e-6}]
+    assert Activations(made).refine(1, stops) == (stops, [])
+
+
+def test_tendon_by_share_length_and_vertices_agree():
+    made = scene(tendon={"length": 60.0})
+    muscle = made.muscle(MUSCLE)
+    x = np.asarray(muscle.mesh.vertices)[:, 0]
+    held = np.zeros(len(x), bool)
+    held[np.concatenate([a.vertices for a in muscle.attachments])] = True
+    tendon = resolve_contraction(muscle).tendon
+    assert tendon[held].all()
+    assert np.abs(x[tendon & ~held]).min() == pytest.approx(100.0, abs=6.0)  # an edge of the mesh
+    share = resolve_contraction(scene(tendon=60.0 / 320.0).muscle(MUSCLE)).tendon
+    assert np.mean(share != tendon) < 0.02  # ways along edges are longer than the axis
+    listed = resolve_contraction(
+        scene(tendon={"vertices": np.flatnonzero(tendon).tolist()}).muscle(MUSCLE)
+    ).tendon
+    assert np.array_equal(listed, tendon)
+    one = resolve_contraction(scene(tendon={"length": 60.0, "at": "origin"}).muscle(MUSCLE)).tendon
+    assert np.array_equal(one, tendon & (x < 0))
+
+
+def test_optimal_fibre_length_gives_the_stretch_at_rest():
+    made = scene(optimal_fibre_length=256.0)
+    lines = made.muscle(MUSCLE).fibres
+    length = np.mean([np.linalg.norm(np.diff(line, axis=0), axis=1).sum() for line in lines])
+    assert resolve_contraction(made.muscle(MUSCLE)).stretch_at_rest == pytest.approx(length / 256.0)
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"activation": 1.2}, "from 0 to 1"),
+        ({"activation": -0.1}, "from 0 to 1"),
+        ({"activation": float("nan")}, "from 0 to 1"),
+        ({"activation": [0, 2]}, "got 2"),
+        ({"activation": "full"}, "got 'full'"),
+        ({"activation": {"file": "no.sto"}}, "cannot read"),
+        ({"activation": {"to": 0.5, "column": "x"}}, "column belongs to file"),
+        ({"tendon": 1.0}, "tendon"),
+        ({"tendon": {"length": 400.0}}, "covers all"),
+        ({"tendon": {"length": 0.01}}, "make it longer"),
+        ({"tendon": {"length": 5.0, "at": "insertoin"}}, "did you mean 'insertion'"),
+        ({"tendon": {"vertices": [10**6]}}, "vertex numbers"),
+        ({"tendon": {"length": 5.0, "share": 0.1}}, "one of share, length and vertices"),
+        ({"shortening": 0.0}, "shortening"),
+        ({"fibre_stretch_at_rest": 1.1, "optimal_fibre_length": 100.0}, "not both"),
+        ({"optimal_fibre_length": 10.0}, "check the unit"),
+        ({"shortenning": 0.5}, "did you mean 'shortening'"),
+    ],
+)
+def test_wrong_keys_are_one_line(keys, words):
+    with pytest.raises(SceneError) as caught:
+        scene(**keys).validate()
+    message = str(caught.value)
+    assert words in message
+    assert "\n" not in message
+    assert MUSCLE in message
+
+
+def test_length_without_fibres_is_refused():
+    made = scene(optimal_fibre_length=256.0)
+    made.muscle(MUSCLE).fibres = None
+    with pytest.raises(SceneError, match="needs fibres"):
+        made.validate()
+
+
+def test_fibres_that_leave_the_muscle_are_refused():
+    made = scene()
+    made.muscle(MUSCLE).fibres = [line + [0, 0, 80.0] for line in made.muscle(MUSCLE).fibres]
+    with pytest.raises(SceneError, match="leaves the muscle"):
+        made.validate()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (STO.format(column="tibia"), "has no column 'muscle', it has tibia"),
+        (STO.format(column="muscl"), "did you mean 'muscl'"),
+        (STO.format(column=MUSCLE).replace("0.8", "1.8"), "row 2"),
+        (STO.format(column=MUSCLE).replace("0.8", "nan"), "row 2"),
+        (STO.format(column=MUSCLE).replace("0.5\t", ""), "rows need 3 values"),
+        (STO.format(column=MUSCLE).replace("0.5\t", "0.0\t"), "increases"),
+        ("time x\n0 1\n", "no OpenSim motion"),
+    ],
+)
+def test_wrong_controls_are_one_line(tmp_path, text, words):
+    path = tmp_path / "controls.sto"
+    path.write_text(text)
+    with pytest.raises(SceneError) as caught:
+        scene(activation={"file": str(path)}).validate()
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert "controls.sto" in str(caught.value)

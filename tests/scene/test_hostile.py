@@ -1,0 +1,276 @@
+"""Scenes and meshes made to break the program: each ends in one line with its code, before anything grows."""
+
+import numpy as np
+import pytest
+import trimesh
+from fuzz.base import base_scene, muscle_mesh, write_base
+from fuzz.harness import check_volume
+from fuzz.meshes import KINDS, damaged_shape
+from fuzz.scenes import Raw, nested, to_toml
+
+from rbfmuscle.models import build_model, check_models
+from rbfmuscle.scene.check import check_initial
+from rbfmuscle.scene.meshes.read import prepare_mesh, read_mesh
+from rbfmuscle.scene.phantom import phantom_scene
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.substeps import check_substeps, estimate_substeps
+from rbfmuscle.validation import MeshError, SceneError, UsageError
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("hostile")
+    write_base(folder)
+    return folder
+
+
+def refused(folder, change, words):
+    """The one line with which the base scene is refused once it was changed."""
+    tables = base_scene()
+    change(tables)
+    path = folder / "scene.toml"
+    path.write_text(to_toml(tables))
+    with pytest.raises(SceneError, match=words) as caught:
+        scene = Scene.load(path)
+        check_models(scene)
+        check_initial(scene)
+    text = str(caught.value)
+    assert "\n" not in text and len(text) < 1000
+    return text
+
+
+def put(*path):
+    """A change of the tables: the last of ``path`` is the value, the others lead to its place."""
+    *keys, last, value = path
+
+    def change(tables):
+        for key in keys:
+            tables = tables[key]
+        tables[last] = value
+
+    return change
+
+
+class TestNumbers:
+    @pytest.mark.parametrize(
+        ("change", "words"),
+        [
+            (put("bone", 1, "scale", 10**20), "whole number must be at most 2\\^53"),
+            (put("contact", "margin", Raw("9" * 5000)), "not valid TOML"),
+            (put("muscle", 0, "attach", 0, "vertices", [10**19]), "2\\^53"),
+            (put("muscle", 0, "attach", 0, "vertices", [2**52]), "out of range"),
+            (put("joint", 0, "centre", nested(1000)), "nested"),
+            (put("joint", 0, "centre", nested(30)), "nested more than 20 deep"),
+            (put("defaults", "model", float("inf")), "defaults.model: must be a finite number, got inf"),
+            (put("defaults", "model", [1, 2]), "model must be a name or a table"),
+            (put("muscle", 0, "model", "seed", 1.5), "seed"),
+            (put("muscle", 0, "model", "kernel", ["cubic"]), "kernel"),
+            (put("contact", "substep_angle", float("nan")), "finite"),
+            (put("muscle", 0, "mesh", "/dev/zero"), "not a mesh|no such"),
+            (put("motion", {"file": "/dev/zero"}), "no such file"),
+            (put("muscle", 0, "attach", 0, "vertices", "/dev/zero"), "no such file"),
+        ],
+    )
+    def test_value_that_no_key_can_mean(self, folder, change, words):
+        try:
+            refused(folder, change, words)
+        except MeshError as error:  # of meshes the mesh is at fault
+            assert "no such" in str(error) or "not a mesh" in str(error)
+
+    def test_numbers_of_files(self, folder):
+        (folder / "huge.txt").write_text("1 2 99999999999999999999")
+        refused(folder, put("muscle", 0, "attach", 0, "vertices", "huge.txt"), "out of range")
+        (folder / "long.txt").write_text("9" * 5000)
+        refused(folder, put("muscle", 0, "attach", 0, "vertices", "long.txt"), "not a vertex number")
+        (folder / "deep.json").write_text("[" * 100_000)
+        refused(folder, put("muscle", 0, "fibres", "deep.json"), "not JSON")
+        for lines in (
+            "[[[1e400, 0, 0], [1, 0, 0]]]",
+            f"[[[{'9' * 400}, 0, 0], [1, 0, 0]]]",
+            '[["a"]]',
+            "[[1]]",
+        ):
+            (folder / "odd.json").write_text(lines)
+            refused(folder, put("muscle", 0, "fibres", "odd.json"), "polyline 0")
+
+    def test_scene_file_of_any_size(self, folder):
+        (folder / "large.toml").write_bytes(b"#" * 5_000_000)
+        with pytest.raises(SceneError, match="5000000 bytes"):
+            Scene.load(folder / "large.toml")
+        with pytest.raises(SceneError, match="no such scene file"):
+            Scene.load("/dev/zero")
+
+    def test_settings_of_the_command_line(self):
+        scene = phantom_scene()
+        for value in (float("inf"), [1], 1.5, {"name": 3}):
+            with pytest.raises((SceneError, UsageError)):
+                check_models(scene.with_options({"model.seed": value}))
+
+
+class TestMotions:
+    def test_angle_of_a_million_degrees(self, folder):
+        text = refused(
+            folder, put("motion", {"ramp": {"hip.flexion": {"to": 1e6, "step": 100.0}}}), "sub-steps"
+        )
+        assert "'hip.flexion' takes about" in text and "motion.max_substeps" in text
+
+    def test_limit_of_substeps_can_be_raised(self, folder):
+        ramp = {"ramp": {"hip.flexion": {"to": 90.0, "step": 3.0}}}
+        refused(folder, put("motion", {**ramp, "max_substeps": 20}), "more than 20")
+        tables = base_scene()
+        tables["motion"] = {**ramp, "max_substeps": 1000}
+        (folder / "long.toml").write_text(to_toml(tables))
+        check_initial(Scene.load(folder / "long.toml"))
+
+    def test_estimate_is_near_what_is_done(self):
+        from rbfmuscle.simulation.plan.plan import plan_scene
+
+        scene = phantom_scene()
+        assert sum(estimate_substeps(scene).values()) == pytest.approx(plan_scene(scene)["substeps"], rel=0.2)
+
+    def test_joint_far_away(self, folder):
+        refused(folder, put("joint", 0, "centre", [1e12, 0.0, 0.0]), "1e\\+12 mm away from all bones")
+
+        def change(tables):
+            tables["joint"][0]["centre"] = [1e5, 0.0, 0.0]
+            tables["motion"]["max_substeps"] = 1000
+
+        text = refused(folder, change, "sub-steps, more than 1000")
+        assert "far from the joint's centre" in text
+
+    def test_angle_of_a_substep_that_is_next_to_nothing(self, folder):
+        refused(folder, put("contact", "substep_angle", 1e-9), "substep_angle = 1e-09 is small")
+
+    @pytest.mark.parametrize("step", [1e-300, 1e-6])
+    def test_waypoints_without_end(self, folder, step):
+        stops = [{"hip.flexion": 0.0}, {"hip.flexion": 80.0}] * 1000
+        refused(folder, put("motion", {"waypoints": stops, "step": step}), "frames, more than 100000")
+        # No pair of stops is too far apart by itself.
+        refused(folder, put("motion", {"waypoints": stops, "step": 0.1}), "frames, more than 100000")
+
+    def test_one_frame_that_needs_too_many(self):
+        scene = phantom_scene().with_options({"motion.max_substeps": 5})
+        with pytest.raises(SceneError, match="more than 5"):
+            check_substeps(scene)
+
+
+def shape(change):
+    """The base muscle's vertices and faces after a change of either."""
+    mesh = muscle_mesh()
+    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    return change(vertices, faces) or (vertices, faces)
+
+
+def flat(vertices, faces):
+    vertices[:, 0] = 34.0
+
+
+def bow_tie(vertices, faces):
+    upper = vertices[:, 2] > -10
+    vertices[upper, :2] = [68.0, 0.0] - vertices[upper, :2]
+
+
+def inside_out_half(vertices, faces):
+    upper = vertices[:, 2] > -10
+    vertices[upper, 2] = -20 - vertices[upper, 2]
+
+
+@pytest.fixture(params=[(kind, seed) for kind in range(KINDS) for seed in range(3)], ids=str)
+def hostile_mesh(request):
+    """A mesh damaged in one of many kinds."""
+    kind, seed = request.param
+    return damaged_shape(np.random.default_rng(seed), kind)
+
+
+class TestMeshes:
+    def test_damaged_mesh_is_mended_with_its_volume_or_refused_in_one_line(self, hostile_mesh, tmp_path):
+        path = tmp_path / "a.stl"
+        hostile_mesh.export(path)
+        try:
+            mesh = read_mesh(path).mesh
+        except MeshError as error:
+            assert "a.stl" in str(error) and "\n" not in str(error)
+        else:
+            assert mesh.is_watertight
+            check_volume(np.asarray(mesh.vertices), np.asarray(mesh.faces), "a.stl")
+
+    @pytest.mark.parametrize("change", [flat, inside_out_half], ids=lambda change: change.__name__)
+    def test_surface_without_an_inside_is_refused(self, change):
+        with pytest.raises(MeshError, match=r"encloses no volume|passes through itself"):
+            prepare_mesh(*shape(change), place="a.ply", name="a")
+
+    def test_turned_half_is_either_right_or_refused(self):
+        try:
+            read = prepare_mesh(*shape(bow_tie), place="a.ply", name="a")
+        except MeshError as error:
+            assert "passes through itself" in str(error) or "encloses no volume" in str(error)
+        else:
+            check_volume(read.mesh.vertices, read.mesh.faces, "a.ply")
+
+    def test_one_triangle_twice(self):
+        with pytest.raises(MeshError):
+            prepare_mesh(np.eye(3) * 50, [[0, 1, 2], [0, 2, 1]], place="a.ply", name="a")
+
+    @pytest.mark.parametrize("value", [1e300, -1e38, np.nan, np.inf])
+    def test_vertex_beyond_all_lengths(self, value):
+        def change(vertices, faces):
+            vertices[5, 1] = value
+
+        with pytest.raises(MeshError, match=r"vertices are (further away|not finite).*number 5"):
+            prepare_mesh(*shape(change), place="a.ply", name="a")
+
+    def test_surface_that_crosses_itself_a_little_is_noted(self):
+        def change(vertices, faces):
+            vertices[:40] += np.random.default_rng(1).normal(size=(40, 3)) * 6
+
+        assert any(
+            "passes through itself" in note for note in prepare_mesh(*shape(change), place="", name="").notes
+        )
+
+    @pytest.mark.parametrize("kind", ["points", "edges", "lines"])
+    @pytest.mark.parametrize("model", ["rbf", "pbd"])
+    def test_collapsed_triangles_make_a_muscle(self, folder, kind, model):
+        def change(vertices, faces):
+            few = faces[[3, 60, 200]]
+            if kind == "points":
+                vertices[few] = vertices[few].mean(axis=1)[:, None]
+            elif kind == "edges":
+                vertices[few[:, 0]] = vertices[few[:, 1]]
+            else:
+                vertices[few[:, 0]] = vertices[few[:, 1:]].mean(axis=1)
+
+        mesh = trimesh.Trimesh(*shape(change), process=False)
+        mesh.export(folder / "collapsed.ply")
+        tables = base_scene()
+        tables["muscle"][0]["mesh"] = "collapsed.ply"
+        tables["muscle"][0]["model"] = {
+            "name": model,
+            **({"centres": 40, "samples": 100} if model == "rbf" else {}),
+        }
+        (folder / "collapsed.toml").write_text(to_toml(tables))
+        scene = Scene.load(folder / "collapsed.toml")
+        built = build_model(scene.muscles[0], scene)
+        assert np.isfinite(built.contact_points()).all()
+        assert scene.muscles[0].mesh.volume == pytest.approx(muscle_mesh().volume, rel=0.1)
+
+    def test_obj_with_numbers_beyond_all_vertices(self, tmp_path):
+        path = tmp_path / "a.obj"
+        for number in ("99999999999999999999", "9" * 5000, "-7"):
+            path.write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 {number}\n")
+            with pytest.raises(MeshError, match=r"a\.obj"):
+                read_mesh(path)
+
+    def test_damaged_stl_says_nothing_of_its_own(self, tmp_path, capfd):
+        mesh = muscle_mesh()
+        whole = {"text": mesh.export(file_type="stl_ascii").encode(), "binary": mesh.export(file_type="stl")}
+        path = tmp_path / "a.stl"
+        for data in (
+            whole["text"][:9000],
+            whole["text"].replace(b"vertex", b"vertex x", 1),
+            whole["binary"][:9000],
+            whole["binary"][:80] + b"\xff\xff\xff\xff" + whole["binary"][84:],
+        ):
+            path.write_bytes(data)
+            with pytest.raises(MeshError, match=r"a\.stl"):
+                read_mesh(path)
+        assert capfd.readouterr() == ("", "")

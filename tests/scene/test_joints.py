@@ -1,0 +1,340 @@
+"""Joints of every kind: functions, the table of kinds, rest poses, couplings, and the way to files and back."""
+
+import itertools
+import math
+import tomllib
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from rbfmuscle.scene.file import SceneFile
+from rbfmuscle.scene.joints.functions import Linear, PiecewiseLinear, Polynomial, Scaled, Spline
+from rbfmuscle.scene.joints.joint import KINDS, frame_angles, frame_at
+from rbfmuscle.scene.joints.skeleton import rest_values
+from rbfmuscle.scene.joints.tables import JointTable, coupling_row, joint_row
+from rbfmuscle.scene.motion import Motion, bone_poses, step_angle, turned_angle
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.frame_loop import simulate_frames
+from rbfmuscle.simulation.plan.contact_pairs import find_contact_pairs, sampled_poses
+from rbfmuscle.simulation.substeps import SubSteps
+from rbfmuscle.validation import SceneError
+
+BOX = trimesh.creation.box((10, 10, 10))
+DEG = math.pi / 180
+
+
+def pair(units="mm", **row):
+    """Bone b on bone a by one joint ``j``."""
+    scene = Scene("pair", units=units).add_bone("a", BOX).add_bone("b", BOX)
+    return scene.add_joint("j", "a", "b", **{"centre": (3.0, -2.0, 5.0), **row})
+
+
+def knee(**coordinate):
+    """Rolls by a spline in one direction and glides by a polynomial in another."""
+    return pair(
+        type="custom",
+        orientation=[10.0, -20.0, 30.0],
+        rotations=[{"axis": [0.1, 0.2, 1.0], "coordinates": ["q"]}],
+        translations=[
+            {"axis": [1, 0, 0], "coordinates": ["q"], "spline": {"x": [-120, -60, 0, 10], "y": [3, 9, 5, 4]}},
+            {"axis": [0, 1, 0], "coordinates": ["q"], "polynomial": [0.001, -0.1, 7.0]},
+        ],
+        coordinates={"q": {"range": [-120, 10], **coordinate}},
+    )
+
+
+class TestFunctions:
+    X, Y = (0.0, 0.7, 1.1, 2.0, 3.5), (1.0, -0.3, 0.4, 2.0, 1.0)
+
+    def test_natural_spline_is_scipys(self):
+        mine, other = Spline(self.X, self.Y, natural=True), CubicSpline(self.X, self.Y, bc_type="natural")
+        for q in np.linspace(0, 3.5, 50):
+            assert mine(q) == pytest.approx(float(other(q)), abs=1e-13)
+
+    def test_spline_of_a_cubic_is_that_cubic_and_goes_on_straight(self):
+        cubic = np.poly1d([0.3, -1.0, 0.5, 2.0])
+        mine = Spline(self.X, tuple(cubic(np.array(self.X))))
+        for q in np.linspace(0, 3.5, 50):
+            assert mine(q) == pytest.approx(cubic(q), abs=1e-12)
+        assert mine(-2.0) == pytest.approx(cubic(0.0) - 2.0 * cubic.deriv()(0.0), abs=1e-12)
+        assert mine(5.0) == pytest.approx(cubic(3.5) + 1.5 * cubic.deriv()(3.5), abs=1e-12)
+
+    def test_spline_bends_smoothly_at_its_points(self):
+        mine, h = Spline(self.X, self.Y), 1e-4
+        for x in self.X[1:-1]:
+            left, right = ((mine(x) - mine(x - h)) / h, (mine(x + h) - mine(x)) / h)
+            assert left == pytest.approx(right, abs=2e-3)  # h times the second derivative
+        assert [mine(x) for x in self.X] == pytest.approx(self.Y, abs=1e-14)
+
+    def test_three_points_are_a_parabola_and_two_a_line(self):
+        parabola = np.poly1d([2.0, -1.0, 3.0])
+        three = Spline((0.0, 1.0, 3.0), tuple(parabola(np.array([0.0, 1.0, 3.0]))))
+        assert three(2.2) == pytest.approx(parabola(2.2), abs=1e-13)
+        assert Spline((1.0, 3.0), (4.0, 8.0))(5.0) == pytest.approx(12.0)
+
+    def test_piecewise_linear_goes_on_beyond_its_ends(self):
+        f = PiecewiseLinear((0.0, 1.0, 2.0), (0.0, 3.0, 3.0))
+        assert [f(-1.0), f(0.5), f(1.5), f(4.0)] == [-3.0, 1.5, 3.0, 3.0]
+
+    @pytest.mark.parametrize(
+        "function",
+        [
+            Linear((2.0,), 0.3),
+            Polynomial((0.5, -1.0, 2.0)),
+            PiecewiseLinear((-1.0, 0.5, 2.0), (1.0, 4.0, 2.0)),
+            Spline((-1.0, 0.5, 2.0, 2.5), (1.0, 4.0, 2.0, 0.0)),
+            Spline((-1.0, 0.5, 2.0), (1.0, 4.0, 2.0), natural=True),
+            Scaled(-1.7, Polynomial((1.0, 0.0, 1.0))),
+        ],
+        ids=lambda f: type(f).__name__,
+    )
+    def test_other_units_change_the_numbers_only(self, function):
+        other = function.rescaled([57.0], 1000.0)
+        for q in np.linspace(-2, 3, 20):
+            assert other(57.0 * q) == pytest.approx(1000.0 * function(q), rel=1e-12)
+
+
+class TestKinds:
+    @pytest.mark.parametrize("kind", sorted(set(KINDS) - {"custom", "fixed"}))
+    def test_each_coordinate_turns_or_shifts_along_its_axis(self, kind):
+        facts = KINDS[kind]
+        directions = [*facts.rotations, *facts.translations]
+        names = [f"q{k}" for k in range(len(directions))]
+        scene = pair(type=kind, coordinates={name: {} for name in names})
+        centre = np.array([3.0, -2.0, 5.0])
+        for k, (name, axis) in enumerate(zip(names, directions)):
+            pose = bone_poses(scene, {f"j.{name}": 0.4})["b"]
+            if k < len(facts.rotations):
+                assert pose[:3, :3] == pytest.approx(Rotation.from_rotvec(0.4 * np.array(axis)).as_matrix())
+                assert pose[:3, :3] @ centre + pose[:3, 3] == pytest.approx(centre)
+            else:
+                assert pose == pytest.approx(frame_at(0.4 * np.array(axis)))
+
+    def test_free_joint_is_body_fixed_turns_after_a_shift(self):
+        scene = pair(type="free", coordinates={name: {} for name in "abcxyz"})
+        q = {"j.a": 0.3, "j.b": -0.5, "j.c": 0.9, "j.x": 1.0, "j.y": 2.0, "j.z": 3.0}
+        pose, centre = bone_poses(scene, q)["b"], np.array([3.0, -2.0, 5.0])
+        assert pose[:3, :3] == pytest.approx(Rotation.from_euler("XYZ", [0.3, -0.5, 0.9]).as_matrix())
+        assert pose[:3, :3] @ centre + pose[:3, 3] == pytest.approx(centre + [1, 2, 3])
+
+    def test_fixed_joint_carries_along(self):
+        scene = Scene("s").add_bone("a", BOX).add_link("b").add_bone("c", BOX)
+        scene.add_joint("j", "a", "b", (0, 0, 0), {"q": (0, 0, 1)})
+        scene.add_joint("f", "b", "c", type="fixed")
+        poses = bone_poses(scene, {"j.q": 0.7})
+        assert list(poses) == ["a", "c"]
+        assert turned_angle(poses["c"][:3, :3]) == pytest.approx(0.7)
+
+    def test_backward_is_the_inverse(self):
+        forth, back = pair(axes={"q": (1, 2, 3)}), pair(axes={"q": (1, 2, 3)}, backward=True)
+        product = bone_poses(forth, {"j.q": 0.8})["b"] @ bone_poses(back, {"j.q": 0.8})["b"]
+        assert product == pytest.approx(np.eye(4), abs=1e-13)
+
+    @pytest.mark.parametrize(
+        ("row", "message"),
+        [
+            (
+                {"type": "hinge", "axes": {"p": (1, 0, 0), "q": (0, 1, 0)}},
+                "a hinge joint has 1 coordinates, 2",
+            ),
+            ({"type": "hinge"}, "name them in axes"),
+            ({"type": "ball"}, "axes needs at least one"),
+            ({"type": "welded"}, "type"),
+            ({"type": "custom", "axes": {"q": (1, 0, 0)}}, "rotations and translations instead of axes"),
+            ({"type": "hinge", "axes": {"q": (1, 0, 0)}, "coordinates": {"r": {}}}, "'r' moves nothing"),
+            (
+                {"type": "custom", "rotations": [{"axis": [1, 0, 0], "coordinates": ["q"], "linear": [1.0]}]},
+                "linear needs a slope",
+            ),
+            (
+                {
+                    "axes": {"q": (1, 0, 0)},
+                    "coordinates": {"q": {"locked": True, "rest": 1.0, "default": 2.0}},
+                },
+                "locked coordinate stays",
+            ),
+            ({"axes": {"q": (1, 0, 0)}, "coordinates": {"q": {"range": [3, 1]}}}, "range must go upwards"),
+        ],
+    )
+    def test_wrong_tables_are_named(self, row, message):
+        with pytest.raises(SceneError, match=message):
+            pair(**row)
+
+
+class TestRestPose:
+    def test_rest_pose_may_be_any_pose(self):
+        """Meshes scanned at 40 degrees: the motion from there is that of meshes moved there by a scene at 0."""
+        zero, scanned = knee(), knee(rest=-40.0)
+        assert np.array_equal(bone_poses(scanned, {})["b"], np.eye(4))
+        assert np.array_equal(bone_poses(scanned, {"j.q": -40 * DEG})["b"], np.eye(4))
+        start = bone_poses(zero, {"j.q": -40 * DEG})["b"]
+        for angle in (-110.0, -40.0, -3.0, 0.0, 15.0):
+            want = bone_poses(zero, {"j.q": angle * DEG})["b"] @ np.linalg.inv(start)
+            assert bone_poses(scanned, {"j.q": angle * DEG})["b"] == pytest.approx(want, abs=1e-12)
+
+    def test_absent_coordinates_stay_at_default_or_rest(self):
+        scene = knee(rest=-40.0)
+        assert scene.set_motion(ramp={"q": {"to": -30, "step": 5}}).motion.frames[0] == {"j.q": -40 * DEG}
+        waiting = knee(rest=-40.0, default=-10.0).set_motion(waypoints=[{}])
+        assert waiting.motion.frames == [{"j.q": -10 * DEG}]
+
+    def test_sampled_poses_and_sub_steps_start_at_rest(self):
+        scene = knee(rest=-40.0).set_motion(ramp={"q": {"from": -40, "to": -38, "step": 1}})
+        assert all(turned_angle(poses["b"][:3, :3]) < 3 * DEG for poses in sampled_poses(scene))
+        stops = SubSteps(scene).split({}, {"j.q": -38.5 * DEG})
+        assert stops[-1] == {"j.q": -38.5 * DEG} and len(stops) == 1
+
+
+class TestCoordinates:
+    def test_locks_ranges_and_couplings_are_honoured(self):
+        scene = pair(
+            type="universal",
+            axes={"p": (1, 0, 0), "q": (0, 1, 0)},
+            coordinates={"p": {"range": [-10, 20], "clamped": True}, "q": {"locked": True, "rest": 0.0}},
+        )
+        moved = bone_poses(scene, {"j.p": 90 * DEG, "j.q": 1.0})["b"]
+        assert moved == pytest.approx(bone_poses(scene, {"j.p": 20 * DEG})["b"])
+
+    def test_couplings_follow_each_other_in_any_order(self):
+        scene = Scene("s").add_bone("a", BOX).add_bone("b", BOX).add_bone("c", BOX).add_bone("d", BOX)
+        for name, bone in zip("xyz", "bcd"):
+            scene.add_joint(name, "a", bone, (0, 0, 0), {name: (0, 0, 1)})
+        scene.add_coupling("z", ["y"], linear=[2.0, 1.0])
+        scene.add_coupling("y", ["x"], polynomial=[0.01, 0.0, 0.0], scale=0.5)
+        poses = bone_poses(scene, {"x.x": 20 * DEG})
+        assert turned_angle(poses["c"][:3, :3]) == pytest.approx(2.0 * DEG)
+        assert turned_angle(poses["d"][:3, :3]) == pytest.approx(4.0 * DEG)  # 5, of which 1 is at rest
+        assert rest_values(scene.joints, scene.couplings)["z.z"] == pytest.approx(1.0 * DEG)
+        with pytest.raises(SceneError, match="follows itself"):
+            scene.add_coupling("x", ["z"])
+        with pytest.raises(SceneError, match="follows other coordinates"):
+            scene.set_motion(ramp={"z": {"to": 3, "step": 1}})
+
+    def test_leaving_a_range_is_reported(self):
+        scene = knee().set_motion(ramp={"q": {"from": 0, "to": 20, "step": 5}})
+        assert scene.motion.notes == [
+            "coordinate 'j.q' leaves its range -120 to 10 in 2 of 5 frames, by up to 10"
+        ]
+        assert any("leaves its range" in str(finding) for finding in scene.check())
+
+    def test_motion_of_a_custom_coordinate_is_told_as_opensim_does(self):
+        row = {"axis": [1, 0, 0], "coordinates": ["q"]}
+        for function, kind in (
+            ({}, "rotation"),
+            ({"linear": [-1, 3]}, "rotation"),
+            ({"linear": [0.5, 0]}, "coupled"),
+        ):
+            scene = pair(type="custom", rotations=[{**row, **function}])
+            assert scene.joints[0].coordinates["q"].motion == kind
+        both = pair(type="custom", rotations=[row], translations=[{**row, "axis": [0, 1, 0]}])
+        assert both.joints[0].coordinates["q"].motion == "translation"
+
+
+class TestRows:
+    def test_rows_make_the_same_joint_again(self):
+        scenes = [
+            knee(rest=-33.3, default=-20.0),
+            pair(axes={"flexion": (-1, 0, 0), "turn": (0.2, 0.3, 0.9)}),
+            pair(
+                type="planar",
+                orientation=[5, 6, 7],
+                coordinates={"r": {"rest": 3.0}, "x": {}, "y": {"rest": 2.5}},
+            ),
+            pair(type="fixed", centre=None),
+            pair(axes={"q": (0, 0, 1)}, backward=True),
+        ]
+        for scene in scenes:
+            again = JointTable.build(joint_row(scene.joints[0]), place="").joint()
+            other = Scene("other").add_bone("a", BOX).add_bone("b", BOX).place_joint(again)
+            names = again.coordinates
+            q = {f"j.{name}": 0.1 * (k + 1) for k, name in enumerate(names)}
+            assert bone_poses(other, q)["b"] == pytest.approx(bone_poses(scene, q)["b"], abs=1e-13)
+            assert again.coordinates == {
+                name: pytest.approx(facts) if isinstance(facts, float) else facts
+                for name, facts in scene.joints[0].coordinates.items()
+            } or joint_row(again) == joint_row(scene.joints[0])
+
+    def test_coupling_rows(self):
+        scene = knee()
+        scene.add_link("p").add_joint("k", "a", "p", (0, 0, 0), type="slider", coordinates={"s": {}})
+        scene.add_coupling("s", ["q"], spline={"x": [-120, 0, 10], "y": [30, 2, 1]}, scale=1.5)
+        row = coupling_row(scene.couplings[0], scene.joints)
+        assert row["coordinate"] == "k.s" and row["of"] == ["j.q"] and row["scale"] == 1.5
+        assert row["spline"]["x"] == pytest.approx([-120, 0, 10]) and row["spline"]["y"] == [30, 2, 1]
+
+    def test_example_of_the_documentation(self):
+        from pathlib import Path
+
+        text = (Path(__file__).parents[2] / "docs" / "scene_file.md").read_text(encoding="utf-8")
+        block = text.split("The knee of a gait model", 1)[1].split("```toml\n", 1)[1].split("```", 1)[0]
+        head = '[scene]\nformat = 1\nunits = "mm"\n'
+        joint = SceneFile.build(tomllib.loads(head + block), place="docs").joint[0].joint()
+        assert joint.coordinates["angle"].motion == "rotation"
+
+    def test_frame_angles(self):
+        for angles in [(0.1, -0.4, 2.0), (3.0, 1.5, -3.0), (0.5, math.pi / 2, 0.0)]:
+            frame = frame_at(np.zeros(3), angles)
+            assert frame_at(np.zeros(3), frame_angles(frame[:3, :3])) == pytest.approx(frame, abs=1e-12)
+
+
+class TestSteps:
+    def test_a_pure_shift_is_cut_into_steps_and_reached(self):
+        from toy_scene import attach, ellipsoid
+
+        mesh = ellipsoid((30, 4, 4))
+        scene = Scene("s").add_bone("a", BOX).add_bone("b", BOX)
+        scene.add_joint("j", "a", "b", (0, 0, 0), type="slider", axes={"s": (1, 0, 0)})
+        ends = [attach(mesh, "a", lambda v: v[:, 0] < -20), attach(mesh, "b", lambda v: v[:, 0] > 20)]
+        scene.add_muscle("m", mesh, attach=[{"bone": e.bone, "vertices": e.vertices.tolist()} for e in ends])
+        scene.motion = Motion([{"j.s": 0.0}, {"j.s": 40.0}])
+        stops = SubSteps(scene).split({"j.s": 0.0}, {"j.s": 40.0})
+        values = [0.0, *(stop["j.s"] for stop in stops)]
+        assert values[-1] == 40.0 and max(b - a for a, b in itertools.pairwise(values)) < 60 / 27 * 1.01
+        box = find_contact_pairs(scene)["m", "b"]
+        assert box[0, 0] <= -70.0 + 1e-9  # seen from b, the muscle's other end is 40 further away
+
+    def test_whole_body_shifts_need_no_sub_steps(self):
+        from toy_scene import attach, ellipsoid
+
+        mesh = ellipsoid((30, 4, 4))
+        scene = Scene("s").add_link("ground").add_bone("a", BOX).add_bone("b", BOX)
+        scene.add_joint("root", "ground", "a", (0, 0, 0), type="slider", axes={"x": (1, 0, 0)})
+        scene.add_joint("j", "a", "b", (0, 0, 0), {"q": (0, 0, 1)})
+        ends = [attach(mesh, "a", lambda v: v[:, 0] < -20), attach(mesh, "b", lambda v: v[:, 0] > 20)]
+        scene.add_muscle("m", mesh, attach=[{"bone": e.bone, "vertices": e.vertices.tolist()} for e in ends])
+        assert len(SubSteps(scene).split({"root.x": 0.0}, {"root.x": 500.0})) == 1
+
+    def test_step_angle_counts_turns_and_shifts(self):
+        scene = knee()
+        turn = step_angle(scene, {"j.q": 0.0}, {"j.q": -0.1}, shifts=False)
+        assert turn == pytest.approx(0.1, rel=1e-9)
+        slide = pair(type="slider", axes={"s": (0, 1, 0)})
+        assert step_angle(slide, {}, {"j.s": 5.0}) == pytest.approx(0.1)
+
+
+def test_custom_joint_that_equals_a_ball_gives_the_same_result():
+    from toy_scene import ToyMuscle, hinged_scene
+
+    def run(joints):
+        scene, fields = hinged_scene(np.radians(np.arange(0, 61, 5)))
+        name = scene.joints[0].name
+        if joints is not None:
+            scene.joints = [joints(scene.joints[0])]
+        assert scene.joints[0].name == name
+        models = [ToyMuscle(muscle, scene) for muscle in scene.muscles]
+        return [
+            f.carried[scene.muscles[0].name][0]
+            for f in simulate_frames(scene, models, fields=fields, surfaces=False)
+        ]
+
+    def custom(ball):
+        row = joint_row(ball)
+        axes = row.pop("axes")
+        row |= {"type": "custom", "rotations": [{"axis": a, "coordinates": [n]} for n, a in axes.items()]}
+        return JointTable.build(row, place="").joint()
+
+    for one, two in zip(run(None), run(custom)):
+        assert np.array_equal(one, two)

@@ -1,0 +1,186 @@
+"""Reading meshes of every format, and mending them only where that is safe."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from rbfmuscle.scene.meshes.read import read_mesh
+from rbfmuscle.validation import MeshError
+
+
+def ball(radius=20.0):
+    return trimesh.creation.icosphere(subdivisions=2, radius=radius)
+
+
+def write(path, vertices, faces):
+    trimesh.Trimesh(vertices, faces, process=False).export(path)
+    return path
+
+
+def write_vtk(path, mesh):
+    import pyvista
+
+    pyvista.make_tri_mesh(mesh.vertices, mesh.faces).save(path)
+    return path
+
+
+class TestFormats:
+    @pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply", ".vtk", ".vtp"])
+    def test_every_format_gives_the_same_surface(self, tmp_path, suffix):
+        mesh = ball()
+        path = tmp_path / f"ball{suffix}"
+        write_vtk(path, mesh) if suffix in (".vtk", ".vtp") else mesh.export(path)
+        read = read_mesh(path)
+        assert read.closed
+        assert len(read.mesh.vertices) == len(mesh.vertices)
+        assert read.mesh.volume == pytest.approx(mesh.volume, rel=1e-6)  # STL and VTK hold float32
+        if suffix != ".stl":
+            assert np.abs(read.mesh.vertices - mesh.vertices).max() < 1e-5 * 20
+
+    def test_obj_keeps_the_order_of_vertices_with_texture_and_quads(self, tmp_path):
+        path = tmp_path / "box.obj"
+        corners = [(x, y, z) for x in (0, 9) for y in (0, 9) for z in (0, 9)]
+        quads = ["1/1 2/2 4/3 3/4", "5 7 8 6", "1 5 6 2", "3//1 4//1 8//1 7//1", "1 3 7 5", "-7 -3 -1 -5"]
+        path.write_text(
+            "\n".join([*(f"v {x} {y} {z}" for x, y, z in corners), "vt 0 0", *(f"f {q}" for q in quads)])
+        )
+        read = read_mesh(path)
+        np.testing.assert_allclose(read.mesh.vertices, corners, atol=1e-9)
+        assert read.mesh.volume == pytest.approx(729)
+
+    def test_scale(self, tmp_path):
+        path = tmp_path / "ball.ply"
+        ball().export(path)
+        assert read_mesh(path, scale=0.001).mesh.volume == pytest.approx(ball().volume * 1e-9, rel=1e-6)
+
+
+class TestMending:
+    def test_inward_mesh_is_turned_and_said_so(self, tmp_path):
+        read = read_mesh(write(tmp_path / "a.ply", ball().vertices, ball().faces[:, ::-1]))
+        assert read.mesh.volume > 0
+        assert any("inward" in note for note in read.notes)
+
+    def test_some_turned_triangles_are_turned_back(self, tmp_path):
+        faces = ball().faces.copy()
+        faces[::7] = faces[::7, ::-1]
+        read = read_mesh(write(tmp_path / "a.ply", ball().vertices, faces))
+        assert read.mesh.volume == pytest.approx(ball().volume, rel=1e-6)
+        assert any("wrong way" in note for note in read.notes)
+
+    def test_small_hole_is_closed_and_a_large_one_refused(self, tmp_path):
+        mesh = ball()
+        read = read_mesh(write(tmp_path / "small.ply", mesh.vertices, mesh.faces[1:]))
+        assert read.closed and any("holes" in note for note in read.notes)
+        cut = mesh.faces[mesh.triangles_center[:, 2] < 8]
+        path = write(tmp_path / "large.ply", mesh.vertices, cut)
+        with pytest.raises(
+            MeshError, match=r"large\.ply.*open.*boundary edges, the widest hole about \(.*\); close"
+        ):
+            read_mesh(path)
+        assert not read_mesh(path, may_be_open=True).closed
+
+    def test_repeated_vertices_are_merged_and_keep_their_numbers(self, tmp_path):
+        mesh = ball()
+        soup = mesh.vertices[mesh.faces].reshape(-1, 3)
+        read = read_mesh(write(tmp_path / "soup.ply", soup, np.arange(len(soup)).reshape(-1, 3)))
+        assert read.closed and len(read.mesh.vertices) == len(mesh.vertices)
+        mapped = read.mesh.vertices[read.vertex_map]
+        assert np.abs(mapped - soup).max() < 1e-4
+
+    def test_fin_and_repeated_and_degenerate_triangles_are_dropped(self, tmp_path):
+        mesh = ball()
+        vertices = np.vstack([mesh.vertices, [[0, 0, 60.0]]])
+        a, b, _ = mesh.faces[0]
+        faces = np.vstack([mesh.faces, [[a, b, len(mesh.vertices)]], mesh.faces[3:4], [[a, a, b]]])
+        read = read_mesh(write(tmp_path / "fin.ply", vertices, faces))
+        assert read.closed and len(read.mesh.vertices) == len(mesh.vertices)
+        assert read.vertex_map[-1] == -1
+        assert any("dangling" in note for note in read.notes)
+
+    def test_crumbs_are_dropped_and_real_parts_refused(self, tmp_path):
+        crumb = trimesh.creation.icosphere(subdivisions=0, radius=0.5)
+        crumb.apply_translation([50, 0, 0])
+        both = trimesh.util.concatenate([ball(), crumb])
+        read = read_mesh(write(tmp_path / "a.ply", both.vertices, both.faces))
+        assert read.mesh.volume == pytest.approx(ball().volume, rel=1e-6)
+        twins = trimesh.util.concatenate([ball(), ball().apply_translation([60, 0, 0])])
+        with pytest.raises(MeshError, match="2 separate parts"):
+            read_mesh(write(tmp_path / "b.ply", twins.vertices, twins.faces))
+
+    def test_cavity_of_a_bone_stays_a_cavity(self, tmp_path):
+        inner = ball(8.0)
+        both = trimesh.util.concatenate(
+            [ball(), trimesh.Trimesh(inner.vertices, inner.faces[:, ::-1], process=False)]
+        )
+        read = read_mesh(write(tmp_path / "a.ply", both.vertices, both.faces), may_be_open=True)
+        assert read.mesh.volume == pytest.approx(ball().volume - inner.volume, rel=1e-6)
+
+    def test_non_manifold_edge_that_cannot_be_mended(self, tmp_path):
+        box = trimesh.creation.box((10, 10, 10))
+        other = trimesh.creation.box((10, 10, 10)).apply_translation([10, 10, 0])
+        both = trimesh.util.concatenate([box, other])
+        both.merge_vertices()  # two boxes that share one edge
+        with pytest.raises(MeshError, match=r"pair\.ply.*more than two triangles.*manifold"):
+            read_mesh(write(tmp_path / "pair.ply", both.vertices, both.faces))
+
+    def test_one_sided_surface_is_refused(self, tmp_path):
+        n = 40
+        angle = np.linspace(0, 2 * np.pi, n, endpoint=False)
+        rim = [
+            [(30 + w * np.cos(t / 2)) * np.cos(t), (30 + w * np.cos(t / 2)) * np.sin(t), w * np.sin(t / 2)]
+            for t in angle
+            for w in (-8, 8)
+        ]
+        faces = []
+        for k in range(n - 1):
+            faces += [[2 * k, 2 * k + 1, 2 * k + 3], [2 * k, 2 * k + 3, 2 * k + 2]]
+        faces += [[2 * n - 2, 2 * n - 1, 0], [2 * n - 2, 0, 1]]
+        with pytest.raises(MeshError, match="one side only"):
+            read_mesh(write(tmp_path / "moebius.ply", np.array(rim), np.array(faces)), may_be_open=True)
+
+
+class TestUnusable:
+    def test_missing_file_names_its_nearest_neighbour(self, tmp_path):
+        ball().export(tmp_path / "femur.ply")
+        with pytest.raises(MeshError, match=r"femr\.ply: no such mesh file, did you mean 'femur.ply'"):
+            read_mesh(tmp_path / "femr.ply")
+
+    @pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply", ".vtk", ".vtp"])
+    def test_unreadable_and_empty_files(self, tmp_path, suffix, capfd):
+        path = tmp_path / f"junk{suffix}"
+        for data in (b"", b"\x00\x01junk" * 30, b"no mesh here\n"):
+            path.write_bytes(data)
+            with pytest.raises(MeshError, match=f"junk\\{suffix}"):
+                read_mesh(path)
+        assert capfd.readouterr().err == ""
+
+    def test_truncated_binary_ply(self, tmp_path):
+        ball().export(tmp_path / "a.ply")
+        (tmp_path / "b.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:1500])
+        with pytest.raises(MeshError, match=r"b\.ply"):
+            read_mesh(tmp_path / "b.ply")
+
+    def test_mesh_without_triangles(self, tmp_path):
+        path = tmp_path / "points.obj"
+        path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
+        with pytest.raises(MeshError, match=r"points\.obj.*the mesh is empty"):
+            read_mesh(path)
+
+    def test_nan_vertex_is_named(self, tmp_path):
+        vertices = ball().vertices.copy()
+        vertices[17, 1] = np.nan
+        path = tmp_path / "nan.obj"
+        rows = [f"v {x} {y} {z}" for x, y, z in vertices] + [f"f {a} {b} {c}" for a, b, c in ball().faces + 1]
+        path.write_text("\n".join(rows))
+        with pytest.raises(MeshError, match=r"nan\.obj: 1 vertices are not finite, the first is number 17"):
+            read_mesh(path)
+
+    def test_face_out_of_range(self, tmp_path):
+        path = tmp_path / "a.obj"
+        path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n")
+        with pytest.raises(MeshError, match=r"a\.obj.*out of bounds .* size 3"):
+            read_mesh(path)
+
+    def test_unknown_suffix(self, tmp_path):
+        with pytest.raises(MeshError, match="not a mesh format"):
+            read_mesh(tmp_path / "a.step")

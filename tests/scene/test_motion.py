@@ -1,0 +1,131 @@
+"""Ramps, waypoints, OpenSim files, and the poses that they give."""
+
+import math
+
+import numpy as np
+import pytest
+import trimesh
+
+from rbfmuscle.scene.motion import bone_poses, interpolate, rotation_about
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.validation import SceneError, UsageError
+
+BOX = trimesh.creation.box((10, 10, 10))
+
+
+def chain():
+    """Three bones: b turns against a about z and x, c against b about y."""
+    scene = Scene("chain")
+    for name in "abcd":
+        scene.add_bone(name, BOX)
+    scene.add_joint("one", "a", "b", (10, 0, 0), {"turn": (0, 0, 2), "roll": (1, 0, 0)})
+    scene.add_joint("two", "b", "c", (20, 0, 0), {"bend": (0, 1, 0)})
+    return scene
+
+
+def degrees(scene, name):
+    return [math.degrees(frame[name]) for frame in scene.motion.frames]
+
+
+class TestFrames:
+    def test_ramp_ends_exactly_and_its_last_step_may_be_short(self):
+        scene = chain().set_motion(ramp={"one.turn": {"from": 0, "to": 25, "step": 10}})
+        assert degrees(scene, "one.turn") == pytest.approx([0, 10, 20, 25])
+
+    def test_ramp_downwards(self):
+        scene = chain().set_motion(ramp={"one.turn": {"from": 10, "to": -10, "step": 5}})
+        assert degrees(scene, "one.turn") == pytest.approx([10, 5, 0, -5, -10])
+
+    def test_several_coordinates_go_together(self):
+        ramp = {"one.turn": {"to": 40, "step": 10}, "two.bend": {"to": -10, "step": 5}}
+        scene = chain().set_motion(ramp=ramp)
+        assert degrees(scene, "one.turn") == pytest.approx([0, 10, 20, 30, 40])
+        assert degrees(scene, "two.bend") == pytest.approx([0, -2.5, -5, -7.5, -10])
+        assert scene.motion.coordinates == ["one.turn", "two.bend"]
+
+    def test_waypoints_there_and_back_hold_what_they_do_not_mention(self):
+        stops = [{"one.turn": 0, "two.bend": 5}, {"one.turn": 10}, {"one.turn": 0}]
+        scene = chain().set_motion(waypoints=stops, step=5)
+        assert degrees(scene, "one.turn") == pytest.approx([0, 5, 10, 5, 0])
+        assert degrees(scene, "two.bend") == pytest.approx([5] * 5)
+
+    def test_bare_coordinate_name_stands_for_its_only_joint(self):
+        assert chain().set_motion(ramp={"bend": {"to": 4, "step": 2}}).motion.coordinates == ["two.bend"]
+
+    @pytest.mark.parametrize("step", [0, -2, math.nan])
+    def test_step_must_be_positive(self, step):
+        with pytest.raises(SceneError, match="step"):
+            chain().set_motion(ramp={"one.turn": {"to": 10, "step": step}})
+
+    def test_tiny_step_is_refused_before_memory_is_taken(self):
+        with pytest.raises(SceneError, match="more than"):
+            chain().set_motion(ramp={"one.turn": {"to": 90, "step": 1e-9}})
+
+    def test_unknown_coordinate_names_the_nearest(self):
+        with pytest.raises(SceneError, match=r"'one.trun', did you mean 'one.turn'"):
+            chain().set_motion(ramp={"one.trun": {"to": 10, "step": 1}})
+
+    def test_slices(self):
+        scene = chain().set_motion(ramp={"one.turn": {"to": 40, "step": 10}})
+        assert degrees(scene.with_options(frames="1::2"), "one.turn") == pytest.approx([10, 30])
+        assert len(scene.with_options(frames="-1").motion) == 1
+        with pytest.raises(UsageError, match="none of the 5 frames"):
+            scene.with_options(frames="7:9")
+
+
+class TestOpenSimFile:
+    TEXT = "motion\nnRows=2\nnColumns=3\ninDegrees={flag}\nendheader\ntime\tbend\t/jointset/one/turn/value\n"
+
+    def write(self, tmp_path, rows, flag="yes"):
+        path = tmp_path / "walk.mot"
+        path.write_text(self.TEXT.format(flag=flag) + rows)
+        return path
+
+    def test_degrees_and_radians(self, tmp_path):
+        self.write(tmp_path, "0 10 20\n0.1 11 21\n")
+        scene = chain().set_motion(file="walk.mot", folder=tmp_path)
+        assert degrees(scene, "two.bend") == pytest.approx([10, 11])
+        assert degrees(scene, "one.turn") == pytest.approx([20, 21])
+        self.write(tmp_path, "0 0.5 1\n", flag="no")
+        assert chain().set_motion(file="walk.mot", folder=tmp_path).motion.frames == [
+            {"two.bend": 0.5, "one.turn": 1.0}
+        ]
+
+    @pytest.mark.parametrize("rows", ["0 1\n", "0 x 1\n", "0 nan 1\n", ""])
+    def test_bad_rows(self, tmp_path, rows):
+        self.write(tmp_path, rows)
+        with pytest.raises(SceneError, match=r"walk\.mot"):
+            chain().set_motion(file="walk.mot", folder=tmp_path)
+
+    def test_missing_file(self, tmp_path):
+        with pytest.raises(SceneError, match=r"cannot read .*none\.mot"):
+            chain().set_motion(file="none.mot", folder=tmp_path)
+
+
+class TestPoses:
+    def test_rest_is_identity_and_a_loose_bone_is_fixed(self):
+        poses = bone_poses(chain(), {})
+        assert list(poses) == list("abcd")
+        assert all(np.array_equal(pose, np.eye(4)) for pose in poses.values())
+
+    def test_joint_centre_stays_and_rotation_is_right_handed(self):
+        pose = bone_poses(chain(), {"one.turn": math.pi / 2})["b"]
+        assert pose @ [10, 0, 0, 1] == pytest.approx([10, 0, 0, 1])
+        assert pose @ [11, 0, 0, 1] == pytest.approx([10, 1, 0, 1])
+
+    def test_child_follows_its_parent(self):
+        q = {"one.turn": 0.3, "one.roll": -0.8, "two.bend": 1.1}
+        poses = bone_poses(chain(), q)
+        parent = rotation_about((0, 0, 1), 0.3, (10, 0, 0)) @ rotation_about((1, 0, 0), -0.8, (10, 0, 0))
+        assert poses["b"] == pytest.approx(parent)
+        assert poses["c"] == pytest.approx(parent @ rotation_about((0, 1, 0), 1.1, (20, 0, 0)))
+        assert np.array_equal(poses["d"], np.eye(4))
+        for pose in poses.values():
+            assert pose[:3, :3] @ pose[:3, :3].T == pytest.approx(np.eye(3), abs=1e-14)
+
+    def test_unknown_coordinate(self):
+        with pytest.raises(SceneError, match=r"did you mean 'two.bend'"):
+            bone_poses(chain(), {"two.bnd": 1.0})
+
+    def test_interpolate(self):
+        assert interpolate({"x": 1.0}, {"x": 3.0, "y": 4.0}, 0.25) == {"x": 1.5, "y": 1.0}

@@ -1,0 +1,216 @@
+"""VTK and VTP files: read as VTK reads them where they are whole, refused in one line where they are not."""
+
+import itertools
+import os
+import re
+import signal
+import zlib
+
+import numpy as np
+import pytest
+import trimesh
+
+from rbfmuscle.scene.meshes import polydata
+from rbfmuscle.scene.meshes.polydata import read_polydata
+from rbfmuscle.scene.meshes.read import read_mesh
+from rbfmuscle.validation import MeshError
+
+BALL = trimesh.creation.icosphere(subdivisions=2, radius=20.0)
+
+
+def vtk_data():
+    import pyvista
+
+    return pyvista.make_tri_mesh(BALL.vertices, BALL.faces)
+
+
+def write_vtp(path, mode="Appended", compressor="ZLib", header="UInt32", *, encode=True, order="Little"):
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
+    writer = vtkXMLPolyDataWriter()
+    writer.SetInputData(vtk_data())
+    writer.SetFileName(str(path))
+    getattr(writer, f"SetDataModeTo{mode}")()
+    getattr(writer, f"SetCompressorTypeTo{compressor}")()
+    getattr(writer, f"SetHeaderTypeTo{header}")()
+    getattr(writer, f"SetByteOrderTo{order}Endian")()
+    writer.SetEncodeAppendedData(encode)
+    writer.SetBlockSize(4096)  # several blocks an array
+    writer.Write()
+    return path
+
+
+def write_legacy(path, *, binary, version):
+    from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
+
+    writer = vtkPolyDataWriter()
+    writer.SetInputData(vtk_data())
+    writer.SetFileName(str(path))
+    writer.SetFileVersion(version)
+    (writer.SetFileTypeToBinary if binary else writer.SetFileTypeToASCII)()
+    writer.Write()
+    return path
+
+
+def assert_is_ball(path):
+    data = read_polydata(path)
+    np.testing.assert_array_equal(data.triangles, BALL.faces)
+    np.testing.assert_allclose(data.points, BALL.vertices, atol=2e-6)  # float32
+
+
+def assert_refused(path, capfd):
+    """In one line that names the file, and with nothing printed by a library."""
+    with pytest.raises(MeshError, match=re.escape(path.name)) as caught:
+        read_mesh(path)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 1000
+    assert capfd.readouterr() == ("", "")
+
+
+VTP_FORMS = [
+    form
+    for form in itertools.product(
+        ("Ascii", "Binary", "Appended"), ("None", "ZLib", "LZMA", "LZ4"), ("UInt32", "UInt64"), (False, True)
+    )
+    if not (form[0] != "Appended" and form[3]) and not (form[0] == "Ascii" and form[1] != "None")
+]
+
+
+class TestWholeFiles:
+    @pytest.mark.parametrize(("mode", "compressor", "header", "encode"), VTP_FORMS)
+    def test_vtp_of_every_encoding_holds_what_vtk_wrote(self, tmp_path, mode, compressor, header, encode):
+        for order in ("Little", "Big"):
+            path = tmp_path / f"{order}.vtp"
+            assert_is_ball(write_vtp(path, mode, compressor, header, encode=encode, order=order))
+
+    @pytest.mark.parametrize("binary", [False, True])
+    @pytest.mark.parametrize("version", [42, 51])
+    def test_legacy_file_holds_what_vtk_wrote(self, tmp_path, binary, version):
+        assert_is_ball(write_legacy(tmp_path / "ball.vtk", binary=binary, version=version))
+
+    def test_quads_strips_and_concave_polygons_become_triangles(self, tmp_path):
+        path = tmp_path / "mixed.vtk"
+        # A unit cube: bottom and top as quads, sides as one strip; and an arrowhead, concave at its corner 10.
+        points = "0 0 0 1 0 0 1 1 0 0 1 0 0 0 1 1 0 1 1 1 1 0 1 1  0 0 5 2 1 5 1.5 0 5 2 -1 5"
+        path.write_text(
+            f"# vtk DataFile Version 3.0\ncube\nASCII\nDATASET POLYDATA\nPOINTS 12 float\n{points}\n"
+            "POLYGONS 3 15\n4 0 3 2 1\n4 4 5 6 7\n4 10 9 8 11\n"
+            "TRIANGLE_STRIPS 1 11\n10 4 0 5 1 6 2 7 3 4 0\n"
+        )
+        data = read_polydata(path)
+        faces = data.triangles
+        cube = trimesh.Trimesh(data.points, faces[(faces < 8).all(axis=1)], process=False)
+        assert abs(cube.volume) == pytest.approx(1.0)
+        arrow = data.points[faces[(faces >= 8).all(axis=1)]]
+        normals = np.cross(arrow[:, 1] - arrow[:, 0], arrow[:, 2] - arrow[:, 0])
+        assert (normals[:, 2] > 0).all() or (normals[:, 2] < 0).all()  # none folds over
+        assert 0.5 * np.linalg.norm(normals, axis=1).sum() == pytest.approx(1.5)
+
+    def test_pieces_are_joined(self, tmp_path):
+        path = write_vtp(tmp_path / "one.vtp", "Ascii", "None")
+        text = path.read_text()
+        piece = text[text.index("<Piece") : text.index("</Piece>") + len("</Piece>")]
+        (tmp_path / "two.vtp").write_text(text.replace(piece, piece + piece))
+        data = read_polydata(tmp_path / "two.vtp")
+        faces = data.triangles
+        np.testing.assert_array_equal(faces, np.vstack([BALL.faces, BALL.faces + len(BALL.vertices)]))
+
+
+class TestDamagedFiles:
+    @pytest.mark.parametrize("form", [("Ascii", "None"), ("Binary", "ZLib"), ("Appended", "LZ4")], ids=str)
+    def test_vtp_cut_anywhere_is_refused_in_one_line(self, tmp_path, form, capfd):
+        whole = write_vtp(tmp_path / "whole.vtp", *form, encode=False).read_bytes()
+        path = tmp_path / "cut.vtp"
+        for cut in np.linspace(1, 0.9 * len(whole), 25).astype(int):
+            path.write_bytes(whole[:cut])
+            assert_refused(path, capfd)
+
+    @pytest.mark.parametrize("binary", [False, True])
+    def test_legacy_file_cut_anywhere_is_refused(self, tmp_path, binary, capfd):
+        whole = write_legacy(tmp_path / "whole.vtk", binary=binary, version=51).read_bytes()
+        end = len(whole) - 4 if binary else len(whole) - 20
+        path = tmp_path / "cut.vtk"
+        for cut in np.linspace(1, end, 25).astype(int):
+            path.write_bytes(whole[:cut])
+            assert_refused(path, capfd)
+
+    @pytest.mark.parametrize(
+        ("old", "new"),
+        [
+            ("POINTS 162", "POINTS 162000000000"),
+            ("POINTS 162", "POINTS -1"),
+            ("POINTS 162", "POINTS 163"),
+            ("double", "quaternion"),
+            ("POLYGONS 320 1280", "POLYGONS 320 " + "9" * 5000),
+            ("DATASET POLYDATA", "DATASET UNSTRUCTURED_GRID"),
+            ("ASCII", "ENIGMA"),
+            ("\n3 ", "\n3 99999 "),
+            ("\n3 ", "\n-3 "),
+        ],
+    )
+    def test_legacy_file_that_says_what_is_not_so(self, tmp_path, old, new, capfd):
+        text = write_legacy(tmp_path / "a.vtk", binary=False, version=42).read_text()
+        assert old in text
+        (tmp_path / "b.vtk").write_text(text.replace(old, new, 1))
+        assert_refused(tmp_path / "b.vtk", capfd)
+
+    @pytest.mark.parametrize(
+        ("old", "new"),
+        [
+            ('type="Float64"', 'type="Float99"'),
+            ('NumberOfPoints="162"', 'NumberOfPoints="99999999999999999999"'),
+            ('NumberOfPolys="320"', 'NumberOfPolys="1000000"'),
+            ("vtkZLibDataCompressor", "vtkLZMADataCompressor"),
+            ("vtkZLibDataCompressor", "vtkEvilCompressor"),
+            ('offset="', 'offset="9999'),
+        ],
+    )
+    def test_vtp_that_says_what_is_not_so(self, tmp_path, old, new, capfd):
+        data = write_vtp(tmp_path / "a.vtp", encode=False).read_bytes()
+        points = old in ('type="Float64"', 'offset="')
+        at = max(data.find(b"<Points>"), 0) if points else 0
+        assert old.encode() in data[at:]
+        (tmp_path / "b.vtp").write_bytes(data[:at] + data[at:].replace(old.encode(), new.encode(), 1))
+        assert_refused(tmp_path / "b.vtp", capfd)
+
+    def test_flipped_bytes_of_compressed_data_never_pass_for_another_mesh(self, tmp_path):
+        whole = write_vtp(tmp_path / "a.vtp", encode=False).read_bytes()
+        start = whole.index(b"<AppendedData")
+        rng = np.random.default_rng(3)
+        path = tmp_path / "b.vtp"
+        for _ in range(40):
+            damaged = bytearray(whole)
+            damaged[rng.integers(start + 40, len(whole) - 40)] ^= 1 << rng.integers(8)
+            path.write_bytes(damaged)
+            try:
+                found = read_mesh(path).mesh
+            except MeshError:
+                continue
+            assert found.volume == pytest.approx(BALL.volume, rel=1e-3)
+
+
+class TestReader:
+    """What a file can do to the process that reads it."""
+
+    @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+    def test_process_that_ends_or_hangs_costs_one_file(self, tmp_path, monkeypatch, capfd, number):
+        path = write_vtp(tmp_path / "a.vtp")
+        assert_is_ball(path)
+        monkeypatch.setattr(polydata, "PATIENCE", 0.5)
+        os.kill(polydata._child(os.getpid()).pid, number)
+        assert_refused(path, capfd)
+        monkeypatch.undo()
+        assert_is_ball(path)
+
+    def test_file_that_unpacks_without_end_is_refused(self, tmp_path, capfd):
+        size = 24 * 10**9
+        block = zlib.compress(bytes(10**6), 9)
+        header = np.array([size // 10**6, 10**6, 0, *[len(block)] * (size // 10**6)], dtype="<u4").tobytes()
+        path = tmp_path / "bomb.vtp"
+        path.write_bytes(
+            b'<?xml version="1.0"?><VTKFile type="PolyData" byte_order="LittleEndian" header_type="UInt32" '
+            b'compressor="vtkZLibDataCompressor"><PolyData><Piece NumberOfPoints="%d" NumberOfPolys="0">'
+            b'<Points><DataArray type="Float64" NumberOfComponents="3" format="appended" offset="0"/></Points>'
+            b'</Piece></PolyData><AppendedData encoding="raw">_%s</AppendedData></VTKFile>'
+            % (size // 24, header + block * (size // 10**6))
+        )
+        assert_refused(path, capfd)

@@ -1,0 +1,393 @@
+"""Scenes from files and from code; each mistake gives one line that names the place and the remedy."""
+
+import pickle
+import re
+
+import numpy as np
+import pytest
+import trimesh
+
+from rbfmuscle.scene import options
+from rbfmuscle.scene.check import bone_collisions, check_initial
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.validation import (
+    LimitExceededError,
+    MeshError,
+    MissingPartError,
+    SceneError,
+    SolveError,
+    UsageError,
+)
+
+TEXT = """
+[scene]
+format = 1
+name = "arm"
+units = "mm"
+[defaults]
+model = { name = "rbf", centres = 60 }
+[[bone]]
+name = "upper"
+mesh = "upper.ply"
+[[bone]]
+name = "lower"
+mesh = "lower.ply"
+[[joint]]
+name = "elbow"
+parent = "upper"
+child = "lower"
+centre = [0, 0, 0]
+axes = { flexion = [0, -2, 0] }
+[motion]
+ramp = { "elbow.flexion" = { from = 0, to = 20, step = 10 } }
+[[muscle]]
+name = "biceps"
+mesh = "biceps.ply"
+attach = [ { bone = "upper", near = 4 }, { bone = "lower", vertices = "lower.txt" } ]
+[contact]
+initial = "keep"
+[detect]
+tunnelling = { angle = 120, action = "report" }
+"""
+
+
+@pytest.mark.parametrize(
+    ("key", "place"), [("model.centres", "muscle.biceps."), ("detect.tunnelling.angle", "")]
+)
+def test_removed_key_is_an_error_that_names_what_replaces_it(tmp_path, monkeypatch, key, place):
+    monkeypatch.setitem(options.REMOVED_KEYS, key, "use another")
+    (tmp_path / "scene.toml").write_text(TEXT)
+    with pytest.raises(SceneError, match=rf"scene.toml: {key} was removed: use another"):
+        Scene.load(tmp_path / "scene.toml")
+    with pytest.raises(UsageError, match=rf"{key} was removed: use another"):
+        built().with_options({place + key: 1})
+
+
+def meshes():
+    upper = trimesh.creation.box((80, 20, 20)).apply_translation([-50, 0, 0])
+    lower = trimesh.creation.box((80, 20, 20)).apply_translation([50, 0, 0])
+    biceps = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
+    biceps.apply_scale([60, 10, 8]).apply_translation([0, 0, 20])
+    return upper, lower, biceps
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for name, mesh in zip(("upper", "lower", "biceps"), meshes()):
+        mesh.export(tmp_path / f"{name}.ply")
+    held = np.flatnonzero(meshes()[2].vertices[:, 0] > 50)
+    (tmp_path / "lower.txt").write_text("\n".join(map(str, held)))
+    (tmp_path / "arm.toml").write_text(TEXT)
+    return tmp_path
+
+
+def load(folder, *changes):
+    """Load the scene with (old, new) replacements in its text."""
+    text = TEXT
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "arm.toml").write_text(text)
+    return Scene.load(folder / "arm.toml")
+
+
+def built():
+    upper, lower, biceps = meshes()
+    scene = Scene("arm", units="mm").add_bone("upper", upper).add_bone("lower", lower)
+    scene.add_joint("elbow", "upper", "lower", (0, 0, 0), {"flexion": (0, -1, 0)})
+    held = np.flatnonzero(biceps.vertices[:, 0] > 50)
+    attach = [{"bone": "upper", "near": 4}, {"bone": "lower", "vertices": held}]
+    return scene.add_muscle("biceps", biceps, attach=attach)
+
+
+class TestLoading:
+    def test_everything_arrives(self, folder):
+        scene = load(folder)
+        assert (scene.name, scene.units) == ("arm", "mm")
+        assert [bone.name for bone in scene.bones] == ["upper", "lower"]
+        assert scene.joints[0].axes["flexion"] == pytest.approx([0, -1, 0])
+        muscle = scene.muscle("biceps")
+        assert (muscle.model, muscle.options) == ("rbf", {"centres": 60})
+        assert [a.bone for a in muscle.attachments] == ["upper", "lower"]
+        assert scene.contact.initial == "keep" and scene.contact.substep_angle == 2
+        assert scene.detect.tunnelling.angle == 120 and scene.sliding is None
+        assert [f["elbow.flexion"] for f in scene.motion.frames] == pytest.approx(np.radians([0, 10, 20]))
+
+    def test_the_same_scene_built_in_code(self, folder):
+        loaded, made = load(folder), built()
+        for a, b in zip(loaded.muscles[0].attachments, made.muscles[0].attachments):
+            assert a.bone == b.bone and np.array_equal(a.vertices, b.vertices)
+
+    def test_sphere_attachment_and_inline_vertices(self, folder):
+        sphere = "sphere = { centre = [60, 0, 20], radius = 12 }"
+        scene = load(folder, ('vertices = "lower.txt"', sphere))
+        points = scene.muscles[0].mesh.vertices[scene.muscles[0].attachments[1].vertices]
+        assert np.linalg.norm(points - [60, 0, 20], axis=1).max() <= 12
+        assert load(folder, ('"lower.txt"', "[1, 2]")).muscles[0].attachments[1].vertices.tolist() == [1, 2]
+
+    def test_model_table_without_a_name_changes_the_default(self, folder):
+        scene = load(folder, ('mesh = "biceps.ply"', 'mesh = "biceps.ply"\nmodel = { kernel = "cubic" }'))
+        assert scene.muscles[0].options == {"centres": 60, "kernel": "cubic"}
+
+    def test_units_and_scale_give_the_same_shape(self, folder):
+        scaled = [(f'"{n}.ply"', f'"{n}.ply"\nscale = 0.001') for n in ("upper", "lower", "biceps")]
+        metres = load(folder, ('units = "mm"', 'units = "m"'), ("near = 4", "near = 0.004"), *scaled)
+        assert metres.length(4) == pytest.approx(0.004)
+        assert metres.muscles[0].mesh.volume * 1e9 == pytest.approx(load(folder).muscles[0].mesh.volume)
+        assert np.array_equal(
+            metres.muscles[0].attachments[0].vertices, load(folder).muscles[0].attachments[0].vertices
+        )
+
+    def test_fibres(self, folder):
+        (folder / "f.json").write_text('{"polylines": [[[0, 0, 1], [1, 0, 1], [2, 0, 1]]]}')
+        scene = load(folder, ('mesh = "biceps.ply"', 'mesh = "biceps.ply"\nfibres = "f.json"\nscale = 1.0'))
+        assert [len(line) for line in scene.muscles[0].fibres] == [3]
+        (folder / "f.json").write_text('{"polylines": [[[0, 0, 1]]]}')
+        with pytest.raises(SceneError, match=r"f\.json: polyline 0 has 1 points"):
+            Scene.load(folder / "arm.toml")
+
+    @pytest.mark.parametrize("name", ["flexion", "extension", "adduction", "internal_rotation", "apriori"])
+    def test_real_hip(self, hip_data, name):
+        scene = Scene.load(hip_data / f"{name}.toml")
+        counts = [[len(a.vertices) for a in muscle.attachments] for muscle in scene.muscles]
+        assert counts == [[761, 109], [584, 125], [3186, 126], [341, 294]]
+        assert [len(line) for line in scene.muscle("gluteus_maximus").fibres] == [6] * 5
+        assert all(not item.notes for item in [*scene.bones, *scene.muscles])
+
+
+class TestMistakes:
+    @pytest.mark.parametrize(
+        ("old", "new", "message"),
+        [
+            (
+                "centre = [0, 0, 0]",
+                "center = [0, 0, 0]",
+                r"\[\[joint\]\] 'elbow': unknown key 'center', did you mean 'cen",
+            ),
+            ("[contact]", "[contcat]", r"unknown key 'contcat', did you mean 'contact'"),
+            (
+                'child = "lower"',
+                'child = "lowr"',
+                r"joint 'elbow': unknown bone 'lowr', did you mean 'lower'",
+            ),
+            (
+                '{ bone = "upper"',
+                '{ bone = "uper"',
+                r"muscle 'biceps' attach 1: unknown bone 'uper', did you mean 'upper'",
+            ),
+            (
+                "elbow.flexion",
+                "elbo.flexion",
+                r"unknown coordinate 'elbo.flexion', did you mean 'elbow.flexion'",
+            ),
+            ('"keep"', '"kep"', r"\[contact\] initial: .*'kep'"),
+            ("step = 10", "step = 0", r"\[motion\] ramp elbow.flexion step: .*greater than 0, got 0"),
+            ("step = 10", 'step = "10"', r"\[motion\] ramp elbow.flexion step: .*'10'"),
+            ("step = 10 }", "step = 10, by = 3 }", r"unknown key 'by'"),
+            ('units = "mm"', 'units = "inch"', r"\[scene\] units: .*'m', 'cm' or 'mm', got 'inch'"),
+            ('units = "mm"', "", r"\[scene\] units: field required"),
+            ("format = 1", "format = 2", r"\[scene\] format: .*got 2"),
+            ("centre = [0, 0, 0]", "centre = [0, 0]", r"'elbow' centre"),
+            ("[0, -2, 0]", "[0, 0, 0]", r"'elbow' axes flexion: must not be the zero vector"),
+            (
+                "near = 4",
+                "near = 4, sphere = { centre = [0,0,0], radius = 3 }",
+                r"one of vertices, near and sphere, got near and",
+            ),
+            (", near = 4", "", r"give one of vertices, near and sphere, got none"),
+            (
+                "near = 4",
+                "near = 0.001",
+                r"near = 0.001 reaches no vertex of the muscle, the nearest is .* away; raise it",
+            ),
+            (
+                "near = 4",
+                "nere = 4",
+                r"\[\[muscle\]\] 'biceps' attach 1: unknown key 'nere', did you mean 'near'",
+            ),
+            ('"lower.txt"', '"nowhere.txt"', r"cannot read .*nowhere.txt"),
+            ("near = 4", "near = 75", r"vertices \(first: \d+\) are attached to both 'upper' and 'lower'"),
+            ('name = "lower"', 'name = "upper"', r"bone 'upper' is given twice"),
+            ('name = "biceps"', 'name = "../x"', r"muscle name '../x' may hold letters"),
+            ("[scene]", "[scene", r"not valid TOML.*line 2"),
+            ("angle = 120", "angle = 400", r"\[detect\] tunnelling angle: .*400"),
+        ],
+    )
+    def test_one_line_names_file_place_and_remedy(self, folder, old, new, message):
+        with pytest.raises(SceneError, match=message) as caught:
+            load(folder, (old, new))
+        text = str(caught.value)
+        assert "\n" not in text and text.startswith(str(folder / "arm.toml"))
+
+    def test_index_out_of_range_names_file_and_value(self, folder):
+        (folder / "lower.txt").write_text("3\n99999\n")
+        with pytest.raises(SceneError, match=r"lower\.txt: vertex 99999 is out of range, .* 0 to 641"):
+            load(folder)
+        (folder / "lower.txt").write_text("3\nx\n")
+        with pytest.raises(SceneError, match=r"lower\.txt: 'x' is not a vertex number"):
+            load(folder)
+
+    def test_muscle_with_no_or_one_attachment(self, folder):
+        both = re.search(r"attach = \[.*\]", TEXT).group()
+        with pytest.raises(SceneError, match="muscle 'biceps' has no attachment"):
+            load(folder, (both, ""))
+        with pytest.raises(SceneError, match="attached to 'upper' only"):
+            load(folder, (', { bone = "lower", vertices = "lower.txt" }', ""))
+
+    def test_no_muscles_and_missing_file(self, folder):
+        with pytest.raises(SceneError, match=r"has no muscles, add a \[\[muscle\]\]$"):
+            load(folder, (TEXT[TEXT.index("[[muscle]]") : TEXT.index("[contact]")], ""))
+        with pytest.raises(SceneError, match=r"has no bones, add a \[\[bone\]\]$"):
+            Scene("bare").validate()
+        with pytest.raises(SceneError, match="no such scene file"):
+            Scene.load(folder / "none.toml")
+        with pytest.raises(SceneError, match="is a folder"):
+            Scene.load(folder)
+
+    @pytest.mark.parametrize(
+        ("scale", "remedy"), [("0.001", "1000 times"), ("100", "0.1 times"), ("1000", "0.01 times")]
+    )
+    def test_wrong_unit_of_a_mesh(self, folder, scale, remedy):
+        with pytest.raises(MeshError, match=rf"bone 'upper' .*upper.ply.* mm across, .*{remedy}"):
+            load(folder, ('"upper.ply"', f'"upper.ply"\nscale = {scale}'), ("near = 4", "near = 5"))
+
+    def test_muscle_in_another_frame(self, folder):
+        far = meshes()[2].apply_translation([0, 900, 0])
+        far.export(folder / "biceps.ply")
+        with pytest.raises(MeshError, match=r"lies .* mm away from all bones"):
+            load(folder, ("near = 4", "vertices = [1, 2]"))
+
+    def test_missing_mesh_names_scene_and_mesh(self, folder):
+        with pytest.raises(
+            MeshError, match=r"arm\.toml: .*bicep\.ply: no such mesh file, did you mean 'biceps.ply'"
+        ):
+            load(folder, ('"biceps.ply"', '"bicep.ply"'))
+
+    def test_joints_form_a_tree(self):
+        scene = built()
+        with pytest.raises(SceneError, match="already the child"):
+            scene.add_joint("again", "upper", "lower", (0, 0, 0), {"x": (1, 0, 0)})
+        with pytest.raises(SceneError, match="hang on itself"):
+            scene.add_joint("loop", "lower", "upper", (0, 0, 0), {"x": (1, 0, 0)})
+
+
+class TestOptions:
+    def test_copy_shares_meshes_and_leaves_the_original_alone(self):
+        scene = built().set_motion(ramp={"elbow.flexion": {"to": 30, "step": 10}})
+        other = scene.with_options(
+            {"contact.substep_angle": 1.0, "detect.tunnelling.angle": 90.0, "motion.step": 5.0},
+            model={"name": "rbf", "centres": 10},
+            frames="1:3",
+        )
+        assert other.muscles[0].mesh is scene.muscles[0].mesh
+        assert (other.contact.substep_angle, scene.contact.substep_angle) == (1.0, 2.0)
+        assert other.detect.tunnelling.angle == 90 and scene.detect is None
+        assert other.muscles[0].options == {"centres": 10} and scene.muscles[0].options == {}
+        assert len(other.motion) == 2 and len(scene.motion) == 4
+
+    def test_another_model_drops_the_options_of_the_first(self, folder):
+        scene = load(folder)
+        assert scene.with_options(model="pbd").muscles[0].options == {}
+        assert scene.with_options(model="rbf").muscles[0].options == {"centres": 60}
+        changed = scene.with_options({"muscle.biceps.model.centres": 70})
+        assert changed.muscles[0].options == {"centres": 70}
+
+    @pytest.mark.parametrize(
+        ("key", "message"),
+        [
+            ("contct.initial", "did you mean 'contact'"),
+            ("contact.initail", "did you mean 'initial'"),
+            ("muscle.bicep.model", "did you mean 'biceps'"),
+            ("motion.ramp.x.y.step", "no ramp 'x.y'"),
+            ("contact", "name a key"),
+        ],
+    )
+    def test_unknown_settings(self, key, message):
+        with pytest.raises(UsageError, match=message):
+            built().with_options({key: 1})
+
+    def test_settings_from_text(self):
+        from rbfmuscle.scene.settings import parse_setting, parse_slice
+
+        assert parse_setting("model.centres=200") == ("model.centres", 200)
+        assert parse_setting("contact.initial=keep") == ("contact.initial", "keep")
+        assert parse_setting("model={name='rbf', a=[1, 2]}") == ("model", {"name": "rbf", "a": [1, 2]})
+        assert parse_slice("2:8:3") == slice(2, 8, 3) and parse_slice("-1") == slice(-1, None)
+        for text in ("a:b", "1:2:0", "", "1:2:3:4"):
+            with pytest.raises(UsageError, match="A:B:S"):
+                parse_slice(text)
+        with pytest.raises(UsageError, match="KEY=VALUE"):
+            parse_setting("centres")
+        for value in ("nan", "-inf", "{a=[inf]}", "99999999999999999999"):
+            with pytest.raises(UsageError, match=r"^model\.rest_error"):
+                parse_setting(f"model.rest_error={value}")
+
+    def test_pickle_and_resolved(self, folder):
+        import json
+
+        scene = load(folder)
+        again = pickle.loads(pickle.dumps(scene))
+        assert again.resolved() == scene.resolved()
+        resolved = json.loads(json.dumps(scene.resolved()))
+        assert resolved["muscles"][0]["model"] == {"name": "rbf", "centres": 60}
+        assert len(resolved["bones"][0]["sha256"]) == 64
+
+
+class TestCheck:
+    def test_clean_scene_has_no_errors(self):
+        assert [f for f in built().check() if f.level == "error"] == []
+
+    def test_mended_meshes_are_reported(self):
+        upper, lower, _ = meshes()
+        scene = Scene().add_bone("upper", upper).add_bone("lower", (lower.vertices, lower.faces[:, ::-1]))
+        assert any(f.place == "lower" and "inward" in f.message for f in scene.check())
+
+    def test_muscle_that_starts_inside_a_bone(self):
+        scene = built()
+        scene.muscles[0].mesh.apply_translation([0, 0, -4])  # 1 mm into the bones in the middle of each
+        (note, *_) = [f for f in scene.check() if "start inside" in f.message]
+        assert note.level == "note"
+        strict = scene.with_options({"contact.initial": "error"})
+        with pytest.raises(SceneError, match=r"muscle 'biceps': .*start inside bone"):
+            check_initial(strict)
+        scene.muscles[0].mesh.apply_translation([-50, 0, -16])
+        scene.muscles[0].mesh.apply_scale(0.5)
+        with pytest.raises(SceneError, match="start inside bone 'upper'"):
+            check_initial(scene)
+
+    def test_motion_that_drives_bones_into_each_other(self):
+        upper, lower = (mesh.subdivide_to_size(5.0) for mesh in meshes()[:2])  # vertices are what is tested
+        scene = Scene().add_bone("upper", upper).add_bone("lower", lower)
+        scene.add_joint("elbow", "upper", "lower", (0, 0, 0), {"flexion": (0, -1, 0)})
+        scene.set_motion(ramp={"elbow.flexion": {"to": 140, "step": 10}})
+        collisions = bone_collisions(scene)
+        assert collisions and collisions[0][1:3] == ("upper", "lower")
+        assert any("into each other" in f.message and f.level == "warning" for f in scene.check())
+
+    def test_bones_that_only_touch_the_same_body_are_not_reported(self):
+        assert bone_collisions(built().set_motion(ramp={"elbow.flexion": {"to": 20, "step": 10}})) == []
+
+    def test_real_hip_collisions_are_those_of_its_readme(self, hip_data):
+        scene = Scene.load(hip_data / "adduction.toml")
+        frames = [15, 22]  # 30 and 44 degrees: the readme has 0.7 mm and about 9 mm
+        depths = {frame: depth for frame, _, _, depth in bone_collisions(scene, frames)}
+        assert depths[15] == pytest.approx(0.7, abs=0.3)
+        assert depths[22] == pytest.approx(9, abs=1)
+        assert bone_collisions(Scene.load(hip_data / "gluteus.toml")) == []
+
+
+def test_exit_codes_are_the_promised_ones(folder):
+    with pytest.raises(SceneError) as scene:
+        load(folder, ("step = 10", "step = 0"))
+    with pytest.raises(MeshError) as mesh:
+        load(folder, ('"biceps.ply"', '"bicep.ply"'))
+    assert (scene.value.exit_code, mesh.value.exit_code) == (3, 4)
+    promised = {
+        UsageError: 2,
+        SceneError: 3,
+        MeshError: 4,
+        SolveError: 5,
+        LimitExceededError: 6,
+        MissingPartError: 7,
+    }
+    assert all(error.exit_code == code for error, code in promised.items())

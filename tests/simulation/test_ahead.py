@@ -1,0 +1,83 @@
+"""`check` looks ahead: held ends driven into bones, attachments taken apart or brought together too far."""
+
+import numpy as np
+import pytest
+import trimesh
+
+import rbfmuscle as rm
+from rbfmuscle.simulation.plan.motion_check import Stretched, check_motion, describe, motion_findings
+
+
+def _box(low, high):
+    low, high = np.array(low, float), np.array(high, float)
+    mesh = trimesh.creation.box(extents=high - low)
+    for _ in range(3):
+        mesh = mesh.subdivide()
+    mesh.apply_translation(0.5 * (low + high))
+    return mesh
+
+
+def _scene(angles, *, shift=()):
+    """A post that stands still and an arm that turns about z past it, a strap from a far block to the arm."""
+    scene = rm.Scene("post", units="mm")
+    scene.add_bone("block", _box([-60, -4, -4], [-50, 4, 4])).add_bone(
+        "post", _box([-4, 18, -10], [4, 26, 10])
+    )
+    scene.add_bone("arm", _box([18, -3, -20], [24, 3, -14]))
+    scene.add_joint("hinge", "block", "arm", (0, 0, 0), {"bend": (0, 0, 1)})
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    strap = trimesh.Trimesh(ball.vertices * [36, 3, 3] + [-14, 0, 0], ball.faces, process=False)
+    x = strap.vertices[:, 0]
+    attach = [
+        {"bone": "block", "vertices": np.flatnonzero(x < -44).tolist()},
+        {"bone": "arm", "vertices": np.flatnonzero(x > 17).tolist()},
+    ]
+    scene.add_muscle("strap", strap, attach=attach)
+    scene.motion = rm.sim.scene.motion.Motion([{"hinge.bend": np.radians(a)} for a in angles])
+    return scene
+
+
+def test_end_driven_into_a_bone_is_found_with_depth_and_frame():
+    # The held end sits at radius 22 about z: at 90 degrees in the middle of the post, which spans 18 to 26.
+    scene = _scene(range(0, 91, 5))
+    driven, _ = check_motion(scene)
+    (one,) = driven
+    assert (one.muscle, one.bone, one.into, one.frame) == ("strap", "arm", "post", 18)
+    held = scene.muscles[0].mesh.vertices[scene.muscles[0].attachments[1].vertices]
+    turned = held[:, [1, 0, 2]] * [-1, 1, 1]
+    deepest = -min(rm.BoneSDF.from_mesh(scene.bones[1].mesh).distance(turned))
+    assert one.depth == pytest.approx(deepest, abs=0.2)  # the field's own error, and thinned vertices
+    assert 14 <= one.first <= 18
+    text = str(motion_findings(scene)[0])
+    assert "strap" in text and "'post'" in text and "carrier" in text
+
+
+def test_nothing_is_found_where_nothing_is_wrong():
+    assert check_motion(_scene(range(0, 41, 5))) == ([], [])
+    assert check_motion(_scene([0])) == ([], [])
+
+
+@pytest.mark.parametrize(("far", "how"), [(45.0, "take apart"), (-40.0, "bring together")])
+def test_ends_taken_apart_or_brought_together(far, how):
+    scene = _scene([0])
+    joint = {"type": "slider", "axes": {"out": [1.0, 0.0, 0.0]}}
+    scene.joints.clear()
+    scene.add_joint("slide", "block", "arm", (0, 0, 0), joint["axes"], type=joint["type"])
+    scene.motion = rm.sim.scene.motion.Motion([{"slide.out": far * k / 10} for k in range(11)])
+    driven, (one,) = check_motion(scene)
+    assert not driven and one.frame == 10 and one.bones == ("block", "arm")
+    assert one.distance - one.rest == pytest.approx(far, rel=1e-9)
+    assert how in str(motion_findings(scene)[0])
+
+
+def test_ends_that_meet_are_told_first():
+    near, met = (Stretched(name, ("a", "b"), 10.0, d, 3, 2) for name, d in (("near", 4.0), ("met", 0.0)))
+    assert [found.place for found in describe(([], [near, met]), "mm")] == ["met", "near"]
+
+
+def test_slender_muscles_of_the_leg_are_named_with_what_is_wrong(leg_data):
+    driven, stretched = check_motion(rm.Scene.load(leg_data / "slender.toml"))
+    deepest = {(one.muscle, one.into): one.depth for one in driven}
+    # The README of the data says 16 mm.
+    assert deepest["popliteus", "tibia"] == pytest.approx(16.0, abs=0.5)
+    assert [one.muscle for one in stretched] == ["plantaris"]
