@@ -66,7 +66,7 @@ class TestInterrupts:
         scene = write_scene(tmp_path, end=60)
         place = {
             "import": "import cyclopts",
-            "load": "from rbfmuscle.scene import mesh_repair as m; name = 'repair'",
+            "load": "from rbfmuscle.scene.meshes import repair as m; name = 'repair'",
             "build": "import pbd_baseline.muscle as m; name = '_contact_carriers'",
             "run": "import rbfmuscle.output.writer as m; name = 'write_mesh'",
         }[moment]
@@ -253,12 +253,6 @@ class TestKilledRuns:
         code, _, err = call(capsys, "render", killed, "-o", killed / "last.png", "--view", "front")
         assert code == 0, err
         assert (killed / "last.png").read_bytes().startswith(b"\x89PNG")
-
-    def test_it_is_scrubbed_in_the_viewer(self, killed):
-        from rbfmuscle.report.viewer.saved import SavedViewer
-
-        viewer = SavedViewer(SavedRun(killed))
-        viewer.scrub(5)
 
     def test_what_was_cut_short_is_left_out(self, killed):
         poses = (killed / "poses.csv").read_text()

@@ -4,15 +4,13 @@ import importlib
 import inspect
 import json
 import pkgutil
-import typing
 
 import pytest
 from blend_model import arm_files
 from command_line import call
-from cyclopts import Parameter
 
 from pbd_baseline.options import PBDOptions
-from rbfmuscle import commands
+from rbfmuscle import cli
 from rbfmuscle.models import MODEL_NAMES
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.scene import options
@@ -72,10 +70,6 @@ SOURCES = {"waypoints", "file", "degrees"}
 # The name of the model decides it, so it is no key of the scene's.
 IMPLIED = {"method"}
 
-SETTINGS = [
-    (f"{table}.{key}", value) for table, (_, values) in TABLES.items() for key, value in values.items()
-]
-MODEL_SETTINGS = [(name, key, value) for name, (_, values) in MODELS.items() for key, value in values.items()]
 OTHERS = [
     ("model", "xpbd", ["xpbd", "xpbd"]),
     ("model", {"name": "pbd", "iterations": 2}, ["pbd", "pbd"]),
@@ -129,23 +123,24 @@ def test_every_key_of_the_motion_is_set_here_or_is_its_source():
     assert ramp == {field.alias or name for name, field in options.RampOptions.model_fields.items()}
 
 
-@pytest.mark.parametrize(("key", "value"), SETTINGS, ids=[key for key, _ in SETTINGS])
+@pytest.mark.parametrize("table", TABLES)
 @pytest.mark.filterwarnings("ignore::rbfmuscle.validation.NumericalWarning")
-def test_key_of_a_table_reaches_the_run(scene_file, tmp_path, capsys, key, value):
-    found = run(capsys, scene_file, tmp_path, (key, value), model="pbd")["scene"]
-    for part in key.split("."):
+def test_keys_of_a_table_reach_the_run(scene_file, tmp_path, capsys, table):
+    settings = [(f"{table}.{key}", value) for key, value in TABLES[table][1].items()]
+    found = run(capsys, scene_file, tmp_path, *settings, model="pbd")["scene"]
+    for part in table.split("."):
         found = found[part]
-    assert found == value
+    assert {key: found[key] for key in TABLES[table][1]} == TABLES[table][1]
 
 
-@pytest.mark.parametrize(
-    ("name", "key", "value"), MODEL_SETTINGS, ids=[f"{name}-{key}" for name, key, _ in MODEL_SETTINGS]
-)
+@pytest.mark.parametrize("name", MODELS)
 @pytest.mark.filterwarnings("ignore::rbfmuscle.validation.NumericalWarning")
-def test_key_of_a_model_reaches_the_run(scene_file, tmp_path, capsys, name, key, value):
-    info = run(capsys, scene_file, tmp_path, (f"model.{key}", value), model=name)
+def test_keys_of_a_model_reach_the_run(scene_file, tmp_path, capsys, name):
+    """One run sets them all: a key that the model does not take would end it."""
+    settings = [(f"model.{key}", value) for key, value in MODELS[name][1].items()]
+    info = run(capsys, scene_file, tmp_path, *settings, model=name)
     for muscle in info["scene"]["muscles"]:
-        assert muscle["model"]["name"] == name and muscle["model"][key] == value
+        assert muscle["model"] == {"name": name, **MODELS[name][1]}
 
 
 @pytest.mark.parametrize(("key", "value", "models"), OTHERS, ids=[str(case[:2]) for case in OTHERS])
@@ -186,23 +181,13 @@ def test_the_name_of_a_model_decides_its_method(scene_file, tmp_path, capsys):
     assert all(name in err for name in MODEL_NAMES)
 
 
-def test_a_flag_that_cannot_be_taken_back_is_off_until_it_is_given():
+def test_flag_without_a_negative_is_off_by_default():
     """``--json`` has no ``--no-json``: were it on by default, nobody could turn it off."""
     found = []
-    for module in pkgutil.walk_packages(commands.__path__, commands.__name__ + "."):
-        for name, function in vars(importlib.import_module(module.name)).items():
-            if not inspect.isfunction(function) or function.__module__ != module.name or name[0] == "_":
-                continue
-            try:
-                hints = typing.get_type_hints(function, include_extras=True)
-            except NameError:  # no command, whose types have to be known where it is called
-                continue
+    for module in pkgutil.walk_packages(cli.__path__, cli.__name__ + "."):
+        for name, function in inspect.getmembers(importlib.import_module(module.name), inspect.isfunction):
             for key, parameter in inspect.signature(function).parameters.items():
-                extras = [e for e in getattr(hints.get(key), "__metadata__", ()) if isinstance(e, Parameter)]
-                if any(extra.negative in ("", ("",), ()) for extra in extras) and parameter.default in (
-                    True,
-                    False,
-                ):
+                if "negative=" in str(parameter.annotation) and isinstance(parameter.default, bool):
                     found.append((name, key))
                     assert parameter.default is False, (name, key)
     assert len(found) >= 8, found

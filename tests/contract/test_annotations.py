@@ -56,8 +56,8 @@ def test_public_functions_are_annotated():
 def test_signatures_of_the_core_name_every_type():
     """Fields, geometry and the RBF model: no parameter or result is `Any`."""
     found = []
-    for room in ("implicit", "geometry", "model"):
-        for path in sorted((ROOT / "rbfmuscle" / room).rglob("*.py")):
+    for package in ("implicit", "geometry", "muscle"):
+        for path in sorted((ROOT / "rbfmuscle" / package).rglob("*.py")):
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.FunctionDef):
                     given = [x.annotation for x in parameters(node)] + [node.returns]
@@ -96,7 +96,9 @@ def vague(source):
 
 
 def test_signatures_of_fields_and_geometry_name_their_types():
-    places = [path for room in ("implicit", "geometry") for path in (ROOT / "rbfmuscle" / room).rglob("*.py")]
+    places = [
+        path for package in ("implicit", "geometry") for path in (ROOT / "rbfmuscle" / package).rglob("*.py")
+    ]
     found = {str(path.relative_to(ROOT)): vague(path.read_text(encoding="utf-8")) for path in places}
     assert {path: names for path, names in found.items() if names} == {}
 

@@ -5,6 +5,7 @@ import pytest
 import trimesh
 
 import rbfmuscle as rm
+from rbfmuscle.scene.motion import Motion
 from rbfmuscle.simulation.plan.motion_check import Stretched, check_motion, describe, motion_findings
 
 
@@ -33,7 +34,7 @@ def _scene(angles, *, shift=()):
         {"bone": "arm", "vertices": np.flatnonzero(x > 17).tolist()},
     ]
     scene.add_muscle("strap", strap, attach=attach)
-    scene.motion = rm.sim.scene.motion.Motion([{"hinge.bend": np.radians(a)} for a in angles])
+    scene.motion = Motion([{"hinge.bend": np.radians(a)} for a in angles])
     return scene
 
 
@@ -63,7 +64,7 @@ def test_ends_taken_apart_or_brought_together(far, how):
     joint = {"type": "slider", "axes": {"out": [1.0, 0.0, 0.0]}}
     scene.joints.clear()
     scene.add_joint("slide", "block", "arm", (0, 0, 0), joint["axes"], type=joint["type"])
-    scene.motion = rm.sim.scene.motion.Motion([{"slide.out": far * k / 10} for k in range(11)])
+    scene.motion = Motion([{"slide.out": far * k / 10} for k in range(11)])
     driven, (one,) = check_motion(scene)
     assert not driven and one.frame == 10 and one.bones == ("block", "arm")
     assert one.distance - one.rest == pytest.approx(far, rel=1e-9)
