@@ -9,23 +9,22 @@ TRUSTED_SHARE = 0.8
 
 
 @compiled(error_model="numpy", nogil=False)
-def direction_loop(points, gradient, pose, box, out):
-    """Unit gradients; away from the middle of the bone's box where there is none."""
+def direction_loop(points, gradient, pose, box):
+    """Normalise gradients in place; away from the middle of the bone's box where there is none."""
     for i in range(len(points)):
         square = 0.0
         for a in range(3):
-            out[i, a] = gradient[i, a]
-            square += out[i, a] ** 2
+            square += gradient[i, a] ** 2
         if square < 1e-18:
             square = 0.0
             for a in range(3):
-                out[i, a] = points[i, a] - pose[a, 3] + 1e-12
+                gradient[i, a] = points[i, a] - pose[a, 3] + 1e-12
                 for b in range(3):
-                    out[i, a] -= 0.5 * pose[a, b] * (box[0, b] + box[1, b])
-                square += out[i, a] ** 2
+                    gradient[i, a] -= 0.5 * pose[a, b] * (box[0, b] + box[1, b])
+                square += gradient[i, a] ** 2
         length = np.sqrt(square)
         for a in range(3):
-            out[i, a] /= length
+            gradient[i, a] /= length
 
 
 @compiled(error_model="numpy", nogil=False)
@@ -48,6 +47,28 @@ def remember_loop(points, pose, near, distance, anchor, bound):
             anchor[i, k] = 0.0
             for j in range(3):
                 anchor[i, k] += pose[j, k] * (points[i, j] - pose[j, 3])
+
+
+@compiled(error_model="numpy", nogil=False)
+def take_contacts_loop(near, distance, direction, limits, found):
+    """Copy the contacts nearer than their reach into the arrays ``found``; return how many there are.
+
+    ``limits`` holds the reach (n,) of every point, the margin, and the depth (n,) that is allowed, or an empty array.
+    """
+    reach, margin, allowed = limits
+    index, gap, normal = found
+    count = 0
+    for n in range(len(near)):
+        i = near[n]
+        here = distance[n] - margin
+        if len(allowed) > 0:
+            here += allowed[i]
+        if here < reach[i]:
+            index[count], gap[count] = i, here
+            for a in range(3):
+                normal[count, a] = direction[n, a]
+            count += 1
+    return count
 
 
 @compiled(error_model="numpy")

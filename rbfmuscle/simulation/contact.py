@@ -13,9 +13,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.simulation.broad_phase import apart_loop, closer_loop, direction_loop, near_loop, remember_loop
+from rbfmuscle.geometry.arrays import Booleans, Floats
+from rbfmuscle.simulation.broad_phase import (
+    apart_loop,
+    closer_loop,
+    direction_loop,
+    near_loop,
+    remember_loop,
+    take_contacts_loop,
+)
 from rbfmuscle.validation import check_points
+
+NONE_ALLOWED: Floats = np.zeros(0)
 
 
 @dataclass(frozen=True)
@@ -193,21 +202,6 @@ class BoneContacts:
         asked = self._near(points, np.full(len(points), reach), [bone_index])
         return any(self._ask(points, near, b, reach)[0].min() < reach for b, near in asked)
 
-    def _of_bones(self, points: Floats, reach: ArrayLike) -> list[tuple[Integers, Floats, Floats, int]]:
-        """Contacts of bones, ``(index, distance, direction, bone)`` of each that has any."""
-        found = []
-        reach = np.full(len(points), reach) if np.ndim(reach) == 0 else np.asarray(reach, dtype=np.float64)
-        for b, near in self._near(points, reach + self.margin, self.reached):
-            limit = reach[near]
-            distance, direction = self._ask(points, near, b, limit + self.margin)
-            distance = distance - self.margin
-            if b in self.allowed and len(self.allowed[b]) == len(points):
-                distance = distance + self.allowed[b][near]
-            keep = distance < limit
-            if keep.any():
-                found.append((near[keep], distance[keep], direction[keep], b))
-        return found
-
     def half_spaces(self, points: ArrayLike, reach: ArrayLike) -> HalfSpaces:
         """All pairs of contact point and obstacle nearer than ``reach``, as :class:`HalfSpaces`.
 
@@ -219,17 +213,34 @@ class BoneContacts:
             For all, or for each point [scene unit].
         """
         points = check_points(points)
-        parts = [(*found, 0.0) for found in self._of_bones(points, reach)]
+        reach = np.full(len(points), reach) if np.ndim(reach) == 0 else np.asarray(reach, dtype=np.float64)
+        near = self._near(points, reach + self.margin, self.reached)
+        room = sum(len(some) for _, some in near)
+        index, source = np.empty(room, np.int64), np.empty(room, np.int64)
+        gap, normal, count = np.empty(room), np.empty((room, 3)), 0
+        for b, some in near:
+            distance, direction = self._ask(points, some, b, reach[some] + self.margin)
+            allowed = self.allowed.get(b, NONE_ALLOWED)
+            limits = reach, self.margin, allowed if len(allowed) == len(points) else NONE_ALLOWED
+            found = index[count:], gap[count:], normal[count:]
+            end = count + take_contacts_loop(some, distance, direction, limits, found)
+            source[count:end] = b
+            count = end
+        spaces = HalfSpaces(index[:count], gap[:count], normal[:count], source[:count])
+        return (
+            self._with_neighbours(spaces, points, float(reach.max(initial=0.0)))
+            if self.neighbours
+            else spaces
+        )
+
+    def _with_neighbours(self, bones: HalfSpaces, points: Floats, reach: float) -> HalfSpaces:
+        """The half-spaces of the bones, then those of the neighbours."""
+        parts = [(bones.index, bones.gap, bones.normal, bones.source, np.zeros(len(bones)))]
         for k, neighbour in enumerate(self.neighbours):
-            found = neighbour.contacts(points, float(np.asarray(reach).max()))
-            if len(found[0]):
-                parts.append((*found, -1 - k, neighbour.give))
-        if not parts:
-            return HalfSpaces(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64))
-        index, gap, normal = (np.concatenate([part[k] for part in parts]) for k in range(3))
-        source = np.concatenate([np.full(len(part[0]), part[3], dtype=np.int64) for part in parts])
-        give = np.concatenate([np.full(len(part[0]), part[4]) for part in parts]) if self.neighbours else None
-        return HalfSpaces(index, gap, normal, source, give)
+            index, gap, normal = neighbour.contacts(points, reach)
+            count = len(index)
+            parts.append((index, gap, normal, np.full(count, -1 - k), np.full(count, neighbour.give)))
+        return HalfSpaces(*(np.concatenate(part) for part in zip(*parts)))
 
     def known(self, count: int) -> tuple[Floats, ...]:
         """Earlier places (r, count, 3) of the contact points in the coordinates of each bone that the muscle can reach,
@@ -254,9 +265,8 @@ class BoneContacts:
         pose = self.poses[self.names[b]]
         distance, gradient = self.fields[b].distance_and_gradient(points, pose=pose, reach=reach)
         # On the medial surface the field has no direction; away from the bone's middle is as good as any.
-        direction = np.empty_like(gradient)
-        direction_loop(points, gradient, pose, self.boxes[self._row[b]], direction)
-        return distance, direction
+        direction_loop(points, gradient, pose, self.boxes[self._row[b]])
+        return distance, gradient
 
     def _within(self, points, limit):
         """Bones whose box is within the greatest limit of the points' box, and how near the nearest other one is."""

@@ -208,7 +208,7 @@ def test_correction_leaves_no_point_behind_the_plate(action):
 
 
 def test_what_cannot_be_turned_back_is_held_on_its_side(monkeypatch):
-    monkeypatch.setattr("rbfmuscle.simulation.stepper.turn_back", lambda *given: None)
+    monkeypatch.setattr("rbfmuscle.simulation.stepper.rotate_with_bone", lambda *given: None)
     # As the step may not be halved, all depends on the planes.
     monkeypatch.setattr("rbfmuscle.simulation.stepper.SMALLEST_STEP", np.radians(40.0))
     stepper, crossed = _swing("substep")
