@@ -124,7 +124,7 @@ def test_several_processes_may_build_the_same_field(folder):
     assert not list(folder.glob("*.part"))
 
 
-def test_arrays_are_used_where_they_lie_and_what_is_written_to_them_stays_here(folder):
+def test_arrays_come_back_as_loops_are_compiled_for_them(folder):
     rng = np.random.default_rng(3)
     arrays = {
         "rows": rng.random((100, 3)),
@@ -136,22 +136,8 @@ def test_arrays_are_used_where_they_lie_and_what_is_written_to_them_stays_here(f
     }
     store_arrays("some", arrays)
     found = load_arrays("some")
+    assert set(found) == set(arrays)
     for name, array in arrays.items():
         np.testing.assert_array_equal(found[name], array)
         assert found[name].dtype == np.asarray(array).dtype
-        # As loops are compiled for them: aligned, and not for reading alone.
-        assert found[name].flags.aligned and found[name].flags.writeable
-        assert not found[name].flags.owndata
-    found["rows"][:] = 0.0
-    np.testing.assert_array_equal(load_arrays("some")["rows"], arrays["rows"])
-    with np.load(cache_path() / f"some{SUFFIX}") as archive:
-        np.testing.assert_array_equal(archive["columns"], arrays["columns"])
-
-
-def test_entries_that_numpy_wrote_are_read(folder):
-    array = np.asfortranarray(np.random.default_rng(3).random((4, 5)))
-    folder.mkdir(exist_ok=True)
-    np.savez(folder / f"other{SUFFIX}", key=np.array("other"), array=array)
-    found = load_arrays("other")
-    np.testing.assert_array_equal(found["array"], array)
-    assert found["array"].flags.aligned
+        assert found[name].flags.aligned and found[name].flags.writeable and found[name].flags.c_contiguous
