@@ -1,10 +1,10 @@
-"""Which points come near which bones, and which way out each shows: loops over points and boxes."""
+"""Broad phase of contact: loops over points and boxes that find which points may be near which bones."""
 
 import numpy as np
 
 from rbfmuscle.jit import compiled
 
-# Share of a queried distance that later calls rely on: a field is exact near its bone, coarser far away.
+# Fraction of a queried distance that later calls rely on: a field is exact near its bone, coarser far away.
 TRUSTED_SHARE = 0.8
 
 
@@ -29,7 +29,7 @@ def direction_loop(points, gradient, pose, box):
 
 @compiled(error_model="numpy", nogil=False)
 def closer_loop(distance, direction, smallest, gradient):
-    """Take over the distances that are smaller, with their directions."""
+    """Replace distances and directions where the new distance is smaller."""
     for i in range(len(distance)):
         if distance[i] < smallest[i]:
             smallest[i] = distance[i]
@@ -39,7 +39,7 @@ def closer_loop(distance, direction, smallest, gradient):
 
 @compiled(error_model="numpy", nogil=False)
 def remember_loop(points, pose, near, distance, anchor, bound):
-    """Keep where points (in bone coordinates) were asked, and below what distance they need not be asked again."""
+    """Store where points were queried, in bone coordinates, and a lower bound of their distance there."""
     for n in range(len(near)):
         i = near[n]
         bound[i] = TRUSTED_SHARE * distance[n]
@@ -73,7 +73,7 @@ def take_contacts_loop(near, distance, direction, limits, found):
 
 @compiled(error_model="numpy")
 def _lower_bound(points, i, pose, bounds, anchor, bound):
-    """Distance that point i has at least: from the bone's box, or an earlier answer less the way since."""
+    """Lower bound of the distance of point i: from the bone's box, or an earlier bound less the motion since."""
     moved, outside = 0.0, 0.0
     for k in range(3):
         local = 0.0
@@ -99,7 +99,7 @@ def box_loop(points, chosen, box):
 
 @compiled(error_model="numpy")
 def boxes_apart(box, pose, bounds):
-    """Distance at least between a box along the world's axes and one (2, 3) along a bone's, in a pose of the bone."""
+    """Lower bound of the distance between a box in world axes and a box (2, 3) in bone axes, in a pose of the bone."""
     square = 0.0
     for k in range(3):
         middle, half = pose[k, 3], 0.0
@@ -113,7 +113,7 @@ def boxes_apart(box, pose, bounds):
 
 @compiled(error_model="numpy", nogil=False)
 def apart_loop(points, poses, boxes, apart):
-    """How far each bone's box is from the points' box at least."""
+    """Lower bound of the distance between each bone's box and the box of the points."""
     box = np.empty((2, 3))
     box_loop(points, np.ones(len(points), np.bool_), box)
     for b in range(len(poses)):
@@ -122,7 +122,7 @@ def apart_loop(points, poses, boxes, apart):
 
 @compiled(error_model="numpy")
 def near_loop(points, free, reach, rows, bones, known, found, counts):
-    """Fill ``found`` (b, n) with the free points that may be nearer than ``reach`` to each bone, and their numbers."""
+    """Fill ``found`` (b, n) with the free points that may be nearer than ``reach`` to each bone, and ``counts``."""
     poses, boxes = bones
     anchor, bound = known
     box, farthest = np.empty((2, 3)), -np.inf

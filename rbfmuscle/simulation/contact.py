@@ -1,7 +1,7 @@
-"""Which points touch which obstacles, and the way out: contacts as half-spaces, several bones at once.
+"""Contacts as half-spaces, with several bones and neighbouring muscles at once.
 
-Obstacles are the bones' distance fields, which stay in bone coordinates and are never rebuilt, and, where a
-scene asks for sliding, the surfaces of neighbouring muscles. Nothing here knows how a muscle is represented.
+Obstacles are the bones' distance fields, which stay in bone coordinates and are never rebuilt, and, with sliding, the
+surfaces of neighbouring muscles. Nothing here depends on how a muscle is represented.
 """
 
 from __future__ import annotations
@@ -42,8 +42,7 @@ class HalfSpaces:
     source : (c,) ndarray of int
         Index of the bone, or ``-1 - k`` for virtual edges of family k.
     give : (c,) ndarray or None
-        How far a contact gives way to the force on it, as a share of how far that force alone would move its point;
-        None where all are rigid.
+        Contact compliance, relative to the contact's diagonal response; None where all are rigid.
     """
 
     index: np.ndarray
@@ -80,7 +79,7 @@ class BoneContacts:
         margin: float = 0.0,
     ) -> None:
         if len(names) != len(fields):
-            raise ValueError(f"one field a bone is needed, got {len(fields)} for {len(names)} bones")
+            raise ValueError(f"one field per bone is needed, got {len(fields)} for {len(names)} bones")
         self.names = list(names)
         self.fields = list(fields)
         self.reached = [b for b, field in enumerate(self.fields) if field is not None]
@@ -112,13 +111,13 @@ class BoneContacts:
         self.poses, self._placed = poses, self.stacked(poses)
 
     def frozen(self) -> BoneContacts:
-        """These obstacles as they stand, for questions from another thread while the bones move on."""
+        """A copy in the present poses, for queries from another thread while the bones move."""
         other = copy.copy(self)
         other.cuts, other._known = list(self.cuts), tuple(part[:, :0] for part in self._known)
         return other
 
     def only(self, index: Any) -> BoneContacts:
-        """These obstacles for some of the contact points, which are then counted in the order of ``index``."""
+        """A copy for a subset ``index`` of the contact points."""
         other = self.frozen()
         if self.contact_bone is not None:
             other.contact_bone = self.contact_bone[index]
@@ -138,7 +137,7 @@ class BoneContacts:
         return self._query(points, bone_index)
 
     def nearest(self, points: ArrayLike, reach: float = np.inf, *, neighbours: bool = True) -> Floats:
-        """Smallest distance over all bones and neighbours at any points: what an extracted surface is cut by.
+        """Smallest distance over all bones and neighbours at any points, by which an extracted surface is clipped.
 
         Parameters
         ----------
@@ -170,8 +169,8 @@ class BoneContacts:
     ) -> tuple[Floats, Floats]:
         """Smallest distance (n,) over bones and, where wanted, neighbours, exact, and its gradient (n, 3), world axes.
 
-        Where the smallest distance is beyond ``limit``, a number or (n,), any value beyond it may stand, without
-        a gradient.
+        Where the smallest distance exceeds ``limit``, a number or (n,), the value is only a lower bound above the
+        limit, without a gradient.
         """
         points = check_points(points)
         near, beyond = self._within(points, limit)
@@ -187,11 +186,11 @@ class BoneContacts:
         return np.concatenate([np.zeros((0, 3)), *(neighbour.points() for neighbour in self.cuts)])
 
     def depth(self, points: Floats) -> float:
-        """How deep the deepest free contact point is in a bone, 0 where none is [scene unit]."""
+        """Greatest depth of a free contact point in a bone [scene unit]; 0 if all are outside."""
         return max([0.0, *(-float(distance.min()) for _, _, distance in self._inside(points))])
 
     def depths(self, points: Floats) -> dict[int, Floats]:
-        """How deep each free contact point is in each bone, by the bone's index, (n,) [scene unit]; 0 outside."""
+        """Depth (n,) of each free contact point in each bone, by the bone's index [scene unit]; 0 outside."""
         found = {b: np.zeros(len(points)) for b in self.reached}
         for b, near, distance in self._inside(points):
             found[b][near] = np.maximum(-distance, 0.0)
@@ -243,10 +242,8 @@ class BoneContacts:
         return HalfSpaces(*(np.concatenate(part) for part in zip(*parts)))
 
     def known(self, count: int) -> tuple[Floats, ...]:
-        """Earlier places (r, count, 3) of the contact points in the coordinates of each bone that the muscle can reach,
-        and distances (r, count) there.
-
-        The distances are lower bounds, -infinity where nothing is known; they hold wherever the bone goes.
+        """Positions (r, count, 3) of the last queries, in the coordinates of each bone in reach, and bounds of the
+        distances there, (r, count); -infinity where nothing is known.
         """
         if self._known[1].shape[1] != count:
             rows = len(self.reached)
@@ -264,21 +261,19 @@ class BoneContacts:
     def _query(self, points, b, reach=np.inf):
         pose = self.poses[self.names[b]]
         distance, gradient = self.fields[b].distance_and_gradient(points, pose=pose, reach=reach)
-        # On the medial surface the field has no direction; away from the bone's middle is as good as any.
+        # On the medial surface the field has no direction: away from the middle of the bone is used.
         direction_loop(points, gradient, pose, self.boxes[self._row[b]])
         return distance, gradient
 
     def _within(self, points, limit):
-        """Bones whose box is within the greatest limit of the points' box, and how near the nearest other one is."""
+        """Bones whose box is within the greatest limit of the points' box, and a bound of the others' distance."""
         apart = np.empty(len(self.reached))
         apart_loop(points, self._placed, self.boxes, apart)
         far = apart > np.max(limit, initial=0.0)
         return [b for b, left in zip(self.reached, far) if not left], apart[far].min(initial=np.inf)
 
     def _near(self, points, reach, bones):
-        """Bones, each with the free contact points that may be nearer to it than their ``reach``: by boxes and by
-        earlier answers.
-        """
+        """Bones, each with the free contact points that may be nearer to it than their ``reach``."""
         rows = np.array([self._row[b] for b in bones], dtype=np.int64)
         found, counts = (
             np.empty((len(rows), len(points)), dtype=np.int64),
@@ -289,13 +284,13 @@ class BoneContacts:
         return [(b, near[:count]) for b, near, count in zip(bones, found, counts.tolist()) if count]
 
     def _inside(self, points):
-        """Bones that free contact points may be in, each with these points and their distances."""
+        """Bones, each with the free contact points that may be inside it and their distances."""
         points = check_points(points)
         for b, near in self._near(points, np.zeros(len(points)), self.reached):
             yield b, near, self._ask(points, near, b, 0.0)[0]
 
     def _ask(self, points, near, b, reach):
-        """Distance to bone b and direction of some of the contact points; what is learnt is remembered."""
+        """Distances and directions of some of the contact points to bone b; stored as bounds for later queries."""
         distance, direction = self._query(points[near], b, reach)
         known = (part[self._row[b]] for part in self.known(len(points)))
         remember_loop(points, self.poses[self.names[b]], near, distance, *known)

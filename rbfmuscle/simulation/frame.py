@@ -1,4 +1,4 @@
-"""What a frame of a motion holds, and what a muscle must offer to be brought through one."""
+"""The data of a frame, and the interface that a muscle model implements."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,11 +12,11 @@ from rbfmuscle.simulation.contact import BoneContacts
 
 @dataclass(frozen=True)
 class Event:
-    """Something a user should know of: ``count`` points of a muscle at a bone, and what was done.
+    """Something a user should know: ``count`` points of a muscle at a bone, and what was done.
 
-    ``action`` is ``"angle_flag"`` (the angle test spoke), ``"reported"`` (crossed, nothing done),
-    ``"rotated"``, ``"halved"`` (the step was), ``"held_back"`` (kept on its side of a plane), ``"grazed"``
-    (crossed by the bone's field, by its triangles less than 0.1 mm deep), ``"unresolved"`` (and nothing helped),
+    ``action`` is ``"angle_flag"`` (the angle test found a crossing), ``"reported"`` (crossed, not corrected),
+    ``"rotated"``, ``"halved"`` (the step), ``"held_back"`` (kept on its side of a plane), ``"grazed"``
+    (crossed by the bone's field, by its triangles less than 0.1 mm deep), ``"unresolved"`` (crossed all the same),
     ``"carried_stretched"``, ``"carried_held_end"`` or ``"carried_sheets"`` (no level set could be shown, so the surface
     is where the material is: it is stretched too far, an end is held inside the bone named, or sheets have met),
     ``"neighbours_let_in"`` (sliding neighbours on all sides left no surface, so it was fitted without them),
@@ -33,7 +33,7 @@ class Event:
 
 @dataclass(frozen=True)
 class ModelSurface:
-    """A closed, outward surface and what the model knows about it.
+    """A closed, outward surface and its quantities.
 
     Attributes
     ----------
@@ -42,9 +42,9 @@ class ModelSurface:
     quantities : dict of str to float
         For example ``solver_penetration_max``, ``condition``, ``time_fit``, ``time_extract``.
     notes : list of (bone, count, action)
-        What becomes events of the frame.
+        Turned into events of the frame.
     origin : tuple of (ModelSurface, (4, 4) ndarray) or None
-        The surface that this one is, moved, and the motion; of one that was not drawn anew.
+        An earlier surface and the rigid motion since, where the muscle moved rigidly.
     """
 
     vertices: np.ndarray
@@ -61,7 +61,7 @@ class Frame:
     Attributes
     ----------
     index : int
-        Place in the scene's motion.
+        Index in the scene's motion.
     coordinates : dict of str to float
         [radian].
     poses : dict of str to (4, 4) ndarray
@@ -79,9 +79,9 @@ class Frame:
     activations : dict of str to float
         Of the muscles that contract.
     work : dict of str to Work
-        Whether each muscle was solved for the frame, carried along as it was, or left where it was, and why.
+        Whether each muscle was solved, moved rigidly or skipped, and why.
     neighbours : dict of (str, str) to (float, float)
-        Of muscles that slide, by pair: their overlap, and the gap opened where they touched at rest (RMS).
+        For each pair that slides: overlap, and RMS gap opened where they touched at rest.
     """
 
     index: int
@@ -98,18 +98,18 @@ class Frame:
 
 
 class Drawing(Protocol):
-    """A model as it was at one moment, ready to be drawn while the model goes on."""
+    """A copy of a model's state, from which its surface is computed, maybe while the model continues."""
 
     def field(self) -> Field | None:
-        """The field whose zero set will be shown, None for a model that has none."""
+        """The field whose zero level set is shown; None for a model without one."""
 
     def surface(self) -> ModelSurface:
-        """The surface, closed and outward; asked for once."""
+        """The surface, closed and outward; called once."""
 
 
 @dataclass(frozen=True)
 class FinishedDrawing:
-    """The drawing of a model that has its surface at hand, and no field."""
+    """The drawing of a model whose surface is known, without a field."""
 
     finished: ModelSurface
 
@@ -122,7 +122,7 @@ class FinishedDrawing:
 
 
 class MuscleModel(Protocol):
-    """What the loop asks of a muscle.
+    """The interface of a muscle to the frame loop.
 
     Attributes
     ----------
@@ -136,34 +136,34 @@ class MuscleModel(Protocol):
     contact_bone: np.ndarray
 
     def contact_points(self) -> np.ndarray:
-        """Points (n, 3) that contacts act on, now; number and order never change."""
+        """Present contact points (n, 3); their number and order never change."""
 
     def predict(self, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> None:
-        """Go along with the bones from one set of poses to the next."""
+        """Move with the bones from one set of poses to the next."""
 
     def solve(self, contacts: BoneContacts) -> None:
-        """Settle under the model's own constraints and these contacts."""
+        """Solve for equilibrium under the model's constraints and these contacts."""
 
     def settle(self, contacts: BoneContacts) -> None:
-        """At rest, where a scene resolves overlap: bring out of the bones what no contact point stands for."""
+        """Move out of the bones, at rest, what no contact point represents."""
 
     def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
         """Move the contact points marked in a bool mask (n,) by a (4, 4) transform."""
 
     def transform(self, motion: np.ndarray) -> None:
-        """Go along with a rigid motion (4, 4), as the muscle is."""
+        """Move the whole muscle rigidly by (4, 4)."""
 
     def snapshot(self) -> Any:
-        """Everything that :meth:`restore` needs to go back to this moment."""
+        """The state, for :meth:`restore`."""
 
     def restore(self, state: Any) -> None:
-        """Go back to a snapshot; it can be used again."""
+        """Return to a snapshot, which stays valid."""
 
     def activate(self, activation: float) -> None:
-        """Take an activation, 0 to 1, that the next :meth:`solve` settles under; for muscles that contract."""
+        """Set the activation, 0 to 1, for the next :meth:`solve`; for muscles that contract."""
 
     def material_mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices and faces of a surface that moves with the material, of constant topology."""
+        """Vertices and faces of a surface of constant topology that moves with the material."""
 
     def drawing(self, contacts: BoneContacts) -> Drawing:
-        """The model as it is now, for its surface."""
+        """A copy of the state, from which the surface is computed."""

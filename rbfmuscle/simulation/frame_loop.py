@@ -30,27 +30,25 @@ __all__ = [
 
 
 class FrameLoop:
-    """Brings muscles along with bones, one frame at a time, from the rest pose on.
+    """Moves muscles with the bones, one frame at a time, from the rest pose on.
 
-    Whatever drives it asks for frames by `advance`: a run through the scene's motion, a window whose coordinates
-    are set by hand, a benchmark. What was returned stands, whatever the next frame comes to. Close it, or use it
-    in a ``with`` block: it holds threads.
+    Call `advance` for each frame. Close the loop, or use it in a ``with`` block: it holds threads.
 
     Parameters
     ----------
     scene : Scene
-        Its motion is looked at only for which bones and neighbours a muscle can meet.
+        Its motion only determines which bones and neighbours a muscle can meet.
     models : sequence of MuscleModel, or mapping of str to MuscleModel
         In their rest state.
     fields : mapping of str to BoneSDF, optional
-        Distance fields of the bones; built for the bones that muscles can reach where not given.
+        Distance fields of the bones; built for the bones in reach where not given.
     surfaces : bool
-        Whether frames carry surfaces; without, none is extracted.
+        Whether surfaces are extracted.
 
     Attributes
     ----------
     here : dict of str to float
-        Where the bones are [radian]; empty at rest, before the first frame.
+        Present coordinates [radian]; empty before the first frame.
     activations : Activations
         Of the muscles that contract.
 
@@ -96,12 +94,12 @@ class FrameLoop:
             raise
 
     def advance(self, coordinates: Mapping[str, float]) -> Frame:
-        """Go on to a frame and show it.
+        """Advance to the given coordinates and return the frame.
 
         Parameters
         ----------
         coordinates : mapping of str to float
-            Where the joints shall be [radian]; absent ones are at rest.
+            Target coordinates [radian]; absent ones are at rest.
 
         Returns
         -------
@@ -115,7 +113,7 @@ class FrameLoop:
         with self.clocked(), self.workers.one_thread_each():
             paths = self._path_to(coordinates)
             if self.surfaces and self._sliding is None and self.workers.parallel:
-                # Nothing waits for another muscle: each goes all the way, and no thread idles in between.
+                # No muscle waits for another: each thread takes one through all its sub-steps.
                 drawn = self.workers.each(
                     lambda stepper: stepper.go(*paths[stepper.name]).draw(), self.steppers
                 )
@@ -127,12 +125,12 @@ class FrameLoop:
         return self.finish(frame, drawn)
 
     def skip(self, coordinates: Mapping[str, float]) -> None:
-        """Go on to a frame and show nothing: its times and events are in the next frame that is shown."""
+        """Advance without surfaces; times and events are counted to the next frame that is returned."""
         with self.clocked(), self.workers.one_thread_each():
             self._solve(self._path_to(coordinates))
 
     def collect(self) -> Frame:
-        """The frame where the muscles are now, without its surfaces."""
+        """The present frame, without surfaces."""
         carried = {stepper.name: stepper.model.material_mesh() for stepper in self.steppers}
         times, events = {}, []
         for stepper in self.steppers:
@@ -146,7 +144,7 @@ class FrameLoop:
         return frame
 
     def finish(self, frame: Frame, drawn: Iterable[tuple[ModelSurface, float]]) -> Frame:
-        """The frame with its surfaces, and the time since the one before."""
+        """Add surfaces and the time since the last frame."""
         for name, (surface, seconds) in zip(frame.carried, drawn):
             frame.surfaces[name] = surface
             frame.events.extend(Event(frame.index, name, *note) for note in surface.notes)
@@ -157,7 +155,7 @@ class FrameLoop:
 
     @contextmanager
     def clocked(self) -> Iterator[None]:
-        """Count the time spent inside to the frame that is finished next."""
+        """Count the time spent inside to the next frame."""
         start = time.perf_counter()
         try:
             yield
@@ -175,13 +173,13 @@ class FrameLoop:
         self.close()
 
     def _cut_for(self, carrier: RigidTransport) -> SubSteps:
-        """Sub-steps for one muscle: by what the bones do that hold it, and those that it can meet."""
+        """Sub-steps of one muscle, by the relative motion of the bones that hold it or that it can meet."""
         contacts = carrier.stepper.contacts
         met = [contacts.names[b] for b in contacts.reached]
         return SubSteps(self.scene, carrier.muscle, bones=met, poses=self._poses)
 
     def _side_by_side(self) -> CoupledStepper | None:
-        """What brings muscles that slide through a frame; those that contract take every sub-step."""
+        """The stepper of muscles that slide, None without sliding; muscles that contract take every sub-step."""
         if self._sliding is None:
             return None
         contract = {muscle.name for muscle in self.scene.muscles if muscle.contraction is not None}
@@ -190,8 +188,8 @@ class FrameLoop:
         return CoupledStepper(self.steppers, self._sliding, cuts)
 
     def _path_to(self, coordinates: Mapping[str, float]) -> dict[str, tuple[list[dict], list[dict]]]:
-        """For each muscle coordinates of its sub-steps to the next frame, from where it is on, and activations."""
-        # Whatever a motion chooses to move starts at rest, which for most coordinates is zero.
+        """For each muscle the coordinates and the activations of its sub-steps to the next frame."""
+        # Coordinates start at rest, which is zero for most.
         here = self.here or dict.fromkeys(coordinates, 0.0) | rest_coordinates(self.scene)
         self.here = completed(self.scene, coordinates)
         for stepper in self.steppers:
@@ -199,14 +197,14 @@ class FrameLoop:
         self._next_index += 1
         found = {name: ([here, *cut.split(here, self.here)], []) for name, cut in self._own_sub_steps.items()}
         if len(found) < len(self.steppers):
-            # Muscles that slide see each other on the way, at stops of the fastest.
+            # Muscles that slide share the sub-steps of the muscle that has the most.
             stops = [here, *self._sub_steps.split(here, self.here)]
             shared = self.activations.refine(self._next_index - 1, stops)
             found.update({s.name: shared for s in self.steppers if s.name not in found})
         return found
 
     def _solve(self, paths: dict[str, tuple[list[dict], list[dict]]]) -> None:
-        """Bring all muscles through sub-steps; those that slide see each other there."""
+        """Advance all muscles through their sub-steps."""
         if self._together is None:
             self.workers.each(lambda stepper: stepper.advance(*paths[stepper.name]), self.steppers)
             return
@@ -214,7 +212,7 @@ class FrameLoop:
         self._together.go(stops, activations, self.workers)
 
     def _drawings(self) -> list[TimedDrawing]:
-        """What draws all muscles as they are now."""
+        """Drawings of all muscles in their present state."""
         if self._sliding is not None:
             self.workers.each(self._sliding.refresh, self.steppers)
             for stepper, found in zip(self.steppers, self.workers.each(self._sliding.measure, self.steppers)):
@@ -236,7 +234,7 @@ def simulate_frames(
 ) -> Iterator[Frame]:
     """Run models through a scene's motion, from the rest pose on, and yield its frames one by one.
 
-    Whatever ends it early (an interrupt, a ``SolveError``), the frames yielded so far stand.
+    Frames yielded before an interrupt or a ``SolveError`` stay valid.
 
     Parameters
     ----------
@@ -276,7 +274,7 @@ def solve_pose(
     models : sequence of MuscleModel
         In their rest state, to which they return.
     coordinates : mapping of str to float
-        Where the joints shall be [radian]; absent ones are at rest.
+        Target coordinates [radian]; absent ones are at rest.
     fields : mapping of str to BoneField, optional
         As for `FrameLoop`.
 
@@ -297,8 +295,8 @@ def solve_pose(
 def _obstacles(scene, models, fields):
     """One BoneContacts for each model, with fields of the bones that it can reach.
 
-    A field is built for all muscles of the scene that can reach its bone, also for those that are not here: so it is
-    the same wherever a muscle is simulated.
+    A field covers the reach of all muscles of the scene, also those without a model here, so that it does not depend on
+    which muscles are simulated.
     """
     regions = find_contact_pairs(scene) if fields is None else None
     here = {model.name for model in models}
@@ -312,7 +310,7 @@ def _obstacles(scene, models, fields):
 
 
 def _sliding(scene, steppers):
-    """The links between muscles, or None where the scene asks for none."""
+    """Sliding between muscles, or None."""
     if scene.sliding is None:
         return None
     from rbfmuscle.simulation.sliding import Sliding

@@ -1,4 +1,4 @@
-"""A scene driven by hand: the frame loop, asked for frames that are not known beforehand."""
+"""A scene whose coordinates are set interactively."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from rbfmuscle.simulation.frame import Frame
 
 
-# What a coordinate may be turned by where the scene's own motion does not go further [degree].
+# Range of a coordinate around rest where the scene's motion does not exceed it [degree, mm].
 FREE_RANGE = 30.0
 
 
 class LiveSession:
-    """Models that follow coordinates set by hand, through the loop that a run goes through.
+    """Models that follow coordinates set interactively.
 
     Parameters
     ----------
@@ -37,13 +37,13 @@ class LiveSession:
     Attributes
     ----------
     limits : dict of str to (float, float)
-        What each coordinate may be set to [radian].
+        Range of each coordinate [radian].
     here : dict of str to float
-        Where the bones are [radian].
+        Present coordinates [radian].
     target : dict of str to float
-        Where they shall be [radian].
+        Target coordinates [radian].
     activation : dict of str to float
-        What the muscles that contract shall have, 0 to 1.
+        Target activation of the muscles that contract, 0 to 1.
     """
 
     def __init__(self, scene: Scene, *, fields: dict[str, Any] | None = None) -> None:
@@ -78,7 +78,7 @@ class LiveSession:
         return self._rest
 
     def reset(self) -> None:
-        """Put models and bones back to rest; the target stays."""
+        """Return models and bones to rest; the target stays."""
         self.close()
         for model, state in zip(self.models, self._rest):
             model.restore(state)
@@ -99,20 +99,19 @@ class LiveSession:
 
     @property
     def arrived(self) -> bool:
-        """Whether the bones are where they shall be, and the muscles as active."""
+        """Whether coordinates and activations have reached their targets."""
         active = self._loop.activations.here if self._loop else dict.fromkeys(self.activation, 0.0)
         return all(abs(self.target[name] - self.here[name]) < 1e-9 for name in self.target) and all(
             abs(value - active[name]) < 1e-9 for name, value in self.activation.items()
         )
 
     def advance(self, stride: float = math.inf) -> Frame:
-        """Go towards the target and return the frame reached.
+        """Move towards the target and return the frame reached.
 
         Parameters
         ----------
         stride : float
-            No coordinate changes by more [radian], so that the next picture does not wait for a long way. Then no
-            activation changes by more than one sub-step's either.
+            Greatest change of a coordinate [radian]. If finite, no activation changes by more than one sub-step's.
 
         Returns
         -------
@@ -145,9 +144,9 @@ class LiveSession:
 
 
 def coordinate_limits(scene: Scene) -> dict[str, tuple[float, float]]:
-    """What each coordinate may be set to by hand: its range, or the motion's own and 30 degrees both ways.
+    """Range of each free coordinate: its own, or the motion's and 30 degrees (30 mm) both ways.
 
-    A coordinate that follows others or is locked cannot be set. A length without a range may go 30 mm both ways.
+    Coordinates that are coupled or locked are left out.
 
     Parameters
     ----------
@@ -179,7 +178,7 @@ def _rest(scene, names):
 
 
 def live_fields(scene: Scene) -> Any:
-    """Distance fields of the bones that muscles reach anywhere within the coordinates' limits.
+    """Distance fields of the bones in reach of a muscle within the coordinates' ranges.
 
     Parameters
     ----------
@@ -193,7 +192,7 @@ def live_fields(scene: Scene) -> Any:
 
 
 def _wide_scene(scene):
-    """The scene with a motion that takes each coordinate to its limits: what muscles can meet by hand."""
+    """The scene with a motion that takes each coordinate to its limits."""
     limits = coordinate_limits(scene)
     rest, stops = _rest(scene, limits), [{}]
     for name, ends in limits.items():

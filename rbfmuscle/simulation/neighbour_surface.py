@@ -1,4 +1,4 @@
-"""A muscle's surface as its neighbours see it: its carried mesh, found through cells that are refilled."""
+"""Signed distance to a moving muscle's material mesh, for its neighbours."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from rbfmuscle.simulation.frame import MuscleModel
 
 
-# A muscle may come to be so many times as thick as at rest.
+# Greatest thickness of a muscle, relative to rest.
 DEEPER = 1.5
-# Least cosine between a surface's normal and the way to a point for which the normal counts as its direction.
+# Least cosine between the surface normal and the direction to a point for which the normal is used.
 RIM = 0.7
-# Mean edges below which a point counts as deep only where the mesh winds around it.
+# Depth, in mean edges, beyond which a point is inside only where its winding number says so.
 FOLDED = 0.3
 
 
@@ -51,12 +51,12 @@ class Skin(NamedTuple):
 
 
 class NeighbourSurface:
-    """Signed distance to a model's carried mesh, for points near it.
+    """Signed distance to a model's material mesh, for points near it.
 
     The nearest vertex is found through a uniform grid of cells as wide as the reach; the nearest point of the
     surface lies in one of the triangles around it, up to the square of an edge over the radius of curvature.
-    Directions come from vertex normals, interpolated, so that they vary smoothly, or where these are at odds with it,
-    as around a rim, from the way to the point; the side from the triangles that meet where the nearest point lies.
+    Directions are interpolated vertex normals, or, around a rim, the direction to the point. The sign is that of the
+    triangles that meet at the nearest point.
 
     Parameters
     ----------
@@ -98,18 +98,20 @@ class NeighbourSurface:
         self.deepest = DEEPER * np.minimum(balls[1], float(reach)) + self.edge
         self.contact = cKDTree(model.contact_points()).query(vertices)[1]
         self.fixed = np.asarray(model.contact_bone)[self.contact] >= 0
-        #: Where it will settle.
-        self.lead = MotionExtrapolator()
+        #: Extrapolates the model's prediction.
+        self.extrapolator = MotionExtrapolator()
         self.refresh()
 
     def refresh(self, way: Mapping[str, float] | None = None) -> None:
-        """Take over where the model is now, or where a step of coordinates, as predicted, will settle it."""
+        """Update from the model's present state, extrapolated by the change ``way`` of the coordinates where given."""
         self._predicted = [np.array(self.model.contact_points()), np.array(self.model.material_mesh()[0])]
-        self.points, self.vertices = self._predicted if way is None else self.lead.ahead(self._predicted, way)
+        self.points, self.vertices = (
+            self._predicted if way is None else self.extrapolator.ahead(self._predicted, way)
+        )
         self.vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
         self.normals = vertex_normals(self.vertices, self.faces)
         self.box = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
-        #: Box about all that the model meets others with.
+        #: Box of the contact points.
         self.reach_box = np.array([self.points.min(axis=0), self.points.max(axis=0)])
         shape = (np.ceil((self.box[1] - self.box[0]) / self.cell).astype(np.int64) + 1).clip(1)
         first = np.zeros(int(np.prod(shape)) + 1, dtype=np.int64)
@@ -117,8 +119,10 @@ class NeighbourSurface:
         _fill_loop(self.vertices, self.cells)
 
     def settled(self, way: Mapping[str, float]) -> None:
-        """Note how far settling moved the model from where it was taken over, after a step of coordinates."""
-        self.lead.learn(way, self._predicted, [self.model.contact_points(), self.model.material_mesh()[0]])
+        """Record how far the solve moved the model from its prediction, for a change ``way`` of the coordinates."""
+        self.extrapolator.learn(
+            way, self._predicted, [self.model.contact_points(), self.model.material_mesh()[0]]
+        )
 
     def apart(self, other: NeighbourSurface, reach: float) -> bool:
         """Whether no point of the other muscle can be nearer than ``reach`` to this surface, by their boxes."""
@@ -155,9 +159,9 @@ class NeighbourSurface:
         distance, normal = np.empty(count), np.empty((count, 3))
         skin = Skin(self.vertices, self.normals, self.faces, self.start, self.ring)
         _distance_loop(points, index, nearest, skin, distance, normal)
-        # Beyond a sharp rim the normals of its two sides disagree: no point is deeper than the muscle is thick.
+        # Beyond a sharp rim the normals of its sides disagree: no point is deeper than the muscle is thick.
         near = (distance < reach) & (distance >= -self.deepest[nearest])
-        # A triangle that is folded over at a rim may take a point far outside for one that is deep.
+        # A folded triangle at a rim may give a point far outside a large depth.
         deep = np.flatnonzero(near & (distance < -FOLDED * self.edge))
         if len(deep):
             inside = np.empty(len(deep), dtype=np.bool_)
@@ -187,7 +191,7 @@ def _fill_loop(vertices, cells):
 
 @compiled
 def _nearest_loop(points, which, vertices, cells, bound, index, nearest):
-    """Nearest vertex within ``bound``, at most a cell, of each point asked for; return how many have one."""
+    """Nearest vertex within ``bound``, at most a cell, of each selected point; return how many have one."""
     box, cell, shape, first, members = cells
     count = 0
     low, high = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)
@@ -236,7 +240,7 @@ def _distance_loop(points, index, nearest, skin, distance, normal):
                     here -= weights[corner] * vertices[faces[f, corner], k]
                 squared += here * here
                 at[k] = here
-            # The triangles that meet where the nearest point lies decide the side together.
+            # The triangles that meet at the nearest point decide the side together.
             same = squared <= least * (1.0 + 1e-9) and squared >= least * (1.0 - 1e-9)
             if squared < least or same:
                 if not same:
@@ -256,7 +260,7 @@ def _distance_loop(points, index, nearest, skin, distance, normal):
             agree += n * way[k]
         length, size = np.sqrt(least), max(np.sqrt(size), 1e-300)
         sign = 1.0 if side >= 0.0 else -1.0
-        # Around a rim the surface's normals vary so fast that the way from it is the better direction.
+        # Around a rim normals vary fast: the direction from the nearest point is better.
         along = sign * agree < RIM * size * length
         for k in range(3):
             normal[q, k] = sign * way[k] / length if along else normal[q, k] / size

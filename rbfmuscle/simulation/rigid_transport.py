@@ -1,8 +1,7 @@
-"""What a step asks of one muscle: to be solved, to be carried along as it is, or nothing at all.
+"""Rigid motion of a muscle whose bones do not move against each other.
 
-Bones that hold a muscle and do not move against each other leave it the shape that it has: it goes with them, rigidly.
-What counts is how these bones lie to each other now and lay when the muscle was solved last. A bone that it only
-touches counts where it comes near: then the muscle is solved as ever.
+Such a muscle keeps its shape and moves with its bones. The relative pose of the bones is compared with that of the last
+solve. If another bone comes near, the muscle is solved.
 """
 
 from __future__ import annotations
@@ -22,25 +21,25 @@ if TYPE_CHECKING:
     from rbfmuscle.scene.scene import Scene
 
 
-# Bones farther than this [mm] from a muscle do not act on it: its samples are some millimetres apart.
+# Bones farther than this [mm] from a muscle do not act on it.
 CLEAR = 2.0
-# Turns [radian] and ways (of the muscle's size) that are rounding.
+# Rotations [radian] and displacements (relative to the muscle's size) below this are rounding errors.
 STILL = 1e-9
-# The way of an attachment that counts as much as a turn by one radian, in sizes of its muscle: an arc of half of it.
+# Displacement of an attachment, in sizes of its muscle, that counts as a rotation by one radian.
 ARC = 0.5
 
 SOLVED, CARRIED, SKIPPED = "solved", "carried", "skipped"
 
 
 class MuscleStatus(NamedTuple):
-    """What a frame took of one muscle.
+    """How a muscle came to a frame.
 
     Attributes
     ----------
     state : {"solved", "carried", "skipped"}
-        Carried: moved as it is, with its bones. Skipped: nothing moved it at all.
+        Carried: moved rigidly with its bones. Skipped: not moved.
     substeps : int
-        In how many sub-steps it was solved.
+        Number of sub-steps in which it was solved.
     reason : str
         Why it was solved, or why it was not.
     """
@@ -51,7 +50,7 @@ class MuscleStatus(NamedTuple):
 
 
 class OwnBones:
-    """How the bones that hold one muscle move against each other.
+    """Relative motion of the bones that hold one muscle.
 
     Parameters
     ----------
@@ -61,7 +60,7 @@ class OwnBones:
     Attributes
     ----------
     names : list of str
-        Bones that hold the muscle; the first holds most of it, and carries it.
+        Bones that hold the muscle; the first holds most of it.
     """
 
     def __init__(self, muscle: Muscle, scene: Scene) -> None:
@@ -75,14 +74,14 @@ class OwnBones:
         self._corners = {name: frame.corners(parts[name]) for name in self.names}
 
     def apart(self, before: Mapping[str, Floats], after: Mapping[str, Floats]) -> tuple[float, str]:
-        """How far the bones turned and moved against the first, from one set of poses to another.
+        """Greatest motion of the bones relative to the first, between two sets of poses.
 
         Returns
         -------
         angle : float
-            The largest turn [radian]; a way of an attachment counts as an arc of half the muscle's size.
+            Greatest rotation [radian]; a displacement counts as an arc of half the muscle's size.
         bone : str
-            Which did.
+            The bone that moved so.
         """
         root, worst, which = self.names[0], 0.0, ""
         for name in self.names[1:]:
@@ -92,7 +91,7 @@ class OwnBones:
         return worst, which
 
     def carriage(self, before: Mapping[str, Floats], after: Mapping[str, Floats]) -> Floats:
-        """The rigid motion (4, 4) of the bone that carries the muscle."""
+        """The rigid motion (4, 4) of the first bone."""
         root = self.names[0]
         return after[root] @ np.linalg.inv(before[root])
 
@@ -105,7 +104,7 @@ def relative_motion(
     corners: Floats,
     size: float,
 ) -> float:
-    """How far a bone turned [radian] or places on it moved (over half a size) against another bone."""
+    """Rotation of a bone [radian], or displacement of its attachment over half the size, against another bone."""
     old, new = (np.linalg.inv(poses[root]) @ poses[bone] for poses in (before, after))
     if np.array_equal(old, new):
         return 0.0
@@ -115,14 +114,14 @@ def relative_motion(
 
 
 def why_never(muscle: Muscle, scene: Scene) -> str:
-    """Why a muscle is never carried as it is: what acts on it where its bones rest; empty where it may be."""
+    """Why a muscle is always solved; empty where it may move rigidly."""
     if scene.sliding is not None:
         return "slides on neighbours"
     return "contracts" if muscle.contraction is not None else ""
 
 
 class RigidTransport:
-    """Carries one muscle along as it is, where that is what a step asks.
+    """Moves one muscle rigidly where its bones do.
 
     Parameters
     ----------
@@ -141,7 +140,7 @@ class RigidTransport:
         self.moved, self.reason = False, ""
 
     def try_carry(self, before: Mapping[str, Floats], after: Mapping[str, Floats]) -> bool:
-        """Bring the muscle from one set of poses to the next if it need not be solved; say whether it was."""
+        """Move the muscle rigidly from one set of poses to the next if it need not be solved; return whether it was."""
         if self.never:
             return False
         if self.solved is None:
@@ -156,7 +155,7 @@ class RigidTransport:
         return self._carry(before, after, near)
 
     def _carry(self, before, after, near):
-        """Carry the muscle; undone, and False, where that brings it to another bone."""
+        """Move the muscle; undo it and return False where another bone is then near."""
         motion, model = self.own.carriage(before, after), self.stepper.model
         saved = model.snapshot() if near else None
         moves = np.abs(motion - np.eye(4)).max() > STILL
@@ -173,7 +172,7 @@ class RigidTransport:
         return True
 
     def _touched(self, bones: Sequence[int]) -> bool:
-        """Whether one of these bones comes near the muscle where both are now."""
+        """Whether one of these bones is near the muscle now."""
         if not bones:
             return False
         contacts, points = self.stepper.contacts, self.stepper.model.contact_points()
@@ -188,7 +187,7 @@ class RigidTransport:
         return relative_motion(before, after, name, self.own.names[0], corners, self.own.size) > STILL
 
     def collect(self, substeps: int) -> MuscleStatus:
-        """What was done since the last call."""
+        """The status since the last call."""
         moved, reason = self.moved, self.reason
         self.moved, self.reason = False, ""
         if substeps:

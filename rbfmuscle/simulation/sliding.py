@@ -1,12 +1,11 @@
 """Neighbouring muscles that keep their distance and slide: virtual edges as half-spaces.
 
 After Cervenka et al. 2023, section 5.4.1: a point nearer to its neighbour than a threshold at rest stays near
-the neighbour's surface; within a strip it is free, so that it slides; beyond a release distance it is let go.
+the neighbour's surface; within a strip it is free, so that it slides; beyond a release distance the link ends.
 
-All muscles predict first; then each sees its neighbours' surfaces where they will be, and what it may do is written as
-planes through its own points. Each of two muscles may use half of the gap between them, or gives way by half of the
-overlap, so both stay on their own side of one surface whatever the other does: the answer does not depend on the order
-in which muscles are solved, nor on how many run at a time.
+All muscles predict first. Each then gets planes through its own points from its neighbours' extrapolated surfaces. Each
+of two muscles may use half of the gap between them, or moves back by half of the overlap, so the result does not depend
+on the order of the muscles or on the number of threads.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class Sliding:
-    """All links of a scene.
+    """All sliding pairs of a scene.
 
     Parameters
     ----------
@@ -73,9 +72,9 @@ class Sliding:
                 stepper.contacts.neighbours += [link.pull for link in held]
 
     def pairs(self) -> dict[tuple[str, str], tuple[float, float]]:
-        """Overlap, and gap opened where they touched (RMS), of each pair that touches or touched, when measured last.
+        """Overlap, and RMS gap opened where they touched at rest, of each pair, when measured last.
 
-        Both muscles are asked; a pair that never met is left out.
+        The greater overlap of the two muscles counts; a pair that never met is left out.
         """
         met: dict[tuple[str, str], list[Met]] = {}
         for name, links in self.links.items():
@@ -92,32 +91,32 @@ class Sliding:
         }
 
     def refresh(self, stepper: Any, way: Mapping[str, float] | None = None) -> None:
-        """Take over a muscle's surface as it is now, or where a step of coordinates, as predicted, will settle it."""
+        """Update a muscle's surface from its present state, extrapolated by the change ``way`` of the coordinates."""
         if stepper.name in self.surfaces:
             with stepper.timed("sliding"):
                 self.surfaces[stepper.name].refresh(way)
 
     def settled(self, stepper: Any, way: Mapping[str, float]) -> None:
-        """Learn from where a step of coordinates settled a muscle."""
+        """Record a muscle's correction for extrapolation."""
         if stepper.name in self.surfaces:
             with stepper.timed("sliding"):
                 self.surfaces[stepper.name].settled(way)
 
     def show(self, drawing: Any) -> None:
-        """Take over the field that a muscle will be shown by, where it has one; its drawing comes afterwards."""
+        """Use the field that a muscle will be shown by, before its surface is drawn."""
         stepper = drawing.stepper
         if self.links[stepper.name]:
             with stepper.timed("surface"):
                 self.surfaces[stepper.name].field = drawing.drawing.field()
 
     def update(self, stepper: Any) -> None:
-        """New planes for one muscle; its neighbours' surfaces have been refreshed."""
+        """Recompute the planes of one muscle; its neighbours' surfaces must be up to date."""
         with stepper.timed("sliding"):
             for link in [*self.links[stepper.name], *self.bone_links[stepper.name]]:
                 link.update()
 
     def measure(self, stepper: Any) -> Any:
-        """Worst of what a muscle's links say: a dict of quantities, empty without neighbours."""
+        """Greatest value of each quantity over a muscle's pairs; empty without neighbours."""
         with stepper.timed("sliding"):
             found = [link.measure() for link in self.links[stepper.name]]
         return {key: max(one[key] for one in found) for key in found[0]} if found else {}
@@ -138,7 +137,7 @@ def sliding_pairs(scene: Scene, names: list[str], reach: float) -> set[frozenset
         return swept_region(muscles[k], bone, poses)
 
     def meet(i, k):
-        """Whether the swept boxes meet as every bone that holds one of the two sees them."""
+        """Whether the swept boxes meet in the coordinates of every bone that holds one of the two."""
         bones = {held.bone for muscle in (muscles[i], muscles[k]) for held in muscle.attachments}
         boxes = ((box(i, bone), box(k, bone)) for bone in bones)
         return all(np.all(a[0] - reach <= b[1]) and np.all(b[0] - reach <= a[1]) for a, b in boxes)

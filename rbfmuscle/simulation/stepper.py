@@ -1,4 +1,4 @@
-"""One muscle on its way through sub-steps: its model, its obstacles, its clock and its events."""
+"""The sub-steps of one muscle: its model, its obstacles, its times and its events."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 
 # Depth [mm] below which a path through a bone counts as touching it; above the error of a bone's field.
 TOUCH = 0.1
-# Rounds in which what still crosses at the smallest step is fenced off, together with what crosses then.
+# Rounds in which points that still cross at the smallest step are held by planes.
 FENCES = 4
-# A step that points pass through in is not halved below this turn [radian].
+# Sub-steps are not halved below this angle [radian].
 SMALLEST_STEP = math.radians(0.1)
 
 
 class TimedDrawing:
-    """A muscle's drawing with what was measured beside it.
+    """A muscle's drawing with the quantities of its sub-steps.
 
     Parameters
     ----------
@@ -47,26 +47,26 @@ class TimedDrawing:
         self._finished: ModelSurface | None = None
 
     def surface(self) -> ModelSurface:
-        """The surface with what was measured; drawn once."""
+        """The surface with all quantities; computed once."""
         if self._finished is None:
             self._finished = self.drawing.surface()
             self._finished.quantities.update(self.measured)
         return self._finished
 
     def draw(self) -> tuple[ModelSurface, float]:
-        """The surface, and the time that it took [s]; from any thread."""
+        """The surface, and the time that it took [s]."""
         start = time.perf_counter()
         return self.surface(), time.perf_counter() - start
 
 
 class CarriedDrawing(TimedDrawing):
-    """A muscle that was carried along as it was when it was drawn.
+    """A drawing moved rigidly.
 
     Parameters
     ----------
     before : TimedDrawing
     motion : (4, 4) ndarray
-        Since then.
+        Since ``before``.
     """
 
     def __init__(self, before: TimedDrawing, motion: Floats) -> None:
@@ -74,7 +74,7 @@ class CarriedDrawing(TimedDrawing):
         self._before, self._motion = before, motion
 
     def surface(self) -> ModelSurface:
-        """The surface that was drawn then, moved."""
+        """The earlier surface, moved."""
         if self._finished is None:
             then, motion = self._before.surface(), self._motion
             vertices = then.vertices @ motion[:3, :3].T + motion[:3, 3]
@@ -84,7 +84,7 @@ class CarriedDrawing(TimedDrawing):
 
 
 class MuscleStepper:
-    """Drives one model through sub-steps.
+    """Advances one model through sub-steps.
 
     Parameters
     ----------
@@ -98,9 +98,9 @@ class MuscleStepper:
     Attributes
     ----------
     carrier : Carrier or None
-        What carries the muscle along where it need not be solved; none unless a loop gives one.
+        Moves the muscle rigidly where it need not be solved; set by the frame loop.
     work : Work
-        What the frame that was collected last took.
+        How the muscle came to the last frame.
     """
 
     def __init__(
@@ -132,35 +132,35 @@ class MuscleStepper:
             self.times[key] = self.times.get(key, 0.0) + time.perf_counter() - start
 
     def advance(self, stops: list[dict[str, float]], activations: Any = ()) -> None:
-        """Go through sub-steps: a list of coordinates, the first of which is where the muscle is.
+        """Advance through a list of coordinates; the first are the present ones.
 
         ``activations`` holds, for muscles that contract, the activation by muscle at the end of each.
         """
         for before, after, activation in itertools.zip_longest(stops[:-1], stops[1:], activations):
-            self.excite(activation)
+            self.set_activation(activation)
             if not self._carries(before, after):
                 self.step(before, after)
 
     def _carries(self, before: Mapping[str, float], after: Mapping[str, float]) -> bool:
-        """Whether a step asks no more of the muscle than to be carried along, which is then done."""
+        """Move the muscle rigidly if it need not be solved; return whether it was."""
         return self.carrier is not None and self.carrier.try_carry(self.poses(before), self.poses(after))
 
     def carried(self, motion: Floats) -> None:
-        """Note that the muscle was moved as it is, by a rigid motion (4, 4)."""
+        """Record a rigid motion (4, 4) of the muscle."""
         self._since = motion @ self._since
 
-    def excite(self, activation: Any) -> None:
-        """Give the model its activation, where it is among those (by muscle; None for no muscle at all)."""
+    def set_activation(self, activation: Any) -> None:
+        """Set the model's activation from a dict by muscle; None changes nothing."""
         if activation is not None and self.name in activation:
             self.model.activate(activation[self.name])
 
     def step(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
-        """One sub-step, watched for tunnelling where the scene asks for it."""
+        """One sub-step, with the tunnelling test where the scene has one."""
         self.begin(before, after)
         self.finish()
 
     def begin(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
-        """First half of a sub-step: the bones move, the muscle goes along."""
+        """First half of a sub-step: the bones move and the model predicts."""
         self.path, poses = (before, after), (self.poses(before), self.poses(after))
         self.saved, self._shown = None, None
         if self.detect is not None:
@@ -168,7 +168,7 @@ class MuscleStepper:
         self._predict(poses)
 
     def finish(self) -> None:
-        """Second half: the muscle settles, and what passed through a bone is brought back."""
+        """Second half: the model solves, and points that passed through a bone are corrected."""
         before, after = self.path
         self.solve(after)
         self.solves += 1
@@ -201,12 +201,12 @@ class MuscleStepper:
             )
 
     def go(self, stops: list[dict], activations: Sequence[dict] = ()) -> TimedDrawing:
-        """Go through sub-steps; what draws the muscle there."""
+        """Advance through sub-steps; return the drawing there."""
         self.advance(stops, activations)
         return self.drawing()
 
     def drawing(self) -> TimedDrawing:
-        """What draws the muscle as it is now, while it goes on."""
+        """The drawing of the present state."""
         if self._shown is not None:
             return CarriedDrawing(self._shown, self._since)
         with self.timed("surface"):
@@ -216,7 +216,7 @@ class MuscleStepper:
         return shown
 
     def report(self, bone: Any, count: int, action: Any) -> None:
-        """Note an event of the present frame; of one kind the most points at one time are kept."""
+        """Record an event of the present frame; of one kind the greatest number of points is kept."""
         key = (self.frame, bone, action)
         self.events[key] = max(int(count), self.events.get(key, 0))
 
@@ -245,7 +245,7 @@ class MuscleStepper:
         return [crossing for crossing in found if len(crossing.index)]
 
     def _correct(self, state, start, poses, before, after, crossings):
-        """Turn what crossed with the bone and solve again; then halve the step, down to the smallest."""
+        """Rotate points that crossed with the bone and solve again; then halve the step, down to the smallest."""
         if self.detect.action == "report":
             self._report_all(crossings, "reported")
             return
@@ -272,7 +272,7 @@ class MuscleStepper:
         self.step(middle, after)
 
     def _held_back(self, state, start, poses, after, crossings):
-        """Solve with what crosses kept on its side of a plane; return what crosses all the same."""
+        """Solve with crossing points held on their side by planes; return what crosses all the same."""
         neighbours = self.contacts.neighbours
         fenced = [*neighbours]
         try:

@@ -1,4 +1,4 @@
-"""Points that pass through a bone within one step: the angle test, the swept test, and the way back.
+"""Points that pass through a bone within one sub-step: the angle test, the swept test, the correction.
 
 Both tests look at a point's path relative to the bone, that is in bone coordinates. The angle test compares
 the directions to the bone at the two ends (Cervenka et al. 2023, equation 1, with the bound on d . d' stated
@@ -33,28 +33,28 @@ RIGHT_ANGLE_AND_HALF = 0.75 * math.pi
 STEP_SHARE = 0.9
 # A path that leaves a bone facing within 90 degrees of where it went in has slid along, not passed through.
 SLIDING_COSINE = 0.0
-# Times that a path is halved to show that it stays clear, before it is traced.
+# Halvings of a path to show that it stays outside, before it is traced.
 HALVINGS = 5
-# Rounds of tracing after which what is still under way counts as traced to where it is.
+# Greatest number of steps in tracing a path.
 MAX_ROUNDS = 10_000
-# Share of the tolerance between places of a path that are held against a bone's triangles.
+# Spacing, relative to the tolerance, of positions on a path that are compared with a bone's triangles.
 GRAZE_STRIDE = 0.2
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """What the paths of some points did at one bone.
+    """Result of following the paths of some points at one bone.
 
     Attributes
     ----------
     index : (c,) ndarray of int
-        Points whose paths may have touched the bone; all others stayed clear of it.
+        Points whose paths may have touched the bone.
     lowest : (c,) ndarray
         Smallest distance found along the path [scene unit]; negative inside.
     through : (c,) ndarray of bool
-        Went in deeper than the tolerance, and came out (or ended) facing another way than it went in.
+        Entered deeper than the tolerance, and left (or ended) in another direction than it entered.
     flagged : (c,) ndarray of bool
-        The angle test's answer: directions at the two ends differ by more than its angle.
+        Result of the angle test: directions at the two ends differ by more than its angle.
     """
 
     index: np.ndarray
@@ -104,7 +104,7 @@ def sweep_paths(
     start, end = start[index], end[index]
     lowest = _halve(field, start, end, distance[index], last, tolerance)
     through = np.zeros(len(index), dtype=bool)
-    # What halving leaves open.
+    # Undecided by halving.
     deep = np.flatnonzero(lowest < -tolerance)
     if len(deep):
         lowest[deep], first, last = _trace(field, start[deep], end[deep], tolerance)
@@ -161,11 +161,10 @@ def find_crossings(
 
 
 def rotate_with_bone(model: Any, crossings: Any, start: Any, before: Any, after: Any, names: Any) -> None:
-    """Put points that crossed back where they were relative to the bone: turned with it about its joint.
+    """Move points that crossed back to where they were relative to the bone: rotated with it about its joint.
 
-    The bone's own motion from ``before`` to ``after`` is the rotation about the joint centre by the step's
-    angle, so a point that is moved by it keeps its place at the bone. The model has predicted already; it is
-    handed the rigid transform from where it predicted the points to where they belong.
+    The bone's motion from ``before`` to ``after`` is the rotation about the joint centre by the step's angle. The model
+    has predicted already; it gets the rigid transform from the predicted to the corrected positions.
     """
     for crossing in crossings:
         motion = after[names[crossing.bone]] @ np.linalg.inv(before[names[crossing.bone]])
@@ -176,9 +175,9 @@ def rotate_with_bone(model: Any, crossings: Any, start: Any, before: Any, after:
 
 
 def one_sided_planes(contacts: Any, crossing: Crossing, start: Any, before: Any, after: Any) -> Planes:
-    """Planes that keep points which crossed on the side of the bone where they were, a half-space for each.
+    """Planes that hold points which crossed on their side of the bone, a half-space for each.
 
-    The plane lies between the point and the bone, square to the way out, and goes along with the bone.
+    The plane lies between the point and the bone, normal to the distance's gradient, and moves with the bone.
     """
     name = contacts.names[crossing.bone]
     back, motion = np.linalg.inv(before[name]), after[name] @ np.linalg.inv(before[name])
@@ -199,7 +198,7 @@ def only_grazed(
     after: Floats,
     tolerance: float,
 ) -> bool:
-    """Whether the bone's own triangles say that no path was deeper in it than the tolerance; its field said more.
+    """Whether, by the exact distance to the bone's triangles, no path was deeper than the tolerance.
 
     Parameters
     ----------
@@ -261,7 +260,7 @@ def _halve(field, start, end, distance, last, tolerance):
 def _trace(field, start, end, tolerance):
     """Smallest distance along each path, and the places (fraction) right before it first went in and after it came out.
 
-    Directions to the bone are told apart outside of it: within a crest, near its middle, they are either side's.
+    Directions are compared outside the bone: near the medial surface of a crest they may be either side's.
     """
     length = np.linalg.norm(end - start, axis=1)
     lowest = np.full(len(start), np.inf)
@@ -312,9 +311,9 @@ def _candidates(contacts, start, end, before, after):
 
 @compiled(error_model="numpy")
 def _candidates_loop(paths, free, poses, boxes, known, found, counts):
-    """Leave out paths that are shorter than what is known of their end's distance to the bone.
+    """Leave out paths that are shorter than a lower bound of their end's distance to the bone.
 
-    That is the distance to the bone's box, and an earlier answer less the way since, (x + y)^2 <= 2 x^2 + 2 y^2.
+    The bound is the distance to the bone's box, or an earlier bound less the motion since; (x + y)^2 <= 2 x^2 + 2 y^2.
     """
     start, end = paths
     before, after = poses
@@ -365,7 +364,7 @@ def _may_touch(start, end, before, after, bounds, anchor, known):
 
 @compiled(error_model="numpy")
 def _carried_way(box, before, after):
-    """How far the farthest point of a box goes from one pose to another: one of its corners, as the way is convex."""
+    """Greatest displacement of a point of a box between two poses: that of a corner, as it is convex."""
     farthest = 0.0
     for corner in range(8):
         square = 0.0

@@ -1,4 +1,4 @@
-"""Threads for what can go side by side."""
+"""Threads for muscles that run in parallel."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -9,7 +9,7 @@ import numba
 
 
 class Workers:
-    """Runs what can go side by side, each with one thread.
+    """Runs functions in parallel, each with one thread.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class Workers:
     def one_thread_each(self) -> AbstractContextManager:
         """Context in which BLAS uses one thread.
 
-        More would spin and take the cores from the loops, and results would depend on how many there are.
+        More would spin and take the cores from the loops, and results would depend on their number.
         """
         return self._blas.limit(limits=1, user_api="blas")
 
@@ -45,6 +45,6 @@ class Workers:
         return list(self._pool.map(act, items))
 
     def close(self) -> None:
-        """End the threads, without what waits for one."""
+        """End the threads; queued work is dropped."""
         if self._pool is not None:
             self._pool.shutdown(wait=True, cancel_futures=True)

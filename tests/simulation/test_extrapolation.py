@@ -7,7 +7,7 @@ from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, joint, muscle, sc
 
 from rbfmuscle.scene.options import SlidingOptions
 from rbfmuscle.simulation.frame_loop import FrameLoop
-from rbfmuscle.simulation.neighbours.extrapolation import MotionExtrapolator, way_between
+from rbfmuscle.simulation.neighbours.extrapolation import MotionExtrapolator, coordinate_change
 from rbfmuscle.simulation.substeps import SubSteps
 
 
@@ -62,7 +62,7 @@ def test_a_muscle_is_seen_nearer_to_where_it_settles_than_its_bones_take_it():
 
         def recorded(stepper, way):
             surface, now = loop._sliding.surfaces[stepper.name], stepper.model.contact_points()
-            if stepper.name == "upper" and surface.lead.parts:
+            if stepper.name == "upper" and surface.extrapolator.parts:
                 misses.append(
                     [
                         np.linalg.norm(part - now, axis=1).max()
@@ -93,7 +93,7 @@ def test_what_settling_does_is_expected_again_as_far_as_the_motion_goes_on(way, 
 
 
 def test_a_way_is_how_coordinates_change():
-    assert way_between({"a": 1.0}, {"a": 3.0, "b": 2.0}) == {"a": 2.0, "b": 2.0}
+    assert coordinate_change({"a": 1.0}, {"a": 3.0, "b": 2.0}) == {"a": 2.0, "b": 2.0}
 
 
 def _spike_into_a_belly(sliding):

@@ -1,4 +1,4 @@
-"""What holds a muscle to a neighbour and keeps it out: linked points, and planes through them."""
+"""Contact of a muscle with one neighbour: linked points (virtual edges), and planes through them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 # Distances [mm]. Points nearer than THRESHOLD (the default) at rest are linked. A linked point is free to STRIP beyond
-# its gap at rest, and is let go RELEASE beyond that.
+# its gap at rest, and is released RELEASE beyond that.
 THRESHOLD, STRIP, RELEASE = 2.0, 0.5, 5.0
 # At rest points this share of a mean edge farther are linked too: a patch where two muscles touch may lie between them.
 BETWEEN = 0.5
@@ -21,19 +21,19 @@ BETWEEN = 0.5
 SEARCH = 3.0
 # Distance [mm] between the surfaces as solved below which they are cut, and how deep an overlap may be.
 CUT_FROM, CUT_DEPTH = 3.0, 6.0
-# Neighbours on all sides, and bones, may leave no place that all of them allow: rigid planes would push without end.
-# So planes give way, by this share of how far their force alone would move the point; nearness more than keeping out.
+# Neighbours on all sides, and bones, may leave no admissible position: rigid planes would push without end.
+# So planes yield: their compliance, relative to the point's own response; larger for planes that pull.
 PUSH_GIVES, PULL_GIVES = 0.1, 1.0
 # How far a plane pushes out of a neighbour at most in one sub-step [mm].
 MOST = 0.5
 
 
-# The answer for muscles that are nowhere near each other.
+# The result for muscles far from each other.
 _FAR = (np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, dtype=np.int64))
 
 
 class Met(NamedTuple):
-    """How a muscle lies to a neighbour.
+    """Overlap and gap of a muscle with a neighbour.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Met(NamedTuple):
     touching : int
         Points that touch the neighbour at rest.
     opened : float
-        Sum of the squares of how much farther these are now.
+        Sum of the squares of how much their gaps have grown.
     """
 
     overlap: float
@@ -80,7 +80,7 @@ class Planes:
 
 
 class SlidingPair:
-    """How one muscle sees one neighbour: which points are linked, and the planes they get.
+    """The linked points of one muscle at one neighbour, and their planes.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ class SlidingPair:
         self.touching = np.zeros(0, dtype=np.int64)
         self.hold = np.full(len(self.free), limits.hold)
         self.before: Any = None
-        #: Box in which the points of this muscle come near the neighbour, and the link that looks the other way.
+        #: Box in which points of this muscle are near the neighbour, and the pair seen from the neighbour.
         self.zone: Any = None
         self.back: SlidingPair | None = None
         index, distance, _, _ = self._near()
@@ -114,7 +114,7 @@ class SlidingPair:
         self.found = _NOTHING
 
     def update(self) -> None:
-        """Planes from where both muscles will settle, as far as their leads tell."""
+        """Recompute the planes from the extrapolated surfaces."""
         limits = self.limits
         points = self.own.points
         index, distance, normal, nearest = self._near()
@@ -129,7 +129,7 @@ class SlidingPair:
         self.pull.set(index[held], slack, -normal[held], points[index[held]])
 
     def _push_out(self, met: tuple[Any, Any, Any]) -> None:
-        """Planes that keep out: those of the muscle's own points, and those that fixed points of the neighbour want."""
+        """Planes that keep the muscle out: at its own points, and at attached points of the neighbour."""
         at, gap, normal = self._given_way()
         index = np.concatenate([met[0], at])
         self.push.set(
@@ -137,9 +137,9 @@ class SlidingPair:
         )
 
     def _given_way(self) -> Any:
-        """Planes (index, gap, normal) by which the muscle gives way to fixed points of the neighbour that came into it.
+        """Planes (index, gap, normal) by which the muscle yields to attached points of the neighbour inside it.
 
-        These take no contact, and the muscle's own points may lie too far apart to meet a thin end.
+        Attached points take no contact, and the muscle's own points may be too sparse to meet a thin end.
         """
         if self.own.apart(self.other, self.limits.search):
             return _FAR[:3]
@@ -170,14 +170,14 @@ class SlidingPair:
         return found
 
     def _met(self, index: Any, distance: Any) -> Met:
-        """How deep the muscle is in the neighbour, and how far what touched it at rest has come away."""
+        """Overlap with the neighbour, and the gaps opened where they touched at rest."""
         apart = np.full(len(self.free), self.limits.reach)
         apart[index] = distance
         opened = np.maximum(apart[self.touching] - np.maximum(self.gap, 0.0), 0.0)
         return Met(max(0.0, -float(distance.min(initial=0.0))), len(opened), float((opened**2).sum()))
 
     def meeting(self) -> Any:
-        """Box in which the two meet, as either sees it, or None: what is held takes no contact, but is met."""
+        """Box in which the two meet, as seen from either; None where they do not."""
         zones = [
             zone for zone in (self.zone, None if self.back is None else self.back.zone) if zone is not None
         ]
@@ -197,7 +197,7 @@ class SlidingPair:
             return value, gradient
         inside = np.all((points > zone[0]) & (points < zone[1]), axis=1)
         if self.own.field is not None and self.other.field is not None:
-            # What is shown is the zero set of the fields: where these are equal both are cut alike.
+            # Both surfaces are clipped where their fields are equal.
             (ours, own), (theirs, normal) = (
                 self.own.field.value_and_gradient(points[inside]),
                 self.other.field.value_and_gradient(points[inside]),
@@ -214,7 +214,7 @@ class SlidingPair:
         return value, gradient
 
     def points(self) -> Floats:
-        """Points (k, 3) of the neighbour where the two meet, which the faces of a surface have to leave outside."""
+        """Points (k, 3) of the neighbour where the two meet, which must stay outside the surface."""
         zone = self.meeting()
         if zone is None:
             return np.zeros((0, 3))
@@ -222,7 +222,7 @@ class SlidingPair:
         return found[np.all((found > low) & (found < high), axis=1)]
 
     def _near(self):
-        """Points near the neighbour: what is or was linked as far as it can be held, the others close by."""
+        """Points near the neighbour: linked ones up to their release distance, others within the search distance."""
         limits = self.limits
         if self.other.apart(self.own, limits.reach):
             return _FAR
@@ -244,7 +244,7 @@ class SlidingPair:
 
 
 class BoneLink:
-    """Points near a bone at rest, held near it in the same way; the bone's own contact keeps them out."""
+    """Points near a bone at rest, linked to it; the bone's own contact keeps them out."""
 
     def __init__(self, stepper: Any, bone_index: Any, limits: Any) -> None:
         self.stepper, self.bone, self.limits = stepper, bone_index, limits

@@ -1,4 +1,4 @@
-"""What a motion can bring together: swept boxes, and the fields worth building."""
+"""Which muscles can reach which bones in a motion, by swept boxes; the fields of these bones."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 # Poses of a motion that a swept box is made of; arcs between them are covered by the padding.
 SAMPLED_POSES = 48
-# Padding of a swept box, as a share of the muscle's diagonal, as a muscle bulges beyond its bones' motions.
+# Padding of a swept box, relative to the muscle's diagonal: a muscle bulges beyond its bones' motions.
 PADDING = 0.1
 
 

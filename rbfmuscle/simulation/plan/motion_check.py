@@ -1,9 +1,4 @@
-"""Looking ahead along a motion: what it asks of a muscle that no muscle can give.
-
-Held ends go where their bones take them. A motion may drive one into another bone, or take the bones apart so far that
-the muscle between them is torn, or together until nothing is left of its length: the solver then shows the best
-compromise, and this says beforehand where and why.
-"""
+"""Checks a motion before the run: attachments that it moves into another bone, too far apart or too close together."""
 
 from __future__ import annotations
 
@@ -24,18 +19,18 @@ if TYPE_CHECKING:
     from rbfmuscle.scene.objects import Muscle
     from rbfmuscle.scene.scene import Scene
 
-# Frames of the motion that are looked at, and vertices of a patch, at most.
+# Greatest numbers of frames and of vertices of an attachment that are checked.
 MOST_FRAMES, MOST_VERTICES = 25, 60
-# A held end is driven into a bone where it lies deeper [mm] than this, beyond how deep it lies at rest.
+# Depth beyond that at rest from which an attachment counts as inside a bone [mm].
 DEEPER = 1.0
-# Bounds of the distance between attachments, in what it is at rest.
+# Bounds of the distance between attachments, relative to rest.
 LONGEST, SHORTEST = 1.5, 0.5
-# Attachments nearer to each other than this share of the muscle's extent lie side by side, not at its ends.
+# Attachments closer than this fraction of the muscle's extent lie side by side, not at its ends.
 APART = 0.3
 
 
 class Driven(NamedTuple):
-    """A held end that the motion drives into a bone it is not held by: how deep, beyond rest, and where first."""
+    """An attachment that the motion moves into another bone: depth beyond rest, and the first frame."""
 
     muscle: str
     bone: str
@@ -46,7 +41,7 @@ class Driven(NamedTuple):
 
 
 class Stretched(NamedTuple):
-    """Two attachments whose distance grows or shrinks too far, with the most of it."""
+    """Two attachments whose distance grows or shrinks too far: the extreme, and the first frame."""
 
     muscle: str
     bones: tuple[str, str]
@@ -57,7 +52,7 @@ class Stretched(NamedTuple):
 
 
 def check_motion(scene: Scene, exact: ExactMeshes | None = None) -> tuple[list[Driven], list[Stretched]]:
-    """Follow the held ends of every muscle along the motion.
+    """Follow the attachments of every muscle along the motion.
 
     Parameters
     ----------
@@ -86,7 +81,7 @@ def check_motion(scene: Scene, exact: ExactMeshes | None = None) -> tuple[list[D
 
 
 def _patches(muscle: Muscle) -> dict[str, Floats]:
-    """Vertices that each bone holds, thinned; all muscles hang on the same bones by name."""
+    """Attached vertices by bone, thinned."""
     found: dict[str, list[Any]] = {}
     for attachment in muscle.attachments:
         found.setdefault(attachment.bone, []).append(attachment.vertices)
@@ -101,7 +96,7 @@ def _patches(muscle: Muscle) -> dict[str, Floats]:
 def _driven(
     scene: Scene, name: str, bone: str, points: Floats, along: tuple[list[int], list[Any]], exact: ExactMeshes
 ) -> list[Driven]:
-    """How deep one patch goes into the bones that do not hold it, beyond how deep it lies there at rest."""
+    """Depth of one attachment in the bones that do not hold it, beyond its depth at rest."""
     frames, poses = along
     bounds = np.array([points.min(axis=0), points.max(axis=0)])
     found = []
@@ -137,7 +132,7 @@ def _stretched(
     extent: float,
     along: tuple[list[int], list[Any]],
 ) -> list[Stretched]:
-    """Whether the middles of two patches part, or meet, too far."""
+    """Whether the centroids of two attachments move too far apart or too close together."""
     frames, poses = along
     middles = [np.append(patches[bone].mean(axis=0), 1.0) for bone in pair]
     distances = np.array(
@@ -155,12 +150,12 @@ def _stretched(
 
 
 def motion_findings(scene: Scene, exact: ExactMeshes | None = None) -> list[Finding]:
-    """The same as warnings, by muscle, each with what can be done about it."""
+    """The same as warnings with remedies."""
     return describe(check_motion(scene, exact), scene.units)
 
 
 def describe(found: tuple[Sequence[Driven], Sequence[Stretched]], units: str) -> list[Finding]:
-    """Warnings for what was found, the worst first."""
+    """Warnings, the worst first."""
     driven, stretched = found
     said = [
         Finding(
@@ -172,7 +167,7 @@ def describe(found: tuple[Sequence[Driven], Sequence[Stretched]], units: str) ->
         )
         for one in sorted(driven, key=lambda one: -one.depth)
     ]
-    # Ends that meet are the worst of all.
+    # Attachments that meet come first.
     for one in sorted(stretched, key=lambda one: -abs(math.log(max(one.distance / one.rest, 1e-12)))):
         how = "take apart" if one.distance > one.rest else "bring together"
         said.append(

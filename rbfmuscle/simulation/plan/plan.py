@@ -1,4 +1,4 @@
-"""What a run of a scene would build and do, found without building it."""
+"""What a run of a scene would build and solve, without building it."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def plan_scene(scene: Scene) -> dict[str, Any]:
 
     Notes
     -----
-    Boxes are those that the run itself takes, so a bone that is listed need not be touched. A bone that comes near a
-    muscle is not foreseen: the muscle may be solved in more frames than this.
+    A listed bone need not be touched. A bone that comes near a muscle is not foreseen: the muscle may then
+    be solved in more frames.
     """
     regions, poses = find_contact_pairs(scene), PoseCache(scene)
     muscles = []
@@ -49,7 +49,7 @@ def plan_scene(scene: Scene) -> dict[str, Any]:
 
 
 def _work(muscle: Muscle, scene: Scene, bones: Sequence[str], poses: PoseCache) -> dict[str, Any]:
-    """What the motion asks of a muscle."""
+    """Frames in which the motion requires a muscle to be solved, moved rigidly or skipped."""
     never = why_never(muscle, scene)
     cut = SubSteps(scene, poses=poses) if never else SubSteps(scene, muscle, bones=bones, poses=poses)
     own, states, reasons = OwnBones(muscle, scene), Counter(), Counter()
