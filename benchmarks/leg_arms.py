@@ -15,7 +15,7 @@ import numpy as np
 from evidence import data_folder
 
 from rbfmuscle.run import simulate
-from rbfmuscle.scene.motion import Motion
+from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.scene import Scene
 
 # Leading coordinate; those that go along (those of the squat, to its end); range of clinical angles that is compared.

@@ -19,7 +19,7 @@ from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.writer import check_writable
 from rbfmuscle.progress import stage
 from rbfmuscle.run import stream_run
-from rbfmuscle.scene.motion import Motion
+from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.options import OutputOptions
 from rbfmuscle.scene.settings import chooses_model
 from rbfmuscle.simulation.frame_loop import simulate_frames

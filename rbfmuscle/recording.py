@@ -23,6 +23,7 @@ from rbfmuscle.sharing.crew import WorkerPool
 from rbfmuscle.sharing.share import MuscleGroup, timed
 from rbfmuscle.simulation.frame import Event, Frame
 from rbfmuscle.simulation.plan.processes import helpers_for
+from rbfmuscle.simulation.substeps import check_substeps
 from rbfmuscle.validation import RBFMuscleError, SceneWarning, SolveError
 
 
@@ -66,17 +67,21 @@ class Recording:
     def _build(self, helpers, fields):
         """All muscles, here or in helpers' hands, and the events of bones; a scene that is refused ends the helpers."""
         if helpers < 2:
-            check_initial(self.scene)
+            self._check()
             return MuscleGroup(self.scene, fields=fields), _bones_driven_together(self.scene)
         crew = WorkerPool(self.scene, helpers)
         try:
-            check_initial(self.scene)
+            self._check()
             driven = _bones_driven_together(self.scene)
             crew.built()
         except BaseException:
             crew.close()
             raise
         return crew, driven
+
+    def _check(self):
+        check_substeps(self.scene)
+        check_initial(self.scene)
 
     def timed(self, part: str) -> AbstractContextManager[None]:
         """Context whose time is added to one entry of ``times`` [s]."""

@@ -11,7 +11,7 @@ from peers.known_scenes import FAR, Bar, _block
 
 from rbfmuscle.metrics.contraction import belly_measures
 from rbfmuscle.metrics.mesh_distance import MeshDistance
-from rbfmuscle.scene.attachments import Attachment
+from rbfmuscle.scene.objects import Attachment
 from rbfmuscle.scene.phantom_shapes import stitch
 from rbfmuscle.scene.scene import Scene
 
@@ -124,7 +124,7 @@ def bar_scene(*, bar=FREE_BAR, spacing=2.5, model="rbf", **contraction):
 
 def with_frames(scene, pulls, length):
     """The scene with one frame for each pull of the slider [mm, positive shortens]."""
-    from rbfmuscle.scene.motion import Motion
+    from rbfmuscle.scene.objects import Motion
 
     far = FAR * length
     moved = scene.copy()

@@ -7,7 +7,7 @@ import trimesh
 
 from rbfmuscle.jit import compiled
 from rbfmuscle.scene.joints.tables import JointTable
-from rbfmuscle.scene.motion import Motion
+from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.options import ContactOptions, DetectOptions
 from rbfmuscle.simulation.frame import FinishedDrawing, ModelSurface
 

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from rbfmuscle.bones.mesh import prepare_bone, winding_test
+from rbfmuscle.bones.mesh import prepare_bone
 from rbfmuscle.geometry.arrays import Booleans, Floats, MeshLike
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.winding import inside_test
 from rbfmuscle.validation import check_mesh, check_points
 
 # Share of the longest side that a baseline's grid reaches beyond the mesh.
@@ -145,7 +146,7 @@ def grid_of(mesh: MeshLike) -> tuple[Any, Floats, Floats]:
     margin = MARGIN * (high - low).max()
     if bone.closed:
         return exact, low - margin, high + margin
-    return _WoundDistance(exact, winding_test(bone)), low - margin, high + margin
+    return _WoundDistance(exact, inside_test(bone.vertices, bone.faces)), low - margin, high + margin
 
 
 class _WoundDistance:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rbfmuscle.scene.attachments import Attachment
+from rbfmuscle.scene.objects import Attachment
 from rbfmuscle.scene.phantom_shapes import stitch
 from rbfmuscle.scene.scene import Scene
 

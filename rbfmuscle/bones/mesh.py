@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.geometry.triangles import opposite_faces, vertex_faces
 from rbfmuscle.validation import MeshError, check_mesh
-
-if TYPE_CHECKING:
-    pass
-
 
 # Area below this share of the squared longest edge is rounding.
 LEAST_SHAPE = 1e-12
@@ -76,16 +70,6 @@ def prepare_bone(vertices: Floats, faces: Integers, *, name: str = "bone") -> Bo
         mesh.faces = np.ascontiguousarray(mesh.faces[:, ::-1])
         mesh.notes.append("faces pointed inward and were turned")
     return mesh
-
-
-def winding_test(mesh: Any) -> Callable[[Floats], Booleans]:
-    """``inside(points) -> (n,) bool`` by generalised winding numbers (Barill 2018)."""
-    import igl
-
-    def inside(points):
-        return igl.fast_winding_number(mesh.vertices, mesh.faces, np.ascontiguousarray(points)) > 0.5
-
-    return inside
 
 
 def _flat(vertices, faces):

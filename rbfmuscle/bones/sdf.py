@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from rbfmuscle.bones.build import build_cells, grid_shape
 from rbfmuscle.bones.cells import BLOCK
-from rbfmuscle.bones.mesh import prepare_bone, winding_test
+from rbfmuscle.bones.mesh import prepare_bone
 from rbfmuscle.bones.query import FieldData, query_loop
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.geometry.arrays import Floats, MeshLike
@@ -24,6 +24,7 @@ from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.rest_frame import BoneFrame, on_one_line
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.geometry.triangles import FIRST
+from rbfmuscle.geometry.winding import inside_test
 from rbfmuscle.validation import MeshError, check_mesh, check_points, check_positive
 
 if TYPE_CHECKING:
@@ -264,14 +265,14 @@ def _build(mesh, frame, tolerance, region, memory_limit, name):
     spacing = min(CELL_SHARE * edge, extent / LEAST_CELLS)
     box = None if region is None else frame.box(region)
     wanted = TOLERANCE_SHARE * edge if tolerance is None else tolerance / frame.size
-    inside = None if mesh.closed else winding_test(mesh)
+    inside = None if mesh.closed else inside_test(mesh.vertices, mesh.faces)
     error = np.inf
     for _ in range(ATTEMPTS):
         spacing = _check_memory(mesh, exact, spacing, tolerance, memory_limit, name)
         cells = build_cells(exact, spacing, BAND * spacing, inside=inside, region=box, doubtful=mesh.doubtful)
         if inside is None and not cells.sound:
             mesh.notes.append("intersects itself: the sign comes from winding numbers")
-            inside = winding_test(mesh)
+            inside = inside_test(mesh.vertices, mesh.faces)
             continue
         data = pack_field(exact, cells)
         error = _measure(mesh, data, exact, BAND * spacing, box)

@@ -71,14 +71,19 @@ def _draw(scene, path):
 def _findings(path):
     from rbfmuscle.models import check_models
     from rbfmuscle.scene.attachments import ExactMeshes
-    from rbfmuscle.scene.check import check_scene
+    from rbfmuscle.scene.check import Finding, check_scene
     from rbfmuscle.simulation.plan.motion_check import motion_findings
+    from rbfmuscle.simulation.substeps import check_substeps
 
     loaded = load_scene(path, skeleton=True)
     check_models(loaded)
     exact = ExactMeshes()
     with stage("fields of the bones"):
         findings = [*check_scene(loaded, exact), *_field_notes(loaded)]
+    try:
+        check_substeps(loaded)
+    except SceneError as error:
+        findings.append(Finding("error", loaded.name, str(error)))
     if not any(finding.level == "error" for finding in findings):
         with stage("looking ahead along the motion"):
             findings += motion_findings(loaded, exact)

@@ -13,7 +13,8 @@ from rbfmuscle.metrics.centreline import Centreline, MuscleAtRest
 from rbfmuscle.models import build_models
 from rbfmuscle.scene.joints.skeleton import all_coordinates
 from rbfmuscle.scene.joints.tables import full_name
-from rbfmuscle.scene.motion import Motion, bone_poses, inner_value
+from rbfmuscle.scene.motion import bone_poses, inner_value
+from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame_loop import FrameLoop
 from rbfmuscle.simulation.plan.contact_pairs import build_fields, find_contact_pairs

@@ -15,7 +15,7 @@ from rbfmuscle.metrics.quantities import ALL, unit_text
 from rbfmuscle.output.runinfo import machine, versions
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.writer import write_json
-from rbfmuscle.scene.scene import MM_PER_UNIT
+from rbfmuscle.scene.objects import MM_PER_UNIT
 
 if TYPE_CHECKING:
     from rbfmuscle.scene.scene import Scene

@@ -21,7 +21,7 @@ Grid = list[tuple[str, str, list[Any]]]
 
 # Of these keys the reference takes the greatest value of the grid, or the least; of all others the scene's own.
 FINER_UP = ("model.centres", "model.samples", "model.iterations", "model.resolution", "model.substeps")
-FINER_DOWN = ("contact.substep_angle", "contact.tolerance", "motion.step")
+FINER_DOWN = ("contact.substep_angle", "motion.step")
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,23 @@
 """How often a mesh winds around a point: once inside a closed one, not at all outside."""
 
+from collections.abc import Callable
+
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.jit import compiled
+
+
+def inside_test(vertices: Floats, faces: Integers) -> Callable[[Floats], Booleans]:
+    """``inside(points) -> (n,) bool`` by fast generalised winding numbers (Barill 2018), for meshes with holes too."""
+    import igl
+
+    vertices, faces = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
+
+    def inside(points: Floats) -> Booleans:
+        return igl.fast_winding_number(vertices, faces, np.ascontiguousarray(points)) > 0.5
+
+    return inside
 
 
 @compiled

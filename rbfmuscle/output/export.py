@@ -9,7 +9,7 @@ from rbfmuscle.output.animation.moving import MovingBone, MovingMuscle, MovingRu
 from rbfmuscle.output.meshfiles import SUFFIXES, write_mesh
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.vtp import Collection
-from rbfmuscle.scene.scene import MM_PER_UNIT
+from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import SolveError, UsageError
 
 # One file a muscle (or bone) and frame; one file a frame; one file of all frames.

@@ -195,7 +195,7 @@ def input_hashes(scene: Scene) -> dict[str, Any]:
     motion = scene.motion.options.file
     if motion is not None:
         motion = (Path(scene.path).parent if scene.path else Path()) / motion
-    sources = [scene.path, motion, *(item.source for item in [*scene.bones, *scene.muscles])]
+    sources = [scene.path, motion, *(b.source for b in scene.bones), *(m.source for m in scene.muscles)]
     found = {}
     for source in dict.fromkeys(str(s) for s in sources if s):
         path = Path(source)

@@ -3,31 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rbfmuscle.bones.mesh import winding_test
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.winding import inside_test
+from rbfmuscle.scene.meshes.read import ReadMesh
+from rbfmuscle.scene.objects import Attachment, Bone
 from rbfmuscle.scene.options import NotNegative, Positive, Table, Vector
 from rbfmuscle.validation import SceneError, did_you_mean, is_file, shown, shown_path
 
 if TYPE_CHECKING:
     import trimesh
-
-    from rbfmuscle.scene.meshes.read import ReadMesh
-    from rbfmuscle.scene.objects import Bone
-
-
-@dataclass
-class Attachment:
-    """Vertices (n,) of a muscle's mesh that move with a bone."""
-
-    bone: str
-    vertices: np.ndarray
 
 
 class SphereTable(Table):
@@ -126,7 +116,11 @@ class ExactMeshes:
         if id(mesh) not in self._known:
             exact = ExactDistance(mesh.vertices, mesh.faces)
             # The mesh is kept too, so that no other one takes its number.
-            self._known[id(mesh)] = mesh, exact, None if mesh.is_watertight else winding_test(exact)
+            self._known[id(mesh)] = (
+                mesh,
+                exact,
+                None if mesh.is_watertight else inside_test(mesh.vertices, mesh.faces),
+            )
         _, exact, inside = self._known[id(mesh)]
         distance = exact.signed_distance(points)
         return distance if inside is None else np.where(inside(points), -1.0, 1.0) * np.abs(distance)

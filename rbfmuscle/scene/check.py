@@ -10,13 +10,13 @@ import numpy as np
 
 from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.attachments import ExactMeshes
+from rbfmuscle.scene.build import validate
 from rbfmuscle.scene.motion import bone_poses
+from rbfmuscle.scene.objects import Bone, Muscle, SceneData
 from rbfmuscle.validation import MeshError, RBFMuscleError, SceneError
 
 if TYPE_CHECKING:
     import trimesh
-
-    from rbfmuscle.scene.scene import Scene
 
 
 SMALLEST_MM = 2.0  # across: the bones of a mouse
@@ -39,28 +39,26 @@ class Finding:
         return f"{self.level}: {self.place}: {self.message}"
 
 
-def check_scene(scene: Scene, exact: ExactMeshes | None = None) -> list[Any]:
+def check_scene(scene: SceneData, exact: ExactMeshes | None = None) -> list[Any]:
     """Return all findings about a scene, the worst first; nothing is solved or changed.
 
     Parameters
     ----------
-    scene : Scene
+    scene : SceneData
     exact : ExactMeshes, optional
         Takes the distances to the bones' meshes, for further questions.
     """
-    findings, exact = [], exact or ExactMeshes()
-    for item in [*scene.bones, *scene.muscles]:
-        findings.extend(Finding("note", item.name, note) for note in item.notes)
+    exact = exact or ExactMeshes()
+    items: list[Bone | Muscle] = [*scene.bones, *scene.muscles]
+    findings = [Finding("note", item.name, note) for item in items for note in item.notes]
     findings.extend(
         Finding("warning", b.name, "the bone is open, inside is told by winding numbers")
         for b in scene.bones
         if not b.closed
     )
-    from rbfmuscle.simulation.substeps import check_substeps
-
-    for test in (scene.validate, lambda: check_extents(scene), lambda: check_substeps(scene)):
+    for test in (validate, check_extents):
         try:
-            test()
+            test(scene)
         except RBFMuscleError as error:
             findings.append(Finding("error", scene.name, str(error)))
     findings.extend(Finding("warning", "motion", note) for note in scene.motion.notes)
@@ -74,7 +72,7 @@ def check_scene(scene: Scene, exact: ExactMeshes | None = None) -> list[Any]:
     return sorted(findings, key=lambda finding: order[finding.level])
 
 
-def check_extents(scene: Scene) -> None:
+def check_extents(scene: SceneData) -> None:
     """Raise MeshError for a mesh whose size or place shows a wrong unit or another frame."""
     for kind, items in (("bone", scene.bones), ("muscle", scene.muscles)):
         for item in items:
@@ -83,7 +81,7 @@ def check_extents(scene: Scene) -> None:
         check_place(scene, muscle.name, muscle.mesh, muscle.source)
 
 
-def check_size(scene: Scene, kind: str, name: str, mesh: trimesh.Trimesh, source: str) -> None:
+def check_size(scene: SceneData, kind: str, name: str, mesh: trimesh.Trimesh, source: str) -> None:
     """Raise MeshError for a mesh smaller than a mouse's or larger than a person's."""
     size = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
     millimetres = size / scene.length(1.0)
@@ -94,7 +92,7 @@ def check_size(scene: Scene, kind: str, name: str, mesh: trimesh.Trimesh, source
         )
 
 
-def check_place(scene: Scene, name: str, mesh: trimesh.Trimesh, source: str) -> None:
+def check_place(scene: SceneData, name: str, mesh: trimesh.Trimesh, source: str) -> None:
     """Raise MeshError for a muscle that lies far away from all bones."""
     if not scene.bones:
         return
@@ -108,7 +106,7 @@ def check_place(scene: Scene, name: str, mesh: trimesh.Trimesh, source: str) -> 
         )
 
 
-def check_centre(scene: Scene, name: str, centre: np.ndarray) -> None:
+def check_centre(scene: SceneData, name: str, centre: np.ndarray) -> None:
     """Raise SceneError for a joint whose centre lies so far from all bones that poses lose their digits."""
     if not scene.bones:
         return
@@ -156,14 +154,11 @@ def _rest_overlaps(scene, exact):
     return findings
 
 
-def check_initial(scene: Scene) -> None:
-    """Raise SceneError if a motion is longer than its limit, or a muscle lies mostly inside a bone.
+def check_initial(scene: SceneData) -> None:
+    """Raise SceneError if a muscle lies mostly inside a bone.
 
     With ``initial = "error"`` a muscle may not lie in a bone at all.
     """
-    from rbfmuscle.simulation.substeps import check_substeps
-
-    check_substeps(scene)
     for finding in _rest_overlaps(scene, ExactMeshes()):
         if finding.level == "error":
             raise SceneError(
@@ -181,12 +176,12 @@ def _depths(points, mesh, exact):
     return depth
 
 
-def bone_collisions(scene: Scene, frames: Any = None, *, exact: ExactMeshes | None = None) -> list[Any]:
+def bone_collisions(scene: SceneData, frames: Any = None, *, exact: ExactMeshes | None = None) -> list[Any]:
     """Return where a motion drives bones into each other.
 
     Parameters
     ----------
-    scene : Scene
+    scene : SceneData
     frames : iterable of int, optional
         Which frames to look at, about ten of the motion by default.
     exact : ExactMeshes, optional

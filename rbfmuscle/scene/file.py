@@ -6,13 +6,14 @@ import hashlib
 import os
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import Field, ValidationError, field_validator
 
 from rbfmuscle.scene.activation.keys import KEYS
 from rbfmuscle.scene.attachments import AttachTable
+from rbfmuscle.scene.build import add_bone, add_link, add_muscle, place_coupling, place_joint, validate
 from rbfmuscle.scene.check import check_centre, check_place, check_size
 from rbfmuscle.scene.joints.tables import (
     CouplingTable,
@@ -22,7 +23,8 @@ from rbfmuscle.scene.joints.tables import (
     make_coupling,
 )
 from rbfmuscle.scene.meshes.read import read_mesh
-from rbfmuscle.scene.motion import coordinate_names, unit_sign
+from rbfmuscle.scene.motion import coordinate_names, make_motion, unit_sign
+from rbfmuscle.scene.objects import SceneData
 from rbfmuscle.scene.options import (
     ContactOptions,
     DetectOptions,
@@ -37,10 +39,7 @@ from rbfmuscle.scene.options import (
 )
 from rbfmuscle.validation import MeshError, SceneError, is_file, shown, shown_path
 
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
-
-
+S = TypeVar("S", bound=SceneData)
 # A scene file is a page or two; long lists of vertices belong into files of their own.
 LARGEST_FILE = 4_000_000
 
@@ -151,40 +150,52 @@ def _read_toml(path):
         raise SceneError(f"{path}: not valid TOML: {what}") from None
 
 
-def load_scene(cls: Any, path: Path, *, skeleton: bool = False) -> Scene:
-    """Return the scene (of class ``cls``) of a TOML file, its meshes read and checked; see `Scene.load`."""
+def load_scene(cls: type[S], path: str | Path, *, skeleton: bool = False) -> S:
+    """Return the scene (of class ``cls``) of a TOML file; its paths are relative to the file.
+
+    Parameters
+    ----------
+    path : path
+    skeleton : bool
+        Accept a scene without muscles; it can be looked at, not run.
+
+    Raises
+    ------
+    SceneError
+        If the file, or a name or value in it, is wrong; the message names it and the remedy.
+    MeshError
+        If a mesh cannot be used.
+    """
+    path = Path(path)
     tables = read_scene_file(path)
-    folder = path.parent
+    scene = cls(tables.scene.name or path.stem, units=tables.scene.units, path=path)
     try:
-        return _build(
-            cls(tables.scene.name or path.stem, units=tables.scene.units), tables, folder, path, skeleton
-        )
+        _fill(scene, tables, path.parent)
+        return scene if skeleton and not scene.muscles else validate(scene)
     except (SceneError, MeshError) as error:
         raise type(error)(f"{path}: {error}") from None
 
 
-def _build(scene, tables, folder, path, skeleton):
-    scene.path = path
+def _fill(scene: SceneData, tables: SceneFile, folder: Path) -> None:
     for bone in tables.bone:
         if bone.mesh is None:
-            scene.add_link(bone.name)
+            add_link(scene, bone.name)
             continue
         read = read_mesh(folder / bone.mesh, name=bone.name, scale=bone.scale, may_be_open=True)
         check_size(scene, "bone", bone.name, read.mesh, read.source)
-        scene.add_bone(bone.name, read)
+        add_bone(scene, bone.name, read)
     for joint in tables.joint:
-        scene.place_joint(joint.joint())
+        place_joint(scene, joint.joint())
         check_centre(scene, joint.name, scene.joints[-1].centre)
     for coupling in tables.coupling:
-        scene.place_coupling(make_coupling(coupling, scene.joints))
+        place_coupling(scene, make_coupling(coupling, scene.joints))
     for muscle in tables.muscle:
         _add_muscle(scene, muscle, tables.defaults, folder)
-    scene.motion = scene.motion_from(tables.motion, folder=folder)
+    scene.motion = make_motion(scene, tables.motion, folder=folder)
     scene.contact = tables.contact
     scene.sliding = tables.sliding
     scene.detect = tables.detect
     scene.output = tables.output
-    return scene if skeleton and not tables.muscle else scene.validate()
 
 
 def _add_muscle(scene, muscle, defaults, folder):
@@ -196,7 +207,8 @@ def _add_muscle(scene, muscle, defaults, folder):
     read = read_mesh(folder / muscle.mesh, name=muscle.name, scale=scale)
     check_size(scene, "muscle", muscle.name, read.mesh, read.source)
     check_place(scene, muscle.name, read.mesh, read.source)
-    scene.add_muscle(
+    add_muscle(
+        scene,
         muscle.name,
         read,
         attach=[_from_folder(entry, folder) for entry in given.get("attach", [])],
@@ -241,7 +253,7 @@ def _place(location, data):
     return " ".join(words)
 
 
-def describe_scene(scene: Scene) -> dict[str, Any]:
+def describe_scene(scene: SceneData) -> dict[str, Any]:
     """Return the scene as plain data for ``run.json``: names, counts, options, sources and hashes."""
     return {
         "name": scene.name,

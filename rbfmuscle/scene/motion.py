@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.scene.joints.joint import rotation_about
+from rbfmuscle.scene.joints.joint import Coordinate, Joint
 from rbfmuscle.scene.joints.skeleton import (
     all_coordinates,
     beyond_range,
@@ -21,133 +20,56 @@ from rbfmuscle.scene.joints.skeleton import (
 )
 from rbfmuscle.scene.joints.tables import FACTORS, full_name
 from rbfmuscle.scene.motion_file import read_motion_file
-from rbfmuscle.scene.options import MotionOptions
+from rbfmuscle.scene.objects import Motion, SceneData
+from rbfmuscle.scene.options import MAX_FRAMES, MotionOptions, RampOptions
 from rbfmuscle.validation import SceneError, did_you_mean
 
-if TYPE_CHECKING:
-    from rbfmuscle.scene.objects import Joint
-    from rbfmuscle.scene.scene import Scene
+# Lever [mm] at which a shift of a joint is counted as a turn.
+SHIFT_LEVER = 50.0
+NOT_MOVED = 1e-9  # A locked coordinate may be given, at its rest value.
 
 
-__all__ = ["Motion", "bone_poses", "coordinate_names", "interpolate", "rotation_about"]
-
-MAX_FRAMES = 100_000
-
-
-class Motion:
-    """The frames of a motion, each a dict of "joint.coordinate" -> value [radian or scene unit].
+def make_motion(scene: SceneData, options: MotionOptions, *, folder: str | Path | None = None) -> Motion:
+    """Return the motion that ``[motion]`` asks of a scene's joints.
 
     Parameters
     ----------
-    frames : list of dict
-        One dict a written frame; a coordinate that is absent stays at rest.
-    options : MotionOptions, optional
-        What the frames were made from.
-    times : list of float, optional
-        Time of each frame [s], where a motion file gives it.
-    progress : (n,) ndarray, optional
-        Where each frame lies in the whole motion, 0 to 1; even where not given.
-    notes : list of str
-        What a user should know: coordinates that leave their range, columns that were not used.
+    scene : SceneData
+    options : MotionOptions
+    folder : path, optional
+        What a relative ``file`` is relative to.
+
+    Raises
+    ------
+    SceneError
+        If a coordinate is unknown, the motion has too many frames, or its file cannot be read.
     """
+    facts = all_coordinates(scene.joints)
+    followers = {coupling.coordinate for coupling in scene.couplings}
+    times, notes = None, []
+    if options.file is not None:
+        path = Path(folder or ".") / options.file
+        frames, times, notes = read_motion_file(path, facts, followers, metre=scene.length(1000.0))
+    else:
+        frames = _asked_frames(options, facts)
+        _refuse_followers(frames, followers, facts)
+    frames = [_with_defaults(frame, facts, followers) for frame in frames]
+    notes += _range_notes(frames, scene.joints)
+    frames = [{name: facts[name].honoured(value) for name, value in frame.items()} for frame in frames]
+    return Motion(frames, options=options, times=times, notes=notes)
 
-    def __init__(
-        self,
-        frames: list[dict[str, float]] | None = None,
-        *,
-        options: MotionOptions | None = None,
-        times: list[Any] | None = None,
-        progress: np.ndarray | None = None,
-        notes: Sequence[Any] = (),
-    ) -> None:
-        self.frames = [dict(frame) for frame in frames] if frames is not None else [{}]
-        self.options = options or MotionOptions()
-        self.times = None if times is None else list(times)
-        self.progress = np.linspace(0.0, 1.0, len(self.frames)) if progress is None else progress
-        self.notes = list(notes)
 
-    @classmethod
-    def from_options(
-        cls,
-        options: MotionOptions,
-        joints: list[Joint],
-        *,
-        couplings: Sequence[Any] = (),
-        metre: float = 1000.0,
-        folder: str | Path | None = None,
-    ) -> Motion:
-        """Return the motion that ``[motion]`` asks for.
-
-        Parameters
-        ----------
-        options : MotionOptions
-        joints : list of Joint
-            Their coordinates are the names that may be used.
-        couplings : list of Coupling
-            Coordinates that follow others cannot be asked for.
-        metre : float
-            Scene units in a metre: OpenSim files are in metres.
-        folder : path, optional
-            What a relative ``file`` is relative to.
-
-        Raises
-        ------
-        SceneError
-            If a coordinate is unknown, the motion has too many frames, or its file cannot be read.
-        """
-        known, times, notes = coordinate_names(joints), None, []
-        facts = all_coordinates(joints)
-        followers = {coupling.coordinate for coupling in couplings}
-        if options.ramp is not None:
-            ramps = {full_name(n, known, place="[motion]"): ramp for n, ramp in options.ramp.items()}
-            frames = _ramp_frames(ramps, facts)
-        elif options.waypoints is not None:
-            stops = [
-                {full_name(n, known, place="[motion]"): v for n, v in s.items()} for s in options.waypoints
-            ]
-            frames = _waypoint_frames(stops, options.step, facts)
-        elif options.file is not None:
-            path = Path(folder or ".") / options.file
-            frames, times, notes = read_motion_file(
-                path, facts, followers, metre=metre, degrees=options.degrees, most=MAX_FRAMES
-            )
-        else:
-            frames = [{}]
-        if options.file is None:
-            _refuse_followers(frames, followers, facts)
-        frames = [_honoured(frame, facts, followers) for frame in frames]
-        notes += _range_notes(frames, joints)
-        frames = [{name: facts[name].honoured(value) for name, value in frame.items()} for frame in frames]
-        return cls(frames, options=options, times=times, notes=notes)
-
-    @property
-    def coordinates(self) -> list[Any]:
-        """Names of the coordinates that change, the one with the widest range first."""
-        names = sorted({name for frame in self.frames for name in frame})
-        spans = {name: np.ptp([frame.get(name, 0.0) for frame in self.frames]) for name in names}
-        return sorted((name for name in names if spans[name] > 0), key=lambda name: -spans[name])
-
-    def check_names(self, known: Collection[str]) -> None:
-        """Raise SceneError if a frame names a coordinate that is not among those known."""
-        for name in (name for frame in self.frames for name in frame):
-            if name not in known:
-                raise SceneError(
-                    f"[motion]: unknown coordinate {name!r}, {did_you_mean(name, sorted(known))}"
-                )
-
-    def sliced(self, frames: slice) -> Motion:
-        """Return the motion of the frames in a slice, as ``frames[A:B:S]`` does."""
-        chosen = self.frames[frames]
-        if not chosen:
-            raise SceneError(
-                f"frames {_slice_text(frames)} selects none of the {len(self.frames)} frames of the motion"
-            )
-        times = None if self.times is None else self.times[frames]
-        progress = self.progress[frames]
-        return Motion(chosen, options=self.options, times=times, progress=progress, notes=self.notes)
-
-    def __len__(self) -> int:
-        return len(self.frames)
+def slice_motion(motion: Motion, frames: slice) -> Motion:
+    """Return the motion of the frames in a slice, as ``frames[A:B:S]`` does."""
+    chosen = motion.frames[frames]
+    if not chosen:
+        text = ":".join(
+            "" if part is None else str(part) for part in (frames.start, frames.stop, frames.step)
+        )
+        raise SceneError(f"frames {text} selects none of the {len(motion)} frames of the motion")
+    times = None if motion.times is None else motion.times[frames]
+    progress = motion.progress[frames]
+    return Motion(chosen, options=motion.options, times=times, progress=progress, notes=motion.notes)
 
 
 def coordinate_names(joints: list[Joint]) -> list[str]:
@@ -155,19 +77,19 @@ def coordinate_names(joints: list[Joint]) -> list[str]:
     return list(all_coordinates(joints))
 
 
-def rest_coordinates(scene: Scene) -> Any:
+def rest_coordinates(scene: SceneData) -> dict[str, float]:
     """Return the coordinates whose rest value is not zero, by full name [radian or scene unit]."""
     if not any(facts.rest for joint in scene.joints for facts in joint.coordinates.values()):
         return {}
     return {name: value for name, value in rest_values(scene.joints, scene.couplings).items() if value}
 
 
-def completed(scene: Scene, coordinates: Any) -> Any:
+def completed(scene: SceneData, coordinates: Mapping[str, float]) -> dict[str, float]:
     """Return coordinates with those that are absent at rest added, where rest is not zero."""
     return {**rest_coordinates(scene), **coordinates}
 
 
-def interpolate(before: dict[str, Any], after: dict[str, float], t: float) -> dict[str, float]:
+def interpolate(before: dict[str, float], after: dict[str, float], t: float) -> dict[str, float]:
     """Return the coordinates between two frames, linear in each.
 
     Parameters
@@ -181,21 +103,17 @@ def interpolate(before: dict[str, Any], after: dict[str, float], t: float) -> di
     return {name: (1 - t) * before.get(name, 0.0) + t * after.get(name, 0.0) for name in names}
 
 
-def bone_poses(scene: Scene, coordinates: dict[str, Any]) -> dict[str, Floats]:
-    """Return the pose of every bone: rest bone coordinates -> world.
+def bone_poses(scene: SceneData, coordinates: dict[str, float]) -> dict[str, Floats]:
+    """Return the pose (4, 4) of every bone: rest bone coordinates -> world.
 
     A joint moves its child, and all that hangs on it, against its parent. At the coordinates at which the
     scene's meshes are (``rest``), every pose is the identity. A bone without a joint is fixed.
 
     Parameters
     ----------
-    scene : Scene
+    scene : SceneData
     coordinates : dict of str -> float
         "joint.coordinate" -> value [radian or scene unit]; absent ones are at rest.
-
-    Returns
-    -------
-    dict of str -> (4, 4) ndarray
     """
     known = all_coordinates(scene.joints)
     for name in coordinates:
@@ -204,23 +122,21 @@ def bone_poses(scene: Scene, coordinates: dict[str, Any]) -> dict[str, Floats]:
     return joint_poses([bone.name for bone in scene.bones], scene.joints, scene.couplings, coordinates)
 
 
-# Lever [mm] at which a shift of a joint is counted as a turn.
-SHIFT_LEVER = 50.0
-
-
-def step_angle(scene: Scene, before: Any, after: Any, *, shifts: bool = True) -> Any:
+def step_angle(
+    scene: SceneData, before: dict[str, float], after: dict[str, float], *, shifts: bool = True
+) -> float:
     """Return the largest turn of a bone against its parent between two sets of coordinates [radian].
 
     With ``shifts``, a shift counts as the turn that moves a place 50 mm from its axis as far.
     """
-    first, second = (joint_values(scene.joints, scene.couplings, q) for q in (before, after))
+    first, second, rest = (joint_values(scene.joints, scene.couplings, q) for q in (before, after, {}))
     lever, largest = scene.length(SHIFT_LEVER), 0.0
     for joint in scene.joints:
-        if first[joint.name] == second[joint.name]:
+        name = joint.name
+        if first[name] == second[name]:
             continue
-        rest = joint_values(scene.joints, scene.couplings, {})[joint.name]
-        motion = joint.motion(second[joint.name], rest) @ np.linalg.inv(joint.motion(first[joint.name], rest))
-        largest = max(largest, turned_angle(motion[:3, :3]))
+        motion = joint.motion(second[name], rest[name]) @ np.linalg.inv(joint.motion(first[name], rest[name]))
+        largest = max(largest, float(turned_angle(motion[:3, :3])))
         if shifts and joint.translations:
             shift = motion[:3, :3] @ joint.centre + motion[:3, 3] - joint.centre
             largest = max(largest, float(np.linalg.norm(shift)) / lever)
@@ -234,58 +150,73 @@ def turned_angle(rotations: Floats) -> Floats:
     return np.arctan2(length, np.trace(rotations, axis1=-2, axis2=-1) - 1.0)
 
 
-def shown_value(scene: Scene, name: str, value: Any) -> Any:
+def shown_value(scene: SceneData, name: str, value: float) -> float:
     """Return a coordinate's value as files and tables show it: degrees, or scene units as it is."""
     facts = all_coordinates(scene.joints).get(name)
     return math.degrees(value) if facts is None or facts.motion == "rotation" else value
 
 
-def inner_value(scene: Scene, name: str, value: Any) -> Any:
+def inner_value(scene: SceneData, name: str, value: float) -> float:
     """Return a coordinate's value [radian or scene unit] from what files and tables show."""
     facts = all_coordinates(scene.joints).get(name)
     return math.radians(value) if facts is None or facts.motion == "rotation" else value
 
 
-def unit_sign(scene: Scene, name: str) -> Any:
+def unit_sign(scene: SceneData, name: str) -> str:
     """Return what follows a coordinate's value in text: the sign for degrees, the scene's unit, or nothing."""
     facts = all_coordinates(scene.joints).get(name)
     return {"translation": f" {scene.units}", "coupled": ""}.get(facts.motion if facts else "", "°")
+
+
+def _asked_frames(options, facts):
+    """Frames of a ramp or of waypoints; the rest pose alone without either."""
+    known = list(facts)
+    if options.ramp is not None:
+        return _ramp_frames({_full(n, known): ramp for n, ramp in options.ramp.items()}, facts)
+    if options.waypoints is not None:
+        stops = [{_full(n, known): v for n, v in stop.items()} for stop in options.waypoints]
+        return _waypoint_frames(stops, options.step, facts)
+    return [{}]
+
+
+def _full(name, known):
+    return full_name(name, known, place="[motion]")
 
 
 def _refuse_followers(frames, followers, facts):
     for name in dict.fromkeys(name for frame in frames for name in frame):
         if name in followers:
             raise SceneError(f"[motion]: {name!r} follows other coordinates by a coupling, move those")
-        if facts[name].locked and any(
-            abs(frame.get(name, facts[name].rest) - facts[name].rest) > 1e-9 for frame in frames
-        ):
+        rest = facts[name].rest
+        if facts[name].locked and any(abs(frame.get(name, rest) - rest) > NOT_MOVED for frame in frames):
             raise SceneError(f"[motion]: {name!r} is locked, unlock it in its joint or leave it out")
 
 
-def _honoured(frame, facts, followers):
-    """The frame with coordinates that it does not mention where their default says, without those that follow."""
+def _with_defaults(frame, facts, followers):
+    """The frame without followers; coordinates that it does not mention are at their default."""
     unsaid = {n: c.resting for n, c in facts.items() if n not in frame and n not in followers and c.resting}
     return {**unsaid, **{name: value for name, value in frame.items() if name not in followers}}
 
 
-def _range_notes(frames, joints):
-    facts, worst, count = all_coordinates(joints), {}, {}
+def _range_notes(frames: list[dict[str, float]], joints: list[Joint]) -> list[str]:
+    facts, found = all_coordinates(joints), {}
     for frame in frames:
         for name, excess in beyond_range(frame, joints).items():
-            worst[name], count[name] = max(worst.get(name, 0.0), excess), count.get(name, 0) + 1
+            found.setdefault(name, []).append(excess)
     notes = []
-    for name, excess in worst.items():
-        low, high = (end / FACTORS[facts[name].motion] for end in facts[name].range)
-        what = "is cut to" if facts[name].clamped else "leaves"
-        excess /= FACTORS[facts[name].motion]
+    for name, excesses in found.items():
+        coordinate = facts[name]
+        ends = [] if coordinate.range is None else [*coordinate.range, max(excesses)]
+        low, high, most = (x / FACTORS[coordinate.motion] for x in ends)
+        what = "is cut to" if coordinate.clamped else "leaves"
         notes.append(
-            f"coordinate {name!r} {what} its range {low:.6g} to {high:.6g} in {count[name]} of {len(frames)} frames, "
-            f"by up to {excess:.3g}"
+            f"coordinate {name!r} {what} its range {low:.6g} to {high:.6g} in {len(excesses)} of {len(frames)} "
+            f"frames, by up to {most:.3g}"
         )
     return notes
 
 
-def _ramp_frames(ramps, facts):
+def _ramp_frames(ramps: dict[str, RampOptions], facts: dict[str, Coordinate]) -> list[dict[str, float]]:
     """All coordinates go together; the one that needs most steps sets the pace, its last may be short."""
     start = {n: _start(ramp.start, facts[n]) for n, ramp in ramps.items()}
     pace = max((abs(ramp.end - start[n]) / ramp.step for n, ramp in ramps.items()), default=0.0)
@@ -296,7 +227,7 @@ def _ramp_frames(ramps, facts):
 
 
 def _start(value, facts):
-    """A ramp that says no start begins at the coordinate's default."""
+    """A ramp without a start begins at the coordinate's default."""
     return facts.resting / FACTORS[facts.motion] if value is None else value
 
 
@@ -318,7 +249,7 @@ def _waypoint_frames(stops, step, facts):
 
 
 def _marks(pace):
-    """Fractions of the way at whole steps, then the end: 2.5 steps give 0, 0.4, 0.8, 1."""
+    """Fractions of the path at whole steps, then the end: 2.5 steps give 0, 0.4, 0.8, 1."""
     _check_count(pace)
     if pace == 0:
         return [0.0]
@@ -332,7 +263,3 @@ def _check_count(count):
             f"[motion]: about {count:.3g} frames, more than {MAX_FRAMES}: a step is too small for its range; "
             "make the step larger or the range smaller"
         )
-
-
-def _slice_text(frames):
-    return ":".join("" if part is None else str(part) for part in (frames.start, frames.stop, frames.step))

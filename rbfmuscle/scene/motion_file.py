@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 
 from rbfmuscle.scene.joints.joint import Coordinate
+from rbfmuscle.scene.options import MAX_FRAMES
 from rbfmuscle.validation import SceneError, is_file, shown_path
 
 NO = ("no", "false", "0")
@@ -16,8 +17,6 @@ def read_motion_file(
     followers: set[str],
     *,
     metre: float,
-    degrees: bool | None,
-    most: int,
 ) -> tuple[list[dict[str, float]], list[float] | None, list[str]]:
     """Read the rows of a motion file as frames.
 
@@ -33,10 +32,6 @@ def read_motion_file(
         Coordinates that follow others; their columns are not used.
     metre : float
         Scene units in a metre.
-    degrees : bool, optional
-        What a header without ``inDegrees`` means; radians, with a note, where this is None too.
-    most : int
-        Rows that a file may have.
 
     Returns
     -------
@@ -49,34 +44,26 @@ def read_motion_file(
         Naming the file and what is wrong in it.
     """
     header, labels, rows = storage_parts(path)
-    if len(rows) > most:
-        raise SceneError(f"[motion]: {path} has {len(rows)} rows, more than {most}")
+    if len(rows) > MAX_FRAMES:
+        raise SceneError(f"[motion]: {path} has {len(rows)} rows, more than {MAX_FRAMES}")
     known = list(facts)
     used = {column: name for column, label in enumerate(labels) if (name := match_label(label, known))}
     if not used:
         names = ", ".join(known[:20]) or "no joints"
         raise SceneError(f"[motion]: {path} has none of the scene's coordinates ({names})")
     _check_twice(path, used)
-    in_degrees, notes = _angle_unit(path, header, degrees)
+    in_degrees, notes = _angle_unit(path, header)
     idle = [name for name in used.values() if name in followers or facts[name].locked]
     notes += [_idle_note(path, name, name in followers) for name in idle]
-    factor = {
-        name: {"rotation": math.pi / 180 if in_degrees else 1.0, "translation": metre}.get(
-            facts[name].motion, 1.0
-        )
-        for name in used.values()
-    }
+    units = {"rotation": math.pi / 180 if in_degrees else 1.0, "translation": metre, "coupled": 1.0}
+    factor = {name: units[facts[name].motion] for name in used.values()}
     frames, times = [], []
-    clock = labels.index("time") if "time" in labels else None
+    clock = [labels.index("time")] if "time" in labels else []
     for number, row in enumerate(rows):
-        values = _numbers(
-            row, len(labels), f"{path} row {number + 1}", [*used, *([] if clock is None else [clock])]
-        )
-        times.append(values.get(clock, 0.0))
-        frames.append(
-            {name: values[column] * factor[name] for column, name in used.items() if name not in idle}
-        )
-    return frames, None if clock is None else times, notes
+        values = _numbers(row, len(labels), f"{path} row {number + 1}", [*used, *clock])
+        times += [values[column] for column in clock]
+        frames.append({name: values[k] * factor[name] for k, name in used.items() if name not in idle})
+    return frames, times if clock else None, notes
 
 
 def match_label(label: str, known: list[str]) -> str | None:
@@ -112,16 +99,16 @@ def storage_parts(
     return header, lines[ends[0] + 1].split(), rows
 
 
-def _angle_unit(path, header, degrees):
-    """Whether angles are degrees, and a note where nobody said."""
+def _angle_unit(path, header):
+    """Whether angles are degrees, and a note where the header does not say."""
     said = header.get("indegrees")
     if said in NO or said in YES:
         return said in YES, []
     if said is not None:
         raise SceneError(f"[motion]: {path}: inDegrees={said} is neither yes nor no")
-    if degrees is not None:
-        return degrees, []
-    return False, [f"{path} does not say inDegrees: angles are taken as radians; set degrees in [motion]"]
+    return False, [
+        f"{path} does not say inDegrees: angles are taken as radians; add inDegrees=yes to its header"
+    ]
 
 
 def _idle_note(path, name, follows):

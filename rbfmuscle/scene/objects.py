@@ -1,69 +1,181 @@
-"""What a scene is made of: bones, joints and muscles, and how they are named."""
+"""What a scene is made of: bones, joints, muscles, a motion and settings, all of it data."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+import copy
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.scene.joints.joint import Joint
-from rbfmuscle.validation import SceneError, check_points, did_you_mean, shown
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.scene.activation.keys import ContractionTable
+from rbfmuscle.scene.joints.joint import Coupling, Joint
+from rbfmuscle.scene.options import (
+    ContactOptions,
+    DetectOptions,
+    MotionOptions,
+    OutputOptions,
+    SlidingOptions,
+)
+from rbfmuscle.validation import SceneError, did_you_mean
 
-__all__ = [
-    "Bone",
-    "Joint",
-    "Muscle",
-    "as_vector",
-    "check_new_name",
-    "check_tree",
-    "find_named",
-    "split_model",
-]
+if TYPE_CHECKING:
+    import trimesh
 
-_NAME_CHARACTERS = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-")
+MM_PER_UNIT = {"m": 1000.0, "cm": 10.0, "mm": 1.0}
 
 
 @dataclass
 class Bone:
-    """A rigid body: its mesh (trimesh.Trimesh, outward, rest pose), where it came from, what was mended."""
+    """A rigid body: its mesh (outward, rest pose), where it came from, what was mended."""
 
     name: str
-    mesh: Any
+    mesh: trimesh.Trimesh
     source: str = ""
     closed: bool = True
-    notes: list = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass
+class Attachment:
+    """Vertices (n,) of a muscle's mesh that move with a bone."""
+
+    bone: str
+    vertices: Integers
 
 
 @dataclass
 class Muscle:
-    """A closed surface (trimesh.Trimesh, outward, rest pose) held by bones, and the model that moves it.
+    """A closed surface (outward, rest pose) held by bones, and the model that moves it.
 
-    ``contraction`` holds the keys of a muscle that contracts (ContractionTable), None for any other.
+    ``contraction`` holds the keys of a muscle that contracts, None for any other.
     """
 
     name: str
-    mesh: Any
+    mesh: trimesh.Trimesh
     model: str = "rbf"
-    options: dict = field(default_factory=dict)
-    attachments: list = field(default_factory=list)
-    fibres: list | None = None
+    options: dict[str, Any] = field(default_factory=dict)
+    attachments: list[Attachment] = field(default_factory=list)
+    fibres: list[Floats] | None = None
     source: str = ""
-    notes: list = field(default_factory=list)
-    contraction: object = None
+    notes: list[str] = field(default_factory=list)
+    contraction: ContractionTable | None = None
 
 
-def split_model(model: dict[str, Any] | str, *, place: str) -> tuple[Any, ...]:
-    """Return (name, options) of a model given as a name or as a table with ``name``."""
-    if isinstance(model, str):
-        return model, {}
-    if isinstance(model, dict):
-        options = dict(model)
-        name = options.pop("name", "rbf")
-        if isinstance(name, str):
-            return name, options
-    raise SceneError(f"{place}: model must be a name or a table with a name, got {shown(model)}")
+class Motion:
+    """The frames of a motion, each a dict of "joint.coordinate" -> value [radian or scene unit].
+
+    Parameters
+    ----------
+    frames : list of dict
+        A coordinate that is absent stays at rest.
+    options : MotionOptions, optional
+        What the frames were made from.
+    times : list of float, optional
+        Time of each frame [s], where a motion file gives it.
+    progress : (n,) ndarray, optional
+        Where each frame lies in the whole motion, 0 to 1; even where not given.
+    notes : list of str
+        Warnings: coordinates that leave their range, columns that were not used.
+    """
+
+    def __init__(
+        self,
+        frames: Sequence[dict[str, float]] | None = None,
+        *,
+        options: MotionOptions | None = None,
+        times: Sequence[float] | None = None,
+        progress: Floats | None = None,
+        notes: Sequence[str] = (),
+    ) -> None:
+        self.frames = [dict(frame) for frame in frames] if frames is not None else [{}]
+        self.options = options or MotionOptions()
+        self.times = None if times is None else list(times)
+        self.progress = np.linspace(0.0, 1.0, len(self.frames)) if progress is None else progress
+        self.notes = list(notes)
+
+    @property
+    def coordinates(self) -> list[str]:
+        """Names of the coordinates that change, the one with the widest range first."""
+        names = sorted({name for frame in self.frames for name in frame})
+        spans = {name: np.ptp([frame.get(name, 0.0) for frame in self.frames]) for name in names}
+        return sorted((name for name in names if spans[name] > 0), key=lambda name: -spans[name])
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+
+@dataclass(eq=False, repr=False)
+class SceneData:
+    """The data of a scene; the class for users is `rbfmuscle.scene.scene.Scene`.
+
+    Attributes
+    ----------
+    name : str
+    units : {"mm", "cm", "m"}
+        Unit of every length in the scene.
+    bones : list of Bone
+    joints : list of Joint
+    couplings : list of Coupling
+        Coordinates that follow others.
+    links : list of str
+        Bones without a mesh, which carry joints only.
+    muscles : list of Muscle
+    motion : Motion
+    contact : ContactOptions
+    sliding : SlidingOptions or None
+    detect : DetectOptions or None
+    output : OutputOptions
+    path : pathlib.Path or None
+        The file it was loaded from.
+    """
+
+    name: str = "scene"
+    _: KW_ONLY
+    units: str = "mm"
+    bones: list[Bone] = field(default_factory=list)
+    joints: list[Joint] = field(default_factory=list)
+    couplings: list[Coupling] = field(default_factory=list)
+    links: list[str] = field(default_factory=list)
+    muscles: list[Muscle] = field(default_factory=list)
+    motion: Motion = field(default_factory=Motion)
+    contact: ContactOptions = field(default_factory=ContactOptions)
+    sliding: SlidingOptions | None = None
+    detect: DetectOptions | None = None
+    output: OutputOptions = field(default_factory=OutputOptions)
+    path: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.units not in MM_PER_UNIT:
+            raise SceneError(f"units must be m, cm or mm, got {self.units!r}")
+
+    def length(self, millimetres: float) -> float:
+        """Return a length given in millimetres in the scene's unit."""
+        return millimetres / MM_PER_UNIT[self.units]
+
+    def bone(self, name: str) -> Bone:
+        """Return the bone of that name, or raise SceneError naming the nearest."""
+        return find_named(self.bones, name, "bone")
+
+    def muscle(self, name: str) -> Muscle:
+        """Return the muscle of that name, or raise SceneError naming the nearest."""
+        return find_named(self.muscles, name, "muscle")
+
+    def copy(self) -> Self:
+        """Return a copy whose lists and tables are its own; meshes are shared."""
+        other = copy.copy(self)
+        for name in ("bones", "joints", "couplings", "links"):
+            setattr(other, name, list(getattr(self, name)))
+        other.muscles = [replace(muscle, options=dict(muscle.options)) for muscle in self.muscles]
+        return other
+
+    def __repr__(self) -> str:
+        muscles = ", ".join(f"{muscle.name} ({muscle.model})" for muscle in self.muscles) or "no muscles"
+        counts = f"{len(self.bones)} bones, {muscles}, {len(self.motion)} frames"
+        return f"<Scene {self.name!r}, {self.units}: {counts}>"
 
 
 def find_named(items: list[Any], name: str, what: str, *, place: str = "") -> Any:
@@ -72,41 +184,4 @@ def find_named(items: list[Any], name: str, what: str, *, place: str = "") -> An
         if item.name == name:
             return item
     hint = did_you_mean(name, [item.name for item in items])
-    raise SceneError(f"{place + ': ' if place else ''}unknown {what} {name!r}, {hint}")
-
-
-def check_new_name(items: list[Any], name: str, what: str) -> None:
-    """Raise SceneError if a name is no name for a file, or taken."""
-    if not isinstance(name, str) or not name or not set(name) <= _NAME_CHARACTERS:
-        raise SceneError(
-            f"{what} name {shown(repr(name))} may hold letters, digits, '_' and '-' only (it becomes a file name)"
-        )
-    if any(item.name == name for item in items):
-        raise SceneError(f"{what} {name!r} is given twice")
-
-
-def check_tree(joints: list[Joint], new: Joint) -> None:
-    """Raise SceneError if bones and joints would no longer form a tree with one joint more."""
-    place, child = f"joint {new.name!r}", new.child
-    if any(other.child == child for other in joints):
-        raise SceneError(f"{place}: bone {child!r} is already the child of another joint")
-    parents, ancestor = {other.child: other.parent for other in joints}, new.parent
-    while ancestor is not None:
-        if ancestor == child:
-            raise SceneError(f"{place}: {child!r} would hang on itself, joints must form a tree")
-        ancestor = parents.get(ancestor)
-
-
-def as_vector(values: Any, name: str, *, unit: bool = False) -> Floats:
-    """Three numbers as an array (3,), of length one where a unit vector is asked for, or raise SceneError."""
-    try:
-        vector = check_points([values], name=name)[0]
-    except (ValueError, TypeError) as error:
-        raise SceneError(f"{name} must be three numbers, got {shown(values)} ({error})") from None
-    if not unit:
-        return vector
-    largest = np.abs(vector).max()
-    if largest == 0:
-        raise SceneError(f"{name} must not be the zero vector")
-    vector = vector / largest  # the squares of very long or short ones leave the range of numbers
-    return vector / np.linalg.norm(vector)
+    raise SceneError(f"{place}unknown {what} {name!r}, {hint}")

@@ -26,18 +26,27 @@ from rbfmuscle.validation import SceneError, did_you_mean, shown
 # 2^53 it is no longer the number that was written once it meets a float.
 DEEPEST = 20
 LARGEST_INTEGER = 2**53
+MAX_FRAMES = 100_000
 
 # Keys that were removed, and what to do instead; a key of a muscle or of its model (`model.KEY`) without the muscle.
 # The table is deleted at 1.0.
 REMOVED_KEYS: dict[str, str] = {
     "contact.from_rest": "delete the key: solve_pose(scene, models, coordinates) in Python solves a pose from rest",
     "contact.detector": "delete the key; for other fields call simulate(scene, fields={bone: field}) in Python",
+    "contact.tolerance": "delete the key: a bone's field errs by 0.4 % of the mean edge of its mesh",
     "contact.still_angle": "delete the key: a muscle is solved whenever its bones move against each other",
     "detect.tunnelling.smallest_step": "delete the key: steps are halved down to 0.1 degrees",
     "sliding.strip": "delete the key: a linked point is free to 0.5 mm beyond its gap at rest",
     "sliding.release": "delete the key: a point 5 mm beyond that is let go",
     "sliding.join": "delete the key: points that come near a neighbour are linked",
     "sliding.cut": "delete the key: overlaps that remain are cut midway in the surfaces",
+    "motion.degrees": "write inDegrees=yes or inDegrees=no into the header of the motion file",
+    "motion.max_substeps": "delete the key: a motion may take 100000 sub-steps",
+    "activation.from": "use a list of numbers, spread over the motion: [from, to]",
+    "activation.to": "use a list of numbers, spread over the motion: [from, to]",
+    "joint.rotations.scale": "multiply the numbers of the function by it",
+    "joint.translations.scale": "multiply the numbers of the function by it",
+    "coupling.scale": "multiply the numbers of the function by it",
     "model.across": "delete the key: the muscle is an elastic solid, set its model.nodes",
     "model.across_weight": "delete the key: the muscle is an elastic solid, set its model.nodes",
     "model.acceleration": "delete the key: each solve combines five iterations",
@@ -188,7 +197,6 @@ class ContactOptions(Table):
     """``[contact]``: how muscles meet bones."""
 
     initial: Literal["resolve", "keep", "error"] = "resolve"
-    tolerance: Positive | None = None
     substep_angle: Annotated[float, Field(gt=0, le=90)] = 2.0
     margin: NotNegative = 0.0
 
@@ -245,8 +253,6 @@ class MotionOptions(Table):
     waypoints: Annotated[list[dict[str, Finite]], Field(min_length=1)] | None = None
     step: Positive | None = None
     file: str | None = None
-    degrees: bool | None = None
-    max_substeps: Annotated[int, Field(ge=1)] = 100_000
 
     @model_validator(mode="after")
     def _check_one_source(self):
@@ -257,6 +263,4 @@ class MotionOptions(Table):
             raise ValueError("waypoints need a step (degrees between frames)")
         if self.step is not None and self.waypoints is None:
             raise ValueError("step belongs to waypoints; a ramp has its own step")
-        if self.degrees is not None and self.file is None:
-            raise ValueError("degrees belongs to a file; ramps and waypoints are in degrees")
         return self

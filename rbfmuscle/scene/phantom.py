@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.scene.attachments import Attachment, signed_distances
+from rbfmuscle.scene.attachments import signed_distances
+from rbfmuscle.scene.objects import Attachment
 from rbfmuscle.scene.options import DetectOptions, TunnellingOptions
 from rbfmuscle.scene.phantom_shapes import (
     Tube,

@@ -3,58 +3,63 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
 from rbfmuscle.scene.activation.keys import KEYS
-from rbfmuscle.scene.objects import split_model
+from rbfmuscle.scene.activation.resolve import contraction_keys
+from rbfmuscle.scene.build import split_model
+from rbfmuscle.scene.motion import make_motion, slice_motion
+from rbfmuscle.scene.objects import Muscle, SceneData
 from rbfmuscle.scene.options import DetectOptions, SlidingOptions, check_plain, check_removed
 from rbfmuscle.validation import SceneError, UsageError, did_you_mean
 
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
-
+S = TypeVar("S", bound=SceneData)
 TABLES = ("contact", "sliding", "detect", "output", "motion")
 
 
-def apply_model(scene: Scene, model: dict[str, Any] | str, *, muscles: Any = None) -> None:
-    """Give muscles (all by default) another model; options of a different model are dropped."""
-    name, options = split_model(model, place="model")
-    for muscle in scene.muscles if muscles is None else muscles:
-        if muscle.model != name:
-            muscle.options = {}
-        muscle.model = name
-        muscle.options.update(options)
-
-
-def apply_settings(scene: Scene, settings: Mapping[str, Any]) -> None:
-    """Set dotted keys of a scene, in place.
-
-    ``model`` or ``model.KEY`` change every muscle, ``muscle.NAME.model`` or ``muscle.NAME.model.KEY`` one;
-    ``contact.KEY``, ``sliding.KEY``, ``detect.KEY`` and ``output.KEY`` change a table (one that the scene
-    lacks is switched on); ``activation`` and the other keys of contraction change every muscle,
-    ``muscle.NAME.activation`` one; ``motion.step`` changes the step of every ramp and
-    ``motion.ramp.NAME.COORDINATE.KEY`` one key of one. Whole models come first, whatever the order, as another
-    model drops the settings of the one before.
+def change_scene(
+    scene: S,
+    settings: Mapping[str, Any] | None = None,
+    *,
+    model: str | dict[str, Any] | None = None,
+    frames: slice | str | None = None,
+) -> S:
+    """Return a copy of a scene with other settings, another model or other frames; meshes are shared.
 
     Parameters
     ----------
-    scene : Scene
-    settings : mapping of str to value
+    settings : mapping, optional
+        Dotted keys with their values: ``{"model.centres": 200, "contact.substep_angle": 1}``. ``model`` and
+        ``model.KEY`` change every muscle, ``muscle.NAME.model.KEY`` one; so do the keys of contraction.
+        ``contact.KEY``, ``sliding.KEY``, ``detect.KEY`` and ``output.KEY`` change a table, one that the scene
+        lacks is switched on. ``motion.step`` changes the step of every ramp, ``motion.ramp.NAME.COORDINATE.KEY``
+        one key of one. Whole models come first, as another model drops the settings of the one before.
+    model : str or dict, optional
+        For every muscle. Options of another model are dropped.
+    frames : slice or str, optional
+        Which frames of the motion, as a slice or "A:B:S".
 
     Raises
     ------
     UsageError
         If a key is unknown, with the nearest right one, or a value is not allowed.
     """
-    for key in sorted(settings, key=lambda key: not chooses_model(key)):
-        value = settings[key]
-        try:
-            _apply(scene, key, value.item() if isinstance(value, np.generic) else value)
-        except SceneError as error:
-            raise UsageError(str(error)) from None
+    changed, settings = scene.copy(), settings or {}
+    try:
+        if model is not None:
+            _set_models(changed.muscles, model)
+        for key in sorted(settings, key=lambda key: not chooses_model(key)):
+            value = settings[key]
+            _apply(changed, key, value.item() if isinstance(value, np.generic) else value)
+        if frames is not None:
+            chosen = parse_slice(frames) if isinstance(frames, str) else frames
+            changed.motion = slice_motion(changed.motion, chosen)
+    except SceneError as error:
+        raise UsageError(str(error)) from None
+    return changed
 
 
 def chooses_model(key: str) -> bool:
@@ -62,25 +67,21 @@ def chooses_model(key: str) -> bool:
     return key == "model" or (key.startswith("muscle.") and key.endswith(".model"))
 
 
-def choose_frames(scene: Scene, frames: slice | str) -> None:
-    """Keep some frames of a scene's motion, in place: a slice or "A:B:S".
-
-    Raises
-    ------
-    UsageError
-        If there is none of them.
-    """
-    try:
-        scene.motion = scene.motion.sliced(parse_slice(frames) if isinstance(frames, str) else frames)
-    except SceneError as error:
-        raise UsageError(str(error)) from None
+def _set_models(muscles: Sequence[Muscle], model: str | dict[str, Any]) -> None:
+    """Give muscles another model; options of a different model are dropped."""
+    name, options = split_model(model, place="model")
+    for muscle in muscles:
+        if muscle.model != name:
+            muscle.options = {}
+        muscle.model = name
+        muscle.options.update(options)
 
 
 def _apply(scene, key, value):
     head, _, rest = key.partition(".")
     check_removed({key: value}, place="")
     if head == "model":
-        _set_model(scene.muscles, scene, rest, value, key)
+        _set_model(scene.muscles, rest, value, key)
     elif head == "muscle":
         name, _, rest = rest.partition(".")
         check_removed({rest: value}, place=f"{key}: ")
@@ -93,7 +94,7 @@ def _apply(scene, key, value):
             raise SceneError(
                 f"{key}: of a muscle its model (muscle.{name}.model.KEY) and {', '.join(KEYS)} can be set"
             )
-        _set_model([muscle], scene, rest, value, key)
+        _set_model([muscle], rest, value, key)
     elif head in KEYS:
         _set_contraction(scene.muscles, scene, head, rest, value)
     elif head == "motion":
@@ -170,9 +171,9 @@ def parse_slice(text: str) -> slice:
     return slice(*numbers)
 
 
-def _set_model(muscles, scene, rest, value, key):
+def _set_model(muscles, rest, value, key):
     if not rest:
-        apply_model(scene, value, muscles=muscles)
+        _set_models(muscles, value)
         return
     for muscle in muscles:
         options = muscle.options = dict(muscle.options)
@@ -187,8 +188,6 @@ def _set_model(muscles, scene, rest, value, key):
 
 
 def _set_contraction(muscles, scene, key, rest, value):
-    from rbfmuscle.scene.activation.resolve import contraction_keys
-
     folder = scene.path.parent if scene.path else None
     for muscle in muscles:
         table = muscle.contraction
@@ -216,4 +215,4 @@ def _set_motion(scene, rest, value, key):
     else:
         values[rest] = value
     table = type(options).build(values, place=f"{key}: motion ")
-    scene.motion = scene.motion_from(table, folder=scene.path.parent if scene.path else None)
+    scene.motion = make_motion(scene, table, folder=scene.path.parent if scene.path else None)

@@ -11,7 +11,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.scene.activation.curve import STEP
 from rbfmuscle.scene.joints.skeleton import all_coordinates
-from rbfmuscle.scene.motion import Motion
+from rbfmuscle.scene.objects import Motion
 from rbfmuscle.simulation.frame_loop import FrameLoop
 from rbfmuscle.simulation.plan.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.validation import UsageError

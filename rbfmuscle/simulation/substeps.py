@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 # No attached point moves farther against a bone in one sub-step than this share of its muscle's diameter.
 TRAVEL = 1.0 / 27.0
+# Sub-steps that one coordinate may take in a motion.
+MOST_SUBSTEPS = 100_000
 # Pieces in which a path is followed to see how far it turns the bones.
 PIECES = 8
 
@@ -70,7 +72,6 @@ class SubSteps:
             self._root, self.bones = own[0], [*dict.fromkeys([*own, *bones])]
             self.relevant = _moving_apart(scene, self.bones)
         self.limit = math.radians(scene.contact.substep_angle)
-        self.most = scene.motion.options.max_substeps
         names = self.bones
         owner, corners, size = [], [], []
         for part in muscles:
@@ -109,10 +110,10 @@ class SubSteps:
         start = {**before, **{k: value for k, value in after.items() if k not in self.relevant}}
         count = max(1, math.ceil(path_angle(self.scene, start, after) / self.limit - 1e-9))
         while True:
-            if count > self.most:
+            if count > MOST_SUBSTEPS:
                 raise SceneError(
-                    f"[motion]: one frame takes more than {self.most} sub-steps; make its step or the angles smaller, "
-                    "or raise motion.max_substeps"
+                    f"[motion]: one frame takes more than {MOST_SUBSTEPS} sub-steps; make its step or "
+                    "the angles smaller"
                 )
             stops = [interpolate(before, after, k / count) for k in range(count + 1)]
             poses = [self._matrices(stop) for stop in stops]
@@ -199,14 +200,15 @@ class PoseCache:
 def _moving_apart(scene: Scene, bones: Sequence[str]) -> set[str]:
     """Coordinates that move some of these bones against others: those of the joints not common to all their chains."""
     joint_of = {joint.child: joint for joint in scene.joints}
-    chains = []
+    chains: list[set[str]] = []
     for bone in bones:
-        chain, name = set(), bone
+        chain: set[str] = set()
+        name = bone
         while name in joint_of and joint_of[name].name not in chain:
             chain.add(joint_of[name].name)
             name = joint_of[name].parent
         chains.append(chain)
-    apart = set.union(*chains) - set.intersection(*chains)
+    apart = chains[0].union(*chains) - chains[0].intersection(*chains)
     found = {f"{j.name}.{name}" for j in scene.joints if j.name in apart for name in j.coordinates}
     for coupling in reversed(scene.couplings):
         if coupling.coordinate in found:
@@ -215,21 +217,20 @@ def _moving_apart(scene: Scene, bones: Sequence[str]) -> set[str]:
 
 
 def check_substeps(scene: Any) -> None:
-    """Refuse a motion of more sub-steps than ``motion.max_substeps``, before anything grows with their number.
+    """Refuse a motion of more sub-steps than `MOST_SUBSTEPS`, before anything grows with their number.
 
     Raises
     ------
     SceneError
-        With the number, the coordinate that takes most of it, and the key that raises the limit.
+        With the number, and the coordinate that takes most of it.
     """
     by_name = estimate_substeps(scene)
     name = max(by_name, key=lambda name: by_name[name], default="")
-    limit = scene.motion.options.max_substeps
-    if by_name and not by_name[name] <= limit:
+    if by_name and not by_name[name] <= MOST_SUBSTEPS:
         raise SceneError(
-            f"[motion]: {name!r} takes about {by_name[name]:.3g} sub-steps, more than {limit} (its way is long, "
-            f"contact.substep_angle = {scene.contact.substep_angle:g} is small, or muscles lie far from the joint's "
-            "centre); correct these, or raise motion.max_substeps"
+            f"[motion]: {name!r} takes about {by_name[name]:.3g} sub-steps, more than {MOST_SUBSTEPS} (its path is "
+            f"long, contact.substep_angle = {scene.contact.substep_angle:g} is small, or muscles lie far from the "
+            "joint's centre); correct these"
         )
 
 

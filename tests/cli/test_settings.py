@@ -21,7 +21,6 @@ TABLES = {
         options.ContactOptions,
         {
             "initial": "keep",
-            "tolerance": 0.1,
             "substep_angle": 4.0,
             "margin": 0.05,
         },
@@ -66,7 +65,7 @@ MODELS = {
     ),
 }  # fmt: skip
 # Where a motion comes from: a file has one of them, and another cannot stand beside it.
-SOURCES = {"waypoints", "file", "degrees"}
+SOURCES = {"waypoints", "file"}
 # The name of the model decides it, so it is no key of the scene's.
 IMPLIED = {"method"}
 
@@ -76,7 +75,6 @@ OTHERS = [
     ("muscle.biceps.model", "arap-volume", ["arap-volume", "rbf"]),
     ("muscle.brachialis.model.centres", 80, ["rbf", "rbf"]),
     ("motion.step", 3.0, ["rbf", "rbf"]),
-    ("motion.max_substeps", 500, ["rbf", "rbf"]),
     ("motion.ramp.elbow.flexion.to", 4.0, ["rbf", "rbf"]),
     ("motion.ramp.elbow.flexion.from", 1.0, ["rbf", "rbf"]),
     ("motion.ramp.elbow.flexion.step", 1.0, ["rbf", "rbf"]),

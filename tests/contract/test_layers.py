@@ -26,7 +26,7 @@ ALLOWED = {
     "rbfmuscle.geometry": ("rbfmuscle.geometry", "rbfmuscle.jit"),
     "rbfmuscle.implicit": (*LEAVES, "rbfmuscle.implicit"),
     "rbfmuscle.bones": (*LEAVES, "rbfmuscle.bones"),
-    "rbfmuscle.scene": CORE,
+    "rbfmuscle.scene": (*LEAVES, "rbfmuscle.scene"),
     "rbfmuscle.simulation": CORE,
     "rbfmuscle.importers": (*LEAVES, "rbfmuscle.scene", "rbfmuscle.importers"),
     "rbfmuscle.muscle": (*CORE, "rbfmuscle.implicit", "rbfmuscle.muscle"),
@@ -137,6 +137,8 @@ def test_imports_only_what_its_package_may(path):
         ("rbfmuscle.jit", "from rbfmuscle.geometry.triangles import vertex_faces"),
         ("rbfmuscle.geometry.triangles", "from rbfmuscle.validation import check_points"),
         ("rbfmuscle.cli.run", "import pbd_baseline"),
+        ("rbfmuscle.scene.check", "from rbfmuscle.simulation.substeps import check_substeps"),
+        ("rbfmuscle.scene.check", "def f():\n    from rbfmuscle.bones.mesh import prepare_bone"),
     ],
 )
 def test_planted_wrong_arrow_is_found(module, source):
@@ -173,7 +175,7 @@ def test_no_package_is_too_full(package, files):
 
 
 def cycles(arrows):
-    """Modules that reach themselves by imports at module level, in groups."""
+    """Modules that reach themselves by imports, in groups."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -186,24 +188,37 @@ def cycles(arrows):
     return [m for m in members if len(m) > 1]
 
 
-def arrows_at_module_level(root=ROOT):
+def all_arrows(root=ROOT):
+    """What each module imports, in functions and under TYPE_CHECKING too."""
     arrows = {}
     for path in sources(root):
-        if path.name == "__init__.py":
-            continue
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        top = ast.Module([node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)], [])
-        module = module_name(path, root)
-        arrows[module] = imported_modules(ast.unparse(top), module) - {module}
+        if path.name != "__init__.py":
+            module = module_name(path, root)
+            arrows[module] = imported_modules(path.read_text(encoding="utf-8"), module) - {module}
     return arrows
 
 
+# To be removed; the test fails when one of them is gone, so that this list does not outlive it.
+KNOWN_CYCLES = [
+    ["rbfmuscle.implicit.placement.density", "rbfmuscle.implicit.placement.sampling"],
+    ["rbfmuscle.muscle.solid", "rbfmuscle.muscle.solid_contact"],
+]
+
+
 def test_no_module_imports_itself_by_others():
-    assert cycles(arrows_at_module_level()) == []
+    assert cycles(all_arrows()) == KNOWN_CYCLES
 
 
-def test_planted_cycle_is_found():
-    assert cycles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]]
+@pytest.mark.parametrize(
+    "late",
+    ["def f():\n    import rbfmuscle.b\n", "if TYPE_CHECKING:\n    from rbfmuscle.b import x\n"],
+    ids=["in a function", "for types"],
+)
+def test_planted_cycle_is_found(tmp_path, late):
+    for name, text in {"a": late, "b": "from rbfmuscle.c import y", "c": "from rbfmuscle import a"}.items():
+        (tmp_path / "rbfmuscle").mkdir(exist_ok=True)
+        (tmp_path / "rbfmuscle" / f"{name}.py").write_text(text)
+    assert cycles(all_arrows(tmp_path)) == [["rbfmuscle.a", "rbfmuscle.b", "rbfmuscle.c"]]
 
 
 def test_right_arrows_pass():

@@ -6,7 +6,9 @@ import trimesh
 
 import rbfmuscle as rm
 from rbfmuscle.models import MODEL_NAMES, build_model
-from rbfmuscle.scene.motion import Motion, bone_poses, rotation_about
+from rbfmuscle.scene.joints.joint import rotation_about
+from rbfmuscle.scene.motion import bone_poses
+from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.options import DetectOptions, SlidingOptions, TunnellingOptions
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.frame_loop import simulate_frames

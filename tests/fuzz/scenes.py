@@ -195,7 +195,6 @@ def _tables(scene, rng):
                 [{}, {"angle": 1e-300}, {"action": "rotate"}, 1],
             ),
             ("output", "surfaces", [False, True, {"format": "stl"}, {"format": "glb"}, {"format": "x"}]),
-            ("motion", "max_substeps", [0, 1, 10**15, -1]),
             ("scene", "units", ["m", "cm", "km", 1]),
         ],
     )

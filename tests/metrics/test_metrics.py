@@ -23,7 +23,7 @@ from rbfmuscle.metrics.penetration import (
 from rbfmuscle.metrics.recorder import MetricsRecorder
 from rbfmuscle.metrics.topology import SurfaceForm, count_components
 from rbfmuscle.scene.joints.joint import Coordinate
-from rbfmuscle.scene.motion import Motion
+from rbfmuscle.scene.objects import Motion
 from rbfmuscle.simulation.frame_loop import Event, Frame, ModelSurface
 
 EYE = np.eye(4)

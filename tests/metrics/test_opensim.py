@@ -7,7 +7,7 @@ import pytest
 from blend_model import arm_scene, use_blend_model
 
 from rbfmuscle.run import simulate
-from rbfmuscle.scene.motion import Motion
+from rbfmuscle.scene.motion import make_motion
 from rbfmuscle.scene.options import MotionOptions
 
 
@@ -41,7 +41,7 @@ def test_motion_file_honours_in_degrees(tmp_path, degrees, factor):
     name = next(iter(joint.axes))
     text = f"m\nversion=1\nnRows=2\nnColumns=2\ninDegrees={degrees}\nendheader\ntime\t{name}\n0\t0\n1\t0.75\n"
     (tmp_path / "a.mot").write_text(text)
-    motion = Motion.from_options(MotionOptions(file="a.mot"), scene.joints, folder=tmp_path)
+    motion = make_motion(scene, MotionOptions(file="a.mot"), folder=tmp_path)
     assert [frame[f"{joint.name}.{name}"] for frame in motion.frames] == pytest.approx([0.0, 0.75 * factor])
 
 

@@ -16,7 +16,7 @@ from rbfmuscle.models import build_model
 from rbfmuscle.muscle import placement
 from rbfmuscle.muscle.muscle import RBFMuscle
 from rbfmuscle.muscle.options import RBFOptions
-from rbfmuscle.scene.motion import Motion
+from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames

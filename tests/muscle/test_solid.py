@@ -13,7 +13,7 @@ from rbfmuscle.models import build_models
 from rbfmuscle.muscle.muscle import RBFMuscle
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.solid import BULK, TONE
-from rbfmuscle.scene.motion import rotation_about
+from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.frame_loop import simulate_frames

@@ -7,7 +7,7 @@ import trimesh
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.models import build_models
-from rbfmuscle.scene.motion import rotation_about
+from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.simulation.frame_loop import FrameLoop
 

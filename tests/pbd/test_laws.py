@@ -19,7 +19,7 @@ from pbd_baseline.topology import Topology
 from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.geometry.rotations import quaternion_matrix
 from rbfmuscle.geometry.surfaces import vertex_normals
-from rbfmuscle.scene.motion import rotation_about
+from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.simulation.contact import HalfSpaces
 
 

@@ -10,7 +10,7 @@ from pbd_baseline.muscle import PBDMuscle
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.topology import Topology
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.scene.motion import rotation_about
+from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.validation import SceneError
 

@@ -14,7 +14,7 @@ from pbd_baseline.self_collision.ridges import NOTHING, Ridges
 from pbd_baseline.self_collision.untangling import Untangling
 from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.metrics.penetration import BoneProbe, bone_depth, surface_depth
-from rbfmuscle.scene.motion import rotation_about
+from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.simulation.contact import HalfSpaces
 from rbfmuscle.simulation.frame_loop import simulate_frames
 

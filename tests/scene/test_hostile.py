@@ -13,6 +13,7 @@ from rbfmuscle.scene.check import check_initial
 from rbfmuscle.scene.meshes.read import prepare_mesh, read_mesh
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation import substeps
 from rbfmuscle.simulation.substeps import check_substeps, estimate_substeps
 from rbfmuscle.validation import MeshError, SceneError, UsageError
 
@@ -33,6 +34,7 @@ def refused(folder, change, words):
     with pytest.raises(SceneError, match=words) as caught:
         scene = Scene.load(path)
         check_models(scene)
+        check_substeps(scene)
         check_initial(scene)
     text = str(caught.value)
     assert "\n" not in text and len(text) < 1000
@@ -112,15 +114,7 @@ class TestMotions:
         text = refused(
             folder, put("motion", {"ramp": {"hip.flexion": {"to": 1e6, "step": 100.0}}}), "sub-steps"
         )
-        assert "'hip.flexion' takes about" in text and "motion.max_substeps" in text
-
-    def test_limit_of_substeps_can_be_raised(self, folder):
-        ramp = {"ramp": {"hip.flexion": {"to": 90.0, "step": 3.0}}}
-        refused(folder, put("motion", {**ramp, "max_substeps": 20}), "more than 20")
-        tables = base_scene()
-        tables["motion"] = {**ramp, "max_substeps": 1000}
-        (folder / "long.toml").write_text(to_toml(tables))
-        check_initial(Scene.load(folder / "long.toml"))
+        assert "'hip.flexion' takes about" in text
 
     def test_estimate_is_near_what_is_done(self):
         from rbfmuscle.simulation.plan.plan import plan_scene
@@ -128,13 +122,13 @@ class TestMotions:
         scene = phantom_scene()
         assert sum(estimate_substeps(scene).values()) == pytest.approx(plan_scene(scene)["substeps"], rel=0.2)
 
-    def test_joint_far_away(self, folder):
+    def test_joint_far_away(self, folder, monkeypatch):
         refused(folder, put("joint", 0, "centre", [1e12, 0.0, 0.0]), "1e\\+12 mm away from all bones")
 
         def change(tables):
             tables["joint"][0]["centre"] = [1e5, 0.0, 0.0]
-            tables["motion"]["max_substeps"] = 1000
 
+        monkeypatch.setattr(substeps, "MOST_SUBSTEPS", 1000)
         text = refused(folder, change, "sub-steps, more than 1000")
         assert "far from the joint's centre" in text
 
@@ -148,10 +142,12 @@ class TestMotions:
         # No pair of stops is too far apart by itself.
         refused(folder, put("motion", {"waypoints": stops, "step": 0.1}), "frames, more than 100000")
 
-    def test_one_frame_that_needs_too_many(self):
-        scene = phantom_scene().with_options({"motion.max_substeps": 5})
+    def test_one_frame_that_needs_too_many(self, monkeypatch):
+        monkeypatch.setattr(substeps, "MOST_SUBSTEPS", 5)
         with pytest.raises(SceneError, match="more than 5"):
-            check_substeps(scene)
+            check_substeps(phantom_scene())
+        with pytest.raises(SceneError, match="more than 5"):
+            substeps.SubSteps(phantom_scene()).split({}, {"hip.flexion": 0.5, "hip.adduction": 0.5})
 
 
 def shape(change):

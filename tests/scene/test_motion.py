@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.scene.motion import bone_poses, interpolate, rotation_about
+from rbfmuscle.scene.joints.joint import rotation_about
+from rbfmuscle.scene.motion import bone_poses, interpolate
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import SceneError, UsageError
 

@@ -21,7 +21,7 @@ from run_folders import timeless
 from rbfmuscle import recording
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.run import simulate, stream_run
-from rbfmuscle.scene.motion import Motion
+from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.sharing import crew as sharing
 from rbfmuscle.sharing.crew import WorkerPool

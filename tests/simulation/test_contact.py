@@ -5,7 +5,7 @@ import pytest
 from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, joint, muscle, scene, sphere
 
 from rbfmuscle.geometry.rest_frame import box_corners, moved_box
-from rbfmuscle.scene.motion import rotation_about
+from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.simulation.broad_phase import boxes_apart
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.frame_loop import simulate_frames

@@ -6,7 +6,7 @@ import trimesh
 
 import rbfmuscle as rm
 from rbfmuscle.models import build_model
-from rbfmuscle.scene.motion import Motion
+from rbfmuscle.scene.objects import Motion
 from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames
 from rbfmuscle.simulation.plan.plan import plan_scene
 from rbfmuscle.simulation.substeps import SubSteps

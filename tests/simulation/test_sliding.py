@@ -6,7 +6,7 @@ import pytest
 import trimesh
 from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, joint, muscle, scene, sphere
 
-from rbfmuscle.scene.motion import rotation_about
+from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.options import SlidingOptions
 from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames
 from rbfmuscle.simulation.neighbour_surface import DEEPER, NeighbourSurface

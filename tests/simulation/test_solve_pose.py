@@ -5,7 +5,7 @@ import pytest
 
 import rbfmuscle as rm
 from rbfmuscle.models import build_models
-from rbfmuscle.scene.motion import Motion
+from rbfmuscle.scene.objects import Motion
 from rbfmuscle.simulation.frame_loop import simulate_frames, solve_pose
 
 POSE = {"hip.flexion": np.radians(24.0), "hip.adduction": np.radians(-10.0)}

@@ -6,7 +6,8 @@ import trimesh
 from toy_scene import ToyMuscle, attach, bone, box, cylinder, ellipsoid, joint, muscle, scene, sphere
 
 from rbfmuscle.geometry.rigid import rigid_fit
-from rbfmuscle.scene.motion import bone_poses, rotation_about
+from rbfmuscle.scene.joints.joint import rotation_about
+from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.options import TunnellingOptions
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.stepper import MuscleStepper

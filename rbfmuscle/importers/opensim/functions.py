@@ -10,8 +10,8 @@ from rbfmuscle.scene.joints.functions import (
     Linear,
     PiecewiseLinear,
     Polynomial,
-    Scaled,
     Spline,
+    scaled,
 )
 from rbfmuscle.validation import SceneError
 
@@ -98,7 +98,7 @@ def read_function(node: Node, *, place: str, depth: int = 0) -> Function:
         if inner is None or depth > 20:
             raise SceneError(f"{place}: a MultiplierFunction without a function; give it one")
         scale = (values("scale") or [1.0])[0]
-        return Scaled(scale, read_function(inner, place=place, depth=depth + 1))
+        return scaled(read_function(inner, place=place, depth=depth + 1), scale)
     if node.tag == "PiecewiseLinearFunction" or node.tag in SPLINES:
         x, y = values("x"), values("y")
         if not x or len(x) != len(y) or any(b <= a for a, b in itertools.pairwise(x)):

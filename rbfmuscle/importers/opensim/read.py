@@ -17,7 +17,7 @@ from rbfmuscle.importers.opensim.model import (
     motion_kinds,
 )
 from rbfmuscle.importers.opensim.xml import read_xml
-from rbfmuscle.scene.joints.functions import Linear, Scaled
+from rbfmuscle.scene.joints.functions import Linear, scaled
 from rbfmuscle.scene.joints.joint import Coordinate, Coupling, TransformAxis, frame_at
 from rbfmuscle.validation import SceneError
 
@@ -221,14 +221,12 @@ def _axes(joint, place):
             raise SceneError(f"{at}: its direction is zero; give it one")
         _check_count(function, len(names), at)
         axes[node.name] = TransformAxis(tuple((direction / size).tolist()), names, function)
-        if isinstance(function, Linear) and len(function.slopes) == 1:
+        if isinstance(function, Linear) and len(function.slopes) == 1 and inner.tag == "LinearFunction":
             slopes[node.name] = function.slopes[0]
     return axes, slopes
 
 
 def _check_count(function, count, at):
-    while isinstance(function, Scaled):
-        function = function.inner
     slopes = len(function.slopes) if isinstance(function, Linear) else None
     if slopes is not None and slopes > count:
         raise SceneError(f"{at}: a linear function of {slopes} coordinates, {count} are named")
@@ -276,7 +274,7 @@ def _read_constraints(model, node):
         target = constraint.word("dependent_coordinate_name")
         if not of or not target:
             raise SceneError(f"{place}: names no coordinates; give it some")
-        model.couplings.append(Coupling(target, of, function if scale == 1.0 else Scaled(scale, function)))
+        model.couplings.append(Coupling(target, of, function if scale == 1.0 else scaled(function, scale)))
     dependents = {coupling.coordinate for coupling in model.couplings}
     for name, facts in model.coordinates().items():
         if facts.locked and name in dependents:

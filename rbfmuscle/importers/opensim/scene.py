@@ -12,7 +12,8 @@ from rbfmuscle.importers.opensim.model import OsimModel
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.scene.joints.functions import Function
 from rbfmuscle.scene.joints.joint import Coordinate, Coupling, Joint, TransformAxis
-from rbfmuscle.scene.scene import MM_PER_UNIT, Scene
+from rbfmuscle.scene.objects import MM_PER_UNIT
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import SceneError, did_you_mean
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report.appearance import BONE_COLOUR, muscle_colours
-from rbfmuscle.scene.scene import MM_PER_UNIT
+from rbfmuscle.scene.objects import MM_PER_UNIT
 
 # Frames a second of a motion that has no times of its own: frame k of the run is frame k of the animation.
 FRAMES_A_SECOND = 24.0

@@ -16,7 +16,7 @@ from rbfmuscle.output.animation.moving import (
     MovingRun,
     linear_rgb,
 )
-from rbfmuscle.scene.scene import MM_PER_UNIT
+from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import MissingPartError
 
 

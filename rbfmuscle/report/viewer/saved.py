@@ -10,7 +10,7 @@ import numpy as np
 from rbfmuscle.geometry.surfaces import edge_lengths, unique_edges
 from rbfmuscle.report.labels import coordinate_texts
 from rbfmuscle.report.viewer.viewer import View, Viewer
-from rbfmuscle.scene.scene import MM_PER_UNIT
+from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import UsageError
 
 if TYPE_CHECKING:

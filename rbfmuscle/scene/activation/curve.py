@@ -6,17 +6,15 @@ import difflib
 import itertools
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.scene.motion import interpolate
 from rbfmuscle.scene.motion_file import storage_parts
+from rbfmuscle.scene.objects import Motion, Muscle, SceneData
 from rbfmuscle.validation import SceneError
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
-
 
 # No activation changes by more in one sub-step; smaller steps change the shapes that are reached by less than
 # 0.1 mm (tests/contract/test_contraction.py).
@@ -25,7 +23,7 @@ STEP = 0.1
 SETTLING = 4
 
 
-def activation_curve(muscle: Any, motion: Any) -> Any:
+def activation_curve(muscle: Muscle, motion: Motion) -> Floats:
     """Activation of one muscle in each frame.
 
     Parameters
@@ -46,16 +44,13 @@ def activation_curve(muscle: Any, motion: Any) -> Any:
         If its file cannot be used.
     """
     progress = np.asarray(motion.progress, dtype=float)
-    given = muscle.contraction.activation
+    given = 0.0 if muscle.contraction is None else muscle.contraction.activation
     if isinstance(given, (int, float)):
         return np.full(len(progress), float(given))
     if isinstance(given, list):
         if len(given) == 1:
             return np.full(len(progress), float(given[0]))
         return np.interp(progress, np.linspace(0.0, 1.0, len(given)), given)
-    if given.file is None:
-        start = given.start or 0.0
-        return start + (given.end - start) * progress
     times, values = read_controls(Path(given.file), given.column or muscle.name, muscle=muscle.name)
     when = times[0] + progress * (times[-1] - times[0]) if motion.times is None else motion.times
     return np.interp(when, times, values)
@@ -133,7 +128,7 @@ class Activations:
         Set by hand, as a window does; goes before the scene's own courses.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: SceneData) -> None:
         self.courses = {
             muscle.name: activation_curve(muscle, scene.motion)
             for muscle in scene.muscles

@@ -13,22 +13,10 @@ Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
 class CurveTable(Table):
-    """``activation`` as a table: a ramp ``from`` ``to`` over the motion, or a ``column`` of a ``file``."""
+    """``activation`` as a table: a ``column`` of a ``file``, by default the one named as the muscle."""
 
-    start: Fraction | None = Field(alias="from", default=None)
-    end: Fraction | None = Field(alias="to", default=None)
-    file: str | None = None
+    file: str
     column: str | None = None
-
-    @model_validator(mode="after")
-    def _check_one_source(self):
-        if (self.file is None) == (self.end is None):
-            raise ValueError("give 'to' (with 'from') or 'file' (with 'column')")
-        if self.file is None and self.column is not None:
-            raise ValueError("column belongs to file")
-        if self.file is not None and self.start is not None:
-            raise ValueError("from belongs to 'to', not to file")
-        return self
 
 
 class TendonTable(Table):

@@ -64,7 +64,7 @@ def _check_activation(value, muscle):
         if isinstance(number, bool) or not isinstance(number, (int, float)) or not 0.0 <= number <= 1.0:
             raise SceneError(
                 f"muscle {muscle!r}: activation must be a number from 0 to 1, a list of them over the motion, or "
-                f"a table with 'to' or 'file', got {number!r}"
+                f"a table with 'file', got {number!r}"
             )
 
 

@@ -1,10 +1,12 @@
-"""Functions of joint coordinates: constant, linear, polynomial, piecewise linear, splines, scaled.
+"""Functions of joint coordinates: constant, linear, polynomial, piecewise linear, splines.
 
 Each takes the values of its coordinates in order and returns one number; those of one variable take the first.
+``rescaled`` gives the function in other units, ``g(f_k q_k) = output * self(q)``, f the ``inputs``.
 """
 
 import bisect
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -20,7 +22,7 @@ class Constant:
         return self.value
 
     def rescaled(self, inputs: list[float], output: float) -> "Constant":
-        """Return the function in other units: ``g(f_k q_k) = output * self(q)``."""
+        """Return the function in other units."""
         return Constant(self.value * output)
 
 
@@ -39,7 +41,7 @@ class Linear:
         return total + self.constant
 
     def rescaled(self, inputs: list[float], output: float) -> "Linear":
-        """Return the function in other units, see `Constant.rescaled`."""
+        """Return the function in other units."""
         slopes = tuple(c if output == f else c * output / f for c, f in zip(self.slopes, inputs))
         return Linear(slopes, self.constant * output)
 
@@ -58,33 +60,42 @@ class Polynomial:
         return total
 
     def rescaled(self, inputs: list[float], output: float) -> "Polynomial":
-        """Return the function in other units, see `Constant.rescaled`."""
+        """Return the function in other units."""
         top = len(self.coefficients) - 1
         return Polynomial(tuple(c * output / inputs[0] ** (top - k) for k, c in enumerate(self.coefficients)))
 
 
 @dataclass(frozen=True)
-class PiecewiseLinear:
-    """Straight between the points; the first and the last piece go on beyond them."""
-
+class _Points:
     x: tuple[float, ...]
     y: tuple[float, ...]
+
+    def rescaled(self, inputs: list[float], output: float) -> Self:
+        """Return the function in other units."""
+        x, y = (tuple(v * f for v in values) for values, f in ((self.x, inputs[0]), (self.y, output)))
+        return replace(self, x=x, y=y)
+
+    def _piece(self, q: float) -> tuple[int, float, float]:
+        """Number of the piece that holds q, its width, and the fraction of it before q."""
+        k = min(max(bisect.bisect_right(self.x, q) - 1, 0), len(self.x) - 2)
+        width = self.x[k + 1] - self.x[k]
+        return k, width, (q - self.x[k]) / width
+
+
+@dataclass(frozen=True)
+class PiecewiseLinear(_Points):
+    """Straight between the points; the first and the last piece go on beyond them."""
 
     def __call__(self, *values: float) -> float:
         """Value at these coordinates."""
         if len(self.x) == 1:
             return self.y[0]
-        k = min(max(bisect.bisect_right(self.x, values[0]) - 1, 0), len(self.x) - 2)
-        t = (values[0] - self.x[k]) / (self.x[k + 1] - self.x[k])
+        k, _, t = self._piece(values[0])
         return self.y[k] + t * (self.y[k + 1] - self.y[k])
-
-    def rescaled(self, inputs: list[float], output: float) -> "PiecewiseLinear":
-        """Return the function in other units, see `Constant.rescaled`."""
-        return PiecewiseLinear(*_rescaled_points(self, inputs, output))
 
 
 @dataclass(frozen=True)
-class Spline:
+class Spline(_Points):
     """Cubic spline through points; beyond them it goes on straight.
 
     With ``natural`` false it is the spline of Forsythe, Malcolm and Moler (1977), which OpenSim calls SimmSpline:
@@ -92,8 +103,6 @@ class Spline:
     With ``natural`` true the second derivative is zero at both ends.
     """
 
-    x: tuple[float, ...]
-    y: tuple[float, ...]
     natural: bool = False
     _bend: tuple[float, ...] = field(init=False, repr=False, compare=False, default=())
 
@@ -106,44 +115,24 @@ class Spline:
         q, x, y, m = values[0], self.x, self.y, self._bend
         if len(x) == 1:
             return y[0]
-        last = len(x) - 1
-        if q < x[0] or q > x[last]:
-            k, t, e, side = (0, 0.0, x[0], 0) if q < x[0] else (last - 1, 1.0, x[last], 1)
-            h = x[k + 1] - x[k]
-            slope = (y[k + 1] - y[k]) / h
+        k, h, t = self._piece(q)
+        if q < x[0] or q > x[-1]:
             # At an end of a piece the slope differs from the chord's by the bends at both.
-            slope += h * (m[k] + 2.0 * m[k + 1]) / 6.0 if side else -h * (2.0 * m[k] + m[k + 1]) / 6.0
-            return (y[last] if side else y[0]) + slope * (q - e)
-        k = min(max(bisect.bisect_right(x, q) - 1, 0), last - 1)
-        h = x[k + 1] - x[k]
-        t = (q - x[k]) / h
+            slope, after = (y[k + 1] - y[k]) / h, q > x[-1]
+            slope += h * (m[k] + 2.0 * m[k + 1]) / 6.0 if after else -h * (2.0 * m[k] + m[k + 1]) / 6.0
+            return (y[-1] if after else y[0]) + slope * (q - (x[-1] if after else x[0]))
         s = 1.0 - t
         bend = (s**3 - s) * m[k] + (t**3 - t) * m[k + 1]
         return s * y[k] + t * y[k + 1] + h * h * bend / 6.0
 
-    def rescaled(self, inputs: list[float], output: float) -> "Spline":
-        """Return the function in other units, see `Constant.rescaled`."""
-        x, y = _rescaled_points(self, inputs, output)
-        return Spline(x, y, natural=self.natural)
+
+Function = Constant | Linear | Polynomial | PiecewiseLinear | Spline
 
 
-@dataclass(frozen=True)
-class Scaled:
-    """``factor`` times another function."""
-
-    factor: float
-    inner: "Function"
-
-    def __call__(self, *values: float) -> float:
-        """Value at these coordinates."""
-        return self.factor * self.inner(*values)
-
-    def rescaled(self, inputs: list[float], output: float) -> "Scaled":
-        """Return the function in other units, see `Constant.rescaled`."""
-        return Scaled(self.factor, self.inner.rescaled(inputs, output))
-
-
-Function = Constant | Linear | Polynomial | PiecewiseLinear | Spline | Scaled
+def scaled(function: Function, factor: float) -> Function:
+    """Return ``factor`` times a function."""
+    count = len(function.slopes) if isinstance(function, Linear) else 1
+    return function.rescaled([1.0] * count, factor)
 
 
 def second_derivatives(x: np.ndarray, y: np.ndarray, *, natural: bool) -> np.ndarray:
@@ -184,7 +173,3 @@ def _third(x, y):
     for order in range(1, 4):
         table = np.diff(table) / (x[order:] - x[:-order])
     return float(table[0])
-
-
-def _rescaled_points(function, inputs, output):
-    return tuple(v * inputs[0] for v in function.x), tuple(v * output for v in function.y)

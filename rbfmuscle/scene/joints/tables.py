@@ -4,20 +4,13 @@ Files and calls speak in degrees and scene units; inside are radians and scene u
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from rbfmuscle.scene.joints.functions import (
-    Constant,
-    Function,
-    Linear,
-    PiecewiseLinear,
-    Polynomial,
-    Scaled,
-    Spline,
-)
+from rbfmuscle.scene.joints.functions import Constant, Function, Linear, PiecewiseLinear, Polynomial, Spline
 from rbfmuscle.scene.joints.joint import (
     IDENTITY,
     KINDS,
@@ -61,24 +54,18 @@ class FunctionTable(Table):
     piecewise: PointsTable | None = None
     spline: PointsTable | None = None
     natural_spline: PointsTable | None = None
-    scale: Finite = 1.0
 
     def function(self, inputs: list[str], output: str, *, place: str) -> Function:
         """Return the function in inner units; ``inputs`` and ``output`` are kinds of motion, keys of `FACTORS`."""
         given = [name for name in FUNCTIONS if getattr(self, name) is not None]
         if len(given) > 1:
             raise SceneError(f"{place}: give one function, not {' and '.join(given)}")
-        kind = given[0] if given else "linear"
-        found = self._plain(kind, len(inputs), place)
+        found = self._plain(given[0] if given else "linear", len(inputs), place)
         if found == IDENTITY and inputs == [output]:
-            return found if self.scale == 1.0 else Scaled(self.scale, found)
-        found = found.rescaled([FACTORS[motion] for motion in inputs], FACTORS[output])
-        return found if self.scale == 1.0 else Scaled(self.scale, found)
+            return found
+        return found.rescaled([FACTORS[motion] for motion in inputs], FACTORS[output])
 
     def _plain(self, kind, count, place):
-        needed = {"constant": 0, "linear": count}.get(kind, 1)
-        if kind != "constant" and (count == 0 or count != needed):
-            raise SceneError(f"{place}: {kind} is of {needed or 1} coordinate, {count} are given")
         if kind == "constant":
             return Constant(self.constant)
         if kind == "linear":
@@ -88,6 +75,8 @@ class FunctionTable(Table):
                     f"{place}: linear needs a slope for each of {count} coordinates and a constant, got {values}"
                 )
             return Linear(tuple(values[:-1]), values[-1])
+        if count != 1:
+            raise SceneError(f"{place}: {kind} is of 1 coordinate, {count} are given")
         if kind == "polynomial":
             return Polynomial(tuple(self.polynomial))
         points = getattr(self, kind)
@@ -127,14 +116,9 @@ class CoordinateTable(Table):
         """Return it in inner units."""
         kind: Any = self.motion or motion
         factor = FACTORS[kind]
-        return Coordinate(
-            kind,
-            self.rest * factor,
-            None if self.default is None else self.default * factor,
-            None if self.range is None else (self.range[0] * factor, self.range[1] * factor),
-            self.clamped,
-            self.locked,
-        )
+        default = None if self.default is None else self.default * factor
+        ends = None if self.range is None else (self.range[0] * factor, self.range[1] * factor)
+        return Coordinate(kind, self.rest * factor, default, ends, self.clamped, self.locked)
 
 
 class JointTable(Table):
@@ -228,7 +212,7 @@ class JointTable(Table):
         for motion, table in tables:
             plain = not any(getattr(table, key) is not None for key in FUNCTIONS)
             slope = 1.0 if plain else (table.linear or [0.0])[0]
-            if table.coordinates == [name] and abs(slope * table.scale) == 1.0:
+            if table.coordinates == [name] and abs(slope) == 1.0:
                 found = motion
         return found
 
@@ -334,20 +318,10 @@ def _axis_row(axis, motions, output):
     return {**row, **_function_row(axis.function, inputs, output)}
 
 
-def _function_row(function, inputs, output):
-    scale = 1.0
-    while isinstance(function, Scaled):
-        scale, function = scale * function.factor, function.inner
+def _function_row(function: Function, inputs: Sequence[str], output: str) -> dict[str, Any]:
     if function == IDENTITY and inputs == [output]:
-        row = {}
-    else:
-        row = _plain_row(
-            function.rescaled([1.0 / FACTORS[motion] for motion in inputs], 1.0 / FACTORS[output])
-        )
-    return row if scale == 1.0 else {**row, "scale": scale}
-
-
-def _plain_row(function):
+        return {}
+    function = function.rescaled([1.0 / FACTORS[motion] for motion in inputs], 1.0 / FACTORS[output])
     if isinstance(function, Constant):
         return {"constant": function.value}
     if isinstance(function, Linear):

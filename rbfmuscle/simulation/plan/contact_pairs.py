@@ -81,12 +81,10 @@ def find_contact_pairs(scene: Scene) -> dict[tuple[Any, ...], Floats]:
 
 def build_fields(scene: Scene, regions: dict[tuple[Any, ...], Floats]) -> dict[str, BoneSDF]:
     """Distance fields of the parts of bones that some muscle can reach, in parallel: dict of bone name to field."""
-    tolerance = scene.contact.tolerance
 
     def build(bone):
         boxes = [box for (_, name), box in regions.items() if name == bone.name]
-        options = {} if tolerance is None else {"tolerance": tolerance}
-        return BoneSDF.from_mesh(bone.mesh, region=union_of(boxes), **options)
+        return BoneSDF.from_mesh(bone.mesh, region=union_of(boxes))
 
     bones = [bone for bone in scene.bones if any(name == bone.name for _, name in regions)]
     if len(bones) < 2:

@@ -1,0 +1,231 @@
+"""Building a scene, part by part, and checking that it is whole. Each function is a method of `Scene` too."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbfmuscle.geometry.arrays import MeshLike
+from rbfmuscle.scene.activation.curve import activation_curve
+from rbfmuscle.scene.activation.resolve import contraction_keys, resolve_contraction
+from rbfmuscle.scene.attachments import AttachTable, resolve_attachments
+from rbfmuscle.scene.fibres import read_fibres
+from rbfmuscle.scene.joints.joint import Coupling, Joint
+from rbfmuscle.scene.joints.skeleton import all_coordinates, ordered
+from rbfmuscle.scene.joints.tables import CouplingTable, JointTable, make_coupling
+from rbfmuscle.scene.meshes.read import ReadMesh, as_mesh
+from rbfmuscle.scene.motion import make_motion
+from rbfmuscle.scene.objects import Attachment, Bone, Muscle, SceneData, find_named
+from rbfmuscle.scene.options import MotionOptions
+from rbfmuscle.validation import SceneError, did_you_mean, shown
+
+if TYPE_CHECKING:
+    pass
+
+S = TypeVar("S", bound=SceneData)
+MeshInput: TypeAlias = str | Path | ReadMesh | MeshLike
+_NAME_CHARACTERS = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-")
+
+
+def add_bone(scene: S, name: str, mesh: MeshInput, *, scale: float = 1.0) -> S:
+    """Add a bone and return the scene.
+
+    Parameters
+    ----------
+    name : str
+    mesh : path, trimesh.Trimesh, (vertices, faces) or ReadMesh
+        Mended where that is safe; holes are kept, with a note.
+    scale : float
+        Factor from the mesh's unit to the scene's.
+    """
+    _check_new_bone(scene, name)
+    read = as_mesh(mesh, name, scale, may_be_open=True)
+    scene.bones.append(Bone(name, read.mesh, read.source, read.closed, read.notes))
+    return scene
+
+
+def add_link(scene: S, name: str) -> S:
+    """Add a bone without a mesh, which carries joints only, and return the scene."""
+    _check_new_bone(scene, name)
+    scene.links.append(name)
+    return scene
+
+
+def add_joint(
+    scene: S,
+    name: str,
+    parent: str,
+    child: str,
+    centre: ArrayLike | None = None,
+    axes: Mapping[str, ArrayLike] | None = None,
+    **keys: Any,
+) -> S:
+    """Add a joint, a ball where no ``type`` is given, and return the scene.
+
+    Parameters
+    ----------
+    name, parent, child : str
+        The child bone moves; a bone may be the child of one joint.
+    centre : (3,) array_like
+    axes : dict of str -> (3,) array_like
+        Axis of each coordinate, in any length.
+    **keys
+        Any other key of ``[[joint]]`` [degree, scene unit]: ``type``, ``orientation``, ``coordinates``, ...
+    """
+    row: dict[str, Any] = {"name": name, "parent": parent, "child": child, **keys}
+    if centre is not None:
+        row["centre"] = _plain(centre)
+    if axes:
+        row["axes"] = {key: _plain(axis) for key, axis in axes.items()}
+    return place_joint(scene, JointTable.build(row, place=f"joint {name!r}: ").joint())
+
+
+def place_joint(scene: S, joint: Joint) -> S:
+    """Add a `Joint` and return the scene; bones and joints form a tree."""
+    place, child = f"joint {joint.name!r}: ", joint.child
+    check_new_name(scene.joints, joint.name, "joint")
+    for bone in (joint.parent, child):
+        if bone not in scene.links:
+            find_named(scene.bones, bone, "bone", place=place)
+    parents, ancestor = {other.child: other.parent for other in scene.joints}, joint.parent
+    if child in parents:
+        raise SceneError(f"{place}bone {child!r} is already the child of another joint")
+    while ancestor is not None:
+        if ancestor == child:
+            raise SceneError(f"{place}{child!r} would hang on itself, joints must form a tree")
+        ancestor = parents.get(ancestor)
+    scene.joints.append(joint)
+    return scene
+
+
+def add_coupling(scene: S, coordinate: str, of: Sequence[str], **function: Any) -> S:
+    """Let a coordinate follow others by a function, as in ``[[coupling]]``, and return the scene.
+
+    Parameters
+    ----------
+    coordinate : str
+    of : list of str
+    **function
+        One of ``constant``, ``linear``, ``polynomial``, ``piecewise``, ``spline``, ``natural_spline``
+        [degree, scene unit].
+    """
+    row = {"coordinate": coordinate, "of": list(of), **function}
+    table = CouplingTable.build(row, place=f"coupling of {coordinate!r}: ")
+    return place_coupling(scene, make_coupling(table, scene.joints))
+
+
+def place_coupling(scene: S, coupling: Coupling) -> S:
+    """Add a `Coupling` and return the scene."""
+    scene.couplings = ordered([*scene.couplings, coupling])
+    return scene
+
+
+def add_muscle(
+    scene: S,
+    name: str,
+    mesh: MeshInput,
+    *,
+    attach: Sequence[Attachment | AttachTable | dict[str, Any]] = (),
+    model: dict[str, Any] | str = "rbf",
+    fibres: str | Path | Sequence[ArrayLike] | None = None,
+    scale: float = 1.0,
+    **contraction: Any,
+) -> S:
+    """Add a muscle and return the scene.
+
+    Parameters
+    ----------
+    name : str
+    mesh : path, trimesh.Trimesh, (vertices, faces) or ReadMesh
+        Closed; mended where that is safe.
+    attach : list of Attachment or dict
+        A dict holds ``bone`` and one of ``vertices`` (indices or a file), ``near`` (distance) and
+        ``sphere`` (``centre``, ``radius``).
+    model : str or dict
+        A model's name, or a table with ``name`` and the model's own options.
+    fibres : path or list of (k, 3) array_like, optional
+    scale : float
+        Factor from the mesh's unit to the scene's; fibres are scaled alike.
+    **contraction
+        ``activation``, ``fibre_stretch_at_rest``, ``optimal_fibre_length``, ``shortening``, ``tendon``.
+        Relative files are relative to ``folder``, where it is given.
+    """
+    folder = contraction.pop("folder", None)
+    check_new_name(scene.muscles, name, "muscle")
+    read = as_mesh(mesh, name, scale, may_be_open=False)
+    model_name, options = split_model(model, place=f"muscle {name!r}")
+    attachments = resolve_attachments(attach, read, scene.bones, muscle=name)
+    lines = None if fibres is None else read_fibres(fibres, scale=scale, muscle=name)
+    keys = contraction_keys(contraction, muscle=name, folder=folder)
+    scene.muscles.append(
+        Muscle(name, read.mesh, model_name, options, attachments, lines, read.source, read.notes, keys)
+    )
+    return scene
+
+
+def set_motion(scene: S, *, folder: Path | None = None, **options: Any) -> S:
+    """Set the motion from the keys of ``[motion]`` (angles in degrees) and return the scene."""
+    table = MotionOptions.build(options, place="[motion] ")
+    scene.motion = make_motion(scene, table, folder=folder)
+    return scene
+
+
+def validate(scene: S) -> S:
+    """Return the scene, or raise SceneError if it cannot be simulated: no bones, no muscles, loose muscles."""
+    for what in ("bones", "muscles"):
+        if not getattr(scene, what):
+            raise SceneError(f"scene {scene.name!r} has no {what}, add a [[{what[:-1]}]]")
+    known = all_coordinates(scene.joints)
+    for name in (name for frame in scene.motion.frames for name in frame):
+        if name not in known:
+            raise SceneError(f"[motion]: unknown coordinate {name!r}, {did_you_mean(name, sorted(known))}")
+    for muscle in scene.muscles:
+        place, bones = f"muscle {muscle.name!r}", sorted({a.bone for a in muscle.attachments})
+        if not bones:
+            raise SceneError(f"{place} has no attachment, give attach a place on two bones")
+        if len(bones) == 1:
+            raise SceneError(f"{place} is attached to {bones[0]!r} only, give attach a second bone")
+        if muscle.contraction is not None:
+            resolve_contraction(muscle)
+            activation_curve(muscle, scene.motion)
+    return scene
+
+
+def split_model(model: dict[str, Any] | str, *, place: str) -> tuple[str, dict[str, Any]]:
+    """Return (name, options) of a model given as a name or as a table with ``name``."""
+    if isinstance(model, str):
+        return model, {}
+    if isinstance(model, dict):
+        options = dict(model)
+        name = options.pop("name", "rbf")
+        if isinstance(name, str):
+            return name, options
+    raise SceneError(f"{place}: model must be a name or a table with a name, got {shown(model)}")
+
+
+def check_new_name(items: Sequence[Bone | Joint | Muscle], name: str, what: str) -> None:
+    """Raise SceneError if a name is no name for a file, or taken."""
+    if not isinstance(name, str) or not name or not set(name) <= _NAME_CHARACTERS:
+        raise SceneError(
+            f"{what} name {shown(repr(name))} may hold letters, digits, '_' and '-' only (it becomes a file name)"
+        )
+    if any(item.name == name for item in items):
+        raise SceneError(f"{what} {name!r} is given twice")
+
+
+def _check_new_bone(scene, name):
+    check_new_name(scene.bones, name, "bone")
+    if name in scene.links:
+        raise SceneError(f"bone {name!r} is given twice")
+
+
+def _plain(vector: ArrayLike) -> Any:
+    """A vector as a list of floats, for its table to check; anything else as it is."""
+    try:
+        return np.asarray(vector, dtype=float).tolist()
+    except (TypeError, ValueError):
+        return vector
