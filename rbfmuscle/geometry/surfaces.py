@@ -84,6 +84,13 @@ def split_pinched_vertices(vertices: Floats, faces: Integers) -> tuple[Floats, I
     return np.vstack([vertices, vertices[at[first][repeated]]]), number[fan].reshape(-1, 3)
 
 
+def label_sheets(faces: Integers, count: int) -> tuple[int, Integers]:
+    """Number of connected sheets of a triangle mesh, and the sheet (count,) of each vertex."""
+    ends = np.concatenate([faces[:, :2], faces[:, 1:]])
+    links = coo_matrix((np.ones(len(ends)), tuple(ends.T)), shape=(count, count))
+    return connected_components(links, directed=False)
+
+
 def edge_lengths(vertices: Floats, edges: Integers) -> Floats:
     """Length (e,) of each edge [unit of the vertices]."""
     return np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
@@ -158,34 +165,6 @@ def volume_about(vertices, faces, origin):
         r = corner_from(vertices, faces[f, 2], origin)
         total += six_volumes(q, r, p)
     return total / 6.0
-
-
-@compiled(error_model="numpy")
-def volume_and_gradient(vertices, faces, gradient):
-    """Enclosed volume; fill its gradient (n, 3), the sum of b x c / 6 over the faces (a, b, c) at each vertex a.
-
-    Measured from the first vertex, so that a far translation costs no digits.
-    """
-    gradient[:] = 0.0
-    volume = 0.0
-    for f in range(len(faces)):
-        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
-        ax, ay, az = corner_from(vertices, i, vertices[0])
-        bx, by, bz = corner_from(vertices, j, vertices[0])
-        cx, cy, cz = corner_from(vertices, k, vertices[0])
-        ux, uy, uz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
-        volume += ax * ux + ay * uy + az * uz
-        gradient[i, 0] += ux
-        gradient[i, 1] += uy
-        gradient[i, 2] += uz
-        gradient[j, 0] += cy * az - cz * ay
-        gradient[j, 1] += cz * ax - cx * az
-        gradient[j, 2] += cx * ay - cy * ax
-        gradient[k, 0] += ay * bz - az * by
-        gradient[k, 1] += az * bx - ax * bz
-        gradient[k, 2] += ax * by - ay * bx
-    gradient /= 6.0
-    return volume / 6.0
 
 
 @compiled(error_model="numpy")

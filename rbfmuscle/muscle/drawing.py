@@ -5,16 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from typing import NamedTuple, TypedDict
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.fields import BoneField, ClipDistance, LevelField
-from rbfmuscle.implicit.extraction.band import box_along
+from rbfmuscle.geometry.fields import ClipDistance, LevelField
 from rbfmuscle.implicit.extraction.material import FittedMesh, carry_material, project_to_level_set
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
-from rbfmuscle.implicit.extraction.obstacles import ObstaclePoints
+from rbfmuscle.implicit.extraction.obstacles import Obstacles
 from rbfmuscle.implicit.extraction.surface import ExtractedSurface, extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.muscle.display_mesh import DisplayMesh
@@ -32,8 +30,6 @@ MARCHING_CELLS = 48
 REACH = 3.0
 # A tenth of the edges this much longer than at rest is the cause of what cannot be fitted.
 STRETCHED = 1.6
-# Bones' vertices, sorted, by the bone's distance field.
-_BONE_POINTS: WeakKeyDictionary[BoneField, ObstaclePoints] = WeakKeyDictionary()
 
 # Where the material is no sound surface, what it does beside a rigid motion is smoothed so often, until it is one;
 # how deep in a bone a vertex of a sound one may be, in mean edges, and how much volume may be lacking.
@@ -66,11 +62,10 @@ class _Neighbours(NamedTuple):
 
 
 class _Surroundings(TypedDict):
-    """Cut, obstacles and axes, as `project_to_level_set` takes them."""
+    """Cut and obstacles, as `project_to_level_set` takes them."""
 
     cut: ClipDistance | None
-    obstacles: list[tuple[ObstaclePoints, Floats]]
-    axes: Floats
+    obstacles: Obstacles
 
 
 class SurfaceBuilder:
@@ -93,7 +88,7 @@ class SurfaceBuilder:
 
     def __init__(self, muscle: Muscle, scene: Scene, rest: RestState, options: RBFOptions) -> None:
         self.name, self.rest, self.options = muscle.name, rest, options
-        self._bones = [bone.mesh for bone in scene.bones]
+        self._bones = [np.asarray(bone.mesh.vertices, dtype=float) for bone in scene.bones]
         self.level = 0.0
         self.shown = DisplayMesh(muscle, rest, options) if options.surface == "material" else None
 
@@ -162,7 +157,6 @@ class SurfaceBuilder:
         return {
             "cut": _BoneCut(contacts, reach, neighbours=neighbours.cut) if contacts.names else None,
             "obstacles": self._obstacles(contacts, neighbours=neighbours.points),
-            "axes": self._axes(contacts),
         }
 
     def _sounder(
@@ -202,7 +196,7 @@ class SurfaceBuilder:
     ) -> ExtractedSurface:
         axes, resolution = self._axes(contacts), self.options.resolution or MARCHING_CELLS
         # Farther than a cell from the bones a lower bound will do: no vertex gets there.
-        reach = 1.25 * float(np.diff(box_along(now.points, axes), axis=0).max()) / resolution
+        reach = 1.25 * float(np.ptp(now.points @ axes.T, axis=0).max()) / resolution
         try:
             result = extract_surface(
                 fit(), points=now.points, resolution=resolution,
@@ -221,21 +215,12 @@ class SurfaceBuilder:
         """Axes that turn with the scene: what is sorted by them then falls out alike."""
         return self.rest.axes @ contacts.poses[self.rest.bones[0]][:3, :3].T
 
-    def _obstacles(
-        self, contacts: BoneContacts, *, neighbours: bool = True
-    ) -> list[tuple[ObstaclePoints, np.ndarray]]:
+    def _obstacles(self, contacts: BoneContacts, *, neighbours: bool = True) -> Obstacles:
         """Points that faces have to leave outside: those of bones, and of sliding neighbours where they meet."""
-        found = [(self._points_of(contacts, b), contacts.poses[contacts.names[b]]) for b in contacts.reached]
+        found = [(self._bones[b], contacts.poses[contacts.names[b]]) for b in contacts.reached]
         points = contacts.neighbour_points() if neighbours else np.zeros((0, 3))
         # A neighbour thinner than the surface's edges would stick through its faces: their corners alone are cut.
-        return [*found, (ObstaclePoints(points), np.eye(4))] if len(points) else found
-
-    def _points_of(self, contacts: BoneContacts, bone: int) -> ObstaclePoints:
-        """A bone's vertices, sorted once for all muscles that share its field."""
-        field = contacts.fields[bone]
-        if field not in _BONE_POINTS:
-            _BONE_POINTS[field] = ObstaclePoints(self._bones[bone].vertices)
-        return _BONE_POINTS[field]
+        return [*found, (points, np.eye(4))] if len(points) else found
 
     def _cause(self, now: Configuration, contacts: BoneContacts) -> tuple[str, str]:
         """Bone and cause of a surface that cannot be fitted: a held end in a bone, stretch, or sheets that met."""

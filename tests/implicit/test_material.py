@@ -8,7 +8,6 @@ from rbfmuscle.geometry.crossing import FaceTree, creased_faces, crossing_faces
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction.material import _Fitting, carry_material, project_to_level_set
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh, _edges_loop
-from rbfmuscle.implicit.extraction.obstacles import ObstaclePoints
 from rbfmuscle.implicit.extraction.projection import Projector
 
 BALL = trimesh.creation.icosphere(3)
@@ -107,7 +106,7 @@ def test_bone_vertices_end_up_outside():
     spike = (middle - 0.1 * edge * BALL.face_normals[0])[None]
     found = project_to_level_set(
         mesh_of(), np.asarray(BALL.vertices), Sphere(), volume=0.97 * VOLUME,
-        obstacles=[(ObstaclePoints(spike), np.eye(4))],
+        obstacles=[(spike, np.eye(4))],
     )  # fmt: skip
     depth = trimesh.proximity.signed_distance(trimesh.Trimesh(found.vertices, found.faces), spike)
     # A hundredth of an edge is the tolerance; 0.12 without being pushed.
@@ -176,7 +175,7 @@ def test_what_falls_on_a_fold_of_the_field_does_not_leap():
 
     places = np.array([[1e-4, 0.0, 0.0], [-1e-4, 0.0, 0.0], [0.9, 0.0, 0.0]])
     ends = []
-    for least in (None, np.full(3, 0.7)):
+    for least in (np.zeros(3), np.full(3, 0.7)):
         projector = Projector(Fold(), None, places.copy(), 0.5, np.zeros(3, dtype=bool))
         projector.least = least
         projector.project(0.0, rounds=2)
@@ -282,7 +281,7 @@ def test_what_is_known_of_the_cut_changes_nothing(shift):
     asked.steepest = np.inf
     carried = np.asarray(BALL.vertices) + [shift, 0.0, 0.0]
     spike = np.array([[0.6 + 1e-3, 0.0, 0.0], [0.62, 0.02, 0.01]])
-    bones = [(ObstaclePoints(spike), np.eye(4))]
+    bones = [(spike, np.eye(4))]
     found = [
         project_to_level_set(mesh_of(), carried, Sphere(), volume=VOLUME, cut=each, obstacles=bones)
         for each in (cut, asked)

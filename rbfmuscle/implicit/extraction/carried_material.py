@@ -2,14 +2,12 @@
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Array, Booleans, Floats, Integers
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.fields import ClipDistance, Field
 from rbfmuscle.geometry.surfaces import vertex_normals
-from rbfmuscle.implicit.extraction.band import BandGrid
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
-from rbfmuscle.implicit.extraction.obstacles import CHORD, ObstaclePoints, faces_within, points_near_cells
+from rbfmuscle.implicit.extraction.obstacles import CHORD, Obstacles, faces_within
 from rbfmuscle.implicit.extraction.projection import CutBounds, Projector
-from rbfmuscle.jit import compiled
 
 # What is within this many mean edges of the bones may come to lie on them.
 NEAR_CUT = 1.5
@@ -90,49 +88,15 @@ class CarriedMaterial:
         part.hold(slice(None))
         self.projector.take(part, rows)
 
-    def push_off(self, obstacles: list[tuple[ObstaclePoints, Floats]] | None, axes: Floats | None) -> None:
+    def push_off(self, obstacles: Obstacles | None) -> None:
         """Move the corners of triangles that a bone's vertices came through."""
         if not obstacles:
             return
         vertices, faces = self.projector.vertices, self.mesh.faces
-        # So large that no corner is farther than 1.3 cells from its triangle's middle.
+        # So large that no corner is farther than 1.3 of it from its triangle's middle.
         spacing = max(self.edge, 0.52 * self.mesh.longest(vertices))
-        size = float(np.ptp(vertices, axis=0).max())
-        grid = BandGrid.around(vertices, resolution=max(int(size / spacing), 4), padding=2, axes=axes)
         if self.projector.bounds is not None:
             distance = self.projector.bounds.distance(vertices)
-            faces = faces[faces_within(vertices, faces, distance, 1.1 * CHORD * grid.spacing)]
-            if len(faces) == 0:
-                return
-        state = np.zeros(int(np.prod(grid.shape)), dtype=np.uint8)
-        cells = _touched_cells(grid, vertices, faces, state)
-        points = points_near_cells(obstacles, grid, state, cells)
-        if self.field is not None:
-            points = points[self.field(points) - self.level < CHORD * grid.spacing]
-        before = vertices.copy()
-        self.projector.push_off(faces, points, grid, PUSHED * self.edge)
-        self.pushed |= (self.projector.vertices != before).any(axis=1)
-
-
-def _touched_cells(grid: BandGrid, vertices: Floats, faces: Integers, state: Array) -> Integers:
-    """Mark the cells that hold vertices or middles of triangles, and those beside them; their flat numbers."""
-    corners = vertices[faces]
-    holders = grid.cells(np.concatenate([corners.reshape(-1, 3), corners.mean(axis=1)]))
-    cells = np.empty(len(state), dtype=np.int64)
-    return cells[: _touch_loop(np.unique(holders), grid.strides, state, cells)]
-
-
-@compiled(error_model="numpy")
-def _touch_loop(holders, strides, state, cells):
-    """Mark cells and their neighbours, each once; returns how many."""
-    count = 0
-    for cell in holders:
-        for i in range(-1, 2):
-            for j in range(-1, 2):
-                for k in range(-1, 2):
-                    near = cell + i * strides[0] + j * strides[1] + k * strides[2]
-                    if 0 <= near < len(state) and state[near] == 0:
-                        state[near] = 1
-                        cells[count] = near
-                        count += 1
-    return count
+            faces = faces[faces_within(vertices, faces, distance, 1.1 * CHORD * spacing)]
+        if len(faces):
+            self.pushed |= self.projector.push_off(faces, obstacles, self.level, spacing, PUSHED * self.edge)

@@ -16,7 +16,7 @@ from rbfmuscle.geometry.fields import ClipDistance, Field
 from rbfmuscle.geometry.surfaces import mesh_volume, vertex_normals
 from rbfmuscle.implicit.extraction.carried_material import CarriedMaterial
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
-from rbfmuscle.implicit.extraction.obstacles import ObstaclePoints
+from rbfmuscle.implicit.extraction.obstacles import Obstacles
 from rbfmuscle.implicit.extraction.surface import ExtractedSurface
 from rbfmuscle.implicit.extraction.untangling import gather, untangle
 from rbfmuscle.jit import compiled
@@ -62,8 +62,7 @@ def project_to_level_set(
     volume: float | None = None,
     level: float = 0.0,
     cut: ClipDistance | None = None,
-    obstacles: list[tuple[ObstaclePoints, Floats]] | None = None,
-    axes: Floats | None = None,
+    obstacles: Obstacles | None = None,
 ) -> FittedMesh:
     """Bring a triangulation onto the zero set of max(field - level, -cut).
 
@@ -72,7 +71,7 @@ def project_to_level_set(
     mesh : MaterialMesh
     vertices : (n, 3) ndarray
         Where the material carries them [scene unit].
-    field, cut, volume, level, obstacles, axes
+    field, cut, volume, level, obstacles
         As for `rbfmuscle.implicit.extraction.surface.extract_surface`.
 
     Returns
@@ -89,7 +88,7 @@ def project_to_level_set(
         fitting.project()
     else:
         fitting.reach(volume)
-    return fitting.finish(volume, obstacles, axes)
+    return fitting.finish(volume, obstacles)
 
 
 def carry_material(
@@ -98,14 +97,13 @@ def carry_material(
     *,
     volume: float | None = None,
     cut: ClipDistance | None = None,
-    obstacles: list[tuple[ObstaclePoints, Floats]] | None = None,
-    axes: Floats | None = None,
+    obstacles: Obstacles | None = None,
 ) -> FittedMesh:
     """A triangulation where the material is, out of the bones and blown up to a volume: for want of a level set.
 
     Parameters
     ----------
-    mesh, vertices, volume, cut, obstacles, axes
+    mesh, vertices, volume, cut, obstacles
         As for `project_to_level_set`.
 
     Returns
@@ -120,7 +118,7 @@ def carry_material(
     """
     fitting = _Fitting(mesh, vertices, None, cut, 0.0)
     fitting.inflate(volume)
-    return fitting.finish(volume, obstacles, axes)
+    return fitting.finish(volume, obstacles)
 
 
 class _Fitting(CarriedMaterial):
@@ -136,7 +134,6 @@ class _Fitting(CarriedMaterial):
     ) -> None:
         super().__init__(mesh, vertices, field, cut, level)
         self.left = np.zeros(len(vertices), dtype=np.bool_)
-        self.evaluations = 0
         self.reach_of = None
         if mesh.slope is not None and field is not None:
             self.projector.known = field.value_and_gradient(self.carried)
@@ -149,7 +146,6 @@ class _Fitting(CarriedMaterial):
         """Newton steps onto the level set, no farther from where the material is than the field is to be trusted."""
         projector = self.projector
         projector.project(self.level)
-        self.evaluations += len(projector.vertices)
         if self.reach_of is None:
             return
         # A way to a bone from outside it, which the field asked for, is as long as the field is to be trusted.
@@ -190,25 +186,23 @@ class _Fitting(CarriedMaterial):
     def finish(
         self,
         volume: float | None,
-        obstacles: list[tuple[ObstaclePoints, Floats]] | None,
-        axes: Floats | None,
+        obstacles: Obstacles | None,
     ) -> FittedMesh:
         """Bone vertices pushed off, crossings smoothed, the volume met: the mesh."""
         gather(self)
-        self.push_off(obstacles, axes)
-        smoothed, crossing = self.settle(volume, obstacles, axes)
+        self.push_off(obstacles)
+        smoothed, crossing = self.settle(volume, obstacles)
         vertices, faces = self.projector.vertices, self.mesh.faces
         check_finite(vertices, name="fitted vertices")
         return FittedMesh(
-            vertices, faces, self.level, mesh_volume(vertices, faces), 1, 0, self.edge,
-            self.evaluations, int(self.left.sum()), smoothed, crossing,
+            vertices, faces, self.level, mesh_volume(vertices, faces), 1, self.edge, int(self.left.sum()), smoothed,
+            crossing,
         )  # fmt: skip
 
     def settle(
         self,
         volume: float | None,
-        obstacles: list[tuple[ObstaclePoints, Floats]] | None,
-        axes: Floats | None,
+        obstacles: Obstacles | None,
     ) -> tuple[int, int]:
         """The volume met and nothing smoothed since; vertices that were, and triangles that cross all the same."""
         smoothed = 0
@@ -220,7 +214,7 @@ class _Fitting(CarriedMaterial):
             smoothed = max(smoothed, touched)
             if turn < CLEAR:
                 # What was smoothed may lie over a bone's vertex again.
-                self.push_off(obstacles, axes)
+                self.push_off(obstacles)
         self.fill(volume)
         return smoothed, int(self.mesh.tree.crossing(self.projector.vertices).sum())
 

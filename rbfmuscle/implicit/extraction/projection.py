@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.fields import ClipDistance, Field
 from rbfmuscle.geometry.surfaces import volume_cubic
-from rbfmuscle.implicit.extraction.obstacles import push_off_points
+from rbfmuscle.implicit.extraction.obstacles import CHORD, Obstacles, points_near_faces, push_off_points
 from rbfmuscle.jit import compiled
-
-if TYPE_CHECKING:
-    from rbfmuscle.implicit.extraction.band import BandGrid
-
 
 # What is no deeper in the cut than this share of a cell counts as out of it.
 OUT = 1e-5
@@ -75,16 +69,16 @@ class Projector:
     ) -> None:
         self.vertices = vertices
         self.spacing = spacing
-        self._field = None if field is None else field.value_and_gradient
+        self._field = field
         self._cut = None if cut is None else cut.value_and_gradient_below
         self._near_cut = near_cut
         # What is known before the first step: the field with its gradient, and the cut by values or lower bounds.
         self.known: tuple[Floats, Floats] | None = None
         self.bounds: CutBounds | None = None
-        # Distance (n,) from the cut at which vertices that fall into it end; 0 where None.
-        self.clearance: Floats | None = None
+        # Distance (n,) from the cut at which vertices that fall into it end.
+        self.clearance = np.zeros(len(vertices))
         # Steepness (n,) of the field below which steps are shortened, not lengthened by a gradient that fades.
-        self.least: Floats | None = None
+        self.least = np.zeros(len(vertices))
         self.slope = np.zeros(len(vertices))
         self.on_field = np.ones(len(vertices), dtype=bool)
         self._direction = np.zeros_like(vertices)
@@ -97,11 +91,12 @@ class Projector:
         todo = np.arange(len(self.vertices))
         for _ in range(rounds):
             x = self.vertices[todo]
-            f, gradient = self._field(x) if self.known is None else self.known
+            f, gradient = self._field.value_and_gradient(x) if self.known is None else self.known
             self.known = None
             step, slope = np.empty_like(x), np.empty(len(x))
-            least = np.zeros(len(x)) if self.least is None else self.least[todo]
-            _newton_loop(f, np.ascontiguousarray(gradient), level, least, todo, step, slope, self._direction)
+            _newton_loop(
+                f, np.ascontiguousarray(gradient), level, self.least[todo], todo, step, slope, self._direction
+            )
             self.slope[todo] = slope
             if self._cut is not None:
                 self._turn_to_cut(x, todo, (f - level) * slope, step, on_field)
@@ -120,7 +115,7 @@ class Projector:
     ) -> None:
         """Replace the steps of vertices that lie on the cut; marks which lie on the field's own surface."""
         rows = np.flatnonzero(self._near_cut[todo])
-        limit = self._limit(todo[rows]) - height[rows]
+        limit = self.clearance[todo[rows]] - height[rows]
         if self.bounds is not None:
             within = self.bounds.within(x[rows], todo[rows], limit)
             rows, limit = rows[within], limit[within]
@@ -129,15 +124,12 @@ class Projector:
         distance, outward = self._cut(x[rows], limit)
         if self.bounds is not None:
             self.bounds.keep(x[rows], todo[rows], distance)
-        distance = distance - self._limit(todo[rows])
+        distance = distance - self.clearance[todo[rows]]
         on_cut = height[rows] < -distance
         on_field[todo[rows]] = ~on_cut
         rows, distance, outward = rows[on_cut], distance[on_cut], outward[on_cut]
         size = np.maximum(np.einsum("ij,ij->i", outward, outward), np.finfo(float).tiny)
         step[rows] = -(distance / size)[:, None] * outward
-
-    def _limit(self, rows: Integers) -> Floats | float:
-        return 0.0 if self.clearance is None else self.clearance[rows]
 
     def hold(self, rows: Integers | slice) -> None:
         """Let vertices stay where they are when the level changes."""
@@ -154,8 +146,7 @@ class Projector:
         part = Projector.__new__(Projector)
         part.vertices, part.spacing = self.vertices[rows], self.spacing
         part._field, part._cut, part._near_cut = self._field, self._cut, self._near_cut[rows]
-        part.clearance = None if self.clearance is None else self.clearance[rows]
-        part.least = None if self.least is None else self.least[rows]
+        part.clearance, part.least = self.clearance[rows], self.least[rows]
         part.known, part.bounds = None, None if self.bounds is None else self.bounds.part(rows)
         part.slope, part._direction = np.zeros(len(rows)), np.zeros((len(rows), 3))
         return part
@@ -172,23 +163,30 @@ class Projector:
             return moved
         rows = np.flatnonzero(self._near_cut)
         for _ in range(2):
-            limit = self._limit(rows) * np.ones(len(rows))
+            limit = self.clearance[rows]
             if self.bounds is not None:
                 within = self.bounds.within(self.vertices[rows], rows, limit)
                 rows, limit = rows[within], limit[within]
             if len(rows) == 0:
                 break
-            distance, outward = self._cut(self.vertices[rows], limit)
-            distance = distance - limit
-            inside = distance < -OUT * self.spacing
-            rows, distance, outward = rows[inside], distance[inside], outward[inside]
+            rows = self._move_out(rows, limit, OUT * self.spacing)
             if len(rows) == 0:
                 break
             moved = max(moved, len(rows))
-            size = np.maximum(np.einsum("ij,ij->i", outward, outward), np.finfo(float).tiny)
-            self.vertices[rows] -= (distance / size)[:, None] * outward
             self.hold(rows)
         return moved
+
+    def _move_out(self, rows: Integers, limit: Floats, slack: float) -> Integers:
+        """Move those of some vertices that are nearer to the cut than a limit, by more than a slack, there: which."""
+        if self._cut is None:
+            return rows[:0]
+        distance, outward = self._cut(self.vertices[rows], limit)
+        distance = distance - limit
+        inside = distance < -slack
+        distance, outward = distance[inside], outward[inside]
+        size = np.maximum(np.einsum("ij,ij->i", outward, outward), np.finfo(float).tiny)
+        self.vertices[rows[inside]] -= (distance / size)[:, None] * outward
+        return rows[inside]
 
     def volume_step(self, faces: Integers, target: float, steps: int = 1) -> float:
         """Change of level that brings the mesh to the target volume, its vertices moving along their directions.
@@ -209,22 +207,34 @@ class Projector:
             change += lack / rate
         return change
 
-    def push_off(self, faces: Integers, points: Floats, grid: BandGrid, tolerance: float) -> None:
-        """Move the vertices around points that came through a triangle; these no longer follow the level."""
+    def push_off(
+        self, faces: Integers, obstacles: Obstacles, level: float, spacing: float, tolerance: float
+    ) -> Booleans:
+        """Move the vertices around points that came through a triangle; these (n,) no longer follow the level.
+
+        Parameters
+        ----------
+        faces : (m, 3) ndarray of int
+            Triangles that are looked at.
+        obstacles : list of pairs of (k, 3) and (4, 4) ndarrays
+        level : float
+            Of the field.
+        spacing, tolerance : float
+            As for `push_off_points`.
+        """
+        pushed = np.zeros(len(self.vertices), dtype=np.bool_)
+        points = points_near_faces(obstacles, self.vertices, faces, spacing)
+        if self._field is not None and len(points):
+            points = points[self._field(points) - level < CHORD * spacing]
         for _ in range(2):
-            moved = np.flatnonzero(push_off_points(self.vertices, faces, points, grid, tolerance))
-            self._direction[moved] = 0.0
-            self.slope[moved] = 0.0
-            if self._cut is None or len(moved) == 0:
+            rows = np.flatnonzero(push_off_points(self.vertices, faces, points, spacing, tolerance))
+            pushed[rows] = True
+            self.hold(rows)
+            if self._cut is None or len(rows) == 0:
                 break
             # What was pushed off one bone vertex must not end in the bone beside it.
-            distance, outward = self._cut(self.vertices[moved], np.zeros(len(moved)))
-            inside = distance < 0.0
-            if not inside.any():
-                break
-            distance, outward = distance[inside], outward[inside]
-            size = np.maximum(np.einsum("ij,ij->i", outward, outward), 1e-12)
-            self.vertices[moved[inside]] -= (distance / size)[:, None] * outward
+            self._move_out(rows, np.zeros(len(rows)), 0.0)
+        return pushed
 
     def shift(self, step: float) -> None:
         """Move the vertices as the level set moves with its level, to first order."""

@@ -1,4 +1,4 @@
-"""Sheets of a zero set in the whole box around a surface, those of its own included that a band never meets."""
+"""Sheets of a zero set in the whole box around a surface, those included that following the surface never meets."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.fields import Field
-from rbfmuscle.implicit.extraction.band import Band, BandGrid
-from rbfmuscle.implicit.extraction.surface import _label_sheets_loop
+from rbfmuscle.geometry.surfaces import label_sheets
+from rbfmuscle.implicit.extraction.marching import Band, Grid
 
-# Cells along the longest side of the boxes that are looked at, and of another look where slender muscles fall into
+# Cells along the longest side of the boxes that are searched, and of another search where slender muscles fall into
 # pieces between the nodes of these. A sheet between the nodes of one is found by the other, or is smaller than both.
 BOXES, FINER = (40, 64), 160
-# Of the longest side: what the box holds on every side of the points, whatever its cells.
+# Of the longest side: what the box holds on every side of the points.
 MARGIN = 0.075
 # Finer cells on every side of what coarser ones crossed: as far as a straight line in one of these is off.
 AROUND = 2
 
 
 class Sheets(NamedTuple):
-    """What a box holds.
+    """Sheets of a box.
 
     Attributes
     ----------
     number : int
-        Of sheets, 0 where the field has one sign.
+        0 where the field has one sign.
     is_open : bool
         Whether one leaves the box.
     cells : int
-        Along the longest side of the box that showed it.
+        Along the longest side of the box.
     """
 
     number: int
@@ -72,32 +72,32 @@ def count_sheets(
     Sheets
     """
     for cells in boxes:
-        found, vertices, spacing = _look(field, points, cells)
+        found, vertices, spacing = _search_box(field, points, cells)
         if found.number > wanted and np.abs(np.asarray(distance(vertices))).max() < spacing:
-            found = _look(field, points, FINER, near=vertices)[0]
+            found = _search_box(field, points, FINER, near=vertices)[0]
         if not found.sound(wanted):
             break
     return found
 
 
-def _look(
+def _search_box(
     field: Field, points: Floats, cells: int, *, near: Floats | None = None
 ) -> tuple[Sheets, Floats, float]:
-    """Sheets of one box, the vertices of their cells' crossings, and the edge of a cell.
+    """Sheets of one box, their vertices before projection, and the edge of a cell.
 
-    Of those near some points alone where these are given, which takes a fifth of the time with many cells.
+    Only of those near some points where these are given, for a fifth of the time with many cells.
     """
-    grid = BandGrid.around(points, resolution=cells, padding=round(MARGIN * cells))
+    grid = Grid.around(points, resolution=cells, padding=round(MARGIN * cells))
     band = Band(grid, field)
     if near is None:
         band.visit_all()
     else:
-        band.seed(np.vstack([points, near]))
+        band.visit(grid.cells(np.vstack([points, near])))
         for _ in range(AROUND):
             band.widen()
-    band.grow(0.0)
+    band.follow(0.0)
     if not band.crosses(0.0):
         return Sheets(0, False, cells), np.zeros((0, 3)), grid.spacing
     coordinates, faces, on_border, _ = band.march(0.0)
-    number = int(_label_sheets_loop(faces, len(coordinates))[1])
+    number, _ = label_sheets(faces, len(coordinates))
     return Sheets(number, bool(on_border.any()), cells), grid.positions(coordinates), grid.spacing
