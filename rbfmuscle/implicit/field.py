@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.implicit.evaluation import evaluate
+from rbfmuscle.implicit.evaluation import Terms, evaluate
 from rbfmuscle.implicit.fit.fitting import Basis, solve, solve_bounded
 from rbfmuscle.implicit.fit.systems import check_degree, frame, hermite_system, hermite_weights
 from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
@@ -78,12 +78,13 @@ class RBFField:
         self.kernel, self.epsilon = kernel, epsilon
         self.weights, (self.coefficients, self.powers) = weights, polynomial
         self.condition, self.smoothing = condition, smoothing
-        self._scaled = np.ascontiguousarray(((centres - self.origin) / self.scale).T)
-        self._rows = np.ascontiguousarray(weights.reshape(len(centres), -1).T)
-        shape = epsilon * self.scale if kernel.has_epsilon else 1.0
-        self._shape = np.ascontiguousarray(np.broadcast_to(shape, len(centres)), dtype=float)
-        coefficients = np.ascontiguousarray(self.coefficients, dtype=float)
-        self._polynomial = coefficients, np.ascontiguousarray(self.powers)
+        rows = np.ascontiguousarray(weights.reshape(len(centres), -1).T)
+        self._terms = Terms(
+            self.origin, self.scale, np.ascontiguousarray(((centres - self.origin) / self.scale).T),
+            rows[0], rows[1:] if len(rows) > 1 else np.zeros((3, len(centres))), len(rows) > 1,
+            float(epsilon * self.scale if kernel.has_epsilon else 1.0),
+            np.ascontiguousarray(self.coefficients, dtype=float), np.ascontiguousarray(self.powers),
+        )  # fmt: skip
 
     @classmethod
     def fit(
@@ -234,7 +235,7 @@ class RBFField:
 
     def __call__(self, points: ArrayLike) -> Floats:
         """Field value at (n, 3) points: (n,), negative inside."""
-        return self._evaluate(check_points(points), False)[0]
+        return evaluate(check_points(points), self._terms, self.kernel, False)[0]
 
     def gradient(self, points: Floats) -> Floats:
         """Gradient at (n, 3) points: (n, 3)."""
@@ -242,7 +243,7 @@ class RBFField:
 
     def value_and_gradient(self, points: Floats) -> tuple[Floats, Floats]:
         """Value (n,) and gradient (n, 3) at (n, 3) points, for little more than the value alone."""
-        return self._evaluate(check_points(points), True)
+        return evaluate(check_points(points), self._terms, self.kernel, True)
 
     def surface(self, resolution: int = 64) -> trimesh.Trimesh:
         """Zero set as a closed outward ``trimesh.Trimesh``; resolution in cells along the longest side."""
@@ -252,12 +253,6 @@ class RBFField:
 
         result = extract_surface(self, points=self.centres, resolution=resolution)
         return trimesh.Trimesh(result.vertices, result.faces, process=False)
-
-    def _evaluate(self, points: Floats, with_gradient: bool) -> tuple[Floats, Floats]:
-        return evaluate(
-            points, (self.origin, self.scale), self._scaled, self._rows, self.kernel, self._shape,
-            self._polynomial, with_gradient,
-        )  # fmt: skip
 
 
 def _solve(basis: Basis, right: Floats, smoothing: float, condition: float) -> tuple[Floats, Floats, float]:

@@ -6,11 +6,14 @@ from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.fields import ClipDistance, Field
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
-from rbfmuscle.implicit.extraction.obstacles import CHORD, Obstacles, faces_within
+from rbfmuscle.implicit.extraction.obstacles import Obstacles
 from rbfmuscle.implicit.extraction.projection import CutBounds, Projector
 
 # What is within this many mean edges of the bones may come to lie on them.
 NEAR_CUT = 1.5
+# A triangle none of whose corners is so many spacings near a bone has no bone vertex behind it by a chord: no point
+# of it is farther from a corner than its longest side over the root of three.
+NEAR_BONE = 1.5
 # What the material takes so many mean edges deep into a bone is sunk.
 SUNK = 1.0
 # Mean edges that a bone's vertex may lie within the surface.
@@ -96,7 +99,7 @@ class CarriedMaterial:
         # So large that no corner is farther than 1.3 of it from its triangle's middle.
         spacing = max(self.edge, 0.52 * self.mesh.longest(vertices))
         if self.projector.bounds is not None:
-            distance = self.projector.bounds.distance(vertices)
-            faces = faces[faces_within(vertices, faces, distance, 1.1 * CHORD * spacing)]
+            near = self.projector.bounds.distance(vertices) < NEAR_BONE * spacing
+            faces = faces[near[faces].any(axis=1)]
         if len(faces):
             self.pushed |= self.projector.push_off(faces, obstacles, self.level, spacing, PUSHED * self.edge)

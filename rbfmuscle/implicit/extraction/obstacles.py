@@ -39,28 +39,13 @@ def points_near_faces(obstacles: Obstacles, vertices: Floats, faces: Integers, s
     found = [np.zeros((0, 3))]
     for points, pose in obstacles:
         local = (middle - pose[:3, 3]) @ pose[:3, :3]
-        inside = (points >= local.min(axis=0) - reach) & (points <= local.max(axis=0) + reach)
-        found.append(points[inside.all(axis=1)] @ pose[:3, :3].T + pose[:3, 3])
+        rows = np.arange(len(points))
+        for axis, along in enumerate(local.T):
+            x = points[rows, axis]
+            rows = rows[(x >= along.min() - reach) & (x <= along.max() + reach)]
+        found.append(points[rows] @ pose[:3, :3].T + pose[:3, 3])
     near = np.concatenate(found)
     return near[np.isfinite(cKDTree(middle).query(near, distance_upper_bound=reach)[0])]
-
-
-def faces_within(vertices: Floats, faces: Integers, distance: Floats, reach: float) -> Booleans:
-    """Mask (m,) of the triangles that may come within reach of what their corners are at a distance from.
-
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-    faces : (m, 3) ndarray of int
-    distance : (n,) ndarray
-        Of the vertices, at least.
-    reach : float
-    """
-    corners = vertices[faces]
-    sides = corners - np.roll(corners, 1, axis=1)
-    longest = np.sqrt(np.einsum("fkc,fkc->fk", sides, sides).max(axis=1))
-    # No point of a triangle is farther from a corner than its longest side over the root of three.
-    return np.asarray(distance[faces].min(axis=1) <= 0.578 * longest + reach, dtype=np.bool_)
 
 
 def push_off_points(

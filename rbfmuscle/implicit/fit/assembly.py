@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.implicit.evaluation import _offsets_loop
 from rbfmuscle.implicit.kernels.radial import _radial_loop
-from rbfmuscle.implicit.kernels.values import _add_values_loop
 from rbfmuscle.jit import compiled
 
 
@@ -53,26 +53,14 @@ def hermite_polynomials(points: Floats, powers: Integers) -> Floats:
 
 
 @compiled(error_model="numpy")
-def _offsets_loop(x, j, scale2, first, d, u):
-    """d (3, m) = x[:, first + i] - x[:, j], u = squared length times scale2."""
-    for i in range(u.size):
-        dx = x[0, first + i] - x[0, j]
-        dy = x[1, first + i] - x[1, j]
-        dz = x[2, first + i] - x[2, j]
-        d[0, i] = dx
-        d[1, i] = dy
-        d[2, i] = dz
-        u[i] = (dx * dx + dy * dy + dz * dz) * scale2
-
-
-@compiled(error_model="numpy")
 def _value_matrix_loop(x, epsilon, form, out):
-    """out[j, i] = phi(|x_i - x_j|), both halves, as whole rows are filled faster; x is (3, n)."""
-    for j in range(x.shape[1]):
-        column = out[j]
-        column[:] = 0.0
-        centre = x[0, j], x[1, j], x[2, j]
-        _add_values_loop(form, x, centre, epsilon * epsilon, 1.0, column)
+    """out[j, i] = phi(|x_i - x_j|); x is (3, n)."""
+    n = x.shape[1]
+    d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((3, n)), np.empty((3, n))
+    for j in range(n):
+        _offsets_loop(x, (x[0, j], x[1, j], x[2, j]), epsilon * epsilon, d, u)
+        _radial_loop(form, 1, u, work, radial)
+        out[j] = radial[0]
 
 
 @compiled(error_model="numpy")
@@ -81,7 +69,7 @@ def _hermite_matrix_loop(x, epsilon, form, out):
     n = x.shape[1]
     d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((3, n)), np.empty((3, n))
     for j in range(n):
-        _offsets_loop(x, j, epsilon * epsilon, 0, d, u)
+        _offsets_loop(x, (x[0, j], x[1, j], x[2, j]), epsilon * epsilon, d, u)
         _radial_loop(form, 7, u, work, radial)
         _hermite_columns_loop(j, epsilon * epsilon, d, radial, out)
 
@@ -92,7 +80,7 @@ def _cubic_hermite_matrix_loop(x, epsilon, out):
     n = x.shape[1]
     d, u, radial = np.empty((3, n)), np.empty(n), np.empty((3, n))
     for j in range(n):
-        _offsets_loop(x, j, epsilon * epsilon, 0, d, u)
+        _offsets_loop(x, (x[0, j], x[1, j], x[2, j]), epsilon * epsilon, d, u)
         for i in range(n):
             s = np.sqrt(u[i])
             radial[0, i] = u[i] * s
@@ -145,7 +133,7 @@ def _normal_matrix_loop(x, normals, epsilon, form, out):
     e2 = epsilon * epsilon
     d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((3, n)), np.empty((3, n))
     for j in range(n):
-        _offsets_loop(x, j, e2, 0, d, u)
+        _offsets_loop(x, (x[0, j], x[1, j], x[2, j]), e2, d, u)
         _radial_loop(form, 7, u, work, radial)
         phi, first, second = radial[0], radial[1], radial[2]
         value, slope = out[j], out[n + j]
