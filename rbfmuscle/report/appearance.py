@@ -1,22 +1,21 @@
-"""Colours and views shared by pictures, plots and exported files."""
+"""Colours of muscles and directions of view, shared by pictures, plots, pages and exported files."""
 
 from __future__ import annotations
 
-import itertools
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-# Muscles nearer to each other than this share of the scene's extent are neighbours.
-NEXT_TO = 0.008
+from rbfmuscle.geometry.arrays import Floats
 
-BONE_COLOUR = "#ece2cb"
+BONE_COLOUR = "#e9e0cd"
 BACKGROUND = "#ffffff"
-# Flesh tones of different lightness and hue, so that neighbours stand apart.
-MUSCLE_COLOURS = ("#b5443f", "#dd8468", "#7f2638", "#c96a80", "#e9b39a", "#a1562f", "#94404f", "#d2505a")
-# Plots need more distance between lines than flesh tones give.
-LINE_COLOURS = ("#b5443f", "#2f6f8f", "#d99a2b", "#4f8a5b", "#7a5aa6", "#8c6d5a", "#c86fa0", "#5d6d7e")
-# Where the camera stands; z is up, as in the medical axes (left, posterior, superior).
+# Told apart by people who are colour-blind (P. Tol, "muted"); its sand is left out, as bones have that colour.
+MUSCLE_COLOURS = ("#cc6677", "#332288", "#44aa99", "#882255", "#88ccee", "#117733", "#aa4499", "#999933")
+# How much nearer to white or black the muscles of one group are, one after the other.
+_SHADES = (0.0, 0.3, -0.25)
+# From the subject to the camera; z is up, as in the medical axes (left, posterior, superior).
 VIEWS = {
     "front": ((0.0, -1.0, 0.12), "from -y"),
     "side": ((-1.0, -0.12, 0.12), "from -x"),
@@ -25,92 +24,90 @@ VIEWS = {
 }
 # What is drawn where nothing else is asked for.
 USUAL_VIEWS = ("front", "side", "back")
-# The least and greatest height of a panel for its width.
-_SHAPES = (0.6, 3.0)
 
 
-def muscle_colours(names: list[str]) -> dict[str, str]:
-    """Dict of muscle name to its colour in pictures."""
-    return {name: MUSCLE_COLOURS[k % len(MUSCLE_COLOURS)] for k, name in enumerate(names)}
-
-
-def line_colours(names: dict[str, Any] | list[str]) -> dict[str, str]:
-    """Dict of muscle name to its colour in plots."""
-    return {name: LINE_COLOURS[k % len(LINE_COLOURS)] for k, name in enumerate(names)}
-
-
-def neighbour_colours(saved: Any) -> dict[str, str]:
-    """Dict of muscle name to its colour; of many muscles those that lie next to each other differ."""
-    from scipy.spatial import cKDTree
-
-    plain = muscle_colours(saved.muscles)
-    if len(plain) <= len(MUSCLE_COLOURS):
-        return plain
-    trees = {}
-    for name in saved.muscles:
-        points = saved.surface(name, saved.frames[0])[0]
-        trees[name] = cKDTree(points[:: max(1, len(points) // 600)])
-    size = float(np.linalg.norm(np.ptp(np.concatenate([tree.data for tree in trees.values()]), axis=0)))
-    near: dict[str, set[str]] = {name: set() for name in trees}
-    for one, two in itertools.combinations(trees, 2):
-        if trees[one].count_neighbors(trees[two], NEXT_TO * size):
-            near[one].add(two)
-            near[two].add(one)
-    found: dict[str, str] = {}
-    for name in sorted(near, key=lambda name: -len(near[name])):
-        taken = [found[other] for other in near[name] if other in found]
-        found[name] = min(
-            MUSCLE_COLOURS, key=lambda colour: (taken.count(colour), list(found.values()).count(colour))
-        )
-    return {name: found[name] for name in saved.muscles}
-
-
-def aim_camera(camera: Any, direction: Any, bounds: Any, size: tuple[int, int]) -> None:
-    """Let a camera look along a direction, in a parallel projection that holds a box.
+def muscle_groups(info: Mapping[str, Any]) -> dict[str, str]:
+    """Group of each muscle by the joints that it crosses.
 
     Parameters
     ----------
-    camera : pyvista.Camera
-    direction : (3,) sequence of float
-        From the box to the camera.
-    bounds : (2, 3) ndarray
-    size : (width, height)
-        Of the view [pixel].
+    info : dict
+        What ``run.json`` holds. Joints that carry a single bone without another joint (a patella, a tendon's end) are
+        left out; a muscle that crosses no other belongs to the bone that it lies along.
     """
-    centre = bounds.mean(axis=0)
-    corners, ahead, up = _projected(direction, bounds)
-    wide, tall = np.ptp(corners, axis=0) / 2
-    wide *= size[1] / size[0]
-    camera.focal_point = centre
-    camera.position = centre + ahead * 4.0 * np.linalg.norm(bounds[1] - bounds[0])
-    camera.up = up
-    camera.parallel_projection = True
-    camera.parallel_scale = 1.04 * max(tall, wide)
+    joints = info["scene"].get("joints", [])
+    above = {joint["child"]: joint for joint in joints}
+    carrying = {joint["parent"] for joint in joints}
+
+    def chain(bone: str) -> list[str]:
+        found = []
+        while bone in above and bone not in found:
+            found.append(bone)
+            bone = above[bone]["parent"]
+        return [*found, bone]
+
+    groups = {}
+    for muscle in info["scene"]["muscles"]:
+        chains = [chain(part["bone"]) for part in muscle.get("attach", [])]
+        crossed = {bone for one in chains for bone in one if any(bone not in other for other in chains)}
+        names = [joint["name"] for joint in joints if joint["child"] in crossed & carrying]
+        if len(joints) == 1 and crossed:
+            names = [joints[0]["name"]]
+        shared = [bone for bone in (chains[0] if chains else []) if all(bone in one for one in chains)]
+        groups[muscle["name"]] = f"across {', '.join(names)}" if names else f"along {(shared or ['?'])[0]}"
+    return groups
 
 
-def _projected(direction, bounds):
-    """Corners of a box (8, 2) as a view sees them, to the right and up; the view's direction, and up."""
-    ahead = np.asarray(direction) / np.linalg.norm(direction)
-    right = np.cross([0.0, 0.0, 1.0], ahead)
-    right /= np.linalg.norm(right)
-    up = np.cross(ahead, right)
-    corners = np.array([[x, y, z] for x in bounds[:, 0] for y in bounds[:, 1] for z in bounds[:, 2]])
-    return (corners - bounds.mean(axis=0)) @ np.stack([right, up], axis=1), ahead, up
-
-
-def fitted_size(bounds: Any, views: Any, size: Any) -> tuple[int, int]:
-    """A panel as large as asked for, in the proportions of what it shows.
+def muscle_colours(names: Sequence[str], groups: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Dict of muscle name to its colour in pictures and plots; of many muscles a hue for each group.
 
     Parameters
     ----------
-    bounds : (2, 3) ndarray
-    views : sequence of str
-    size : (width, height)
-        Pixels.
+    names : sequence of str
+    groups : dict of str to str, optional
+        From `muscle_groups`.
     """
-    spans = [np.ptp(_projected(VIEWS[view][0], bounds)[0], axis=0) for view in views]
-    wide, tall = np.max(spans, axis=0)
-    shape = float(np.clip(tall / max(wide, 1e-12), *_SHAPES))
-    area = float(size[0] * size[1])
-    # Even numbers: films ask for them.
-    return 2 * round(0.5 * (area / shape) ** 0.5), 2 * round(0.5 * (area * shape) ** 0.5)
+    if groups is None or len(names) <= len(MUSCLE_COLOURS):
+        return {name: MUSCLE_COLOURS[k % len(MUSCLE_COLOURS)] for k, name in enumerate(names)}
+    kinds = list(dict.fromkeys(groups[name] for name in names))
+    found, seen = {}, dict.fromkeys(kinds, 0)
+    for name in names:
+        kind = groups[name]
+        hue = MUSCLE_COLOURS[kinds.index(kind) % len(MUSCLE_COLOURS)]
+        found[name] = mixed_colour(hue, _SHADES[seen[kind] % len(_SHADES)])
+        seen[kind] += 1
+    return found
+
+
+def mixed_colour(colour: str, share: float) -> str:
+    """A colour brought nearer to white (share above 0) or to black (below)."""
+    values = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+    end = 255 if share > 0 else 0
+    return "#" + "".join(f"{round(value + abs(share) * (end - value)):02x}" for value in values)
+
+
+def rgb(colour: str) -> Floats:
+    """Red, green and blue (3,) of a colour like "#cc6677", 0 to 1."""
+    return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255.0
+
+
+def motion_direction(poses: Sequence[Mapping[str, Floats]]) -> Floats:
+    """Direction (3,) from which the motion is seen in its plane: along the axis about which a bone turns most.
+
+    Parameters
+    ----------
+    poses : sequence of dict of str to (4, 4) ndarray
+        Of each frame, by bone. From the side where no bone turns, or about an axis that is nearly upright.
+    """
+    usual = np.array(VIEWS["side"][0])
+    widest, axis = np.radians(2.0), usual
+    for bone, start in poses[0].items():
+        for pose in poses[1:]:
+            turn = pose[bone][:3, :3] @ start[:3, :3].T
+            skew = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+            angle = float(np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0)))
+            if angle > widest and np.linalg.norm(skew) > 1e-9:
+                widest, axis = angle, skew / np.linalg.norm(skew)
+    if abs(axis[2]) > 0.8:
+        return usual
+    return axis if axis @ usual > 0 or (axis @ usual == 0 and axis[1] < 0) else -axis

@@ -1,8 +1,7 @@
-"""A moving run as one page that turns and scrubs in a browser: the animated glTF and what draws it, no network.
+"""Moving runs as data that a script in a page turns, scrubs and switches on and off; no network.
 
-The viewer is three.js with its glTF loader and trackball controls, as trimesh carries them in its own template for
-notebooks; trimesh is needed anyway, so nothing more is installed. What is ours is the bar below: a slider over the
-frames, a button that plays them, and a box for each muscle and bone.
+Positions are whole numbers of `Packer.step`, kept as second differences along the frames and first differences along
+the vertices; all arrays follow each other in one deflated stream, their bytes sorted by place, as base64.
 """
 
 from __future__ import annotations
@@ -10,170 +9,144 @@ from __future__ import annotations
 import base64
 import html
 import json
-import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
 from importlib import resources
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-from rbfmuscle.output.animation.gltf import animated_glb
-from rbfmuscle.output.animation.moving import FRAMES_A_SECOND, MovingRun
-from rbfmuscle.validation import MissingPartError
+import numpy as np
 
-# Where the library ends and the page of trimesh's own begins.
-_BEGIN, _END = "<script>", "THREE.GLTFLoader=GLTFLoader;})();"
-_CLOSING = "</script"
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.output.animation.moving import FRAMES_A_SECOND, MovingMuscle, MovingRun
 
-_PAGE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>
-html,body{{margin:0;height:100%;overflow:hidden;background:#fbfaf8;color:#26282b;
-font:15px/1.4 system-ui,"Segoe UI",Helvetica,Arial,sans-serif}}
-#view{{position:absolute;inset:0 0 76px 0}}
-#bar{{position:absolute;left:0;right:0;bottom:0;height:76px;box-sizing:border-box;padding:8px 16px;background:#fff;
-border-top:1px solid #e5e3de}}
-#row{{display:flex;gap:14px;align-items:center}}
-#frame{{flex:1}}
-#caption{{min-width:22ch;font-variant-numeric:tabular-nums}}
-#names{{display:flex;flex-wrap:nowrap;gap:14px;overflow-x:auto;font-size:13.5px;white-space:nowrap;padding-top:6px}}
-#names i{{display:inline-block;width:11px;height:11px;border-radius:3px;margin:0 4px 0 2px}}
-#view p{{padding:24px;max-width:70ch}}
-button{{font:inherit;min-width:6ch;padding:3px 10px}}
-</style>
-</head>
-<body>
-<div id="view"></div>
-<div id="bar"><div id="row"><button id="play" type="button">Play</button>
-<input id="frame" type="range" min="0" max="{last}" value="0" step="1" aria-label="frame">
-<span id="caption"></span></div><div id="names"></div></div>
-<script id="told" type="application/json">{told}</script>
-<script id="model" type="model/gltf-binary;base64">{model}</script>
-<script>{library}</script>
-<script>{script}</script>
-</body>
-</html>
-"""
+# Whole numbers of which the longest side of all that moves has so many: 0.03 mm of 900.
+_STEPS = 30_000
 
-_SCRIPT = """
-(function(){
-"use strict";
-const told=JSON.parse(document.getElementById("told").textContent);
-const view=document.getElementById("view"),slider=document.getElementById("frame");
-const caption=document.getElementById("caption"),play=document.getElementById("play");
-function fail(error){const p=document.createElement("p");
-p.textContent="This page needs WebGL 2 to draw: "+error;view.append(p);}
-function bytes(){const text=atob(document.getElementById("model").textContent.trim());
-const found=new Uint8Array(text.length);
-for(let k=0;k<text.length;k++)found[k]=text.charCodeAt(k);return found.buffer;}
-let renderer;
-try{renderer=new THREE.WebGLRenderer({antialias:true});}catch(error){fail(error);return;}
-const scene=new THREE.Scene(),camera=new THREE.PerspectiveCamera(30,1,0.001,1000);
-scene.background=new THREE.Color(0xfbfaf8);
-scene.add(new THREE.HemisphereLight(0xffffff,0xb8b0a8,0.55));
-const light=new THREE.DirectionalLight(0xffffff,0.75);scene.add(light);
-renderer.outputEncoding=THREE.sRGBEncoding;
-renderer.setPixelRatio(window.devicePixelRatio);
-view.append(renderer.domElement);
-const controls=new THREE.TrackballControls(camera,renderer.domElement);
-controls.rotateSpeed=2.5;controls.dynamicDampingFactor=0.25;
-function draw(){light.position.copy(camera.position);renderer.render(scene,camera);}
-function fit(){const w=view.clientWidth||1,h=view.clientHeight||1;camera.aspect=w/h;
-camera.updateProjectionMatrix();renderer.setSize(w,h);controls.handleResize();draw();}
-new THREE.GLTFLoader().parse(bytes(),"",function(gltf){
-scene.add(gltf.scene);
-const actions=[],mixer=new THREE.AnimationMixer(gltf.scene);
-gltf.animations.forEach(function(clip){const action=mixer.clipAction(clip);action.play();actions.push(action);});
-const box=new THREE.Box3().setFromObject(gltf.scene),ball=box.getBoundingSphere(new THREE.Sphere());
-controls.target.copy(ball.center);
-const away=1.15*ball.radius/Math.sin(0.5*camera.fov*Math.PI/180);
-camera.position.copy(ball.center).add(new THREE.Vector3(0.45,0.12,0.88).normalize().multiplyScalar(away));
-camera.near=0.01*away;camera.far=10*away;
-function show(k){actions.forEach(function(action){action.time=told.times[k];});mixer.update(0);
-caption.textContent=told.captions[k];draw();}
-slider.oninput=function(){show(Number(slider.value));};
-let started=null,from=0;
-play.onclick=function(){if(started!==null){started=null;play.textContent="Play";return;}
-play.textContent="Stop";started=performance.now();from=Number(slider.value);};
-function step(now){requestAnimationFrame(step);controls.update();
-if(started!==null){const last=told.times.length-1;
-const k=(from+Math.floor((now-started)/1000*told.rate))%(last+1);
-if(k!==Number(slider.value)){slider.value=k;show(k);}}}
-controls.addEventListener("change",draw);
-const names=document.getElementById("names");
-told.parts.forEach(function(part){let node=null;
-gltf.scene.traverse(function(one){if(one.userData.name===part.name&&!node)node=one;});
-const label=document.createElement("label"),box=document.createElement("input"),dot=document.createElement("i");
-box.type="checkbox";box.checked=true;dot.style.background=part.colour;
-box.onchange=function(){node.visible=box.checked;draw();};
-label.append(box,dot,part.name);names.append(label);});
-window.addEventListener("resize",fit);
-fit();show(0);requestAnimationFrame(step);
-window.rbfmuscle={scene:gltf.scene,show:show,frames:told.times.length};
-},fail);
-})();
+_PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">
+<title>{title}</title><style>
+html,body{{margin:0;height:100%;font:15px/1.4 system-ui,"Segoe UI",Helvetica,Arial,sans-serif;color:#26282b}}
+.scene{{height:100%}}{style}</style></head>
+<body><div class="scene" data-scene="scene"></div>
+<script id="scene" type="application/json">{data}</script><script>{script}</script></body></html>
 """
 
 
-def write_animated_page(path: Path, run: MovingRun, captions: list[str]) -> None:
+def write_animated_page(
+    path: Path, run: MovingRun, captions: list[str], direction: Floats | None = None
+) -> None:
     """Write a run as one ``.html`` file that needs nothing else.
 
     Parameters
     ----------
     path : pathlib.Path
     run : MovingRun
-        In metres.
     captions : list of str
-        What is said of each frame.
-
-    Raises
-    ------
-    UsageError
-        If a muscle's surface has other vertices in other frames.
-    MissingPartError
-        If the trimesh that is installed brings no viewer.
+        Of each frame.
+    direction : (3,) ndarray, optional
+        From which it is first seen.
     """
-    library = viewer_library()
-    times = [float(t) for t in run.times - run.times[0]]
-    shown: list[Any] = [*run.muscles, *run.bones]
-    parts = [
-        {"name": part.name, "colour": "#" + "".join(f"{round(255 * float(c)):02x}" for c in part.colour)}
-        for part in shown
-    ]
-    told = {"times": times, "captions": captions, "parts": parts, "rate": FRAMES_A_SECOND / 2.0}
+    data = pack_runs({"": run}, captions, direction=direction)
     page = _PAGE.format(
-        title=html.escape(run.name),
-        last=len(times) - 1,
-        # No name may end the script that holds it.
-        told=json.dumps(told).replace("<", "\\u003c"),
-        model=base64.b64encode(animated_glb(run, "html")).decode("ascii"),
-        library=library,
-        script=_SCRIPT,
+        title=html.escape(run.name), data=data, script=scene_file("scene.js"), style=scene_file("scene.css")
     )
     path.write_text(page, encoding="utf-8")
 
 
-def viewer_library() -> str:
-    """three.js with a loader of glTF and trackball controls, as one script.
+def scene_file(name: str) -> str:
+    """The script or style that shows what `pack_runs` packs: ``scene.js``, ``scene.css``."""
+    return (resources.files("rbfmuscle.output.animation") / name).read_text(encoding="utf-8")
 
-    Raises
-    ------
-    MissingPartError
-        If the trimesh that is installed does not bring it.
+
+def pack_runs(
+    runs: Mapping[str, MovingRun],
+    captions: list[str],
+    *,
+    direction: Floats | None = None,
+    groups: Mapping[str, str] | None = None,
+    colours: Mapping[str, str] | None = None,
+) -> str:
+    """JSON of one or several runs of the same frames and bones, which ``scene.js`` shows beside each other.
+
+    Parameters
+    ----------
+    runs : dict of str to MovingRun
+        By what stands above each.
+    captions : list of str
+        Of each frame.
+    direction : (3,) ndarray, optional
+        From which they are first seen.
+    groups, colours : dict of str to str, optional
+        Of each muscle; the colours of the runs where not given.
     """
-    try:
-        packed = (resources.files("trimesh.resources") / "templates" / "viewer.zip").read_bytes()
-        with zipfile.ZipFile(BytesIO(packed)) as archive:
-            template = archive.read("viewer.html.template").decode("utf-8")
-        start = template.index(_BEGIN) + len(_BEGIN)
-        library = template[start : template.index(_END, start) + len(_END)]
-    except (OSError, KeyError, ValueError, ModuleNotFoundError, zipfile.BadZipFile):
-        raise MissingPartError(
-            "export to html takes its viewer from trimesh, and the version installed brings none that is known; "
-            "pip install 'trimesh>=4.6.4,<6', or export to animated-glb"
-        ) from None
-    # A script must not hold its own closing tag.
-    return library.replace(_CLOSING, "<\\/script")
+    first = next(iter(runs.values()))
+    packer = _Packer(runs)
+    parts: list[dict[str, Any]] = []
+    for panel, run in enumerate(runs.values()):
+        for muscle in run.muscles:
+            part = {"name": muscle.name, "panel": panel, "pieces": list(_pieces(packer, muscle))}
+            part["colour"] = (colours or {}).get(muscle.name) or _hex(muscle.colour)
+            parts.append(part | {"group": (groups or {}).get(muscle.name, "")})
+    for bone in first.bones:
+        piece = packer.piece([bone.vertices], bone.faces)
+        poses = bone.poses[:, :3].round(6) if bone.moves else bone.poses[:1, :3].round(6)
+        parts.append(
+            {
+                "name": bone.name,
+                "panel": -1,
+                "pieces": [piece],
+                "colour": _hex(bone.colour),
+                "poses": poses.reshape(len(poses), 12).tolist(),
+            }
+        )
+    facts = {
+        "panels": list(runs), "captions": captions, "parts": parts, "direction": list(direction or (-1.0, -0.12, 0.12))
+        if direction is None else [float(x) for x in direction], "up": first.up, "step": packer.step,
+        "origin": packer.origin.tolist(), "rate": FRAMES_A_SECOND / 2.0, "bytes": packer.text(),
+    }  # fmt: skip
+    # No name may end the script that holds it.
+    return json.dumps(facts, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def _pieces(packer: _Packer, muscle: MovingMuscle) -> Iterator[dict[str, int]]:
+    """Runs of frames of a muscle that have the same triangles."""
+    start = 0
+    for k in range(1, len(muscle.vertices) + 1):
+        if k == len(muscle.vertices) or muscle.faces[k] is not muscle.faces[start]:
+            yield packer.piece(muscle.vertices[start:k], muscle.faces[start])
+            start = k
+
+
+def _hex(colour: Floats) -> str:
+    return "#" + "".join(f"{round(255 * float(part)):02x}" for part in colour)
+
+
+class _Packer:
+    """Arrays on their way into one stream."""
+
+    def __init__(self, runs: Mapping[str, MovingRun]) -> None:
+        sets = [part.vertices for run in runs.values() for part in run.bones]
+        sets += [points for run in runs.values() for part in run.muscles for points in part.vertices]
+        low = np.min([points.min(axis=0) for points in sets], axis=0)
+        high = np.max([points.max(axis=0) for points in sets], axis=0)
+        self.origin, self.step = low, float((high - low).max()) / _STEPS or 1.0
+        self.parts: list[bytes] = []
+
+    def piece(self, frames: list[Floats], faces: Integers) -> dict[str, int]:
+        """Take in the points of some frames and their triangles; how many there are of each."""
+        whole = np.rint((np.asarray(frames) - self.origin) / self.step).astype(np.int32)
+        for axis, times in ((0, 2), (1, 1)):
+            for _ in range(times):
+                whole = np.diff(whole, axis=axis, prepend=0)
+        self._add(whole.astype("<i2"))
+        self._add(np.diff(np.asarray(faces, dtype="<i4").ravel(), prepend=0).astype("<i4"))
+        return {"frames": len(frames), "points": len(frames[0]), "faces": len(faces)}
+
+    def _add(self, values: Integers) -> None:
+        places = np.frombuffer(values.tobytes(), dtype=np.uint8).reshape(-1, values.itemsize)
+        self.parts.append(places.T.tobytes())
+
+    def text(self) -> str:
+        """All of it, deflated, as base64."""
+        return base64.b64encode(zlib.compress(b"".join(self.parts), 7)).decode("ascii")

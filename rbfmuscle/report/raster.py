@@ -1,0 +1,129 @@
+"""Triangles as a picture: a depth buffer in memory, so that drawing needs neither graphics nor a display."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.surfaces import vertex_normals
+from rbfmuscle.jit import compiled
+
+# Each pixel is the mean of so many by so many.
+_FINER = 2
+_MARGIN = 0.05
+
+
+class Solid(NamedTuple):
+    """What is drawn: vertices (n, 3), faces (m, 3), colour (3,) or (n, 3) from 0 to 1, and opacity from 0 to 1."""
+
+    vertices: Floats
+    faces: Integers
+    colour: Floats
+    opacity: float = 1.0
+
+
+class Camera(NamedTuple):
+    """A parallel projection: ``axes`` (3, 3) are right, up and towards the camera; ``scale`` is pixels per unit."""
+
+    axes: Floats
+    centre: Floats
+    scale: float
+    size: tuple[int, int]
+
+    def project(self, points: Floats) -> Floats:
+        """Pixel to the right, pixel downwards and distance towards the camera of points (n, 3)."""
+        found = (points - self.centre) @ self.axes.T
+        found[:, 0] = 0.5 * self.size[0] + self.scale * found[:, 0]
+        found[:, 1] = 0.5 * self.size[1] - self.scale * found[:, 1]
+        return found
+
+
+def view_axes(direction: Sequence[float] | Floats) -> Floats:
+    """Right, up and towards the camera (3, 3), seen from a direction with z up."""
+    ahead = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
+    right = np.cross([0.0, 0.0, 1.0], ahead)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(ahead, right), ahead])
+
+
+def aim(direction: Sequence[float] | Floats, points: Floats, size: tuple[int, int]) -> Camera:
+    """A camera that sees all points (n, 3) from a direction, as large as a picture of ``size`` holds them."""
+    axes = view_axes(direction)
+    seen = points @ axes.T
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    wide, tall, _ = np.maximum(high - low, 1e-9)
+    scale = (1.0 - 2.0 * _MARGIN) * min(size[0] / wide, size[1] / tall)
+    return Camera(axes, 0.5 * (low + high) @ axes, float(scale), size)
+
+
+def fitted_size(direction: Sequence[float] | Floats, points: Floats, area: float) -> tuple[int, int]:
+    """Width and height of so many pixels, in the proportions of what is seen; even numbers, as films ask for."""
+    wide, tall, _ = np.maximum(np.ptp(points @ view_axes(direction).T, axis=0), 1e-9)
+    shape = float(np.clip(tall / wide, 0.6, 2.2))
+    return 2 * round(0.5 * (area / shape) ** 0.5), 2 * round(0.5 * (area * shape) ** 0.5)
+
+
+def draw_solids(solids: Sequence[Solid], camera: Camera, background: Floats) -> Integers:
+    """Picture (h, w, 3) of uint8; of solids that are not opaque the nearest one is seen, over all that are."""
+    fine = camera._replace(scale=camera.scale * _FINER, size=(_FINER * camera.size[0], _FINER * camera.size[1]))
+    depth, image = _layer([solid for solid in solids if solid.opacity >= 1.0], fine, background)
+    veils = [solid for solid in solids if solid.opacity < 1.0]
+    if veils:
+        over, veil = _layer(veils, fine, background)
+        share = np.where(over > depth, veil[..., 3], 0.0)[..., None]
+        image = (1.0 - share) * image + share * veil
+    height, width = camera.size[1], camera.size[0]
+    mean = image[..., :3].reshape(height, _FINER, width, _FINER, 3).mean(axis=(1, 3))
+    return np.round(255.0 * np.clip(mean, 0.0, 1.0)).astype(np.uint8)
+
+
+def _layer(solids: Sequence[Solid], camera: Camera, background: Floats) -> tuple[Floats, Floats]:
+    """Depth (h, w) and colour with opacity (h, w, 4) of what is nearest."""
+    depth = np.full(camera.size[::-1], -np.inf, dtype=np.float32)
+    image = np.empty((*depth.shape, 4), dtype=np.float32)
+    image[:] = [*background, 1.0]
+    for solid in solids:
+        shades = np.empty((len(solid.vertices), 4))
+        shades[:, :3], shades[:, 3] = _shaded(solid, camera.axes), solid.opacity
+        _raster_loop(camera.project(solid.vertices), shades, solid.faces.astype(np.int64), depth, image)
+    return depth, image
+
+
+def _shaded(solid: Solid, axes: Floats) -> Floats:
+    """Colours (n, 3) in the light of a lamp up and left of the camera."""
+    normals = vertex_normals(solid.vertices, solid.faces)
+    lamp = np.array([-0.35, 0.45, 1.0]) @ axes
+    lamp /= np.linalg.norm(lamp)
+    half = lamp + axes[2]
+    facing = np.clip(normals @ lamp, 0.0, 1.0)[:, None]
+    gloss = np.clip(normals @ (half / np.linalg.norm(half)), 0.0, 1.0)[:, None] ** 24
+    return solid.colour * (0.42 + 0.62 * facing) + 0.1 * gloss
+
+
+@compiled
+def _raster_loop(points, shades, faces, depth, image):
+    height, width = depth.shape
+    for f in range(len(faces)):
+        a, b, c = points[faces[f, 0]], points[faces[f, 1]], points[faces[f, 2]]
+        area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        if area == 0.0:
+            continue
+        left, right = max(0.0, min(a[0], b[0], c[0])), min(width - 1.0, max(a[0], b[0], c[0]))
+        top, bottom = max(0.0, min(a[1], b[1], c[1])), min(height - 1.0, max(a[1], b[1], c[1]))
+        for y in range(int(np.ceil(top)), int(np.floor(bottom)) + 1):
+            for x in range(int(np.ceil(left)), int(np.floor(right)) + 1):
+                u = ((b[0] - x) * (c[1] - y) - (b[1] - y) * (c[0] - x)) / area
+                v = ((c[0] - x) * (a[1] - y) - (c[1] - y) * (a[0] - x)) / area
+                w = 1.0 - u - v
+                if u < 0.0 or v < 0.0 or w < 0.0:
+                    continue
+                z = u * a[2] + v * b[2] + w * c[2]
+                if z > depth[y, x]:
+                    depth[y, x] = z
+                    for k in range(4):
+                        image[y, x, k] = (
+                            u * shades[faces[f, 0], k] + v * shades[faces[f, 1], k] + w * shades[faces[f, 2], k]
+                        )
