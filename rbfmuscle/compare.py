@@ -31,12 +31,19 @@ if TYPE_CHECKING:
 
 # The motion is repeated with steps this many times as long.
 COARSER = 5
+# After a model's name: solved until it no longer changes.
+CONVERGED = "-converged"
+_SETTLED = {"model.iterations": 600}
+NAMES = {"rbf": "RBF", "pbd": "PBD", "pbd-paper": "PBD of the paper", "xpbd": "XPBD"}
+_PAPER_SWEEPS = 3
+# Beside the mesh model of few sweeps the same one converged.
+DEFAULT = ("rbf", "pbd", "pbd-converged", *(name for name in COMPARED if name not in ("rbf", "pbd")))
 
 
 def compare_models(
     scene: Scene,
     directory: str | Path,
-    models: Sequence[str] = COMPARED,
+    models: Sequence[str] = DEFAULT,
     *,
     frames: Any = None,
     settings: dict[str, Any] | None = None,
@@ -52,7 +59,8 @@ def compare_models(
         Takes ``comparison.json``, ``comparison.csv``, ``report.html``, ``models.webp`` and for each model a
         folder that holds its run.
     models : list of str
-        Distances are measured to the first. One that cannot be solved is left out, and named in the tables.
+        Distances are measured to the first. A mesh model with "-converged" after its name is solved until it no
+        longer changes. One that cannot be solved is left out, and named in the tables.
     frames : slice or str, optional
         Frames of the motion, a slice or "A:B:S".
     settings : dict, optional
@@ -75,8 +83,6 @@ def compare_models(
         If the scene cannot be simulated.
     SolveError
         If no model could be solved.
-    MissingPartError
-        If there are no graphics to draw with; everything else is written.
 
     Examples
     --------
@@ -101,15 +107,26 @@ def compare_models(
         raise SolveError("; ".join(f"{name}: {reason}" for name, reason in failed.items()))
     with stage("distances between models"):
         matrix = add_distances(results, folder, poses)
-    table = write_tables(folder, next(iter(variants.values())), results, failed, matrix, poses)
+    labels = {name: _label(name, variant) for name, variant in variants.items()}
+    first = next(iter(variants.values()))
+    table = write_tables(folder, first, results, failed, labels=labels, matrix=matrix, poses=poses)
 
     from rbfmuscle.report.comparison_page import write_page
 
     with stage("drawing pictures" if pictures else "writing the report"):
-        missing = write_page(folder, table, pictures=pictures)
-    if missing is not None:
-        raise missing
+        write_page(folder, table, pictures=pictures)
     return table
+
+
+def _label(name: str, scene: Scene) -> str:
+    """What a model is called, from the settings that it ran with."""
+    base = name.removesuffix(CONVERGED)
+    title, sweeps = NAMES.get(base, base), scene.muscles[0].options.get("iterations", 0)
+    if name != base:
+        return f"{title}, converged"
+    if base == "pbd" and sweeps in (0, _PAPER_SWEEPS):
+        return f"{title}, {_PAPER_SWEEPS} sweeps as in the paper"
+    return f"{title}, {sweeps} sweeps" if sweeps and base != "rbf" else title
 
 
 def _variants(scene, models, settings):
@@ -117,22 +134,23 @@ def _variants(scene, models, settings):
     if len(models) < 2 or len(set(models)) < len(models):
         raise UsageError(f"give two or more different models, got {', '.join(models) or 'none'}")
     for name in models:
-        check_model_name(name)
+        base = check_model_name(name.removesuffix(CONVERGED))
+        if base == "rbf" and name != base:
+            raise UsageError(f"{name}: only mesh models have sweeps; give rbf")
     for key in settings:
         model = key.rpartition(":")[0]
         if model and model not in models:
             raise UsageError(f"{key}: model {model!r} is not compared; models: {', '.join(models)}")
     variants = {}
     for name in models:
-        mine = {
-            key.rpartition(":")[2]: value
-            for key, value in settings.items()
-            if key.rpartition(":")[0] in ("", name)
-        }
+        mine = dict(_SETTLED) if name.endswith(CONVERGED) else {}
+        for key, value in settings.items():
+            if key.rpartition(":")[0] in ("", name):
+                mine[key.rpartition(":")[2]] = value
         # As in the scene file, a model given for all is the model whose settings these are; each then takes its turn.
         whole = {key: value for key, value in mine.items() if chooses_model(key)}
         own = {key: value for key, value in mine.items() if not chooses_model(key)}
-        variant = configure_scene(scene, whole).with_options(model=name)
+        variant = configure_scene(scene, whole).with_options(model=name.removesuffix(CONVERGED))
         variant = configure_scene(variant, own).validate()
         variant.output = OutputOptions(report=False, preview=False)
         variants[name] = variant

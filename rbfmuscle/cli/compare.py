@@ -47,7 +47,8 @@ def compare(
     output
         Folder for the results; each model's run is in a folder of its own there.
     models
-        Names with commas between; distances are measured to the first. All models by default.
+        Names with commas between; distances are measured to the first. A mesh model with "-converged" after its
+        name is solved until it no longer changes. All models, and pbd-converged, by default.
     settings
         KEY=VALUE as for run, for all models; MODEL:KEY=VALUE for one. May be repeated.
     frames
@@ -58,12 +59,11 @@ def compare(
         Print JSON and nothing else.
     """
     from rbfmuscle import interruption
-    from rbfmuscle.compare import compare_models
-    from rbfmuscle.models import COMPARED
+    from rbfmuscle.compare import DEFAULT, compare_models
     from rbfmuscle.output.writer import json_text
     from rbfmuscle.scene.settings import parse_settings
 
-    names = [name.strip() for name in models.split(",") if name.strip()] if models else list(COMPARED)
+    names = [name.strip() for name in (models or "").split(",") if name.strip()] or list(DEFAULT)
     changes = parse_settings(settings)
     with Progress("compare") as progress, interruption.keeping(lambda: output.exists()):
 
@@ -103,4 +103,5 @@ def _print_table(table, output):
             texts = ("-" if value is None else f"{value:.3g}" for value in cells)
             unit = table["measures"][quantity]["unit"]
             print(f"{quantity:{width}}" + "".join(f"{text:>18}" for text in texts) + f"  {unit}")
+    print(table["answer"])
     print(f"{table['frames']} frames, in {output}, open {output / 'report.html'}")

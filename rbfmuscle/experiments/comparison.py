@@ -22,8 +22,17 @@ if TYPE_CHECKING:
     from rbfmuscle.simulation.frame import Frame, MuscleModel
 
 
-FORMAT = 1
+FORMAT = 2
 LAW, MESH, OWN, FIRST, COST = "law", "input mesh", "own run", "first model", "cost"
+AGAINST = {
+    LAW: "a law",
+    MESH: "the input mesh",
+    OWN: "the run itself",
+    FIRST: "the first model",
+    COST: "what it costs",
+}
+# A model keeps out of bones that is no deeper in one [mm].
+KEPT_OUT = 0.3
 
 
 class Measure(NamedTuple):
@@ -42,68 +51,30 @@ class Measure(NamedTuple):
 
 
 MEASURES = {
-    "volume_error": Measure("volume error", "1", LAW, 1e-5, "worst frame, relative to the input mesh"),
-    "penetration_max": Measure(
-        "surface in a bone", "length", LAW, 0.02, "deepest surface vertex in a bone, worst frame"
-    ),
-    "bone_penetration_max": Measure(
-        "bone in the muscle", "length", LAW, 0.02, "deepest bone vertex in the muscle, worst frame"
-    ),
-    "solver_penetration_max": Measure(
-        "model in a bone before the cut",
-        "length",
-        LAW,
-        0.02,
-        "deepest point of the model, before bones are cut away",
-    ),
+    "volume_error": Measure("volume error", "1", LAW, 1e-5, "relative to the input mesh"),
+    "penetration_max": Measure("surface in a bone", "length", LAW, 0.02, "deepest surface vertex in a bone"),
+    "bone_penetration_max": Measure("bone in the muscle", "length", LAW, 0.02, "deepest bone vertex in it"),
+    "solver_penetration_max": Measure("in a bone before the cut", "length", LAW, 0.02, "deepest point of the model"),
     "components": Measure("pieces", "1", LAW, 0.0, "connected pieces of the surface, most in any frame"),
-    "euler": Measure(
-        "Euler characteristic", "1", LAW, 0.0, "2 for a sphere, two less for a handle; worst frame", 2.0
-    ),
-    "self_crossing": Measure(
-        "self-crossing", "1", LAW, 0.0, "triangles that cross others of the surface, worst frame"
-    ),
-    "flicker_rms": Measure(
-        "flicker (RMS)", "length", LAW, 0.01, "surface against carried mesh, frame to frame"
-    ),
+    "euler": Measure("Euler characteristic", "1", LAW, 0.0, "2 for a sphere, two less for a handle", 2.0),
+    "self_crossing": Measure("self-crossing", "1", LAW, 0.0, "triangles that cross others of the surface"),
+    "flicker_rms": Measure("flicker (RMS)", "length", LAW, 0.01, "surface against carried mesh, frame to frame"),
     "flicker_max": Measure("flicker (greatest)", "length", LAW, 0.05, "the same, greatest"),
-    "tunnelled": Measure("tunnelled points", "1", LAW, 0.0, "points beyond a bone, worst frame"),
-    "return_rms": Measure(
-        "return error (RMS)", "length", LAW, 0.02, "first pose before and after the motion there and back"
-    ),
+    "tunnelled": Measure("tunnelled points", "1", LAW, 0.0, "points beyond a bone"),
+    "return_rms": Measure("return error (RMS)", "length", LAW, 0.02, "first pose before and after the motion"),
     "return_max": Measure("return error (greatest)", "length", LAW, 0.1, "the same, greatest distance"),
-    "step_rms": Measure(
-        "step dependence (RMS)",
-        "length",
-        LAW,
-        0.02,
-        "last pose by the scene's steps and by five times coarser",
-    ),
+    "step_rms": Measure("step dependence (RMS)", "length", LAW, 0.02, "last pose by the scene's steps and coarser"),
     "step_max": Measure("step dependence (greatest)", "length", LAW, 0.1, "the same, greatest distance"),
     "rest_error_rms": Measure("rest error (RMS)", "length", MESH, 0.02, "surface to input mesh at rest"),
     "rest_error_max": Measure("rest error (greatest)", "length", MESH, 0.1, "the same, greatest distance"),
-    "strain_rms": Measure(
-        "strain", "1", OWN, 0.002, "edges between the same 1200 material points for all models, worst frame"
-    ),
-    "curvature_variation": Measure(
-        "curvature variation",
-        "1/length",
-        OWN,
-        0.0,
-        "unevenness of mean curvature among neighbours, worst pose",
-    ),
-    "distance_rms": Measure(
-        "distance (RMS)", "length", FIRST, 0.0, "to the first model's surface, worst pose"
-    ),
+    "strain_rms": Measure("strain", "1", OWN, 0.002, "edges between the same 1200 material points of all models"),
+    "curvature_variation": Measure("curvature variation", "1/length", OWN, 0.0, "mean curvature among neighbours"),
+    "distance_rms": Measure("distance (RMS)", "length", FIRST, 0.0, "to the first model's surface, worst pose"),
     "distance_max": Measure("distance (greatest)", "length", FIRST, 0.0, "the same, greatest distance"),
-    "time_frame": Measure(
-        "time a frame (median)", "s", COST, 0.0, "wall time, all muscles, surfaces included"
-    ),
-    "time_frame_p95": Measure("time a frame (95 %)", "s", COST, 0.0, "the same, exceeded by one frame in 20"),
-    "time_solve": Measure(
-        "solution", "s", COST, 0.0, "prediction, solution, contacts; median, summed over muscles"
-    ),
-    "time_surface": Measure("surface", "s", COST, 0.0, "fit and extraction; median, summed over muscles"),
+    "time_frame": Measure("time per frame", "s", COST, 0.0, "median of all muscles together, surfaces included"),
+    "time_frame_p95": Measure("time per frame (95 %)", "s", COST, 0.0, "the same, exceeded by one frame in 20"),
+    "time_solve": Measure("solution", "s", COST, 0.0, "prediction, solution, contacts; median, sum over muscles"),
+    "time_surface": Measure("surface", "s", COST, 0.0, "fit and extraction; median, sum over muscles"),
     "time_build": Measure("build", "s", COST, 0.0, "models of all muscles, once, with filled caches"),
     "memory": Measure("memory", "MB", COST, 0.0, "arrays held by the models after the motion, summed"),
 }
@@ -261,7 +232,9 @@ def write_tables(
     folder: Path,
     scene: Scene,
     results: dict[str, Any],
-    failed: dict[str, Any],
+    failed: dict[str, str],
+    *,
+    labels: dict[str, str],
     matrix: list[list[float]],
     poses: list[int],
 ) -> dict[str, Any]:
@@ -275,6 +248,8 @@ def write_tables(
         Model -> muscle or "all" -> quantity -> value.
     failed : dict of str to str
         Models that did not finish, and why.
+    labels : dict of str to str
+        Model -> what it is called.
     matrix : list of list of float
     poses : list of int
 
@@ -291,14 +266,15 @@ def write_tables(
         "frames": len(scene.motion),
         "poses": poses,
         "models": list(results),
+        "labels": {name: labels[name] for name in results},
         "failed": failed,
+        "answer": describe(results, labels, scene.units),
         "measures": {
             name: {"title": m.title, "unit": units[name], "against": m.against, "meaning": m.meaning}
             for name, m in MEASURES.items()
         },
         "results": results,
         "distances": matrix,
-        "verdicts": {name: verdict(results, name, scene.units) for name in results},
         "machine": machine(),
         "versions": versions(),
     }
@@ -308,11 +284,8 @@ def write_tables(
         rows.writerow(("model", "muscle", "quantity", "value", "unit", "against"))
         for model, muscles in results.items():
             for muscle, values in muscles.items():
-                for name in MEASURES:
-                    if name in values:
-                        rows.writerow(
-                            (model, muscle, name, values[name], units[name], MEASURES[name].against)
-                        )
+                for name in [name for name in MEASURES if name in values]:
+                    rows.writerow((model, muscle, name, values[name], units[name], MEASURES[name].against))
     return table
 
 
@@ -321,7 +294,7 @@ def measure_unit(kind: str, units: str) -> str:
     return f"1/{units}" if kind == "1/length" else unit_text(kind, units)
 
 
-def best_models(results: dict[str, Any], quantity: str, units: str) -> list[Any]:
+def best_models(results: dict[str, Any], quantity: str, units: str) -> list[str]:
     """Models that are as good as the best in a measure: within 5 %, or within what does not count."""
     measure = MEASURES[quantity]
     values = {
@@ -336,23 +309,33 @@ def best_models(results: dict[str, Any], quantity: str, units: str) -> list[Any]
     return [name for name, value in values.items() if value <= limit]
 
 
-def verdict(results: dict[str, Any], model: str, units: str) -> dict[str, Any]:
-    """In what a model is best alone, and in what another is better.
+def describe(results: dict[str, Any], labels: dict[str, str], units: str) -> str:
+    """One sentence: how the first model keeps out of bones at which price, and how near another comes at which price.
 
-    Returns
-    -------
-    dict
-        ``best``: quantities; ``loses``: dicts of quantity, value, other and its value.
+    Parameters
+    ----------
+    results : dict of str to dict
+        As for `write_tables`; distances are to the first model.
+    labels : dict of str to str
+    units : str
     """
-    best, loses = [], []
-    for quantity in MEASURES:
-        good = best_models(results, quantity, units)
-        if not good or quantity not in results[model][ALL]:
-            continue
-        if good == [model]:
-            best.append(quantity)
-        elif model not in good:
-            other = min(good, key=lambda name: abs(results[name][ALL][quantity]))
-            value, theirs = (results[name][ALL][quantity] for name in (model, other))
-            loses.append({"quantity": quantity, "value": value, "other": other, "other_value": theirs})
-    return {"best": best, "loses": loses}
+    first, *others = results
+    whole = {name: found[ALL] for name, found in results.items()}
+    depth = {name: max(v.get("penetration_max", 0.0), v.get("bone_penetration_max", 0.0)) for name, v in whole.items()}
+    limit = KEPT_OUT / MM_PER_UNIT[units]
+    words = {
+        name: f"{'keeps out of bones' if deep <= limit else 'stands in bones'} ({deep:.2g} {units})"
+        for name, deep in depth.items()
+    }
+    text = f"{labels[first]} {words[first]}"
+    timed = [name for name in others if "time_frame" in whole[name] and "time_frame" in whole[first]]
+    quick = min(timed, key=lambda name: whole[name]["time_frame"], default=None)
+    if quick:
+        ratio = whole[first]["time_frame"] / whole[quick]["time_frame"]
+        text += f" at {ratio:.2g} times the time of {labels[quick]}, which {words[quick]}"
+    near = min(others, key=lambda name: whole[name].get("distance_rms", math.inf), default=None)
+    if near and "distance_rms" in whole[near]:
+        text += f"; {labels[near]} comes within {whole[near]['distance_rms']:.2g} {units} RMS of it"
+        if near in timed:
+            text += f" at {whole[near]['time_frame'] / whole[first]['time_frame']:.2g} times its time"
+    return f"{text}."

@@ -1,232 +1,241 @@
-"""The report of a comparison: pictures side by side, distance maps, plots, table; one HTML file."""
+"""The page of a comparison: what it amounts to, the models moving beside each other, five rows; all else folded."""
 
 from __future__ import annotations
 
-import html
+import io
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rbfmuscle.experiments.comparison import COST, FIRST, LAW, MEASURES, MESH, OWN, best_models
+import numpy as np
+
+from rbfmuscle.experiments.comparison import AGAINST, MEASURES, best_models
+from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.metrics.quantities import ALL
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.appearance import line_colours
-from rbfmuscle.report.comparison_plots import plot_models
-from rbfmuscle.report.page import STYLE, embedded_image
-from rbfmuscle.report.render import chosen_frames, draw_pictures
-from rbfmuscle.validation import SolveError
+from rbfmuscle.report.appearance import MUSCLE_COLOURS, motion_direction
+from rbfmuscle.report.page import (
+    BAD,
+    GOOD,
+    PLAIN,
+    Cell,
+    Light,
+    Page,
+    Section,
+    definitions,
+    embedded_image,
+    limit_state,
+    number,
+    table,
+)
+from rbfmuscle.report.paint import scale_chips, scale_colours
+from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
+from rbfmuscle.report.raster import fitted_size
+from rbfmuscle.report.render import Panel, chosen_frames, draw_panels, muscle_path, save_images
+from rbfmuscle.report.report import COUNTS, packed_scene
 
-_VIEWS = ["front", "back"]
-_MODULE = "rbfmuscle.report.comparison_pictures"
-# Of all panels beside each other, and the least and greatest of one [pixel].
-_WIDTH, _LEAST, _MOST = 1560, 220, 420
+LIGHTS = ("volume_error", "penetration_max", "bone_penetration_max", "return_rms", "time_frame")
+# Pixels of a panel, of all beside each other; frames of the animation.
+_AREA, _WHOLE, _FRAMES = 90_000, 400_000, 12
 # Distance maps: from the greatest distance of the models down to what leaves the map its colours.
 _MAP_SHARE = 0.25
-GROUPS = {
-    LAW: "Against laws",
-    MESH: "Against the input mesh",
-    OWN: "Of each run itself",
-    FIRST: "Against the first model",
-    COST: "What it costs",
-}
-PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">
-<title>{title}</title><style>{style}
-td.best{{font-weight:700;color:#1f6138;background:#e9f4ec}}tr.group th{{background:#f4f2ed;text-align:left}}
-</style></head><body><main>
-<h1>{title}</h1><p class="sub">Comparison of muscle models</p>
-{failed}<div class="facts">{facts}</div>
-<h2>In short</h2>{verdicts}
-<h2>Side by side</h2>{pictures}
-<h2>Distance to {first}</h2>{maps}
-<h2>Table</h2><p class="note">Worst over muscles and frames, unless a row says otherwise. Green: the best model,
-and those within 5 % of it or nearer than what counts. Each row belongs to the reference above it.</p>
-<div class="wide">{table}</div>
-<h2>Between the models</h2><p class="note">Distance of each pair of models in the last pose, root mean square over
-all muscles [{units}].</p><div class="wide">{matrix}</div>
-<h2>Over the motion</h2><p class="legend">{legend}</p><div class="plots">{plots}</div>
-<h2>How to read this</h2>{explanation}<dl>{measures}</dl>
-<footer>{footer}</footer></main></body></html>
-"""
-EXPLANATION = """<p>All models ran through the same frames and sub-steps of the same scene, one after another in one
-process, with the same bone fields, contact margin and number of threads, each after a warm-up that loads and
-compiles. <b>The time a frame</b> is the wall time of prediction, solution, contacts, tunnelling test and surface of
-all muscles; metrics, files and pictures are outside. Where muscles run side by side the sums over muscles exceed
-it. Mesh models show the mesh that they carry, so their surface costs nothing; the RBF model fits a field and
-extracts its zero level set. <b>Strain</b> is that of the same material points for all models, so a finer mesh does not
-count as better or worse. <b>Curvature variation</b> is high where a surface is creased or lumpy. The
-<b>distance to the first model</b> is no error: it says how far models differ, not which is right.</p>"""
+_READING = """<p>All models ran through the same frames and sub-steps of the same scene, one after another in one process,
+with the same bone fields, contact margin and number of threads, each after a warm-up that loads and compiles. <b>The time
+per frame</b> is the wall time of prediction, solution, contacts, tunnelling test and surface of all muscles; metrics, files
+and pictures are outside. <b>Solution</b> and <b>surface</b> are sums over muscles, which run side by side, and may exceed
+it. <b>Strain</b> is that of the same material points in all models. <b>Curvature variation</b> is high where a surface is
+creased or lumpy. The <b>distance to the first model</b> is no error: it says how far models differ, not which is right.</p>"""
 
 
-def write_page(folder: Path, table: dict[str, Any], *, pictures: bool = True) -> Exception | None:
+def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) -> None:
     """Write ``report.html`` and ``models.webp``.
 
     Parameters
     ----------
     folder : pathlib.Path
         With a run of each model.
-    table : dict
+    found : dict
         From `rbfmuscle.experiments.comparison.write_tables`.
     pictures : bool
-
-    Returns
-    -------
-    MissingPartError or None
-        Why there are no pictures, where drawing failed. The report is written all the same.
 
     Raises
     ------
     SolveError
-        If the report cannot be written.
+        If a file cannot be written.
     """
-    images, missing = draw_pictures(
-        folder, lambda work: _jobs(table, folder, work) if pictures else [], module=_MODULE
+    runs = {name: SavedRun(folder / name) for name in found["models"]}
+    page = _page(found, runs)
+    if pictures:
+        moving = folder / "models.webp"
+        _draw_models(found, runs, moving)
+        page.scene = packed_scene({found["labels"][name]: run for name, run in runs.items()})
+        page.picture = embedded_image(moving.read_bytes(), "webp", "the motion, models beside each other")
+        if len(runs) > 1:
+            page.sections.insert(1, Section(f"Distance to {_label(found, 0)}", _distance_map(found, runs), "last pose"))
+    else:
+        page.missing = "No pictures: they were switched off."
+    page.write(folder / "report.html")
+
+
+def _page(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> Page:
+    machine = found["machine"]
+    failed = [f"{name} did not finish: {reason}" for name, reason in found["failed"].items()]
+    terms = ((measure.title, measure.meaning) for measure in MEASURES.values())
+    return Page(
+        f"{found['scene']}: models compared",
+        [
+            f"{len(next(iter(runs.values())).muscles)} muscles",
+            f"{found['frames']} frames",
+            f"{machine['threads']} threads",
+        ],
+        " ".join([found["answer"], *failed]),
+        BAD if failed else PLAIN,
+        lights=[light for quantity in LIGHTS if (light := _light(found, runs, quantity))],
+        heads=[found["labels"][name] for name in found["models"]],
+        sections=[
+            Section("Every measure", _measures(found), "worst over muscles and frames; the best in green"),
+            Section("Over the motion", _plots(found, runs)),
+            Section("Between the models", _matrix(found), f"RMS over all muscles in the last pose, {found['units']}"),
+            Section("How to read this", _READING + definitions(terms)),
+        ],
+        footer=", ".join(f"{name} {value}" for name, value in found["versions"].items()),
+        layout="below",
     )
-    moving = folder / "models.webp"
-    try:
-        page = _page(folder, table, images, moving.read_bytes() if moving.is_file() else None, missing)
-        (folder / "report.html").write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise SolveError(f"cannot write the report: {error.strerror}") from None
-    return missing
 
 
-def _jobs(table, folder, work):
-    models, poses = table["models"], table["poses"]
-    wide = min(_MOST, max(_LEAST, _WIDTH // len(models)))
-    size = (wide, int(1.15 * wide))
-    job = {"models": models, "views": _VIEWS, "size": size}
-    jobs = [{**job, "file": str(work / f"pose_{k:06d}.png"), "frames": [k]} for k in poses]
-    if len(models) > 1:
-        others = {**job, "models": models[1:], "reference": models[0], "limit": map_limit(table)}
-        jobs += [
-            {**others, "file": str(work / f"map_{k:06d}.png"), "frames": [k]} for k in poses[1:] or poses
+def _label(found: dict[str, Any], place: int) -> str:
+    return found["labels"][found["models"][place]]
+
+
+def _light(found: dict[str, Any], runs: Mapping[str, SavedRun], quantity: str) -> Light | None:
+    limit = next(iter(runs.values())).info["limits"].get(quantity)
+    cells = []
+    for name in found["models"]:
+        value = found["results"][name][ALL].get(quantity)
+        state = PLAIN if value is None else limit_state(value, limit, count=quantity in COUNTS)
+        cells.append(Cell(shown(found, quantity, value), value, state))
+    if all(cell.value is None for cell in cells):
+        return None
+    measure = MEASURES[quantity]
+    return Light(measure.title, cells, "" if limit is None else f"≤ {shown(found, quantity, limit)}", measure.meaning)
+
+
+def shown(found: dict[str, Any], quantity: str, value: float | None) -> str:
+    """A value of a measure with its unit; lengths that do not count as zero."""
+    measure, unit = MEASURES[quantity], found["measures"][quantity]["unit"]
+    if value is not None and measure.kind == "length" and found["units"] == "mm" and abs(value) < 0.5 * measure.floor:
+        value = 0.0
+    if quantity == "strain_rms" and value is not None:
+        return f"{100 * value:.2g} %"
+    return number(value, unit)
+
+
+def _measures(found: dict[str, Any]) -> str:
+    rows = []
+    for quantity, measure in MEASURES.items():
+        values = [found["results"][name][ALL].get(quantity) for name in found["models"]]
+        if all(value is None for value in values):
+            continue
+        good = best_models(found["results"], quantity, found["units"])
+        good = [] if len(good) == len(values) else good
+        cells = [
+            Cell(shown(found, quantity, value), value, GOOD if name in good else PLAIN)
+            for name, value in zip(found["models"], values)
         ]
-    if table["frames"] > 1:
-        moving = {**job, "views": _VIEWS[:1], "file": str((folder / "models.webp").resolve())}
-        jobs.append({**moving, "frames": chosen_frames(SavedRun(folder / models[0]).frames)})
-    return jobs
+        rows.append([measure.title, Cell(AGAINST[measure.against]), *cells])
+    return table(["", "against", *(found["labels"][name] for name in found["models"])], rows)
 
 
-def map_limit(table: dict[str, Any]) -> float:
+def _matrix(found: dict[str, Any]) -> str:
+    labels = [found["labels"][name] for name in found["models"]]
+    rows = [
+        [label, *(Cell("" if i == j else number(value), value) for j, value in enumerate(line))]
+        for i, (label, line) in enumerate(zip(labels, found["distances"]))
+    ]
+    return table(["", *labels], rows)
+
+
+def _plots(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> str:
+    """Moment arms and lengths of each muscle, then the worst over muscles and the time, a line for each model."""
+    first = next(iter(runs.values()))
+    axis, label = motion_axis(first)
+    panels = [
+        (f"Moment arm: {muscle}, {about}", arm_unit(first, about), lambda run, m=muscle, a=about: run.series(m, "moment_arm", a))
+        for muscle in first.muscles for about in first.arm_coordinates(muscle)
+    ]  # fmt: skip
+    panels += [
+        (f"Length: {muscle}", first.units, lambda run, m=muscle: run.series(m, "length")) for muscle in first.muscles
+    ]
+    panels += [
+        (f"{MEASURES[q].title}, worst muscle", first.units, lambda run, q=q: worst_series(run, q)) for q in LIGHTS[1:3]
+    ]
+    panels.append(("Time per frame after the first", "ms", _times))
+    pictures = []
+    for title, unit, series in panels:
+        tracks = []
+        for k, (name, run) in enumerate(runs.items()):
+            frames, values = series(run)
+            if len(frames) and np.isfinite(values).any():
+                colour = MUSCLE_COLOURS[k % len(MUSCLE_COLOURS)]
+                tracks.append(Track(found["labels"][name], colour, np.array([axis[f] for f in frames]), values))
+        if tracks and any(np.ptp(track.y) > 0 for track in tracks):
+            pictures.append(line_plot(title, tracks, (label, unit), legend=True))
+    return f'<div class="plots">{"".join(pictures)}</div>'
+
+
+def _times(run: SavedRun) -> tuple[Floats, Floats]:
+    frames, values = run.series(ALL, "time_frame")
+    return frames[1:], 1e3 * values[1:]
+
+
+def worst_series(run: SavedRun, quantity: str) -> tuple[Floats, Floats]:
+    """Frames, and of each frame the value of greatest magnitude among the muscles."""
+    found = [series for muscle in run.muscles if len((series := run.series(muscle, quantity))[0])]
+    if not found:
+        return np.zeros(0), np.zeros(0)
+    values = np.array([values for _, values in found])
+    return found[0][0], values[np.argmax(np.abs(values), axis=0), np.arange(values.shape[1])]
+
+
+def _draw_models(found: dict[str, Any], runs: Mapping[str, SavedRun], path: Path) -> None:
+    """The motion in its plane, models beside each other."""
+    first = next(iter(runs.values()))
+    frames = chosen_frames(first.frames, _FRAMES)
+    titles = [found["labels"][name] for name in runs]
+    save_images(draw_panels(_panels(runs, frames), frames, titles, {}), path, 4.0)
+
+
+def _panels(runs: Mapping[str, SavedRun], frames: list[int], paint: Any = None) -> list[Panel]:
+    first = next(iter(runs.values()))
+    seen = muscle_path(list(runs.values()), [frames[0], frames[len(frames) // 2], frames[-1]])
+    direction = motion_direction([first.poses[frame] for frame in frames])
+    size = fitted_size(direction, seen, min(_AREA, _WHOLE / len(runs)))
+    return [Panel(run, direction, size, seen, paint) for run in runs.values()]
+
+
+def _distance_map(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> str:
+    """The other models in the last pose, coloured by their distance to the first."""
+    (_, reference), *others = runs.items()
+    limit = map_limit(found)
+
+    def paint(saved: SavedRun, muscle: str, frame: int, vertices: Floats) -> Floats:
+        away = MeshDistance(*reference.surface(muscle, frame)).unsigned(vertices)
+        return scale_colours(np.minimum(away / limit, 1.0))
+
+    texts = [f"{limit * share:.3g} {found['units']}" for share in np.linspace(0, 1, 5)]
+    titles = [found["labels"][name] for name, _ in others]
+    panels = _panels(dict(others), reference.frames, paint)
+    (image,) = draw_panels(panels, reference.frames[-1:], titles, scale_chips([*texts[:-1], f"{texts[-1]} or more"]))
+    out = io.BytesIO()
+    image.save(out, "png")
+    return embedded_image(out.getvalue(), "png", "distance to the first model")
+
+
+def map_limit(found: dict[str, Any]) -> float:
     """Distance at which the maps' colours end: one, two or five times a power of ten."""
-    greatest = max(found[ALL].get("distance_max", 0.0) for found in table["results"].values())
+    greatest = max(results[ALL].get("distance_max", 0.0) for results in found["results"].values())
     wanted = max(_MAP_SHARE * greatest, 1e-12)
     power = 10.0 ** math.floor(math.log10(wanted))
     return next(step * power for step in (1, 2, 5, 10) if step * power >= wanted * 0.999)
-
-
-def _page(folder, table, images, moving, missing):
-    runs = {name: SavedRun(folder / name) for name in table["models"]}
-    poses = [embedded_image(data, "png", name) for name, data in images.items() if name.startswith("pose")]
-    maps = [embedded_image(data, "png", name) for name, data in images.items() if name.startswith("map")]
-    if moving is not None:
-        poses.insert(0, embedded_image(moving, "webp", "the motion, models beside each other"))
-    nothing = f'<p class="note">There are no pictures: {html.escape(str(missing or "switched off"))}.</p>'
-    return PAGE.format(
-        style=STYLE,
-        title=html.escape(table["scene"]),
-        first=html.escape(table["models"][0]),
-        units=table["units"],
-        failed=_failed(table),
-        facts=_facts(table),
-        verdicts=_verdicts(table),
-        pictures="".join(f"<figure>{item}</figure>" for item in poses) or nothing,
-        maps="".join(f"<figure>{item}</figure>" for item in maps) or nothing,
-        table=_table(table),
-        matrix=_matrix(table),
-        legend="".join(
-            f'<span><i style="background:{colour}"></i>{html.escape(name)}</span>'
-            for name, colour in line_colours(table["models"]).items()
-        ),
-        plots="".join(
-            f"<figure>{embedded_image(svg, 'svg+xml', title)}</figure>" for title, svg in plot_models(runs)
-        ),
-        explanation=EXPLANATION,
-        measures="".join(
-            f"<dt>{html.escape(m.title)}</dt><dd>{html.escape(m.meaning)}</dd>" for m in MEASURES.values()
-        ),
-        footer=html.escape(", ".join(f"{name} {value}" for name, value in table["versions"].items())),
-    )
-
-
-def _failed(table):
-    return "".join(
-        f'<p class="bad">{html.escape(name)} did not finish: {html.escape(reason)}</p>'
-        for name, reason in table["failed"].items()
-    )
-
-
-def _facts(table):
-    machine = table["machine"]
-    facts = [
-        ("models", len(table["models"])),
-        ("muscles", len(next(iter(table["results"].values()))) - 1),
-        ("frames", table["frames"]),
-        ("cores", machine["cores"]),
-        ("threads", machine["threads"]),
-    ]
-    return "".join(f"<div><b>{html.escape(str(value))}</b><span>{name}</span></div>" for name, value in facts)
-
-
-def _verdicts(table):
-    rows = []
-    for name, found in table["verdicts"].items():
-        best = ", ".join(MEASURES[quantity].title for quantity in found["best"])
-        loses = "; ".join(
-            f"{MEASURES[e['quantity']].title} {cell(table, e['quantity'], e['value'])} against "
-            f"{cell(table, e['quantity'], e['other_value'])} ({html.escape(e['other'])})"
-            for e in found["loses"]
-        )
-        rows.append(
-            f"<p><b>{html.escape(name)}</b> alone is best in: {best or 'nothing'}. Another is better in: "
-            f"{loses or 'nothing'}.</p>"
-        )
-    return "".join(rows)
-
-
-def _table(table):
-    models = table["models"]
-    head = "".join(f"<th>{html.escape(name)}</th>" for name in models)
-    rows, group = [], None
-    for quantity, measure in MEASURES.items():
-        values = [table["results"][name][ALL].get(quantity) for name in models]
-        if all(value is None for value in values):
-            continue
-        if measure.against != group:
-            group = measure.against
-            rows.append(f'<tr class="group"><th colspan="{len(models) + 1}">{GROUPS[group]}</th></tr>')
-        good = best_models(table["results"], quantity, table["units"])
-        good = [] if len(good) == len(models) else good
-        cells = "".join(
-            f"<td{' class=best' if name in good else ''}>{cell(table, quantity, value)}</td>"
-            for name, value in zip(models, values)
-        )
-        rows.append(f"<tr><th>{html.escape(measure.title)}</th>{cells}</tr>")
-    return f"<table><tr><th></th>{head}</tr>{''.join(rows)}</table>"
-
-
-def cell(table: dict[str, Any], quantity: str, value: float | None) -> str:
-    """A value with its unit, as people read it."""
-    if value is None:
-        return "-"
-    unit = table["measures"][quantity]["unit"]
-    if unit == "s":
-        return f"{value:.3g} s" if value >= 1.0 else f"{1000 * value:.3g} ms"
-    if quantity in ("volume_error", "strain_rms"):
-        return f"{100 * value:.2g} %"
-    if MEASURES[quantity].kind == "length" and abs(value) < 0.5 * MEASURES[quantity].floor:
-        value = 0.0
-    return f"{value:.3g}" if unit == "1" else f"{value:.3g} <small>{html.escape(unit)}</small>"
-
-
-def _matrix(table):
-    models = table["models"]
-    head = "".join(f"<th>{html.escape(name)}</th>" for name in models)
-    rows = "".join(
-        f"<tr><th>{html.escape(name)}</th>"
-        + "".join(f"<td>{'' if i == j else format(value, '.3g')}</td>" for j, value in enumerate(line))
-        + "</tr>"
-        for i, (name, line) in enumerate(zip(models, table["distances"]))
-    )
-    return f"<table><tr><th></th>{head}</tr>{rows}</table>"

@@ -1,25 +1,31 @@
-"""What is written beside a picture: the frame, where its joints are, what colours mean."""
+"""What is written beside a picture: titles, the frame with where its joints are, what colours mean."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from rbfmuscle.geometry.arrays import Integers
 from rbfmuscle.report.appearance import BACKGROUND
 
-_STRIP = 30
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+    from rbfmuscle.output.saved import SavedRun
+
+_LINE, _CHIP = 22, 17
 # Coordinates that a caption names at most.
 MOST_SHOWN = 4
 
 
-def caption(saved: Any, frame: int) -> Any:
+def caption(saved: SavedRun, frame: int) -> str:
     """Frame number and joint angles, as text."""
     entry = next(entry for entry in saved.info["frames"] if entry["frame"] == frame)
     clock = [f"{entry['time']:.4g} s"] if "time" in entry else []
     return ", ".join([f"frame {frame}", *clock, *coordinate_texts(saved.info, entry)])
 
 
-def coordinate_texts(info: dict[str, Any], entry: dict[str, Any]) -> Any:
+def coordinate_texts(info: Mapping[str, Any], entry: Mapping[str, Any]) -> list[str]:
     """A frame's coordinates as text, each with its unit; of many, those that the motion moves most.
 
     Parameters
@@ -38,14 +44,14 @@ def coordinate_texts(info: dict[str, Any], entry: dict[str, Any]) -> Any:
     return [f"{name} {value:.4g}{units.get(name, '°')}" for name, value in values.items()]
 
 
-def labelled(image: Integers, text: str, titles: list[Any], chips: dict[str, Any]) -> Any:
-    """Image with a title above each column, and below a strip with a caption and what colours mean.
+def labelled(image: Integers, text: str, titles: Sequence[str], chips: Mapping[str, str]) -> Image:
+    """Image with a strip above that has a title for each column, and one below with text and what colours mean.
 
     Parameters
     ----------
     image : (h, w, 3) ndarray of uint8
     text : str
-    titles : list of str
+    titles : sequence of str
     chips : dict of str to colour
     """
     from PIL import Image, ImageDraw, ImageFont
@@ -53,23 +59,22 @@ def labelled(image: Integers, text: str, titles: list[Any], chips: dict[str, Any
     font = ImageFont.load_default(13)
     height, width = image.shape[:2]
     pen = ImageDraw.Draw(Image.new("RGB", (1, 1)))
-    # Where each word begins: side by side, and in another line where there is no room.
-    x, y, places = 8, height + 7, []
+    x, y, places = 8, height + _LINE + 5, []
     parts = [text] if pen.textlength(text, font=font) <= width - 16 else text.split(", ")
     for name in [*parts, *chips]:
-        wide = int(pen.textlength(name, font=font)) + (17 if len(places) >= len(parts) else 0)
+        wide = int(pen.textlength(name, font=font)) + (_CHIP if len(places) >= len(parts) else 0)
         if places and x + wide > width:
-            x, y = 8, y + _STRIP - 8
+            x, y = 8, y + _LINE
         places.append((x, y))
         x += wide + 20
-    sheet = Image.new("RGB", (width, y - 7 + _STRIP), BACKGROUND)
-    sheet.paste(Image.fromarray(image), (0, 0))
+    sheet = Image.new("RGB", (width, y + _LINE + 3), BACKGROUND)
+    sheet.paste(Image.fromarray(image), (0, _LINE))
     pen = ImageDraw.Draw(sheet)
     for k, title in enumerate(titles):
-        pen.text((k * width // len(titles) + 8, 6), title, fill="#8a8a8a", font=font)
+        pen.text((k * width // len(titles) + 8, 4), title, fill="#5f646b", font=font)
     for place, part in zip(places, parts):
-        pen.text(place, part, fill="#333333", font=font)
+        pen.text(place, part, fill="#26282b", font=font)
     for (x, y), (name, colour) in zip(places[len(parts) :], chips.items()):
         pen.rectangle((x, y + 2, x + 12, y + 14), fill=colour)
-        pen.text((x + 17, y), name, fill="#333333", font=font)
+        pen.text((x + _CHIP, y), name, fill="#26282b", font=font)
     return sheet

@@ -1,198 +1,192 @@
-"""The report's frame: markup, style, the words that explain it, and tables that hold dozens of muscles."""
+"""The page of a run, a comparison, a kernel study or a sweep: answer, picture, rows with lights, all else folded."""
 
 from __future__ import annotations
 
 import base64
-import html
 import math
-from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import NamedTuple
 
-from rbfmuscle.metrics.summary import LEAST
+from rbfmuscle.validation import SolveError
 
-STYLE = """
-:root{--ink:#26282b;--soft:#6a6f76;--line:#e5e3de;--paper:#fbfaf8;--accent:#a63d38}
-*{box-sizing:border-box}
-body{margin:0;background:var(--paper);color:var(--ink);
-font:15px/1.55 system-ui,"Segoe UI",Helvetica,Arial,sans-serif}
-main{max-width:1120px;margin:0 auto;padding:36px 24px 60px}
-h1{font-size:30px;margin:0 0 2px;font-weight:650;letter-spacing:-.01em}
-h2{font-size:19px;margin:40px 0 12px;font-weight:650}
-.sub{color:var(--soft);margin:0 0 22px}
-.facts{display:flex;flex-wrap:wrap;gap:10px;margin:18px 0}
-.facts div{background:#fff;border:1px solid var(--line);border-radius:9px;padding:9px 16px;min-width:104px}
-.facts b{display:block;font-size:18px;font-weight:650}.facts span{color:var(--soft);font-size:12.5px}
-p.good,p.bad{border-radius:9px;padding:11px 16px;margin:14px 0;font-weight:550}
-p.good{background:#e9f4ec;color:#1f6138}p.bad{background:#fbeae8;color:#8e2a22}
-.note{color:var(--soft)}
-figure{margin:0 0 14px;padding:8px;overflow:hidden;
-background:#fff;border:1px solid var(--line);border-radius:9px}
-figure img{display:block;max-width:100%;height:auto;margin:auto}
-.plots{display:grid;grid-template-columns:repeat(auto-fill,minmax(420px,1fr));gap:14px}
-.plots figure{margin:0}.plots img{width:100%}
-.legend{margin:0 0 12px;color:var(--soft);font-size:13.5px}.legend span{margin-right:20px;white-space:nowrap}
-.legend i{display:inline-block;width:18px;height:4px;border-radius:2px;margin-right:7px;vertical-align:middle}
-.legend i.limit{height:0;border-top:2px dashed #c0392b;border-radius:0}
-.wide{overflow-x:auto}
-table{border-collapse:collapse;background:#fff;border:1px solid var(--line);font-size:13.5px;min-width:60%}
-th,td{padding:6px 13px;border-bottom:1px solid var(--line);text-align:right}
-td{font-variant-numeric:tabular-nums}
-th{font-weight:600}th:first-child,td:first-child{text-align:left}
-td.bad{color:#8e2a22;background:#fbeae8;font-weight:600}
-small{color:var(--soft);font-weight:400}
-table.sortable thead th{cursor:pointer;vertical-align:bottom}
-input.find{font:inherit;padding:3px 8px;border:1px solid var(--line);border-radius:6px}
-details{margin:6px 0}summary{cursor:pointer}
-dl{display:grid;grid-template-columns:max-content 1fr;gap:3px 18px;font-size:14px}
-dt{font-weight:600}dd{margin:0}
-footer{margin-top:44px;color:var(--soft);font-size:12.5px}
-"""
+GOOD, NEAR, BAD, PLAIN = "good", "near", "bad", "plain"
+_SYMBOLS = {GOOD: "✓", NEAR: "!", BAD: "✕"}
+# From this share of a limit a value is near it.
+_NEAR_LIMIT = 0.8
 
-EXPLANATION = """
-<p>Each muscle is one closed surface in each frame. A good run keeps its <b>volume</b> (the error is
-relative to the input mesh), stays out of the <b>bones</b> (deepest surface vertex inside a bone, and
-deepest bone vertex inside the muscle, both by exact distance to the meshes) and in <b>one piece</b>.
-Where the model cuts the bone out of the surface, <i>solver_penetration_max</i> tells how deep it was
-before, so that the cut hides nothing. The table shows the worst frame of each quantity; cells in red are
-beyond the limit in the last column, and dashed lines in the plots are the same limits. The first frame
-may load and compile; times are therefore given as medians.</p>
-"""
 
-# From so many muscles on tables have a row a muscle, and pictures a colour that neighbours do not share.
-MANY = 9
+class Cell(NamedTuple):
+    """A cell of a table: its text, what a column is sorted by, and good, bad or plain."""
 
-SORTING = """
-<script>
-document.querySelectorAll("table.sortable th").forEach(function(head){head.onclick=function(){
-const table=head.closest("table"),body=table.tBodies[0],k=head.cellIndex,
-down=head.dataset.down!=="1";head.dataset.down=down?"1":"0";
-const value=function(row){const cell=row.cells[k],v=cell.dataset.v;
-return v===undefined?cell.textContent:(v===""?-Infinity:parseFloat(v))};
-[...body.rows].sort(function(a,b){const x=value(a),y=value(b);
-return (x<y?-1:x>y?1:0)*(down&&typeof x==="number"?-1:1)*(!down&&typeof x==="string"?-1:1)})
-.forEach(function(row){body.append(row)})}});
-document.querySelectorAll("input.find").forEach(function(field){field.oninput=function(){
-const words=field.value.toLowerCase().split(/[ ,]+/).filter(Boolean);
-document.querySelectorAll("table.sortable tbody tr").forEach(function(row){
-const name=row.cells[0].textContent.toLowerCase();
-row.hidden=words.length>0&&!words.some(function(word){return name.includes(word)})})}});
-</script>
-"""
+    text: str
+    value: float | None = None
+    state: str = PLAIN
 
-PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8">
-<meta name="viewport" content="width=device-width,initial-scale=1">
-<title>{title}</title><style>{style}</style></head><body><main>
-<h1>{title}</h1><p class="sub">Report of a muscle simulation</p>
-{verdict}
-<div class="facts">{facts}</div>
-<h2>Motion</h2>{pictures}
-<h2>Over the motion</h2><p class="legend">{legend}</p><div class="plots">{plots}</div>
-<h2>Summary</h2><div class="wide">{table}</div>
-{neighbours}<h2>Events</h2>{events}
-<h2>Time of each stage</h2><p class="note">Milliseconds a frame: median, and the 95th percentile in grey; then in
-how many frames a muscle was solved, carried along as it was, or left where it was, in how many sub-steps, and why.</p>
-<div class="wide">{stages}</div>
-<h2>How to read this</h2>{explanation}<dl>{quantities}</dl>
-<footer>{versions}</footer>
-</main>{script}</body></html>
-"""
+
+class Light(NamedTuple):
+    """A row beside the picture: cells with their states, the limit, and a note below the title."""
+
+    title: str
+    cells: Sequence[Cell]
+    limit: str = ""
+    note: str = ""
+
+
+class Section(NamedTuple):
+    """What is folded: ``body`` is markup."""
+
+    title: str
+    body: str
+    hint: str = ""
+
+
+@dataclass
+class Page:
+    """What a page says, in its order.
+
+    Attributes
+    ----------
+    title : str
+    facts : list of str
+        Few words each, beside the title.
+    answer : str
+        One sentence.
+    state : {"good", "near", "bad", "plain"}
+    scene : str
+        From `pack_runs`; moves.
+    picture : str
+        Markup; in place of the scene where a browser cannot show it.
+    missing : str
+        Why there is no picture.
+    lights : list of Light
+    heads : sequence of str
+        Of the lights' cells.
+    sections : list of Section
+    footer : str
+    layout : {"beside", "below"}
+        Where the lights stand.
+    """
+
+    title: str
+    facts: Sequence[str]
+    answer: str
+    state: str = PLAIN
+    scene: str = ""
+    picture: str = ""
+    missing: str = ""
+    lights: Sequence[Light] = ()
+    heads: Sequence[str] = ("worst",)
+    sections: list[Section] = field(default_factory=list)
+    footer: str = ""
+    layout: str = "beside"
+
+    def html(self) -> str:
+        """The page, which needs no other file."""
+        from jinja2 import Environment
+        from markupsafe import Markup
+
+        from rbfmuscle.output.animation.page import scene_file
+
+        style, script = _template("page.css"), _template("page.js")
+        if self.scene:
+            style, script = style + scene_file("scene.css"), script + scene_file("scene.js")
+        self.picture = Markup(self.picture)
+        self.sections = [part._replace(body=Markup(part.body)) for part in self.sections if part.body]
+        template = Environment(autoescape=True).from_string(_template("page.html"))
+        return template.render(page=self, style=Markup(style), script=Markup(script), symbols=_SYMBOLS)
+
+    def write(self, path: Path) -> None:
+        """Write the page; raises SolveError where that fails."""
+        try:
+            path.write_text(self.html(), encoding="utf-8")
+        except OSError as error:
+            raise SolveError(f"cannot write {path}: {error.strerror}") from None
+
+
+def _template(name: str) -> str:
+    return (resources.files("rbfmuscle.report") / "templates" / name).read_text(encoding="utf-8")
 
 
 def embedded_image(data: bytes, kind: str, text: str) -> str:
-    """An ``img`` element that holds the picture itself.
+    """An ``img`` element that holds the picture itself; ``text`` stands where it is not shown."""
+    from markupsafe import escape
 
-    Parameters
-    ----------
-    data : bytes
-    kind : str
-        Of image, as in its media type: png, webp, svg+xml.
-    text : str
-        What stands for the picture where it is not shown.
+    return f'<img alt="{escape(text)}" src="data:image/{kind};base64,{base64.b64encode(data).decode()}">'
+
+
+def limit_state(value: float, limit: float | None, *, least: bool = False, count: bool = False) -> str:
+    """Light of a value: good, near its limit (from four fifths of it; no count is near) or bad; without limit plain.
+
+    With ``least`` the limit is the least allowed value.
     """
-    return f'<img alt="{html.escape(text)}" src="data:image/{kind};base64,{base64.b64encode(data).decode()}">'
+    if limit is None:
+        return PLAIN
+    if not (value >= limit if least else abs(value) <= limit):
+        return BAD
+    return NEAR if not least and not count and abs(value) > _NEAR_LIMIT * limit else GOOD
 
 
-def find_field() -> str:
-    """A field that shows the rows of the muscles whose names hold what is typed."""
-    return (
-        '<p class="note">Click a heading to sort. Show muscles whose names hold '
-        '<input class="find" placeholder="gluteus, vastus"></p>'
-    )
+def number(value: float | None, unit: str = "") -> str:
+    """A value with as many digits as say something, and its unit; lengths in millimetres from 0.01 up."""
+    if value is None or math.isnan(value):
+        return "–"
+    if unit == "s":
+        return f"{_digits(value)} s" if abs(value) >= 1.0 else f"{_digits(1e3 * value)} ms"
+    if unit == "mm" and 0.0 < abs(value) < 0.01:
+        return "< 0.01 mm"
+    return f"{_digits(value)} {unit}" if unit not in ("", "1") else _digits(value)
 
 
-def worst_first(
-    muscles: Mapping[str, Mapping[str, Any]], beyond: Collection[tuple[str, str]], limits: Mapping[str, float]
-) -> list[str]:
-    """Names of the muscles: those with the most quantities beyond a limit first, then by how near they come to one."""
-
-    def rank(name: str) -> tuple[float, ...]:
-        found = muscles[name]
-        count = sum((name, quantity) in beyond for quantity in found)
-        shares = [
-            abs(facts["worst"]) / limits[quantity]
-            for quantity, facts in found.items()
-            if limits.get(quantity) and quantity not in LEAST and facts.get("worst") is not None
-        ]
-        return -count, -max((share for share in shares if math.isfinite(share)), default=0.0)
-
-    return sorted(muscles, key=rank)
+def _digits(value: float) -> str:
+    size = abs(value)
+    if not math.isfinite(value) or value == 0.0:
+        return f"{value:g}"
+    if 1e-3 <= size < 1e5:
+        return f"{value:.0f}" if size >= 100 else f"{value:.3g}" if size >= 10 else f"{value:.2g}"
+    return f"{value:.0e}".replace("e-0", "e-").replace("e+0", "e+")
 
 
-def sortable_table(
-    head: Sequence[str], rows: Iterable[Sequence[tuple[str, float | str | None, bool]]]
-) -> str:
-    """A table that a click on a heading sorts.
+def sentence(text: str) -> str:
+    """A text with a capital letter and a full stop."""
+    return text[:1].upper() + text[1:] + ("" if text.endswith(".") else ".")
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[Cell | str]], *, find: bool = False) -> str:
+    """Markup of a table that a click on a heading sorts.
 
     Parameters
     ----------
     head : sequence of str
-        Markup of the headings.
-    rows : iterable of sequences of (markup, value, bad)
-        Cells; a number is what the column is sorted by, a text means its own markup.
+    rows : iterable of sequences of Cell or str
+        The first cell of a row names it.
+    find : bool
+        With a field that shows the rows whose names hold what is typed.
     """
+    from markupsafe import escape
+
     lines = []
     for row in rows:
         cells = []
-        for k, (markup, value, bad) in enumerate(row):
-            tag = "th" if k == 0 else "td"
-            data = (
-                "" if isinstance(value, str) else f' data-v="{"" if value is None else format(value, ".6g")}"'
-            )
-            mark = ' class="bad"' if bad else ""
-            cells.append(f"<{tag}{data}{mark}>{markup}</{tag}>")
+        for k, cell in enumerate(Cell(c) if isinstance(c, str) else c for c in row):
+            kind = "th" if k == 0 else "td"
+            data = "" if cell.value is None else f' data-value="{cell.value:.6g}"'
+            text = "text" if cell.value is None and len(cell.text) > 24 and k else ""
+            style = f' class="{text or cell.state}"' if text or cell.state != PLAIN else ""
+            cells.append(f"<{kind}{data}{style}>{escape(cell.text)}</{kind}>")
         lines.append(f"<tr>{''.join(cells)}</tr>")
-    headings = "".join(f"<th>{text}</th>" for text in head)
+    headings = "".join(f"<th>{escape(text)}</th>" for text in head)
+    field = '<input class="find" placeholder="find names, as: gluteus, vastus">' if find else ""
     return (
-        f'<table class="sortable"><thead><tr>{headings}</tr></thead><tbody>{"".join(lines)}</tbody></table>'
+        f'{field}<div class="wide"><table class="sortable"><thead><tr>{headings}</tr></thead>'
+        f"<tbody>{''.join(lines)}</tbody></table></div>"
     )
 
 
-def folded_events(events: Sequence[Sequence[Any]], most: int) -> str:
-    """Events by action, each kind folded away, with the muscles that have most of them.
+def definitions(pairs: Iterable[tuple[str, str]]) -> str:
+    """Markup of terms and what they mean."""
+    from markupsafe import escape
 
-    Parameters
-    ----------
-    events : sequence of (frame, muscle, bone, count, action)
-    most : int
-        Rows of each kind that are shown.
-    """
-    kinds: dict[str, list[Sequence[Any]]] = {}
-    for event in events:
-        kinds.setdefault(event[4], []).append(event)
-    parts = []
-    for action, found in sorted(kinds.items(), key=lambda kind: -len(kind[1])):
-        often = ", ".join(f"{name or 'bones'} {n}" for name, n in Counter(e[1] for e in found).most_common(6))
-        head = "<tr><th>frame</th><th>muscle</th><th>bone</th><th>count</th></tr>"
-        rows = "".join(
-            "<tr>" + "".join(f"<td>{html.escape(str(value))}</td>" for value in event[:4]) + "</tr>"
-            for event in found[:most]
-        )
-        left = len(found) - most
-        more = f'<p class="note">and {left} more in events.csv</p>' if left > 0 else ""
-        parts.append(
-            f"<details><summary><b>{html.escape(action)}</b> {len(found)}: {html.escape(often)}</summary>"
-            f"<table>{head}{rows}</table>{more}</details>"
-        )
-    return "".join(parts)
+    return f"<dl>{''.join(f'<dt>{escape(term)}</dt><dd>{escape(text)}</dd>' for term, text in pairs)}</dl>"

@@ -1,52 +1,245 @@
-"""Plots of a saved run over its motion."""
+"""Plots as SVG: lines along a motion, and points of error against time."""
 
 from __future__ import annotations
 
-import io
-import textwrap
-from typing import TYPE_CHECKING, Any
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from rbfmuscle.metrics.quantities import ALL
-from rbfmuscle.report.appearance import LINE_COLOURS, line_colours
+from rbfmuscle.geometry.arrays import Floats
 
 if TYPE_CHECKING:
     from rbfmuscle.output.saved import SavedRun
 
-
-# From so many lines on a plot names only those that go furthest, so many of them.
-MANY, NAMED = 9, 6
-PLOT_STYLE = {
-    "font.size": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": "#9a9a9a",
-    "axes.labelcolor": "#444444",
-    "axes.titlesize": 10.5,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.grid": True,
-    "grid.color": "#ececec",
-    "xtick.color": "#666666",
-    "ytick.color": "#666666",
-    "svg.fonttype": "path",
-    "svg.hashsalt": "rbfmuscle",
-}
-# Title, quantity, factor, unit of the axis (None: the table's), whether the limit is drawn on both sides.
-PANELS = (
-    ("Volume error", "volume_error", 100.0, "%", True),
-    ("Surface inside a bone", "penetration_max", 1.0, None, False),
-    ("Bone inside the muscle", "bone_penetration_max", 1.0, None, False),
-    ("Inside a bone before the cut", "solver_penetration_max", 1.0, None, False),
-    ("Time a frame", "time_frame", 1000.0, "ms", False),
-    ("Edge strain of the carried mesh (RMS)", "edge_strain_rms", 100.0, "%", False),
-    ("Length", "length", 1.0, None, False),
-)
+_INK, _SOFT, _GRID, _LIMIT = "#26282b", "#5f646b", "#e8e6e0", "#a3281f"
+_LEFT, _RIGHT, _TOP, _BOTTOM = 52, 12, 26, 36
+# Of a letter at the size of labels [pixel].
+_LETTER = 6.2
 
 
-def motion_axis(saved: Any) -> tuple[dict[int, float], str]:
-    """What the plots run along.
+class Track(NamedTuple):
+    """A line of a plot: its name, colour, and places x and values y."""
+
+    name: str
+    colour: str
+    x: Floats
+    y: Floats
+
+
+class Point(NamedTuple):
+    """A point of error against time: a star where it is the default; its label is drawn where it has one."""
+
+    x: float
+    y: float
+    label: str
+    colour: str
+    star: bool = False
+    front: bool = False
+
+
+class _Axes:
+    """The frame of a plot, and where values lie in it."""
+
+    def __init__(self, size: tuple[int, int], spans: Sequence[tuple[float, float]], *, log: bool) -> None:
+        self.size, self.log = size, log
+        self.spans = [_widened(*span, log) for span in spans]
+        self.parts: list[str] = []
+
+    def place(self, value: float, axis: int) -> float:
+        low, high = self.spans[axis]
+        share = (
+            math.log(value / low) / math.log(high / low) if self.log else (value - low) / (high - low or 1.0)
+        )
+        wide, tall = self.size
+        if axis == 0:
+            return _LEFT + share * (wide - _LEFT - _RIGHT)
+        return tall - _BOTTOM - share * (tall - _TOP - _BOTTOM)
+
+    def text(self, x: float, y: float, words: str, *, anchor: str = "start", colour: str = _SOFT, bold: bool = False) -> None:
+        """Add words at a place [pixel]."""
+        from markupsafe import escape
+
+        weight = ' font-weight="600"' if bold else ""
+        self.parts.append(
+            f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{colour}" font-size="11.5"{weight}>'
+            f"{escape(words)}</text>"
+        )
+
+    def line(self, x: Sequence[float], y: Sequence[float], colour: str, *, width: float = 1.8, more: str = "") -> None:
+        """Add a line through values; it is broken where one is no number."""
+        path, pen = [], "M"
+        for a, b in zip(x, y):
+            if math.isfinite(a) and math.isfinite(b):
+                path.append(f"{pen}{self.place(a, 0):.1f} {self.place(b, 1):.1f}")
+            pen = "L" if math.isfinite(b) else "M"
+        self.parts.append(
+            f'<path d="{"".join(path)}" fill="none" stroke="{colour}" stroke-width="{width}" '
+            f'stroke-linejoin="round" {more}/>'
+        )
+
+    def frame(self, title: str, labels: tuple[str, str]) -> None:
+        """Add the grid with its numbers, the title and the labels of the axes."""
+        (left, right), (low, high) = self.spans
+        wide, tall = self.size
+        for value in _ticks(left, right, 6, self.log):
+            x = self.place(value, 0)
+            self.parts.append(f'<path d="M{x:.1f} {_TOP}V{tall - _BOTTOM}" stroke="{_GRID}"/>')
+            self.text(x, tall - _BOTTOM + 14, f"{value:.4g}", anchor="middle")
+        for value in _ticks(low, high, 5, self.log):
+            y = self.place(value, 1)
+            self.parts.append(f'<path d="M{_LEFT} {y:.1f}H{wide - _RIGHT}" stroke="{_GRID}"/>')
+            self.text(_LEFT - 5, y + 4, f"{value:.4g}", anchor="end")
+        self.text(6, 15, title, colour=_INK, bold=True)
+        self.text(wide - _RIGHT, tall - 5, labels[0], anchor="end")
+        self.text(wide - _RIGHT, 15, labels[1], anchor="end")
+
+    def svg(self, title: str) -> str:
+        from markupsafe import escape
+
+        wide, tall = self.size
+        return (
+            f'<svg viewBox="0 0 {wide} {tall}" role="img"><title>{escape(title)}</title>'
+            f"{''.join(self.parts)}</svg>"
+        )
+
+
+def line_plot(
+    title: str,
+    tracks: Sequence[Track],
+    labels: tuple[str, str],
+    *,
+    limits: Sequence[float] = (),
+    zero: bool = False,
+    legend: bool = False,
+) -> str:
+    """Markup of a plot of lines.
+
+    Parameters
+    ----------
+    title : str
+    tracks : sequence of Track
+        A line that bears a muscle's name is switched on and off with it.
+    labels : (str, str)
+        Of the axes.
+    limits : sequence of float
+        Drawn as dashed lines.
+    zero : bool
+        Whether the axis begins at zero.
+    legend : bool
+        Whether the lines' names stand below.
+    """
+    from markupsafe import escape
+
+    values = np.concatenate([track.y[np.isfinite(track.y)] for track in tracks])
+    places = np.concatenate([track.x for track in tracks])
+    low, high = [*values, *limits], [*values, *limits]
+    span = (0.0 if zero else float(min(low)), float(max(high)))
+    axes = _Axes((420, 230), [(float(places.min()), float(places.max())), span], log=False)
+    axes.spans[0] = (float(places.min()), float(places.max()) or 1.0)
+    axes.frame(title, labels)
+    for limit in limits:
+        axes.line(axes.spans[0], (limit, limit), _LIMIT, width=1.0, more='stroke-dasharray="5 4"')
+    for track in tracks:
+        axes.parts.append(f'<g data-muscle="{escape(track.name)}"><title>{escape(track.name)}</title>')
+        axes.line(track.x, track.y, track.colour)
+        axes.parts.append("</g>")
+    for k, track in enumerate(tracks if legend else ()):
+        axes.size = (axes.size[0], 230 + 15 * (k + 1))
+        axes.text(_LEFT, axes.size[1] - 4, f"— {track.name}", colour=track.colour, bold=True)
+    return axes.svg(title)
+
+
+def front_plot(points: Sequence[Point], labels: tuple[str, str], *, groups: Mapping[str, str] = {}) -> str:
+    """Markup of error against time on logarithmic axes: the front joined, its points and the default labelled.
+
+    Parameters
+    ----------
+    points : sequence of Point
+    labels : (str, str)
+        Of the axes.
+    groups : dict of str to str
+        What the colours stand for.
+    """
+    shown = [point for point in points if point.x > 0 and point.y > 0]
+    if not shown:
+        return ""
+    spans = [(min(p[k] for p in shown), max(p[k] for p in shown)) for k in (0, 1)]
+    axes = _Axes((760, 460), spans, log=True)
+    axes.frame("", labels)
+    taken: list[tuple[float, float, float, float]] = []
+    for colour in dict.fromkeys(point.colour for point in shown):
+        front = sorted(point for point in shown if point.front and point.colour == colour)
+        axes.line([p.x for p in front], [p.y for p in front], colour, width=1.2)
+    for point in shown:
+        x, y = axes.place(point.x, 0), axes.place(point.y, 1)
+        taken.append((x - 6, y - 6, x + 6, y + 6))
+        shape = _star(x, y) if point.star else f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4.5"'
+        faint = 1.0 if point.star or point.front else 0.4
+        axes.parts.append(f'{shape} fill="{point.colour}" fill-opacity="{faint}"/>')
+    for point in sorted(shown, key=lambda point: not point.star):
+        if point.label and (point.star or point.front):
+            _label(axes, point, taken)
+    for k, (name, colour) in enumerate(groups.items()):
+        axes.text(axes.size[0] - _RIGHT, _TOP + 16 + 16 * k, name, anchor="end", colour=colour, bold=True)
+    return axes.svg(f"{labels[1]} against {labels[0]}")
+
+
+def _label(axes: _Axes, point: Point, taken: list[tuple[float, float, float, float]]) -> None:
+    """Write a point's label where it covers nothing, joined to it by a line where that is far away."""
+    x, y = axes.place(point.x, 0), axes.place(point.y, 1)
+    wide = _LETTER * len(point.label)
+    for far in (9, 18, 32, 48, 66, 86, 108):
+        for dx, dy in ((1, -0.4), (-1, -0.4), (1, 1), (-1, 1), (0, -1), (0, 1.2)):
+            left = x + far * dx - (wide if dx < 0 else 0.5 * wide if dx == 0 else 0)
+            box = (left, y + far * dy - 9, left + wide, y + far * dy + 4)
+            inside = box[0] > _LEFT and box[2] < axes.size[0] - 4 and _TOP < box[1] and box[3] < axes.size[1] - _BOTTOM
+            if inside and not any(_overlap(box, other) for other in taken):
+                taken.append(box)
+                if far > 9:
+                    axes.parts.append(
+                        f'<path d="M{x:.1f} {y:.1f}L{min(max(x, left), left + wide):.1f} {y + far * dy - 3:.1f}" '
+                        f'stroke="{_SOFT}" stroke-width="0.6"/>'
+                    )
+                axes.text(left, y + far * dy, point.label, colour=_INK, bold=point.star)
+                return
+
+
+def _overlap(one, other):
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+
+
+def _star(x: float, y: float) -> str:
+    corners = [
+        (x + r * math.sin(math.pi * k / 5), y - r * math.cos(math.pi * k / 5))
+        for k, r in zip(range(10), (10, 4) * 5)
+    ]
+    return f'<polygon points="{" ".join(f"{a:.1f},{b:.1f}" for a, b in corners)}"'
+
+
+def _widened(low: float, high: float, log: bool) -> tuple[float, float]:
+    if log:
+        share = max((high / low) ** 0.12, 1.15)
+        return low / share, high * share
+    room = 0.06 * (high - low) or 0.05 * abs(high) or 1.0
+    return (low if low == 0.0 else low - room), high + room
+
+
+def _ticks(low: float, high: float, count: int, log: bool) -> list[float]:
+    """Round values between two, about so many."""
+    if log:
+        steps = (1, 2, 5) if high / low < 300 else (1,)
+        powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+        return [step * 10.0**power for power in powers for step in steps if low <= step * 10.0**power <= high]
+    raw = (high - low) / count
+    power = 10.0 ** math.floor(math.log10(raw)) if raw > 0 else 1.0
+    step = next(s * power for s in (1, 2, 2.5, 5, 10) if s * power >= raw * 0.999)
+    return [round(k * step, 12) for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
+
+
+def motion_axis(saved: SavedRun) -> tuple[dict[int, float], str]:
+    """What plots run along.
 
     Returns
     -------
@@ -67,118 +260,7 @@ def motion_axis(saved: Any) -> tuple[dict[int, float], str]:
     return {frame: float(frame) for frame in saved.frames}, "frame"
 
 
-def plot_panels(saved: SavedRun) -> list[tuple[str, bytes]]:
-    """Draw every panel that the run has values for.
-
-    Parameters
-    ----------
-    saved : SavedRun
-
-    Returns
-    -------
-    list of (title, bytes)
-        SVG pictures.
-    """
-    import matplotlib
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
-
-    axis, label = motion_axis(saved)
-    pictures = []
-    panels = [(*panel, None) for panel in PANELS]
-    # About one coordinate after the other: arms about several are no one line, nor of one unit.
-    panels += [
-        (f"Moment arm: {name}", "moment_arm", 1.0, arm_unit(saved, name), False, name)
-        for name in saved.arm_coordinates()
-    ]
-    with matplotlib.rc_context(PLOT_STYLE):
-        for title, quantity, factor, unit, both, coordinate in panels:
-            figure = Figure(figsize=(4.6, 2.7), layout="constrained")
-            FigureCanvasSVG(figure)
-            axes = figure.add_subplot()
-            if not _draw_lines(axes, saved, quantity, factor, axis, coordinate):
-                continue
-            _draw_limit(axes, saved, quantity, factor, both)
-            axes.set_title(title)
-            axes.set_xlabel(label)
-            axes.set_ylabel(unit or saved.units)
-            out = io.BytesIO()
-            figure.savefig(out, format="svg", metadata={"Date": None})
-            pictures.append((title, out.getvalue()))
-    return pictures
-
-
-def wrapped(title: str) -> str:
-    """A panel's title on as many lines as it needs."""
-    return "\n".join(textwrap.wrap(title, 48))
-
-
-def arm_unit(saved: Any, coordinate: str) -> str:
+def arm_unit(saved: SavedRun, coordinate: str) -> str:
     """Unit of the moment arms about a coordinate of a saved run."""
     shift = saved.info.get("scene", {}).get("coordinate_units", {}).get(coordinate, "").strip()
     return "1" if shift else saved.units
-
-
-def _draw_lines(axes, saved, quantity, factor, axis, coordinate=None):
-    colours = line_colours(saved.muscles)
-    tracks = [
-        (muscle, saved.series(muscle, quantity, coordinate), colours[muscle]) for muscle in saved.muscles
-    ]
-    if quantity == "time_frame":
-        tracks.append(("all together", saved.series(ALL, quantity), "#222222"))
-    tracks = [(name, *series, colour) for name, series, colour in tracks if len(series[0])]
-    named = _furthest(tracks) if len(tracks) > MANY else None
-    for name, frames, values, colour in tracks:
-        places = [axis[frame] for frame in frames]
-        if named is None:
-            axes.plot(places, values * factor, color=colour, lw=1.6, label=name, marker="o", ms=2.2)
-        elif name not in named:
-            axes.plot(places, values * factor, color="#d4d2cd", lw=0.8, zorder=1)
-        else:
-            axes.plot(places, values * factor, color=named[name], lw=1.6, label=name, zorder=2)
-    if named:
-        axes.legend(fontsize=6.5, frameon=False, loc="best", handlelength=1.2)
-    if quantity == "time_frame" and tracks:
-        # The first frame loads and compiles, and so may a later one that meets something new; it would flatten
-        # all others, so it ends at the edge, and the edge says how high it goes.
-        later = factor * np.concatenate([values[1:] for _, _, values, _ in tracks])
-        if len(later):
-            top = 1.15 * min(later.max(), 3.0 * np.percentile(later, 90))
-            axes.set_ylim(0, top)
-            _name_hidden(axes, tracks[-1], axis, factor, top)
-    return bool(tracks)
-
-
-def _furthest(tracks):
-    """Colours of the muscles that go furthest, and of all together: what a plot of many names."""
-    reach = {name: np.nanmax(np.abs(values), initial=0.0) for name, _, values, _ in tracks}
-    chosen = sorted(reach, key=lambda name: -reach[name])[:NAMED]
-    return dict(zip(chosen, LINE_COLOURS))
-
-
-def _name_hidden(axes, track, axis, factor, top):
-    """Write the height of frames that go beyond the plot, of one track, beside where they leave it."""
-    _, frames, values, colour = track
-    for frame, value in zip(frames, values * factor):
-        if value > top:
-            text = f"{value / 1000:.1f} s" if value >= 1000 else f"{value:.0f} ms"
-            axes.annotate(
-                text,
-                (axis[frame], top),
-                (3, -3),
-                textcoords="offset points",
-                fontsize=7,
-                color=colour,
-                va="top",
-            )
-
-
-def _draw_limit(axes, saved, quantity, factor, both):
-    limit = saved.info.get("limits", {}).get(quantity)
-    if limit is None:
-        return
-    low, high = axes.get_ylim()
-    for value in (limit, -limit) if both else (limit,):
-        axes.axhline(value * factor, color="#c0392b", lw=0.9, ls=(0, (4, 3)), zorder=0)
-    if not both:
-        axes.set_ylim(min(0.0, low), max(high, 1.1 * limit * factor))

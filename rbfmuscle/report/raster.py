@@ -75,9 +75,8 @@ def draw_solids(solids: Sequence[Solid], camera: Camera, background: Floats) -> 
         over, veil = _layer(veils, fine, background)
         share = np.where(over > depth, veil[..., 3], 0.0)[..., None]
         image = (1.0 - share) * image + share * veil
-    height, width = camera.size[1], camera.size[0]
-    mean = image[..., :3].reshape(height, _FINER, width, _FINER, 3).mean(axis=(1, 3))
-    return np.round(255.0 * np.clip(mean, 0.0, 1.0)).astype(np.uint8)
+    corners = [image[i::_FINER, j::_FINER, :3] for i in range(_FINER) for j in range(_FINER)]
+    return np.round(255.0 * np.clip(sum(corners) / len(corners), 0.0, 1.0)).astype(np.uint8)
 
 
 def _layer(solids: Sequence[Solid], camera: Camera, background: Floats) -> tuple[Floats, Floats]:

@@ -1,36 +1,113 @@
-"""Pictures and animations of a saved run, drawn in a process of their own.
-
-VTK may end the process where no graphics exist. So everything is saved first, then this module is run as
-``python -m rbfmuscle.report.render DIR`` with the job on its standard input.
-"""
+"""Pictures and animations of saved runs."""
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report.appearance import (
     BACKGROUND,
+    BONE_COLOUR,
     MUSCLE_COLOURS,
     USUAL_VIEWS,
     VIEWS,
-    fitted_size,
+    motion_direction,
+    muscle_colours,
+    muscle_groups,
+    rgb,
 )
 from rbfmuscle.report.labels import caption, labelled
-from rbfmuscle.report.paint import check_colouring, painting
-from rbfmuscle.report.stage import Stage, path_bounds
-from rbfmuscle.validation import MissingPartError, RBFMuscleError, UsageError
+from rbfmuscle.report.paint import activations, check_colouring, scale_chips, scale_colours
+from rbfmuscle.report.raster import Solid, aim, draw_solids, fitted_size
+from rbfmuscle.validation import SolveError, UsageError
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 ANIMATIONS = (".webp", ".gif")
-_TIMEOUT = 1800
-# Code of a child that could draw and could not save.
-_REFUSED = 3
+# Pixels of a panel, and of one of the preview; frames of the preview.
+_AREA, _PREVIEW_AREA, _PREVIEW_FRAMES = 220_000, 110_000, 12
+# Colours (n, 3) of a muscle's vertices in a frame.
+Paint = Callable[[SavedRun, str, int, Floats], Floats]
+
+
+class Panel:
+    """A run seen from one direction, as large in all frames.
+
+    Parameters
+    ----------
+    saved : SavedRun
+    direction : (3,) sequence of float
+        From the subject to the camera.
+    size : (width, height)
+        Pixels.
+    path : (n, 3) ndarray
+        What is to be seen.
+    paint : callable, optional
+        ``paint(saved, muscle, frame, vertices)`` gives colours (n, 3); the muscles' own where not given.
+    """
+
+    def __init__(
+        self,
+        saved: SavedRun,
+        direction: Sequence[float] | Floats,
+        size: tuple[int, int],
+        path: Floats,
+        paint: Paint | None = None,
+    ) -> None:
+        self.saved, self.paint = saved, paint
+        self.colours = muscle_colours(saved.muscles, muscle_groups(saved.info))
+        self.bones = {name: saved.bone(name) for name in saved.bones}
+        self.camera = aim(direction, path, size)
+
+    def draw(self, frame: int) -> Integers:
+        """Picture (h, w, 3) of a frame."""
+        solids = []
+        for name, (vertices, faces) in self.bones.items():
+            pose = self.saved.poses[frame][name]
+            solids.append(Solid(vertices @ pose[:3, :3].T + pose[:3, 3], faces, rgb(BONE_COLOUR)))
+        for name, colour in self.colours.items():
+            vertices, faces = self.saved.surface(name, frame)
+            shade = rgb(colour) if self.paint is None else self.paint(self.saved, name, frame, vertices)
+            solids.append(Solid(vertices, faces, shade))
+        return draw_solids(solids, self.camera, rgb(BACKGROUND))
+
+
+def muscle_path(runs: Sequence[SavedRun], frames: Sequence[int]) -> Floats:
+    """Points (n, 3) of all muscles in some frames."""
+    return np.concatenate(
+        [run.surface(name, frame)[0][::3] for run in runs for name in run.muscles for frame in frames]
+    )
+
+
+def draw_panels(
+    panels: Sequence[Panel], frames: Sequence[int], titles: Sequence[str], chips: Mapping[str, str]
+) -> list[Image]:
+    """Panels beside each other, a picture for each frame, with titles above and caption and colours below."""
+    return [
+        labelled(
+            np.concatenate([panel.draw(frame) for panel in panels], axis=1),
+            caption(panels[0].saved, frame),
+            titles,
+            chips,
+        )
+        for frame in frames
+    ]
+
+
+def draw_preview(saved: SavedRun, path: Path) -> None:
+    """Write the whole motion, seen in its plane and from the front, as an animation."""
+    frames = chosen_frames(saved.frames, _PREVIEW_FRAMES)
+    seen = muscle_path([saved], frames[:: max(1, len(frames) // 4)] + frames[-1:])
+    directions = [motion_direction([saved.poses[frame] for frame in frames]), VIEWS["front"][0]]
+    size = fitted_size(directions[0], seen, _PREVIEW_AREA)
+    panels = [Panel(saved, direction, size, seen) for direction in directions]
+    save_images(draw_panels(panels, frames, ["plane of the motion", "front"], _chips(saved)), path, 4.0)
 
 
 def render_run(
@@ -38,8 +115,8 @@ def render_run(
     output: str | Path,
     *,
     frame: int | None = None,
-    views: list[str] | None = None,
-    size: tuple[int, int] = (420, 520),
+    views: Sequence[str] | None = None,
+    area: int = _AREA,
     seconds: float = 5.0,
     colour: str = "muscle",
 ) -> None:
@@ -55,8 +132,8 @@ def render_run(
         Of a picture; the last one where not given.
     views : list of str, optional
         Of `VIEWS`, side by side; `USUAL_VIEWS` where not given.
-    size : (width, height)
-        Of one view [pixel].
+    area : int
+        Pixels of one view.
     seconds : float
         Length of an animation.
     colour : {"muscle", "activation"}
@@ -66,8 +143,6 @@ def render_run(
     ------
     UsageError
         If the folder holds nothing to draw, or the suffix, frame or view is unknown.
-    MissingPartError
-        If there are no graphics to draw with.
     """
     saved, output = SavedRun(directory), Path(output)
     views = list(views or USUAL_VIEWS)
@@ -84,145 +159,59 @@ def render_run(
         raise UsageError(
             f"frame {frame} was not written; the run has {saved.frames[0]} to {saved.frames[-1]}"
         )
+    seen = muscle_path([saved], sorted({saved.frames[0], saved.frames[len(saved.frames) // 2], saved.frames[-1]}))
+    paint, chips = (_activation_paint(saved), _activation_chips()) if colour == "activation" else (None, _chips(saved))
+    panels = [
+        Panel(saved, VIEWS[view][0], fitted_size(VIEWS[views[0]][0], seen, area), seen, paint) for view in views
+    ]
     frames = [frame] if output.suffix == ".png" else saved.frames
-    job = {"file": str(output.resolve()), "frames": frames, "views": views, "size": size, "colour": colour}
-    draw(directory, [job], seconds)
+    images = draw_panels(panels, frames, [f"{view} ({VIEWS[view][1]})" for view in views], chips)
+    save_images(images, output, seconds)
 
 
-def draw(
-    directory: str | Path,
-    jobs: list[Any],
-    seconds: float = 5.0,
-    *,
-    module: str = "rbfmuscle.report.render",
-) -> None:
-    """Draw pictures in a child process.
-
-    Parameters
-    ----------
-    directory : path
-    jobs : list of dict
-        ``file``, ``frames``, ``views``, ``size``; several frames make an animation.
-    seconds : float
-        Length of an animation.
-    module : str
-        What draws them, run with ``-m``.
-
-    Raises
-    ------
-    MissingPartError
-        If the child cannot draw; the message holds its last words.
-    """
-    command = [sys.executable, "-m", module, str(directory)]
-    text = json.dumps({"jobs": jobs, "seconds": seconds})
-    try:
-        done = subprocess.run(
-            command, input=text, capture_output=True, text=True, timeout=_TIMEOUT, check=False
-        )
-    except subprocess.TimeoutExpired:
-        raise MissingPartError(f"drawing took longer than {_TIMEOUT} s and was stopped") from None
-    if done.returncode != 0:
-        words = [line.strip() for line in done.stderr.splitlines() if line.strip()]
-        reason = words[-1][-160:] if words else f"the drawing process ended with code {done.returncode}"
-        # What Python itself refuses is no want of graphics.
-        blame = (
-            ""
-            if done.returncode == _REFUSED
-            else "; drawing needs OpenGL (a display, or Mesa's libegl1 and libgl1)"
-        )
-        raise MissingPartError(f"no pictures: {reason}{blame}")
+def _chips(saved: SavedRun) -> dict[str, str]:
+    """Names of the muscles with their colours; of many, those of the groups."""
+    groups = muscle_groups(saved.info)
+    colours = muscle_colours(saved.muscles, groups)
+    if len(colours) <= len(MUSCLE_COLOURS):
+        return colours
+    return {groups[name]: colours[name] for name in reversed(saved.muscles)}
 
 
-def draw_pictures(directory: str | Path, make_jobs: Callable[..., Any], **how: Any) -> tuple[Any, ...]:
-    """Draw pictures to memory.
-
-    Parameters
-    ----------
-    directory : path
-    make_jobs : callable
-        ``make_jobs(folder)`` gives the jobs, whose PNG files go to that folder.
-    **how
-        As for `draw`.
-
-    Returns
-    -------
-    images : dict of str to bytes
-        The PNG files by their stems.
-    missing : MissingPartError or None
-        Why not all are drawn.
-    """
-    missing = None
-    with tempfile.TemporaryDirectory() as folder:
-        jobs = make_jobs(Path(folder))
-        if jobs:
-            try:
-                draw(directory, jobs, **how)
-            except MissingPartError as error:
-                missing = error
-        return {path.stem: path.read_bytes() for path in sorted(Path(folder).glob("*.png"))}, missing
+def _activation_chips() -> dict[str, str]:
+    return scale_chips([f"activation {share:g}" for share in np.linspace(0, 1, 5)])
 
 
-def chosen_frames(frames: list[int], most: int = 24) -> list[int]:
-    """At most so many of the frames of a motion for an animation, evenly, the last one included."""
+def _activation_paint(saved: SavedRun) -> Paint:
+    """Each muscle by its activation, 0 where it does not contract."""
+    known = activations(saved)
+    return lambda _, muscle, frame, vertices: scale_colours(
+        np.full(len(vertices), known.get((muscle, frame), 0.0))
+    )
+
+
+def chosen_frames(frames: Sequence[int], most: int) -> list[int]:
+    """At most so many of the frames of a motion, evenly, the last one included."""
     stride = -(-len(frames) // most)
-    return frames[(len(frames) - 1) % stride :: stride]
+    return list(frames[(len(frames) - 1) % stride :: stride])
 
 
-def _draw_job(saved, job, seconds, stages):
-    views, size, colour = tuple(job["views"]), tuple(job["size"]), job.get("colour", "muscle")
-    paint, chips = painting(saved, colour, job["frames"])
-    if job.get("fit"):
-        size = fitted_size(path_bounds([saved]), views, size)
-    if (views, *size, colour) not in stages:
-        stages[views, *size, colour] = Stage([[(saved, view) for view in views]], size, paint)
-    stage = stages[views, *size, colour]
-    titles = [f"{view} ({VIEWS[view][1]})" for view in job["views"]]
-    if paint is None:
-        # A legend of dozens says nothing that the table does not say better.
-        chips = stage.colours if len(saved.muscles) <= len(MUSCLE_COLOURS) else {}
-    images = [labelled(stage.show(frame), caption(saved, frame), titles, chips) for frame in job["frames"]]
-    save_images(images, job["file"], seconds)
-
-
-def save_images(images: list[Any], path: str, seconds: float) -> None:
-    """Save one picture, or several as an animation of so many seconds; all on sheets of one size."""
+def save_images(images: Sequence[Image], path: Path, seconds: float) -> None:
+    """Save one picture, or several of one width as an animation of so many seconds; raises SolveError if it fails."""
     from PIL import Image
 
     width, height = (max(image.size[k] for image in images) for k in range(2))
-    for k, image in enumerate(images):
-        if image.size != (width, height):
-            sheet = Image.new("RGB", (width, height), BACKGROUND)
-            sheet.paste(image, (0, 0))
-            images[k] = sheet
-    if len(images) == 1:
-        images[0].save(path)
-        return
-    pause = max(20, int(1000 * seconds / len(images)))
-    pauses = [pause] * (len(images) - 1) + [900]
-    kinds: dict[str, dict[str, Any]] = {".webp": {"quality": 82, "method": 2}, ".gif": {"optimize": False}}
-    kind = kinds[Path(path).suffix]
-    if path.endswith(".gif"):
-        images = [image.quantize(128, dither=Image.Dither.NONE) for image in images]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=pauses, loop=0, **kind)
-
-
-def main(arguments: Any, opened: Any = SavedRun, draw_job: Any = _draw_job) -> Any:
-    """The child's part: read the jobs, open the folder, draw, leave with 0.
-
-    ``draw_job(found, job, seconds, stages)`` keeps in ``stages`` what later jobs can use again.
-    """
-    task, stages = json.loads(sys.stdin.read()), {}
+    sheets = []
+    for image in images:
+        sheets.append(Image.new("RGB", (width, height), BACKGROUND))
+        sheets[-1].paste(image, (0, 0))
+    kind: dict[str, Any] = {}
+    if len(sheets) > 1:
+        pause = max(20, int(1000 * seconds / len(sheets)))
+        pauses = [pause] * (len(sheets) - 1) + [900]
+        kind = {"save_all": True, "append_images": sheets[1:], "duration": pauses, "loop": 0}
+        kind |= {"quality": 82, "method": 2} if path.suffix == ".webp" else {}
     try:
-        found = opened(arguments[0])
-        for job in task["jobs"]:
-            draw_job(found, job, task["seconds"], stages)
-        for stage in stages.values():
-            stage.close()
-    except (RBFMuscleError, OSError, ValueError) as error:
-        print(error, file=sys.stderr)
-        return _REFUSED
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+        sheets[0].save(path, **kind)
+    except OSError as error:
+        raise SolveError(f"cannot write {path}: {error.strerror}") from None

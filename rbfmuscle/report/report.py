@@ -1,50 +1,78 @@
-"""The report of a run: one HTML file with pictures, animation, plots and tables; no network needed."""
+"""The report of a run: its verdict, the moving scene, five rows with limits; plots and tables folded."""
 
 from __future__ import annotations
 
-import html
 import math
-from concurrent.futures import ThreadPoolExecutor
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
-from rbfmuscle.metrics.quantities import QUANTITIES
-from rbfmuscle.metrics.summary import LEAST, describe_verdict, exceeded
+import numpy as np
+
+from rbfmuscle.metrics.quantities import ALL, QUANTITIES
+from rbfmuscle.metrics.summary import LEAST, describe_verdict, exceeded, within
+from rbfmuscle.output.animation.moving import read_moving
+from rbfmuscle.output.animation.page import pack_runs
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.appearance import USUAL_VIEWS, line_colours
+from rbfmuscle.report.appearance import motion_direction, muscle_colours, muscle_groups
+from rbfmuscle.report.labels import caption
 from rbfmuscle.report.page import (
-    EXPLANATION,
-    MANY,
-    PAGE,
-    SORTING,
-    STYLE,
+    BAD,
+    GOOD,
+    PLAIN,
+    Cell,
+    Light,
+    Page,
+    Section,
+    definitions,
     embedded_image,
-    find_field,
-    folded_events,
-    sortable_table,
-    worst_first,
+    limit_state,
+    number,
+    sentence,
+    table,
 )
-from rbfmuscle.report.plots import plot_panels
-from rbfmuscle.report.render import chosen_frames, draw_pictures
-from rbfmuscle.validation import SolveError
+from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
+from rbfmuscle.report.render import chosen_frames, draw_preview
 
-if TYPE_CHECKING:
-    from rbfmuscle.validation import MissingPartError
-
-
-_PICTURE_SIZE = (330, 400)
-_PREVIEW_SIZE = (330, 400)
-_MOST_EVENTS = 60
-# What frames took of a muscle.
+# What the rows beside the picture say, and the quantities that each holds to a limit.
+LIGHTS = {
+    "Keeps its volume": ("volume_error",),
+    "Stays out of bones": ("penetration_max", "bone_penetration_max", "solver_penetration_max"),
+    "Is the scanned shape at rest": ("rest_error_rms", "rest_error_max"),
+    "Is one closed piece": ("components", "euler", "self_crossing", "unfitted_fraction"),
+    "Moves without jumps": ("flicker_rms", "flicker_max", "tunnelled"),
+}
+COUNTS = ("components", "euler", "self_crossing", "tunnelled")
+# Title, quantity, factor, unit (None: the scene's), whether it can be of either sign.
+PANELS = (
+    ("Length", "length", 1.0, None, False),
+    ("Activation", "activation", 1.0, "", False),
+    ("Volume error", "volume_error", 100.0, "%", True),
+    ("Surface inside a bone", "penetration_max", 1.0, None, False),
+    ("Bone inside the muscle", "bone_penetration_max", 1.0, None, False),
+    ("Inside a bone before the cut", "solver_penetration_max", 1.0, None, False),
+    ("Edge strain of the carried mesh (RMS)", "edge_strain_rms", 100.0, "%", False),
+    ("Time per frame after the first", "time_frame", 1000.0, "ms", False),
+)
+_MECHANICS = ("length", "activation")
+# Below this share of its limit a quantity is flat, and named in place of a plot.
+_FLAT = 0.01
+# Points of all muscles in all frames that a page holds, and events of each kind.
+_MOST_POINTS, _MOST_EVENTS = 2_600_000, 60
 _WORK = ("solved", "carried", "skipped", "substeps")
-# Volume, moment arms and stage times have tables or plots of their own.
+# Tables or plots of their own.
 _ELSEWHERE = ("volume", "moment_arm", "time_solve", "time_fit", "time_extract")
-_TABLE = [name for name in QUANTITIES if name not in _ELSEWHERE]
+_READING = """<p>Each muscle is one closed surface in each frame. Depths in bones are exact distances to the bone meshes;
+where the model cuts the bone out of the surface, the depth before the cut is given too. Limits are those of
+<code>run.json</code>; a row is amber from four fifths of its limit. The first frame may load and compile, so times are
+medians. Drag to turn the picture, scroll or pinch to zoom, drag with shift to move it; names below it switch muscles
+and their lines on and off.</p>"""
 
 
 def write_report(
     directory: str | Path, *, report: bool = True, preview: bool = True, pictures: bool = True
-) -> MissingPartError:
+) -> None:
     """Write ``report.html`` and ``preview.webp`` for a saved run.
 
     Parameters
@@ -54,12 +82,7 @@ def write_report(
     report, preview : bool
         Which of both.
     pictures : bool
-        Draw pictures of the poses; without, the report says that there are none.
-
-    Returns
-    -------
-    MissingPartError or None
-        Why there are no pictures, where drawing failed. The report is written all the same.
+        With the moving scene in the report.
 
     Raises
     ------
@@ -68,235 +91,240 @@ def write_report(
     """
     saved = SavedRun(directory)
     animation = saved.directory / "preview.webp"
-    with ThreadPoolExecutor(1) as beside:
-        # The child that draws leaves a core to the plots.
-        drawing = beside.submit(
-            draw_pictures,
-            saved.directory,
-            lambda folder: _jobs(saved, folder, animation, report and pictures, preview),
+    if preview and saved.has_surfaces() and len(saved.frames) > 1:
+        draw_preview(saved, animation)
+    if not report:
+        return
+    page = _page(saved)
+    if not pictures or not saved.has_surfaces():
+        page.missing = "No pictures: " + (
+            "they were switched off." if saved.has_surfaces() else "this run kept no surfaces."
         )
-        plots = plot_panels(saved) if report else []
-        images, missing = drawing.result()
-    if report:
-        moving = animation.read_bytes() if animation.is_file() else None
-        reason = str(missing) if missing else ("" if pictures else "pictures were switched off")
-        try:
-            (saved.directory / "report.html").write_text(
-                _page(saved, plots, (images, moving, reason)), encoding="utf-8"
-            )
-        except OSError as error:
-            raise SolveError(f"cannot write the report: {error.strerror}") from None
-    return missing
+    else:
+        page.scene = packed_scene({"": saved})
+        if animation.is_file():
+            page.picture = embedded_image(animation.read_bytes(), "webp", "the motion")
+    page.write(saved.directory / "report.html")
 
 
-def key_frames(saved: SavedRun) -> list[int]:
-    """First, middle and last written frame, each once."""
-    middle = saved.frames[len(saved.frames) // 2]
-    return list(dict.fromkeys([saved.frames[0], middle, saved.frames[-1]]))
-
-
-def _jobs(saved, folder, animation, pictures, preview):
-    if not saved.has_surfaces():
-        return []
-    jobs = []
-    if pictures:
-        for frame in key_frames(saved):
-            job = {"file": str(folder / f"{frame:06d}.png"), "frames": [frame], "views": list(USUAL_VIEWS)}
-            jobs.append({**job, "size": _PICTURE_SIZE, "fit": True})
-    if preview and len(saved.frames) > 1:
-        job = {
-            "file": str(animation.resolve()),
-            "frames": chosen_frames(saved.frames),
-            "views": ["front", "side"],
-        }
-        jobs.append({**job, "size": _PREVIEW_SIZE, "fit": True})
-    return jobs
-
-
-def _page(saved, plots, drawn):
-    info = saved.info
-    return PAGE.format(
-        style=STYLE,
-        title=html.escape(info["scene"]["name"]),
-        facts=_facts(saved),
-        verdict=_verdict(saved),
-        pictures=_pictures(*drawn),
-        legend=_legend(saved),
-        plots="".join(f"<figure>{embedded_image(data, 'svg+xml', title)}</figure>" for title, data in plots),
-        table=_summary(saved),
-        stages=_stages(saved),
-        events=_events(saved),
-        explanation=EXPLANATION,
-        script=SORTING,
-        neighbours=_neighbours(saved),
-        quantities="".join(
-            f"<dt>{name}</dt><dd>{html.escape(meaning)}</dd>" for name, (_, meaning) in QUANTITIES.items()
-        ),
-        versions=html.escape(", ".join(f"{name} {value}" for name, value in info["versions"].items())),
+def packed_scene(runs: Mapping[str, SavedRun]) -> str:
+    """Runs of one scene as data of a moving picture, of as many frames as a page holds."""
+    first = next(iter(runs.values()))
+    points = sum(len(run.surface(name, run.frames[0])[0]) for run in runs.values() for name in run.muscles)
+    frames = chosen_frames(first.frames, max(2, _MOST_POINTS // max(points, 1)))
+    groups = muscle_groups(first.info)
+    return pack_runs(
+        {title: read_moving(run, frames, unit=run.units) for title, run in runs.items()},
+        [caption(first, frame) for frame in frames],
+        direction=motion_direction([first.poses[frame] for frame in frames]),
+        groups=groups if len(first.muscles) > 1 else {},
+        colours=muscle_colours(first.muscles, groups),
     )
 
 
-def _facts(saved):
+def _page(saved: SavedRun) -> Page:
+    info = saved.info
+    complete = info["status"] == "complete"
+    answer = describe_verdict(info["muscles"], info["limits"])
+    if not complete:
+        answer = f"the run ended early ({info['status']}): {info['message'] or ''}"
+    beyond = exceeded(info["muscles"], info["limits"])
+    sections = [*_plots(saved), Section("Every quantity of every muscle", _summary(saved), "worst frame of each")]
+    sections += [
+        Section("Neighbours", _neighbours(saved)),
+        Section("Events", _events(saved.events), f"{len(saved.events)}"),
+        Section("Time of each stage", _stages(saved), "milliseconds per frame: median and 95th percentile"),
+        Section("How to read this", _READING + definitions((n, meaning) for n, (_, meaning) in QUANTITIES.items())),
+    ]
+    return Page(
+        info["scene"]["name"],
+        _facts(saved),
+        sentence(answer),
+        BAD if beyond or not complete else GOOD,
+        lights=_lights(saved),
+        sections=sections,
+        footer=", ".join(f"{name} {value}" for name, value in info["versions"].items()),
+    )
+
+
+def _facts(saved: SavedRun) -> list[str]:
     info = saved.info
     models = sorted({muscle["model"]["name"] for muscle in info["scene"]["muscles"]})
     frame = info.get("frame_time") or {}
+    time = f"{number(frame['median'], 's')} per frame" if frame.get("median") else ""
     facts = [
-        ("model", ", ".join(models)),
-        ("muscles", len(saved.muscles)),
-        ("frames", len(saved.frames)),
-        ("time a frame, median", f"{1000 * frame['median']:.0f} ms" if frame.get("median") else "-"),
-        ("whole run", f"{info['times']['wall']:.1f} s"),
-        ("status", info["status"]),
+        f"model {', '.join(models)}",
+        f"{len(saved.muscles)} muscles",
+        f"{len(saved.frames)} frames",
+        time,
+        f"{info['times']['wall']:.1f} s in all",
     ]
-    return "".join(f"<div><b>{html.escape(str(value))}</b><span>{name}</span></div>" for name, value in facts)
+    return [fact for fact in facts if fact]
 
 
-def _beyond(saved):
-    """Set of (muscle, quantity) beyond the limits in run.json."""
-    return {(muscle, name) for muscle, name, *_ in exceeded(saved.info["muscles"], saved.info["limits"])}
+def _lights(saved: SavedRun) -> list[Light]:
+    """A row for each of `LIGHTS`, then one for whatever else is beyond a limit."""
+    muscles, limits = saved.info["muscles"], saved.info["limits"]
+    rows = [_light(saved, title, quantities) for title, quantities in LIGHTS.items()]
+    known = {quantity for quantities in LIGHTS.values() for quantity in quantities}
+    other = {name.partition(":")[0] for _, name, *_ in exceeded(muscles, limits)} - known
+    return [row for row in rows if row] + [row for q in sorted(other) if (row := _light(saved, q, (q,)))]
 
 
-def _verdict(saved):
-    if saved.info["status"] != "complete":
-        message = html.escape(saved.info["message"] or "")
-        return f'<p class="bad">The run ended early ({saved.info["status"]}): {message}</p>'
-    text = html.escape(describe_verdict(saved.info["muscles"], saved.info["limits"]))
-    return f'<p class="{"bad" if _beyond(saved) else "good"}">{text[0].upper()}{text[1:]}.</p>'
+def _light(saved: SavedRun, title: str, quantities: Sequence[str]) -> Light | None:
+    """The worst of some quantities against their limits, over muscles and frames."""
+    limits, found = saved.info["limits"], []
+    for muscle, table_ in saved.info["muscles"].items():
+        for name in quantities:
+            facts = table_.get(name)
+            if facts and limits.get(name) is not None and muscle != ALL:
+                worst = math.nan if facts.get("worst") is None else facts["worst"]
+                found.append((_excess(name, worst, limits[name]), muscle, name, worst, facts))
+    if not found:
+        return None
+    _, muscle, name, worst, facts = max(found, key=lambda entry: entry[0])
+    unit, limit = facts["unit"], limits[name]
+    sign = "≥" if name in LEAST else "≤"
+    state = limit_state(worst, limit, least=name in LEAST, count=name in COUNTS)
+    note = f"{name}: {muscle}, frame {facts.get('worst_frame', '–')}".replace("_", " ")
+    shown = f"{sign} {limit:g}{'' if unit == '1' else ' ' + unit}"
+    return Light(title, [Cell(number(worst, unit), worst, state)], shown, note if worst else name.replace("_", " "))
 
 
-def _pictures(images, moving, reason):
-    if not images and moving is None:
-        text = html.escape(reason or "this run kept no surfaces")
-        return f'<p class="note">There are no pictures: {text}.</p>'
-    parts = [embedded_image(data, "png", f"frame {int(name)}") for name, data in images.items()]
-    if moving is not None:
-        parts.insert(0, embedded_image(moving, "webp", "the whole motion"))
-    note = f'<p class="note">{html.escape(reason)}</p>' if reason else ""
-    return note + "".join(f"<figure>{part}</figure>" for part in parts)
+def _excess(name: str, worst: float, limit: float) -> float:
+    """How near a worst value is to its limit: 1 where it is there, more beyond."""
+    if not within(name, worst, limit):
+        return math.inf if limit <= 0 or name in LEAST or math.isnan(worst) else abs(worst) / limit
+    return 0.0 if name in COUNTS or limit <= 0 else abs(worst) / limit
 
 
-def _legend(saved):
-    if len(saved.muscles) >= MANY:
-        return "In each plot the muscles that go furthest are named; all others are grey. <span>" + (
-            '<i class="limit"></i>limit</span>'
-        )
-    chips = "".join(
-        f'<span><i style="background:{colour}"></i>{html.escape(name)}</span>'
-        for name, colour in line_colours(saved.muscles).items()
-    )
-    return f'{chips}<span><i class="limit"></i>limit</span>'
+def _plots(saved: SavedRun) -> list[Section]:
+    """Moment arms and lengths, then what else changes along the motion."""
+    axis = motion_axis(saved)
+    arms = [
+        (f"Moment arm: {name}", "moment_arm", 1.0, arm_unit(saved, name), False, name)
+        for name in saved.arm_coordinates()
+    ]
+    mechanics, errors, flat = [], [], []
+    for title, quantity, factor, unit, both, coordinate in [*arms, *((*panel, None) for panel in PANELS)]:
+        tracks = _tracks(saved, quantity, factor, axis[0], coordinate)
+        if not tracks:
+            continue
+        limit, greatest = saved.info["limits"].get(quantity), max(np.nanmax(np.abs(t.y), initial=0.0) for t in tracks)
+        if quantity not in _MECHANICS and not coordinate and greatest <= _FLAT * factor * (limit or 0.0):
+            flat.append(f"{title.lower()} at most {greatest:.2g} {saved.units if unit is None else unit}")
+            continue
+        limits = [] if limit is None else [factor * limit, -factor * limit] if both else [factor * limit]
+        labels = axis[1], saved.units if unit is None else unit
+        zero = quantity not in ("length", "moment_arm") and not both
+        picture = line_plot(title, tracks, labels, limits=limits, zero=zero)
+        (mechanics if coordinate or quantity in _MECHANICS else errors).append(picture)
+    flat_note = f'<p class="note">Flat over the motion: {"; ".join(flat)}.</p>' if flat else ""
+    return [
+        Section("Moment arms and lengths", _grid(mechanics)),
+        Section("Errors and times over the motion", _grid(errors) + flat_note),
+    ]
 
 
-def _summary(saved):
-    muscles, beyond = saved.info["muscles"], _beyond(saved)
-    used = [name for name in _TABLE if any(name in found for found in muscles.values())]
-    if len(muscles) >= MANY:
-        return _by_muscle(saved, muscles, beyond, used)
-    head = "".join(f"<th>{html.escape(name)}</th>" for name in muscles)
-    rows = []
+def _grid(pictures: Sequence[str]) -> str:
+    return f'<div class="plots">{"".join(pictures)}</div>' if pictures else ""
+
+
+def _tracks(
+    saved: SavedRun, quantity: str, factor: float, axis: Mapping[int, float], coordinate: str | None
+) -> list[Track]:
+    """Lines of the muscles in the colours of the picture; of times without the first frame, and all together."""
+    colours = muscle_colours(saved.muscles, muscle_groups(saved.info))
+    if quantity == "time_frame" and len(saved.muscles) > 1:
+        colours[ALL] = "#26282b"
+    tracks = []
+    for name, colour in colours.items():
+        frames, values = saved.series(name, quantity, coordinate)
+        if quantity == "time_frame":
+            frames, values = frames[1:], values[1:]
+        if len(frames) and np.isfinite(values).any():
+            tracks.append(Track(name, colour, np.array([axis[frame] for frame in frames]), factor * values))
+    return tracks
+
+
+def _summary(saved: SavedRun) -> str:
+    """A row for each muscle, those beyond most limits first."""
+    muscles, limits = saved.info["muscles"], saved.info["limits"]
+    used = [q for q in QUANTITIES if q not in _ELSEWHERE and any(q in found for found in muscles.values())]
+    head = ["muscle"]
     for name in used:
-        cells = []
-        for muscle, found in muscles.items():
-            mark = ' class="bad"' if (muscle, name) in beyond else ""
-            cells.append(f"<td{mark}>{_cell(name, found.get(name))}</td>")
-        rows.append(
-            f"<tr><th>{_named(name, muscles)}</th>{''.join(cells)}<td>{_shown_limit(saved, name)}</td></tr>"
-        )
-    return f"<table><tr><th></th>{head}<th>limit</th></tr>{''.join(rows)}</table>"
-
-
-def _by_muscle(saved, muscles, beyond, used):
-    """A row a muscle, the worst first, for a report of many."""
-    head = [
-        "muscle",
-        *(f"{_named(name, muscles)}<br><small>{_shown_limit(saved, name)}</small>" for name in used),
-    ]
+        unit = next(found[name]["unit"] for found in muscles.values() if name in found)
+        limit = "" if name not in limits else f" ({'≥' if name in LEAST else '≤'} {limits[name]:g})"
+        head.append(f"{name.replace('_', ' ')}{'' if unit == '1' else f' [{unit}]'}{limit}")
     rows = []
-    for muscle in worst_first(muscles, beyond, saved.info["limits"]):
-        found = muscles[muscle]
-        cells = [(html.escape(muscle), muscle, False)]
-        for name in used:
-            facts = found.get(name) or {}
-            value = facts.get("median" if name == "time_frame" else "worst")
-            cells.append((_cell(name, facts), value, (muscle, name) in beyond))
-        rows.append(cells)
-    return find_field() + sortable_table(head, rows)
+    for muscle, found in muscles.items():
+        cells = [_cell(name, found.get(name), limits.get(name)) for name in used]
+        rows.append((-sum(cell.state == BAD for cell in cells), [muscle, *cells]))
+    return table(head, [row for _, row in sorted(rows, key=lambda row: row[0])], find=len(rows) > 8)
 
 
-def _named(name, muscles):
-    unit = next(found[name]["unit"] for found in muscles.values() if name in found)
-    return name if unit in ("1", "s") else f"{name} <small>{unit}</small>"
-
-
-def _shown_limit(saved, name):
-    limit = saved.info["limits"].get(name)
-    return "" if limit is None else f"{'≥' if name in LEAST else '≤'} {limit:g}"
-
-
-def _cell(name, facts):
+def _cell(name: str, facts: Mapping[str, Any] | None, limit: float | None) -> Cell:
     if not facts or facts.get("worst") is None:
-        return "-"
+        return Cell("–")
     if name in ("length", "edge_strain_rms"):
-        return f"{facts['min']:.4g} … {facts['max']:.4g}"
+        return Cell(f"{facts['min']:.4g} … {facts['max']:.4g}", facts["max"])
     if name == "time_frame":
-        return f"{1000 * facts['median']:.3g} ms <small>median</small>"
-    small = f" <small>frame {facts['worst_frame']}</small>" if facts["worst"] else ""
-    return f"{facts['worst']:.3g}{small}"
+        return Cell(number(facts["median"], "s"), facts["median"])
+    where = f", frame {facts['worst_frame']}" if facts["worst"] and name not in COUNTS else ""
+    state = limit_state(facts["worst"], limit, least=name in LEAST, count=name in COUNTS)
+    return Cell(f"{number(facts['worst'])}{where}", facts["worst"], BAD if state == BAD else PLAIN)
 
 
-def _stages(saved):
-    """What each stage took of each muscle, the most expensive first, and what its frames took."""
+def _stages(saved: SavedRun) -> str:
+    """What each stage took of each muscle, the most expensive first, and in how many frames it was solved, and why."""
     stages, work = saved.info.get("stages") or {}, saved.info.get("work") or {}
-    names = list(dict.fromkeys(key for table in stages.values() for key in table))
+    names = list(dict.fromkeys(key for found in stages.values() for key in found))
     rows = []
-    for muscle, table in sorted(stages.items(), key=lambda row: -(_median(row[1].get("time_frame")) or 0.0)):
-        cells = [(html.escape(muscle), muscle, False)]
-        cells += [(_milliseconds(table.get(name)), _median(table.get(name)), False) for name in names]
-        rows.append(cells + _work(work.get(muscle)))
-    return sortable_table(["", *(name.removeprefix("time_") for name in names), *_WORK, "mostly for"], rows)
+    for muscle, found in sorted(stages.items(), key=lambda row: -_median(row[1].get("time_frame"))):
+        cells: list[Cell | str] = [muscle]
+        for name in names:
+            facts = found.get(name)
+            text = f"{1e3 * facts['median']:.1f}, {1e3 * facts['p95']:.1f}" if _median(facts) >= 0 else "–"
+            cells.append(Cell(text, _median(facts)))
+        rows.append([*cells, *_work(work.get(muscle))])
+    head = ["muscle", *(name.removeprefix("time_") for name in names), *_WORK, "mostly for"]
+    return table(head, rows) if rows else ""
 
 
-def _median(facts):
-    value = facts and facts["median"]
-    return value if value is not None and math.isfinite(value) else None
+def _median(facts: Mapping[str, float] | None) -> float:
+    """Median of a stage, -1 where there is none."""
+    return facts["median"] if facts and facts["median"] is not None and math.isfinite(facts["median"]) else -1.0
 
 
-def _work(done):
-    """Cells of what the frames took of a muscle."""
+def _work(done: Mapping[str, Any] | None) -> list[Cell | str]:
     if not done:
-        return [("-", None, False)] * len(_WORK) + [("-", "", False)]
+        return ["–"] * (len(_WORK) + 1)
     most = max(done["reasons"], key=lambda state: done[state], default="")
-    counts = [(str(done[name]), done[name], False) for name in _WORK]
-    return [*counts, (html.escape(done["reasons"].get(most, "")), "", False)]
+    return [*(Cell(str(done[name]), done[name]) for name in _WORK), done["reasons"].get(most, "")]
 
 
-def _milliseconds(facts):
-    if not facts or facts["median"] is None or not math.isfinite(facts["median"]):
-        return "-"
-    return f"{1000 * facts['median']:.1f} <small>{1000 * facts['p95']:.1f}</small>"
-
-
-def _neighbours(saved):
+def _neighbours(saved: SavedRun) -> str:
     """Pairs of muscles that slide on each other, the deepest overlap first."""
-    pairs = saved.info.get("neighbours") or []
-    if not pairs:
-        return ""
     rows = [
         [
-            (html.escape(" and ".join(pair["muscles"])), "", False),
-            (
-                f"{pair['overlap_max']:.3g} <small>frame {pair['overlap_frame']}</small>",
-                pair["overlap_max"],
-                False,
-            ),
-            (f"{pair['gap_rms']:.3g} <small>frame {pair['gap_frame']}</small>", pair["gap_rms"], False),
+            " and ".join(pair["muscles"]),
+            Cell(f"{number(pair['overlap_max'])}, frame {pair['overlap_frame']}", pair["overlap_max"]),
+            Cell(f"{number(pair['gap_rms'])}, frame {pair['gap_frame']}", pair["gap_rms"]),
         ]
-        for pair in pairs
+        for pair in saved.info.get("neighbours") or []
     ]
-    unit = html.escape(saved.units)
-    head = ["pair", f"overlap <small>{unit}</small>", f"gap opened, RMS <small>{unit}</small>"]
-    return f'<h2>Neighbours</h2><div class="wide">{sortable_table(head, rows)}</div>'
+    return table(["pair", f"overlap [{saved.units}]", f"gap opened, RMS [{saved.units}]"], rows) if rows else ""
 
 
-def _events(saved):
-    return folded_events(saved.events, _MOST_EVENTS) if saved.events else '<p class="note">None.</p>'
+def _events(events: Iterable[Sequence[Any]]) -> str:
+    """Events by action, the commonest first, with the muscles that have most of them."""
+    kinds: dict[str, list[Sequence[Any]]] = {}
+    for event in events:
+        kinds.setdefault(event[4], []).append(event)
+    parts = []
+    for action, found in sorted(kinds.items(), key=lambda kind: -len(kind[1])):
+        often = ", ".join(f"{name or 'bones'} {n}" for name, n in Counter(e[1] for e in found).most_common(6))
+        rows = [[str(value) for value in event[:4]] for event in found[:_MOST_EVENTS]]
+        left = f"<p>and {len(found) - len(rows)} more in events.csv</p>" if len(found) > len(rows) else ""
+        parts.append(f"<h4>{action}: {often}</h4>{table(['frame', 'muscle', 'bone', 'count'], rows)}{left}")
+    return "".join(parts)

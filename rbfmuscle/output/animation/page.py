@@ -1,6 +1,6 @@
 """Moving runs as data that a script in a page turns, scrubs and switches on and off; no network.
 
-Positions are whole numbers of `Packer.step`, kept as second differences along the frames and first differences along
+Positions are whole numbers of a step, kept as second differences along the frames and first differences along
 the vertices; all arrays follow each other in one deflated stream, their bytes sorted by place, as base64.
 """
 
@@ -22,6 +22,8 @@ from rbfmuscle.output.animation.moving import FRAMES_A_SECOND, MovingMuscle, Mov
 
 # Whole numbers of which the longest side of all that moves has so many: 0.03 mm of 900.
 _STEPS = 30_000
+# From which it is seen where nothing else is asked for.
+_USUAL = (-1.0, -0.12, 0.12)
 
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">
@@ -101,8 +103,8 @@ def pack_runs(
             }
         )
     facts = {
-        "panels": list(runs), "captions": captions, "parts": parts, "direction": list(direction or (-1.0, -0.12, 0.12))
-        if direction is None else [float(x) for x in direction], "up": first.up, "step": packer.step,
+        "panels": list(runs), "captions": captions, "parts": parts, "up": first.up, "step": packer.step,
+        "direction": [float(x) for x in (_USUAL if direction is None else direction)],
         "origin": packer.origin.tolist(), "rate": FRAMES_A_SECOND / 2.0, "bytes": packer.text(),
     }  # fmt: skip
     # No name may end the script that holds it.
@@ -149,4 +151,4 @@ class _Packer:
 
     def text(self) -> str:
         """All of it, deflated, as base64."""
-        return base64.b64encode(zlib.compress(b"".join(self.parts), 7)).decode("ascii")
+        return base64.b64encode(zlib.compress(b"".join(self.parts), 6)).decode("ascii")

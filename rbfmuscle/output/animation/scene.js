@@ -77,7 +77,7 @@ class Scene {
       part.rgb = [1, 3, 5].map((k) => parseInt(part.colour.slice(k, k + 2), 16) / 255);
     }
     data.panels.forEach((name) => name && element("span", this.stage, {className: "title", textContent: name}));
-    this.build(); this.listen(); this.look(data.direction); this.show(0);
+    this.build(); this.listen(); this.look(data.direction); this.show(data.captions.length - 1);
     new ResizeObserver(() => this.draw()).observe(this.stage);
   }
 
