@@ -19,9 +19,8 @@ from rbfmuscle.experiments.kernel_study import check_placement, row_name
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.geometry.surfaces import mesh_volume, vertex_areas
 from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
-from rbfmuscle.implicit.placement.density import GREEDY_LARGEST
 from rbfmuscle.implicit.placement.refinement import FITTED
-from rbfmuscle.implicit.placement.sampling import SurfaceSample, sample_surface
+from rbfmuscle.implicit.placement.sampling import GREEDY_LARGEST, SurfaceSample, sample_surface
 from rbfmuscle.validation import UsageError, check_mesh
 
 # Kernels that take part by default, the quickest first.

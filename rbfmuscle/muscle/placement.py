@@ -16,9 +16,8 @@ from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field_fit import FieldFit, wanted_derivatives
 from rbfmuscle.implicit.kernels.table import get_kernel
-from rbfmuscle.implicit.placement.density import GREEDY_LARGEST
 from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
-from rbfmuscle.implicit.placement.sampling import SurfaceSample, sample_surface
+from rbfmuscle.implicit.placement.sampling import GREEDY_LARGEST, SurfaceSample, sample_surface
 from rbfmuscle.implicit.selection import BOUND, choose_epsilon, spacing, surface_error
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.scene.objects import Muscle

@@ -135,7 +135,7 @@ class EmbeddedSolid:
         self.scale, self.side = diameter(points), float(np.prod(lattice.spacing)) ** (1 / 3) * frame.size
         self.rest = frame.points(lattice.rest)
         self.columns, self.shares, self.slopes_at = self._embed(points)
-        self.quad_columns = lattice.quadrature.columns
+        self.quad_columns = lattice.quadrature.indices
         self.slopes = np.ascontiguousarray(lattice.quadrature.slopes @ frame.axes / frame.size)
         self.weights = lattice.weights * frame.size**3
         self.quad_points = frame.points(lattice.points)
@@ -158,7 +158,7 @@ class EmbeddedSolid:
         """Nodes (n, 27), shape functions (n, 27) and their slopes (n, 27, 3) at points of the muscle at rest."""
         frame = self.frame
         found = self.lattice.embed((points - frame.origin) @ frame.axes.T / frame.size)
-        return found.columns, found.shares, found.slopes @ frame.axes / frame.size
+        return found.indices, found.weights, found.slopes @ frame.axes / frame.size
 
     def _assemble(self, lattice: Lattice) -> None:
         """Matrix of the energy for frozen targets, with its springs; its inverse; the weights of the bones."""

@@ -150,6 +150,8 @@ def test_too_few_points_for_the_topology_are_refused():
         sample_surface(mesh.vertices, mesh.faces, 5)
     with pytest.raises(ValueError, match="at least 4"):
         sample_surface(mesh.vertices, mesh.faces, 3)
+    with pytest.raises(ValueError, match="placement"):
+        sample_surface(mesh.vertices, mesh.faces, 20, placement="evn")
 
 
 @pytest.mark.parametrize("placement", ["adaptive", "greedy"])
@@ -194,14 +196,8 @@ def test_greedy_placement_of_thousands_follows_the_curvature_alone():
     np.testing.assert_array_equal(greedy.points, adaptive.points)
 
 
-def test_unknown_placement_is_refused():
-    mesh = trimesh.creation.icosphere(2)
-    with pytest.raises(ValueError, match="placement"):
-        sample_surface(mesh.vertices, mesh.faces, 20, placement="evn")
-
-
 @needs_hip
-@pytest.mark.parametrize("count", [150, 300, 600, 2000])
+@pytest.mark.parametrize("count", [150, 2000])
 @pytest.mark.parametrize("muscle", MUSCLES)
 def test_real_muscles_get_an_even_cover_and_a_closed_control_mesh(muscle, count):
     mesh = trimesh.load(HIP / f"{muscle}.ply", process=False)
@@ -214,24 +210,15 @@ def test_real_muscles_get_an_even_cover_and_a_closed_control_mesh(muscle, count)
 
 
 def test_off_surface_points_stay_nearest_to_their_own_point():
-    mesh = plate(1.0)
-    sample = sample_surface(mesh.vertices, mesh.faces, 400)
-    points, values = off_surface_points(sample.points, sample.normals, distance=5.0)
-    assert len(points) == len(values) == 1200
-    distance, owner = trimesh.proximity.cKDTree(sample.points).query(points)
+    """Two sheets 0.8 apart: half the distance to the nearest point outside, a quarter of the gap inside."""
+    sheet = np.stack(np.meshgrid(*[np.arange(5.0)] * 2), axis=-1).reshape(-1, 2)
+    points = np.vstack([np.c_[sheet, np.zeros(25)], np.c_[sheet, np.full(25, 0.8)]])
+    normals = np.repeat([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]], 25, axis=0)
+    where, values = off_surface_points(points, normals)
+    np.testing.assert_allclose(values, np.repeat([0.0, 0.4, -0.2], 50), atol=1e-12)
+    distance, owner = trimesh.proximity.cKDTree(points).query(where)
     np.testing.assert_allclose(distance, np.abs(values), atol=1e-12)
-    np.testing.assert_array_equal(owner, np.tile(np.arange(400), 3))
-    assert values[400:800].max() == 5.0
-    # Inside, the far side of the plate cuts the step back.
-    broad = np.abs(sample.normals[:, 2]) > 0.99
-    assert np.abs(values[800:][broad]).max() < 5.0
-
-
-def test_off_surface_points_refuse_bad_numbers():
-    with pytest.raises(ValueError, match="distance"):
-        off_surface_points(np.eye(3), np.eye(3), distance=-1.0)
-    with pytest.raises(ValueError, match="safety"):
-        off_surface_points(np.eye(3), np.eye(3), safety=2.0)
+    np.testing.assert_array_equal(owner, np.tile(np.arange(50), 3))
 
 
 def test_cells_are_equalised_until_no_vertex_would_rather_be_in_a_neighbouring_one():

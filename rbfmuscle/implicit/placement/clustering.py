@@ -6,6 +6,8 @@ import heapq
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import face_normals, unique_edges
@@ -94,7 +96,8 @@ def cluster_mesh(fine: FineMesh, density: Floats, count: int, seed: int) -> tupl
     labels = np.full(len(fine.vertices), -1)
     _farthest_loop(start, other, length, first, count, labels)
     _equalise_loop(fine.vertices, weight, edges, labels, count, 200)
-    _connect_loop(fine.vertices, weight, start, other, labels, count)
+    _mark_loose(tail, other, weight, labels, count)
+    _join_loop(start, other, labels)
     return contract_clusters(fine.faces, labels, weight, count)
 
 
@@ -186,42 +189,24 @@ def _equalise_loop(vertices, weight, edges, labels, count, rounds):
             break
 
 
+def _mark_loose(tail: Integers, other: Integers, weight: Floats, labels: Integers, count: int) -> None:
+    """Label all but the heaviest connected piece of each cell with -2."""
+    same = labels[tail] == labels[other]
+    links = coo_matrix((np.ones(same.sum()), (tail[same], other[same])), shape=(len(labels), len(labels)))
+    _, piece = connected_components(links, directed=False)
+    heaviest = np.full(count, -1)
+    ordered = np.argsort(np.bincount(piece, weight))
+    cell = labels[np.unique(piece, return_index=True)[1]][ordered]
+    heaviest[cell[cell >= 0]] = ordered[cell >= 0]
+    labels[(labels >= 0) & (piece != heaviest[labels])] = -2
+
+
 @compiled
-def _connect_loop(vertices, weight, start, other, labels, count):
-    """Keep the heaviest connected piece of each cell; the rest joins the cells around it."""
-    size = len(labels)
-    piece = np.full(size, -1)
-    stack = np.empty(size, dtype=np.int64)
-    best = np.full(count, -1)
-    heaviest = np.zeros(count)
-    pieces = 0
-    for v in range(size):
-        if piece[v] >= 0 or labels[v] < 0:
-            continue
-        top, total = 1, 0.0
-        stack[0] = v
-        piece[v] = pieces
-        while top > 0:
-            top -= 1
-            u = stack[top]
-            total += weight[u]
-            for e in range(start[u], start[u + 1]):
-                w = other[e]
-                if piece[w] < 0 and labels[w] == labels[v]:
-                    piece[w] = pieces
-                    stack[top] = w
-                    top += 1
-        if total > heaviest[labels[v]] or best[labels[v]] < 0:
-            heaviest[labels[v]] = total
-            best[labels[v]] = pieces
-        pieces += 1
-    loose = 0
-    for v in range(size):
-        if labels[v] >= 0 and piece[v] != best[labels[v]]:
-            labels[v] = -2
-            loose += 1
+def _join_loop(start, other, labels):
+    """Vertices of label -2 join a cell beside them."""
+    loose = (labels == -2).sum()
     while loose > 0:
-        for v in range(size):
+        for v in range(len(labels)):
             if labels[v] != -2:
                 continue
             for e in range(start[v], start[v + 1]):

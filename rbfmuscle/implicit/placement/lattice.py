@@ -24,10 +24,20 @@ LEAST_REGION = 0.3  # of the mean volume of the regions
 
 @dataclass(frozen=True)
 class Embedding:
-    """Shape functions at points: values (n, w), slopes (n, w, 3) by rest coordinates, their nodes (n, w)."""
+    """Shape functions at points.
 
-    columns: np.ndarray
-    shares: np.ndarray
+    Attributes
+    ----------
+    indices : (n, 27) ndarray of int
+        Nodes of each point.
+    weights : (n, 27) ndarray
+        Values of their shape functions.
+    slopes : (n, 27, 3) ndarray
+        Gradients of these, by rest coordinates [1 / length].
+    """
+
+    indices: np.ndarray
+    weights: np.ndarray
     slopes: np.ndarray
 
 
@@ -40,9 +50,7 @@ class Lattice:
         Of the rest mesh.
     faces : (m, 3) ndarray of int
     nodes : int
-        About how many nodes are wanted.
-    degree : {1, 2}
-        Of the shape functions along each axis: linear ones or quadratic B-splines.
+        About how many nodes are wanted. Shape functions are quadratic B-splines along each axis.
 
     Attributes
     ----------
@@ -56,8 +64,7 @@ class Lattice:
         Sides of a cell.
     """
 
-    def __init__(self, vertices: Floats, faces: Integers, nodes: int, *, degree: int = 2) -> None:
-        self.degree = degree
+    def __init__(self, vertices: Floats, faces: Integers, nodes: int) -> None:
         self.axes = _axes(vertices)
         box = vertices @ self.axes.T
         self.low, self.extent = box.min(axis=0), np.ptp(box, axis=0)
@@ -94,15 +101,14 @@ class Lattice:
         return (cells[:, 0] * self.count[1] + cells[:, 1]) * self.count[2] + cells[:, 2]
 
     def _number_nodes(self) -> None:
-        width = self.degree + 1
-        steps = np.stack(np.meshgrid(*[np.arange(width)] * 3, indexing="ij"), -1).reshape(-1, 3)
+        steps = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), -1).reshape(-1, 3)
         corner = self.cells[:, None, :] + steps
-        size = self.count + self.degree
+        size = self.count + 2
         flat = (corner[..., 0] * size[1] + corner[..., 1]) * size[2] + corner[..., 2]
         known, self.nodes = np.unique(flat, return_inverse=True)
         self.nodes = self.nodes.reshape(flat.shape).astype(np.int64)
         self.place = np.stack([known // (size[1] * size[2]), known // size[2] % size[1], known % size[2]], 1)
-        self.rest = (self.low + (self.place - 0.5 * (self.degree - 1)) * self.spacing) @ self.axes
+        self.rest = (self.low + (self.place - 0.5) * self.spacing) @ self.axes
         self.tree = cKDTree(self.cells + 0.5)
 
     def embed(self, points: Floats) -> Embedding:
@@ -117,8 +123,8 @@ class Lattice:
         return self._at(cell, local - self.cells[cell])
 
     def _at(self, cell: Integers, s: Floats) -> Embedding:
-        value, slope = _basis(s, self.degree)
-        shares = np.einsum("na,nb,nc->nabc", value[:, 0], value[:, 1], value[:, 2])
+        value, slope = _basis(s)
+        weights = np.einsum("na,nb,nc->nabc", value[:, 0], value[:, 1], value[:, 2])
         parts = [
             np.einsum("na,nb,nc->nabc", *(slope[:, k] if k == axis else value[:, k] for k in range(3)))
             / self.spacing[axis]
@@ -127,7 +133,7 @@ class Lattice:
         count = len(s)
         slopes = np.stack(parts, -1).reshape(count, -1, 3) @ self.axes
         return Embedding(
-            np.ascontiguousarray(self.nodes[cell]), np.ascontiguousarray(shares.reshape(count, -1)),
+            np.ascontiguousarray(self.nodes[cell]), np.ascontiguousarray(weights.reshape(count, -1)),
             np.ascontiguousarray(slopes),
         )  # fmt: skip
 
@@ -216,11 +222,8 @@ def _axes(points: Floats) -> Floats:
     return axes
 
 
-def _basis(s: Floats, degree: int) -> tuple[Floats, Floats]:
-    """Values and slopes (n, 3, degree + 1) of the uniform B-splines of a cell at s in [0, 1]^3."""
-    one = np.ones_like(s)
-    if degree == 1:
-        return np.stack([1 - s, s], -1), np.stack([-one, one], -1)
+def _basis(s: Floats) -> tuple[Floats, Floats]:
+    """Values and slopes (n, 3, 3) of the uniform quadratic B-splines of a cell at s in [0, 1]^3."""
     value = np.stack([0.5 * (1 - s) ** 2, 0.5 + s - s**2, 0.5 * s**2], -1)
     return value, np.stack([s - 1, 1 - 2 * s, s], -1)
 
