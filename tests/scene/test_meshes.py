@@ -73,9 +73,7 @@ class TestMending:
         assert read.closed and any("holes" in note for note in read.notes)
         cut = mesh.faces[mesh.triangles_center[:, 2] < 8]
         path = write(tmp_path / "large.ply", mesh.vertices, cut)
-        with pytest.raises(
-            MeshError, match=r"large\.ply.*open.*boundary edges, the widest hole about \(.*\); close"
-        ):
+        with pytest.raises(MeshError, match=r"large\.ply.*open.*boundary edges, one at \(.*\); close"):
             read_mesh(path)
         assert not read_mesh(path, may_be_open=True).closed
 
@@ -87,15 +85,23 @@ class TestMending:
         mapped = read.mesh.vertices[read.vertex_map]
         assert np.abs(mapped - soup).max() < 1e-4
 
-    def test_fin_and_repeated_and_degenerate_triangles_are_dropped(self, tmp_path):
+    def test_repeated_and_degenerate_triangles_and_loose_vertices_are_dropped(self, tmp_path):
+        mesh = ball()
+        vertices = np.vstack([mesh.vertices[:5], [[0, 0, 60.0]], mesh.vertices[5:]])
+        faces = mesh.faces + (mesh.faces >= 5)
+        a, b, _ = faces[0]
+        read = read_mesh(write(tmp_path / "a.ply", vertices, np.vstack([faces, faces[3:4], [[a, a, b]]])))
+        assert read.closed and len(read.mesh.vertices) == len(mesh.vertices)
+        assert read.vertex_map[5] == -1 and read.vertex_map[6] == 5
+        assert any("2 degenerate or repeated" in note for note in read.notes)
+
+    def test_dangling_triangle_is_dropped(self, tmp_path):
         mesh = ball()
         vertices = np.vstack([mesh.vertices, [[0, 0, 60.0]]])
-        a, b, _ = mesh.faces[0]
-        faces = np.vstack([mesh.faces, [[a, b, len(mesh.vertices)]], mesh.faces[3:4], [[a, a, b]]])
+        faces = np.vstack([mesh.faces, [[*mesh.faces[0, :2], len(mesh.vertices)]]])
         read = read_mesh(write(tmp_path / "fin.ply", vertices, faces))
-        assert read.closed and len(read.mesh.vertices) == len(mesh.vertices)
-        assert read.vertex_map[-1] == -1
-        assert any("dangling" in note for note in read.notes)
+        assert read.closed and read.vertex_map[-1] == -1
+        assert any("1 dangling" in note for note in read.notes)
 
     def test_crumbs_are_dropped_and_real_parts_refused(self, tmp_path):
         crumb = trimesh.creation.icosphere(subdivisions=0, radius=0.5)
