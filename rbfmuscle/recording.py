@@ -11,13 +11,14 @@ from datetime import UTC, datetime
 import numba
 
 from rbfmuscle.geometry.fields import BoneField
-from rbfmuscle.metrics.quantities import Row
-from rbfmuscle.metrics.recorder import MetricsRecorder
-from rbfmuscle.metrics.summary import LIMITS, Summary, default_limit
+from rbfmuscle.metrics.joint_gaps import joint_gaps
+from rbfmuscle.metrics.quantities import ALL, Row
+from rbfmuscle.metrics.rows import frame_rows, moment_arm_rows
+from rbfmuscle.metrics.summary import LIMITS, Summary, default_limit, describe_verdict
 from rbfmuscle.output.runinfo import Clock, Stages, build_info, frame_facts
 from rbfmuscle.output.sinks import Sink
 from rbfmuscle.progress import stage
-from rbfmuscle.scene.check import bone_collisions, bone_findings, check_initial
+from rbfmuscle.scene.check import bone_collisions, bone_findings, check_initial, sampled_frames
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.sharing.crew import WorkerPool
 from rbfmuscle.sharing.share import MuscleGroup, timed
@@ -57,27 +58,27 @@ class Recording:
         self.status, self.message = "running", ""
         self.summary, self.stages = Summary(), Stages()
         self.written: list[dict] = []
+        self._path: dict[int, dict[str, float]] = {}
         self._place = {muscle.name: k for k, muscle in enumerate(scene.muscles)}
         with self.timed("build"), stage("building"):
-            self.recorder = MetricsRecorder(scene) if scene.output.metrics else None
             alone = models_here or fields is not None
             helpers = 0 if alone else helpers_for(scene, numba.get_num_threads())
-            self.share, self._driven = self._build(helpers, fields)
+            self.share, self._skeleton = self._build(helpers, fields)
 
     def _build(self, helpers, fields):
-        """All muscles, here or in helpers' hands, and the events of bones; a scene that is refused ends the helpers."""
+        """All muscles, in this process or in several, and what is said of the bones; a refused scene ends the processes."""
         if helpers < 2:
             self._check()
-            return MuscleGroup(self.scene, fields=fields), _bones_driven_together(self.scene)
+            return MuscleGroup(self.scene, fields=fields), _check_skeleton(self.scene)
         crew = WorkerPool(self.scene, helpers)
         try:
             self._check()
-            driven = _bones_driven_together(self.scene)
+            skeleton = _check_skeleton(self.scene)
             crew.built()
         except BaseException:
             crew.close()
             raise
-        return crew, driven
+        return crew, skeleton
 
     def _check(self):
         check_substeps(self.scene)
@@ -114,8 +115,7 @@ class Recording:
             raise
         finally:
             self.close()
-            kept = {entry["frame"] for entry in self.written}
-            rows = [] if self.recorder is None else [r for r in self.recorder.finish() if r.frame in kept]
+            rows = self._moment_arms()
             self.summary.add(rows)
             # What ended the run says more than a disk that then refuses the rest.
             with suppress(*((SolveError,) if self.status == "failed" else ())):
@@ -131,13 +131,22 @@ class Recording:
         for frame, measured in self.share.frames():
             # By muscle, whoever solved it.
             frame.events.sort(key=lambda event: self._place[event.muscle])
-            frame.events.extend(self._driven.get(frame.index, []))
+            events, together = self._skeleton.get(frame.index, ([], {}))
+            frame.events.extend(events)
             self.stages.add(frame)
             rows: list[Row] = []
-            if self.recorder is not None:
-                rows = self.recorder.add(frame, measured)
+            if self.scene.output.metrics:
+                before = next(reversed(self._path.values()), None)
+                rows = frame_rows(self.scene, frame, before, {**measured, ALL: together})
                 self.summary.add(rows)
+            self._path[frame.index] = dict(frame.coordinates)
             yield frame, rows
+
+    def _moment_arms(self) -> list[Row]:
+        """Rows of the frames that were written."""
+        kept = {entry["frame"] for entry in self.written}
+        path = {index: coordinates for index, coordinates in self._path.items() if index in kept}
+        return moment_arm_rows(self.scene, path, self.summary.series("length"))
 
     def _spent(self):
         """Wall time of all parts so far [s]."""
@@ -149,25 +158,39 @@ class Recording:
     def info(self, status: str | None = None) -> dict:
         """What ``run.json`` holds by now."""
         self.times["wall"] = time.perf_counter() - self._start
+        table = self.summary.table()
+        limits = {name: default_limit(name, self.scene) for name in LIMITS}
         return build_info(
             self.scene,
             ending=(status or self.status, self.message),
             clock=Clock(self.started, self._spent(), self.stages),
             frames=self.written,
-            summary=self.summary.table(),
-            limits={name: default_limit(name, self.scene) for name in LIMITS},
+            summary=table,
+            limits=limits,
+            verdict=describe_verdict(table, limits),
             options=self.options,
         )
 
 
-def _bones_driven_together(scene):
-    """Events by frame, for some frames of the motion, and a warning for each pair of bones."""
+Found = tuple[list[Event], dict[str, float]]
+
+
+def _check_skeleton(scene: Scene) -> dict[int, Found]:
+    """Events and values of the bones for some frames of the motion, and a warning for each pair that meets."""
     collisions = bone_collisions(scene)
     for finding in bone_findings(collisions, scene.units):
         warnings.warn(f"{finding.place}: {finding.message}", SceneWarning, stacklevel=5)
     for note in scene.motion.notes:
         warnings.warn(f"motion: {note}", SceneWarning, stacklevel=5)
-    events = {}
-    for frame, first, second, _ in collisions:
-        events.setdefault(frame, []).append(Event(frame, "", f"{first} and {second}", 1, "bones_overlap"))
-    return events
+    found: dict[int, Found] = {}
+    for frame, first, second, depth in collisions:
+        events, values = found.setdefault(frame, ([], {}))
+        events.append(Event(frame, "", f"{first} and {second}", 1, "bones_overlap"))
+        values["bone_overlap"] = max(values.get("bone_overlap", 0.0), depth)
+    opened = scene.length(LIMITS["joint_gap"].value)
+    for frame, parent, child, opening in joint_gaps(scene, sampled_frames(scene)):
+        events, values = found.setdefault(frame, ([], {}))
+        values["joint_gap"] = max(values.get("joint_gap", 0.0), opening)
+        if opening > opened:
+            events.append(Event(frame, "", f"{parent} and {child}", 1, "joint_opens"))
+    return found

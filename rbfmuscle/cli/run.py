@@ -132,10 +132,8 @@ def _run_scene(scene, output, *, as_json, **asked):
 
         print(json_text({"directory": str(output), **info}))
     else:
-        from rbfmuscle.metrics.summary import describe_verdict
-
         _print_summary(info["muscles"], loaded.units)
-        print(f"verdict: {describe_verdict(info['muscles'], info['limits'])}")
+        print(f"verdict: {info['verdict']}")
         report = output / "report.html"
         there = f"in {output}, open {report}" if report.exists() else f"in {output}"
         print(f"{len(info['frames'])} frames in {time.perf_counter() - start:.1f} s, {there}")

@@ -5,6 +5,7 @@ The tree is a balanced binary heap over triangles in an order that halves them a
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -90,11 +91,24 @@ class ExactDistance:
         self.order, self.starts, self.across = self.layout.order, self.layout.starts, self.layout.across
         self.records = np.empty((len(faces), WIDTH))
         self.boxes = np.empty((2 * len(self.starts) - 2, 6))
-        self.edge_normals = np.empty((len(faces), 3, 3))
-        self.vertex_normals = np.empty((len(vertices), 3))
         fill_records(vertices, faces, self.order, self.records)
-        fill_pseudonormals(vertices, faces, self.across, self.edge_normals, self.vertex_normals)
         _box_loop(vertices, faces, self.order, self.starts, self.boxes)
+
+    @cached_property
+    def _pseudonormals(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        edges, vertices = np.empty((len(self.faces), 3, 3)), np.empty((len(self.vertices), 3))
+        fill_pseudonormals(self.vertices, self.faces, self.across, edges, vertices)
+        return edges, vertices
+
+    @property
+    def edge_normals(self) -> NDArray[np.float64]:
+        """Pseudonormals (m, 3, 3) of the faces' edges."""
+        return self._pseudonormals[0]
+
+    @property
+    def vertex_normals(self) -> NDArray[np.float64]:
+        """Pseudonormals (n, 3) of the vertices."""
+        return self._pseudonormals[1]
 
     @property
     def closed(self) -> bool:

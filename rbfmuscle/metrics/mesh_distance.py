@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.exact_distance import ExactDistance, Layout
-from rbfmuscle.geometry.winding import winding_number
+from rbfmuscle.geometry.arrays import Booleans, Floats
+from rbfmuscle.geometry.exact_distance import STACK, ExactDistance, Layout, nearest_triangle, record_square
+from rbfmuscle.geometry.threads import in_chunks
+from rbfmuscle.jit import compiled
+from rbfmuscle.metrics.columns import Columns
 from rbfmuscle.validation import check_mesh, check_points
+
+_HERE = np.eye(4)
 
 
 class MeshDistance:
     """Exact distance of points to a closed, outward mesh; negative inside.
 
-    The tree is built once and kept, so a bone is prepared once and asked in its own coordinates.
+    What answers is built at the first question and kept: a bone is prepared once and asked in its own coordinates.
 
     Parameters
     ----------
@@ -26,16 +32,10 @@ class MeshDistance:
     layout : Layout, optional
         Of the same faces at another moment, as `ExactDistance` takes it.
 
-    Attributes
-    ----------
-    layout : Layout
-
     Notes
     -----
-    The sign comes from the pseudonormal of the feature (face, edge or vertex) that holds the closest point
-    (Baerentzen and Aanaes 2005), which is exact for closed, consistently oriented meshes. Where that normal
-    is nearly square to the way to the point, as at a sliver folded on itself, and for meshes with holes, the
-    winding number decides (Jacobson et al. 2013; Barill et al. 2018): inside where it exceeds one half.
+    A point is inside where the mesh winds around it: counted exactly for closed meshes (`Columns`); for those with
+    holes the winding number exceeds one half (Jacobson et al. 2013; Barill et al. 2018).
     """
 
     def __init__(
@@ -43,60 +43,61 @@ class MeshDistance:
     ) -> None:
         self.closed = closed
         self.vertices, self.faces = check_mesh(vertices, faces)
-        self._exact = ExactDistance(self.vertices, self.faces, layout=layout)
-        self.layout = self._exact.layout
+        self._known_layout = layout
+
+    @cached_property
+    def _exact(self) -> ExactDistance:
+        return ExactDistance(self.vertices, self.faces, layout=self._known_layout)
+
+    @cached_property
+    def _columns(self) -> Columns:
+        return Columns(self.vertices, self.faces)
+
+    @property
+    def layout(self) -> Layout | None:
+        """For the same faces at a later moment; None where no distance was asked for yet."""
+        return self._exact.layout if "_exact" in self.__dict__ else self._known_layout
+
+    def inside(self, points: ArrayLike, *, pose: Floats = _HERE) -> Booleans:
+        """Which points lie inside, (n,) ndarray of bool.
+
+        Parameters
+        ----------
+        points : (n, 3) array_like
+        pose : (4, 4) ndarray, optional
+            Carries the points into the mesh's coordinates.
+        """
+        points = check_points(points)
+        if self.closed:
+            return self._columns.inside(points, pose)
+        import igl
+
+        points = points @ pose[:3, :3].T + pose[:3, 3]
+        return np.asarray(igl.fast_winding_number(self.vertices, self.faces, points) > 0.5)
 
     def unsigned(self, points: ArrayLike) -> Floats:
-        """Distance to the surface.
-
-        Parameters
-        ----------
-        points : (n, 3) array_like
-
-        Returns
-        -------
-        (n,) ndarray
-            [scene unit]
-        """
-        return np.abs(self._exact.signed_distance(check_points(points)))
-
-    def signed(self, points: ArrayLike) -> Floats:
-        """Distance to the surface, negative inside.
-
-        Parameters
-        ----------
-        points : (n, 3) array_like
-
-        Returns
-        -------
-        (n,) ndarray
-            [scene unit]
-        """
+        """Distance to the surface, (n,) ndarray [scene unit]; points as (n, 3) array_like."""
         points = check_points(points)
-        if len(points) == 0:
-            return np.zeros(0)
-        if not self.closed:
-            import igl
+        out = np.empty(len(points))
 
-            inside = igl.fast_winding_number(self.vertices, self.faces, points) > 0.5
-            return np.where(inside, -1.0, 1.0) * self.unsigned(points)
-        out, closest, _, normal = self._exact.nearest(points)
-        # At a face the normal points along the way; elsewhere it may be nearly square to it.
-        unsure = np.abs(np.einsum("ij,ij->i", points - closest, normal)) < 0.1 * np.abs(out)
-        for n in np.flatnonzero(unsure):
-            inside = winding_number(points[n], self.vertices, self.faces) > 0.5
-            out[n] = -abs(out[n]) if inside else abs(out[n])
+        def work(first: int, last: int) -> None:
+            _distance_loop(points[first:last], self._exact.tree, out[first:last])
+
+        in_chunks(len(points), work)
         return out
 
-    def depth(self, points: ArrayLike) -> Floats:
-        """How deep points lie inside, 0 where outside.
+    def signed(self, points: ArrayLike) -> Floats:
+        """Distance to the surface, negative inside, (n,) ndarray [scene unit]; points as (n, 3) array_like."""
+        return np.where(self.inside(points), -1.0, 1.0) * self.unsigned(points)
 
-        The deepest point is looked at again with the winding number, until one is inside for certain: where a
-        mesh is folded on itself a sign can be wrong, and one wrong sign would decide the greatest depth.
+    def depth(self, points: ArrayLike, *, pose: Floats = _HERE) -> Floats:
+        """How deep points lie inside, 0 where outside.
 
         Parameters
         ----------
         points : (n, 3) array_like
+        pose : (4, 4) ndarray, optional
+            Carries the points into the mesh's coordinates.
 
         Returns
         -------
@@ -104,10 +105,19 @@ class MeshDistance:
             [scene unit]
         """
         points = check_points(points)
-        depth = np.maximum(-self.signed(points), 0.0)
-        while depth.any():
-            deepest = int(depth.argmax())
-            if winding_number(points[deepest], self.vertices, self.faces) > 0.5:
-                break
-            depth[deepest] = 0.0
-        return depth
+        out, inside = np.zeros(len(points)), self.inside(points, pose=pose)
+        if inside.any():
+            out[inside] = self.unsigned(points[inside] @ pose[:3, :3].T + pose[:3, 3])
+        return out
+
+
+@compiled
+def _distance_loop(points, tree, out):
+    stack = np.empty(STACK, np.int64), np.empty(STACK)
+    best = np.int64(-1)
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        # The last answer bounds the next one where points come in order.
+        square = np.inf if best < 0 else record_square(tree.records, best, x, y, z)
+        best, square = nearest_triangle(tree, (x, y, z), best, square, 0.0, stack)
+        out[i] = np.sqrt(square)

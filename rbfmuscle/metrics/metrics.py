@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.exact_distance import Layout
 from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.metrics.centreline import Centreline, MuscleAtRest, moving_joints
+from rbfmuscle.jit import compiled
+from rbfmuscle.metrics.centreline import Centreline, MuscleAtRest, carried_middle, moving_joints
+from rbfmuscle.metrics.contraction import ContractionStudy, belly_measures
 from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.metrics.penetration import BoneProbe, bone_depth, surface_depth
 from rbfmuscle.metrics.quantities import QUANTITIES
@@ -22,25 +23,15 @@ if TYPE_CHECKING:
     from rbfmuscle.simulation.frame import Frame
 
 
+Values = dict[str, float]
+
 _FROM_MODEL = ("solver_penetration_max", "unfitted_fraction", "condition", "time_fit", "time_extract")
 
 # Events whose points stayed beyond a bone; those turned back or halved away are in events.csv only.
 _THROUGH = ("reported", "unresolved")
 
-
-class Measured(NamedTuple):
-    """What was measured of one muscle in a frame.
-
-    Attributes
-    ----------
-    values : dict of str to float
-        By quantity, in the order of `QUANTITIES`.
-    length : float
-        Along its centreline [scene unit], NaN where it has none.
-    """
-
-    values: dict[str, float]
-    length: float
+# Of these the greatest at rest is the overlap that is left there.
+_OVERLAPS = ("penetration_max", "bone_penetration_max", "solver_penetration_max")
 
 
 class MuscleMeasures:
@@ -61,8 +52,8 @@ class MuscleMeasures:
             if muscle.name in carried
         }
 
-    def measure(self, frame: Frame) -> dict[str, Measured]:
-        """Measure a frame: dict of muscle name to Measured."""
+    def measure(self, frame: Frame) -> dict[str, Values]:
+        """Measure a frame: for each muscle its values by quantity, in the order of `QUANTITIES`."""
         at_rest = all(np.abs(pose - np.eye(4)).max() < 1e-9 for pose in frame.poses.values())
         trackers = list(self.trackers.values())
         found = each(lambda tracker: tracker.measure(frame, self.probes, at_rest), trackers)
@@ -73,92 +64,100 @@ class _Tracker:
     """What has to be kept of one muscle from frame to frame."""
 
     def __init__(self, muscle: Any, scene: Any, vertices: Floats, faces: Integers) -> None:
-        self.name = muscle.name
+        self.name, self.mesh, self.attachments = muscle.name, muscle.mesh, muscle.attachments
         self.rest_volume = float(muscle.mesh.volume)
-        self.mesh = muscle.mesh
         self.edges = unique_edges(faces)
         self.rest_lengths = edge_lengths(vertices, self.edges)
         rest = MuscleAtRest(muscle, scene.joints, vertices, faces, moving_joints(scene))
         self.line = Centreline(rest) if len(muscle.attachments) > 1 else None
-        self.contraction = _contraction(rest)
-        self.rest_measured = False
-        self.offset = None
+        self.contraction = ContractionStudy(rest) if muscle.contraction is not None else None
         self.form = SurfaceForm()
-        # Of the last surface: its faces, and what its distance can be had quicker with while they stay.
-        self.layout: tuple[Integers, Layout] | None = None
+        self.rest_measured = False
+        # Of the last surface.
+        self.distance: MeshDistance | None = None
+        self.offset: Floats | None = None
 
-    def length_of(self, frame: Frame) -> float:
-        if self.line is None:
-            return math.nan
-        return self.line.length(frame.carried[self.name][0], frame.poses)
-
-    def measure(self, frame: Frame, probes: list[BoneProbe], at_rest: bool) -> Measured:
+    def measure(self, frame: Frame, probes: list[BoneProbe], at_rest: bool) -> dict[str, float]:
         """What there is to measure of this muscle in a frame."""
-        found = {}
-        if self.name in frame.surfaces:
-            surface = frame.surfaces[self.name]
-            found.update(self._of_surface(surface, frame, probes, at_rest and not self.rest_measured))
-            self.rest_measured = self.rest_measured or at_rest
+        found: dict[str, float] = {}
+        carried, surface = frame.carried[self.name][0], frame.surfaces.get(self.name)
+        if surface is not None:
+            found.update(self._of_surface(surface, carried, probes, frame.poses))
             found.update({q: surface.quantities[q] for q in _FROM_MODEL if q in surface.quantities})
+            if at_rest and not self.rest_measured:
+                found.update(self._at_rest(surface, probes, frame.poses))
+                found["initial_overlap"] = max(found.get(name, 0.0) for name in _OVERLAPS)
+                self.rest_measured = True
         mine = [event for event in frame.events if event.muscle == self.name]
         found["tunnelled"] = sum(event.count for event in mine if event.action in _THROUGH)
-        found["edge_strain_rms"] = edge_strain(frame.carried[self.name][0], self.edges, self.rest_lengths)
-        length = self.length_of(frame)
+        found["edge_strain_rms"] = edge_strain(carried, self.edges, self.rest_lengths)
         if self.line is not None:
-            found["length"] = length
+            found["length"] = self.line.length(carried, frame.poses)
         if self.contraction is not None:
             found["activation"] = frame.activations[self.name]
-            surface = frame.surfaces.get(self.name)
-            found.update(self.contraction.measure(frame.carried[self.name][0], frame.poses, surface))
+            found.update(self.contraction.measure(carried, frame.poses, surface))
         times = frame.times.get(self.name, {})
         if times:
             found["time_solve"] = times.get("time_predict", 0.0) + times.get("time_solve", 0.0)
             found["time_frame"] = times["time_frame"]
-        values = {quantity: found[quantity] for quantity in QUANTITIES if quantity in found}
-        return Measured(values, length)
+        return {quantity: float(found[quantity]) for quantity in QUANTITIES if quantity in found}
 
-    def _of_surface(self, surface, frame, probes, first_rest):
+    def _of_surface(self, surface, carried, probes, poses):
         vertices, faces = surface.vertices, np.asarray(surface.faces)
+        # Surfaces that keep their faces share the order of the tree.
+        same = self.distance is not None and np.array_equal(self.distance.faces, faces)
+        layout = self.distance.layout if same else None
+        self.distance = MeshDistance(vertices, faces, layout=layout)
         volume = mesh_volume(vertices, faces)
-        known = self.layout is not None and np.array_equal(self.layout[0], faces)
-        distance = MeshDistance(vertices, faces, layout=self.layout[1] if known else None)
-        self.layout = faces, distance.layout
-        depth = surface_depth(vertices, probes, frame.poses)
-        found = {
+        depth = surface_depth(vertices, probes, poses)
+        return {
             "volume": volume,
             "volume_error": volume / self.rest_volume - 1.0,
             "penetration_max": depth.max(),
             "penetration_fraction": np.mean(depth > 0.0),
-            "bone_penetration_max": bone_depth(vertices, faces, probes, frame.poses, distance=distance),
-            **self.form.measure(surface),
+            "bone_penetration_max": bone_depth(vertices, faces, probes, poses, distance=self.distance),
+            **self.form.measure(surface, same_faces=same),
+            **self._flicker(carried, vertices),
         }
-        found["flicker_rms"], found["flicker_max"] = self._flicker(distance, frame.carried[self.name][0])
-        if first_rest:
-            rms, worst = surface_distance(vertices, faces, self.mesh.vertices, self.mesh.faces)
-            found.update(rest_error_rms=rms, rest_error_max=worst)
+
+    def _flicker(self, carried, vertices):
+        """Change of the signed distances of the carried vertices to the surface; of a mesh that is shown, none."""
+        if np.array_equal(carried, vertices):
+            return {}
+        before, self.offset = self.offset, self.distance.signed(carried)
+        return {"flicker": np.abs(self.offset - before).max() if before is not None else 0.0}
+
+    def _at_rest(self, surface, probes, poses):
+        """What is measured once, in the first frame in which all bones are at rest."""
+        mesh = self.mesh.vertices, self.mesh.faces
+        rms, worst = surface_distance(surface.vertices, surface.faces, *mesh)
+        bones = {probe.name: probe for probe in probes}
+        gaps = [bones[a.bone].unsigned(mesh[0][a.vertices]).min() for a in self.attachments]
+        found = {"rest_error_rms": rms, "rest_error_max": worst, "end_gap": max(gaps, default=0.0)}
+        if self.line is not None:
+            first, last = (carried_middle(end, poses) for end in self.line.ends)
+            found["thickness"] = belly_measures(*map(np.asarray, mesh), first, last)["belly_thickness"]
         return found
-
-    def _flicker(self, distance, carried):
-        """Change of the signed distances of the carried mesh's vertices to the surface since the last frame."""
-        before = self.offset
-        self.offset = distance.signed(carried)
-        change = self.offset - before if before is not None else np.zeros(1)
-        return float(np.sqrt(np.mean(change**2))), float(np.abs(change).max())
-
-
-def _contraction(rest):
-    if rest.muscle.contraction is None:
-        return None
-    from rbfmuscle.metrics.contraction import ContractionStudy
-
-    return ContractionStudy(rest)
 
 
 def edge_strain(vertices: Floats, edges: Integers, rest_lengths: Floats) -> float:
     """Root mean square of the relative change of edge lengths."""
-    used = rest_lengths > 0
-    strain = edge_lengths(vertices, edges)[used] / rest_lengths[used] - 1.0
-    return float(np.sqrt(np.mean(strain**2)))
+    return math.sqrt(_strain_loop(vertices, edges, rest_lengths))
+
+
+@compiled
+def _strain_loop(vertices, edges, rest_lengths):
+    """Mean square over the edges that have a length at rest."""
+    total, count = 0.0, 0
+    for e in range(len(edges)):
+        a, b = edges[e, 0], edges[e, 1]
+        x = vertices[a, 0] - vertices[b, 0]
+        y = vertices[a, 1] - vertices[b, 1]
+        z = vertices[a, 2] - vertices[b, 2]
+        if rest_lengths[e] > 0.0:
+            total += (np.sqrt(x * x + y * y + z * z) / rest_lengths[e] - 1.0) ** 2
+            count += 1
+    return total / max(count, 1)
 
 
 def surface_distance(

@@ -2,69 +2,31 @@
 
 from __future__ import annotations
 
-from threading import Lock
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.mesh_distance import MeshDistance
-from rbfmuscle.metrics.occupancy import OccupancyGrid
 
 if TYPE_CHECKING:
     import trimesh
 
 
-class BoneProbe:
+class BoneProbe(MeshDistance):
     """One bone, prepared once in its own coordinates.
 
     Parameters
     ----------
     name : str
     mesh : trimesh.Trimesh
-        Faces outward. Holes are allowed; the sign then comes from winding numbers.
+        Faces outward. Holes are allowed; the side then comes from winding numbers.
     """
 
     def __init__(self, name: str, mesh: trimesh.Trimesh) -> None:
+        super().__init__(mesh.vertices, mesh.faces, closed=bool(mesh.is_watertight))
         self.name = name
-        self.vertices = np.ascontiguousarray(mesh.vertices, dtype=float)
-        self.faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
         self.bounds = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
-        self.closed = bool(mesh.is_watertight)
-        self._distance: MeshDistance | None = None
-        self._grid: OccupancyGrid | None = None
-        self._making = Lock()
-
-    def depth(self, points: Floats) -> Floats:
-        """How deep points lie inside the bone.
-
-        Parameters
-        ----------
-        points : (n, 3) ndarray
-            Bone coordinates [scene unit].
-
-        Returns
-        -------
-        (n,) ndarray
-            Distance to the bone's surface where inside, else 0.
-        """
-        out = np.zeros(len(points))
-        near = np.flatnonzero(np.all((points > self.bounds[0]) & (points < self.bounds[1]), axis=1))
-        if len(near) == 0:
-            return out
-        distance, grid = self._prepared()
-        if grid is not None:
-            near = near[grid.candidates(points[near])]
-        out[near] = distance.depth(points[near])
-        return out
-
-    def _prepared(self) -> tuple[MeshDistance, OccupancyGrid | None]:
-        """What answers, made when a point first comes near, by whichever thread brings it."""
-        with self._making:
-            if self._distance is None:
-                self._grid = OccupancyGrid(self.vertices, self.faces) if self.closed else None
-                self._distance = MeshDistance(self.vertices, self.faces, closed=self.closed)
-            return self._distance, self._grid
 
 
 def bone_coordinates(points: Floats, pose: Floats) -> Floats:
@@ -88,19 +50,24 @@ def surface_depth(vertices: Floats, probes: list[BoneProbe], poses: dict[str, Fl
         The greatest depth over all bones; 0 where a vertex is in none.
     """
     out = np.zeros(len(vertices))
-    if len(vertices) == 0:
-        return out
-    for probe in bones_about(vertices.min(axis=0), vertices.max(axis=0), probes, poses):
-        np.maximum(out, probe.depth(bone_coordinates(vertices, poses[probe.name])), out=out)
+    for probe in bones_about(vertices, probes, poses):
+        np.maximum(out, probe.depth(vertices, pose=_inverse(poses[probe.name])), out=out)
     return out
 
 
-def bones_about(
-    low: Floats, high: Floats, probes: list[BoneProbe], poses: dict[str, Floats]
-) -> list[BoneProbe]:
-    """The bones whose boxes, where they are now, meet the box from ``low`` to ``high`` (3,)."""
-    if not probes:
+def _inverse(pose):
+    back = np.eye(4)
+    back[:3, :3] = pose[:3, :3].T
+    back[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return back
+
+
+def bones_about(vertices: Floats, probes: list[BoneProbe], poses: dict[str, Floats]) -> list[BoneProbe]:
+    """The bones whose boxes, where they are now, meet the box of the points (n, 3)."""
+    if not probes or len(vertices) == 0:
         return []
+    # Column by column, which takes a tenth of the time of both at once.
+    low, high = (np.array([end(column) for column in vertices.T]) for end in (np.min, np.max))
     placed = np.array([poses[probe.name] for probe in probes])
     ends = np.array([probe.bounds for probe in probes])
     middle = np.einsum("bij,bj->bi", placed[:, :3, :3], ends.mean(axis=1)) + placed[:, :3, 3]
@@ -133,25 +100,7 @@ def bone_depth(
     float
         [scene unit]; 0 where no bone vertex is inside.
     """
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    near = []
-    for probe in bones_about(low, high, probes, poses):
-        pose = poses[probe.name]
-        local = bone_coordinates(vertices, pose)
-        within = _rows_within_box_of(local, probe.vertices)
-        near.append(probe.vertices[within] @ pose[:3, :3].T + pose[:3, 3])
-    points = np.concatenate(near) if near else np.zeros((0, 3))
-    if len(points) == 0:
-        return 0.0
-    points = points[OccupancyGrid(vertices, faces).candidates(points)]
     distance = MeshDistance(vertices, faces) if distance is None else distance
-    return float(distance.depth(points).max(initial=0.0))
-
-
-def _rows_within_box_of(points: Floats, others: Floats) -> Integers:
-    """Rows of the others inside the box of points; axis by axis, as a bone has many and few are near one muscle."""
-    rows = np.arange(len(others))
-    for axis in range(3):
-        ends, values = points[:, axis], others[rows, axis]
-        rows = rows[(values > ends.min()) & (values < ends.max())]
-    return rows
+    near = bones_about(vertices, probes, poses)
+    depths = [distance.depth(probe.vertices, pose=poses[probe.name]).max(initial=0.0) for probe in near]
+    return float(max(depths, default=0.0))

@@ -1,50 +1,70 @@
-"""What a run amounts to: least, greatest and mean of each quantity, and the limits that it is held to."""
+"""What a run amounts to: least, greatest and mean of each quantity, the limits it is held to, and its verdict."""
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from rbfmuscle.metrics.quantities import ALL, QUANTITIES
+from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row
+from rbfmuscle.scene.scene import MM_PER_UNIT
 from rbfmuscle.validation import LimitExceededError, UsageError, did_you_mean
 
 if TYPE_CHECKING:
     from rbfmuscle.scene.scene import Scene
 
+# Of a run: muscle -> quantity -> facts, as `Summary.table` gives them.
+Table = Mapping[str, Mapping[str, Mapping[str, Any]]]
 
-# Quantity: greatest allowed magnitude; lengths in millimetres, converted to the scene's unit.
+
+class Limit(NamedTuple):
+    """Greatest allowed magnitude of a quantity (of those in `LEAST` the least), lengths in millimetres."""
+
+    value: float
+    title: str
+    remedy: str
+
+
+_SMALLER_STEPS = "lower contact.substep_angle"
+_MORE_CENTRES = "raise model.centres"
+_JOINT = "correct the joint's centre, axes or range"
 LIMITS = {
-    "volume_error": 1e-3,
-    "penetration_max": 0.5,
-    "bone_penetration_max": 0.5,
-    "solver_penetration_max": 3.0,
-    "components": 1.0,
-    "euler": 2.0,
-    "self_crossing": 0.0,
-    "unfitted_fraction": 0.05,
-    "flicker_rms": 0.1,
-    "flicker_max": 0.5,
-    "tunnelled": 0.0,
-    "rest_error_rms": 0.6,
-    "rest_error_max": 5.0,
+    "volume_error": Limit(1e-9, "volume error", "let the model settle: raise its iterations or sweeps"),
+    "penetration_max": Limit(0.1, "surface in a bone", _SMALLER_STEPS),
+    "bone_penetration_max": Limit(0.3, "bone in the muscle", f"{_SMALLER_STEPS} or {_MORE_CENTRES}"),
+    "initial_overlap": Limit(0.3, "overlap left at rest", "move muscle or bone apart: rbfmuscle check SCENE"),
+    "components": Limit(1.0, "pieces", f"look at it with rbfmuscle view; {_MORE_CENTRES}"),
+    "euler": Limit(2.0, "Euler characteristic", f"look at it with rbfmuscle view; {_MORE_CENTRES}"),
+    "self_crossings": Limit(0.0, "self-crossing triangles", _SMALLER_STEPS),
+    "unfitted_fraction": Limit(0.999, "surface shown without a fit", f"{_SMALLER_STEPS} or {_MORE_CENTRES}"),
+    "flicker": Limit(0.5, "flicker", _SMALLER_STEPS),
+    "slack": Limit(1.03, "slack", "let the fibres shorten further"),
+    "tunnelled": Limit(0.0, "points beyond a bone", _SMALLER_STEPS),
+    "rest_error_rms": Limit(0.6, "rest error", _MORE_CENTRES),
+    "end_gap": Limit(25.0, "end away from its bone", "correct the attachment, or give it a tendon"),
+    "bone_overlap": Limit(0.0, "bones in each other", _JOINT),
+    "joint_gap": Limit(5.0, "joint that opens", _JOINT),
 }
-
-MOST_NAMED = 6  # exceeded limits that a verdict names
 # Quantities of which too little is wrong: their limit is the least allowed value.
 LEAST = {"euler"}
+# A muscle thinner than this [mm] may have this rest error [mm].
+THIN, THIN_REST_ERROR = 10.0, 1.0
+# A muscle that is slack at rest may be so by this much more.
+MORE_SLACK = 0.03
+MOST_NAMED = 6  # exceeded limits that a verdict names
 
 
 class Summary:
     """Collects rows of metrics; keeps numbers only, no surfaces."""
 
     def __init__(self) -> None:
-        self._values = defaultdict(lambda: defaultdict(list))
-        self._units = {}
+        self._values: dict[str, dict[str, list[tuple[int, float]]]] = defaultdict(lambda: defaultdict(list))
+        self._units: dict[str, str] = {}
 
-    def add(self, rows: list[Any]) -> None:
+    def add(self, rows: Iterable[Row]) -> None:
         """Take in rows of metrics."""
         for row in rows:
             quantity = row.quantity
@@ -53,8 +73,12 @@ class Summary:
             self._values[row.muscle][quantity].append((row.frame, row.value))
             self._units[quantity] = row.unit
 
-    def table(self) -> dict[str, Any]:
-        """Nested dict: muscle -> quantity -> unit, count, min, max, mean, median, last, worst and its frame.
+    def series(self, quantity: str) -> dict[str, dict[int, float]]:
+        """Values of a quantity by muscle and frame."""
+        return {muscle: dict(found[quantity]) for muscle, found in self._values.items() if quantity in found}
+
+    def table(self) -> dict[str, dict[str, dict[str, Any]]]:
+        """Nested dict: muscle -> quantity -> unit, count, min, max, mean, median, first, last, worst and its frame.
 
         ``worst`` is the value of greatest magnitude, or the least where that is what is limited (`LEAST`). A moment
         arm is named with its coordinate.
@@ -68,7 +92,12 @@ class Summary:
         frames = [frame for frame, _ in found]
         values = np.array([value for _, value in found])
         finite = values[np.isfinite(values)]
-        facts = {"unit": self._units[quantity], "count": len(values), "last": float(values[-1])}
+        facts = {
+            "unit": self._units[quantity],
+            "count": len(values),
+            "first": float(values[0]),
+            "last": float(values[-1]),
+        }
         if len(finite):
             sound = np.where(np.isfinite(values), values, np.nan)
             worst = int(np.nanargmin(sound) if quantity in LEAST else np.nanargmax(np.abs(sound)))
@@ -83,7 +112,9 @@ class Summary:
         return facts
 
 
-def parse_limits(limits: Any, scene: Scene) -> dict[str, Any]:
+def parse_limits(
+    limits: str | Sequence[str] | Mapping[str, float] | None, scene: Scene
+) -> dict[str, float]:
     """Limits as a dict of quantity to greatest allowed magnitude.
 
     Parameters
@@ -100,7 +131,7 @@ def parse_limits(limits: Any, scene: Scene) -> dict[str, Any]:
     """
     if not limits:
         return {}
-    if isinstance(limits, dict):
+    if isinstance(limits, Mapping):
         parts = [f"{name}={value}" for name, value in limits.items()]
     else:
         listed = [limits] if isinstance(limits, str) else limits
@@ -112,7 +143,8 @@ def parse_limits(limits: Any, scene: Scene) -> dict[str, Any]:
             continue
         name, given, value = part.replace("<=", "=").partition("=")
         name = name.strip()
-        _check_quantity(name)
+        if name not in QUANTITIES:
+            raise UsageError(f"--fail-on: unknown quantity {name!r}, {did_you_mean(name, QUANTITIES)}")
         if given:
             found[name] = _number(value, part)
         elif name in LIMITS:
@@ -120,69 +152,6 @@ def parse_limits(limits: Any, scene: Scene) -> dict[str, Any]:
         else:
             raise UsageError(f"--fail-on {name}: give a value, for instance {name}=1")
     return found
-
-
-def default_limit(quantity: str, scene: Scene) -> float:
-    """Limit of a quantity in the scene's unit."""
-    is_length = QUANTITIES[quantity][0] == "length"
-    return scene.length(LIMITS[quantity]) if is_length else LIMITS[quantity]
-
-
-def within(quantity: str, worst: float, limit: float) -> bool:
-    """Whether a worst value keeps to a limit, which is the least allowed value for those in `LEAST`; NaN does not."""
-    return worst >= limit if quantity in LEAST else abs(worst) <= limit
-
-
-def exceeded(table: dict[str, Any], limits: dict[str, Any]) -> list[Any]:
-    """List of (muscle, quantity, worst value, limit, frame) beyond the limits; NaN counts as beyond."""
-    found = []
-    for muscle, quantities in table.items():
-        for name, facts in quantities.items():
-            limit = limits.get(name.partition(":")[0])
-            if limit is None or muscle == ALL:
-                continue
-            worst = facts.get("worst")
-            worst = math.nan if worst is None else worst  # as a file has it
-            if not within(name, worst, limit):
-                found.append((muscle, name, worst, limit, facts.get("worst_frame")))
-    return found
-
-
-def describe_verdict(table: dict[str, Any], limits: dict[str, Any]) -> str:
-    """One sentence: all muscles within their limits, or what exceeds one, with its value, the worst ratio first."""
-    found = exceeded(table, limits)
-    if not found:
-        return "every muscle stays within every limit in every frame"
-    found.sort(key=_excess, reverse=True)
-    parts = [
-        f"{muscle}: {name} {worst:.3g} (limit {limit:g}) at frame {frame}"
-        for muscle, name, worst, limit, frame in found[:MOST_NAMED]
-    ]
-    more = f" and {len(found) - MOST_NAMED} more" if len(found) > MOST_NAMED else ""
-    return f"beyond a limit: {'; '.join(parts)}{more}"
-
-
-def _excess(row):
-    """How many times its limit a worst value is, as far as that can be said."""
-    _, quantity, worst, limit, _ = row
-    bounded = quantity not in LEAST and limit > 0 and math.isfinite(worst)
-    return abs(worst) / limit if bounded else math.inf
-
-
-def require_limits(table: dict[str, Any], limits: dict[str, Any]) -> None:
-    """Raise LimitExceededError naming everything beyond the limits."""
-    found = exceeded(table, limits)
-    if found:
-        text = "; ".join(
-            f"{m}: {q} = {v:.4g} {'<' if q in LEAST else '>'} {limit:g} at frame {f}"
-            for m, q, v, limit, f in found
-        )
-        raise LimitExceededError(text)
-
-
-def _check_quantity(name):
-    if name not in QUANTITIES:
-        raise UsageError(f"--fail-on: unknown quantity {name!r}, {did_you_mean(name, QUANTITIES)}")
 
 
 def _number(text, part):
@@ -193,3 +162,106 @@ def _number(text, part):
     if not math.isfinite(value) or value < 0:
         raise UsageError(f"--fail-on {part}: the limit must be a number, zero or more")
     return value
+
+
+def default_limit(quantity: str, scene: Scene) -> float:
+    """Limit of a quantity in the scene's unit."""
+    return _in_unit(LIMITS[quantity].value, quantity, scene.units)
+
+
+def _in_unit(value, quantity, unit):
+    return value / MM_PER_UNIT[unit] if QUANTITIES[quantity][0] == "length" else value
+
+
+def _allowed(quantity, limit, found):
+    """The limit of one muscle: thin ones and those that are slack at rest have their own in place of the default."""
+    unit = found[quantity]["unit"]
+    if limit != _in_unit(LIMITS[quantity].value, quantity, unit) if quantity in LIMITS else True:
+        return limit
+    if quantity == "rest_error_rms" and "thickness" in found:
+        thickness = found["thickness"]["first"] * MM_PER_UNIT[unit]
+        return _in_unit(THIN_REST_ERROR, quantity, unit) if thickness < THIN else limit
+    if quantity == "slack" and found["slack"]["first"] is not None:
+        return max(limit, found["slack"]["first"] + MORE_SLACK)
+    return limit
+
+
+def within(quantity: str, worst: float, limit: float) -> bool:
+    """Whether a worst value keeps to a limit, which is the least allowed value for those in `LEAST`; NaN does not."""
+    return worst >= limit if quantity in LEAST else abs(worst) <= limit
+
+
+def exceeded(table: Table, limits: Mapping[str, float]) -> list[tuple[str, str, float, float, int | None]]:
+    """List of (muscle, quantity, worst value, limit, frame) beyond the limits; NaN counts as beyond."""
+    found = []
+    for muscle, quantities in table.items():
+        for name, facts in quantities.items():
+            limit = limits.get(name.partition(":")[0])
+            if limit is None:
+                continue
+            limit = _allowed(name, limit, quantities)
+            worst = facts.get("worst")
+            worst = math.nan if worst is None else worst  # as a file has it
+            if not within(name, worst, limit):
+                found.append((muscle, name, worst, limit, facts.get("worst_frame")))
+    return sorted(found, key=_excess, reverse=True)
+
+
+def _excess(row):
+    """How many times its limit a worst value is, as far as that can be said."""
+    _, quantity, worst, limit, _ = row
+    bounded = quantity not in LEAST and limit > 0 and math.isfinite(worst)
+    return abs(worst) / limit if bounded else math.inf
+
+
+def describe_verdict(table: Table, limits: Mapping[str, float]) -> str:
+    """Which muscles are within all limits and which are not, the worst value of each, and what to do."""
+    muscles, found = [name for name in table if name != ALL], exceeded(table, limits)
+    wrong = [name for name in dict.fromkeys(row[0] for row in found) if name != ALL]
+    if not muscles:
+        text = "nothing was measured"
+    elif not wrong:
+        text = "every muscle is within all limits in every frame"
+    else:
+        named = _listed(wrong)
+        text = f"{len(muscles) - len(wrong)} of {len(muscles)} muscles are within all limits, not {named}"
+    if not found:
+        return text
+    worst = list({row[0]: row for row in reversed(found)}.values())
+    worst.sort(key=_excess, reverse=True)
+    remedies = dict.fromkeys(
+        f"{LIMITS[name].title}: {LIMITS[name].remedy}" for _, name, *_ in worst[:MOST_NAMED] if name in LIMITS
+    )
+    values = "; ".join(_describe_excess(row, table) for row in worst[:MOST_NAMED])
+    to_do = f". What to do: {'; '.join(remedies)}" if remedies else ""
+    return f"{text}. Worst: {values}{to_do}"
+
+
+def _listed(names):
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return f"{', '.join(names[:MOST_NAMED])}{more}"
+
+
+def _describe_excess(row, table):
+    muscle, quantity, worst, limit, frame = row
+    unit = table[muscle][quantity]["unit"]
+    value = f"{shown_number(worst)}{'' if unit == '1' else f' {unit}'}"
+    place = "the bones" if muscle == ALL else muscle
+    title = LIMITS[quantity].title if quantity in LIMITS else quantity
+    return f"{place}, {title} {value} at frame {frame} (limit {limit:g})"
+
+
+def shown_number(value: float) -> str:
+    """A number as people read it: three digits, and what is rounding only as less than 1e-12."""
+    return "< 1e-12" if 0.0 < abs(value) < 1e-12 else f"{value:.3g}"
+
+
+def require_limits(table: Table, limits: Mapping[str, float]) -> None:
+    """Raise LimitExceededError naming everything beyond the limits."""
+    found = exceeded(table, limits)
+    if found:
+        text = "; ".join(
+            f"{m}: {q} = {v:.4g} {'<' if q in LEAST else '>'} {limit:g} at frame {f}"
+            for m, q, v, limit, f in found
+        )
+        raise LimitExceededError(text)

@@ -1,34 +1,19 @@
 """Whether a surface is what a muscle should be: in one piece without handles, and nowhere through itself."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components
 
-from rbfmuscle.geometry.arrays import Integers
-from rbfmuscle.geometry.crossing import FaceTree, crossing_faces
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.crossing import FaceTree
 
 if TYPE_CHECKING:
     from rbfmuscle.simulation.frame import ModelSurface
 
 
-class Crossings(NamedTuple):
-    """Triangles of a surface that cross others of it.
-
-    Attributes
-    ----------
-    count : int
-        Triangles that take part in a crossing.
-    area : float
-        Their share of the surface's area.
-    """
-
-    count: int  # type: ignore[assignment]  # a field by the name of tuple's own method
-    area: float
-
-
-def euler_characteristic(faces: np.ndarray) -> int:
+def euler_characteristic(faces: Integers) -> int:
     """Vertices less edges plus triangles; 2 for a sphere, two less for each handle.
 
     Parameters
@@ -42,8 +27,8 @@ def euler_characteristic(faces: np.ndarray) -> int:
     return len(np.unique(faces)) - len(edges) + len(faces)
 
 
-def self_crossing(vertices: np.ndarray, faces: np.ndarray, tree: FaceTree | None = None) -> Crossings:
-    """Triangles that cross others of the same surface, as `rbfmuscle.geometry.crossing.crossing_faces` sees them.
+def self_crossings(vertices: Floats, faces: Integers, *, tree: FaceTree | None = None) -> int:
+    """Number of triangles that cross others of the same surface (`rbfmuscle.geometry.crossing.crossing_faces`).
 
     Parameters
     ----------
@@ -53,13 +38,8 @@ def self_crossing(vertices: np.ndarray, faces: np.ndarray, tree: FaceTree | None
     tree : FaceTree, optional
         Of these faces, from whatever moment, where it is at hand.
     """
-    marked = crossing_faces(vertices, faces) if tree is None else tree.crossing(vertices)
-    if not marked.any():
-        return Crossings(0, 0.0)
-    a, b, c = (np.asarray(vertices)[faces[:, k]] for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    share = area[marked].sum() / max(area.sum(), np.finfo(float).tiny)
-    return Crossings(int(marked.sum()), float(share))
+    tree = FaceTree(vertices, faces) if tree is None else tree
+    return int(tree.crossing(vertices).sum())
 
 
 def count_components(count: int, faces: Integers) -> int:
@@ -78,23 +58,18 @@ class SurfaceForm:
 
     def __init__(self) -> None:
         self._drawn: ModelSurface | None = None
-        self._faces: np.ndarray | None = None
         self._tree: FaceTree | None = None
-        self._pieces: dict[str, float] = {}
-        self._crossings: dict[str, float] = {}
+        self._found: dict[str, float] = {}
 
-    def measure(self, surface: "ModelSurface") -> dict[str, float]:
-        """``components``, ``euler``, ``self_crossing`` and ``self_crossing_area``."""
-        faces = np.asarray(surface.faces)
-        if self._faces is None or not (self._faces is faces or np.array_equal(self._faces, faces)):
-            self._tree = FaceTree(surface.vertices, faces)
-            self._pieces = {
-                "components": count_components(len(surface.vertices), faces),
-                "euler": euler_characteristic(faces),
-            }
+    def measure(self, surface: "ModelSurface", *, same_faces: bool) -> dict[str, float]:
+        """``components``, ``euler`` and ``self_crossings``; ``same_faces`` where the last surface had these faces."""
+        vertices, faces = surface.vertices, np.asarray(surface.faces)
+        if self._tree is None or not same_faces:
+            self._tree = FaceTree(vertices, faces)
+            self._found["components"] = count_components(len(vertices), faces)
+            self._found["euler"] = euler_characteristic(faces)
         drawn = surface.origin[0] if surface.origin is not None else surface
         if self._drawn is not drawn:
-            found = self_crossing(surface.vertices, faces, self._tree)
-            self._crossings = {"self_crossing": found.count, "self_crossing_area": found.area}
-        self._faces, self._drawn = faces, drawn
-        return {**self._pieces, **self._crossings}
+            self._found["self_crossings"] = self_crossings(vertices, faces, tree=self._tree)
+        self._drawn = drawn
+        return dict(self._found)

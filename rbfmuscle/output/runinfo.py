@@ -46,6 +46,7 @@ def build_info(
     frames: list[Any],
     summary: dict[str, Any],
     limits: dict[str, float],
+    verdict: str,
     options: dict[str, Any],
 ) -> dict[str, Any]:
     """Assemble ``run.json``.
@@ -62,6 +63,8 @@ def build_info(
         From `Summary.table`.
     limits : dict
         Quantity -> limit in the unit of ``metrics.csv``.
+    verdict : str
+        Which muscles are within the limits, as the terminal and the report say it.
     options : dict
         What the caller asked for.
 
@@ -86,6 +89,7 @@ def build_info(
         "work": clock.stages.work(),
         **({"neighbours": clock.stages.neighbours()} if clock.stages.pairs else {}),
         "limits": limits,
+        "verdict": verdict,
         "muscles": {name: facts for name, facts in summary.items() if name != "all"},
         "frame_time": summary.get("all", {}).get("time_frame"),
         "frames": frames,

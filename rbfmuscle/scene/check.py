@@ -192,8 +192,7 @@ def bone_collisions(scene: SceneData, frames: Any = None, *, exact: ExactMeshes 
     list of (frame, bone, other, depth)
         Depth [scene unit]: the deepest vertex of either bone in the other, in excess of the depth at rest.
     """
-    if frames is None:
-        frames = np.unique(np.linspace(0, len(scene.motion) - 1, MOTION_SAMPLES).round().astype(int)).tolist()
+    frames = sampled_frames(scene) if frames is None else frames
     exact = exact or ExactMeshes()
     rest: dict[Any, float] | None = None
     found = []
@@ -206,6 +205,12 @@ def bone_collisions(scene: SceneData, frames: Any = None, *, exact: ExactMeshes 
             if depth - (rest or {}).get(pair, 0.0) > scene.length(COUNTED_DEPTH_MM):
                 found.append((frame, *pair, depth))
     return found
+
+
+def sampled_frames(scene: Scene) -> list[int]:
+    """About ten frames along a motion, the first and the last among them."""
+    chosen = np.linspace(0, len(scene.motion) - 1, MOTION_SAMPLES).round().astype(int)
+    return [int(frame) for frame in np.unique(chosen)]
 
 
 def _pair_depths(scene, poses, exact):

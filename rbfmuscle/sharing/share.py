@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import NamedTuple
 
 from rbfmuscle.geometry.fields import BoneField
-from rbfmuscle.metrics.metrics import Measured, MuscleMeasures
+from rbfmuscle.metrics.metrics import MuscleMeasures, Values
 from rbfmuscle.models import build_models
 from rbfmuscle.progress import stage
 from rbfmuscle.scene.scene import Scene
@@ -22,12 +22,12 @@ class Solved(NamedTuple):
     Attributes
     ----------
     frame : Frame
-    measured : dict of str to Measured
-        By muscle; empty where metrics are not asked for.
+    measured : dict of str to dict
+        Values by muscle and quantity; empty where metrics are not asked for.
     """
 
     frame: Frame
-    measured: dict[str, Measured]
+    measured: dict[str, Values]
 
 
 class MuscleGroup:
@@ -84,7 +84,7 @@ class MuscleGroup:
             first = False
             if frame is None:
                 return
-            measured: dict[str, Measured] = {}
+            measured: dict[str, Values] = {}
             if self._measures is not None:
                 with timed(self.times, "metrics"):
                     measured = self._measures.measure(frame)

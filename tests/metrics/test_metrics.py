@@ -10,17 +10,17 @@ import trimesh
 
 from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
 from rbfmuscle.metrics.centreline import Centreline, MuscleAtRest, slice_operator, split_ends
+from rbfmuscle.metrics.columns import Columns
 from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.metrics.metrics import MuscleMeasures, edge_strain, surface_distance
 from rbfmuscle.metrics.moment_arms import moment_arms
-from rbfmuscle.metrics.occupancy import OccupancyGrid
 from rbfmuscle.metrics.penetration import (
     BoneProbe,
     bone_depth,
     bones_about,
     surface_depth,
 )
-from rbfmuscle.metrics.recorder import MetricsRecorder
+from rbfmuscle.metrics.rows import frame_rows, moment_arm_rows
 from rbfmuscle.metrics.topology import SurfaceForm, count_components
 from rbfmuscle.scene.joints.joint import Coordinate
 from rbfmuscle.scene.objects import Motion
@@ -63,53 +63,44 @@ class TestVolume:
         assert mesh_volume(vertices, faces[:, ::-1]) == pytest.approx(-1)
 
 
-class TestOccupancy:
-    @pytest.mark.parametrize("cells", [5, 20, 64])
-    def test_no_inner_point_is_left_out(self, blob, cells):
-        points = np.random.default_rng(1).uniform(*blob.bounds, size=(4000, 3))
-        inside = np.flatnonzero(igl.signed_distance(points, *arrays(blob))[0] < 0)
-        assert np.isin(inside, OccupancyGrid(*arrays(blob), cells=cells).candidates(points)).all()
+class TestColumns:
+    @pytest.mark.parametrize("turn", [0.0, 0.4, 2.0])
+    def test_inside_is_where_the_winding_number_says_so(self, blob, turn):
+        vertices, faces = arrays(blob)
+        vertices = trimesh.transform_points(vertices, turned(turn, (1, 2, 3)))
+        points = np.random.default_rng(1).uniform(1.1 * vertices.min(0), 1.1 * vertices.max(0), size=(4000, 3))
+        expected = igl.winding_number(vertices, faces, points) > 0.5
+        assert 500 < expected.sum() < 3500
+        np.testing.assert_array_equal(Columns(vertices, faces).inside(points, EYE), expected)
 
-    def test_most_outer_points_are_left_out(self, blob):
-        points = np.random.default_rng(2).uniform(*blob.bounds, size=(4000, 3))
-        outside = igl.signed_distance(points, *arrays(blob))[0] > 0
-        candidates = OccupancyGrid(*arrays(blob), cells=64).candidates(points)
-        assert outside[candidates].sum() < 0.2 * outside.sum()
+    def test_lines_through_edges_and_corners_are_counted_once(self):
+        box = trimesh.creation.box((2, 2, 2)).subdivide().subdivide()
+        axis = np.linspace(-1.5, 1.5, 7)  # every line runs through a corner or an edge of the triangles
+        points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+        away = np.abs(np.abs(points).max(axis=1) - 1.0) > 1e-9
+        found = Columns(*arrays(box)).inside(points, EYE)
+        np.testing.assert_array_equal(found[away], np.abs(points[away]).max(axis=1) < 1.0)
 
-    @pytest.mark.parametrize("axis", [0, 1, 2])
-    def test_nothing_beyond_the_grid_is_a_candidate_however_near(self, blob, axis):
-        grid = OccupancyGrid(*arrays(blob), cells=16)
-        ends = grid.origin, grid.origin + np.array(grid.state.shape) * grid.spacing
-        middle = 0.5 * (ends[0] + ends[1])
-        points = np.tile(middle, (6, 1))
-        for k, beyond in enumerate((1e-9, 0.3, 5.0)):
-            points[k, axis] = ends[0][axis] - beyond * grid.spacing
-            points[3 + k, axis] = ends[1][axis] + beyond * grid.spacing
-        assert len(grid.candidates(points)) == 0 and len(grid.candidates(middle[None])) == 1
-
-    @pytest.mark.parametrize("scale", [2.0**-10, 1.0, 2.0**10])
-    def test_slanted_triangles_mark_only_cells_that_they_meet(self, scale):
-        corners = scale * np.vstack([np.eye(3), -np.eye(3)])
-        octahedron = trimesh.convex.convex_hull(corners)
-        grid = OccupancyGrid(*arrays(octahedron), cells=32)
-        points = scale * np.random.default_rng(9).uniform(-1.0, 1.0, (3000, 3))
-        above = np.abs(points).sum(axis=1) - scale
-        found = np.isin(np.arange(3000), grid.candidates(points))
-        assert found[above < 0.0].all() and not found[above > 4.0 * grid.spacing].any()
+    def test_a_pose_carries_the_points(self, blob):
+        pose = turned(0.7, (3, 1, 2), (1, 2, 3))
+        points = np.random.default_rng(2).uniform(*(1.5 * blob.bounds), size=(2000, 3))
+        columns = Columns(*arrays(blob))
+        expected = columns.inside(trimesh.transform_points(points, pose), EYE)
+        np.testing.assert_array_equal(columns.inside(points, pose), expected)
 
     @pytest.mark.parametrize("scale", [2.0**-10, 2.0**10])
-    def test_candidates_are_the_same_in_any_unit(self, blob, scale):
+    def test_the_unit_changes_nothing(self, blob, scale):
         vertices, faces = arrays(blob)
         points = np.random.default_rng(6).uniform(*(1.2 * blob.bounds), size=(2000, 3))
-        found = OccupancyGrid(vertices, faces, cells=24).candidates(points)
-        same = OccupancyGrid(scale * vertices, faces, cells=24).candidates(scale * points)
-        np.testing.assert_array_equal(same, found)
+        found = Columns(vertices, faces).inside(points, EYE)
+        np.testing.assert_array_equal(Columns(scale * vertices, faces).inside(scale * points, EYE), found)
 
-    def test_large_triangles_mark_only_cells_that_they_meet(self):
-        grid = OccupancyGrid(*arrays(trimesh.creation.box((1, 1, 1))), cells=16)
-        far = np.array([[0.7, 0.7, 0.7], [0.0, 0.0, 0.66]])
-        assert len(grid.candidates(far)) == 0
-        assert len(grid.candidates(np.zeros((1, 3)))) == 1
+    def test_a_mesh_wound_twice_is_inside_where_either_is(self):
+        ball = trimesh.creation.icosphere(subdivisions=3)
+        both = trimesh.util.concatenate([ball, ball.copy().apply_translation([1.0, 0, 0])])
+        points = np.array([[0.5, 0, 0], [-0.5, 0, 0], [1.5, 0, 0], [2.5, 0, 0], [0.5, 0, 0.95]])
+        found = Columns(*arrays(both)).inside(points, EYE)
+        assert found.tolist() == [True, True, True, False, False]
 
 
 class TestMeshDistance:
@@ -191,7 +182,7 @@ class TestPenetration:
             poses[probe.name] = turned(rng.uniform(0, 3), rng.normal(size=3))
             poses[probe.name][:3, 3] = rng.uniform(-25, 25, 3)
         ball = trimesh.creation.icosphere(subdivisions=3, radius=7.0)
-        near = bones_about(*ball.bounds, probes, poses)
+        near = bones_about(np.array(ball.vertices), probes, poses)
         assert 0 < len(near) < len(probes)
         for probe in probes:
             moved = trimesh.Trimesh(probe.vertices, probe.faces).apply_transform(poses[probe.name])
@@ -220,11 +211,11 @@ class TestMeshMeasures:
         other = ModelSurface(np.array(torus.vertices), np.array(torus.faces))
         moved = ModelSurface(folded.vertices + 5.0, one.faces, origin=(folded, np.eye(4)))
         form = SurfaceForm()
-        found = [form.measure(surface) for surface in (one, folded, moved, other)]
+        found = [form.measure(s, same_faces=s is not other) for s in (one, folded, moved, other)]
         assert [m["euler"] for m in found] == [2, 2, 2, 0]
-        assert found[0]["self_crossing"] == 0 < found[1]["self_crossing"]
+        assert found[0]["self_crossings"] == 0 < found[1]["self_crossings"]
         assert found[2] == found[1]
-        assert found[3]["self_crossing"] == 0
+        assert found[3]["self_crossings"] == 0
 
     @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
     def test_strain_knows_no_unit(self, scale):
@@ -381,7 +372,7 @@ class TestMomentArm:
         assert self.arms([0.0, 0.1, 0.2, 0.2], [1.0, np.nan, 2.0, 2.0]) == [None] * 4
 
 
-class TestRecorder:
+class TestRows:
     @pytest.fixture
     def scene(self):
         mesh = rod()
@@ -414,18 +405,15 @@ class TestRecorder:
         return Frame(index, {"joint.bend": angle}, poses, {"rod": surface}, carried, events, times, 3.0)
 
     def rows(self, scene):
-        measures, recorder = (
-            MuscleMeasures(scene, {"rod": arrays(scene.muscles[0].mesh)}),
-            MetricsRecorder(scene),
-        )
+        measures = MuscleMeasures(scene, {"rod": arrays(scene.muscles[0].mesh)})
         frames = [self.frame(scene, k) for k in range(3)]
-        return [row for f in frames for row in recorder.add(f, measures.measure(f))] + recorder.finish()
+        before = [None, *(frame.coordinates for frame in frames)]
+        rows = [row for f, b in zip(frames, before) for row in frame_rows(scene, f, b, measures.measure(f))]
+        lengths = {"rod": {row.frame: row.value for row in rows if row.quantity == "length"}}
+        return rows + moment_arm_rows(scene, {f.index: f.coordinates for f in frames}, lengths)
 
     def test_values_units_and_order(self, scene):
         rows = self.rows(scene)
-        for arms in (False, True):  # those of all frames come last
-            frames = [r.frame for r in rows if (r.quantity == "moment_arm") == arms]
-            assert frames == sorted(frames)
         assert {r.coordinate for r in rows} == {"joint.bend"}
         at = {(r.frame, r.muscle, r.quantity): r for r in rows}
         assert at[2, "rod", "volume_error"].value == pytest.approx(0.02)
@@ -454,6 +442,6 @@ class TestRecorder:
         vertices = trimesh.transform_points(frame.surfaces["rod"].vertices, move)
         moved.surfaces = {"rod": ModelSurface(vertices, frame.surfaces["rod"].faces, {})}
         moved.carried = {"rod": (vertices, frame.carried["rod"][1])}
-        before, after = (measures.measure(each)["rod"].values for each in (frame, moved))
+        before, after = (measures.measure(each)["rod"] for each in (frame, moved))
         for name in ("volume", "penetration_max", "penetration_fraction", "length", "components"):
             assert after[name] == pytest.approx(before[name], rel=1e-8)
