@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.output.vtp import write_vtp
-from rbfmuscle.scene.meshes.polydata import read_polydata
+from rbfmuscle.output.vtp import read_vtp, write_vtp
 from rbfmuscle.validation import MeshError
 
 SUFFIXES = {"pvd": ".vtp", "vtp": ".vtp", "ply": ".ply", "stl": ".stl", "obj": ".obj", "glb": ".glb"}
@@ -61,8 +60,7 @@ def read_mesh(path: str | Path) -> tuple[Floats, Integers]:
     if not path.is_file():
         raise MeshError(f"{path} is missing")
     if path.suffix == ".vtp":
-        data = read_polydata(path)
-        return data.points, data.triangles
+        return read_vtp(path)
     import trimesh
 
     mesh = trimesh.load_mesh(path, process=path.suffix == ".stl")

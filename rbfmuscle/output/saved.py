@@ -105,10 +105,8 @@ class SavedRun:
 
     def bone(self, name: str) -> tuple[Floats, Integers]:
         """Vertices and faces of a bone at rest."""
-        first = self.frames[0]
-        vertices, faces = read_mesh(self._file("bones", name, first))
-        pose = self.poses[first][name]
-        return (vertices - pose[:3, 3]) @ pose[:3, :3], faces
+        self._check_surfaces()
+        return read_mesh(self.directory / "bones" / f"{name}{self.suffix}")
 
     def series(self, muscle: str, quantity: str, coordinate: str | None = None) -> tuple[Integers, Floats]:
         """Frames and values of a quantity of a muscle, of moment arms those of a coordinate, as two arrays."""
@@ -147,9 +145,12 @@ class SavedRun:
     def _has_files(self, frame):
         return self.suffix is None or all(self._file("surfaces", m, frame).is_file() for m in self.muscles)
 
-    def _file(self, folder, name, frame):
+    def _check_surfaces(self):
         if self.suffix is None:
             raise UsageError(f"{self.directory} has no surfaces: the run's scene had output.surfaces = false")
+
+    def _file(self, folder, name, frame):
+        self._check_surfaces()
         return self.directory / folder / f"{name}_{frame:04d}{self.suffix}"
 
     def _table(self, name):

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.threads import each
+from rbfmuscle.output.light_mesh import light_mesh
 from rbfmuscle.output.meshfiles import SUFFIXES, write_mesh
 from rbfmuscle.output.vtp import Collection
 from rbfmuscle.validation import SolveError, UsageError
@@ -79,7 +80,9 @@ class RunWriter:
         output = scene.output
         self.format = output.surfaces.format if output.surfaces else None
         self.count, self._failed = 0, False
+        # Pose of the file that shows a bone now, and its meshes for a series.
         self._bone_files: dict[str, tuple[Floats, str]] = {}
+        self._light: dict[str, tuple[Floats, Integers]] = {}
         try:
             self._clear()
             self._tables = {name: self._table(name, columns) for name, columns in _tables(output)}
@@ -180,18 +183,31 @@ class RunWriter:
         return entries
 
     def _write_bones(self, frame):
-        """Bones of a frame; one that stands where it stood is not written again."""
+        """Bones where they are now: the mesh at rest, written once; one that has moved with few triangles, in a series.
+
+        Whoever wants more takes the mesh at rest and the pose.
+        """
         entries = []
         for bone in self.scene.bones:
             pose = frame.poses[bone.name]
-            known = self._bone_files.get(bone.name)
-            if known is None or np.abs(known[0] - pose).max() > 0.0:
-                file = f"bones/{bone.name}_{frame.index:04d}{SUFFIXES[self.format]}"
-                vertices = np.asarray(bone.mesh.vertices) @ pose[:3, :3].T + pose[:3, 3]
-                write_mesh(self.directory / file, vertices, bone.mesh.faces)
-                known = self._bone_files[bone.name] = (pose.copy(), file)
-            entries.append((bone.name, known[1]))
+            if bone.name not in self._bone_files:
+                file = f"bones/{bone.name}{SUFFIXES[self.format]}"
+                write_mesh(self.directory / file, bone.mesh.vertices, bone.mesh.faces)
+                self._bone_files[bone.name] = (np.eye(4), file)
+            stood, file = self._bone_files[bone.name]
+            if self.format == "pvd" and not np.array_equal(stood, pose):
+                vertices, faces = self._light_bone(bone)
+                moved = vertices @ pose[:3, :3].T + pose[:3, 3]
+                file = f"bones/{bone.name}_{frame.index:04d}.vtp"
+                write_mesh(self.directory / file, moved.astype(np.float32), faces)
+                self._bone_files[bone.name] = (pose.copy(), file)
+            entries.append((bone.name, file))
         return entries
+
+    def _light_bone(self, bone):
+        if bone.name not in self._light:
+            self._light[bone.name] = light_mesh(bone.mesh.vertices, bone.mesh.faces)
+        return self._light[bone.name]
 
     def _roll_back(self, frame):
         """Leave the folder as it was before a frame that could not be written.
@@ -223,6 +239,9 @@ class RunWriter:
         for old in _OLD_FILES:
             (self.directory / old).unlink(missing_ok=True)
         self._remove(-1)
+        for suffix in SUFFIXES.values():
+            for old in (self.directory / "bones").glob(f"*{suffix}"):
+                old.unlink()
         for folder in ("surfaces", "bones") if self.format is not None else ():
             (self.directory / folder).mkdir(exist_ok=True)
 

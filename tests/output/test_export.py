@@ -8,13 +8,18 @@ import pytest
 import trimesh
 from blend_model import arm_scene, use_blend_model
 
+from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.output.export import MESHES, export_run
+from rbfmuscle.output.light_mesh import light_mesh
 from rbfmuscle.output.meshfiles import SUFFIXES, read_mesh, write_mesh
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.output.vtp import Collection, write_vtp
+from rbfmuscle.output.vtp import Collection, read_vtp, write_vtp
 from rbfmuscle.output.writer import write_json
 from rbfmuscle.run import simulate
 from rbfmuscle.validation import MeshError, UsageError
+
+# Positions are written to 36 binary digits.
+ROUNDING = 2.0**-36
 
 pyvista = pytest.importorskip("pyvista")
 
@@ -41,9 +46,27 @@ class TestVtp:
         path = tmp_path / "a.vtp"
         write_vtp(path, *mesh)
         data = pyvista.read(path)
-        np.testing.assert_array_equal(data.points, mesh[0])
+        np.testing.assert_allclose(data.points, mesh[0], rtol=ROUNDING, atol=0)
         np.testing.assert_array_equal(data.regular_faces, mesh[1])
         assert data.n_open_edges == 0
+        exact = mesh_volume(*mesh)
+        assert mesh_volume(np.asarray(data.points, dtype=float), mesh[1]) == pytest.approx(exact, rel=1e-10)
+
+    def test_our_reader_reads_what_pyvista_reads(self, tmp_path, mesh):
+        for vertices in (mesh[0], mesh[0].astype(np.float32)):
+            write_vtp(tmp_path / "a.vtp", vertices, mesh[1])
+            data, (points, faces) = pyvista.read(tmp_path / "a.vtp"), read_vtp(tmp_path / "a.vtp")
+            np.testing.assert_array_equal(points, data.points)
+            np.testing.assert_array_equal(faces, data.regular_faces)
+        np.testing.assert_array_equal(points, vertices)  # single precision is kept
+
+    @pytest.mark.parametrize("size", [0, 40, 900, 9000])
+    def test_a_file_that_is_cut_off_is_refused(self, tmp_path, mesh, size):
+        path = tmp_path / "a.vtp"
+        write_vtp(path, *mesh)
+        path.write_bytes(path.read_bytes()[:size])
+        with pytest.raises(MeshError, match="damaged or was not written by a run"):
+            read_vtp(path)
 
     def test_values_of_vertices_are_point_data(self, tmp_path, mesh):
         values = {"distance": np.linspace(-1.0, 1.0, len(mesh[0]))}
@@ -56,7 +79,7 @@ class TestVtp:
         faces = rng.integers(0, len(vertices), size=(100_000, 3))
         write_vtp(tmp_path / "a.vtp", vertices, faces)
         data = pyvista.read(tmp_path / "a.vtp")
-        np.testing.assert_array_equal(data.points, vertices)
+        np.testing.assert_allclose(data.points, vertices, rtol=ROUNDING, atol=0)
         np.testing.assert_array_equal(data.regular_faces, faces)
 
 
@@ -95,10 +118,11 @@ class TestMeshFiles:
 
 
 class TestSaved:
-    def test_surfaces_come_back_unchanged(self, run):
+    def test_surfaces_come_back(self, run):
         made, folder = run
         vertices, faces = SavedRun(folder).surface("biceps", 1)
-        np.testing.assert_array_equal(vertices, made.frames[1].surfaces["biceps"].vertices)
+        expected = made.frames[1].surfaces["biceps"].vertices
+        np.testing.assert_allclose(vertices, expected, rtol=ROUNDING, atol=0)
         np.testing.assert_array_equal(faces, made.frames[1].surfaces["biceps"].faces)
 
     def test_paraview_collection_has_every_frame_and_muscle(self, run):
@@ -112,8 +136,21 @@ class TestSaved:
         np.testing.assert_allclose(bones.read()[1].points, expected, atol=1e-5)  # single precision
 
     def test_bones_at_rest_come_back(self, run):
-        vertices, _ = SavedRun(run[1]).bone("fore")
-        np.testing.assert_allclose(vertices, run[0].scene.bones[1].mesh.vertices, atol=1e-5)
+        for bone in run[0].scene.bones:
+            vertices, faces = SavedRun(run[1]).bone(bone.name)
+            np.testing.assert_allclose(vertices, bone.mesh.vertices, rtol=ROUNDING, atol=0)
+            np.testing.assert_array_equal(faces, bone.mesh.faces)
+
+    def test_a_bone_that_moves_is_light_in_the_series(self, tmp_path):
+        ball = trimesh.creation.icosphere(subdivisions=6, radius=20.0)
+        vertices, faces = light_mesh(ball.vertices, ball.faces)
+        assert len(vertices) <= 800 and faces.max() == len(vertices) - 1
+        away = np.linalg.norm(vertices, axis=1) - 20.0
+        assert -1.0 < away.min() and away.max() < 1e-9  # the mean of a cell of 3 mm lies inside the sphere
+        light = trimesh.Trimesh(vertices, faces, process=False)
+        assert light.volume == pytest.approx(ball.volume, rel=0.05)
+        box = trimesh.creation.box((1, 2, 3))
+        np.testing.assert_array_equal(light_mesh(box.vertices, box.faces)[0], box.vertices)
 
     def test_no_run_is_said(self, tmp_path):
         with pytest.raises(UsageError, match="holds no run"):

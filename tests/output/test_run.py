@@ -88,10 +88,10 @@ class TestStream:
         info = stream_run(arm_scene(), tmp_path)
         assert files_in(tmp_path) == [
             "bones.pvd",
-            "bones/fore_0000.vtp",
+            "bones/fore.vtp",
             "bones/fore_0001.vtp",
             "bones/fore_0002.vtp",
-            "bones/upper_0000.vtp",
+            "bones/upper.vtp",
             "events.csv",
             "metrics.csv",
             "poses.csv",
