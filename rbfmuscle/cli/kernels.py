@@ -33,20 +33,20 @@ def kernels(
     error: float | None = None,
     as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
 ) -> int:
-    """Rank kernels, shape parameters and numbers of centres on one surface.
+    """Rank kernels, shape parameters and numbers of centres on a surface, or on each muscle of a scene.
 
     Parameters
     ----------
     source
         A mesh (STL, OBJ, PLY, VTK, VTP), a scene file, or ``phantom``.
     output
-        Folder for kernels.html, kernels.csv, kernels.json and recommended.vtp.
+        Folder for kernels.html, kernels.csv, kernels.json and recommended_NAME.vtp.
     names
         Kernels; all by default. Separate by commas or blanks.
     centres
         Numbers of centres; 150 and 300 by default. Separate by commas or blanks.
     muscle
-        Of a scene; the first by default.
+        Of a scene; every one by default.
     placement
         fitted or greedy; fitted centres lie beside the surface and meet all of it best.
     resolution
@@ -54,39 +54,36 @@ def kernels(
     units
         Name of the unit of a mesh, for the text only.
     error
-        In place of a table: the fewest centres and the kernel that reach this RMS distance, in the mesh's unit; of a
-        scene for each muscle, or the one named.
+        In place of a table: the fewest centres and the kernel that reach this RMS distance, in the mesh's unit.
     as_json
         Print JSON and nothing else.
     """
     from rbfmuscle.experiments.kernel_study import study_kernels
-    from rbfmuscle.metrics.mesh_distance import MeshDistance
     from rbfmuscle.output.writer import check_writable, json_text
-    from rbfmuscle.report.kernel_page import write_study
+    from rbfmuscle.report.kernel_page import answer, write_studies
 
     chosen, counts = _split(names), _counts(centres)
-    meshes, units = _meshes(source, muscle, units, every=error is not None)
+    meshes, units = _meshes(source, muscle, units)
     check_writable(output)
     if error is not None:
         return _find_wanted(meshes, output, error, chosen, placement, units, as_json)
-    (title, mesh), *_ = meshes.items()
-    with Progress("kernels", what="fit") as bar:
-        study = study_kernels(
-            mesh, kernels=chosen, centres=counts, placement=placement, resolution=resolution, units=units,
-            progress=bar,
-        )  # fmt: skip
-        try:
-            write_study(
-                study, output, title=f"Kernels for {title}", mesh=MeshDistance(mesh.vertices, mesh.faces)
-            )
-        except OSError as failed:
-            raise UsageError(
-                f"cannot write to {output}: {failed.strerror}; choose another --output"
-            ) from None
+    studies = {}
+    for name, mesh in meshes.items():
+        with Progress(f"kernels of {name}", what="fit") as bar:
+            studies[name] = study_kernels(
+                mesh, kernels=chosen, centres=counts, placement=placement, resolution=resolution, units=units,
+                progress=bar,
+            )  # fmt: skip
+    try:
+        write_studies(studies, output, meshes)
+    except OSError as failed:
+        raise UsageError(f"cannot write to {output}: {failed.strerror}; choose another --output") from None
     if as_json:
-        print(json_text({"rows": study.rows}))
+        print(json_text({"rows": [{"surface": name, **row} for name, s in studies.items() for row in s.rows]}))
     else:
-        _print(study, output)
+        for name, study in studies.items():
+            _print(study, name)
+        print(f"{answer(studies)}\npage in {output / 'kernels.html'}")
     return 0
 
 
@@ -104,15 +101,15 @@ def _split(texts: list[str] | None) -> list[str] | None:
 
 
 def _meshes(
-    source: str, muscle: str | None, units: str, *, every: bool
+    source: str, muscle: str | None, units: str
 ) -> tuple[dict[str, trimesh.Trimesh], str]:
-    """Meshes by name, and their unit: of a scene the named muscle, every one, or the first."""
+    """Meshes by name, and their unit: of a scene the named muscle, or every one."""
     from rbfmuscle.scene.meshes.read import read_mesh
 
     if is_mesh(source):
         return {Path(source).stem: read_mesh(source).mesh}, units
     scene = load_scene(source)
-    chosen = [scene.muscle(muscle)] if muscle else scene.muscles if every else scene.muscles[:1]
+    chosen = [scene.muscle(muscle)] if muscle else scene.muscles
     return {each.name: each.mesh for each in chosen}, scene.units
 
 
@@ -155,11 +152,11 @@ def _find_wanted(
     return 0
 
 
-def _print(study: KernelStudy, output: Path) -> None:
-    from rbfmuscle.experiments.kernel_study import row_name, row_toml
+def _print(study: KernelStudy, name: str) -> None:
+    from rbfmuscle.experiments.kernel_study import describe, row_toml
 
-    print(f"{'kernel':26s} {'centres':>7s} {'eps h':>6s} {'RMS':>8s} {'Hausd.':>8s} {'vol %':>7s} {'cond.':>8s} "
-          f"{'fit ms':>7s}   [{study.units or 'mesh units'}]")  # fmt: skip
+    print(f"{name + ' [' + (study.units or 'mesh units') + ']':26s} {'centres':>7s} {'eps h':>6s} {'RMS':>8s} "
+          f"{'Hausd.':>8s} {'vol %':>7s} {'cond.':>8s} {'fit ms':>7s}")  # fmt: skip
     for row in study.rows:
         shape = "" if row["shape"] is None else f"{row['shape']:.3g}"
         start = f"{row['kernel']:26s} {row['centres']:7d} {shape:>6s} "
@@ -168,9 +165,6 @@ def _print(study: KernelStudy, output: Path) -> None:
             continue
         print(f"{start}{row['rms']:8.3g} {row['hausdorff']:8.3g} {100 * row['volume_error']:7.3g} "
               f"{row['condition']:8.1e} {1e3 * row['fit_time']:7.3g}")  # fmt: skip
-    print(f"page in {output / 'kernels.html'}")
-    if study.recommended is None:
-        print("recommended: none, every field is unfit; try more centres")
-        return
-    print(f"recommended: {row_name(study.recommended)}, the quickest within 5 % of the least error")
-    print(f"to paste at the end of a [[muscle]]:\n\n{row_toml(study.recommended)}")
+    print(describe(study.rows))
+    if study.recommended is not None:
+        print(f"to paste at the end of the [[muscle]] {json.dumps(name)}:\n\n{row_toml(study.recommended)}\n")

@@ -34,7 +34,7 @@ def sweep(
     error: str = "error_rms",
     as_json: Json = False,
 ) -> None:
-    """Run scenes under a grid of settings: errors, time per frame, Pareto front, scenes apart from the others.
+    """Run scenes under a grid of settings: errors, time per frame, Pareto front.
 
     Points that the folder holds done are not run again.
 
@@ -123,9 +123,6 @@ def _finish(points, output, units, error, as_json):
     else:
         for verdict in table["verdicts"]:
             print(verdict["text"])
-        apart = [f"{row['scene']}: {row['muscle']} {row['quantity']}" for row in table["outliers"][:5]]
-        for row in apart:
-            print(f"apart from the other scenes: {row}")
         print(f"{table['done']} points done, {table['failed']} failed, in {output}, open {output}/sweep.html")
     bad = [row for row in table["rows"] if row["status"] != "done"]
     for row in bad[:5]:

@@ -323,19 +323,15 @@ def describe(results: dict[str, Any], labels: dict[str, str], units: str) -> str
     whole = {name: found[ALL] for name, found in results.items()}
     depth = {name: max(v.get("penetration_max", 0.0), v.get("bone_penetration_max", 0.0)) for name, v in whole.items()}
     limit = KEPT_OUT / MM_PER_UNIT[units]
-    words = {
-        name: f"{'keeps out of bones' if deep <= limit else 'stands in bones'} ({deep:.2g} {units})"
-        for name, deep in depth.items()
-    }
-    text = f"{labels[first]} {words[first]}"
+    text = f"{labels[first]} {'keeps out of' if depth[first] <= limit else 'stands in'} bones ({depth[first]:.2g} {units})"
     timed = [name for name in others if "time_frame" in whole[name] and "time_frame" in whole[first]]
     quick = min(timed, key=lambda name: whole[name]["time_frame"], default=None)
     if quick:
         ratio = whole[first]["time_frame"] / whole[quick]["time_frame"]
-        text += f" at {ratio:.2g} times the time of {labels[quick]}, which {words[quick]}"
+        text += f" at {ratio:.2g} times the time of {labels[quick]} ({depth[quick]:.2g} {units})"
     near = min(others, key=lambda name: whole[name].get("distance_rms", math.inf), default=None)
     if near and "distance_rms" in whole[near]:
-        text += f"; {labels[near]} comes within {whole[near]['distance_rms']:.2g} {units} RMS of it"
+        text += f"; {labels[near]}, comes within {whole[near]['distance_rms']:.2g} {units} RMS of it"
         if near in timed:
             text += f" at {whole[near]['time_frame'] / whole[first]['time_frame']:.2g} times its time"
     return f"{text}."

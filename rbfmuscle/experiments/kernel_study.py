@@ -62,6 +62,24 @@ def row_toml(row: dict) -> str:
     return "\n".join([*lines, f'placement = "{row["placement"]}"'])
 
 
+def describe(rows: list[dict]) -> str:
+    """What to use of the rows of a study, and why, in one sentence."""
+    best = recommend(rows)
+    if best is None:
+        return "Every field is unfit; take more centres."
+    good = [row for row in rows if not row["unfit"] and row["centres"] == best["centres"]]
+    least = min(row["rms"] for row in good)
+    tied = [row for row in good if row["rms"] <= ALIKE * least]
+    use = f"use {best['kernel']} with {best['centres']} centres"
+    if len(tied) == 1:
+        other = min((row["rms"] for row in good if row is not best), default=None)
+        behind = f", whose error is {100 * (1 - best['rms'] / other):.0f} % less than the next" if other else ""
+        return f"{use[0].upper()}{use[1:]}{behind}."
+    spread = 100 * (max(row["rms"] for row in tied) / least - 1)
+    reason = "without a shape parameter to choose" if not best["epsilon"] else "of sound condition"
+    return f"{len(tied)} kernels tie within {max(spread, 1):.0f} %: {use}, the quickest {reason}."
+
+
 def row_name(row: dict) -> str:
     """A row in words."""
     return f"{row['kernel']}, {row['centres']} centres"

@@ -1,16 +1,13 @@
-"""The tables of a sweep, its Pareto front with the default's place, and scenes that lie apart from the others."""
+"""The tables of a sweep, and its Pareto front with the default's place."""
 
 from __future__ import annotations
 
 import csv
 import math
 import os
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from rbfmuscle.experiments.sweep import SweepPoint
 from rbfmuscle.experiments.sweep_run import VALUES, SweepFolder
@@ -18,11 +15,6 @@ from rbfmuscle.output.writer import write_json
 
 # The default may be this much worse than the front, in error and in time at once.
 NEAR = 1.1
-FACTS = ("count", "min", "max", "mean", "median", "last", "worst", "worst_frame")
-# A scene lies apart where its mean is so many robust standard deviations (1.4826 times the median absolute deviation)
-# from the median of at least so many scenes (Iglewicz and Hoaglin 1993). The deviation counts as no less than a share
-# of the median.
-APART, LEAST_SCENES, LEAST_SHARE = 3.5, 5, 0.005
 
 
 def sweep_rows(
@@ -53,17 +45,12 @@ def sweep_rows(
 
 
 def pareto_front(errors: Sequence[float], times: Sequence[float]) -> list[int]:
-    """Indices of the points that no other beats in one of error and time without losing in the other.
+    """Indices, by growing time, of the points that no other beats in error or time without losing in the other.
 
     Parameters
     ----------
     errors, times : sequence of float
         NaN takes no part.
-
-    Returns
-    -------
-    list of int
-        By growing time.
     """
     front, least = [], math.inf
     for k in sorted(range(len(errors)), key=lambda k: (times[k], errors[k])):
@@ -82,7 +69,7 @@ def mark_front(rows: list[dict[str, Any]], quantity: str = "error_rms") -> list[
     -------
     list of dict
         ``factor``: the least by which both error and time of the default must fall to lie on the front, 1 on it;
-        ``near``: up to `NEAR`; ``faster``, ``better``: labels of the quickest point of no greater error and the most
+        ``near``: up to `NEAR`; ``faster``, ``better``: keys of the quickest point of no greater error and the most
         accurate of no greater time, None where there is none; ``text``: all of it in words.
     """
     verdicts = []
@@ -98,7 +85,7 @@ def mark_front(rows: list[dict[str, Any]], quantity: str = "error_rms") -> list[
     return verdicts
 
 
-def _judge(default, rows, quantity):
+def _judge(default: dict[str, Any], rows: list[dict[str, Any]], quantity: str) -> dict[str, Any]:
     error, time = default[quantity], default["time_frame"]
     others = [r for r in rows if r is not default and math.isfinite(r[quantity])]
     factor = max([1.0, *(min(_ratio(error, r[quantity]), _ratio(time, r["time_frame"])) for r in others)])
@@ -107,41 +94,23 @@ def _judge(default, rows, quantity):
     faster = min(quicker, key=lambda r: r["time_frame"], default=None)
     better = min(finer, key=lambda r: r[quantity], default=None)
     what = f"default of {default['model']}" if default["model"] else "default"
-    where = "on" if default["front"] else f"{'within 10 % of' if factor <= NEAR else 'off'}"
-    figures = f"{_figures(default, quantity)}, factor {factor:.2f}"
-    text = f"{default['scene']}: the {what} lies {where} the front ({figures})."
-    for row, words in ((faster, "Quicker at no greater error"), (better, "Better in no more time")):
-        text += f" {words}: {row['label']} ({_figures(row, quantity)})." if row else ""
-    labels = {"faster": faster and faster["label"], "better": better and better["label"]}
-    return {"scene": default["scene"], "factor": factor, "near": factor <= NEAR, **labels, "text": text}
+    where = "on" if default["front"] else "within 10 % of" if factor <= NEAR else f"a factor of {factor:.2g} off"
+    text = f"{default['scene']}: the {what} lies {where} the Pareto front ({_figures(default, quantity)})"
+    for row, words in ((faster, "as accurate and quicker"), (better, "as quick and more accurate")):
+        text += f"; {words}: {row['label']} ({_figures(row, quantity)})" if row else ""
+    keys = {"faster": faster and faster["key"], "better": better and better["key"], "default": default["key"]}
+    return {"scene": default["scene"], "factor": factor, "near": factor <= NEAR, **keys, "text": f"{text}."}
 
 
-def _ratio(mine, other):
+def _ratio(mine: float, other: float) -> float:
     return mine / other if other > 0 else (math.inf if mine > 0 else 1.0)
 
 
-def _figures(row, quantity):
-    return f"{row[quantity]:.3g} at {1e3 * row['time_frame']:.3g} ms a frame"
-
-
-def outliers(values: Sequence[tuple[str, str, str, float]]) -> list[dict[str, Any]]:
-    """Values (scene, muscle, quantity, value) far from the median of their muscle and quantity, the farthest first."""
-    groups = defaultdict(list)
-    for scene, muscle, quantity, value in values:
-        groups[muscle, quantity].append((scene, value))
-    found = []
-    for (muscle, quantity), group in groups.items():
-        sound = np.array([value for _, value in group if math.isfinite(value)])
-        if len(sound) < LEAST_SCENES:
-            continue
-        median = float(np.median(sound))
-        spread = max(1.4826 * float(np.median(np.abs(sound - median))), LEAST_SHARE * abs(median), 1e-12)
-        for scene, value in group:
-            apart = abs(value - median) / spread
-            if not apart <= APART:
-                row = {"scene": scene, "muscle": muscle, "quantity": quantity, "value": value}
-                found.append({**row, "median": median, "apart": apart if math.isfinite(apart) else math.inf})
-    return sorted(found, key=lambda row: -row["apart"])
+def _figures(row: dict[str, Any], quantity: str) -> str:
+    time = row["time_frame"]
+    spent = f"{time:.2g} s" if time >= 1.0 else f"{1e3 * time:.2g} ms"
+    unit = f" {row['units']}" if quantity in ("error_rms", "error_max", "rest_error_rms") else ""
+    return f"{row[quantity]:.2g}{unit} at {spent} per frame"
 
 
 def write_table(
@@ -151,42 +120,22 @@ def write_table(
     *,
     quantity: str = "error_rms",
 ) -> dict[str, Any]:
-    """Write ``sweep.csv`` (a line a point), ``quantities.csv`` (a line a muscle and quantity) and ``sweep.json``.
-
-    Returns
-    -------
-    dict
-        What ``sweep.json`` holds: counts, ``verdicts``, ``outliers`` among scenes in their own settings, ``rows``.
-    """
+    """Write ``sweep.csv``, a line a point, and ``sweep.json``; what the latter holds: counts, verdicts, rows."""
     folder = SweepFolder(directory)
     rows = sweep_rows(points, folder, units)
     verdicts = mark_front(rows, quantity)
-    own, long = [], []
-    for point in points:
-        for muscle, found in folder.read(point.key).get("muscles", {}).items():
-            for name, facts in found.items():
-                long.append([point.scene, point.label, muscle, name, facts["unit"], *map(facts.get, FACTS)])
-                if point.role == "default" and not name.startswith("time") and facts.get("mean") is not None:
-                    own.append((point.scene, muscle, f"{name} [{facts['unit']}]", facts["mean"]))
     keys = list(dict.fromkeys(key for row in rows for key in row["settings"]))
     columns = [name for name in rows[0] if name not in ("settings", "label", "model")]
-    _write_csv(folder.directory / "sweep.csv", [*keys, *columns], [_flat(row, keys, columns) for row in rows])
-    head = ["scene", "point", "muscle", "quantity", "unit", *FACTS]
-    _write_csv(folder.directory / "quantities.csv", head, long)
+    part = folder.directory / ".sweep.csv.part"
+    with open(part, "w", encoding="utf-8", newline="") as file:
+        lines = csv.writer(file, lineterminator="\n")
+        lines.writerow([*keys, *columns])
+        for row in rows:
+            values = [row["settings"].get(key, "") for key in keys] + [row[name] for name in columns]
+            # Digits beyond nine places are rounding.
+            lines.writerow([f"{round(v, 9):.6g}" if isinstance(v, float) else v for v in values])
+    os.replace(part, folder.directory / "sweep.csv")
     counts = {status: sum(r["status"] == status for r in rows) for status in ("done", "failed", "missing")}
-    table = {"quantity": quantity, **counts, "verdicts": verdicts, "outliers": outliers(own), "rows": rows}
+    table = {"quantity": quantity, **counts, "verdicts": verdicts, "rows": rows}
     write_json(folder.directory / "sweep.json", table)
     return table
-
-
-def _flat(row, keys, columns):
-    """A row with its settings before its values; digits beyond nine places are rounding."""
-    values = [row["settings"].get(key, "") for key in keys] + [row[name] for name in columns]
-    return [f"{round(v, 9):.6g}" if isinstance(v, float) else v for v in values]
-
-
-def _write_csv(path, head, lines):
-    part = path.with_name(f".{path.name}.part")
-    with open(part, "w", encoding="utf-8", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([head, *lines])
-    os.replace(part, path)

@@ -1,128 +1,165 @@
-"""The kernel study as files: a table, a page with a plot, and the recommended surface with its error."""
+"""The kernel study of one or several surfaces as files: tables, a page, and the recommended surfaces."""
 
 from __future__ import annotations
 
-import base64
 import csv
-import html
-import io
+from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from rbfmuscle.experiments.kernel_study import cost, row_name, row_toml
+from rbfmuscle.experiments.kernel_study import ALIKE, cost, describe, row_name, row_toml
 from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.output.vtp import write_vtp
 from rbfmuscle.output.writer import json_text
-from rbfmuscle.report.page import STYLE
+from rbfmuscle.report.appearance import MUSCLE_COLOURS
+from rbfmuscle.report.page import BAD, GOOD, PLAIN, Cell, Light, Page, Section, number, table
+from rbfmuscle.report.plots import Point, front_plot
 
 if TYPE_CHECKING:
+    import trimesh
+
     from rbfmuscle.experiments.kernel_study import KernelStudy
 
+# Quantity: heading, factor.
 COLUMNS = {
-    "kernel": "kernel", "centres": "centres", "placement": "placement", "shape": "epsilon times spacing",
-    "rms": "RMS", "hausdorff": "Hausdorff", "normal_error": "normals, degrees", "volume_error": "volume, %",
-    "components": "sheets", "condition": "condition", "fit_time": "fit, ms",
-    "evaluation_time": "20,000 values, ms", "note": "note",
+    "centres": ("centres", 1.0), "placement": ("placement", 1.0), "shape": ("epsilon times spacing", 1.0),
+    "rms": ("RMS", 1.0), "hausdorff": ("greatest", 1.0), "normal_error": ("normals [°]", 1.0),
+    "volume_error": ("volume [%]", 100.0), "components": ("sheets", 1.0), "condition": ("condition", 1.0),
+    "fit_time": ("fit [ms]", 1e3), "evaluation_time": ("20,000 values [ms]", 1e3), "note": ("note", 1.0),
 }  # fmt: skip
-SCALE = {"volume_error": 100.0, "fit_time": 1e3, "evaluation_time": 1e3}
-
-PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">
-<title>{title}</title><style>{style} tr.front td:first-child{{font-weight:650}} td.text{{text-align:left}}
-pre{{overflow-x:auto}} td{{white-space:nowrap}} td.text{{min-width:19em;white-space:normal}}</style>
-</head><body><main><h1>{title}</h1>
-<p class="sub">Each kernel with as many centres, its shape parameter chosen by the error at other points of the mesh</p>
-<p>Recommended: <b>{best}</b>, the quickest of those within 5 % of the least error. Distances{units} are measured both
-ways between the mesh and the extracted surface, normals by the field's gradient. Kernels in bold are on the Pareto
-front of error against time. A volume error is that of the level zero; a muscle's level is moved until its volume is
-right.</p>
-<figure><img alt="error against time" src="data:image/png;base64,{plot}"></figure>
-<h2>All of them</h2><div class="wide"><table><tr>{head}</tr>{body}</table></div>{unfit}
-<h2>To paste</h2><pre>{toml}</pre>
-</main></body></html>
-"""
+_MOST_LIGHTS = 5
+_READING = """<p>Each kernel has the same number of centres; its shape parameter is chosen by the error at other points of
+the mesh. Distances are measured both ways between the mesh and the extracted surface, root mean square and greatest, normals
+by the field's gradient. The volume error is that of the level zero; a muscle's level is moved until its volume is right.
+Recommended is the quickest row (a fit and 20,000 values, processor time of one thread) that errs at most 5 % more than the
+best; of those alike in time one without a parameter, then the best-conditioned one.</p>"""
 
 
-def write_study(
-    study: KernelStudy, directory: str | Path, *, title: str = "Kernels", mesh: MeshDistance | None = None
+def write_studies(
+    studies: Mapping[str, KernelStudy], directory: str | Path, meshes: Mapping[str, trimesh.Trimesh]
 ) -> None:
-    """Write ``kernels.csv``, ``kernels.json``, ``kernels.html``, and the recommended surface.
+    """Write ``kernels.csv``, ``kernels.json`` and ``kernels.html``, and each recommended surface as a VTP file.
 
     Parameters
     ----------
-    study : KernelStudy
+    studies : dict of str to KernelStudy
+        By the name of the surface.
     directory : path
-    title : str
-    mesh : MeshDistance, optional
-        With it ``recommended.vtp`` holds each vertex's distance from the mesh, positive outside.
+    meshes : dict of str to trimesh.Trimesh
+        ``recommended_NAME.vtp`` holds each vertex's distance from them, positive outside.
     """
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
+    rows = [{"surface": name, **row} for name, study in studies.items() for row in study.rows]
     with (directory / "kernels.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(study.rows[0]))
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
         writer.writeheader()
-        writer.writerows(study.rows)
-    facts = {"title": title, "units": study.units, "rows": study.rows}
-    (directory / "kernels.json").write_text(json_text(facts), encoding="utf-8")
-    best = study.recommended
-    if best is not None and mesh is not None:
+        writer.writerows(rows)
+    units = next(iter(studies.values())).units
+    (directory / "kernels.json").write_text(json_text({"units": units, "rows": rows}), encoding="utf-8")
+    for name, study in studies.items():
         surfaces = dict(zip(map(row_name, study.rows), study.surfaces, strict=True))
-        surface = surfaces[row_name(best)]
+        surface = surfaces.get(row_name(study.recommended)) if study.recommended else None
         if surface is not None:
+            mesh = MeshDistance(meshes[name].vertices, meshes[name].faces)
             values = {"distance": mesh.signed(surface[0])}
-            write_vtp(directory / "recommended.vtp", *surface, values=values)
-    bad = "".join(
-        f"<li>{html.escape(row_name(row))}: {html.escape(row['unfit'])}</li>"
-        for row in study.rows
-        if row["unfit"]
+            write_vtp(directory / f"recommended_{name}.vtp", *surface, values=values)
+    _page(studies).write(directory / "kernels.html")
+
+
+def answer(studies: Mapping[str, KernelStudy]) -> str:
+    """What to use and why: of one surface its own sentence, of several the kernel that is near the best on most."""
+    if len(studies) == 1:
+        return describe(next(iter(studies.values())).rows)
+    tied: Counter[str] = Counter()
+    for study in studies.values():
+        good = [row for row in study.rows if not row["unfit"]]
+        tied.update({row["kernel"] for row in good if row["rms"] <= ALIKE * good[0]["rms"]})
+    if not tied:
+        return "Every field is unfit on every surface; take more centres."
+    chosen = Counter(study.recommended["kernel"] for study in studies.values() if study.recommended)
+    kernel = max(chosen, key=lambda name: (tied[name], chosen[name]))
+    return (
+        f"Use {kernel}: within 5 % of the least error on {tied[kernel]} of {len(studies)} muscles, "
+        f"and the quickest such kernel on {chosen[kernel]}."
     )
-    page = PAGE.format(
-        title=html.escape(title), style=STYLE, plot=base64.b64encode(_plot(study)).decode(),
-        best=html.escape(row_name(best)) if best else "none, every field is unfit",
-        toml=html.escape(row_toml(best)) if best else "", unfit=f"<h2>Unfit</h2><ul>{bad}</ul>" if bad else "",
-        units=f" in {html.escape(study.units)}" if study.units else "",
-        head="".join(f"<th>{html.escape(name)}</th>" for name in COLUMNS.values()),
-        body="".join(_row(row) for row in study.rows if not row["unfit"]),
-    )  # fmt: skip
-    (directory / "kernels.html").write_text(page, encoding="utf-8")
 
 
-def _plot(study: KernelStudy) -> bytes:
-    """Error against the time of a fit and 20,000 values, the front named, as a PNG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+def _page(studies: Mapping[str, KernelStudy]) -> Page:
+    several, rows = len(studies) > 1, [row for study in studies.values() for row in study.rows]
+    units = next(iter(studies.values())).units
+    surfaces = f"all {len(studies)} muscles" if several else next(iter(studies)).replace("_", " ")
+    kernels = len({row["kernel"] for row in rows})
+    centres = ", ".join(str(count) for count in sorted({row["centres"] for row in rows}))
+    sections = [
+        Section(f"Every row{f' of {name}' if several else ''}", _rows(study), f"distances in {units or 'mesh units'}")
+        for name, study in studies.items()
+    ]
+    toml = "\n\n".join(f"# {name}\n{row_toml(s.recommended)}" for name, s in studies.items() if s.recommended)
+    found = any(study.recommended for study in studies.values())
+    return Page(
+        f"Kernels for {surfaces}",
+        [f"{kernels} kernels", f"{centres} centres", "named by --muscle" if not several else "--muscle for one"],
+        answer(studies),
+        GOOD if found else BAD,
+        picture=_plot(studies, units),
+        lights=_lights(studies, units),
+        heads=["RMS error", "fit and values"],
+        sections=[
+            *sections,
+            Section("To paste at the end of a [[muscle]]", f"<pre>{toml}</pre>" if toml else ""),
+            Section("How to read this", _READING),
+        ],
+    )
 
-    figure = Figure(figsize=(8.0, 5.0), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots()
+
+def _lights(studies: Mapping[str, KernelStudy], units: str) -> list[Light]:
+    """Of one surface its best rows, each with whether it ties; of several what is recommended for each."""
+    lights = []
+    if len(studies) > 1:
+        return [_light(study.recommended, name, units, GOOD) for name, study in studies.items() if study.recommended]
+    (study,) = studies.values()
     good = [row for row in study.rows if not row["unfit"]]
-    for count in sorted({row["centres"] for row in good}):
-        rows = [row for row in good if row["centres"] == count]
-        axes.plot([1e3 * cost(r) for r in rows], [r["rms"] for r in rows], "o", ms=5, alpha=0.6,
-                  label=f"{count} centres")  # fmt: skip
-    front = sorted((1e3 * cost(row), row["rms"], row["kernel"]) for row in good if row["front"])
-    axes.plot(
-        [point[0] for point in front], [point[1] for point in front], "-", color="0.3", lw=1.0, zorder=0
-    )
-    for x, y, name in front:
-        axes.annotate(name, (x, y), xytext=(6, 3), textcoords="offset points", fontsize=9)
-    if good:
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.legend(fontsize=9)
-    axes.set_xlabel("fit and 20,000 values [ms of one thread]")
-    axes.set_ylabel(f"RMS error [{study.units or 'mesh units'}]")
-    buffer = io.BytesIO()
-    figure.savefig(buffer, dpi=110, format="png")
-    return buffer.getvalue()
+    best = study.recommended
+    for row in [best, *(row for row in good if row is not best)][:_MOST_LIGHTS] if best else []:
+        state = GOOD if row["rms"] <= ALIKE * good[0]["rms"] else PLAIN
+        lights.append(_light(row, "recommended" if row is best else "", units, state))
+    return lights
 
 
-def _row(row: dict) -> str:
-    cells = []
-    for name in COLUMNS:
-        value = row[name]
-        if isinstance(value, float):
-            value = f"{value * SCALE.get(name, 1.0):.3g}"
-        kind = ' class="text"' if name == "note" else ""
-        cells.append(f"<td{kind}>{'' if value is None else html.escape(str(value))}</td>")
-    return f"<tr{' class=front' if row['front'] else ''}>{''.join(cells)}</tr>"
+def _light(row: dict[str, Any], note: str, units: str, state: str) -> Light:
+    cells = [
+        Cell(number(row["rms"], units), row["rms"], state),
+        Cell(number(cost(row), "s"), cost(row)),
+    ]
+    return Light(row_name(row), cells, note=note)
+
+
+def _plot(studies: Mapping[str, KernelStudy], units: str) -> str:
+    """Error against the time of a fit and 20,000 values: a colour a surface, or of one a number of centres."""
+    rows = [(name, study, row) for name, study in studies.items() for row in study.rows if not row["unfit"]]
+    keys = [name if len(studies) > 1 else f"{row['centres']} centres" for name, _, row in rows]
+    colours = {key: MUSCLE_COLOURS[k % len(MUSCLE_COLOURS)] for k, key in enumerate(sorted(set(keys)))}
+    points = [
+        Point(1e3 * cost(row), row["rms"], row["kernel"], colours[key], row is study.recommended, row["front"])
+        for key, (_, study, row) in zip(keys, rows)
+    ]
+    labels = ("a fit and 20,000 values [ms of one thread]", f"RMS error [{units or 'mesh units'}]")
+    return front_plot(points, labels, groups=colours)
+
+
+def _rows(study: KernelStudy) -> str:
+    lines = []
+    for row in study.rows:
+        cells = [shown(name, row[name]) for name in COLUMNS]
+        state = GOOD if row is study.recommended else BAD if row["unfit"] else PLAIN
+        lines.append([row["kernel"], *cells, Cell(row["unfit"] or ("on the front" if row["front"] else ""), None, state)])
+    return table(["kernel", *(head for head, _ in COLUMNS.values()), "verdict"], lines)
+
+
+def shown(name: str, value: Any) -> Cell:
+    """A cell of a row's quantity."""
+    if isinstance(value, float):
+        return Cell(number(COLUMNS[name][1] * value), value)
+    return Cell("" if value is None else str(value), value if isinstance(value, int) else None)

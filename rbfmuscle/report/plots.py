@@ -166,7 +166,7 @@ def front_plot(points: Sequence[Point], labels: tuple[str, str], *, groups: Mapp
     if not shown:
         return ""
     spans = [(min(p[k] for p in shown), max(p[k] for p in shown)) for k in (0, 1)]
-    axes = _Axes((760, 460), spans, log=True)
+    axes = _Axes((500, 370), spans, log=True)
     axes.frame("", labels)
     taken: list[tuple[float, float, float, float]] = []
     for colour in dict.fromkeys(point.colour for point in shown):
@@ -199,7 +199,7 @@ def _label(axes: _Axes, point: Point, taken: list[tuple[float, float, float, flo
                 taken.append(box)
                 if far > 9:
                     axes.parts.append(
-                        f'<path d="M{x:.1f} {y:.1f}L{min(max(x, left), left + wide):.1f} {y + far * dy - 3:.1f}" '
+                        f'<path d="M{x:.1f} {y:.1f}L{min(max(x, box[0]), box[2]):.1f} {min(max(y, box[1]), box[3]):.1f}" '
                         f'stroke="{_SOFT}" stroke-width="0.6"/>'
                     )
                 axes.text(left, y + far * dy, point.label, colour=_INK, bold=point.star)
@@ -231,7 +231,9 @@ def _ticks(low: float, high: float, count: int, log: bool) -> list[float]:
     if log:
         steps = (1, 2, 5) if high / low < 300 else (1,)
         powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-        return [step * 10.0**power for power in powers for step in steps if low <= step * 10.0**power <= high]
+        found = [step * 10.0**power for power in powers for step in steps if low <= step * 10.0**power <= high]
+        if len(found) > 2:
+            return found
     raw = (high - low) / count
     power = 10.0 ** math.floor(math.log10(raw)) if raw > 0 else 1.0
     step = next(s * power for s in (1, 2, 2.5, 5, 10) if s * power >= raw * 0.999)

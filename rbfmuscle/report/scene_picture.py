@@ -1,32 +1,47 @@
-"""A scene before it runs as one picture: patches in the colour of their bone, joint axes, far ends, overlaps.
-
-Drawn in a process of its own, ``python -m rbfmuscle.report.scene_picture FOLDER``, as pictures of runs are.
-"""
+"""A scene before it runs as one picture: patches in the colour of their bone, joint axes, far ends, overlaps."""
 
 from __future__ import annotations
 
-import json
-import sys
-import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.report.appearance import BACKGROUND, LINE_COLOURS, VIEWS, aim_camera
-from rbfmuscle.report.render import draw, main
+from rbfmuscle.report.appearance import BACKGROUND, MUSCLE_COLOURS, VIEWS, mixed_colour, rgb
+from rbfmuscle.report.labels import labelled
+from rbfmuscle.report.raster import Camera, Solid, aim, draw_solids
 
 if TYPE_CHECKING:
+    from PIL.ImageDraw import ImageDraw
+
+    from rbfmuscle.scene.objects import Bone, Muscle
     from rbfmuscle.scene.scene import Scene
 
 # A patch farther than this [mm] from its bone is a far end; a muscle deeper than this in a bone overlaps it.
 FAR, DEEP = 6.0, 1.0
-SIZE = (560, 1000)
-BONE_OPACITY, MUSCLE_OPACITY = 1.0, 0.28
-MUSCLE, FAR_END, OVERLAP, AXIS = "#9a8f8f", "#111111", "#e3001b", "#0057d9"
-_PALE = 0.72
-_STRIP, _LINE, _TEXT = 34, 24, 15
+SIZE = (480, 860)
+_MUSCLE, _OPACITY, _FAR_END, _OVERLAP, _AXIS = "#9a8f8f", 0.4, "#111111", "#e3001b", "#0057d9"
+_PALE, _MOST_NAMED = 0.72, 6
+
+
+class FarEnd(NamedTuple):
+    """A patch away from its bone: least distance, and the line to the nearest place on the bone."""
+
+    muscle: str
+    bone: str
+    gap: float
+    line: Floats
+
+
+class Overlap(NamedTuple):
+    """Free vertices of a muscle inside a bone: the greatest depth, and their places."""
+
+    muscle: str
+    bone: str
+    depth: float
+    points: Floats
 
 
 def draw_scene(scene: Scene, path: str | Path) -> dict[str, int]:
@@ -41,261 +56,123 @@ def draw_scene(scene: Scene, path: str | Path) -> dict[str, int]:
     -------
     dict of str to int
         How many ``far_ends`` and ``overlaps`` (pairs of a muscle and a bone) are marked.
-
-    Raises
-    ------
-    MissingPartError
-        If there are no graphics to draw with.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        facts = write_parts(scene, Path(folder))
-        draw(folder, [{"file": str(Path(path).resolve())}], module="rbfmuscle.report.scene_picture")
-    return {"far_ends": len(facts["far"]), "overlaps": len(facts["overlaps"])}
+    far, overlaps = find_faults(scene)
+    colours = {bone.name: _bone_colour(k) for k, bone in enumerate(scene.bones)}
+    solids = [Solid(*_mesh(bone), rgb(mixed_colour(colours[bone.name], _PALE))) for bone in scene.bones]
+    solids += [solid for muscle in scene.muscles for solid in _muscle_solids(muscle, colours)]
+    points = np.concatenate([solid.vertices for solid in solids])
+    images = []
+    for direction, _ in VIEWS.values():
+        camera = aim(direction, points, SIZE)
+        images.append(_marked(draw_solids(solids, camera, rgb(BACKGROUND)), camera, scene, far, overlaps))
+    chips = {**colours, "joint centres and axes": _AXIS}
+    if far:
+        chips[f"ends far from their bone ({len(far)})"] = _FAR_END
+    if overlaps:
+        chips[f"muscle inside a bone ({len(overlaps)} pairs)"] = _OVERLAP
+    text = ", ".join([f"{scene.name}: held patches in the colour of their bone", *_notes(scene, far, overlaps)])
+    labelled(np.concatenate(images, axis=1), text, [title for _, title in VIEWS.values()], chips).save(path)
+    return {"far_ends": len(far), "overlaps": len(overlaps)}
 
 
-def write_parts(scene: Scene, folder: Path) -> dict[str, Any]:
-    """Write what is drawn: meshes as arrays, all else as JSON, which is returned."""
+def find_faults(scene: Scene) -> tuple[list[FarEnd], list[Overlap]]:
+    """Ends of muscles away from their bones, and muscles that start inside bones."""
     millimetre = scene.length(1.0)
-    arrays, far, overlaps = {}, [], []
-    for k, bone in enumerate(scene.bones):
-        arrays[f"bone{k}"], arrays[f"bone{k}f"] = _mesh(bone)
     distances = {bone.name: ExactDistance(*_mesh(bone)) for bone in scene.bones}
-    names = [bone.name for bone in scene.bones]
-    for k, muscle in enumerate(scene.muscles):
-        vertices, faces = _mesh(muscle)
-        arrays[f"muscle{k}"], arrays[f"muscle{k}f"] = vertices, faces
-        attached_bone = np.full(len(vertices), -1)
+    bones = {bone.name: bone for bone in scene.bones}
+    far, overlaps = [], []
+    for muscle in scene.muscles:
+        vertices, _ = _mesh(muscle)
+        free = np.ones(len(vertices), dtype=bool)
         for held in muscle.attachments:
-            attached_bone[held.vertices] = names.index(held.bone)
-            gap, end = _gap(
-                vertices[held.vertices], distances[held.bone], scene.bones[names.index(held.bone)]
-            )
+            patch = vertices[held.vertices]
+            free[held.vertices] = False
+            gap = float(distances[held.bone].signed_distance(patch).min())
             if gap > FAR * millimetre:
-                far.append({"muscle": muscle.name, "bone": held.bone, "gap": gap, "line": end})
-        arrays[f"muscle{k}h"] = attached_bone
-        deep = _inside(vertices, attached_bone, scene, distances, DEEP * millimetre)
-        if len(deep["points"]):
-            arrays[f"deep{k}"] = deep.pop("points")
-            overlaps += [{"muscle": muscle.name, **one} for one in deep["bones"]]
-    facts = {
-        "name": scene.name,
-        "units": scene.units,
-        "bones": names,
-        "muscles": [muscle.name for muscle in scene.muscles],
-        "joints": [_joint(joint) for joint in scene.joints if joint.coordinates],
-        "far": far,
-        "overlaps": overlaps,
-    }
-    np.savez(folder / "parts.npz", **arrays)
-    (folder / "facts.json").write_text(json.dumps(facts), encoding="utf-8")
-    return facts
+                middle, places = patch.mean(axis=0), _mesh(bones[held.bone])[0]
+                nearest = places[np.argmin(((places - middle) ** 2).sum(axis=1))]
+                far.append(FarEnd(muscle.name, held.bone, gap, np.array([middle, nearest])))
+        for bone in scene.bones:
+            low, high = bone.mesh.bounds
+            near = vertices[((vertices > low) & (vertices < high)).all(axis=1) & free]
+            depth = -distances[bone.name].signed_distance(near) if len(near) else np.zeros(0)
+            deep = depth > DEEP * millimetre
+            if deep.any():
+                overlaps.append(Overlap(muscle.name, bone.name, float(depth.max()), near[deep]))
+    return far, overlaps
 
 
-def _mesh(item):
+def _mesh(item: Bone | Muscle) -> tuple[Floats, Integers]:
     return np.asarray(item.mesh.vertices, dtype=float), np.asarray(item.mesh.faces)
 
 
-def _gap(points, distance, bone):
-    """Least distance of a patch from its bone, and the line from its middle to the nearest place there."""
-    gap = float(distance.signed_distance(points).min())
-    vertices = np.asarray(bone.mesh.vertices, dtype=float)
-    middle = points.mean(axis=0)
-    nearest = vertices[np.argmin(((vertices - middle) ** 2).sum(axis=1))]
-    return gap, [middle.tolist(), nearest.tolist()]
+def _muscle_solids(muscle: Muscle, colours: dict[str, str]) -> list[Solid]:
+    """A muscle as a veil, and its held patches in the colours of their bones."""
+    vertices, faces = _mesh(muscle)
+    held = np.zeros(len(vertices), dtype=bool)
+    solids = []
+    for attachment in muscle.attachments:
+        mine = np.zeros(len(vertices), dtype=bool)
+        mine[attachment.vertices] = True
+        solids.append(Solid(vertices, faces[mine[faces].all(axis=1)], rgb(colours[attachment.bone])))
+        held |= mine
+    veil = Solid(vertices, faces[~held[faces].all(axis=1)], rgb(_MUSCLE), _OPACITY)
+    return [veil, *(solid for solid in solids if len(solid.faces))]
 
 
-def _inside(vertices, attached_bone, scene, distances, deep):
-    """Vertices deeper in a bone than allowed, of those that no bone holds, and which bones these are."""
-    marked, bones = np.zeros(len(vertices), dtype=bool), []
-    for bone in scene.bones:
-        low, high = bone.mesh.bounds
-        near = np.flatnonzero(((vertices > low) & (vertices < high)).all(axis=1) & (attached_bone < 0))
-        if len(near) == 0:
+def _marked(
+    image: Integers, camera: Camera, scene: Scene, far: list[FarEnd], overlaps: list[Overlap]
+) -> Integers:
+    """The picture with joints, far ends and overlaps drawn over it."""
+    from PIL import Image, ImageDraw
+
+    sheet = Image.fromarray(image)
+    pen = ImageDraw.Draw(sheet)
+    for overlap in overlaps:
+        for x, y, _ in camera.project(overlap.points):
+            pen.ellipse((x - 2, y - 2, x + 2, y + 2), fill=_OVERLAP)
+    for end in far:
+        pen.line([tuple(place[:2]) for place in camera.project(end.line)], fill=_FAR_END, width=3)
+    _draw_joints(pen, camera, scene)
+    return np.asarray(sheet)
+
+
+def _draw_joints(pen: ImageDraw, camera: Camera, scene: Scene) -> None:
+    """Centres, axes and names of the joints; names of those at one place below each other."""
+    from PIL import ImageFont
+
+    font, rows = ImageFont.load_default(13), []
+    for joint in scene.joints:
+        if not joint.coordinates:
             continue
-        depth = -distances[bone.name].signed_distance(vertices[near])
-        if depth.max() > deep:
-            marked[near[depth > deep]] = True
-            bones.append({"bone": bone.name, "depth": float(depth.max())})
-    return {"points": vertices[marked], "bones": bones}
+        centre = np.asarray(joint.centre, dtype=float)
+        x, y, _ = camera.project(centre[None])[0]
+        for axis in (*joint.rotations, *joint.translations):
+            if axis.coordinates:
+                along = joint.frame[:3, :3] @ np.asarray(axis.direction, dtype=float)
+                reach = 26.0 / camera.scale / np.linalg.norm(along)
+                ends = camera.project(np.array([centre - reach * along, centre + reach * along]))
+                pen.line([tuple(end[:2]) for end in ends], fill=_AXIS, width=2)
+        pen.ellipse((x - 4, y - 4, x + 4, y + 4), fill=_AXIS)
+        row, wide = y - 7, pen.textlength(joint.name, font=font)
+        left = min(x + 8, camera.size[0] - wide - 4)
+        while any(abs(row - other) < 14 and left < end and start < left + wide for other, start, end in rows):
+            row += 14
+        rows.append((row, left, left + wide))
+        pen.text((left, row), joint.name, fill=_AXIS, font=font)
 
 
-def _joint(joint):
-    """Place and axes of a joint for the picture."""
-    moving = [axis.direction for axis in (*joint.rotations, *joint.translations) if axis.coordinates]
-    axes = [(joint.frame[:3, :3] @ np.asarray(direction, dtype=float)).tolist() for direction in moving]
-    return {"name": joint.name, "centre": np.asarray(joint.centre, dtype=float).tolist(), "axes": axes}
-
-
-class ScenePicture:
-    """The child's window: three views of one scene.
-
-    Parameters
-    ----------
-    folder : Path
-        From `write_parts`.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        import pyvista
-
-        self.facts = json.loads((folder / "facts.json").read_text(encoding="utf-8"))
-        with np.load(folder / "parts.npz") as found:
-            self.parts = dict(found)
-        self.colours = [_bone_colour(k) for k in range(len(self.facts["bones"]))]
-        window = (SIZE[0] * len(VIEWS), SIZE[1])
-        self.plotter = pyvista.Plotter(
-            off_screen=True, shape=(1, len(VIEWS)), border=False, window_size=window
-        )
-        self.plotter.set_background(BACKGROUND)
-        points = np.vstack([part for name, part in self.parts.items() if name[-1].isdigit()])
-        bounds = np.array([points.min(axis=0), points.max(axis=0)])
-        self.size = float(np.linalg.norm(np.ptp(points, axis=0)))
-        for column, (direction, _) in enumerate(VIEWS.values()):
-            self.plotter.subplot(0, column)
-            self._add_all()
-            aim_camera(self.plotter.camera, direction, bounds, SIZE)
-            self.plotter.enable_anti_aliasing("ssaa")
-
-    def picture(self) -> Any:
-        """The views side by side, (h, w, 3) uint8."""
-        self.plotter.render()
-        return self.plotter.screenshot(return_img=True)
-
-    def close(self) -> None:
-        """Let the plotter go."""
-        self.plotter.close()
-
-    def _add_all(self):
-        import pyvista
-
-        look = {"smooth_shading": True, "ambient": 0.2, "render": False, "reset_camera": False}
-        for k, colour in enumerate(self.colours):
-            mesh = pyvista.make_tri_mesh(self.parts[f"bone{k}"], self.parts[f"bone{k}f"])
-            self.plotter.add_mesh(mesh, color=_paler(colour), opacity=BONE_OPACITY, **look)
-        for k in range(len(self.facts["muscles"])):
-            self._add_muscle(k, look)
-        for joint in self.facts["joints"]:
-            self._add_joint(joint, look)
-        self._add_names()
-        for far in self.facts["far"]:
-            line = pyvista.Line(*far["line"]).tube(radius=0.0022 * self.size)
-            self.plotter.add_mesh(line, color=FAR_END, **look)
-
-    def _add_muscle(self, k, look):
-        import pyvista
-
-        points, faces = self.parts[f"muscle{k}"], self.parts[f"muscle{k}f"]
-        attached_bone = self.parts[f"muscle{k}h"][faces]
-        held = np.where((attached_bone == attached_bone[:, :1]).all(axis=1), attached_bone[:, 0], -1)
-        self.plotter.add_mesh(
-            pyvista.make_tri_mesh(points, faces[held < 0]), color=MUSCLE, opacity=MUSCLE_OPACITY, **look
-        )
-        for bone in np.unique(held[held >= 0]):
-            patch = pyvista.make_tri_mesh(points, faces[held == bone])
-            self.plotter.add_mesh(patch, color=self.colours[bone], **look)
-        if f"deep{k}" in self.parts:
-            self.plotter.add_mesh(
-                pyvista.PolyData(self.parts[f"deep{k}"]), color=OVERLAP, point_size=6,
-                render_points_as_spheres=True, render=False, reset_camera=False,
-            )  # fmt: skip
-
-    def _add_joint(self, joint, look):
-        import pyvista
-
-        centre = np.array(joint["centre"])
-        reach = 0.07 * self.size if len(joint["axes"]) > 1 else 0.09 * self.size
-        for axis in joint["axes"]:
-            way = reach * np.array(axis) / np.linalg.norm(axis)
-            line = pyvista.Line(centre - way, centre + way).tube(radius=0.002 * self.size)
-            self.plotter.add_mesh(line, color=AXIS, **look)
-        self.plotter.add_mesh(pyvista.Sphere(0.006 * self.size, centre), color=AXIS, **look)
-
-    def _add_names(self):
-        """Names of the joints, one below the other where they share a place."""
-        groups: list[tuple[Any, list[str]]] = []
-        for joint in self.facts["joints"]:
-            centre = np.array(joint["centre"])
-            near = [names for place, names in groups if np.linalg.norm(place - centre) < 0.04 * self.size]
-            if near:
-                near[0].append(joint["name"])
-            else:
-                groups.append((centre, [joint["name"]]))
-        if groups:
-            self.plotter.add_point_labels(
-                [place for place, _ in groups], ["\n".join(names) for _, names in groups], font_size=13,
-                text_color=AXIS, shape=None, always_visible=True, show_points=False, render=False, reset_camera=False,
-            )  # fmt: skip
-
-
-def _bone_colour(k):
+def _bone_colour(k: int) -> str:
     """A colour for the k-th bone; darker ones where there are more bones than colours."""
-    colour = LINE_COLOURS[k % len(LINE_COLOURS)]
-    return _mixed(colour, 0, min(0.45 * (k // len(LINE_COLOURS)), 0.8))
+    return mixed_colour(MUSCLE_COLOURS[k % len(MUSCLE_COLOURS)], -min(0.45 * (k // len(MUSCLE_COLOURS)), 0.8))
 
 
-def _paler(colour):
-    return _mixed(colour, 255, _PALE)
-
-
-def _mixed(colour, other, share):
-    """A colour brought nearer to a grey (0 black, 255 white)."""
-    values = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
-    return "#" + "".join(f"{round(value + share * (other - value)):02x}" for value in values)
-
-
-def _legend(facts, colours, width):
-    """A strip under the views: colours of the bones, then what the marks mean and what they found."""
-    from PIL import Image, ImageDraw, ImageFont
-
-    font = ImageFont.load_default(_TEXT)
-    chips = list(zip(facts["bones"], colours))
-    units = facts["units"]
-    marks = [("joint centres and axes", AXIS)]
-    if facts["far"]:
-        marks.append((f"ends far from their bone ({len(facts['far'])})", FAR_END))
-    if facts["overlaps"]:
-        marks.append((f"muscle inside a bone ({len(facts['overlaps'])} pairs)", OVERLAP))
-    worst = sorted(facts["far"], key=lambda one: -one["gap"])[:6]
-    notes = [f"{one['muscle']} ends {one['gap']:.3g} {units} from {one['bone']}" for one in worst]
-    deepest = sorted(facts["overlaps"], key=lambda one: -one["depth"])[:6]
-    notes += [f"{one['muscle']} is {one['depth']:.3g} {units} deep in {one['bone']}" for one in deepest]
-    image = Image.new("RGB", (width, 4000), BACKGROUND)
-    pen = ImageDraw.Draw(image)
-    y = 8
-    for entries, boxed in ((chips, True), (marks, True), ([(note, None) for note in notes], False)):
-        x = 14
-        for text, colour in entries:
-            wide = pen.textlength(text, font=font) + (26 if boxed else 0) + 22
-            if x + wide > width and x > 14:
-                x, y = 14, y + _LINE
-            if boxed:
-                pen.rectangle((x, y + 3, x + 16, y + 15), fill=colour)
-            pen.text((x + (24 if boxed else 0), y), text, fill="#26282b", font=font)
-            x += wide
-        y += _LINE if entries else 0
-    return image.crop((0, 0, width, y + 6))
-
-
-def _draw_job(found, job, seconds, stages):
-    from PIL import Image, ImageDraw, ImageFont
-
-    stage = ScenePicture(found)
-    stages[id(stage)] = stage
-    image = Image.fromarray(stage.picture())
-    legend = _legend(stage.facts, stage.colours, image.width)
-    whole = Image.new("RGB", (image.width, _STRIP + image.height + legend.height), BACKGROUND)
-    pen, font = ImageDraw.Draw(whole), ImageFont.load_default(_TEXT + 2)
-    pen.text(
-        (14, 8), f"{stage.facts['name']}: held patches in the colour of their bone", fill="#26282b", font=font
-    )
-    for column, (_, title) in enumerate(VIEWS.values()):
-        pen.text(
-            (SIZE[0] * (column + 1) - 70, 10), title, fill="#6a6f76", font=ImageFont.load_default(_TEXT - 2)
-        )
-    whole.paste(image, (0, _STRIP))
-    whole.paste(legend, (0, _STRIP + image.height))
-    whole.save(job["file"])
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:], Path, _draw_job))
+def _notes(scene: Scene, far: list[FarEnd], overlaps: list[Overlap]) -> list[str]:
+    """The worst of what is marked, in words."""
+    ends = sorted(far, key=lambda end: -end.gap)[:_MOST_NAMED]
+    deepest = sorted(overlaps, key=lambda overlap: -overlap.depth)[:_MOST_NAMED]
+    return [
+        *(f"{end.muscle} ends {end.gap:.3g} {scene.units} from {end.bone}" for end in ends),
+        *(f"{one.muscle} is {one.depth:.3g} {scene.units} deep in {one.bone}" for one in deepest),
+    ]

@@ -1,106 +1,121 @@
-"""A sweep as a picture and a page: error against time per frame, the front, scenes that lie apart, every point."""
+"""The page of a sweep: the default's place, the Pareto front with labelled points, rows to choose from, every point."""
 
 from __future__ import annotations
 
-import html
-import io
-import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from rbfmuscle.report.appearance import LINE_COLOURS
-from rbfmuscle.report.page import STYLE, embedded_image
-from rbfmuscle.report.plots import PLOT_STYLE
+from rbfmuscle.report.appearance import MUSCLE_COLOURS
+from rbfmuscle.report.page import GOOD, NEAR, PLAIN, Cell, Light, Page, Section, number, table
+from rbfmuscle.report.plots import Point, front_plot
 
 SHOWN = ("error_rms", "error_max", "volume_error", "penetration_max", "bone_penetration_max", "time_frame")
-PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">
-<title>{title}</title><style>{style}</style></head><body><main><h1>{title}</h1><p class="sub">{counts}</p>
-{verdicts}{picture}{outliers}<h2>Points</h2>
-<p class="note">Lengths in the scene's unit, times in milliseconds per frame. Points that ran beside others share
-memory and caches with them.</p><div class="wide">{points}</div>
-<h2>How to read this</h2><p><b>error_rms</b> is the distance between a point's surfaces and those of the
-<b>reference</b>, the finest point of the grid, at the same poses, both ways, root mean square over frames and muscles.
-It says how far a setting is from the finest one, not how far the model is from a real muscle. A point is on the
-<b>front</b> if no other is as accurate in less time. A scene lies <b>apart</b> where a mean over its frames is more
-than 3.5 robust standard deviations from the median of five scenes or more.</p></main></body></html>
-"""
+_READING = """<p><b>error_rms</b> is the distance between a point's surfaces and those of the <b>reference</b> at the same
+poses, both ways, root mean square over frames and muscles. It says how far a setting is from the reference, not how far the
+model is from a real muscle. A point is on the <b>front</b> if no other is as accurate in less time. Points that ran beside
+others share memory and caches with them.</p>"""
+_INSIDE = """<p>The reference is itself a point of the grid, so points near it err little by definition. Give a finer one
+(<code>--reference</code>) to judge the default.</p>"""
 
 
-def write_page(table: dict[str, Any], directory: str | Path) -> None:
-    """Write the self-contained ``sweep.html``, and ``pareto.png`` where there is a front.
+def write_page(found: dict[str, Any], directory: str | Path) -> None:
+    """Write the self-contained ``sweep.html``, and ``pareto.svg`` where there is a front.
 
     Parameters
     ----------
-    table : dict
+    found : dict
         From `write_table`.
     directory : path
     """
-    directory, rows = Path(directory), table["rows"]
-    picture = ""
-    if any(row["front"] for row in rows):
-        drawn = draw_front(rows, table["quantity"])
-        (directory / "pareto.png").write_bytes(drawn)
-        picture = f"<figure>{embedded_image(drawn, 'png', 'Error against time per frame')}</figure>"
-    settings = list(dict.fromkeys(key for row in rows for key in row["settings"]))
-    head = ["scene", *settings, "role", "front", *SHOWN, "error"]
-    lines = [[row["settings"].get(name, row.get(name, "")) for name in head] for row in rows]
-    apart = [list(found.values()) for found in table["outliers"]]
-    text = PAGE.format(
-        title=html.escape(f"Sweep of {', '.join(dict.fromkeys(row['scene'] for row in rows))}"[:120]),
-        style=STYLE,
-        counts=", ".join(f"{table[status]} points {status}" for status in ("done", "failed", "missing")),
-        verdicts="".join(
-            f'<p class="{"good" if v["near"] else "bad"}">{html.escape(v["text"])}</p>'
-            for v in table["verdicts"]
-        ),
+    directory, rows, quantity = Path(directory), found["rows"], found["quantity"]
+    picture = front_picture(rows, quantity)
+    if picture:
+        (directory / "pareto.svg").write_text(
+            picture.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1), encoding="utf-8"
+        )
+    verdicts, inside = found["verdicts"], inside_grid(rows)
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    judged = PLAIN if inside or not verdicts else GOOD if all(v["near"] for v in verdicts) else NEAR
+    Page(
+        f"Sweep of {', '.join(scenes)}"[:120],
+        [f"{found[status]} points {status}" for status in ("done", "failed", "missing") if found[status]],
+        " ".join(v["text"] for v in verdicts) or f"{found['done']} points are done; none is judged.",
+        judged,
         picture=picture,
-        outliers="<h2>Apart from the other scenes</h2>" + _table(list(table["outliers"][0]), apart)
-        if apart
-        else "",
-        points=_table(head, lines),
+        missing="" if picture else "No front: no point has both an error and a time.",
+        lights=_lights(rows, verdicts, quantity),
+        heads=[quantity.replace("_", " "), "per frame"],
+        sections=[
+            Section("Every point", _points(rows)),
+            Section("How to read this", _READING + (_INSIDE if inside else "")),
+        ],
+    ).write(directory / "sweep.html")
+
+
+def inside_grid(rows: Iterable[dict[str, Any]]) -> bool:
+    """Whether a reference has no setting beyond those of the other points."""
+    rows = list(rows)
+    others = [row["settings"] for row in rows if row["role"] != "reference"]
+    values = {(key, str(value)) for settings in others for key, value in settings.items()}
+    return any(
+        {(key, str(value)) for key, value in row["settings"].items()} <= values
+        for row in rows
+        if row["role"] == "reference"
     )
-    (directory / "sweep.html").write_text(text, encoding="utf-8")
 
 
-def _table(head, lines):
-    rows = "".join(
-        "<tr>" + "".join(f"<td>{_cell(n, v)}</td>" for n, v in zip(head, line)) + "</tr>" for line in lines
-    )
-    return f"<table><tr>{''.join(f'<th>{html.escape(name)}</th>' for name in head)}</tr>{rows}</table>"
+def front_picture(rows: Iterable[dict[str, Any]], quantity: str) -> str:
+    """SVG of the error against time per frame: a colour for each scene and model, fronts joined and labelled."""
+    rows = [row for row in rows if row["role"] != "reference" and row["status"] == "done"]
+    groups = list(dict.fromkeys(_group(row) for row in rows))
+    colours = {group: MUSCLE_COLOURS[k % len(MUSCLE_COLOURS)] for k, group in enumerate(groups)}
+    points = [
+        Point(1e3 * row["time_frame"], row[quantity], _short(row), colours[_group(row)], row["role"] == "default", row["front"])
+        for row in rows
+    ]  # fmt: skip
+    labels = ("time per frame [ms]", quantity.replace("_", " "))
+    return front_plot(points, labels, groups=colours if len(groups) > 1 else {})
 
 
-def _cell(name, value):
-    if isinstance(value, bool):
-        return "yes" if value else ""
-    if not isinstance(value, float):
-        return html.escape(str(value))
-    shown = 1e3 * value if name.startswith("time_") else value
-    return "" if math.isnan(value) else f"{shown:.3g}"
+def _group(row: dict[str, Any]) -> str:
+    return f"{row['scene']} {row['model']}".strip()
 
 
-def draw_front(rows: list[dict[str, Any]], quantity: str) -> bytes:
-    """PNG of the error against time per frame, a colour a scene and model, stars for the defaults."""
-    import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+def _short(row: dict[str, Any]) -> str:
+    """A point's settings without what names the table that they are in."""
+    if row["role"] == "default":
+        return "default"
+    return ", ".join(f"{key.rpartition('.')[2]} {value}" for key, value in row["settings"].items() if key != "model")
 
-    with matplotlib.rc_context(PLOT_STYLE):
-        figure = Figure(figsize=(7.6, 4.6), layout="constrained")
-        FigureCanvasAgg(figure)
-        axes = figure.add_subplot()
-        groups = list(dict.fromkeys(f"{row['scene']} {row['model']}".strip() for row in rows))
-        for row in rows:
-            if row["role"] == "reference" or not (row[quantity] > 0.0 and row["time_frame"] > 0.0):
-                continue
-            group = f"{row['scene']} {row['model']}".strip()
-            shape = "*" if row["role"] == "default" else "o"
-            (dot,) = axes.plot(1e3 * row["time_frame"], row[quantity], shape, label=group)
-            dot.set(ms=14 if shape == "*" else 5, alpha=1.0 if row["front"] else 0.4)
-            dot.set_color(LINE_COLOURS[groups.index(group) % len(LINE_COLOURS)])
-        axes.set(xscale="log", yscale="log", xlabel="time per frame [ms]", ylabel=quantity)
-        named = dict(zip(*reversed(axes.get_legend_handles_labels())))
-        axes.legend(named.values(), named.keys(), frameon=False, fontsize=8.5)
-        out = io.BytesIO()
-        figure.savefig(out, format="png", dpi=130, metadata={"Software": None})
-    return out.getvalue()
+
+def _lights(rows: list[dict[str, Any]], verdicts: list[dict[str, Any]], quantity: str) -> list[Light]:
+    """Of each default: itself, what is quicker, what is more accurate; then the two ends of the front."""
+    by_key, lights = {row["key"]: row for row in rows}, []
+    front = sorted((row for row in rows if row["front"]), key=lambda row: row["time_frame"])
+    several = len(verdicts) > 1
+    chosen = [(f"default of {v['scene']}" if several else "default", v["default"], v) for v in verdicts]
+    for verdict in verdicts[:2]:
+        chosen += [("as accurate, quicker", verdict["faster"], None), ("as quick, more accurate", verdict["better"], None)]
+    chosen += [("the quickest", front[0]["key"], None), ("the most accurate", front[-1]["key"], None)] if front else []
+    for title, key, verdict in chosen:
+        if key:
+            row = by_key[key]
+            state = PLAIN if verdict is None or inside_grid(rows) else GOOD if verdict["near"] else NEAR
+            unit = row["units"] if quantity in ("error_rms", "error_max", "rest_error_rms") else ""
+            cells = [
+                Cell(number(row[quantity], unit), row[quantity], state),
+                Cell(number(row["time_frame"], "s"), row["time_frame"]),
+            ]
+            lights.append(Light(title, cells, note="" if verdict else _short(row)))
+    return lights
+
+
+def _points(rows: list[dict[str, Any]]) -> str:
+    settings = list(dict.fromkeys(key for row in rows for key in row["settings"]))
+    lines = []
+    for row in rows:
+        cells = [Cell(str(row["settings"].get(key, ""))) for key in settings]
+        values = [Cell(number(row[name], "s" if name.startswith("time_") else ""), row[name]) for name in SHOWN]
+        lines.append([row["scene"], *cells, row["role"], "yes" if row["front"] else "", *values, row["error"] or row["status"]])
+    return table(["scene", *settings, "role", "on the front", *(name.replace("_", " ") for name in SHOWN), "status"], lines)

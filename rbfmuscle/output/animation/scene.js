@@ -77,6 +77,9 @@ class Scene {
       part.rgb = [1, 3, 5].map((k) => parseInt(part.colour.slice(k, k + 2), 16) / 255);
     }
     data.panels.forEach((name) => name && element("span", this.stage, {className: "title", textContent: name}));
+    // Where it is narrow, models stand below each other.
+    const width = home.clientWidth, panels = data.panels.length;
+    if (width < 600 && panels > 1) home.style.height = `${(0.75 * panels * width + 180).toFixed()}px`;
     this.build(); this.listen(); this.look(data.direction); this.show(data.captions.length - 1);
     new ResizeObserver(() => this.draw()).observe(this.stage);
   }
@@ -212,24 +215,25 @@ class Scene {
     const [width, height] = [stage.clientWidth, stage.clientHeight], fine = window.devicePixelRatio || 1;
     if (!width || !height || !box) return;
     canvas.width = Math.round(width * fine); canvas.height = Math.round(height * fine);
+    const titles = [...stage.querySelectorAll(".title")], strip = (w) => titles.reduce((most, title) => {
+      title.style.width = `${w}px`; return Math.max(most, title.offsetHeight); }, 0);
     let columns = panels, size = 0;
     for (let n = 1; n <= panels; n++) {
-      const fits = Math.min(width / n / box.wide, (height / Math.ceil(panels / n) - 26) / box.tall);
+      const fits = Math.min(width / n / box.wide, (height / Math.ceil(panels / n) - strip(width / n)) / box.tall);
       if (fits > size) [size, columns] = [fits, n];
     }
-    const rows = Math.ceil(panels / columns), [w, h] = [width / columns, height / rows];
-    const titles = stage.querySelectorAll(".title");
+    const w = width / columns, above = strip(w), h = height / Math.ceil(panels / columns) - above;
     for (let k = 0; k < panels; k++) {
-      const x = (k % columns) * w, y = Math.floor(k / columns) * h;
-      gl.viewport(...[x, height - y - h, w, h].map((value) => Math.round(value * fine)));
-      gl.scissor(...[x, height - y - h, w, h].map((value) => Math.round(value * fine)));
+      const x = (k % columns) * w, y = Math.floor(k / columns) * (h + above);
+      const place = [x, height - y - above - h, w, h].map((value) => Math.round(value * fine));
+      gl.viewport(...place); gl.scissor(...place);
       gl.clearColor(1, 1, 1, 1); gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-      if (titles[k]) titles[k].style.cssText = `left:${x}px;top:${y}px;width:${w}px`;
-      this.panel(k, w, h, titles[k] ? 24 : 0, 0.47 * size);
+      if (titles[k]) Object.assign(titles[k].style, {left: `${x}px`, top: `${y}px`});
+      this.panel(k, w, h, 0.47 * size);
     }
   }
 
-  panel(number, w, h, strip, size) {
+  panel(number, w, h, size) {
     const gl = this.gl, axes = this.axes(), {box, program} = this, scale = size * this.zoom;
     const place = (name) => gl.getUniformLocation(program, name);
     for (const part of this.data.parts) {
@@ -239,7 +243,7 @@ class Scene {
       const at = axes.map((axis) => dot(axis, add(shift, box.centre, -1)));
       const factors = [2 * scale / w, 2 * scale / h, -1 / (4 * box.deep)];
       const view = [0, 1, 2].flatMap((k) => [...rows.map((row, j) => factors[j] * row[k]), 0]);
-      view.push(factors[0] * at[0] + 2 * this.shift[0] / w, factors[1] * at[1] + (2 * this.shift[1] - strip) / h,
+      view.push(factors[0] * at[0] + 2 * this.shift[0] / w, factors[1] * at[1] + 2 * this.shift[1] / h,
         factors[2] * at[2], 1);
       gl.uniformMatrix4fv(place("view"), false, view);
       gl.uniformMatrix3fv(place("turn"), false, [0, 1, 2].flatMap((k) => rows.map((row) => row[k])));
