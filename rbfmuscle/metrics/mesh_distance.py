@@ -90,6 +90,14 @@ class MeshDistance:
         """Distance to the surface, negative inside, (n,) ndarray [scene unit]; points as (n, 3) array_like."""
         return np.where(self.inside(points), -1.0, 1.0) * self.unsigned(points)
 
+    def nearest(self, points: ArrayLike) -> tuple[Floats, Floats, Floats]:
+        """Signed distance (n,), nearest point (n, 3) and the outward pseudonormal there (n, 3) of points (n, 3)."""
+        points = check_points(points)
+        if len(points) == 0:
+            return np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))
+        distance, closest, _, normal = self._exact.nearest(points)
+        return np.where(self.inside(points), -1.0, 1.0) * np.abs(distance), closest, normal
+
     def depth(self, points: ArrayLike, *, pose: Floats = _HERE) -> Floats:
         """How deep points lie inside, 0 where outside.
 

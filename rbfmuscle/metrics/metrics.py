@@ -13,6 +13,7 @@ from rbfmuscle.geometry.threads import each
 from rbfmuscle.jit import compiled
 from rbfmuscle.metrics.centreline import Centreline, MuscleAtRest, carried_middle, moving_joints
 from rbfmuscle.metrics.contraction import ContractionStudy, belly_measures
+from rbfmuscle.metrics.geodesic import path_length, shortest_path
 from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.metrics.penetration import BoneProbe, bone_depth, surface_depth
 from rbfmuscle.metrics.quantities import QUANTITIES
@@ -77,6 +78,14 @@ class _Tracker:
         self.distance: MeshDistance | None = None
         self.offset: Floats | None = None
 
+    def _of_line(self, carried: Floats, probes: list[BoneProbe], poses: dict[str, Floats]) -> dict[str, float]:
+        """Length of the centreline, and over that of the shortest path between its ends."""
+        if self.line is None:
+            return {}
+        line = self.line.points(carried, poses)
+        length, shortest = path_length(line), path_length(shortest_path(line, probes, poses))
+        return {"length": length, "slack": length / shortest if shortest > 0.0 else math.nan}
+
     def measure(self, frame: Frame, probes: list[BoneProbe], at_rest: bool) -> dict[str, float]:
         """What there is to measure of this muscle in a frame."""
         found: dict[str, float] = {}
@@ -91,8 +100,7 @@ class _Tracker:
         mine = [event for event in frame.events if event.muscle == self.name]
         found["tunnelled"] = sum(event.count for event in mine if event.action in _THROUGH)
         found["edge_strain_rms"] = edge_strain(carried, self.edges, self.rest_lengths)
-        if self.line is not None:
-            found["length"] = self.line.length(carried, frame.poses)
+        found.update(self._of_line(carried, probes, frame.poses))
         if self.contraction is not None:
             found["activation"] = frame.activations[self.name]
             found.update(self.contraction.measure(carried, frame.poses, surface))

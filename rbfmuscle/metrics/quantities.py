@@ -32,7 +32,7 @@ QUANTITIES = {
     "edge_strain_rms": ("1", "relative change of edge lengths of the carried mesh"),
     "condition": ("1", "condition estimate of the fit"),
     "length": ("length", "centreline from origin to insertion"),
-    "slack": ("1", "centreline over the shortest path between the ends"),
+    "slack": ("1", "this length over that of the shortest path over the bones between its ends"),
     "moment_arm": ("length", "minus the change of length with the coordinate's angle"),
     "activation": ("1", "activation, 0 to 1; this and the next six for muscles that contract"),
     "fibre_length": ("length", "mean length of the scene's fibres without their tendon"),

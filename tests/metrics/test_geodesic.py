@@ -1,0 +1,61 @@
+"""The shortest path over bones between a muscle's ends, against closed forms."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from rbfmuscle.metrics.geodesic import path_length, shortest_path
+from rbfmuscle.metrics.penetration import BoneProbe
+
+RADIUS, FAR = 10.0, 25.0
+
+
+def ball():
+    return BoneProbe("ball", trimesh.creation.icosphere(5, RADIUS))
+
+
+def over_the_ball(height):
+    """Points from one side of the ball to the other, over it for a positive height."""
+    x = np.linspace(-FAR, FAR, 20)
+    return np.stack([x, np.zeros(20), height * (1 - (x / FAR) ** 2)], axis=1)
+
+
+def wrapped():
+    """Length of a string from one side of a circle to the other: two tangents and an arc."""
+    tangent = np.sqrt(FAR**2 - RADIUS**2)
+    return 2 * tangent + RADIUS * (np.pi - 2 * np.arctan2(tangent, RADIUS))
+
+
+@pytest.mark.parametrize("height", [20.0, -20.0, 12.0])
+def test_string_over_a_ball_is_two_tangents_and_an_arc(height):
+    path = shortest_path(over_the_ball(height), [ball()], {"ball": np.eye(4)})
+    # 33 nodes cut the arc's corners, and the ball has facets: a thousandth of the length.
+    assert path_length(path) == pytest.approx(wrapped(), rel=1e-3)
+    assert np.sign(path[len(path) // 2, 2]) == np.sign(height)
+    assert np.linalg.norm(path[1:-1], axis=1).min() > 0.995 * RADIUS
+
+
+def test_string_without_anything_between_is_straight():
+    line = over_the_ball(8.0)
+    away = np.eye(4)
+    away[:3, 3] = 0.0, 40.0, 0.0
+    for probes, poses in (([], {}), ([ball()], {"ball": away})):
+        assert path_length(shortest_path(line, probes, poses)) == pytest.approx(2 * FAR, rel=1e-12)
+
+
+def test_string_goes_along_with_the_scene():
+    motion = np.eye(4)
+    motion[:3, :3] = Rotation.from_rotvec([0.3, -0.5, 0.8]).as_matrix()
+    motion[:3, 3] = 3.0, -7.0, 11.0
+    line = over_the_ball(15.0)
+    before = shortest_path(line, [ball()], {"ball": np.eye(4)})
+    after = shortest_path(line @ motion[:3, :3].T + motion[:3, 3], [ball()], {"ball": motion})
+    assert np.allclose(after, before @ motion[:3, :3].T + motion[:3, 3], atol=1e-6)
+
+
+def test_path_is_no_longer_than_a_line_beside_the_bones():
+    rng = np.random.default_rng(2)
+    line = over_the_ball(18.0)
+    line[1:-1] += rng.uniform(0.0, 2.0, (len(line) - 2, 3)) * [0.0, 1.0, 1.0]
+    assert path_length(shortest_path(line, [ball()], {"ball": np.eye(4)})) < path_length(line)
