@@ -79,7 +79,9 @@ def kernels(
     except OSError as failed:
         raise UsageError(f"cannot write to {output}: {failed.strerror}; choose another --output") from None
     if as_json:
-        print(json_text({"rows": [{"surface": name, **row} for name, s in studies.items() for row in s.rows]}))
+        print(
+            json_text({"rows": [{"surface": name, **row} for name, s in studies.items() for row in s.rows]})
+        )
     else:
         for name, study in studies.items():
             _print(study, name)
@@ -100,9 +102,7 @@ def _split(texts: list[str] | None) -> list[str] | None:
     return [part for text in texts or [] for part in text.split(",") if part] or None
 
 
-def _meshes(
-    source: str, muscle: str | None, units: str
-) -> tuple[dict[str, trimesh.Trimesh], str]:
+def _meshes(source: str, muscle: str | None, units: str) -> tuple[dict[str, trimesh.Trimesh], str]:
     """Meshes by name, and their unit: of a scene the named muscle, or every one."""
     from rbfmuscle.scene.meshes.read import read_mesh
 

@@ -73,7 +73,9 @@ def describe(rows: list[dict]) -> str:
     use = f"use {best['kernel']} with {best['centres']} centres"
     if len(tied) == 1:
         other = min((row["rms"] for row in good if row is not best), default=None)
-        behind = f", whose error is {100 * (1 - best['rms'] / other):.0f} % less than the next" if other else ""
+        behind = (
+            f", whose error is {100 * (1 - best['rms'] / other):.0f} % less than the next" if other else ""
+        )
         return f"{use[0].upper()}{use[1:]}{behind}."
     spread = 100 * (max(row["rms"] for row in tied) / least - 1)
     reason = "without a shape parameter to choose" if not best["epsilon"] else "of sound condition"

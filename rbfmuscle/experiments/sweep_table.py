@@ -94,7 +94,9 @@ def _judge(default: dict[str, Any], rows: list[dict[str, Any]], quantity: str) -
     faster = min(quicker, key=lambda r: r["time_frame"], default=None)
     better = min(finer, key=lambda r: r[quantity], default=None)
     what = f"default of {default['model']}" if default["model"] else "default"
-    where = "on" if default["front"] else "within 10 % of" if factor <= NEAR else f"a factor of {factor:.2g} off"
+    where = (
+        "on" if default["front"] else "within 10 % of" if factor <= NEAR else f"a factor of {factor:.2g} off"
+    )
     text = f"{default['scene']}: the {what} lies {where} the Pareto front ({_figures(default, quantity)})"
     for row, words in ((faster, "as accurate and quicker"), (better, "as quick and more accurate")):
         text += f"; {words}: {row['label']} ({_figures(row, quantity)})" if row else ""

@@ -43,7 +43,7 @@ def shortest_path(line: Floats, probes: list[BoneProbe], poses: dict[str, Floats
         Two nodes only where nothing lies between the ends.
     """
     chord = np.linspace(line[0], line[-1], NODES)
-    near = bones_about(line.min(axis=0), line.max(axis=0), probes, poses)
+    near = bones_about(line, probes, poses)
     if not near or _planes(chord, near, poses)[0][1:-1].min() >= 0.0:
         return chord[[0, -1]]
     string = _evenly(line)

@@ -78,7 +78,9 @@ class _Tracker:
         self.distance: MeshDistance | None = None
         self.offset: Floats | None = None
 
-    def _of_line(self, carried: Floats, probes: list[BoneProbe], poses: dict[str, Floats]) -> dict[str, float]:
+    def _of_line(
+        self, carried: Floats, probes: list[BoneProbe], poses: dict[str, Floats]
+    ) -> dict[str, float]:
         """Length of the centreline, and over that of the shortest path between its ends."""
         if self.line is None:
             return {}

@@ -41,8 +41,14 @@ QUANTITIES = {
     "belly_thickness": ("length", "least width of the greatest section across that line"),
     "csa_max": ("area", "area of the greatest section across that line"),
     "csa_place": ("1", "where it lies: 0 at the origin, 1 at the insertion"),
-    "bone_overlap": ("length", "depth of two bones in each other beyond that at rest; muscle 'all', some frames"),
-    "joint_gap": ("length", "how much wider than at rest a joint's bones are apart; muscle 'all', some frames"),
+    "bone_overlap": (
+        "length",
+        "depth of two bones in each other beyond that at rest; muscle 'all', some frames",
+    ),
+    "joint_gap": (
+        "length",
+        "how much wider than at rest a joint's bones are apart; muscle 'all', some frames",
+    ),
     "time": ("s", "time of the frame in the motion file; muscle 'all'"),
     "time_solve": ("s", "prediction, solution and contacts"),
     "time_fit": ("s", "fit of the field"),

@@ -112,9 +112,7 @@ class Summary:
         return facts
 
 
-def parse_limits(
-    limits: str | Sequence[str] | Mapping[str, float] | None, scene: Scene
-) -> dict[str, float]:
+def parse_limits(limits: str | Sequence[str] | Mapping[str, float] | None, scene: Scene) -> dict[str, float]:
     """Limits as a dict of quantity to greatest allowed magnitude.
 
     Parameters

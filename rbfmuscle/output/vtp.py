@@ -69,7 +69,9 @@ def read_vtp(path: str | Path) -> tuple[Floats, Integers]:
         text, _, data = Path(path).read_bytes().partition(_BEFORE_DATA)
         starts = re.findall(rb'type="(\w+)" Name="(Points|connectivity)"[^>]*offset="(\d+)"', text)
         found = {name: _unpacked(data, kind.decode(), int(start)) for kind, name, start in starts}
-        return found[b"Points"].reshape(-1, 3).astype(float), found[b"connectivity"].reshape(-1, 3).astype(int)
+        return found[b"Points"].reshape(-1, 3).astype(float), found[b"connectivity"].reshape(-1, 3).astype(
+            int
+        )
     except (KeyError, ValueError, IndexError, zlib.error):
         raise MeshError(f"{path} is damaged or was not written by a run; run the scene again") from None
 

@@ -73,7 +73,9 @@ def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) ->
         page.scene = packed_scene({found["labels"][name]: run for name, run in runs.items()})
         page.picture = embedded_image(moving.read_bytes(), "webp", "the motion, models beside each other")
         if len(runs) > 1:
-            page.sections.insert(1, Section(f"Distance to {_label(found, 0)}", _distance_map(found, runs), "last pose"))
+            page.sections.insert(
+                1, Section(f"Distance to {_label(found, 0)}", _distance_map(found, runs), "last pose")
+            )
     else:
         page.missing = "No pictures: they were switched off."
     page.write(folder / "report.html")
@@ -97,7 +99,11 @@ def _page(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> Page:
         sections=[
             Section("Every measure", _measures(found), "worst over muscles and frames; the best in green"),
             Section("Over the motion", _plots(found, runs)),
-            Section("Between the models", _matrix(found), f"RMS over all muscles in the last pose, {found['units']}"),
+            Section(
+                "Between the models",
+                _matrix(found),
+                f"RMS over all muscles in the last pose, {found['units']}",
+            ),
             Section("How to read this", _READING + definitions(terms)),
         ],
         footer=", ".join(f"{name} {value}" for name, value in found["versions"].items()),
@@ -119,13 +125,20 @@ def _light(found: dict[str, Any], runs: Mapping[str, SavedRun], quantity: str) -
     if all(cell.value is None for cell in cells):
         return None
     measure = MEASURES[quantity]
-    return Light(measure.title, cells, "" if limit is None else f"≤ {shown(found, quantity, limit)}", measure.meaning)
+    return Light(
+        measure.title, cells, "" if limit is None else f"≤ {shown(found, quantity, limit)}", measure.meaning
+    )
 
 
 def shown(found: dict[str, Any], quantity: str, value: float | None) -> str:
     """A value of a measure with its unit; lengths that do not count as zero."""
     measure, unit = MEASURES[quantity], found["measures"][quantity]["unit"]
-    if value is not None and measure.kind == "length" and found["units"] == "mm" and abs(value) < 0.5 * measure.floor:
+    if (
+        value is not None
+        and measure.kind == "length"
+        and found["units"] == "mm"
+        and abs(value) < 0.5 * measure.floor
+    ):
         value = 0.0
     if quantity == "strain_rms" and value is not None:
         return f"{100 * value:.2g} %"
@@ -166,10 +179,12 @@ def _plots(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> str:
         for muscle in first.muscles for about in first.arm_coordinates(muscle)
     ]  # fmt: skip
     panels += [
-        (f"Length: {muscle}", first.units, lambda run, m=muscle: run.series(m, "length")) for muscle in first.muscles
+        (f"Length: {muscle}", first.units, lambda run, m=muscle: run.series(m, "length"))
+        for muscle in first.muscles
     ]
     panels += [
-        (f"{MEASURES[q].title}, worst muscle", first.units, lambda run, q=q: worst_series(run, q)) for q in LIGHTS[1:3]
+        (f"{MEASURES[q].title}, worst muscle", first.units, lambda run, q=q: worst_series(run, q))
+        for q in LIGHTS[1:3]
     ]
     panels.append(("Time per frame after the first", "ms", _times))
     pictures = []
@@ -179,7 +194,9 @@ def _plots(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> str:
             frames, values = series(run)
             if len(frames) and np.isfinite(values).any():
                 colour = MUSCLE_COLOURS[k % len(MUSCLE_COLOURS)]
-                tracks.append(Track(found["labels"][name], colour, np.array([axis[f] for f in frames]), values))
+                tracks.append(
+                    Track(found["labels"][name], colour, np.array([axis[f] for f in frames]), values)
+                )
         if tracks and any(np.ptp(track.y) > 0 for track in tracks):
             pictures.append(line_plot(title, tracks, (label, unit), legend=True))
     return f'<div class="plots">{"".join(pictures)}</div>'
@@ -227,7 +244,9 @@ def _distance_map(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> str:
     texts = [f"{limit * share:.3g} {found['units']}" for share in np.linspace(0, 1, 5)]
     titles = [found["labels"][name] for name, _ in others]
     panels = _panels(dict(others), reference.frames, paint)
-    (image,) = draw_panels(panels, reference.frames[-1:], titles, scale_chips([*texts[:-1], f"{texts[-1]} or more"]))
+    (image,) = draw_panels(
+        panels, reference.frames[-1:], titles, scale_chips([*texts[:-1], f"{texts[-1]} or more"])
+    )
     out = io.BytesIO()
     image.save(out, "png")
     return embedded_image(out.getvalue(), "png", "distance to the first model")

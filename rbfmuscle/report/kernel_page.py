@@ -93,14 +93,22 @@ def _page(studies: Mapping[str, KernelStudy]) -> Page:
     kernels = len({row["kernel"] for row in rows})
     centres = ", ".join(str(count) for count in sorted({row["centres"] for row in rows}))
     sections = [
-        Section(f"Every row{f' of {name}' if several else ''}", _rows(study), f"distances in {units or 'mesh units'}")
+        Section(
+            f"Every row{f' of {name}' if several else ''}",
+            _rows(study),
+            f"distances in {units or 'mesh units'}",
+        )
         for name, study in studies.items()
     ]
     toml = "\n\n".join(f"# {name}\n{row_toml(s.recommended)}" for name, s in studies.items() if s.recommended)
     found = any(study.recommended for study in studies.values())
     return Page(
         f"Kernels for {surfaces}",
-        [f"{kernels} kernels", f"{centres} centres", "named by --muscle" if not several else "--muscle for one"],
+        [
+            f"{kernels} kernels",
+            f"{centres} centres",
+            "named by --muscle" if not several else "--muscle for one",
+        ],
         answer(studies),
         GOOD if found else BAD,
         picture=_plot(studies, units),
@@ -118,7 +126,11 @@ def _lights(studies: Mapping[str, KernelStudy], units: str) -> list[Light]:
     """Of one surface its best rows, each with whether it ties; of several what is recommended for each."""
     lights = []
     if len(studies) > 1:
-        return [_light(study.recommended, name, units, GOOD) for name, study in studies.items() if study.recommended]
+        return [
+            _light(study.recommended, name, units, GOOD)
+            for name, study in studies.items()
+            if study.recommended
+        ]
     (study,) = studies.values()
     good = [row for row in study.rows if not row["unfit"]]
     best = study.recommended
@@ -142,7 +154,9 @@ def _plot(studies: Mapping[str, KernelStudy], units: str) -> str:
     keys = [name if len(studies) > 1 else f"{row['centres']} centres" for name, _, row in rows]
     colours = {key: MUSCLE_COLOURS[k % len(MUSCLE_COLOURS)] for k, key in enumerate(sorted(set(keys)))}
     points = [
-        Point(1e3 * cost(row), row["rms"], row["kernel"], colours[key], row is study.recommended, row["front"])
+        Point(
+            1e3 * cost(row), row["rms"], row["kernel"], colours[key], row is study.recommended, row["front"]
+        )
         for key, (_, study, row) in zip(keys, rows)
     ]
     labels = ("a fit and 20,000 values [ms of one thread]", f"RMS error [{units or 'mesh units'}]")
@@ -154,7 +168,13 @@ def _rows(study: KernelStudy) -> str:
     for row in study.rows:
         cells = [shown(name, row[name]) for name in COLUMNS]
         state = GOOD if row is study.recommended else BAD if row["unfit"] else PLAIN
-        lines.append([row["kernel"], *cells, Cell(row["unfit"] or ("on the front" if row["front"] else ""), None, state)])
+        lines.append(
+            [
+                row["kernel"],
+                *cells,
+                Cell(row["unfit"] or ("on the front" if row["front"] else ""), None, state),
+            ]
+        )
     return table(["kernel", *(head for head, _ in COLUMNS.values()), "verdict"], lines)
 
 

@@ -57,7 +57,16 @@ class _Axes:
             return _LEFT + share * (wide - _LEFT - _RIGHT)
         return tall - _BOTTOM - share * (tall - _TOP - _BOTTOM)
 
-    def text(self, x: float, y: float, words: str, *, anchor: str = "start", colour: str = _SOFT, bold: bool = False) -> None:
+    def text(
+        self,
+        x: float,
+        y: float,
+        words: str,
+        *,
+        anchor: str = "start",
+        colour: str = _SOFT,
+        bold: bool = False,
+    ) -> None:
         """Add words at a place [pixel]."""
         from markupsafe import escape
 
@@ -67,7 +76,9 @@ class _Axes:
             f"{escape(words)}</text>"
         )
 
-    def line(self, x: Sequence[float], y: Sequence[float], colour: str, *, width: float = 1.8, more: str = "") -> None:
+    def line(
+        self, x: Sequence[float], y: Sequence[float], colour: str, *, width: float = 1.8, more: str = ""
+    ) -> None:
         """Add a line through values; it is broken where one is no number."""
         path, pen = [], "M"
         for a, b in zip(x, y):
@@ -194,7 +205,12 @@ def _label(axes: _Axes, point: Point, taken: list[tuple[float, float, float, flo
         for dx, dy in ((1, -0.4), (-1, -0.4), (1, 1), (-1, 1), (0, -1), (0, 1.2)):
             left = x + far * dx - (wide if dx < 0 else 0.5 * wide if dx == 0 else 0)
             box = (left, y + far * dy - 9, left + wide, y + far * dy + 4)
-            inside = box[0] > _LEFT and box[2] < axes.size[0] - 4 and _TOP < box[1] and box[3] < axes.size[1] - _BOTTOM
+            inside = (
+                box[0] > _LEFT
+                and box[2] < axes.size[0] - 4
+                and box[1] > _TOP
+                and box[3] < axes.size[1] - _BOTTOM
+            )
             if inside and not any(_overlap(box, other) for other in taken):
                 taken.append(box)
                 if far > 9:
@@ -231,7 +247,9 @@ def _ticks(low: float, high: float, count: int, log: bool) -> list[float]:
     if log:
         steps = (1, 2, 5) if high / low < 300 else (1,)
         powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-        found = [step * 10.0**power for power in powers for step in steps if low <= step * 10.0**power <= high]
+        found = [
+            step * 10.0**power for power in powers for step in steps if low <= step * 10.0**power <= high
+        ]
         if len(found) > 2:
             return found
     raw = (high - low) / count

@@ -68,7 +68,9 @@ def fitted_size(direction: Sequence[float] | Floats, points: Floats, area: float
 
 def draw_solids(solids: Sequence[Solid], camera: Camera, background: Floats) -> Integers:
     """Picture (h, w, 3) of uint8; of solids that are not opaque the nearest one is seen, over all that are."""
-    fine = camera._replace(scale=camera.scale * _FINER, size=(_FINER * camera.size[0], _FINER * camera.size[1]))
+    fine = camera._replace(
+        scale=camera.scale * _FINER, size=(_FINER * camera.size[0], _FINER * camera.size[1])
+    )
     depth, image = _layer([solid for solid in solids if solid.opacity >= 1.0], fine, background)
     veils = [solid for solid in solids if solid.opacity < 1.0]
     if veils:
@@ -124,5 +126,7 @@ def _raster_loop(points, shades, faces, depth, image):
                     depth[y, x] = z
                     for k in range(4):
                         image[y, x, k] = (
-                            u * shades[faces[f, 0], k] + v * shades[faces[f, 1], k] + w * shades[faces[f, 2], k]
+                            u * shades[faces[f, 0], k]
+                            + v * shades[faces[f, 1], k]
+                            + w * shades[faces[f, 2], k]
                         )

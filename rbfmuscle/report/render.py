@@ -159,10 +159,15 @@ def render_run(
         raise UsageError(
             f"frame {frame} was not written; the run has {saved.frames[0]} to {saved.frames[-1]}"
         )
-    seen = muscle_path([saved], sorted({saved.frames[0], saved.frames[len(saved.frames) // 2], saved.frames[-1]}))
-    paint, chips = (_activation_paint(saved), _activation_chips()) if colour == "activation" else (None, _chips(saved))
+    seen = muscle_path(
+        [saved], sorted({saved.frames[0], saved.frames[len(saved.frames) // 2], saved.frames[-1]})
+    )
+    paint, chips = (
+        (_activation_paint(saved), _activation_chips()) if colour == "activation" else (None, _chips(saved))
+    )
     panels = [
-        Panel(saved, VIEWS[view][0], fitted_size(VIEWS[views[0]][0], seen, area), seen, paint) for view in views
+        Panel(saved, VIEWS[view][0], fitted_size(VIEWS[views[0]][0], seen, area), seen, paint)
+        for view in views
     ]
     frames = [frame] if output.suffix == ".png" else saved.frames
     images = draw_panels(panels, frames, [f"{view} ({VIEWS[view][1]})" for view in views], chips)

@@ -129,12 +129,17 @@ def _page(saved: SavedRun) -> Page:
     if not complete:
         answer = f"the run ended early ({info['status']}): {info['message'] or ''}"
     beyond = exceeded(info["muscles"], info["limits"])
-    sections = [*_plots(saved), Section("Every quantity of every muscle", _summary(saved), "worst frame of each")]
+    sections = [
+        *_plots(saved),
+        Section("Every quantity of every muscle", _summary(saved), "worst frame of each"),
+    ]
     sections += [
         Section("Neighbours", _neighbours(saved)),
         Section("Events", _events(saved.events), f"{len(saved.events)}"),
         Section("Time of each stage", _stages(saved), "milliseconds per frame: median and 95th percentile"),
-        Section("How to read this", _READING + definitions((n, meaning) for n, (_, meaning) in QUANTITIES.items())),
+        Section(
+            "How to read this", _READING + definitions((n, meaning) for n, (_, meaning) in QUANTITIES.items())
+        ),
     ]
     return Page(
         info["scene"]["name"],
@@ -188,7 +193,9 @@ def _light(saved: SavedRun, title: str, quantities: Sequence[str]) -> Light | No
     state = limit_state(worst, limit, least=name in LEAST, count=name in COUNTS)
     note = f"{name}: {muscle}, frame {facts.get('worst_frame', '–')}".replace("_", " ")
     shown = f"{sign} {limit:g}{'' if unit == '1' else ' ' + unit}"
-    return Light(title, [Cell(number(worst, unit), worst, state)], shown, note if worst else name.replace("_", " "))
+    return Light(
+        title, [Cell(number(worst, unit), worst, state)], shown, note if worst else name.replace("_", " ")
+    )
 
 
 def _excess(name: str, worst: float, limit: float) -> float:
@@ -210,7 +217,10 @@ def _plots(saved: SavedRun) -> list[Section]:
         tracks = _tracks(saved, quantity, factor, axis[0], coordinate)
         if not tracks:
             continue
-        limit, greatest = saved.info["limits"].get(quantity), max(np.nanmax(np.abs(t.y), initial=0.0) for t in tracks)
+        limit, greatest = (
+            saved.info["limits"].get(quantity),
+            max(np.nanmax(np.abs(t.y), initial=0.0) for t in tracks),
+        )
         if quantity not in _MECHANICS and not coordinate and greatest <= _FLAT * factor * (limit or 0.0):
             flat.append(f"{title.lower()} at most {greatest:.2g} {saved.units if unit is None else unit}")
             continue
@@ -293,7 +303,9 @@ def _stages(saved: SavedRun) -> str:
 
 def _median(facts: Mapping[str, float] | None) -> float:
     """Median of a stage, -1 where there is none."""
-    return facts["median"] if facts and facts["median"] is not None and math.isfinite(facts["median"]) else -1.0
+    return (
+        facts["median"] if facts and facts["median"] is not None and math.isfinite(facts["median"]) else -1.0
+    )
 
 
 def _work(done: Mapping[str, Any] | None) -> list[Cell | str]:
@@ -313,7 +325,9 @@ def _neighbours(saved: SavedRun) -> str:
         ]
         for pair in saved.info.get("neighbours") or []
     ]
-    return table(["pair", f"overlap [{saved.units}]", f"gap opened, RMS [{saved.units}]"], rows) if rows else ""
+    return (
+        table(["pair", f"overlap [{saved.units}]", f"gap opened, RMS [{saved.units}]"], rows) if rows else ""
+    )
 
 
 def _events(events: Iterable[Sequence[Any]]) -> str:

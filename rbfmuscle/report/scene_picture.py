@@ -71,7 +71,9 @@ def draw_scene(scene: Scene, path: str | Path) -> dict[str, int]:
         chips[f"ends far from their bone ({len(far)})"] = _FAR_END
     if overlaps:
         chips[f"muscle inside a bone ({len(overlaps)} pairs)"] = _OVERLAP
-    text = ", ".join([f"{scene.name}: held patches in the colour of their bone", *_notes(scene, far, overlaps)])
+    text = ", ".join(
+        [f"{scene.name}: held patches in the colour of their bone", *_notes(scene, far, overlaps)]
+    )
     labelled(np.concatenate(images, axis=1), text, [title for _, title in VIEWS.values()], chips).save(path)
     return {"far_ends": len(far), "overlaps": len(overlaps)}
 

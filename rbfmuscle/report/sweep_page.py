@@ -86,7 +86,9 @@ def _short(row: dict[str, Any]) -> str:
     """A point's settings without what names the table that they are in."""
     if row["role"] == "default":
         return "default"
-    return ", ".join(f"{key.rpartition('.')[2]} {value}" for key, value in row["settings"].items() if key != "model")
+    return ", ".join(
+        f"{key.rpartition('.')[2]} {value}" for key, value in row["settings"].items() if key != "model"
+    )
 
 
 def _lights(rows: list[dict[str, Any]], verdicts: list[dict[str, Any]], quantity: str) -> list[Light]:
@@ -96,8 +98,15 @@ def _lights(rows: list[dict[str, Any]], verdicts: list[dict[str, Any]], quantity
     several = len(verdicts) > 1
     chosen = [(f"default of {v['scene']}" if several else "default", v["default"], v) for v in verdicts]
     for verdict in verdicts[:2]:
-        chosen += [("as accurate, quicker", verdict["faster"], None), ("as quick, more accurate", verdict["better"], None)]
-    chosen += [("the quickest", front[0]["key"], None), ("the most accurate", front[-1]["key"], None)] if front else []
+        chosen += [
+            ("as accurate, quicker", verdict["faster"], None),
+            ("as quick, more accurate", verdict["better"], None),
+        ]
+    chosen += (
+        [("the quickest", front[0]["key"], None), ("the most accurate", front[-1]["key"], None)]
+        if front
+        else []
+    )
     for title, key, verdict in chosen:
         if key:
             row = by_key[key]
@@ -116,6 +125,20 @@ def _points(rows: list[dict[str, Any]]) -> str:
     lines = []
     for row in rows:
         cells = [Cell(str(row["settings"].get(key, ""))) for key in settings]
-        values = [Cell(number(row[name], "s" if name.startswith("time_") else ""), row[name]) for name in SHOWN]
-        lines.append([row["scene"], *cells, row["role"], "yes" if row["front"] else "", *values, row["error"] or row["status"]])
-    return table(["scene", *settings, "role", "on the front", *(name.replace("_", " ") for name in SHOWN), "status"], lines)
+        values = [
+            Cell(number(row[name], "s" if name.startswith("time_") else ""), row[name]) for name in SHOWN
+        ]
+        lines.append(
+            [
+                row["scene"],
+                *cells,
+                row["role"],
+                "yes" if row["front"] else "",
+                *values,
+                row["error"] or row["status"],
+            ]
+        )
+    return table(
+        ["scene", *settings, "role", "on the front", *(name.replace("_", " ") for name in SHOWN), "status"],
+        lines,
+    )

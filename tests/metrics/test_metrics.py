@@ -68,7 +68,9 @@ class TestColumns:
     def test_inside_is_where_the_winding_number_says_so(self, blob, turn):
         vertices, faces = arrays(blob)
         vertices = trimesh.transform_points(vertices, turned(turn, (1, 2, 3)))
-        points = np.random.default_rng(1).uniform(1.1 * vertices.min(0), 1.1 * vertices.max(0), size=(4000, 3))
+        points = np.random.default_rng(1).uniform(
+            1.1 * vertices.min(0), 1.1 * vertices.max(0), size=(4000, 3)
+        )
         expected = igl.winding_number(vertices, faces, points) > 0.5
         assert 500 < expected.sum() < 3500
         np.testing.assert_array_equal(Columns(vertices, faces).inside(points, EYE), expected)

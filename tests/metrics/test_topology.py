@@ -1,7 +1,6 @@
 """Handles, surfaces that cross themselves, and what comes and goes between frames."""
 
 import numpy as np
-import pytest
 import trimesh
 
 from rbfmuscle.geometry.crossing import crossing_faces
