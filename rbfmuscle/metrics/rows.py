@@ -10,7 +10,7 @@ from rbfmuscle.metrics.moment_arms import REACH, moment_arms
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, unit_text
 from rbfmuscle.scene.joints.skeleton import all_coordinates
 from rbfmuscle.scene.motion import shown_value
-from rbfmuscle.scene.scene import MM_PER_UNIT
+from rbfmuscle.scene.objects import MM_PER_UNIT
 
 if TYPE_CHECKING:
     from rbfmuscle.scene.scene import Scene

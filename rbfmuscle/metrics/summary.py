@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row
-from rbfmuscle.scene.scene import MM_PER_UNIT
+from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import LimitExceededError, UsageError, did_you_mean
 
 if TYPE_CHECKING:

@@ -207,7 +207,7 @@ def bone_collisions(scene: SceneData, frames: Any = None, *, exact: ExactMeshes 
     return found
 
 
-def sampled_frames(scene: Scene) -> list[int]:
+def sampled_frames(scene: SceneData) -> list[int]:
     """About ten frames along a motion, the first and the last among them."""
     chosen = np.linspace(0, len(scene.motion) - 1, MOTION_SAMPLES).round().astype(int)
     return [int(frame) for frame in np.unique(chosen)]
