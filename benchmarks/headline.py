@@ -14,10 +14,10 @@ from pathlib import Path
 
 os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
-import numpy as np  # noqa: E402
-from evidence import write_evidence  # noqa: E402
+import numpy as np
+from evidence import write_evidence
 
-import rbfmuscle as rm  # noqa: E402
+import rbfmuscle as rm
 
 ROOT = Path(__file__).resolve().parent.parent
 MODELS = ("rbf", "pbd", "pbd-converged")
