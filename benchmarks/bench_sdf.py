@@ -20,7 +20,7 @@ from peers.detectors import TreeDetector, VoxelDetector
 from peers.serendipity import SerendipityField
 from peers.spline import SplineField
 
-from rbfmuscle.bones.errors import points_near
+from rbfmuscle.bones.mesh import points_near
 from rbfmuscle.bones.sdf import BoneSDF
 
 PSEUDONORMAL = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
@@ -59,11 +59,11 @@ def judge(points, vertices, faces):
 
 def accuracy(field, vertices, faces):
     """Errors in mm and degrees as a line of text."""
-    near, _ = points_near(vertices, faces, ACCURACY, width=1.0)
+    near = points_near(vertices, faces, ACCURACY, 1.0)
     exact, _ = judge(near, vertices, faces)
     found = field.distance(near)
     error, wrong = found - exact, np.mean(found * exact < 0.0)
-    band, _ = points_near(vertices, faces, ACCURACY // 4, seed=1, width=2.0)
+    band = points_near(vertices, faces, ACCURACY // 4, 2.0, seed=1)
     exact, direction = judge(band, vertices, faces)
     away = np.abs(exact) > 1e-2
     gradient = field.gradient(band)[away]
@@ -79,7 +79,7 @@ def accuracy(field, vertices, faces):
 
 def row(name, field, build, vertices, faces, count=SPEED):
     """One field's line of the table."""
-    points, _ = points_near(vertices, faces, count, seed=2, width=1.0)
+    points = points_near(vertices, faces, count, 1.0, seed=2)
     ordered = points[np.lexsort(np.floor(points / 4.0).T)]
     value = on_one_thread(lambda: field.distance(points)) / count
     both = on_one_thread(lambda: field.distance_and_gradient(points)) / count
@@ -122,7 +122,7 @@ def bone_table(name, mesh):
 
 def exact_tools(mesh, vertices, faces):
     """Time of the exact distances of libigl and trimesh."""
-    points, _ = points_near(vertices, faces, 20 * SLOW, seed=2, width=1.0)
+    points = points_near(vertices, faces, 20 * SLOW, 1.0, seed=2)
     spent, _ = least(lambda: igl.signed_distance(points, vertices, faces, PSEUDONORMAL), 2)
     threads = os.environ.get("OMP_NUM_THREADS", "all")
     print(
@@ -150,7 +150,7 @@ def build_stages(mesh):
     spent, field = least(
         lambda: BoneSDF.from_mesh((vertices, np.delete(faces, hole, axis=0)), cache=False), 1
     )
-    points, _ = points_near(vertices, faces, ACCURACY, seed=3, width=3.0)
+    points = points_near(vertices, faces, ACCURACY, 3.0, seed=3)
     points = points[np.linalg.norm(points - place, axis=1) > 2.0 * radius]
     right = np.mean(field.distance(points) * judge(points, vertices, faces)[0] >= 0.0)
     print(

@@ -8,24 +8,25 @@ the inner band.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rbfmuscle.bones.cells import BLOCK
 from rbfmuscle.bones.lattice import corner_ids, lattice, mark_corners, mark_loop, small_ids_loop
 from rbfmuscle.bones.lists import LONGEST, SLACK, folded_list, list_loop
-from rbfmuscle.bones.query import COUNT
+from rbfmuscle.bones.query import COUNT, FieldData
 from rbfmuscle.geometry.arrays import Array, Booleans, Floats, Integers
-from rbfmuscle.geometry.exact_distance import STACK, nearest_triangle, record_square, signed_side
+from rbfmuscle.geometry.exact_distance import (
+    STACK,
+    ExactDistance,
+    nearest_triangle,
+    record_square,
+    signed_side,
+)
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.geometry.triangles import FIRST
 from rbfmuscle.jit import compiled
-
-if TYPE_CHECKING:
-    from rbfmuscle.geometry.exact_distance import ExactDistance
-
 
 # Fine cells of a block.
 CUT = BLOCK**3
@@ -41,30 +42,8 @@ UNIT_SHARE = 1 / 16
 FAR_DIRECTIONS = 200
 
 
-@dataclass
-class Cells:
-    """The sparse grid, arrays named as in FieldData; ``sound`` tells whether the signs agree with the
-    distances.
-    """
-
-    origin: np.ndarray
-    block: float
-    unit: float
-    blocks: np.ndarray
-    cells: np.ndarray
-    lists: np.ndarray
-    corners: np.ndarray
-    far: np.ndarray
-    across: np.ndarray
-    sound: bool
-    nodes: int
-
-
-@dataclass
-class _Nodes:
-    """Points where the exact distance was asked for: nearest record, signed distance, doubt about the
-    sign.
-    """
+class _Nodes(NamedTuple):
+    """Points where the exact distance was asked for: nearest record, signed distance, doubt about the sign."""
 
     record: np.ndarray
     distance: np.ndarray
@@ -83,11 +62,12 @@ class _Builder:
         )
         place = np.full(len(exact.order) + 1, -1, dtype=np.int32)
         place[exact.order] = np.arange(len(exact.order))
-        turn = (exact.records[:, FIRST].astype(np.int64)[:, None] + np.arange(3)) % 3
-        self.across = place[np.maximum(exact.across[exact.order[:, None], turn], -1)]
+        #: Corner of its face that is the first of each record, and the two that follow.
+        self.turn = (exact.records[:, FIRST].astype(np.int64)[:, None] + np.arange(3)) % 3
+        self.across = place[np.maximum(exact.across[exact.order[:, None], self.turn], -1)]
         self.lists: list[Array] = []
         self.corners: list[Array] = []
-        self.length = self.rows = self.count = 0
+        self.length = self.rows = 0
         self.sound = True
 
     def nodes(self, index: Array, edge: float, near: Array | None = None) -> Any:
@@ -102,7 +82,6 @@ class _Builder:
             _node_loop(points[a:b], near[a:b], exact.tree, normals, record[a:b], distance[a:b])
 
         in_chunks(len(points), work, least=256)
-        self.count += len(points)
         doubt = np.zeros(len(points), dtype=np.bool_)
         if self.inside is not None:
             signed = np.where(self.inside(points), -np.abs(distance), np.abs(distance))
@@ -120,9 +99,7 @@ class _Builder:
         *,
         probe: bool = True,
     ) -> Array:
-        """Lists of cells with least corner ``low`` (n, 3) in edges, probed inside; returns their offsets
-        (n,).
-        """
+        """Lists of cells with least corner ``low`` (n, 3) in edges, probed inside; returns their offsets (n,)."""
         count = len(ids)
         offsets = np.empty(count, dtype=np.int32)
         rows = np.empty((count if self.inside is not None else 0, 12), dtype=np.float32)
@@ -158,8 +135,10 @@ def build_cells(
     inside: Callable[..., Any] | None = None,
     region: Floats | None = None,
     doubtful: Booleans | None = None,
-) -> Cells:
-    """Sparse cells about the mesh of an exact tree.
+) -> tuple[FieldData, bool]:
+    """What queries read: sparse cells about the mesh of an exact tree; and whether signs agree with the distances.
+
+    Records are in single precision and relative to the grid's origin, where that loses nothing.
 
     Parameters
     ----------
@@ -175,9 +154,6 @@ def build_cells(
     doubtful : (m,) ndarray of bool, optional
         Faces whose pseudonormals are not to be believed.
 
-    Returns
-    -------
-    Cells
     """
     block, coarse = BLOCK * spacing, BLOCK * BLOCK * spacing
     low, high = exact.vertices.min(axis=0), exact.vertices.max(axis=0)
@@ -194,8 +170,24 @@ def build_cells(
     cells = _block_level(builder, table, chosen, block, bands, (box - origin) / block)
     far = _far_records(exact, float(np.linalg.norm(high - low)))
     lists, corners = np.concatenate(builder.lists), np.concatenate(builder.corners)
-    tables = (table, cells, lists, corners, far, builder.across)
-    return Cells(origin, block, builder.unit, *tables, builder.sound, builder.count)
+    records = np.empty((len(exact.records), 16), dtype=np.float32)
+    records[:, :3] = exact.records[:, :3] - origin
+    records[:, 3:] = exact.records[:, 3:16]
+    rows = exact.order[:, None], builder.turn
+    data = FieldData(
+        grid=np.array([*origin, 1.0 / block, builder.unit]),
+        blocks=table,
+        cells=cells,
+        lists=lists,
+        corners=corners,
+        far=far,
+        records=records,
+        edge_normals=exact.edge_normals[rows].astype(np.float32),
+        vertex_normals=exact.vertex_normals.astype(np.float32),
+        vertices=exact.faces[rows].astype(np.int32),
+        across=builder.across,
+    )
+    return data, builder.sound
 
 
 def grid_shape(low: Floats, high: Floats, spacing: float, band: float) -> Integers:
@@ -224,9 +216,7 @@ def _coarse_level(builder, shape, edge, band, box):
 
 
 def _block_level(builder, table, chosen, edge, bands, box):
-    """Put the blocks' lists, and what refers to smaller cells, in the table; return the smaller cells (k,
-    64).
-    """
+    """Put the blocks' lists, and what refers to smaller cells, in the table; return the smaller cells (k, 64)."""
     if len(chosen) == 0:
         return np.zeros((0, CUT), dtype=np.int32)
     index, wanted = mark_corners(chosen, table.shape)

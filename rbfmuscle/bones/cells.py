@@ -14,9 +14,7 @@ INVERSE, UNIT = 3, 4
 
 @compiled(error_model="numpy", inline="always")
 def _block_entry(x, y, z, scale, blocks):
-    """Entry of the block that holds a point relative to the origin, the fine cell in it, and whether it is
-    far.
-    """
+    """Entry of the block that holds a point relative to the origin, the fine cell in it, and whether it is far."""
     u, v, w = x * scale, y * scale, z * scale
     nx, ny, nz = blocks.shape
     far = u < -1.0 or v < -1.0 or w < -1.0 or u > nx + 1.0 or v > ny + 1.0 or w > nz + 1.0

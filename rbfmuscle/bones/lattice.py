@@ -17,9 +17,7 @@ def lattice(shape: Iterable[int]) -> Integers:
 
 
 def mark_corners(blocks: Integers, shape: tuple[int, int, int]) -> tuple[Array, Integers]:
-    """Number of each corner of the blocks in a dense table (-1 elsewhere), and the corners (n, 3) in
-    order.
-    """
+    """Number of each corner of the blocks in a dense table (-1 elsewhere), and the corners (n, 3) in order."""
     index = np.full(np.array(shape) + 1, -1, dtype=np.int32)
     for step in lattice((2, 2, 2)):
         index[tuple((blocks + step).T)] = 0

@@ -111,3 +111,20 @@ def _mend(mesh):
             mesh.notes.append("neighbouring faces were oriented alike")
         across = _across(mesh)
     return across
+
+
+def points_near(vertices: Floats, faces: Integers, count: int, width: float, *, seed: int = 0) -> Floats:
+    """Random points (count, 3) up to ``width`` from the surface, along the faces' normals."""
+    rng = np.random.default_rng(seed)
+    corners = vertices[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    face = rng.choice(len(area), count, p=area / area.sum())
+    points = np.einsum("nk,nkj->nj", rng.dirichlet(np.ones(3), count), corners[face])
+    return points + rng.uniform(-width, width, (count, 1)) * (normal[face] / area[face, None])
+
+
+def mean_edge(vertices: Floats, faces: Integers) -> float:
+    """Mean length of the sides of triangles."""
+    corners = vertices[faces]
+    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())

@@ -140,14 +140,19 @@ def _mixed_side(x, y, z, entry, lists, corners):
 
 
 @compiled(error_model="numpy", inline="always")
-def _offset(n, x, y, z, records):
-    """Offset of a point from its nearest point of record n, in the record's frame; and whether that is
-    inside.
-    """
+def _in_frame(n, x, y, z, records):
+    """A point in the frame of record n."""
     qx, qy, qz = x - records[n, 0], y - records[n, 1], z - records[n, 2]
     u = qx * records[n, 3] + qy * records[n, 4] + qz * records[n, 5]
     v = qx * records[n, 6] + qy * records[n, 7] + qz * records[n, 8]
     w = qx * records[n, 9] + qy * records[n, 10] + qz * records[n, 11]
+    return u, v, w
+
+
+@compiled(error_model="numpy", inline="always")
+def _offset(n, x, y, z, records):
+    """Offset of a point from its nearest point of record n, in the record's frame; and whether that is inside."""
+    u, v, w = _in_frame(n, x, y, z, records)
     bx, cx, cy = records[n, 12], records[n, 13], records[n, 14]
     ex, eu = cx - bx, u - bx
     inside = (v >= 0.0) & (eu * cy - v * ex <= 0.0) & (v * cx - u * cy <= 0.0)
@@ -165,9 +170,7 @@ def _walk(best, square, x, y, z, records, across):
     its edges, mostly that to the nearest.
     """
     for _ in range(WALK):
-        qx, qy, qz = x - records[best, 0], y - records[best, 1], z - records[best, 2]
-        u = qx * records[best, 3] + qy * records[best, 4] + qz * records[best, 5]
-        v = qx * records[best, 6] + qy * records[best, 7] + qz * records[best, 8]
+        u, v, _ = _in_frame(best, x, y, z, records)
         bx, cx, cy = records[best, 12], records[best, 13], records[best, 14]
         _, _, feature = nearest_in_frame(bx, cx, cy, records[best, 15], 1.0 / (cx * cx + cy * cy), u, v)
         if feature == FACE:
@@ -198,10 +201,7 @@ def _world(n, du, dv, dw, records):
 @compiled(error_model="numpy")
 def _crossed_side(x, y, z, n, records, edge_normals, vertex_normals, vertices):
     """Projection of the offset from an edge or a corner of record n on its pseudonormal."""
-    qx, qy, qz = x - records[n, 0], y - records[n, 1], z - records[n, 2]
-    u = qx * records[n, 3] + qy * records[n, 4] + qz * records[n, 5]
-    v = qx * records[n, 6] + qy * records[n, 7] + qz * records[n, 8]
-    w = qx * records[n, 9] + qy * records[n, 10] + qz * records[n, 11]
+    u, v, w = _in_frame(n, x, y, z, records)
     cx, cy = records[n, 13], records[n, 14]
     du, dv, feature = nearest_in_frame(
         records[n, 12], cx, cy, records[n, 15], 1.0 / (cx * cx + cy * cy), u, v
@@ -279,9 +279,7 @@ def _stage(points, pose, reach, data, found, square):
 
 @compiled(error_model="numpy")
 def _finish(count, data, found, square):
-    """Turn squared into signed distances, and fill the offsets from the surface in the frames of the
-    records.
-    """
+    """Turn squared into signed distances, and fill the offsets from the surface in the frames of the records."""
     local, entry, best, offset = found
     lists, records, across = data.lists, data.records, data.across
     for n in range(count):

@@ -1,35 +1,30 @@
 """BoneSDF: signed distance and gradient of a rigid bone, in any pose.
 
 The field stays in bone coordinates and is never rebuilt; queries carry points there inside their loop.
-Distances are negative inside. What a query reads, and how, is in ``sdf_query.py``; how it is built, in
-``sdf_build.py``.
+Distances are negative inside. What a query reads, and how, is in ``query.py``; how it is built, in ``build.py``.
 """
 
 from __future__ import annotations
 
 import logging
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rbfmuscle.bones.build import build_cells, grid_shape
 from rbfmuscle.bones.cells import BLOCK
-from rbfmuscle.bones.mesh import prepare_bone
+from rbfmuscle.bones.mesh import mean_edge, points_near, prepare_bone
 from rbfmuscle.bones.query import FieldData, query_loop
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.geometry.arrays import Floats, MeshLike
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.rest_frame import BoneFrame, on_one_line
+from rbfmuscle.geometry.surfaces import face_normals
 from rbfmuscle.geometry.threads import in_chunks
-from rbfmuscle.geometry.triangles import FIRST
 from rbfmuscle.geometry.winding import inside_test
 from rbfmuscle.validation import MeshError, check_mesh, check_points, check_positive
-
-if TYPE_CHECKING:
-    from rbfmuscle.bones.build import Cells
-
 
 log = logging.getLogger(__name__)
 
@@ -79,7 +74,7 @@ class BoneSDF:
     [2.0, -1.0]
     """
 
-    def __init__(self, vertices: Floats, frame: BoneFrame, parts: Any) -> None:
+    def __init__(self, vertices: Floats, frame: BoneFrame, parts: _Parts) -> None:
         self.vertices, self.faces, self.notes = vertices, parts.faces, tuple(parts.notes)
         used = self.vertices[np.unique(self.faces)]
         self.bounds = np.array([used.min(axis=0), used.max(axis=0)])
@@ -92,11 +87,6 @@ class BoneSDF:
     def memory(self) -> int:
         """Bytes that queries read."""
         return sum(array.nbytes for array in self.data)
-
-    @property
-    def fine_cells(self) -> int:
-        """Number of fine cells."""
-        return self.data.cells.size
 
     @cached_property
     def exact(self) -> ExactDistance:
@@ -144,7 +134,8 @@ class BoneSDF:
         region = None if region is None else check_points(region, name="region")
         if region is not None and (region.shape != (2, 3) or np.any(region[0] > region[1])):
             raise ValueError(f"region must be (2, 3), least corner first, got {region.tolist()}")
-        key = _key(vertices, faces, tolerance, region, memory_limit) if cache else None
+        box = None if region is None else region.tolist()
+        key = content_key(vertices, faces, (tolerance, box, memory_limit)) if cache else None
         arrays = None if key is None else load_arrays(key)
         parts = None if arrays is None else _from_arrays(arrays)
         vertices, faces = check_mesh(vertices, faces, name=name)
@@ -176,17 +167,7 @@ class BoneSDF:
             Points further away than this may get any lower bound of their distance that is above it: much
             faster.
         """
-        points, pose = check_points(points), _check_pose(pose)
-        out = np.empty(len(points))
-        placed, size = self._frame.placed(pose), self._frame.size
-        reach = _local_reach(reach, len(points), size)
-
-        def work(a, b):
-            query_loop(points[a:b], placed, reach[a:b], out[a:b], NO_GRADIENT, self.data)
-
-        in_chunks(len(points), work, least=4096)
-        out *= size
-        return out
+        return self._query(points, pose, reach, gradient=False)[0]
 
     def gradient(self, points: Floats, pose: Floats | None = None) -> Floats:
         """Gradient of the distance, (n, 3) unit vectors in the axes of ``points``."""
@@ -200,33 +181,22 @@ class BoneSDF:
         On the surface the gradient is the normal of the triangle. It is zero where only a lower bound is
         given.
         """
+        return self._query(points, pose, reach, gradient=True)
+
+    def _query(self, points, pose, reach, *, gradient):
         points, pose = check_points(points), _check_pose(pose)
-        distance, gradient = np.empty(len(points)), np.empty((len(points), 3))
         placed, size = self._frame.placed(pose), self._frame.size
-        reach = _local_reach(reach, len(points), size)
+        # Not below zero, as cells inside the bone have zero for a bound.
+        reach = np.broadcast_to(np.maximum(reach, 0.0) / size, len(points)).copy()
+        distance, slope = np.empty(len(points)), np.empty((len(points) if gradient else 0, 3))
 
         def work(a, b):
-            query_loop(points[a:b], placed, reach[a:b], distance[a:b], gradient[a:b], self.data)
+            query_loop(points[a:b], placed, reach[a:b], distance[a:b], slope[a:b], self.data)
 
         in_chunks(len(points), work, least=4096)
         distance *= size
-        gradient *= size
-        return distance, gradient
-
-    def direction(self, points: Floats, pose: Floats | None = None) -> Floats:
-        """Unit direction (n, 3) in which the distance grows: out of the bone, also from inside."""
-        return self.gradient(points, pose)
-
-    def closest_point(self, points: Floats, pose: Floats | None = None) -> Floats:
-        """Nearest point (n, 3) of the bone's mesh, exact."""
-        points, pose = check_points(points), _check_pose(pose)
-        local = (points - pose[:3, 3]) @ pose[:3, :3]
-        return self.exact.closest_point(local) @ pose[:3, :3].T + pose[:3, 3]
-
-
-def _key(vertices, faces, tolerance, region, memory_limit):
-    box = None if region is None else np.asarray(region).tolist()
-    return content_key(vertices, faces, (tolerance, box, memory_limit))
+        slope *= size
+        return distance, slope
 
 
 def _check_pose(pose):
@@ -236,13 +206,6 @@ def _check_pose(pose):
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise ValueError(f"pose must be a finite (4, 4) transform, got shape {pose.shape}")
     return pose
-
-
-def _local_reach(reach, count, size):
-    """Reach of each point in local units; not below zero, as cells inside the bone have zero for a bound."""
-    if np.ndim(reach) == 0:
-        return np.full(count, max(reach, 0.0) / size)
-    return np.maximum(reach, 0.0) / size
 
 
 class _Parts(NamedTuple):
@@ -259,7 +222,7 @@ class _Parts(NamedTuple):
 def _build(mesh, frame, tolerance, region, memory_limit, name):
     """Refine until the field errs by no more than the tolerance."""
     exact = ExactDistance(mesh.vertices, mesh.faces)
-    edge = _mean_edge(mesh)
+    edge = mean_edge(mesh.vertices, mesh.faces)
     used = mesh.vertices[np.unique(mesh.faces)]
     extent = float(np.ptp(used, axis=0).max())
     spacing = min(CELL_SHARE * edge, extent / LEAST_CELLS)
@@ -269,12 +232,13 @@ def _build(mesh, frame, tolerance, region, memory_limit, name):
     error = np.inf
     for _ in range(ATTEMPTS):
         spacing = _check_memory(mesh, exact, spacing, tolerance, memory_limit, name)
-        cells = build_cells(exact, spacing, BAND * spacing, inside=inside, region=box, doubtful=mesh.doubtful)
-        if inside is None and not cells.sound:
+        data, sound = build_cells(
+            exact, spacing, BAND * spacing, inside=inside, region=box, doubtful=mesh.doubtful
+        )
+        if inside is None and not sound:
             mesh.notes.append("intersects itself: the sign comes from winding numbers")
             inside = inside_test(mesh.vertices, mesh.faces)
             continue
-        data = pack_field(exact, cells)
         error = _measure(mesh, data, exact, BAND * spacing, box)
         reached = _Parts(mesh.faces, mesh.notes, data, spacing, error, inside is None)
         if error <= wanted:
@@ -286,22 +250,14 @@ def _build(mesh, frame, tolerance, region, memory_limit, name):
     return reached
 
 
-def _mean_edge(mesh):
-    corners = mesh.vertices[mesh.faces]
-    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
-
-
 def _check_memory(mesh, exact, spacing, tolerance, limit, name):
     """Spacing that fits in the memory: larger if the caller asked for no tolerance, else an error."""
     low, high = exact.vertices.min(axis=0), exact.vertices.max(axis=0)
-    corners = mesh.vertices[mesh.faces]
-    area = 0.5 * np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
+    area = float(np.linalg.norm(face_normals(mesh.vertices, mesh.faces), axis=1).sum())
 
     def need(h):
         table = 4.0 * np.prod(BLOCK * grid_shape(low, high, h, BAND * h).astype(np.float64))
-        return table + 25.0 * (2 * BAND + 6) * float(area.sum()) / h**2 + 160.0 * len(mesh.faces)
+        return table + 25.0 * (2 * BAND + 6) * area / h**2 + 160.0 * len(mesh.faces)
 
     if need(spacing) <= limit:
         return spacing
@@ -320,45 +276,17 @@ def _check_memory(mesh, exact, spacing, tolerance, limit, name):
 
 def _measure(mesh, data, exact, band, region):
     """RMS error at points spread over the band, in the region."""
-    rng = np.random.default_rng(0)
-    corners = mesh.vertices[mesh.faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(normal, axis=1)
+    faces = mesh.faces
     if region is not None:
-        area = area * np.all((corners.min(axis=1) <= region[1]) & (corners.max(axis=1) >= region[0]), axis=1)
-    if area.sum() == 0.0:
+        corners = mesh.vertices[faces]
+        faces = faces[np.all((corners.min(axis=1) <= region[1]) & (corners.max(axis=1) >= region[0]), axis=1)]
+    if len(faces) == 0:
         return 0.0
-    which = rng.choice(len(area), PROBES, p=area / area.sum())
-    weight = rng.dirichlet(np.ones(3), PROBES)
-    points = np.einsum("nk,nkj->nj", weight, corners[which])
-    unit = normal[which] / np.linalg.norm(normal[which], axis=1, keepdims=True)
-    points += unit * rng.uniform(-band, band, (PROBES, 1))
+    points = points_near(mesh.vertices, faces, PROBES, band)
     distance = np.empty(len(points))
     query_loop(points, IDENTITY, np.full(PROBES, np.inf), distance, NO_GRADIENT, data)
     difference = np.abs(distance) - np.abs(exact.signed_distance(points))
     return float(np.sqrt(np.mean(difference**2)))
-
-
-def pack_field(exact: ExactDistance, cells: Cells) -> FieldData:
-    """Arrays for queries, single precision and relative to the grid's origin, where that loses nothing."""
-    records = np.empty((len(exact.records), 16), dtype=np.float32)
-    records[:, :3] = exact.records[:, :3] - cells.origin
-    records[:, 3:] = exact.records[:, 3:16]
-    turn = (exact.records[:, FIRST].astype(np.int64)[:, None] + np.arange(3)) % 3
-    rows = exact.order[:, None]
-    return FieldData(
-        grid=np.array([*cells.origin, 1.0 / cells.block, cells.unit]),
-        blocks=cells.blocks,
-        cells=cells.cells,
-        lists=cells.lists,
-        corners=cells.corners,
-        far=cells.far,
-        records=records,
-        edge_normals=exact.edge_normals[rows, turn].astype(np.float32),
-        vertex_normals=exact.vertex_normals.astype(np.float32),
-        vertices=exact.faces[rows, turn].astype(np.int32),
-        across=cells.across,
-    )
 
 
 def _to_arrays(parts):

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.winding import inside_test
 from rbfmuscle.scene.meshes.read import ReadMesh
-from rbfmuscle.scene.objects import Attachment, Bone
+from rbfmuscle.scene.objects import Attachment, Bone, find_named
 from rbfmuscle.scene.options import NotNegative, Positive, Table, Vector
-from rbfmuscle.validation import SceneError, did_you_mean, is_file, shown, shown_path
+from rbfmuscle.validation import SceneError, is_file, shown, shown_path
 
 if TYPE_CHECKING:
     import trimesh
@@ -37,9 +38,13 @@ class AttachTable(Table):
 
 
 def resolve_attachments(
-    attach: Sequence[Any], read: ReadMesh, bones: list[Bone], *, muscle: str
-) -> list[Any]:
-    """Return the Attachment list of a muscle.
+    attach: Sequence[Attachment | AttachTable | dict[str, Any]],
+    read: ReadMesh,
+    bones: list[Bone],
+    *,
+    muscle: str,
+) -> list[Attachment]:
+    """Return the attachments of a muscle.
 
     Parameters
     ----------
@@ -57,33 +62,33 @@ def resolve_attachments(
     """
     found = []
     for number, entry in enumerate(attach):
-        place = f"muscle {muscle!r} attach {number + 1}"
-        if isinstance(entry, Attachment):
-            entry = {"bone": entry.bone, "vertices": np.asarray(entry.vertices).tolist()}
-        elif isinstance(entry, dict):
-            entry = {
-                key: value.tolist() if isinstance(value, np.ndarray) else value
-                for key, value in entry.items()
-            }
-        table = entry if isinstance(entry, AttachTable) else AttachTable.build(entry, place=f"{place}: ")
-        bone = next((bone for bone in bones if bone.name == table.bone), None)
-        if bone is None:
+        place = f"muscle {muscle!r} attach {number + 1}: "
+        if not isinstance(entry, AttachTable):
+            row = vars(entry) if isinstance(entry, Attachment) else entry
+            plain = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in row.items()}
+            entry = AttachTable.build(plain, place=place)
+        bone = find_named(bones, entry.bone, "bone", place=place)
+        found.append(Attachment(bone.name, np.unique(_select(entry, read, bone, place))))
+    for first, second in itertools.combinations(found, 2):
+        shared = np.intersect1d(first.vertices, second.vertices)
+        if first.bone != second.bone and len(shared):
             raise SceneError(
-                f"{place}: unknown bone {table.bone!r}, {did_you_mean(table.bone, [b.name for b in bones])}"
+                f"muscle {muscle!r}: {len(shared)} vertices (first: {shared[0]}) are attached to both "
+                f"{first.bone!r} and {second.bone!r}, make the attachments smaller"
             )
-        found.append(Attachment(bone.name, np.unique(_select(table, read, bone, place))))
-    _check_overlap(found, muscle)
     return found
 
 
 def _select(table, read, bone, place):
     given = [key for key in ("vertices", "near", "sphere") if getattr(table, key) is not None]
     if len(given) != 1:
-        what = " and ".join(given) if given else "none"
-        raise SceneError(f"{place}: give one of vertices, near and sphere, got {what}")
-    points = np.asarray(read.mesh.vertices)
+        raise SceneError(f"{place}give one of vertices, near and sphere, got {' and '.join(given) or 'none'}")
     if table.vertices is not None:
-        return _listed_vertices(table.vertices, read, place)
+        kept = read.vertex_map[listed_vertices(table.vertices, len(read.vertex_map), place)]
+        if not (kept >= 0).any():
+            raise SceneError(f"{place}none of its vertices is part of the mended surface")
+        return kept[kept >= 0]
+    points = np.asarray(read.mesh.vertices)
     if table.sphere is not None:
         distance = np.linalg.norm(points - table.sphere.centre, axis=1)
         limit, what = table.sphere.radius, "sphere.radius"
@@ -93,7 +98,7 @@ def _select(table, read, bone, place):
     chosen = np.flatnonzero(distance <= limit)
     if len(chosen) == 0:
         raise SceneError(
-            f"{place}: {what} = {limit:g} reaches no vertex of the muscle, "
+            f"{place}{what} = {limit:g} reaches no vertex of the muscle, "
             f"the nearest is {distance.min():.4g} away; raise it"
         )
     return chosen
@@ -126,58 +131,29 @@ class ExactMeshes:
         return distance if inside is None else np.where(inside(points), -1.0, 1.0) * np.abs(distance)
 
 
-def _listed_vertices(listed, read, place):
+def listed_vertices(listed: str | list[int], count: int, place: str) -> Integers:
+    """Return the vertex numbers of a list or of a text file, below ``count``; ``place`` begins each message."""
+    numbers: list[int] = []
     if isinstance(listed, str):
-        numbers, place = _read_numbers(Path(listed), place), f"{place}: {listed}"
-    else:
-        numbers = _whole_numbers(listed, place)
-    if len(numbers) == 0:
-        raise SceneError(f"{place}: no vertex numbers")
-    wrong = (numbers < 0) | (numbers >= len(read.vertex_map))
-    if wrong.any():
-        raise SceneError(
-            f"{place}: vertex {numbers[wrong][0]} is out of range, "
-            f"the mesh has vertices 0 to {len(read.vertex_map) - 1}"
-        )
-    kept = read.vertex_map[numbers]
-    kept = kept[kept >= 0]
-    if len(kept) == 0:
-        raise SceneError(f"{place}: none of its vertices is part of the mended surface")
-    return kept
-
-
-def _read_numbers(path, place):
-    if not is_file(path):
-        raise SceneError(f"{place}: cannot read {shown_path(path)}: no such file")
-    try:
-        words = path.read_text(encoding="utf-8", errors="replace").split()
-    except OSError as error:
-        raise SceneError(f"{place}: cannot read {path}: {error.strerror}") from None
-    numbers = []
-    for word in words:
+        place = f"{place}{shown_path(listed)}: "
+        if not is_file(listed):
+            raise SceneError(f"{place}cannot read it: no such file")
         try:
-            numbers.append(int(word))
-        except ValueError:
-            raise SceneError(f"{place}: {path}: {shown(repr(word))} is not a vertex number") from None
-    return _whole_numbers(numbers, f"{place}: {path}")
-
-
-def _whole_numbers(numbers, place):
-    try:
-        return np.array(numbers, dtype=np.int64)
-    except OverflowError:
-        largest = max(numbers, key=abs)
-        raise SceneError(f"{place}: vertex {shown(largest)} is out of range") from None
-
-
-def _check_overlap(found, muscle):
-    for k, first in enumerate(found):
-        for second in found[k + 1 :]:
-            if first.bone == second.bone:
-                continue
-            shared = np.intersect1d(first.vertices, second.vertices)
-            if len(shared):
-                raise SceneError(
-                    f"muscle {muscle!r}: {len(shared)} vertices (first: {shared[0]}) are attached to both "
-                    f"{first.bone!r} and {second.bone!r}, make the attachments smaller"
-                )
+            words = Path(listed).read_text(encoding="utf-8", errors="replace").split()
+        except OSError as error:
+            raise SceneError(f"{place}cannot read it: {error.strerror}") from None
+        for word in words:
+            try:
+                numbers.append(int(word))
+            except ValueError:
+                raise SceneError(f"{place}{shown(repr(word))} is not a vertex number") from None
+    else:
+        numbers = list(listed)
+    if not numbers:
+        raise SceneError(f"{place}no vertex numbers")
+    wrong = [number for number in numbers if not 0 <= number < count]
+    if wrong:
+        raise SceneError(
+            f"{place}vertex {shown(wrong[0])} is out of range, the mesh has vertices 0 to {count - 1}"
+        )
+    return np.array(numbers, dtype=np.int64)

@@ -152,15 +152,13 @@ def add_muscle(
         Factor from the mesh's unit to the scene's; fibres are scaled alike.
     **contraction
         ``activation``, ``fibre_stretch_at_rest``, ``optimal_fibre_length``, ``shortening``, ``tendon``.
-        Relative files are relative to ``folder``, where it is given.
     """
-    folder = contraction.pop("folder", None)
     check_new_name(scene.muscles, name, "muscle")
     read = as_mesh(mesh, name, scale, may_be_open=False)
     model_name, options = split_model(model, place=f"muscle {name!r}")
     attachments = resolve_attachments(attach, read, scene.bones, muscle=name)
     lines = None if fibres is None else read_fibres(fibres, scale=scale, muscle=name)
-    keys = contraction_keys(contraction, muscle=name, folder=folder)
+    keys = contraction_keys(contraction, muscle=name)
     scene.muscles.append(
         Muscle(name, read.mesh, model_name, options, attachments, lines, read.source, read.notes, keys)
     )

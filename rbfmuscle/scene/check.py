@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.attachments import ExactMeshes
 from rbfmuscle.scene.build import validate
@@ -39,7 +42,7 @@ class Finding:
         return f"{self.level}: {self.place}: {self.message}"
 
 
-def check_scene(scene: SceneData, exact: ExactMeshes | None = None) -> list[Any]:
+def check_scene(scene: SceneData, exact: ExactMeshes | None = None) -> list[Finding]:
     """Return all findings about a scene, the worst first; nothing is solved or changed.
 
     Parameters
@@ -51,25 +54,25 @@ def check_scene(scene: SceneData, exact: ExactMeshes | None = None) -> list[Any]
     exact = exact or ExactMeshes()
     items: list[Bone | Muscle] = [*scene.bones, *scene.muscles]
     findings = [Finding("note", item.name, note) for item in items for note in item.notes]
-    findings.extend(
-        Finding("warning", b.name, "the bone is open, inside is told by winding numbers")
-        for b in scene.bones
-        if not b.closed
-    )
+    findings += [
+        Finding("warning", bone.name, "the bone is open, its inside follows from winding numbers")
+        for bone in scene.bones
+        if not bone.closed
+    ]
+    findings += [Finding("warning", "motion", note) for note in scene.motion.notes]
+    findings += _rest_overlaps(scene, exact)
+    wrong = []
     for test in (validate, check_extents):
         try:
             test(scene)
         except RBFMuscleError as error:
-            findings.append(Finding("error", scene.name, str(error)))
-    findings.extend(Finding("warning", "motion", note) for note in scene.motion.notes)
-    findings.extend(_rest_overlaps(scene, exact))
+            wrong.append(str(error))
     try:
-        findings.extend(bone_findings(bone_collisions(scene, exact=exact), scene.units))
+        findings += bone_findings(bone_collisions(scene, exact=exact), scene.units)
     except SceneError as error:
-        if all(str(error) != finding.message for finding in findings):
-            findings.append(Finding("error", scene.name, str(error)))
-    order = {"error": 0, "warning": 1, "note": 2}
-    return sorted(findings, key=lambda finding: order[finding.level])
+        wrong.append(str(error))
+    findings += [Finding("error", scene.name, message) for message in dict.fromkeys(wrong)]
+    return sorted(findings, key=lambda finding: ("error", "warning", "note").index(finding.level))
 
 
 def check_extents(scene: SceneData) -> None:
@@ -94,30 +97,32 @@ def check_size(scene: SceneData, kind: str, name: str, mesh: trimesh.Trimesh, so
 
 def check_place(scene: SceneData, name: str, mesh: trimesh.Trimesh, source: str) -> None:
     """Raise MeshError for a muscle that lies far away from all bones."""
-    if not scene.bones:
-        return
-    corners = np.concatenate([bone.mesh.bounds for bone in scene.bones])
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    away = np.linalg.norm(np.maximum(low - mesh.bounds[1], mesh.bounds[0] - high).clip(min=0))
-    if away > FAR_AWAY * np.linalg.norm(high - low):
+    away, size = _away_from_bones(scene, *mesh.bounds)
+    if away > FAR_AWAY * size:
         raise MeshError(
             f"muscle {name!r} ({source or 'built in code'}) lies {away:.4g} {scene.units} away from all bones; "
             "bring the meshes into one frame and unit (scale)"
         )
 
 
-def check_centre(scene: SceneData, name: str, centre: np.ndarray) -> None:
+def check_centre(scene: SceneData, name: str, centre: Floats) -> None:
     """Raise SceneError for a joint whose centre lies so far from all bones that poses lose their digits."""
-    if not scene.bones:
-        return
-    corners = np.concatenate([bone.mesh.bounds for bone in scene.bones])
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    away = float(np.linalg.norm(np.maximum(low - centre, centre - high).clip(min=0)))
-    if away > FARTHEST_CENTRE * np.linalg.norm(high - low):
+    away, size = _away_from_bones(scene, centre, centre)
+    if away > FARTHEST_CENTRE * size:
         raise SceneError(
             f"joint {name!r}: centre {np.asarray(centre).tolist()} lies {away:.4g} {scene.units} away from all bones; "
             f"correct it, it is in the scene's unit ({scene.units})"
         )
+
+
+def _away_from_bones(scene, low, high):
+    """Distance of a box from that of all bones, and the diagonal of that; no distance without bones."""
+    if not scene.bones:
+        return 0.0, 0.0
+    corners = np.concatenate([bone.mesh.bounds for bone in scene.bones])
+    least, most = corners.min(axis=0), corners.max(axis=0)
+    away = np.maximum(least - high, low - most).clip(min=0)
+    return float(np.linalg.norm(away)), float(np.linalg.norm(most - least))
 
 
 def _likely_scale(millimetres):
@@ -134,18 +139,17 @@ def _rest_overlaps(scene, exact):
     findings = []
     for muscle in scene.muscles:
         points = np.asarray(muscle.mesh.vertices)
-        held = np.zeros(len(points), dtype=bool)
-        for attachment in muscle.attachments:
-            held[attachment.vertices] = True
         for bone in scene.bones:
             depth = _depths(points, bone.mesh, exact)
-            inside = (depth > 0) & ~held
-            if not inside.any():
+            for attachment in muscle.attachments:
+                depth[attachment.vertices] = 0.0
+            inside = np.count_nonzero(depth)
+            if not inside:
                 continue
-            share = inside.sum() / len(points)
+            share = inside / len(points)
             message = (
-                f"{inside.sum()} free vertices ({100 * share:.2g} %) start inside bone {bone.name!r}, "
-                f"up to {depth[inside].max():.3g} {scene.units} deep"
+                f"{inside} free vertices ({100 * share:.2g} %) start inside bone {bone.name!r}, "
+                f"up to {depth.max():.3g} {scene.units} deep"
             )
             level = "note" if scene.contact.initial == "resolve" else "warning"
             if scene.contact.initial == "error" or share > 0.5:
@@ -176,8 +180,12 @@ def _depths(points, mesh, exact):
     return depth
 
 
-def bone_collisions(scene: SceneData, frames: Any = None, *, exact: ExactMeshes | None = None) -> list[Any]:
-    """Return where a motion drives bones into each other.
+def bone_collisions(
+    scene: SceneData, frames: Iterable[int] | None = None, *, exact: ExactMeshes | None = None
+) -> list[tuple[int, str, str, float]]:
+    """Return where a motion drives bones into each other, as (frame, bone, other, depth [scene unit]).
+
+    The depth is that of the deepest vertex of either bone in the other; pairs that do not move are left out.
 
     Parameters
     ----------
@@ -186,23 +194,14 @@ def bone_collisions(scene: SceneData, frames: Any = None, *, exact: ExactMeshes 
         Which frames to look at, about ten of the motion by default.
     exact : ExactMeshes, optional
         Distances to the bones' meshes.
-
-    Returns
-    -------
-    list of (frame, bone, other, depth)
-        Depth [scene unit]: the deepest vertex of either bone in the other, in excess of the depth at rest.
     """
     frames = sampled_frames(scene) if frames is None else frames
     exact = exact or ExactMeshes()
-    rest: dict[Any, float] | None = None
     found = []
     for frame in frames:
-        poses = bone_poses(scene, scene.motion.frames[frame])
-        depths = _pair_depths(scene, poses, exact)
-        if rest is None and depths:
-            rest = _pair_depths(scene, bone_poses(scene, {}), exact)
+        depths = _pair_depths(scene, bone_poses(scene, scene.motion.frames[frame]), exact)
         for pair, depth in depths.items():
-            if depth - (rest or {}).get(pair, 0.0) > scene.length(COUNTED_DEPTH_MM):
+            if depth > scene.length(COUNTED_DEPTH_MM):
                 found.append((frame, *pair, depth))
     return found
 
@@ -216,32 +215,24 @@ def sampled_frames(scene: SceneData) -> list[int]:
 def _pair_depths(scene, poses, exact):
     """Deepest vertex of either bone in the other, for the pairs that move against each other and overlap."""
     depths = {}
-    for k, first in enumerate(scene.bones):
-        for second in scene.bones[k + 1 :]:
-            relative = np.linalg.solve(poses[second.name], poses[first.name])
-            if np.allclose(relative, np.eye(4), atol=1e-12):
-                continue
-            back = np.linalg.inv(relative)
-            (low, high), other = moved_box(first.mesh.bounds, relative), second.mesh.bounds
-            if np.any(low > other[1]) or np.any(high < other[0]):
-                continue
-            one = np.asarray(first.mesh.vertices) @ relative[:3, :3].T + relative[:3, 3]
-            two = np.asarray(second.mesh.vertices) @ back[:3, :3].T + back[:3, 3]
-            deepest = max(_depths(one, second.mesh, exact).max(), _depths(two, first.mesh, exact).max())
-            if deepest > 0:
-                depths[first.name, second.name] = float(deepest)
+    for first, second in itertools.combinations(scene.bones, 2):
+        relative = np.linalg.solve(poses[second.name], poses[first.name])
+        if np.allclose(relative, np.eye(4), atol=1e-12):
+            continue
+        back = np.linalg.inv(relative)
+        (low, high), other = moved_box(first.mesh.bounds, relative), second.mesh.bounds
+        if np.any(low > other[1]) or np.any(high < other[0]):
+            continue
+        one = np.asarray(first.mesh.vertices) @ relative[:3, :3].T + relative[:3, 3]
+        two = np.asarray(second.mesh.vertices) @ back[:3, :3].T + back[:3, 3]
+        deepest = max(_depths(one, second.mesh, exact).max(), _depths(two, first.mesh, exact).max())
+        if deepest > 0:
+            depths[first.name, second.name] = float(deepest)
     return depths
 
 
-def bone_findings(collisions: list[Any], units: str) -> list[Any]:
-    """Return a warning for each pair of bones that the motion drives into each other.
-
-    Parameters
-    ----------
-    collisions : list
-        From `bone_collisions`.
-    units : str
-    """
+def bone_findings(collisions: list[tuple[int, str, str, float]], units: str) -> list[Finding]:
+    """Return a warning for each pair of bones that the motion drives into each other, from `bone_collisions`."""
     worst = {}
     for frame, first, second, depth in collisions:
         start, deepest = worst.get((first, second), (frame, 0.0))

@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field, ValidationError, field_validator
 
 from rbfmuscle.scene.activation.keys import KEYS
+from rbfmuscle.scene.activation.resolve import contraction_keys
 from rbfmuscle.scene.attachments import AttachTable
 from rbfmuscle.scene.build import add_bone, add_link, add_muscle, place_coupling, place_joint, validate
 from rbfmuscle.scene.check import check_centre, check_place, check_size
@@ -24,7 +25,7 @@ from rbfmuscle.scene.joints.tables import (
 )
 from rbfmuscle.scene.meshes.read import read_mesh
 from rbfmuscle.scene.motion import coordinate_names, make_motion, unit_sign
-from rbfmuscle.scene.objects import SceneData
+from rbfmuscle.scene.objects import Bone, Muscle, SceneData
 from rbfmuscle.scene.options import (
     ContactOptions,
     DetectOptions,
@@ -140,14 +141,11 @@ def _read_toml(path):
         raise SceneError(f"{path}: cannot read the scene file: {error.strerror}") from None
     except UnicodeDecodeError:
         raise SceneError(f"{path}: not a text file in UTF-8, give a scene file (.toml)") from None
-    except tomllib.TOMLDecodeError as error:
+    except RecursionError:
+        raise SceneError(f"{path}: not valid TOML: tables or lists are nested too deep") from None
+    except ValueError as error:  # TOML, and integers of thousands of digits
         quotes = "; text stands in quotes" if str(error).startswith("Invalid value") else ""
         raise SceneError(f"{path}: not valid TOML: {shown(str(error))}{quotes}") from None
-    except (ValueError, RecursionError) as error:  # integers of thousands of digits; nesting without end
-        what = (
-            "tables or lists are nested too deep" if isinstance(error, RecursionError) else shown(str(error))
-        )
-        raise SceneError(f"{path}: not valid TOML: {what}") from None
 
 
 def load_scene(cls: type[S], path: str | Path, *, skeleton: bool = False) -> S:
@@ -215,9 +213,9 @@ def _add_muscle(scene, muscle, defaults, folder):
         model=_merge_model(given.get("model", "rbf"), defaults.model),
         fibres=str(folder / fibres) if fibres is not None else None,
         scale=scale,
-        folder=folder,
-        **{key: given[key] for key in KEYS if key in given},
     )
+    contraction = {key: given[key] for key in KEYS if key in given}
+    scene.muscles[-1].contraction = contraction_keys(contraction, muscle=muscle.name, folder=folder)
 
 
 def _merge_model(model, default):
@@ -255,24 +253,19 @@ def _place(location, data):
 
 def describe_scene(scene: SceneData) -> dict[str, Any]:
     """Return the scene as plain data for ``run.json``: names, counts, options, sources and hashes."""
+    units = {name: unit_sign(scene, name) for name in coordinate_names(scene.joints)}
+    motion = scene.motion.options.model_dump(by_alias=True, exclude_none=True)
+    times = {} if scene.motion.times is None else {"times": scene.motion.times}
     return {
         "name": scene.name,
         "units": scene.units,
         "file": str(scene.path) if scene.path else None,
-        "bones": [{"name": b.name, **_mesh_facts(b)} for b in scene.bones],
+        "bones": [{"name": bone.name, **_describe_mesh(bone)} for bone in scene.bones],
         "links": list(scene.links),
         "joints": [joint_row(joint) for joint in scene.joints],
         "couplings": [coupling_row(coupling, scene.joints) for coupling in scene.couplings],
-        "coordinate_units": {
-            name: unit_sign(scene, name)
-            for name in coordinate_names(scene.joints)
-            if unit_sign(scene, name) != "°"
-        },
-        "motion": {
-            **scene.motion.options.model_dump(by_alias=True, exclude_none=True),
-            "frames": len(scene.motion.frames),
-            **({} if scene.motion.times is None else {"times": scene.motion.times}),
-        },
+        "coordinate_units": {name: unit for name, unit in units.items() if unit != "°"},
+        "motion": {**motion, "frames": len(scene.motion), **times},
         "muscles": [_describe_muscle(muscle) for muscle in scene.muscles],
         "contact": scene.contact.model_dump(),
         "sliding": scene.sliding.model_dump() if scene.sliding else None,
@@ -281,22 +274,19 @@ def describe_scene(scene: SceneData) -> dict[str, Any]:
     }
 
 
-def _describe_muscle(muscle):
+def _describe_muscle(muscle: Muscle) -> dict[str, Any]:
+    keys = muscle.contraction
     return {
         "name": muscle.name,
         "model": {"name": muscle.model, **muscle.options},
         "attach": [{"bone": a.bone, "vertices": len(a.vertices)} for a in muscle.attachments],
         "fibres": len(muscle.fibres) if muscle.fibres else 0,
-        **_describe_contraction(muscle.contraction),
-        **_mesh_facts(muscle),
+        **({} if keys is None else keys.model_dump(by_alias=True, exclude_none=True)),
+        **_describe_mesh(muscle),
     }
 
 
-def _describe_contraction(keys):
-    return {} if keys is None else keys.model_dump(by_alias=True, exclude_none=True)
-
-
-def _mesh_facts(item):
+def _describe_mesh(item: Bone | Muscle) -> dict[str, Any]:
     vertices = np.ascontiguousarray(item.mesh.vertices, dtype=np.float64)
     faces = np.ascontiguousarray(item.mesh.faces, dtype=np.int64)
     return {

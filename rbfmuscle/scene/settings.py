@@ -78,36 +78,31 @@ def _set_models(muscles: Sequence[Muscle], model: str | dict[str, Any]) -> None:
 
 
 def _apply(scene, key, value):
-    head, _, rest = key.partition(".")
     check_removed({key: value}, place="")
-    if head == "model":
-        _set_model(scene.muscles, rest, value, key)
-    elif head == "muscle":
-        name, _, rest = rest.partition(".")
-        check_removed({rest: value}, place=f"{key}: ")
-        head, _, rest = rest.partition(".")
-        muscle = scene.muscle(name)
-        if head in KEYS:
-            _set_contraction([muscle], scene, head, rest, value)
-            return
-        if head != "model":
+    head, _, rest = key.partition(".")
+    muscles = scene.muscles
+    if head == "muscle":
+        name, _, inner = rest.partition(".")
+        check_removed({inner: value}, place=f"{key}: ")
+        head, _, rest = inner.partition(".")
+        muscles = [scene.muscle(name)]
+        if head != "model" and head not in KEYS:
             raise SceneError(
                 f"{key}: of a muscle its model (muscle.{name}.model.KEY) and {', '.join(KEYS)} can be set"
             )
-        _set_model([muscle], rest, value, key)
+    if head == "model":
+        _set_model(muscles, rest, value, key)
     elif head in KEYS:
-        _set_contraction(scene.muscles, scene, head, rest, value)
+        _set_contraction(muscles, scene, head, rest, value)
+    elif head not in TABLES:
+        raise SceneError(f"{key}: unknown setting, {did_you_mean(head, ['model', 'muscle', *KEYS, *TABLES])}")
+    elif not rest:
+        raise SceneError(f"{key}: name a key of the table, for instance {head}.KEY=VALUE")
     elif head == "motion":
         _set_motion(scene, rest, value, key)
-    elif head in TABLES and rest:
-        table = getattr(scene, head)
-        if table is None:
-            table = {"sliding": SlidingOptions, "detect": DetectOptions}[head]()
-        setattr(scene, head, table.changed(rest, value, place=f"{key}: "))
-    elif head in TABLES:
-        raise SceneError(f"{key}: name a key of the table, for instance {head}.KEY=VALUE")
     else:
-        raise SceneError(f"{key}: unknown setting, {did_you_mean(head, ['model', 'muscle', *KEYS, *TABLES])}")
+        table = getattr(scene, head) or {"sliding": SlidingOptions, "detect": DetectOptions}[head]()
+        setattr(scene, head, table.changed(rest, value, place=f"{key}: "))
 
 
 def parse_setting(text: str) -> tuple[Any, ...]:

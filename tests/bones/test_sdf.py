@@ -7,7 +7,6 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.validation import MeshError
 
 SHAPES = {
@@ -120,20 +119,6 @@ def test_pose_moves_points_and_turns_gradients(shape):
     same = np.linalg.norm(turned - gradient @ pose[:3, :3].T, axis=1) < 1e-3
     assert same.mean() > 0.999  # a point on a crease may take either side
     np.testing.assert_array_equal(field.distance(moved, pose), there)
-    np.testing.assert_allclose(
-        field.closest_point(moved, pose),
-        trimesh.transform_points(field.closest_point(points), pose),
-        atol=1e-9,
-    )
-    np.testing.assert_array_equal(field.direction(moved, pose), turned)
-
-
-def test_closest_point_is_exact(shape):
-    mesh, field = shape
-    points = _near(mesh, 3.0, 2000)
-    np.testing.assert_allclose(
-        field.closest_point(points), ExactDistance(mesh.vertices, mesh.faces).closest_point(points), atol=1e-9
-    )
 
 
 def test_reach_gives_lower_bounds_beyond_it_and_the_same_within(shape):

@@ -159,7 +159,7 @@ def test_optimal_fibre_length_gives_the_stretch_at_rest():
         ({"tendon": {"length": 400.0}}, "covers all"),
         ({"tendon": {"length": 0.01}}, "make it longer"),
         ({"tendon": {"length": 5.0, "at": "insertoin"}}, "did you mean 'insertion'"),
-        ({"tendon": {"vertices": [10**6]}}, "vertex numbers"),
+        ({"tendon": {"vertices": [10**6]}}, "out of range"),
         ({"tendon": {"length": 5.0, "share": 0.1}}, "one of share, length and vertices"),
         ({"shortening": 0.0}, "shortening"),
         ({"fibre_stretch_at_rest": 1.1, "optimal_fibre_length": 100.0}, "not both"),
@@ -193,7 +193,7 @@ def test_fibres_that_leave_the_muscle_are_refused():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (STO.format(column="tibia"), "has no column 'muscle', it has tibia"),
+        (STO.format(column="tibia"), "has no column 'muscle', known: tibia"),
         (STO.format(column="muscl"), "did you mean 'muscl'"),
         (STO.format(column=MUSCLE).replace("0.8", "1.8"), "row 2"),
         (STO.format(column=MUSCLE).replace("0.8", "nan"), "row 2"),

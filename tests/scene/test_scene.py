@@ -205,7 +205,7 @@ class TestMistakes:
                 "nere = 4",
                 r"\[\[muscle\]\] 'biceps' attach 1: unknown key 'nere', did you mean 'near'",
             ),
-            ('"lower.txt"', '"nowhere.txt"', r"cannot read .*nowhere.txt"),
+            ('"lower.txt"', '"nowhere.txt"', r"nowhere.txt: cannot read it"),
             ("near = 4", "near = 75", r"vertices \(first: \d+\) are attached to both 'upper' and 'lower'"),
             ('name = "lower"', 'name = "upper"', r"bone 'upper' is given twice"),
             ('name = "biceps"', 'name = "../x"', r"muscle name '../x' may hold letters"),

@@ -11,6 +11,8 @@ from scipy.sparse.csgraph import dijkstra
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.scene.activation.keys import KEYS, Contraction, ContractionTable, CurveTable
+from rbfmuscle.scene.attachments import listed_vertices
+from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.validation import SceneError, did_you_mean
 
 # A fibre that lies farther outside than this share of the muscle's diagonal is one of another muscle or frame:
@@ -18,26 +20,19 @@ from rbfmuscle.validation import SceneError, did_you_mean
 OUTSIDE = 0.1
 
 
-def contraction_keys(given: dict[str, Any], *, muscle: str, folder: str | Path | None = None) -> Any:
+def contraction_keys(
+    given: dict[str, Any], *, muscle: str, folder: str | Path | None = None
+) -> ContractionTable | None:
     """The checked keys of one muscle, or None where it has none.
 
     Parameters
     ----------
     given : dict
-        The keys that were given; None counts as not given.
+        None counts as not given.
     muscle : str
         For messages.
     folder : path, optional
         What relative files are relative to.
-
-    Returns
-    -------
-    ContractionTable or None
-
-    Raises
-    ------
-    SceneError
-        Naming the muscle, the key and what it may be.
     """
     for key in given:
         if key not in KEYS:
@@ -68,16 +63,8 @@ def _check_activation(value, muscle):
             )
 
 
-def resolve_contraction(muscle: Any) -> Any:
+def resolve_contraction(muscle: Muscle) -> Any:
     """What the keys of a muscle come to on its mesh, or None where it has none.
-
-    Parameters
-    ----------
-    muscle : rbfmuscle.scene.objects.Muscle
-
-    Returns
-    -------
-    Contraction or None
 
     Raises
     ------
@@ -134,15 +121,15 @@ def _tendon(muscle, table):
         return tendon
     place = f"muscle {muscle.name!r} tendon"
     if table.vertices is not None:
-        tendon[_listed(table.vertices, len(vertices), place)] = True
+        tendon[listed_vertices(table.vertices, len(vertices), f"{place}: ")] = True
     else:
         bones = [attachment.bone for attachment in muscle.attachments]
         if table.at is not None and table.at not in bones:
             raise SceneError(f"{place}: not attached to {table.at!r}, {did_you_mean(table.at, bones)}")
-        groups = {}
-        for attachment in muscle.attachments:
-            groups.setdefault(attachment.bone, []).append(np.asarray(attachment.vertices))
-        ends = {bone: np.concatenate(found) for bone, found in groups.items()}
+        ends = {
+            bone: np.concatenate([a.vertices for a in muscle.attachments if a.bone == bone])
+            for bone in dict.fromkeys(bones)
+        }
         away = {bone: _along_surface(vertices, muscle.mesh.faces, end) for bone, end in ends.items()}
         for bone in ends if table.at is None else [table.at]:
             reach = table.length
@@ -150,31 +137,13 @@ def _tendon(muscle, table):
                 others = np.concatenate([end for other, end in ends.items() if other != bone])
                 reach = table.share * float(away[bone][others].mean())
             tendon |= away[bone] <= reach
-    held = np.unique(np.concatenate([np.asarray(a.vertices) for a in muscle.attachments]))
-    belly = ~tendon
-    belly[held] = False
-    if not belly.any():
+    free = np.ones(len(vertices), dtype=bool)
+    free[np.concatenate([a.vertices for a in muscle.attachments])] = False
+    if not (free & ~tendon).any():
         raise SceneError(f"{place}: covers all of the muscle, leave a belly that can contract")
-    tendon_free = tendon.copy()
-    tendon_free[held] = False
-    if not tendon_free.any():
+    if not (free & tendon).any():
         raise SceneError(f"{place}: holds no vertex beyond the attachments, make it longer")
     return tendon
-
-
-def _listed(listed, count, place):
-    if isinstance(listed, str):
-        place = f"{place}: {listed}"
-        try:
-            listed = [int(word) for word in Path(listed).read_text(encoding="utf-8").split()]
-        except OSError as error:
-            raise SceneError(f"{place}: cannot be read: {error.strerror}") from None
-        except ValueError as error:
-            raise SceneError(f"{place}: holds something that is no vertex number ({error})") from None
-    numbers = np.asarray(listed, dtype=int)
-    if len(numbers) == 0 or numbers.min() < 0 or numbers.max() >= count:
-        raise SceneError(f"{place}: needs vertex numbers from 0 to {count - 1}")
-    return numbers
 
 
 def _along_surface(vertices, faces, start):
