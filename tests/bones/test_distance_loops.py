@@ -39,11 +39,6 @@ def around(count=250, seed=0, pad=0.6):
     return np.random.default_rng(seed).uniform([-pad] * 3, [2 + pad, 2 + pad, 0.8 + pad], (count, 3))
 
 
-def test_mesh_of_the_test_is_closed_and_outward(solid):
-    assert trimesh.Trimesh(*solid, process=False).is_watertight
-    assert trimesh.Trimesh(*solid, process=False).volume == pytest.approx(3 * 0.8)
-
-
 def test_distance_is_that_to_the_triangles_on_either_side(field, solid):
     points = around()
     distance, _ = exact(points, solid)
@@ -63,13 +58,6 @@ def test_gradient_points_away_from_the_nearest_point_outside_and_to_it_inside(fi
     expected = (points - nearest) / np.where(distance == 0, 1.0, distance)[:, None]
     agree = np.linalg.norm(gradient - expected, axis=1)[clear] < 1e-4
     assert agree.mean() > 0.98
-
-
-@pytest.mark.parametrize("away", [3.0, 30.0])
-def test_beyond_the_grid_distances_stay_exact(field, solid, away):
-    unit = np.random.default_rng(2).normal(size=(40, 3))
-    points = [1.0, 1.0, 0.4] + away * unit / np.linalg.norm(unit, axis=1, keepdims=True)
-    np.testing.assert_allclose(field.distance(points), exact(points, solid)[0], rtol=1e-5)
 
 
 def test_edges_and_corners_have_their_sides(field, solid):
@@ -93,16 +81,6 @@ def test_reach_leaves_what_is_near_exact_and_bounds_what_is_far(field, solid):
         near = distance <= reach
         np.testing.assert_allclose(found[near], distance[near], atol=1e-6)
         assert (found[~near] > reach - 1e-9).all() and (found[~near] <= distance[~near] + 1e-6).all()
-
-
-def test_answers_do_not_depend_on_company(field):
-    """A stage of many points that are all out of reach is answered at once; alone or together, bounds hold."""
-    points = np.vstack([around(100, seed=5) + [40.0, 0, 0], around(30, seed=6)])
-    together = field.distance(points, reach=0.5)
-    alone = np.array([field.distance(p[None], reach=0.5)[0] for p in points])
-    near = alone <= 0.5
-    np.testing.assert_array_equal(together[near], alone[near])
-    assert (together[~near] > 0.5).all() and (alone[~near] > 0.5).all()
 
 
 def test_a_mixed_cell_interpolates_what_its_corners_say_and_ends_at_its_sides():
@@ -156,20 +134,3 @@ def test_a_cells_list_holds_what_is_nearest_to_the_points_within_it():
             far.append(here / least - 1.0)
     # A walk ends where no neighbour is nearer, a hair before the goal at most.
     assert grown > 20 and max(far) < 0.02 and np.mean(np.array(far) < 1e-6) > 0.95
-
-
-def test_small_cells_that_no_triangle_of_their_block_comes_near_are_left_out():
-    plate = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 2.0, 0.5], [3.0, 2.0, 0.5]])
-    exact = ExactDistance(plate, np.array([[0, 1, 2], [1, 3, 2]]))
-    origin, edge, band, side = np.array([0.4, -0.7, -1.1]), 1.2, 0.1, 4
-    blocks = np.array(list(np.ndindex(2, 3, 2)))
-    active = np.ones((len(blocks), side**3), dtype=np.bool_)
-    held, offsets = np.array([2, 0, 1], dtype=np.int32), np.zeros(len(blocks), dtype=np.int64)
-    build._near_loop(blocks, offsets, held, exact.records, (origin, edge, band, side), active)
-    small = edge / side
-    cells = np.array(list(np.ndindex(side, side, side)))
-    middle = origin + edge * blocks[:, None] + small * (cells + 0.5)
-    away = np.sqrt(igl.point_mesh_squared_distance(middle.reshape(-1, 3), plate, exact.faces)[0])
-    wanted = away.reshape(active.shape) < band + 0.5 * np.sqrt(3.0) * small
-    np.testing.assert_array_equal(active, wanted)
-    assert 0.05 < wanted.mean() < 0.95

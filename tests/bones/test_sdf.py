@@ -121,17 +121,6 @@ def test_pose_moves_points_and_turns_gradients(shape):
     np.testing.assert_array_equal(field.distance(moved, pose), there)
 
 
-def test_reach_gives_lower_bounds_beyond_it_and_the_same_within(shape):
-    mesh, field = shape
-    points = np.concatenate([_near(mesh, 2.0, 3000), _near(mesh, 40.0, 3000)])
-    whole = field.distance(points)
-    for found in (field.distance(points, reach=2.0), field.distance_and_gradient(points, reach=2.0)[0]):
-        near = whole <= 2.0
-        np.testing.assert_array_equal(found[near], whole[near])
-        assert np.all(found[~near] > 2.0)
-        assert np.all(found[~near] <= whole[~near] + 1e-6)
-
-
 def test_reach_of_each_point(shape):
     mesh, field = shape
     points = np.concatenate([_near(mesh, 2.0, 3000), _near(mesh, 40.0, 3000)])
@@ -143,20 +132,6 @@ def test_reach_of_each_point(shape):
     np.testing.assert_array_equal(gradient[near], slope[near])
     assert np.all(found[~near] > reach[~near])
     assert np.all(found <= whole + 1e-6)
-
-
-def test_order_and_threads_do_not_matter(shape):
-    mesh, field = shape
-    points = _near(mesh, 3.0, 30000)
-    order = np.random.default_rng(0).permutation(len(points))
-    whole = field.distance(points)
-    np.testing.assert_array_equal(whole[order], field.distance(points[order]))
-    before = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        np.testing.assert_array_equal(whole, field.distance(points))
-    finally:
-        numba.set_num_threads(before)
 
 
 def test_same_field_from_any_number_of_threads():
@@ -172,17 +147,6 @@ def test_same_field_from_any_number_of_threads():
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize("scale", [1e-3, 0.1, 1e3])
-def test_units_do_not_matter(scale):
-    mesh = SHAPES["torus"]()
-    small = mesh.copy().apply_scale(scale)
-    points = _near(mesh, 1.0, 3000)
-    one, other = BoneSDF.from_mesh(mesh, cache=False), BoneSDF.from_mesh(small, cache=False)
-    np.testing.assert_allclose(
-        other.distance(scale * points), scale * one.distance(points), atol=2e-5 * scale
-    )
-
-
 def test_region_is_fine_inside_and_right_outside():
     mesh = SHAPES["torus"]()
     region = np.array([[5.0, -30.0, -10.0], [30.0, 30.0, 10.0]])
@@ -196,14 +160,6 @@ def test_region_is_fine_inside_and_right_outside():
     # Outside, coarse cells of 16 times the edge answer.
     assert error.max() < 0.3 * 16 * part.spacing
     assert np.mean((part.distance(points) * exact < 0.0) & (np.abs(exact) > 0.5)) < 0.01
-
-
-def test_a_region_without_a_face_has_nothing_to_be_wrong_in():
-    mesh = trimesh.creation.icosphere(subdivisions=1, radius=10.0)
-    field = BoneSDF.from_mesh(mesh, region=[[30.0, -2.0, -2.0], [34.0, 2.0, 2.0]], cache=False)
-    points = np.array([[31.0, 0.0, 0.5], [33.0, 1.0, -1.0], [0.0, 12.0, 0.0]])
-    exact = field.exact.signed_distance(points)
-    assert np.abs(field.distance(points) - exact).max() < 0.3 * 16 * field.spacing
 
 
 def test_smaller_tolerance_gives_smaller_errors():
@@ -223,25 +179,6 @@ def test_smaller_tolerance_gives_smaller_errors():
 def test_tolerance_beyond_the_memory_is_a_clear_error():
     with pytest.raises(MeshError, match=r"tib: a tolerance .* needs about .* MB.*memory limit"):
         BoneSDF.from_mesh(SHAPES["torus"](), tolerance=1e-9, memory_limit=3_000_000, cache=False, name="tib")
-
-
-def test_default_fits_in_the_memory_instead_of_failing():
-    field = BoneSDF.from_mesh(SHAPES["torus"](), memory_limit=700_000, cache=False)
-    assert field.memory < 1_000_000
-    assert field.distance(np.array([[20.0, 0.0, 0.0]]))[0] < -4.0
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"tolerance": 0.0}, "tolerance must be a positive"),
-        ({"tolerance": np.nan}, "tolerance must be a positive"),
-        ({"region": [[1.0, 0, 0], [0, 1, 1]]}, "region must be"),
-    ],
-)
-def test_bad_options_are_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        BoneSDF.from_mesh(SHAPES["box"](), cache=False, **arguments)
 
 
 def test_bad_points_and_poses_are_refused():

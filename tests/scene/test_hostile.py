@@ -15,7 +15,7 @@ from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation import substeps
 from rbfmuscle.simulation.substeps import check_substeps, estimate_substeps
-from rbfmuscle.validation import MeshError, SceneError, UsageError
+from rbfmuscle.validation import MeshError, SceneError
 
 
 @pytest.fixture(scope="module")
@@ -57,20 +57,15 @@ class TestNumbers:
     @pytest.mark.parametrize(
         ("change", "words"),
         [
-            (put("bone", 1, "scale", 10**20), "whole number must be at most 2\\^53"),
             (put("contact", "margin", Raw("9" * 5000)), "not valid TOML"),
             (put("muscle", 0, "attach", 0, "vertices", [10**19]), "2\\^53"),
             (put("muscle", 0, "attach", 0, "vertices", [2**52]), "out of range"),
             (put("joint", 0, "centre", nested(1000)), "nested"),
-            (put("joint", 0, "centre", nested(30)), "nested more than 20 deep"),
             (put("defaults", "model", float("inf")), "defaults.model: must be a finite number, got inf"),
-            (put("defaults", "model", [1, 2]), "model must be a name or a table"),
             (put("muscle", 0, "model", "seed", 1.5), "seed"),
-            (put("muscle", 0, "model", "kernel", ["cubic"]), "kernel"),
             (put("contact", "substep_angle", float("nan")), "finite"),
             (put("muscle", 0, "mesh", "/dev/zero"), "not a mesh|no such"),
             (put("motion", {"file": "/dev/zero"}), "no such file"),
-            (put("muscle", 0, "attach", 0, "vertices", "/dev/zero"), "no such file"),
         ],
     )
     def test_value_that_no_key_can_mean(self, folder, change, words):
@@ -94,19 +89,6 @@ class TestNumbers:
         ):
             (folder / "odd.json").write_text(lines)
             refused(folder, put("muscle", 0, "fibres", "odd.json"), "polyline 0")
-
-    def test_scene_file_of_any_size(self, folder):
-        (folder / "large.toml").write_bytes(b"#" * 5_000_000)
-        with pytest.raises(SceneError, match="5000000 bytes"):
-            Scene.load(folder / "large.toml")
-        with pytest.raises(SceneError, match="no such scene file"):
-            Scene.load("/dev/zero")
-
-    def test_settings_of_the_command_line(self):
-        scene = phantom_scene()
-        for value in (float("inf"), [1], 1.5, {"name": 3}):
-            with pytest.raises((SceneError, UsageError)):
-                check_models(scene.with_options({"model.seed": value}))
 
 
 class TestMotions:
@@ -161,11 +143,6 @@ def flat(vertices, faces):
     vertices[:, 0] = 34.0
 
 
-def bow_tie(vertices, faces):
-    upper = vertices[:, 2] > -10
-    vertices[upper, :2] = [68.0, 0.0] - vertices[upper, :2]
-
-
 def inside_out_half(vertices, faces):
     upper = vertices[:, 2] > -10
     vertices[upper, 2] = -20 - vertices[upper, 2]
@@ -194,18 +171,6 @@ class TestMeshes:
     def test_surface_without_an_inside_is_refused(self, change):
         with pytest.raises(MeshError, match=r"encloses no volume|passes through itself"):
             prepare_mesh(*shape(change), place="a.ply", name="a")
-
-    def test_turned_half_is_either_right_or_refused(self):
-        try:
-            read = prepare_mesh(*shape(bow_tie), place="a.ply", name="a")
-        except MeshError as error:
-            assert "passes through itself" in str(error) or "encloses no volume" in str(error)
-        else:
-            check_volume(read.mesh.vertices, read.mesh.faces, "a.ply")
-
-    def test_one_triangle_twice(self):
-        with pytest.raises(MeshError):
-            prepare_mesh(np.eye(3) * 50, [[0, 1, 2], [0, 2, 1]], place="a.ply", name="a")
 
     @pytest.mark.parametrize("value", [1e300, -1e38, np.nan, np.inf])
     def test_vertex_beyond_all_lengths(self, value):

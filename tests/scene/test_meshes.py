@@ -48,11 +48,6 @@ class TestFormats:
         np.testing.assert_allclose(read.mesh.vertices, corners, atol=1e-9)
         assert read.mesh.volume == pytest.approx(729)
 
-    def test_scale(self, tmp_path):
-        path = tmp_path / "ball.ply"
-        ball().export(path)
-        assert read_mesh(path, scale=0.001).mesh.volume == pytest.approx(ball().volume * 1e-9, rel=1e-6)
-
 
 class TestMending:
     def test_inward_mesh_is_turned_and_said_so(self, tmp_path):
@@ -186,7 +181,3 @@ class TestUnusable:
         path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n")
         with pytest.raises(MeshError, match=r"a\.obj.*out of bounds .* size 3"):
             read_mesh(path)
-
-    def test_unknown_suffix(self, tmp_path):
-        with pytest.raises(MeshError, match="not a mesh format"):
-            read_mesh(tmp_path / "a.step")

@@ -33,10 +33,6 @@ class TestFrames:
         scene = chain().set_motion(ramp={"one.turn": {"from": 0, "to": 25, "step": 10}})
         assert degrees(scene, "one.turn") == pytest.approx([0, 10, 20, 25])
 
-    def test_ramp_downwards(self):
-        scene = chain().set_motion(ramp={"one.turn": {"from": 10, "to": -10, "step": 5}})
-        assert degrees(scene, "one.turn") == pytest.approx([10, 5, 0, -5, -10])
-
     def test_several_coordinates_go_together(self):
         ramp = {"one.turn": {"to": 40, "step": 10}, "two.bend": {"to": -10, "step": 5}}
         scene = chain().set_motion(ramp=ramp)
@@ -53,18 +49,9 @@ class TestFrames:
     def test_bare_coordinate_name_stands_for_its_only_joint(self):
         assert chain().set_motion(ramp={"bend": {"to": 4, "step": 2}}).motion.coordinates == ["two.bend"]
 
-    @pytest.mark.parametrize("step", [0, -2, math.nan])
-    def test_step_must_be_positive(self, step):
-        with pytest.raises(SceneError, match="step"):
-            chain().set_motion(ramp={"one.turn": {"to": 10, "step": step}})
-
     def test_tiny_step_is_refused_before_memory_is_taken(self):
         with pytest.raises(SceneError, match="more than"):
             chain().set_motion(ramp={"one.turn": {"to": 90, "step": 1e-9}})
-
-    def test_unknown_coordinate_names_the_nearest(self):
-        with pytest.raises(SceneError, match=r"'one.trun', did you mean 'one.turn'"):
-            chain().set_motion(ramp={"one.trun": {"to": 10, "step": 1}})
 
     def test_slices(self):
         scene = chain().set_motion(ramp={"one.turn": {"to": 40, "step": 10}})
@@ -98,10 +85,6 @@ class TestOpenSimFile:
         with pytest.raises(SceneError, match=r"walk\.mot"):
             chain().set_motion(file="walk.mot", folder=tmp_path)
 
-    def test_missing_file(self, tmp_path):
-        with pytest.raises(SceneError, match=r"cannot read .*none\.mot"):
-            chain().set_motion(file="none.mot", folder=tmp_path)
-
 
 class TestPoses:
     def test_rest_is_identity_and_a_loose_bone_is_fixed(self):
@@ -123,10 +106,6 @@ class TestPoses:
         assert np.array_equal(poses["d"], np.eye(4))
         for pose in poses.values():
             assert pose[:3, :3] @ pose[:3, :3].T == pytest.approx(np.eye(3), abs=1e-14)
-
-    def test_unknown_coordinate(self):
-        with pytest.raises(SceneError, match=r"did you mean 'two.bend'"):
-            bone_poses(chain(), {"two.bnd": 1.0})
 
     def test_interpolate(self):
         assert interpolate({"x": 1.0}, {"x": 3.0, "y": 4.0}, 0.25) == {"x": 1.5, "y": 1.0}

@@ -113,11 +113,6 @@ class TestLoading:
         assert scene.detect.tunnelling.angle == 120 and scene.sliding is None
         assert [f["elbow.flexion"] for f in scene.motion.frames] == pytest.approx(np.radians([0, 10, 20]))
 
-    def test_the_same_scene_built_in_code(self, folder):
-        loaded, made = load(folder), built()
-        for a, b in zip(loaded.muscles[0].attachments, made.muscles[0].attachments):
-            assert a.bone == b.bone and np.array_equal(a.vertices, b.vertices)
-
     def test_sphere_attachment_and_inline_vertices(self, folder):
         sphere = "sphere = { centre = [60, 0, 20], radius = 12 }"
         scene = load(folder, ('vertices = "lower.txt"', sphere))
@@ -146,14 +141,6 @@ class TestLoading:
         with pytest.raises(SceneError, match=r"f\.json: polyline 0 has 1 points"):
             Scene.load(folder / "arm.toml")
 
-    @pytest.mark.parametrize("name", ["flexion", "extension", "adduction", "internal_rotation", "apriori"])
-    def test_real_hip(self, hip_data, name):
-        scene = Scene.load(hip_data / f"{name}.toml")
-        counts = [[len(a.vertices) for a in muscle.attachments] for muscle in scene.muscles]
-        assert counts == [[761, 109], [584, 125], [3186, 126], [341, 294]]
-        assert [len(line) for line in scene.muscle("gluteus_maximus").fibres] == [6] * 5
-        assert all(not item.notes for item in [*scene.bones, *scene.muscles])
-
 
 class TestMistakes:
     @pytest.mark.parametrize(
@@ -164,7 +151,6 @@ class TestMistakes:
                 "center = [0, 0, 0]",
                 r"\[\[joint\]\] 'elbow': unknown key 'center', did you mean 'cen",
             ),
-            ("[contact]", "[contcat]", r"unknown key 'contcat', did you mean 'contact'"),
             (
                 'child = "lower"',
                 'child = "lowr"',
@@ -180,30 +166,19 @@ class TestMistakes:
                 "elbo.flexion",
                 r"unknown coordinate 'elbo.flexion', did you mean 'elbow.flexion'",
             ),
-            ('"keep"', '"kep"', r"\[contact\] initial: .*'kep'"),
             ("step = 10", "step = 0", r"\[motion\] ramp elbow.flexion step: .*greater than 0, got 0"),
-            ("step = 10", 'step = "10"', r"\[motion\] ramp elbow.flexion step: .*'10'"),
-            ("step = 10 }", "step = 10, by = 3 }", r"unknown key 'by'"),
             ('units = "mm"', 'units = "inch"', r"\[scene\] units: .*'m', 'cm' or 'mm', got 'inch'"),
             ('units = "mm"', "", r"\[scene\] units: field required"),
-            ("format = 1", "format = 2", r"\[scene\] format: .*got 2"),
-            ("centre = [0, 0, 0]", "centre = [0, 0]", r"'elbow' centre"),
             ("[0, -2, 0]", "[0, 0, 0]", r"'elbow' axes flexion: must not be the zero vector"),
             (
                 "near = 4",
                 "near = 4, sphere = { centre = [0,0,0], radius = 3 }",
                 r"one of vertices, near and sphere, got near and",
             ),
-            (", near = 4", "", r"give one of vertices, near and sphere, got none"),
             (
                 "near = 4",
                 "near = 0.001",
                 r"near = 0.001 reaches no vertex of the muscle, the nearest is .* away; raise it",
-            ),
-            (
-                "near = 4",
-                "nere = 4",
-                r"\[\[muscle\]\] 'biceps' attach 1: unknown key 'nere', did you mean 'near'",
             ),
             ('"lower.txt"', '"nowhere.txt"', r"nowhere.txt: cannot read it"),
             ("near = 4", "near = 75", r"vertices \(first: \d+\) are attached to both 'upper' and 'lower'"),
@@ -218,14 +193,6 @@ class TestMistakes:
             load(folder, (old, new))
         text = str(caught.value)
         assert "\n" not in text and text.startswith(str(folder / "arm.toml"))
-
-    def test_index_out_of_range_names_file_and_value(self, folder):
-        (folder / "lower.txt").write_text("3\n99999\n")
-        with pytest.raises(SceneError, match=r"lower\.txt: vertex 99999 is out of range, .* 0 to 641"):
-            load(folder)
-        (folder / "lower.txt").write_text("3\nx\n")
-        with pytest.raises(SceneError, match=r"lower\.txt: 'x' is not a vertex number"):
-            load(folder)
 
     def test_muscle_with_no_or_one_attachment(self, folder):
         both = re.search(r"attach = \[.*\]", TEXT).group()
@@ -243,25 +210,6 @@ class TestMistakes:
             Scene.load(folder / "none.toml")
         with pytest.raises(SceneError, match="is a folder"):
             Scene.load(folder)
-
-    @pytest.mark.parametrize(
-        ("scale", "remedy"), [("0.001", "1000 times"), ("100", "0.1 times"), ("1000", "0.01 times")]
-    )
-    def test_wrong_unit_of_a_mesh(self, folder, scale, remedy):
-        with pytest.raises(MeshError, match=rf"bone 'upper' .*upper.ply.* mm across, .*{remedy}"):
-            load(folder, ('"upper.ply"', f'"upper.ply"\nscale = {scale}'), ("near = 4", "near = 5"))
-
-    def test_muscle_in_another_frame(self, folder):
-        far = meshes()[2].apply_translation([0, 900, 0])
-        far.export(folder / "biceps.ply")
-        with pytest.raises(MeshError, match=r"lies .* mm away from all bones"):
-            load(folder, ("near = 4", "vertices = [1, 2]"))
-
-    def test_missing_mesh_names_scene_and_mesh(self, folder):
-        with pytest.raises(
-            MeshError, match=r"arm\.toml: .*bicep\.ply: no such mesh file, did you mean 'biceps.ply'"
-        ):
-            load(folder, ('"biceps.ply"', '"bicep.ply"'))
 
     def test_joints_form_a_tree(self):
         scene = built()
