@@ -44,6 +44,7 @@ REMOVED_KEYS: dict[str, str] = {
     "motion.max_substeps": "delete the key: a motion may take 100000 sub-steps",
     "activation.from": "use a list of numbers, spread over the motion: [from, to]",
     "activation.to": "use a list of numbers, spread over the motion: [from, to]",
+    "tendon.share": "give the share alone: tendon = 0.2",
     "joint.rotations.scale": "multiply the numbers of the function by it",
     "joint.translations.scale": "multiply the numbers of the function by it",
     "coupling.scale": "multiply the numbers of the function by it",

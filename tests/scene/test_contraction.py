@@ -143,7 +143,7 @@ def test_optimal_fibre_length_gives_the_stretch_at_rest():
         ({"tendon": {"length": 0.01}}, "make it longer"),
         ({"tendon": {"length": 5.0, "at": "insertoin"}}, "did you mean 'insertion'"),
         ({"tendon": {"vertices": [10**6]}}, "out of range"),
-        ({"tendon": {"length": 5.0, "share": 0.1}}, "one of share, length and vertices"),
+        ({"tendon": {"length": 5.0, "vertices": [1]}}, "one of length and vertices"),
         ({"fibre_stretch_at_rest": 1.1, "optimal_fibre_length": 100.0}, "not both"),
         ({"optimal_fibre_length": 10.0}, "check the unit"),
         ({"shortenning": 0.5}, "did you mean 'shortening'"),

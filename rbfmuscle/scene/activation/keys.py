@@ -3,13 +3,16 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from rbfmuscle.scene.options import Positive, Table
 
 KEYS = ("activation", "fibre_stretch_at_rest", "optimal_fibre_length", "shortening", "tendon")
 
 Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+
+
+TENDON_STRAIN = 0.033
 
 
 class CurveTable(Table):
@@ -22,24 +25,21 @@ class CurveTable(Table):
 class TendonTable(Table):
     """``tendon`` as a table: where the tendon is, and its strain at full activation.
 
-    ``share`` of the muscle's length or ``length`` from every attachment, or from the bone ``at`` alone; or
-    ``vertices`` of the muscle's mesh. The strain of 0.033 at the greatest isometric force is Zajac's (Critical
-    Reviews in Biomedical Engineering 17, 1989).
+    ``length`` from every attachment, or from the bone ``at`` alone; or ``vertices`` of the muscle's mesh. The strain
+    of 0.033 at the greatest isometric force is Zajac's (Critical Reviews in Biomedical Engineering 17, 1989).
     """
 
-    share: Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False)] | None = None
     length: Positive | None = None
     vertices: str | list[int] | None = None
     at: str | None = None
-    strain: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = 0.033
+    strain: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = TENDON_STRAIN
 
     @model_validator(mode="after")
     def _check_one_place(self):
-        given = [key for key in ("share", "length", "vertices") if getattr(self, key) is not None]
-        if len(given) != 1:
-            raise ValueError(f"give one of share, length and vertices, got {' and '.join(given) or 'none'}")
+        if (self.length is None) == (self.vertices is None):
+            raise ValueError("give one of length and vertices")
         if self.at is not None and self.vertices is not None:
-            raise ValueError("at (a bone) belongs to share and length, not to vertices")
+            raise ValueError("at (a bone) belongs to length, not to vertices")
         return self
 
 
@@ -64,13 +64,7 @@ class ContractionTable(Table):
     fibre_stretch_at_rest: Annotated[float, Field(gt=0.2, lt=5, allow_inf_nan=False)] | None = None
     optimal_fibre_length: Positive | None = None
     shortening: Annotated[float, Field(gt=0.1, le=1, allow_inf_nan=False)] = 0.5
-    tendon: TendonTable | None = None
-
-    @field_validator("tendon", mode="before")
-    @classmethod
-    def _number_is_a_share(cls, value):
-        number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        return {"share": float(value)} if number else value
+    tendon: Annotated[float, Field(gt=0, lt=1)] | TendonTable | None = None
 
     @model_validator(mode="after")
     def _check_one_length(self):

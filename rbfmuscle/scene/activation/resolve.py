@@ -9,8 +9,16 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.csgraph import dijkstra
 
+from rbfmuscle.geometry.arrays import Booleans
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.scene.activation.keys import KEYS, Contraction, ContractionTable, CurveTable
+from rbfmuscle.scene.activation.keys import (
+    KEYS,
+    TENDON_STRAIN,
+    Contraction,
+    ContractionTable,
+    CurveTable,
+    TendonTable,
+)
 from rbfmuscle.scene.attachments import listed_vertices
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.validation import SceneError, did_you_mean
@@ -47,6 +55,8 @@ def contraction_keys(
             found[key] = {**value, inner: str(Path(folder) / value[inner])}
     if isinstance(found.get("activation"), dict):
         found["activation"] = CurveTable.build(found["activation"], place=f"muscle {muscle!r} activation: ")
+    if isinstance(found.get("tendon"), dict):
+        found["tendon"] = TendonTable.build(found["tendon"], place=f"muscle {muscle!r} tendon: ")
     return ContractionTable.build(found, place=f"muscle {muscle!r} ")
 
 
@@ -79,7 +89,7 @@ def resolve_contraction(muscle: Muscle) -> Any:
     stretch = keys.fibre_stretch_at_rest or 1.0
     if keys.optimal_fibre_length is not None:
         stretch = _stretch_from_length(muscle, keys.optimal_fibre_length)
-    strain = keys.tendon.strain if keys.tendon is not None else 0.0
+    strain = keys.tendon.strain if isinstance(keys.tendon, TendonTable) else TENDON_STRAIN
     given = keys.fibre_stretch_at_rest is not None or keys.optimal_fibre_length is not None
     return Contraction(stretch, keys.shortening, _tendon(muscle, keys.tendon), strain, given)
 
@@ -113,36 +123,41 @@ def _check_fibres(muscle):
             )
 
 
-def _tendon(muscle, table):
-    """Vertices that are tendon, (n,) bool."""
+def _tendon(muscle: Muscle, given: float | TendonTable | None) -> Booleans:
+    """Vertices (n,) that are tendon."""
     vertices = np.asarray(muscle.mesh.vertices, dtype=float)
     tendon = np.zeros(len(vertices), dtype=bool)
-    if table is None:
+    if given is None:
         return tendon
     place = f"muscle {muscle.name!r} tendon"
-    if table.vertices is not None:
-        tendon[listed_vertices(table.vertices, len(vertices), f"{place}: ")] = True
+    if isinstance(given, TendonTable) and given.vertices is not None:
+        tendon[listed_vertices(given.vertices, len(vertices), f"{place}: ")] = True
     else:
-        bones = [attachment.bone for attachment in muscle.attachments]
-        if table.at is not None and table.at not in bones:
-            raise SceneError(f"{place}: not attached to {table.at!r}, {did_you_mean(table.at, bones)}")
-        ends = {
-            bone: np.concatenate([a.vertices for a in muscle.attachments if a.bone == bone])
-            for bone in dict.fromkeys(bones)
-        }
-        away = {bone: _along_surface(vertices, muscle.mesh.faces, end) for bone, end in ends.items()}
-        for bone in ends if table.at is None else [table.at]:
-            reach = table.length
-            if reach is None:
-                others = np.concatenate([end for other, end in ends.items() if other != bone])
-                reach = table.share * float(away[bone][others].mean())
-            tendon |= away[bone] <= reach
+        tendon = _near_ends(muscle, given, place)
     free = np.ones(len(vertices), dtype=bool)
     free[np.concatenate([a.vertices for a in muscle.attachments])] = False
     if not (free & ~tendon).any():
         raise SceneError(f"{place}: covers all of the muscle, leave a belly that can contract")
     if not (free & tendon).any():
         raise SceneError(f"{place}: holds no vertex beyond the attachments, make it longer")
+    return tendon
+
+
+def _near_ends(muscle, given, place):
+    """Vertices (n,) up to a length from the attachments, or a share of the way to the others."""
+    vertices, bones = muscle.mesh.vertices, [attachment.bone for attachment in muscle.attachments]
+    at, length = (None, None) if isinstance(given, float) else (given.at, given.length)
+    if at is not None and at not in bones:
+        raise SceneError(f"{place}: not attached to {at!r}, {did_you_mean(at, bones)}")
+    ends = {
+        bone: np.concatenate([a.vertices for a in muscle.attachments if a.bone == bone])
+        for bone in dict.fromkeys(bones)
+    }
+    tendon = np.zeros(len(vertices), dtype=bool)
+    for bone in ends if at is None else [at]:
+        away = _along_surface(np.asarray(vertices, dtype=float), muscle.mesh.faces, ends[bone])
+        others = np.concatenate([end for other, end in ends.items() if other != bone])
+        tendon |= away <= (given * float(away[others].mean()) if length is None else length)
     return tendon
 
 
