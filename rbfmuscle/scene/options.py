@@ -84,15 +84,7 @@ Axis = Annotated[Vector, AfterValidator(_check_length)]
 
 
 def check_plain(value: object, *, place: str) -> None:
-    """Raise SceneError where TOML holds what no key can mean: endless nesting, vast integers, nan or inf.
-
-    Parameters
-    ----------
-    value : object
-        What a TOML reader returned: tables, lists, numbers, texts.
-    place : str
-        Begins the message.
-    """
+    """Raise SceneError where TOML holds what no key can mean: deep nesting, vast integers, nan or inf."""
     open_parts = [(value, place, 0)]
     while open_parts:
         part, where, depth = open_parts.pop()
@@ -112,16 +104,9 @@ def check_plain(value: object, *, place: str) -> None:
 
 
 def check_removed(values: object, *, place: str, prefix: str = "") -> None:
-    """Raise SceneError where a table holds a key that was removed, naming what to do instead.
+    """Raise SceneError where a table, or list of tables, holds a removed key; the message says what to do instead.
 
-    Parameters
-    ----------
-    values : object
-        A table, or a list of tables, as a TOML reader returned it.
-    place : str
-        Begins the message.
-    prefix : str
-        Dotted name of the table, with a full stop at its end.
+    ``place`` begins the message; ``prefix`` is the dotted name of the table, with a full stop at its end.
     """
     for row in values if isinstance(values, list) else [values]:
         for key, value in row.items() if isinstance(row, dict) else ():
@@ -173,15 +158,9 @@ class Table(BaseModel):
 
 
 def describe_error(error: Any, *, root: str = "", name_row: Callable[..., Any] | None = None) -> str:
-    """Return the first problem of a pydantic error as "where: what, given value".
+    """Return the first problem of a pydantic error as "root: where: what, given value".
 
-    Parameters
-    ----------
-    error : pydantic.ValidationError
-    root : str
-        Prefix of the location.
-    name_row : callable, optional
-        Turns the location (a tuple) into the words that a user knows the place by.
+    ``name_row`` turns the location (a tuple) into words.
     """
     first = error.errors(include_url=False)[0]
     where = name_row(first["loc"]) if name_row else ".".join(str(part) for part in first["loc"])
@@ -231,7 +210,7 @@ class SurfaceOptions(Table):
 
 
 class OutputOptions(Table):
-    """``[output]``: what a run leaves behind."""
+    """``[output]``: which files a run writes."""
 
     surfaces: SurfaceOptions | Literal[False] = SurfaceOptions()
     metrics: bool = True

@@ -8,7 +8,7 @@ import trimesh
 from rbfmuscle.bones import build, lists, query
 from rbfmuscle.bones.query import _mixed_side
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.geometry.exact_distance import STACK, ExactDistance, record_square
+from rbfmuscle.geometry.exact_distance import ExactDistance, record_square
 
 
 def angle_iron():
@@ -111,26 +111,3 @@ def test_walks_from_beside_the_nearest_triangle_lead_to_it():
             for walk in (query._walk, lists._walk):
                 end = walk(int(start), squares[start], *point, records, across)
                 assert squares[end] == pytest.approx(squares[nearest], rel=1e-5)
-
-
-def test_a_cells_list_holds_what_is_nearest_to_the_points_within_it():
-    ball = trimesh.creation.icosphere(subdivisions=1)
-    exact = ExactDistance(np.array(ball.vertices) * [2.0, 1.0, 0.7], np.array(ball.faces))
-    across = build._Builder(exact, np.zeros(3), 1.0, None, None).across
-    origin, edge, grown, far = np.array([-2.5, -1.5, 0.45]), 0.5, 0, []
-    for low in np.ndindex(10, 6, 2):
-        middle = origin + edge * (np.array(low) + 0.5)
-        squares = [record_square(exact.records, n, *middle) for n in range(len(ball.faces))]
-        listed = np.full(lists.MOST, -1, dtype=np.int64)
-        listed[0] = int(np.argmin(squares))
-        mesh = (exact.tree, across, origin, np.zeros(len(ball.faces), dtype=np.bool_))
-        stack = np.empty(STACK, dtype=np.int64), np.empty(STACK)
-        count = lists._probe(listed, 1, False, np.array(low), edge, mesh, stack)
-        grown += count > 1
-        for probe in lists.PROBES:
-            at = origin + edge * (np.array(low) + 0.5 + probe)
-            least = min(record_square(exact.records, n, *at) for n in range(len(ball.faces)))
-            here = min(record_square(exact.records, n, *at) for n in listed[:count])
-            far.append(here / least - 1.0)
-    # A walk ends where no neighbour is nearer, a hair before the goal at most.
-    assert grown > 20 and max(far) < 0.02 and np.mean(np.array(far) < 1e-6) > 0.95

@@ -23,12 +23,6 @@ def shape(request):
     return mesh, BoneSDF.from_mesh(mesh, cache=False)
 
 
-@pytest.fixture(scope="module")
-def femur(hip_data):
-    mesh = trimesh.load(hip_data / "femur.ply", process=False)
-    return mesh, BoneSDF.from_mesh(mesh, cache=False)
-
-
 def _near(mesh, width, count=20000, seed=0):
     points, faces = trimesh.sample.sample_surface(mesh, count, seed=seed)
     rng = np.random.default_rng(seed)
@@ -59,18 +53,6 @@ def test_band_meets_the_promised_accuracy(shape):
     assert np.abs(error).max() <= 0.3
     assert np.mean(field.distance(points) * exact < 0.0) <= 1e-4
     assert np.median(_angles(field, field.exact, _near(mesh, 2.0))) <= 0.5
-
-
-def test_femur_meets_the_promised_accuracy_and_memory(femur):
-    mesh, field = femur
-    points = _near(mesh, 1.0, 200_000)
-    exact = field.exact.signed_distance(points)
-    error = field.distance(points) - exact
-    assert np.sqrt(np.mean(error**2)) <= 0.01
-    assert np.abs(error).max() <= 0.3
-    assert np.mean(field.distance(points) * exact < 0.0) <= 1e-4
-    assert np.median(_angles(field, field.exact, _near(mesh, 2.0))) <= 0.5
-    assert field.memory <= 20e6
 
 
 def test_distances_far_from_the_bone_are_right(shape):

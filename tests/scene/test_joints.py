@@ -60,10 +60,6 @@ class TestFunctions:
         assert mine(-2.0) == pytest.approx(cubic(0.0) - 2.0 * cubic.deriv()(0.0), abs=1e-12)
         assert mine(5.0) == pytest.approx(cubic(3.5) + 1.5 * cubic.deriv()(3.5), abs=1e-12)
 
-    def test_piecewise_linear_goes_on_beyond_its_ends(self):
-        f = PiecewiseLinear((0.0, 1.0, 2.0), (0.0, 3.0, 3.0))
-        assert [f(-1.0), f(0.5), f(1.5), f(4.0)] == [-3.0, 1.5, 3.0, 3.0]
-
     @pytest.mark.parametrize(
         "function",
         [

@@ -161,12 +161,6 @@ class TestUnusable:
         with pytest.raises(MeshError, match=r"b\.ply"):
             read_mesh(tmp_path / "b.ply")
 
-    def test_mesh_without_triangles(self, tmp_path):
-        path = tmp_path / "points.obj"
-        path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
-        with pytest.raises(MeshError, match=r"points\.obj.*the mesh is empty"):
-            read_mesh(path)
-
     def test_nan_vertex_is_named(self, tmp_path):
         vertices = ball().vertices.copy()
         vertices[17, 1] = np.nan

@@ -87,11 +87,6 @@ class TestScene:
         gap = signed_distances(np.asarray(first.vertices), second).min()
         assert 0.5 < gap < 2.0
 
-    def test_muscles_do_not_overlap(self, scene):
-        for k, first in enumerate(scene.muscles):
-            for second in scene.muscles[k + 1 :]:
-                assert signed_distances(np.asarray(first.mesh.vertices), second.mesh).min() > 0
-
     def test_fibres_lie_inside(self, scene):
         for muscle in scene.muscles:
             for line in muscle.fibres:

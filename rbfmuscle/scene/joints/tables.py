@@ -143,32 +143,21 @@ class JointTable(Table):
             raise SceneError(f"{place}: centre is missing, give the joint's place at rest")
         angles = tuple(math.radians(angle) for angle in self.orientation or (0.0, 0.0, 0.0))
         frame = frame_at(np.array(self.centre or (0.0, 0.0, 0.0)), angles)
-        if self.type == "custom":
-            parts: Any = self._custom(place)
-        else:
-            parts = self._of_kind(place)
-        rest: Any = {"kind": self.type, "backward": self.backward}
-        return Joint(self.name, self.parent, self.child, frame, *parts, **rest)
+        coordinates, turns, shifts = self._custom(place) if self.type == "custom" else self._of_kind(place)
+        bones = self.parent, self.child
+        return Joint(self.name, *bones, frame, coordinates, turns, shifts, self.type, self.backward)
 
     def _of_kind(self, place):
         kind = KINDS[self.type]
         if self.rotations or self.translations:
             raise SceneError(f"{place}: rotations and translations belong to type 'custom', give axes")
-        directions = [*kind.rotations, *kind.translations]
-        if self.axes:
-            axes = self.axes
-        else:
-            axes = dict(zip(self.coordinates, directions))
+        axes = self.axes or dict(zip(self.coordinates, [*kind.rotations, *kind.translations]))
         count = len(axes) or len(self.coordinates)
         if not kind.least <= count <= kind.most:
             words = f"{kind.least}" if kind.least == kind.most else f"{kind.least} to {kind.most}"
-            if count == 0:
-                raise SceneError(
-                    f"{place}: axes needs at least one coordinate"
-                    if self.type == "ball"
-                    else f"{place}: a {self.type} joint has {words} coordinates, name them in axes"
-                )
-            raise SceneError(f"{place}: a {self.type} joint has {words} coordinates, {count} are given")
+            raise SceneError(
+                f"{place}: a {self.type} joint has {words} coordinates, {count} are given; name them in axes"
+            )
         self._check_known(axes, place)
         turning = len(kind.rotations) if self.type != "ball" else count
         made, coordinates = [], {}
@@ -178,7 +167,7 @@ class JointTable(Table):
             if table.motion not in (None, motion):
                 raise SceneError(f"{place}: {name!r} is a {motion} here, not a {table.motion}")
             coordinates[name] = table.coordinate(motion)
-            made.append(TransformAxis(unit(axis, f"{place}: axis {name!r}"), (name,)))
+            made.append(TransformAxis(unit(axis), (name,)))
         return coordinates, tuple(made[:turning]), tuple(made[turning:])
 
     def _custom(self, place):
@@ -190,17 +179,15 @@ class JointTable(Table):
         ]
         named = dict.fromkeys(name for _, table in tables for name in table.coordinates)
         self._check_known(named, place)
-        kinds = {name: self._motion_of(name, tables) for name in named}
-        order = [*self.coordinates, *(name for name in named if name not in self.coordinates)]
         coordinates = {
-            name: self.coordinates.get(name, CoordinateTable()).coordinate(kinds[name]) for name in order
+            name: self.coordinates.get(name, CoordinateTable()).coordinate(self._motion_of(name, tables))
+            for name in {**self.coordinates, **named}
         }
         made = {"rotation": [], "translation": []}
-        for k, (motion, table) in enumerate(tables):
-            at = f"{place}: {motion} {k + 1 - (len(self.rotations) if motion == 'translation' else 0)}"
+        for motion, table in tables:
+            at = f"{place}: {motion} {len(made[motion]) + 1}"
             function = table.function([coordinates[n].motion for n in table.coordinates], motion, place=at)
-            axis = unit(table.axis, f"{at}: axis")
-            made[motion].append(TransformAxis(axis, tuple(table.coordinates), function))
+            made[motion].append(TransformAxis(unit(table.axis), tuple(table.coordinates), function))
         return coordinates, tuple(made["rotation"]), tuple(made["translation"])
 
     def _motion_of(self, name, tables):
@@ -231,15 +218,10 @@ class CouplingTable(FunctionTable):
     of: list[str] = Field(min_length=1)
 
 
-def unit(values: list[float], name: str) -> tuple[float, float, float]:
-    """Return a direction (3,) at length one, or raise SceneError naming it."""
-    vector = np.asarray(values, dtype=float)
-    size = np.linalg.norm(vector)
-    if vector.shape != (3,) or not np.isfinite(size):
-        raise SceneError(f"{name} must be three numbers, got {values!r}")
-    if size == 0:
-        raise SceneError(f"{name} must not be the zero vector")
-    return tuple((vector / size).tolist())
+def unit(axis: list[float]) -> tuple[float, float, float]:
+    """Return an axis (3,), not zero, at length one."""
+    x, y, z = (value / math.hypot(*axis) for value in axis)
+    return x, y, z
 
 
 def full_name(name: str, known: list[str], *, place: str) -> str:
