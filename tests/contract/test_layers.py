@@ -200,7 +200,6 @@ def all_arrows(root=ROOT):
 
 # To be removed; the test fails when one of them is gone, so that this list does not outlive it.
 KNOWN_CYCLES = [
-    ["rbfmuscle.implicit.placement.density", "rbfmuscle.implicit.placement.sampling"],
     ["rbfmuscle.muscle.solid", "rbfmuscle.muscle.solid_contact"],
 ]
 
