@@ -9,7 +9,7 @@ import numpy as np
 from pbd_baseline.rest import RestState
 from pbd_baseline.self_collision.ridges import faces_of
 from rbfmuscle.geometry.arrays import Booleans, Floats
-from rbfmuscle.geometry.crossing import FaceTree, creased_faces
+from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.rigid import smooth_displacement
 from rbfmuscle.jit import compiled
 
@@ -74,9 +74,9 @@ class Untangling:
     def _untangle(self, points, settle):
         faces, among = self.topology.faces, None
         for turn in range(ROUNDS):
-            bad = self._crossing(points, among)
+            bad = self.tree.crossing(points, among)
             if not bad.any() and among is not None:
-                bad = self._crossing(points, None)
+                bad = self.tree.crossing(points)
             if not bad.any():
                 return 0
             marked = np.zeros(len(points), dtype=np.bool_)
@@ -97,15 +97,6 @@ class Untangling:
         area = np.linalg.norm(normals, axis=1)
         lost = max(0.0, before - self.volume.volume(points)) / max(area.sum(), 1e-300)
         points[rows] += (min(lost, MOST * self.edge) + swell) * normals / np.maximum(area, 1e-300)[:, None]
-
-    def _crossing(self, points, among):
-        """Triangles that cross others, of those ``among``, or of all where sheets do or the surface has a crease."""
-        if among is None:
-            bad = self.tree.crossing(points, by_sheets=True)
-            return (
-                bad if bad.any() else self.tree.crossing(points, creased_faces(points, self.topology.faces))
-            )
-        return self.tree.crossing(points, among)
 
     def around(self, marked: Booleans, rings: int) -> Booleans:
         """Vertices within some rings of those marked (n,)."""

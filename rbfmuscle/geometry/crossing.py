@@ -3,7 +3,6 @@
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.geometry.triangles import triangle_normal
 from rbfmuscle.jit import compiled
 
@@ -11,12 +10,6 @@ from rbfmuscle.jit import compiled
 LEAF, BITS = 4, 10
 # Pairs of nodes that wait at a time: less than four for each level of the tree.
 WAITING = 512
-# Triangles close together whose normals are all within this of one direction [radian] are taken for one sheet, so
-# that two of them are less than twice that apart (ALONG is its cosine): well below the right angle by which what goes
-# through a sheet looks away from it on one of its sides.
-ONE_SHEET, ALONG = 0.5, np.cos(2 * 0.5)
-# Cosine between a triangle's normal and that at a corner below which the surface has a crease there.
-CREASED = 0.7
 
 
 class FaceTree:
@@ -44,9 +37,7 @@ class FaceTree:
         self.closed = _is_closed(self.faces)
         self._room = 16 * self.leaves
 
-    def crossing(
-        self, vertices: Floats, among: Booleans | None = None, *, by_sheets: bool = False
-    ) -> Booleans:
+    def crossing(self, vertices: Floats, among: Booleans | None = None) -> Booleans:
         """Which triangles cross others, as `crossing_faces` says, for places of the vertices now.
 
         Parameters
@@ -54,36 +45,28 @@ class FaceTree:
         vertices : (n, 3) ndarray
         among : (m,) ndarray of bool, optional
             Only pairs with one of these triangles.
-        by_sheets : bool
-            Leave out pairs whose normals are less than a radian apart: of a closed surface, what goes through a
-            sheet has another side, which is seen. It takes a third of the time, and may miss single triangles.
         """
         vertices = np.ascontiguousarray(vertices, dtype=np.float64)
         faces, count = self._corners, len(self._corners)
         box, node = np.empty((self.leaves, 6, LEAF)), np.empty((2 * self.leaves, 6))
         _boxes_loop(vertices, faces, box, self.leaves, node)
-        sheets = by_sheets and self.closed
-        cone, units = np.zeros((2 * self.leaves, 4)), np.zeros((count, 3))
-        if sheets:
-            _cones_loop(vertices, faces, self.leaves, (units, cone))
         asked = np.ones(count, dtype=np.bool_) if among is None else among[self.order]
         wanted = np.zeros(2 * self.leaves, dtype=np.bool_)
         _wanted_loop(asked, self.leaves, wanted)
-        plain = np.full(len(vertices), self.closed and not by_sheets, dtype=np.bool_)
-        if plain.any():
+        plain = np.full(len(vertices), self.closed, dtype=np.bool_)
+        if self.closed:
             _plain_loop(vertices, faces, np.zeros_like(vertices), np.zeros(len(vertices), np.int64), plain)
-        pairs = self._pairs((node, cone, wanted), sheets)
         found = np.zeros(count, dtype=np.bool_)
-        _cross_loop(vertices, faces, (pairs, box, units), (asked, plain, sheets), found)
+        _cross_loop(vertices, faces, (self._pairs(node, wanted), box), (asked, plain), found)
         marked = np.zeros(count, dtype=np.bool_)
         marked[self.order] = found
         return marked
 
-    def _pairs(self, tree: tuple[Floats, Floats, Booleans], sheets: bool) -> Integers:
+    def _pairs(self, node: Floats, wanted: Booleans) -> Integers:
         """Pairs (k, 2) of leaves whose boxes touch."""
         while True:
             pairs = np.empty((self._room, 2), dtype=np.int64)
-            count = _pairs_loop(tree, sheets, pairs)
+            count = _pairs_loop(node, wanted, pairs)
             if count <= len(pairs):
                 return pairs[:count]
             self._room = max(self._room, 2 * count)
@@ -120,34 +103,6 @@ def crossing_faces(vertices: Floats, faces: Integers) -> Booleans:
     return FaceTree(vertices, faces).crossing(vertices)
 
 
-def creased_faces(vertices: Floats, faces: Integers) -> Booleans:
-    """Mask (m,) of the triangles at vertices around which the surface is no smooth sheet.
-
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-    faces : (m, 3) ndarray of int
-        Closed, outward.
-    """
-    sharp, found = np.zeros(len(vertices), dtype=np.bool_), np.zeros(len(faces), dtype=np.bool_)
-    _creased_loop(vertices, faces, vertex_normals(vertices, faces), sharp, found)
-    return found
-
-
-@compiled(error_model="numpy")
-def _creased_loop(vertices, faces, normals, sharp, found):
-    """A vertex is sharp where a triangle looks away from its normal by more than the angle of CREASED."""
-    for f in range(len(faces)):
-        x, y, z = triangle_normal(vertices, faces, f)
-        least = CREASED * np.sqrt(x * x + y * y + z * z)
-        for k in range(3):
-            v = faces[f, k]
-            if normals[v, 0] * x + normals[v, 1] * y + normals[v, 2] * z <= least:
-                sharp[v] = True
-    for f in range(len(faces)):
-        found[f] = sharp[faces[f, 0]] or sharp[faces[f, 1]] or sharp[faces[f, 2]]
-
-
 @compiled
 def _boxes_loop(vertices, faces, box, leaves, node):
     """Boxes of the triangles, leaf by leaf, and of the tree's nodes: node k holds those of 2k and 2k + 1."""
@@ -174,53 +129,6 @@ def _wanted_loop(asked, leaves, wanted):
         wanted[leaves + f // LEAF] |= asked[f]
     for k in range(leaves - 1, 0, -1):
         wanted[k] = wanted[2 * k] or wanted[2 * k + 1]
-
-
-@compiled
-def _cones_loop(vertices, faces, leaves, out):
-    """Unit normals, and a cone around those of each node: its axis, and how far another may be from it."""
-    units, cone = out
-    for m in range(len(faces)):
-        x, y, z = triangle_normal(vertices, faces, m)
-        length = max(np.sqrt(x * x + y * y + z * z), 1e-300)
-        units[m, 0], units[m, 1], units[m, 2] = x / length, y / length, z / length
-        for a in range(3):
-            cone[leaves + m // LEAF, a] += units[m, a]
-    for k in range(leaves, 2 * leaves):
-        _normalise(cone, k)
-        first = LEAF * (k - leaves)
-        least = 1.0
-        for m in range(first, min(first + LEAF, len(faces))):
-            along = units[m, 0] * cone[k, 0] + units[m, 1] * cone[k, 1] + units[m, 2] * cone[k, 2]
-            least = min(least, along)
-        cone[k, 3] = np.arccos(max(least, -1.0))
-    for k in range(leaves - 1, 0, -1):
-        for a in range(3):
-            cone[k, a] = cone[2 * k, a] + cone[2 * k + 1, a]
-        _normalise(cone, k)
-        for c in range(2 * k, 2 * k + 2):
-            if cone[c, 0] != 0.0 or cone[c, 1] != 0.0 or cone[c, 2] != 0.0:
-                along = cone[k, 0] * cone[c, 0] + cone[k, 1] * cone[c, 1] + cone[k, 2] * cone[c, 2]
-                cone[k, 3] = max(cone[k, 3], cone[c, 3] + np.arccos(min(max(along, -1.0), 1.0)))
-    # What the axes of two nodes may differ by: the square of the chord of twice what is left of the angle.
-    for k in range(2 * leaves):
-        cone[k, 3] = (2.0 * np.sin(max(ONE_SHEET - cone[k, 3], 0.0))) ** 2
-
-
-@compiled
-def _normalise(cone, k):
-    length = max(np.sqrt(cone[k, 0] ** 2 + cone[k, 1] ** 2 + cone[k, 2] ** 2), 1e-300)
-    for a in range(3):
-        cone[k, a] /= length
-
-
-@compiled
-def _one_sheet(cone, i, j):
-    """Whether all normals of two nodes are near one direction, the mean of the nodes' axes."""
-    square = 0.0
-    for a in range(3):
-        square += (cone[i, a] - cone[j, a]) ** 2
-    return square < min(cone[i, 3], cone[j, 3])
 
 
 @compiled
@@ -269,9 +177,8 @@ def _plain_loop(vertices, faces, normals, turns, plain):
 
 
 @compiled
-def _pairs_loop(tree, sheets, pairs):
+def _pairs_loop(node, wanted, pairs):
     """Pairs of leaves whose boxes touch, from the root down; how many there are, also beyond the room for them."""
-    node, cone, wanted = tree
     leaves = len(node) // 2
     waiting = np.empty((WAITING, 2), dtype=np.int64)
     waiting[0, 0], waiting[0, 1] = 1, 1
@@ -289,17 +196,16 @@ def _pairs_loop(tree, sheets, pairs):
             for q in range(2 * j, 2 * j + 2):
                 if p > q or _apart(node, p, node, q) or not (wanted[p] or wanted[q]):
                     continue
-                if not (sheets and _one_sheet(cone, p, q)):
-                    waiting[count, 0], waiting[count, 1] = p, q
-                    count += 1
+                waiting[count, 0], waiting[count, 1] = p, q
+                count += 1
     return met
 
 
 @compiled
 def _cross_loop(vertices, faces, leaves, asked, found):
     """The triangles of pairs of leaves: which of them touch by their boxes, then which of these cross."""
-    pairs, box, units = leaves
-    among, plain, sheets = asked
+    pairs, box = leaves
+    among, plain = asked
     for k in range(len(pairs)):
         i, j = pairs[k, 0], pairs[k, 1]
         for m in range(LEAF):
@@ -320,15 +226,8 @@ def _cross_loop(vertices, faces, leaves, asked, found):
                     continue
                 if (found[f] and found[g]) or not (among[f] or among[g]):
                     continue
-                if sheets and _along(units, f, g) > ALONG:
-                    continue
                 if _meet(faces, f, g, plain) and _cross(vertices, faces, f, g):
                     found[f], found[g] = True, True
-
-
-@compiled
-def _along(units, f, g):
-    return units[f, 0] * units[g, 0] + units[f, 1] * units[g, 1] + units[f, 2] * units[g, 2]
 
 
 @compiled

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.geometry.crossing import FaceTree, creased_faces, crossing_faces
+from rbfmuscle.geometry.crossing import FaceTree, crossing_faces
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction.material import _Fitting, carry_material, project_to_level_set
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh, _edges_loop
@@ -201,44 +201,6 @@ def test_a_tree_made_at_rest_finds_crossings_later():
     some[np.flatnonzero(expected)[:1]] = True
     assert tree.crossing(moved, some)[some].all()
     assert not tree.crossing(np.asarray(BALL.vertices)).any()
-
-
-@pytest.mark.parametrize("noise", [0.0, 0.02, 0.05, 0.1, 0.3])
-@pytest.mark.parametrize("seed", range(4))
-def test_a_look_by_sheets_sees_whether_anything_crosses(noise, seed):
-    points = np.asarray(BALL.vertices) * [1.0, 0.6, 0.2]
-    tree = FaceTree(points, np.asarray(BALL.faces))
-    moved = points + noise * np.random.default_rng(seed).normal(size=points.shape)
-    quick, exact = tree.crossing(moved, by_sheets=True), tree.crossing(moved)
-    assert quick.any() == exact.any()
-    assert not (quick & ~exact).any()
-
-
-@pytest.mark.parametrize("tilt", [0.0, 0.5, 1.0])
-def test_a_look_by_sheets_sees_a_bump_that_goes_through_the_other_side(tilt):
-    points, away = np.asarray(BALL.vertices) * [1.0, 1.0, 0.2], np.array([np.sin(tilt), 0.0, -np.cos(tilt)])
-    near = np.exp(-(((points[:, :2]) ** 2).sum(axis=1)) / 0.05) * (points[:, 2] > 0)
-    tree = FaceTree(points, np.asarray(BALL.faces))
-    assert tree.crossing(points + 0.8 * near[:, None] * away, by_sheets=True).any()
-
-
-@pytest.mark.parametrize("seed", [9, 15, 26])
-def test_one_vertex_dragged_over_its_neighbours_is_seen_at_its_crease(seed):
-    """A fold within a sheet, which a look by sheets misses."""
-    ball = trimesh.creation.icosphere(subdivisions=4)
-    points, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
-    edge, rng = ball.edges_unique_length.mean(), np.random.default_rng(seed)
-    vertex = rng.integers(len(points))
-    way = np.cross(points[vertex], rng.normal(size=3))
-    moved = points.copy()
-    moved[vertex] += edge * rng.uniform(0.8, 1.4) * way / np.linalg.norm(way)
-    moved[vertex] += 0.1 * edge * rng.normal() * points[vertex]
-    tree = FaceTree(points, faces)
-    expected = crossing_faces(moved, faces)
-    assert expected.any() and not tree.crossing(moved, by_sheets=True).any()
-    creased = creased_faces(moved, faces)
-    assert creased.sum() < 40 and not creased_faces(points, faces).any()
-    np.testing.assert_array_equal(tree.crossing(moved, creased), expected)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05, 0.1, 0.3])

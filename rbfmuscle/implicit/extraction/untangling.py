@@ -3,7 +3,6 @@
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Integers
-from rbfmuscle.geometry.crossing import creased_faces
 from rbfmuscle.implicit.extraction.carried_material import CarriedMaterial
 
 # Rounds of smoothing for triangles that cross others, and how the smoothed region grows with them.
@@ -41,10 +40,7 @@ def untangle(material: CarriedMaterial) -> int:
     touched = np.zeros(len(material.carried), dtype=np.bool_)
     among: Booleans | None = None
     for turn in range(0 if material.field is None else -RETURN, UNTANGLE + 1):
-        # What was not moved does not begin to cross; where nothing crosses, a quick look is enough, and one at creases:
-        # what crosses within a sheet is folded there.
-        if among is None and not material.mesh.tree.crossing(projector.vertices, by_sheets=True).any():
-            among = creased_faces(projector.vertices, faces)
+        # What was not moved does not begin to cross.
         bad = material.mesh.tree.crossing(projector.vertices, among)
         if turn == UNTANGLE or not bad.any():
             break

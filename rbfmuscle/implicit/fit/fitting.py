@@ -45,7 +45,7 @@ KEPT = 1e12
 _DEPENDENT = 1e-9
 
 
-# What a basis without normals holds in their place.
+# Of a basis without normals.
 NO_NORMALS = np.zeros((0, 3))
 
 
@@ -145,7 +145,7 @@ def solve(basis: Basis, right: Floats, *, smoothing: float = 0.0) -> tuple[Float
     NumericalWarning
         Where a ridge was needed.
     """
-    factor = factorise(basis, smoothing)
+    factor = factorise(_smoothed(basis, smoothing), basis.polynomials)
     if factor is not None:
         solution = factor.solve(right)
         if solution[2] < DOUBTFUL:
@@ -161,10 +161,7 @@ def solve_bounded(
 ) -> tuple[Floats, Floats, float]:
     """Weights, polynomial coefficients and an estimate of the condition, which a ridge keeps below the given one.
 
-    Values and derivatives are unknowns of different units. Cholesky's digits do not depend on the choice (van der
-    Sluis 1969), an estimate of the condition does: with derivatives in units of the centres' spacing, and on the
-    weights that annihilate polynomials alone, `quintic` with 300 centres has 2e9 where unit-ball coordinates say 4e11.
-    The ridge is the largest eigenvalue over the bound, in these units.
+    The ridge is the largest eigenvalue over the bound, with derivatives in units of the centres' spacing.
 
     Parameters
     ----------
@@ -202,15 +199,13 @@ def _factorise_bounded(basis: Basis, condition: float, smoothing: float) -> tupl
     """Factor with a ridge, and the units (size,) of its unknowns."""
     # about the spacing of so many centres in the unit ball; a factor of three either way changes little
     count, unit = len(basis.points), 1.0 / math.sqrt(len(basis.points))
-    matrix = basis.matrix()
-    if smoothing:
-        matrix.ravel(order="K")[:: basis.size + 1] += smoothing
+    matrix = _smoothed(basis, smoothing)
     with np.errstate(all="ignore"):  # the upper triangle, which is never read, holds anything
         matrix[count:, :count] *= unit
         matrix[count:, count:] *= unit**2
     scale = np.ones(basis.size)
     scale[count:] = unit
-    factor = factorise_matrix(matrix, np.ascontiguousarray(basis.polynomials * scale), condition=condition)
+    factor = factorise(matrix, np.ascontiguousarray(basis.polynomials * scale), condition=condition)
     if factor is None:
         raise_if_singular(basis)
         raise np.linalg.LinAlgError(
@@ -221,7 +216,7 @@ def _factorise_bounded(basis: Basis, condition: float, smoothing: float) -> tupl
 
 @dataclass(frozen=True)
 class Factor:
-    """What `factorise` leaves of a basis; letters as in the head of this file.
+    """A factored matrix; letters as in the head of this file.
 
     Attributes
     ----------
@@ -265,30 +260,29 @@ class Factor:
         return vector - self.directions @ (self.directions.T @ vector)
 
 
-def factorise(basis: Basis, smoothing: float = 0.0) -> Factor | None:
-    """Factor of A + smoothing I on the weights that annihilate polynomials.
+def _smoothed(basis: Basis, smoothing: float) -> Floats:
+    """The matrix of a basis with the smoothing on its diagonal."""
+    matrix = basis.matrix()
+    if smoothing:
+        matrix.ravel(order="K")[:: basis.size + 1] += smoothing
+    return matrix
+
+
+def factorise(matrix: Floats, polynomials: Floats, *, condition: float = math.inf) -> Factor | None:
+    """Factor of A on the weights that annihilate polynomials.
 
     Parameters
     ----------
-    basis : Basis
-    smoothing : float
+    matrix : (size, size) ndarray
+        A: lower triangle valid, Fortran order; overwritten.
+    polynomials : (q, size) ndarray
+    condition : float
+        Bound: the largest eigenvalue on these weights, over the bound, is added to the diagonal, and is ``norm``.
 
     Returns
     -------
     Factor or None
         None where the matrix is not definite in floating-point numbers, or the polynomials are dependent.
-    """
-    matrix = basis.matrix()
-    if smoothing:
-        matrix.ravel(order="K")[:: basis.size + 1] += smoothing
-    return factorise_matrix(matrix, basis.polynomials)
-
-
-def factorise_matrix(matrix: Floats, polynomials: Floats, *, condition: float = math.inf) -> Factor | None:
-    """Factor of a matrix A (lower triangle valid, Fortran order; overwritten) with polynomials (q, size).
-
-    With a bound of the ``condition`` the largest eigenvalue on the weights that annihilate polynomials, over that
-    bound, is added to the diagonal, and ``norm`` is theirs.
     """
     q, size = polynomials.shape
     norm = largest_eigenvalue(size, lambda vector: blas.dsymv(1.0, matrix, vector, lower=1))
