@@ -11,8 +11,8 @@ import numpy as np
 
 from rbfmuscle.implicit.extraction.sheets import count_sheets
 from rbfmuscle.implicit.extraction.surface import extract_surface
-from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.kernels.table import KERNELS
+from rbfmuscle.implicit.field_fit import FieldFit
+from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
 from rbfmuscle.implicit.selection import spacing
 from rbfmuscle.validation import NumericalWarning
 
@@ -94,7 +94,7 @@ def outcome(kernel, points, normals, shape, judge, bound):
         warnings.simplefilter("always", NumericalWarning)
         try:
             apart = spacing(np.unique(np.asarray(points, dtype=float), axis=0)).mean()
-            field = RBFField.fit_surface(points, normals, kernel=kernel, epsilon=shape / apart)
+            field = FieldFit(get_kernel(kernel), shape / apart, "all").fit(points, normals)
             error = judge(field)
         except (ValueError, np.linalg.LinAlgError) as failed:
             return "refused", None, str(failed)

@@ -67,14 +67,6 @@ class ExactDistance:
     layout : Layout, optional
         Of the same faces with their vertices elsewhere, as in a frame before: halves the time.
 
-    Attributes
-    ----------
-    layout : Layout
-
-    Notes
-    -----
-    About 5 ms to build for 10,000 triangles, and 1 microsecond a point near the surface.
-
     Examples
     --------
     >>> tetrahedron = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]

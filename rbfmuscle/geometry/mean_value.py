@@ -19,8 +19,7 @@ _EXACT = 1e-8
 def mean_value_weights(points: ArrayLike, vertices: ArrayLike, faces: ArrayLike) -> Floats:
     """Weights of a mesh's vertices that give back each point.
 
-    They are smooth inside, sum to one and reproduce every affine motion of the vertices exactly, so a point that
-    they carry goes along with a rigid motion, a stretch or a shear of the mesh without error.
+    They are smooth inside, sum to one and reproduce every affine motion of the vertices exactly.
 
     Parameters
     ----------

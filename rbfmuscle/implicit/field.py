@@ -17,7 +17,6 @@ from rbfmuscle.implicit.evaluation import Terms, evaluate
 from rbfmuscle.implicit.fit.fitting import Basis, solve, solve_bounded
 from rbfmuscle.implicit.fit.systems import check_degree, frame, hermite_system, hermite_weights
 from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
-from rbfmuscle.implicit.placement.off_surface import off_surface_points
 from rbfmuscle.validation import (
     NumericalWarning,
     UsageError,
@@ -188,49 +187,7 @@ class RBFField:
         weights, polynomial = hermite_weights(basis, weights), (coefficients, basis.powers)
         fitted = cls(points, (origin, scale), kernel, epsilon, weights, polynomial, condition, smoothing)
         if kernel.has_epsilon:
-            _warn_if_narrow(fitted, points, normals)
-        return fitted
-
-    @classmethod
-    def fit_surface(
-        cls,
-        points: ArrayLike,
-        normals: ArrayLike,
-        *,
-        kernel: Kernel | str = "cubic",
-        epsilon: float = 1.0,
-        smoothing: float = 0.0,
-        derivatives: str = "all",
-        condition: float = np.inf,
-    ) -> RBFField:
-        """Fit a surface through points with normals, whatever the kernel.
-
-        A Hermite fit where the kernel is C2. Else a fit to values on the surface and off it (Carr et al. 2001): three
-        centres a point, and normals only as good as finite differences.
-
-        Parameters
-        ----------
-        points : (K, 3) array_like
-        normals : (K, 3) array_like
-        kernel, epsilon, smoothing, derivatives, condition
-            As in `fit_hermite`.
-
-        Returns
-        -------
-        RBFField
-        """
-        kernel = get_kernel(kernel)
-        if kernel.hermite:
-            return cls.fit_hermite(
-                points, normals, kernel=kernel, epsilon=epsilon, smoothing=smoothing, derivatives=derivatives,
-                condition=condition,
-            )  # fmt: skip
-        fitted = cls.fit(
-            *off_surface_points(points, normals), kernel=kernel, epsilon=epsilon, smoothing=smoothing,
-            condition=condition,
-        )  # fmt: skip
-        if kernel.has_epsilon:
-            _warn_if_narrow(fitted, points, normals)
+            warn_if_narrow(fitted, points, normals)
         return fitted
 
     def __call__(self, points: ArrayLike) -> Floats:
@@ -266,7 +223,7 @@ def _solve(basis: Basis, right: Floats, smoothing: float, condition: float) -> t
     return solve(basis, right, smoothing=smoothing)
 
 
-def _warn_if_narrow(fitted: RBFField, points: ArrayLike, normals: ArrayLike) -> None:
+def warn_if_narrow(fitted: RBFField, points: ArrayLike, normals: ArrayLike) -> None:
     """Warn where the field does not rise outwards between its centres: the kernel does not reach that far."""
     points, normals = check_points(points), check_vectors(normals, len(points))
     if len(points) < 20:

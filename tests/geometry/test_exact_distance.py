@@ -72,10 +72,11 @@ def test_points_on_corners_edges_and_faces_are_at_zero():
     assert np.abs(tree(box).signed_distance(points)).max() < 1e-15
 
 
-def test_triangles_without_area_count_as_their_longest_edge():
-    vertices = np.array([[0.0, 0, 0], [2, 0, 0], [1, 0, 0], [5, 5, 5]])
+@pytest.mark.parametrize("axis", range(3))
+def test_triangles_without_area_count_as_their_longest_edge(axis):
+    vertices = np.roll([[0.0, 0, 0], [2, 0, 0], [1, 0, 0], [5, 5, 5]], axis, axis=1)
     exact = ExactDistance(vertices, [[0, 1, 2], [3, 3, 3]])
-    points = np.array([[1.0, 3, 0], [-1, 0, 0], [4, 0, 0], [5, 5, 6]])
+    points = np.roll([[1.0, 3, 0], [-1, 0, 0], [4, 0, 0], [5, 5, 6]], axis, axis=1)
     np.testing.assert_allclose(np.abs(exact.signed_distance(points)), [3.0, 1.0, 2.0, 1.0])
 
 
@@ -86,13 +87,6 @@ def test_closed_tells_open_and_inconsistent_meshes_apart():
     assert tree(box).closed
     assert not ExactDistance(box.vertices, box.faces[1:]).closed
     assert not ExactDistance(box.vertices, turned).closed
-
-
-def test_order_of_points_does_not_matter(shape):
-    points = _points(shape)
-    order = np.random.default_rng(1).permutation(len(points))
-    exact = tree(shape)
-    np.testing.assert_allclose(exact.signed_distance(points)[order], exact.signed_distance(points[order]))
 
 
 def test_reach_of_zero_is_refused():

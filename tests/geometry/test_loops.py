@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from pbd_baseline.contraction import _stretch_loop
 from pbd_baseline.shapes import _scale_loop
 from rbfmuscle.geometry.crossing import FaceTree
-from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.fields import LevelField
 from rbfmuscle.geometry.mean_value import mean_value_weights
 from rbfmuscle.geometry.rest_frame import BoneFrame
@@ -124,34 +123,6 @@ def test_scaled_directions_have_the_length_asked_for_and_nothing_stays_nothing()
     _scale_loop(direction, length)
     np.testing.assert_allclose(np.linalg.norm(direction, axis=1), [10.0, 0.0, 0.5])
     np.testing.assert_allclose(np.cross(direction, before), 0.0, atol=1e-12)
-
-
-def test_exact_distance_on_a_few_triangles_is_that_of_libigl_signs_included():
-    vertices, faces = solid()
-    points = np.random.default_rng(6).uniform([2.5, -1.5, 0.0], [7.5, 1.5, 2.0], (60, 3))
-    expected, _, closest, _ = igl.signed_distance(
-        points, vertices, faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-    )[:4]
-    distance, found, _, _ = ExactDistance(vertices, faces).nearest(points)
-    assert (expected < 0).any() and (expected > 0).any()
-    np.testing.assert_allclose(distance, expected, atol=1e-12)
-    np.testing.assert_allclose(found, closest, atol=1e-9)
-
-
-def test_triangles_that_are_segments_or_points_are_as_far_as_these():
-    """Beside a sound triangle: one whose corners lie on a line along each axis, and one that is a point."""
-    axes = [size * unit for unit in np.eye(3) for size in (1.0, 3.0)]
-    vertices = np.array([[0.0, 0, 9], [1, 0, 9], [0, 1, 9], [0, 0, 0], *axes])
-    faces = np.array([[0, 1, 2], [3, 3, 3], [3, 4, 5], [3, 6, 7], [3, 8, 9]])
-    points = np.random.default_rng(7).uniform(-1, 4, (40, 3))
-    distance = np.abs(ExactDistance(vertices, faces).nearest(points)[0])
-    along = np.clip(points, 0.0, 3.0)
-    to_axes = [np.linalg.norm(points - along * unit, axis=1) for unit in np.eye(3)]
-    flat = np.clip(points[:, :2], 0, None)
-    over = np.maximum(flat.sum(axis=1) - 1.0, 0.0)[:, None] / 2.0
-    nearest = np.clip(flat - over, 0, 1)
-    to_face = np.linalg.norm(points - np.column_stack([nearest, np.full(40, 9.0)]), axis=1)
-    np.testing.assert_allclose(distance, np.minimum(np.min(to_axes, axis=0), to_face), atol=1e-12)
 
 
 def test_a_field_less_a_level_is_zero_where_the_field_has_the_level():

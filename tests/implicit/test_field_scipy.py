@@ -1,7 +1,5 @@
 """Interpolation beside SciPy's RBFInterpolator, where the kernels coincide."""
 
-import time
-
 import numpy as np
 import pytest
 from scipy.interpolate import RBFInterpolator
@@ -36,22 +34,3 @@ def test_values_are_those_of_scipy(kernel, count):
     degree = KERNELS[kernel].degree
     expected = RBFInterpolator(points, values, kernel=kernel, epsilon=SHARED[kernel], degree=degree)(where)
     assert np.abs(field(where) - expected).max() < 1e-8
-
-
-@pytest.mark.benchmark
-@pytest.mark.parametrize("kernel", ["cubic", "gaussian"])
-def test_time_beside_scipy(kernel):
-    points, values, _ = problem(1000)
-    where = np.random.default_rng(0).uniform(-1, 1, (64**3, 3))
-    times = {}
-    for name, make in (("ours", RBFField.fit), ("scipy", RBFInterpolator)):
-        fits, evaluations = [], []
-        for _ in range(2):
-            start = time.perf_counter()
-            field = make(points, values, kernel=kernel, epsilon=6.0)
-            middle = time.perf_counter()
-            field(where)
-            fits.append(middle - start)
-            evaluations.append(time.perf_counter() - middle)
-        times[name] = min(fits), min(evaluations)
-    print(f"{kernel}: fit and evaluation, ours {times['ours']}, scipy {times['scipy']} s")

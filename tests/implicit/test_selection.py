@@ -1,6 +1,7 @@
 """Epsilon chosen on a surface: as good as a scan, closed, in one sheet; and how sheets are counted."""
 
 import warnings
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -37,9 +38,7 @@ def both_ways(plate, kernel, epsilon):
     vertices, _, distance, centres, _ = plate
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NumericalWarning)
-        field = RBFField.fit_surface(
-            centres.points, centres.normals, kernel=kernel, epsilon=epsilon, condition=BOUND
-        )
+        field = replace(fit_of(kernel), epsilon=epsilon).fit(centres.points, centres.normals)
         if not count_sheets(field, centres.points, distance.unsigned).sound():
             return np.inf  # sheets of its own away from the surface: no field to use
         found = extract_surface(field, points=centres.points, resolution=48)

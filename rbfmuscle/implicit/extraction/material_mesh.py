@@ -50,7 +50,7 @@ class MaterialMesh:
         """Mask (n,) of the vertices within some rings of marked ones."""
         for _ in range(rings):
             grown = marked.copy()
-            _grow_loop(marked, self.start, self.other, grown)
+            grown[self.other[np.repeat(marked, np.diff(self.start))]] = True
             marked = grown
         return marked
 
@@ -71,14 +71,6 @@ def _edges_loop(vertices, faces):
             total += length
             greatest = max(greatest, length)
     return total / (3.0 * len(faces)), greatest
-
-
-@compiled(error_model="numpy")
-def _grow_loop(marked, start, other, out):
-    for v in range(len(marked)):
-        if marked[v]:
-            for n in range(start[v], start[v + 1]):
-                out[other[n]] = True
 
 
 @compiled(error_model="numpy")
