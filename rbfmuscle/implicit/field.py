@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.implicit.evaluation import Terms, evaluate
 from rbfmuscle.implicit.fit.fitting import Basis, solve, solve_bounded
-from rbfmuscle.implicit.fit.systems import check_degree, frame, hermite_system, hermite_weights
+from rbfmuscle.implicit.fit.systems import check_count, frame, hermite_system, hermite_weights
 from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
 from rbfmuscle.validation import (
     NumericalWarning,
@@ -93,7 +93,6 @@ class RBFField:
         *,
         kernel: Kernel | str = "cubic",
         epsilon: float = 1.0,
-        degree: int | None = None,
         smoothing: float = 0.0,
         condition: float = np.inf,
     ) -> RBFField:
@@ -107,8 +106,6 @@ class RBFField:
         kernel : str or Kernel
         epsilon : float
             Shape parameter [1/scene unit]; without effect on the interpolant of polyharmonic kernels.
-        degree : int, optional
-            Of the polynomial part, -1 for none; the kernel's least by default.
         smoothing : float
             Added to the diagonal, in coordinates scaled to order one; 0 interpolates.
         condition : float
@@ -121,17 +118,17 @@ class RBFField:
         Raises
         ------
         UsageError
-            For an unknown kernel or a degree below the kernel's least.
+            For an unknown kernel.
         numpy.linalg.LinAlgError
             If the system is singular; the message names the likely cause.
         """
         points = check_points(points)
         values = check_values(values, len(points))
         kernel, epsilon = get_kernel(kernel), check_positive(epsilon, name="epsilon")
-        degree = check_degree(kernel, degree, len(points))
+        check_count(kernel, len(points))
         origin, scale = frame(points)
         shape = epsilon * scale if kernel.has_epsilon else 1.0
-        basis = Basis((points - origin) / scale, kernel, shape, degree)
+        basis = Basis((points - origin) / scale, kernel, shape)
         weights, coefficients, condition = _solve(basis, values, smoothing, condition)
         polynomial = coefficients, basis.powers
         return cls(points, (origin, scale), kernel, epsilon, weights, polynomial, condition, smoothing)

@@ -88,7 +88,7 @@ def test_definite_solve_equals_the_augmented_indefinite_one(kernel, kind):
     unit = fibonacci(40)
     radii = np.linspace(0.4, 1.0, 40)[:, None]
     kernel = get_kernel(kernel)
-    basis = Basis(radii * unit * [0.5, 0.7, 1.0], kernel, 2.0, kernel.degree, kind=kind, normals=unit)
+    basis = Basis(radii * unit * [0.5, 0.7, 1.0], kernel, 2.0, kind=kind, normals=unit)
     right = np.random.default_rng(3).normal(size=basis.size)
     weights, coefficients, condition = solve(basis, right)
     q = len(basis.powers)
@@ -101,7 +101,7 @@ def test_definite_solve_equals_the_augmented_indefinite_one(kernel, kind):
 def test_condition_estimate_is_within_a_factor_of_thirty(kernel):
     points = np.random.default_rng(4).uniform(-0.5, 0.5, (200, 3))
     kernel = get_kernel(kernel)
-    basis = Basis(points, kernel, 4.0, kernel.degree)
+    basis = Basis(points, kernel, 4.0)
     _, _, condition = solve(basis, points[:, 0])
     matrix = basis.full_matrix()[: basis.size, : basis.size]
     free = np.linalg.qr(basis.polynomials.T, mode="complete")[0][:, len(basis.powers) :]
@@ -142,9 +142,7 @@ def test_smoothed_fit_minimises_residual_and_energy(kernel):
     rng, kernel, smoothing = np.random.default_rng(0), get_kernel(kernel), 0.02
     points, values = rng.uniform(-1, 1, (40, 3)), rng.normal(size=40)
     origin, scale = frame(points)
-    basis = Basis(
-        (points - origin) / scale, kernel, 1.5 * scale if kernel.has_epsilon else 1.0, kernel.degree
-    )
+    basis = Basis((points - origin) / scale, kernel, 1.5 * scale if kernel.has_epsilon else 1.0)
     full, block = basis.full_matrix()[:40, :40], basis.polynomials
     null = np.linalg.svd(block)[2][len(block) :].T if len(block) else np.eye(40)
     root = np.linalg.cholesky(null.T @ full @ null)
@@ -177,9 +175,7 @@ def test_coplanar_centres_and_high_degree_are_named():
     with pytest.raises(np.linalg.LinAlgError, match="collinear"):
         RBFField.fit(points * [1, 0, 0], points[:, 0])
     with pytest.raises(np.linalg.LinAlgError, match="degree too high"):
-        RBFField.fit(points[:5], points[:5, 0], degree=2)
-    with pytest.raises(UsageError, match="at least 1"):
-        RBFField.fit(points, points[:, 0], degree=0)
+        RBFField.fit(points[:5], points[:5, 0], kernel="quintic")
 
 
 def test_flat_kernel_is_reported():

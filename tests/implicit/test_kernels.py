@@ -143,16 +143,3 @@ def test_wendland_functions_of_dimension_one_are_refused():
     for name in ("wendland_10", "wendland_11", "wendland_12"):
         with pytest.raises(UsageError, match="one dimension only"):
             get_kernel(name)
-
-
-def test_exponent_of_a_family_can_be_chosen():
-    kernel = get_kernel("generalised_multiquadric", parameter=2.5)
-    assert kernel.order == 3 and kernel.phi(1.0) == pytest.approx(-(2**2.5), rel=1e-14)
-    assert get_kernel("skala_cervenka", parameter=0.5).smoothness == 2
-    for name, wrong in (("skala_cervenka", 2.0), ("generalised_multiquadric", 2.0), ("cubic", 1.0)):
-        with pytest.raises(UsageError):
-            get_kernel(name, parameter=wrong)
-
-
-def test_rows_are_numbered_in_order():
-    assert [kernel.id for kernel in KERNELS.values()] == list(range(len(KERNELS)))

@@ -6,9 +6,7 @@ import pytest
 
 from rbfmuscle.implicit.evaluation import Terms, evaluate
 from rbfmuscle.implicit.kernels.radial import _exp_loop, _log_loop
-from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
-
-EVERY = [*KERNELS.values(), get_kernel("generalised_multiquadric", parameter=0.7)]
+from rbfmuscle.implicit.kernels.table import KERNELS
 
 
 def in_units_of_last_place(found, exact):
@@ -46,7 +44,7 @@ def field_terms(centres, weights, epsilon, frame=None, polynomial=None):
 
 
 @pytest.mark.parametrize("epsilon", [0.7, 3.0])
-@pytest.mark.parametrize("kernel", EVERY, ids=lambda kernel: f"{kernel.name}-{kernel.parameter}")
+@pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)
 def test_values_are_sums_of_the_kernel(kernel, epsilon):
     rng = np.random.default_rng(2)
     centres = rng.uniform(-1, 1, (250, 3))
@@ -60,7 +58,7 @@ def test_values_are_sums_of_the_kernel(kernel, epsilon):
         assert np.abs(found - phi @ weights[0]).max() < 1e-14 * (np.abs(phi) @ np.abs(weights[0])).max()
 
 
-@pytest.mark.parametrize("kernel", EVERY, ids=lambda kernel: f"{kernel.name}-{kernel.parameter}")
+@pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)
 @pytest.mark.parametrize("dipoles", [False, True], ids=["values", "hermite"])
 def test_values_and_slopes_are_those_of_the_literal_sum(kernel, dipoles):
     """A few centres, in scaled coordinates off the origin, with a linear polynomial; slopes by central differences."""

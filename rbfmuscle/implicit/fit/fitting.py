@@ -59,7 +59,6 @@ class Basis:
     kernel : Kernel
     epsilon : float
         In scaled coordinates.
-    degree : int
     kind : str
         "value", "gradient" (values and all derivatives) or "normal" (values and normal derivatives).
     normals : (K, 3) ndarray, optional
@@ -71,14 +70,13 @@ class Basis:
         points: Floats,
         kernel: Kernel,
         epsilon: float,
-        degree: int,
         *,
         kind: str = "value",
         normals: Floats = NO_NORMALS,
     ) -> None:
         self.points, self.kernel, self.epsilon = points, kernel, float(epsilon)
         self.kind, self.normals = kind, normals
-        self.powers = assembly.exponents(degree)
+        self.powers = assembly.exponents(kernel.degree)
         if kind == "gradient":
             block = assembly.hermite_polynomials(points, self.powers)
         elif kind == "normal":

@@ -31,13 +31,13 @@ def hermite_system(
     shape = epsilon * scale if kernel.has_epsilon else 1.0
     scaled = (points - origin) / scale
     if derivatives == "all":
-        basis = Basis(scaled, kernel, shape, kernel.degree, kind="gradient")
+        basis = Basis(scaled, kernel, shape, kind="gradient")
         return basis, np.concatenate([np.zeros(len(points)), normals.T.ravel()]) * scale, origin, scale
     lengths = np.linalg.norm(normals, axis=1)
     if not lengths.all():
         raise UsageError(f"normals must not be zero, row {int(np.argmin(lengths))} is")
     unit = normals / lengths[:, None]
-    basis = Basis(scaled, kernel, shape, kernel.degree, kind="normal", normals=unit)
+    basis = Basis(scaled, kernel, shape, kind="normal", normals=unit)
     return basis, np.concatenate([np.zeros(len(points)), lengths]) * scale, origin, scale
 
 
@@ -49,16 +49,12 @@ def hermite_weights(basis: Basis, weights: Floats) -> Floats:
     return np.column_stack([value, along[:, None] * basis.normals])
 
 
-def check_degree(kernel: Kernel, degree: int | None, count: int) -> int:
-    """Degree of the polynomial part for so many points: the kernel's least where None, never below it."""
-    least = kernel.degree
-    degree = least if degree is None else int(degree)
-    if degree < least:
-        raise UsageError(f"degree of kernel '{kernel.name}' must be at least {least}, got {degree}")
+def check_count(kernel: Kernel, count: int) -> None:
+    """Raise LinAlgError where a kernel's polynomial has more terms than there are points."""
+    degree = kernel.degree
     terms = (degree + 1) * (degree + 2) * (degree + 3) // 6
     if terms > count:
         raise np.linalg.LinAlgError(
-            f"degree {degree} has {terms} polynomial terms, more than the {count} points; "
-            "degree too high: lower it or add points"
+            f"degree {degree} of kernel '{kernel.name}' has {terms} polynomial terms, more than the {count} points; "
+            "degree too high: use a kernel of lower order or add points"
         )
-    return degree

@@ -111,7 +111,7 @@ def _base_loop(base, parameter, u, s, b, more):
         for i in range(u.size):
             b[i] = 0.5 * b[i]
     elif base == BINOMIAL:
-        _binomial_loop(parameter, u, b, more)
+        _binomial_loop(parameter, u, b)
     elif base == POWER:
         _log_loop(u, more)
         _exp_loop(0.5 * parameter, more, b)
@@ -123,8 +123,8 @@ def _base_loop(base, parameter, u, s, b, more):
 
 
 @compiled(error_model="numpy")
-def _binomial_loop(beta, u, b, more):
-    """b = (1 + u)**beta, by roots where beta is a half."""
+def _binomial_loop(beta, u, b):
+    """b = (1 + u)**beta for beta = 1.5, 0.5, -0.5 and -1."""
     if beta == 0.5:
         for i in range(u.size):
             b[i] = np.sqrt(1.0 + u[i])
@@ -134,14 +134,9 @@ def _binomial_loop(beta, u, b, more):
     elif beta == -1.0:
         for i in range(u.size):
             b[i] = 1.0 / (1.0 + u[i])
-    elif beta == 1.5:
-        for i in range(u.size):
-            b[i] = (1.0 + u[i]) * np.sqrt(1.0 + u[i])
     else:
         for i in range(u.size):
-            b[i] = 1.0 + u[i]
-        _log_loop(b, more)
-        _exp_loop(beta, more, b)
+            b[i] = (1.0 + u[i]) * np.sqrt(1.0 + u[i])
 
 
 @compiled(error_model="numpy", fastmath={"contract"})

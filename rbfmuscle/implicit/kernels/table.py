@@ -19,7 +19,7 @@ was not checked against the original of 2019, and neither was the default expone
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,8 +38,6 @@ class Kernel:
     Attributes
     ----------
     name : str
-    id : int
-        Row number in the table.
     order : int
         Order m of conditional positive definiteness; polynomials of degree m - 1 must be added.
     compact : bool
@@ -53,7 +51,6 @@ class Kernel:
     """
 
     name: str
-    id: int
     order: int
     compact: bool
     smoothness: int
@@ -236,10 +233,10 @@ _ROWS = [
 
 def _build() -> dict[str, Kernel]:
     kernels = {}
-    for number, (name, order, smooth, compact, has_epsilon, parameter, base, rows) in enumerate(_ROWS):
+    for name, order, smooth, compact, has_epsilon, parameter, base, rows in _ROWS:
         table = np.array(rows(parameter) if callable(rows) else rows)
         table.setflags(write=False)
-        kernels[name] = Kernel(name, number, order, compact, smooth, has_epsilon, parameter, base, table)
+        kernels[name] = Kernel(name, order, compact, smooth, has_epsilon, parameter, base, table)
     return kernels
 
 
@@ -252,21 +249,18 @@ _REFUSED = {
 }
 
 
-def get_kernel(name: Kernel | str, *, parameter: float | None = None) -> Kernel:
+def get_kernel(name: Kernel | str) -> Kernel:
     """Look a kernel up by name.
 
     Parameters
     ----------
     name : str or Kernel
         A key of ``KERNELS``; a Kernel is handed back as it is.
-    parameter : float, optional
-        The exponent of ``generalised_multiquadric`` (beta > 0, no integer) or ``skala_cervenka`` (0 < a < 2).
 
     Raises
     ------
     UsageError
-        For an unknown name (with the nearest right one), a kernel that is not positive definite in three
-        dimensions, or a parameter out of range.
+        For an unknown name (with the nearest right one), or a kernel that is not positive definite in three dimensions.
     """
     if isinstance(name, Kernel):
         return name
@@ -274,18 +268,4 @@ def get_kernel(name: Kernel | str, *, parameter: float | None = None) -> Kernel:
         raise UsageError(f"kernel '{name}' is refused: {_REFUSED[name]}; use wendland_c0, _c2, _c4 or _c6")
     if name not in KERNELS:
         raise UsageError(f"unknown kernel {str(name)!r}, {did_you_mean(name, KERNELS)}")
-    kernel = KERNELS[name]
-    return kernel if parameter is None else _with_parameter(kernel, float(parameter))
-
-
-def _with_parameter(kernel: Kernel, value: float) -> Kernel:
-    if kernel.name == "generalised_multiquadric":
-        if not 0 < value < 4 or value == int(value):
-            raise UsageError(f"beta of {kernel.name} must lie in (0, 4) and be no integer, got {value}")
-        return replace(kernel, parameter=value, order=math.ceil(value), table=np.array(_binomial_rows(value)))
-    if kernel.name == "skala_cervenka":
-        if not 0 < value < 2:
-            raise UsageError(f"a of {kernel.name} must lie in (0, 2) (it is singular at 2), got {value}")
-        smooth = 2 if value <= 1 else 3
-        return replace(kernel, parameter=value, smoothness=smooth, table=np.array(_skala_rows(value)))
-    raise UsageError(f"kernel '{kernel.name}' has no parameter of its own, got {value}")
+    return KERNELS[name]
