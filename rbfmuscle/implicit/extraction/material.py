@@ -1,10 +1,7 @@
 """A triangulation that goes with the material and is brought onto a level set: no grid, one topology.
 
-Marching cubes sees a sheet only where a node of its grid lies inside, so rims come and go with the grid, and sheets
-that come within a cell of each other grow together. A triangulation of the rest surface that the muscle carries
-along starts next to the level set, keeps its topology, and samples the same material in every frame. Vertices go
-onto the zero set of max(f - s, -d) by Newton steps, the level s follows from the volume as for the marched mesh, and
-what a fold of the field or the edge of a bone has turned inside out is smoothed.
+Vertices go onto the zero set of max(f - s, -d) by Newton steps, the level s follows from the volume as for the marched
+mesh, and what a fold of the field or the edge of a bone has turned inside out is smoothed.
 """
 
 from dataclasses import dataclass

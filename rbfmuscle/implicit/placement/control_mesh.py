@@ -1,10 +1,8 @@
-"""Control triangulation: a closed triangle mesh contracted, cluster by cluster, to one vertex a cluster.
+"""Control triangulation: a closed triangle mesh contracted to one vertex for each cluster.
 
-The dual of a clustering (ACVD: Valette & Chassery 2004) is a closed 2-manifold only if every cluster is a
-disc and any two meet in one piece. Here the same triangulation is reached by contracting edges inside each
-cluster, each contraction allowed only where it keeps the manifold (link condition: the ends of the edge share
-exactly two neighbours; Dey et al. 1999). What cannot be contracted goes to a neighbouring cluster. The result
-is therefore closed, 2-manifold and of the input's genus, whatever the clusters look like.
+Edges inside each cluster are contracted where that keeps the manifold (link condition: the ends of the edge share
+exactly two neighbours; Dey et al. 1999); what cannot be contracted goes to a neighbouring cluster. The result is
+closed, 2-manifold and of the input's genus for any clustering.
 """
 
 from __future__ import annotations

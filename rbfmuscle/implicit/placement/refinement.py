@@ -1,9 +1,8 @@
 """Centres and normals that fit the whole surface in the least-squares sense, not only where the centres lie.
 
-A Hermite field is linear in what it is asked for at its centres: values v_j and gradients g_j. Asked for v = 0 and
-the surface's own normals it errs between the centres as it must. Here v and g are what makes the field smallest at many
-points of the surface; a centre of value v_j then moves by -v_j along its normal, so that the field is still one of
-zeros and unit normals, refitted in motion like any other, and takes no more numbers.
+A Hermite field is linear in the values v_j and gradients g_j asked for at its centres. Here these are what makes the
+field smallest at many points of the surface; a centre of value v_j then moves by -v_j along its normal, so that the
+field is still one of zeros and unit normals.
 """
 
 from __future__ import annotations
