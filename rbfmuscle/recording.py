@@ -14,7 +14,7 @@ from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.metrics.joint_gaps import joint_gaps
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.rows import frame_rows, moment_arm_rows
-from rbfmuscle.metrics.summary import LIMITS, Summary, default_limit, describe_verdict
+from rbfmuscle.metrics.summary import LIMITS, Summary, default_limit, describe_verdict, exceeded
 from rbfmuscle.output.runinfo import Clock, Stages, build_info, frame_facts
 from rbfmuscle.output.sinks import Sink
 from rbfmuscle.progress import stage
@@ -66,7 +66,7 @@ class Recording:
             self.share, self._skeleton = self._build(helpers, fields)
 
     def _build(self, helpers, fields):
-        """All muscles, in this process or in several, and what is said of the bones; a refused scene ends the processes."""
+        """All muscles, in this process or in several, and what is found of the bones."""
         if helpers < 2:
             self._check()
             return MuscleGroup(self.scene, fields=fields), _check_skeleton(self.scene)
@@ -168,6 +168,7 @@ class Recording:
             summary=table,
             limits=limits,
             verdict=describe_verdict(table, limits),
+            beyond=exceeded(table, limits),
             options=self.options,
         )
 

@@ -171,17 +171,25 @@ def _in_unit(value, quantity, unit):
     return value / MM_PER_UNIT[unit] if QUANTITIES[quantity][0] == "length" else value
 
 
-def _allowed(quantity, limit, found):
-    """The limit of one muscle: thin ones and those that are slack at rest have their own in place of the default."""
+def muscle_limit(quantity: str, limit: float, found: Mapping[str, Mapping[str, Any]]) -> float:
+    """Limit of one muscle: thin ones and those that are slack at rest have their own in place of the default.
+
+    Parameters
+    ----------
+    quantity : str
+    limit : float
+        Of all muscles, in the unit of ``metrics.csv``.
+    found : dict
+        Facts of the muscle by quantity.
+    """
     unit = found[quantity]["unit"]
-    if limit != _in_unit(LIMITS[quantity].value, quantity, unit) if quantity in LIMITS else True:
+    if quantity not in LIMITS or limit != _in_unit(LIMITS[quantity].value, quantity, unit):
         return limit
     if quantity == "rest_error_rms" and "thickness" in found:
-        thickness = found["thickness"]["first"] * MM_PER_UNIT[unit]
-        return _in_unit(THIN_REST_ERROR, quantity, unit) if thickness < THIN else limit
-    if quantity == "slack" and found["slack"]["first"] is not None:
-        return max(limit, found["slack"]["first"] + MORE_SLACK)
-    return limit
+        thin = found["thickness"]["first"] < _in_unit(THIN, "thickness", unit)
+        return _in_unit(THIN_REST_ERROR, quantity, unit) if thin else limit
+    first = found[quantity]["first"]
+    return max(limit, first + MORE_SLACK) if quantity == "slack" and first is not None else limit
 
 
 def within(quantity: str, worst: float, limit: float) -> bool:
@@ -197,7 +205,7 @@ def exceeded(table: Table, limits: Mapping[str, float]) -> list[tuple[str, str, 
             limit = limits.get(name.partition(":")[0])
             if limit is None:
                 continue
-            limit = _allowed(name, limit, quantities)
+            limit = muscle_limit(name, limit, quantities)
             worst = facts.get("worst")
             worst = math.nan if worst is None else worst  # as a file has it
             if not within(name, worst, limit):
@@ -225,14 +233,14 @@ def describe_verdict(table: Table, limits: Mapping[str, float]) -> str:
         text = f"{len(muscles) - len(wrong)} of {len(muscles)} muscles are within all limits, not {named}"
     if not found:
         return text
-    worst = list({row[0]: row for row in reversed(found)}.values())
-    worst.sort(key=_excess, reverse=True)
-    remedies = dict.fromkeys(
-        f"{LIMITS[name].title}: {LIMITS[name].remedy}" for _, name, *_ in worst[:MOST_NAMED] if name in LIMITS
-    )
-    values = "; ".join(_describe_excess(row, table) for row in worst[:MOST_NAMED])
+    # The worst of each muscle first, then whatever else is beyond a limit.
+    first = sorted({row[0]: row for row in reversed(found)}.values(), key=_excess, reverse=True)
+    named = [*first, *(row for row in found if row not in first)][:MOST_NAMED]
+    remedies = dict.fromkeys(LIMITS[quantity].remedy for _, quantity, *_ in named if quantity in LIMITS)
+    values = "; ".join(_describe_excess(row, table) for row in named)
+    more = f" and {len(found) - len(named)} more" if len(found) > len(named) else ""
     to_do = f". What to do: {'; '.join(remedies)}" if remedies else ""
-    return f"{text}. Worst: {values}{to_do}"
+    return f"{text}. Worst: {values}{more}{to_do}"
 
 
 def _listed(names):

@@ -107,12 +107,8 @@ def _export_animation(
     path = folder / f"{run.name}{SUFFIX_OF[name]}"
     if name == "html":
         from rbfmuscle.output.animation.page import write_animated_page
-        from rbfmuscle.report.labels import coordinate_texts
 
-        told = {
-            entry["frame"]: ", ".join(coordinate_texts(saved.info, entry)) for entry in saved.info["frames"]
-        }
-        write_animated_page(path, run, [f"frame {frame}: {told[frame]}" for frame in frames])
+        write_animated_page(path, run, [saved.caption(frame) for frame in frames])
     elif name == "usd":
         from rbfmuscle.output.animation.usd import write_usd
 

@@ -47,6 +47,7 @@ def build_info(
     summary: dict[str, Any],
     limits: dict[str, float],
     verdict: str,
+    beyond: list[Any],
     options: dict[str, Any],
 ) -> dict[str, Any]:
     """Assemble ``run.json``.
@@ -65,6 +66,7 @@ def build_info(
         Quantity -> limit in the unit of ``metrics.csv``.
     verdict : str
         Which muscles are within the limits, as the terminal and the report say it.
+    beyond : list of (muscle, quantity, worst value, limit, frame)
     options : dict
         What the caller asked for.
 
@@ -90,6 +92,7 @@ def build_info(
         **({"neighbours": clock.stages.neighbours()} if clock.stages.pairs else {}),
         "limits": limits,
         "verdict": verdict,
+        "beyond": beyond,
         "muscles": {name: facts for name, facts in summary.items() if name != "all"},
         "frame_time": summary.get("all", {}).get("time_frame"),
         "frames": frames,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,9 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.output.meshfiles import SUFFIXES, read_mesh
 from rbfmuscle.validation import UsageError
+
+# Coordinates that a caption names at most.
+MOST_SHOWN = 4
 
 
 class SavedRun:
@@ -126,6 +130,12 @@ class SavedRun:
         rows = (r for r in self.metrics if r.quantity == "moment_arm" and muscle in (None, r.muscle))
         return list(dict.fromkeys(r.coordinate for r in rows))
 
+    def caption(self, frame: int) -> str:
+        """Frame number, time and joint coordinates of a frame, as text."""
+        entry = next(entry for entry in self.info["frames"] if entry["frame"] == frame)
+        clock = [f"{entry['time']:.4g} s"] if "time" in entry else []
+        return ", ".join([f"frame {frame}", *clock, *coordinate_texts(self.info, entry)])
+
     def has_surfaces(self) -> bool:
         """Whether there is something to draw."""
         return self.suffix is not None and bool(self.frames)
@@ -160,3 +170,22 @@ class SavedRun:
         text = path.read_text(encoding="utf-8")
         whole = text[: text.rfind("\n") + 1]  # the last line of a run that was killed may be cut
         return list(csv.reader(io.StringIO(whole, newline="")))[1:]
+
+
+def coordinate_texts(info: Mapping[str, Any], entry: Mapping[str, Any]) -> list[str]:
+    """A frame's coordinates as text, each with its unit; of many, those that the motion moves most.
+
+    Parameters
+    ----------
+    info : dict
+        What ``run.json`` holds.
+    entry : dict
+        Of its ``frames``.
+    """
+    values = entry["coordinates"]
+    if len(values) > MOST_SHOWN:
+        tracks = {n: [row["coordinates"].get(n, 0.0) for row in info["frames"]] for n in values}
+        spans = {n: max(track) - min(track) for n, track in tracks.items()}
+        values = {n: values[n] for n in sorted(values, key=lambda n: -spans[n])[:MOST_SHOWN]}
+    units = info["scene"].get("coordinate_units", {})
+    return [f"{name} {value:.4g}{units.get(name, '°')}" for name, value in values.items()]

@@ -1,4 +1,4 @@
-"""Colours of muscles and directions of view, shared by pictures, plots, pages and exported files."""
+"""Groups of muscles and directions of view, shared by pictures, plots and pages."""
 
 from __future__ import annotations
 
@@ -9,12 +9,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 
-BONE_COLOUR = "#e9e0cd"
 BACKGROUND = "#ffffff"
-# Told apart by people who are colour-blind (P. Tol, "muted"); its sand is left out, as bones have that colour.
-MUSCLE_COLOURS = ("#cc6677", "#332288", "#44aa99", "#882255", "#88ccee", "#117733", "#aa4499", "#999933")
-# How much nearer to white or black the muscles of one group are, one after the other.
-_SHADES = (0.0, 0.3, -0.25)
 # From the subject to the camera; z is up, as in the medical axes (left, posterior, superior).
 VIEWS = {
     "front": ((0.0, -1.0, 0.12), "from -y"),
@@ -56,39 +51,6 @@ def muscle_groups(info: Mapping[str, Any]) -> dict[str, str]:
         shared = [bone for bone in (chains[0] if chains else []) if all(bone in one for one in chains)]
         groups[muscle["name"]] = f"across {', '.join(names)}" if names else f"along {(shared or ['?'])[0]}"
     return groups
-
-
-def muscle_colours(names: Sequence[str], groups: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Dict of muscle name to its colour in pictures and plots; of many muscles a hue for each group.
-
-    Parameters
-    ----------
-    names : sequence of str
-    groups : dict of str to str, optional
-        From `muscle_groups`.
-    """
-    if groups is None or len(names) <= len(MUSCLE_COLOURS):
-        return {name: MUSCLE_COLOURS[k % len(MUSCLE_COLOURS)] for k, name in enumerate(names)}
-    kinds = list(dict.fromkeys(groups[name] for name in names))
-    found, seen = {}, dict.fromkeys(kinds, 0)
-    for name in names:
-        kind = groups[name]
-        hue = MUSCLE_COLOURS[kinds.index(kind) % len(MUSCLE_COLOURS)]
-        found[name] = mixed_colour(hue, _SHADES[seen[kind] % len(_SHADES)])
-        seen[kind] += 1
-    return found
-
-
-def mixed_colour(colour: str, share: float) -> str:
-    """A colour brought nearer to white (share above 0) or to black (below)."""
-    values = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
-    end = 255 if share > 0 else 0
-    return "#" + "".join(f"{round(value + abs(share) * (end - value)):02x}" for value in values)
-
-
-def rgb(colour: str) -> Floats:
-    """Red, green and blue (3,) of a colour like "#cc6677", 0 to 1."""
-    return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255.0
 
 
 def motion_direction(poses: Sequence[Mapping[str, Floats]]) -> Floats:

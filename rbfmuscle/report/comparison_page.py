@@ -14,8 +14,9 @@ from rbfmuscle.experiments.comparison import AGAINST, MEASURES, best_models
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.metrics.quantities import ALL
+from rbfmuscle.output.colours import MUSCLE_COLOURS
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.appearance import MUSCLE_COLOURS, motion_direction
+from rbfmuscle.report.appearance import motion_direction
 from rbfmuscle.report.page import (
     BAD,
     GOOD,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rbfmuscle.geometry.arrays import Integers
 from rbfmuscle.report.appearance import BACKGROUND
@@ -11,37 +11,8 @@ from rbfmuscle.report.appearance import BACKGROUND
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-    from rbfmuscle.output.saved import SavedRun
 
 _LINE, _CHIP = 22, 17
-# Coordinates that a caption names at most.
-MOST_SHOWN = 4
-
-
-def caption(saved: SavedRun, frame: int) -> str:
-    """Frame number and joint angles, as text."""
-    entry = next(entry for entry in saved.info["frames"] if entry["frame"] == frame)
-    clock = [f"{entry['time']:.4g} s"] if "time" in entry else []
-    return ", ".join([f"frame {frame}", *clock, *coordinate_texts(saved.info, entry)])
-
-
-def coordinate_texts(info: Mapping[str, Any], entry: Mapping[str, Any]) -> list[str]:
-    """A frame's coordinates as text, each with its unit; of many, those that the motion moves most.
-
-    Parameters
-    ----------
-    info : dict
-        What ``run.json`` holds.
-    entry : dict
-        Of its ``frames``.
-    """
-    values = entry["coordinates"]
-    if len(values) > MOST_SHOWN:
-        tracks = {n: [row["coordinates"].get(n, 0.0) for row in info["frames"]] for n in values}
-        spans = {n: max(track) - min(track) for n, track in tracks.items()}
-        values = {n: values[n] for n in sorted(values, key=lambda n: -spans[n])[:MOST_SHOWN]}
-    units = info["scene"].get("coordinate_units", {})
-    return [f"{name} {value:.4g}{units.get(name, '°')}" for name, value in values.items()]
 
 
 def labelled(image: Integers, text: str, titles: Sequence[str], chips: Mapping[str, str]) -> Image:

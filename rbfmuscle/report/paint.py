@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.output.colours import rgb
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.appearance import rgb
 from rbfmuscle.validation import UsageError
 
 COLOURINGS = ("muscle", "activation")

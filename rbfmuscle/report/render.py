@@ -9,19 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.output.colours import BONE_COLOUR, MUSCLE_COLOURS, muscle_colours, rgb
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report.appearance import (
     BACKGROUND,
-    BONE_COLOUR,
-    MUSCLE_COLOURS,
     USUAL_VIEWS,
     VIEWS,
     motion_direction,
-    muscle_colours,
     muscle_groups,
-    rgb,
 )
-from rbfmuscle.report.labels import caption, labelled
+from rbfmuscle.report.labels import labelled
 from rbfmuscle.report.paint import activations, check_colouring, scale_chips, scale_colours
 from rbfmuscle.report.raster import Solid, aim, draw_solids, fitted_size
 from rbfmuscle.validation import SolveError, UsageError
@@ -92,7 +89,7 @@ def draw_panels(
     return [
         labelled(
             np.concatenate([panel.draw(frame) for panel in panels], axis=1),
-            caption(panels[0].saved, frame),
+            panels[0].saved.caption(frame),
             titles,
             chips,
         )

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES
-from rbfmuscle.metrics.summary import LEAST, describe_verdict, exceeded, within
+from rbfmuscle.metrics.summary import LEAST, exceeded, muscle_limit, within
 from rbfmuscle.output.animation.moving import read_moving
 from rbfmuscle.output.animation.page import pack_runs
+from rbfmuscle.output.colours import muscle_colours
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.appearance import motion_direction, muscle_colours, muscle_groups
-from rbfmuscle.report.labels import caption
+from rbfmuscle.report.appearance import motion_direction, muscle_groups
 from rbfmuscle.report.page import (
     BAD,
     GOOD,
@@ -38,12 +38,12 @@ from rbfmuscle.report.render import chosen_frames, draw_preview
 # What the rows beside the picture say, and the quantities that each holds to a limit.
 LIGHTS = {
     "Keeps its volume": ("volume_error",),
-    "Stays out of bones": ("penetration_max", "bone_penetration_max", "solver_penetration_max"),
-    "Is the scanned shape at rest": ("rest_error_rms", "rest_error_max"),
-    "Is one closed piece": ("components", "euler", "self_crossing", "unfitted_fraction"),
-    "Moves without jumps": ("flicker_rms", "flicker_max", "tunnelled"),
+    "Stays out of bones": ("penetration_max", "bone_penetration_max", "initial_overlap", "tunnelled"),
+    "Is the scanned shape at rest": ("rest_error_rms", "end_gap"),
+    "Is one closed piece": ("components", "euler", "self_crossings", "unfitted_fraction"),
+    "Moves without jumps": ("flicker", "slack"),
 }
-COUNTS = ("components", "euler", "self_crossing", "tunnelled")
+COUNTS = ("components", "euler", "self_crossings", "tunnelled")
 # Title, quantity, factor, unit (None: the scene's), whether it can be of either sign.
 PANELS = (
     ("Length", "length", 1.0, None, False),
@@ -115,7 +115,7 @@ def packed_scene(runs: Mapping[str, SavedRun]) -> str:
     groups = muscle_groups(first.info)
     return pack_runs(
         {title: read_moving(run, frames, unit=run.units) for title, run in runs.items()},
-        [caption(first, frame) for frame in frames],
+        [first.caption(frame) for frame in frames],
         direction=motion_direction([first.poses[frame] for frame in frames]),
         groups=groups if len(first.muscles) > 1 else {},
         colours=muscle_colours(first.muscles, groups),
@@ -125,10 +125,9 @@ def packed_scene(runs: Mapping[str, SavedRun]) -> str:
 def _page(saved: SavedRun) -> Page:
     info = saved.info
     complete = info["status"] == "complete"
-    answer = describe_verdict(info["muscles"], info["limits"])
+    answer = info["verdict"]
     if not complete:
         answer = f"the run ended early ({info['status']}): {info['message'] or ''}"
-    beyond = exceeded(info["muscles"], info["limits"])
     sections = [
         *_plots(saved),
         Section("Every quantity of every muscle", _summary(saved), "worst frame of each"),
@@ -145,7 +144,7 @@ def _page(saved: SavedRun) -> Page:
         info["scene"]["name"],
         _facts(saved),
         sentence(answer),
-        BAD if beyond or not complete else GOOD,
+        BAD if info["beyond"] or not complete else GOOD,
         lights=_lights(saved),
         sections=sections,
         footer=", ".join(f"{name} {value}" for name, value in info["versions"].items()),
@@ -184,11 +183,12 @@ def _light(saved: SavedRun, title: str, quantities: Sequence[str]) -> Light | No
             facts = table_.get(name)
             if facts and limits.get(name) is not None and muscle != ALL:
                 worst = math.nan if facts.get("worst") is None else facts["worst"]
-                found.append((_excess(name, worst, limits[name]), muscle, name, worst, facts))
+                limit = muscle_limit(name, limits[name], table_)
+                found.append((_excess(name, worst, limit), muscle, name, worst, facts, limit))
     if not found:
         return None
-    _, muscle, name, worst, facts = max(found, key=lambda entry: entry[0])
-    unit, limit = facts["unit"], limits[name]
+    _, muscle, name, worst, facts, limit = max(found, key=lambda entry: entry[0])
+    unit = facts["unit"]
     sign = "≥" if name in LEAST else "≤"
     state = limit_state(worst, limit, least=name in LEAST, count=name in COUNTS)
     note = f"{name}: {muscle}, frame {facts.get('worst_frame', '–')}".replace("_", " ")
@@ -268,7 +268,8 @@ def _summary(saved: SavedRun) -> str:
         head.append(f"{name.replace('_', ' ')}{'' if unit == '1' else f' [{unit}]'}{limit}")
     rows = []
     for muscle, found in muscles.items():
-        cells = [_cell(name, found.get(name), limits.get(name)) for name in used]
+        own = {name: muscle_limit(name, limits[name], found) for name in used if name in limits and name in found}
+        cells = [_cell(name, found.get(name), own.get(name)) for name in used]
         rows.append((-sum(cell.state == BAD for cell in cells), [muscle, *cells]))
     return table(head, [row for _, row in sorted(rows, key=lambda row: row[0])], find=len(rows) > 8)
 

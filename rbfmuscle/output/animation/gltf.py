@@ -15,7 +15,8 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
-from rbfmuscle.output.animation.moving import MovingBone, MovingMuscle, MovingRun, linear_rgb
+from rbfmuscle.output.animation.moving import MovingBone, MovingMuscle, MovingRun
+from rbfmuscle.output.colours import linear_rgb
 from rbfmuscle.validation import UsageError
 
 _FLOAT, _INT = 5126, 5125

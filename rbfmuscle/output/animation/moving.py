@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.output.colours import BONE_COLOUR, muscle_colours, rgb
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.appearance import BONE_COLOUR, muscle_colours
 from rbfmuscle.scene.objects import MM_PER_UNIT
 
 # Frames a second of a motion that has no times of its own: frame k of the run is frame k of the animation.
@@ -94,7 +94,7 @@ def read_moving(saved: SavedRun, frames: list[int], *, unit: str, up: str = "z")
         vertices, faces = saved.bone(name)
         poses = np.array([saved.poses[frame][name] for frame in frames])
         poses[:, :3, 3] *= factor
-        bones.append(MovingBone(name, _rgb(BONE_COLOUR), vertices * factor, faces, poses))
+        bones.append(MovingBone(name, rgb(BONE_COLOUR), vertices * factor, faces, poses))
     times = saved.times or {frame: frame / FRAMES_A_SECOND for frame in frames}
     name = str(saved.info["scene"].get("name") or Path(saved.directory).name)
     at = np.array([times[frame] for frame in frames], dtype=float)
@@ -108,13 +108,4 @@ def _read_muscle(saved, name, frames, factor):
         same = faces and np.array_equal(faces[0], triangles)
         vertices.append(points * factor)
         faces.append(faces[0] if same else triangles)
-    return MovingMuscle(name, _rgb(muscle_colours(saved.muscles)[name]), vertices, faces)
-
-
-def _rgb(colour):
-    return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255.0
-
-
-def linear_rgb(colour: Floats) -> Floats:
-    """A colour (3,) as screens show it in the linear light that USD and glTF count in."""
-    return np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
+    return MovingMuscle(name, rgb(muscle_colours(saved.muscles)[name]), vertices, faces)

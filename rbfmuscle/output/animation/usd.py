@@ -14,8 +14,8 @@ from rbfmuscle.output.animation.moving import (
     MovingBone,
     MovingMuscle,
     MovingRun,
-    linear_rgb,
 )
+from rbfmuscle.output.colours import linear_rgb
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import MissingPartError
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rbfmuscle.geometry.surfaces import edge_lengths, unique_edges
-from rbfmuscle.report.labels import coordinate_texts
+from rbfmuscle.output.saved import coordinate_texts
 from rbfmuscle.report.viewer.viewer import View, Viewer
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import UsageError

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.surfaces import vertex_normals
-from rbfmuscle.report.appearance import BACKGROUND, BONE_COLOUR, muscle_colours
+from rbfmuscle.output.colours import BONE_COLOUR, muscle_colours
+from rbfmuscle.report.appearance import BACKGROUND
 from rbfmuscle.report.viewer.viewer import COLOURINGS
 from rbfmuscle.validation import MissingPartError
 

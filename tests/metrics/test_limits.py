@@ -1,0 +1,168 @@
+"""The limits that a run is held to, row by row, and the sentence that says which muscles keep to them."""
+
+import re
+
+import numpy as np
+import pytest
+import trimesh
+from blend_model import arm_scene, use_blend_model
+
+from rbfmuscle.metrics.joint_gaps import joint_gaps
+from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, unit_text
+from rbfmuscle.metrics.summary import (
+    LIMITS,
+    Summary,
+    default_limit,
+    describe_verdict,
+    exceeded,
+    parse_limits,
+    shown_number,
+)
+from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.run import simulate, stream_run
+from rbfmuscle.validation import LimitExceededError
+
+# Of issue and docs, in millimetres: what is just allowed, and what is not.
+TABLE = {
+    "volume_error": (1e-9, 1.1e-9),
+    "penetration_max": (0.1, 0.11),
+    "bone_penetration_max": (0.3, 0.31),
+    "initial_overlap": (0.3, 0.31),
+    "rest_error_rms": (0.6, 0.61),
+    "flicker": (0.5, 0.51),
+    "self_crossings": (0, 1),
+    "components": (1, 2),
+    "euler": (2, 0),
+    "slack": (1.03, 1.04),
+    "end_gap": (25.0, 25.1),
+    "unfitted_fraction": (0.9, 1.0),
+    "tunnelled": (0, 1),
+    "bone_overlap": (0.0, 0.06),
+    "joint_gap": (5.0, 5.1),
+}
+
+
+def facts(values, *, units="mm", muscle="psoas", **others):
+    """Table of a run in which a muscle has these values, frame by frame, and another none."""
+    summary = Summary()
+    rows = [(muscle, values), ("other", {"components": [1.0]}), *others.items()]
+    for name, quantities in rows:
+        for quantity, series in quantities.items():
+            unit = unit_text(QUANTITIES[quantity][0], units)
+            summary.add(Row(k, "", 0.0, name, quantity, value, unit) for k, value in enumerate(series))
+    return summary.table()
+
+
+@pytest.mark.parametrize("units", ["mm", "m"])
+@pytest.mark.parametrize("quantity", TABLE)
+def test_each_row_of_the_table_is_kept_up_to_its_limit_and_broken_beyond(quantity, units):
+    scale = 0.001 if units == "m" and QUANTITIES[quantity][0] == "length" else 1.0
+    limits = {name: default_limit(name, arm_scene(units=units)) for name in LIMITS}
+    # Slack at rest and twice in the motion: a muscle that is straight at rest.
+    allowed, beyond = (
+        {quantity: [1.0 if quantity == "slack" else scale * v, scale * v]} for v in TABLE[quantity]
+    )
+    assert exceeded(facts(allowed, units=units), limits) == []
+    assert "every muscle is within all limits" in describe_verdict(facts(allowed, units=units), limits)
+    ((muscle, name, worst, limit, _),) = exceeded(facts(beyond, units=units), limits)
+    assert (muscle, name, limit) == ("psoas", quantity, pytest.approx(scale * LIMITS[quantity].value))
+    assert worst == pytest.approx(scale * TABLE[quantity][1])
+    told = describe_verdict(facts(beyond, units=units), limits)
+    assert told.startswith("1 of 2 muscles are within all limits, not psoas. Worst: psoas, ")
+    assert LIMITS[quantity].remedy in told and shown_number(worst) in told
+
+
+def test_the_table_is_complete():
+    assert set(TABLE) == set(LIMITS)
+
+
+@pytest.mark.parametrize(
+    ("thickness", "error", "kept"), [(9.9, 0.95, True), (10.1, 0.95, False), (9.9, 1.05, False)]
+)
+def test_a_thin_muscle_may_have_a_larger_rest_error(thickness, error, kept):
+    table = facts({"rest_error_rms": [error], "thickness": [thickness]})
+    assert (exceeded(table, {"rest_error_rms": 0.6}) == []) == kept
+    # A limit that is asked for is taken as it is.
+    assert exceeded(table, {"rest_error_rms": 0.9}) != []
+
+
+@pytest.mark.parametrize(
+    ("rest", "later", "kept"), [(1.05, 1.07, True), (1.05, 1.09, False), (1.0, 1.031, False)]
+)
+def test_a_muscle_that_is_slack_at_rest_may_be_a_little_more_so(rest, later, kept):
+    assert (exceeded(facts({"slack": [rest, later]}), {"slack": 1.03}) == []) == kept
+
+
+def test_not_a_number_is_beyond_every_limit():
+    assert [row[1] for row in exceeded(facts({"volume_error": [np.nan]}), {"volume_error": 1.0})] == [
+        "volume_error"
+    ]
+
+
+def test_the_worst_by_its_limit_is_named_first_and_bones_are_named_too():
+    values = {"penetration_max": [0.2], "volume_error": [1e-6]}
+    table = facts(values, teres={"flicker": [0.0, 3.0]}, **{ALL: {"joint_gap": [0.0, 8.0]}})
+    told = describe_verdict(table, {name: limit.value for name, limit in LIMITS.items()})
+    assert told.startswith(
+        "1 of 3 muscles are within all limits, not psoas, teres. Worst: psoas, volume error 1e-06 at frame 0 "
+        "(limit 1e-09); teres, flicker 3 mm at frame 1 (limit 0.5); the bones, joint that opens 8 mm at frame 1"
+    )
+    assert [told.count(LIMITS[name].remedy) for name in ("flicker", "joint_gap")] == [1, 1]
+
+
+def test_numbers_are_shown_as_people_read_them():
+    assert [shown_number(v) for v in (4.11e-15, -2e-13, 0.0, 0.12345, -31.26)] == [
+        "< 1e-12", "< 1e-12", "0", "0.123", "-31.3",
+    ]  # fmt: skip
+
+
+def test_limits_of_the_command_line_follow_the_unit():
+    limits = parse_limits("all", arm_scene(units="m"))
+    assert limits["penetration_max"] == pytest.approx(0.0001) and limits["volume_error"] == 1e-9
+    assert parse_limits("flicker=2,euler", arm_scene()) == {"flicker": 2.0, "euler": 2.0}
+
+
+def shifted_arm(shift):
+    """The arm with its muscle moved down, into the bones, or up, away from them."""
+    scene = arm_scene(end=10)
+    scene.muscles[0].mesh.apply_translation([0.0, 0.0, shift])
+    return scene
+
+
+@pytest.mark.parametrize(
+    ("shift", "quantity", "least"), [(-2.5, "initial_overlap", 0.3), (40.0, "end_gap", 25.0)]
+)
+def test_overlap_and_ends_away_from_bones_are_seen_in_a_run(shift, quantity, least, monkeypatch, tmp_path):
+    use_blend_model(monkeypatch)
+    scene = shifted_arm(shift).with_options({"contact.initial": "keep"})
+    assert simulate(arm_scene(end=10)).values("biceps", quantity)[0] < least
+    info = stream_run(scene, tmp_path, pictures=False)  # a warning by default
+    found = {row[1]: row[2] for row in info["beyond"]}
+    assert found[quantity] > least and LIMITS[quantity].title in info["verdict"]
+    assert SavedRun(tmp_path).info["verdict"] == info["verdict"]
+    with pytest.raises(LimitExceededError, match=quantity) as caught:
+        stream_run(scene, tmp_path, fail_on="all", pictures=False)
+    assert caught.value.exit_code == 6
+
+
+def test_a_joint_that_opens_is_measured_and_one_that_is_apart_at_rest_is_not():
+    scene = arm_scene()
+    scene.joints.clear()
+    scene.add_joint("elbow", "upper", "fore", (0, 0, 30), {"flexion": (0, -1, 0)})  # far from where the bones meet
+    rest = 4.0  # between the ends of the boxes
+    (_, parent, child, closed), (*_, opened) = joint_gaps(scene, [0, 2])
+    assert (parent, child, closed) == ("upper", "fore", 0.0)
+    turned = trimesh.transformations.rotation_matrix(np.radians(-20.0), [0, 1, 0], [0, 0, 30.0])
+    corners = trimesh.transform_points(scene.bones[1].mesh.vertices, turned)
+    gaps = np.linalg.norm(corners[:, None] - np.asarray(scene.bones[0].mesh.vertices), axis=2)
+    assert opened == pytest.approx(gaps.min() - rest) and opened > 5.0
+    scene.bones[1].mesh.apply_translation([20.0, 0.0, 0.0])
+    assert joint_gaps(scene, [0, 2]) == []
+
+
+def test_terminal_and_report_say_the_same(monkeypatch, tmp_path):
+    use_blend_model(monkeypatch)
+    info = stream_run(arm_scene(end=10), tmp_path, settings={"output.report": True}, pictures=False)
+    page = re.sub(r"\s+", " ", (tmp_path / "report.html").read_text(encoding="utf-8"))
+    said = info["verdict"][1:]  # capitalised on the page
+    assert said.replace("<", "&lt;") in page
