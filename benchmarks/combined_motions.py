@@ -28,7 +28,7 @@ STEP = 1.5
 WALK, FARTHEST, SEED = 40, 20.0, 7
 # What is shown of each muscle, its greatest over the frames, and the flicker that is wanted [mm].
 WORST = (
-    "self_crossing", "flicker_max", "flicker_rms", "unfitted_fraction", "penetration_max", "bone_penetration_max",
+    "self_crossings", "flicker", "unfitted_fraction", "penetration_max", "bone_penetration_max",
     "volume_error",
 )  # fmt: skip
 FLICKER = 0.5
@@ -142,7 +142,7 @@ def measure(scene: rm.Scene, model: str | None) -> tuple[list[tuple], float]:
         }
         euler = run.values(name, "euler")
         worst = {q: abs(run.values(name, q)).max(initial=0.0) for q in WORST if q in run.summary[name]}
-        flicker = run.values(name, "flicker_max")
+        flicker = run.values(name, "flicker")
         worst["steady"], worst["leap"] = steady_flicker(run, name)
         rows.append((name, int((euler != 2).sum()), len(euler), int((flicker > FLICKER).sum()), worst, count))
     return rows, spent
@@ -153,14 +153,14 @@ def show(title: str, frames: int, rows: list[tuple], spent: float) -> None:
     print(f"\n{title}: {frames} frames, {spent:.2f} s of processor time each, measures included")
     print(
         "| muscle | frames with handles | crossing | flicker max (frames over 0.5) | of steady material "
-        "| leap | rms | unfitted | surface in bones "
+        "| leap | unfitted | surface in bones "
         "| bones in muscle | volume | unresolved | grazed | held back |"
     )
-    print("|---" * 14 + "|")
+    print("|---" * 13 + "|")
     for name, handles, count, over, worst, events in rows:
         print(
-            f"| {name} | {handles} of {count} | {worst['self_crossing']:.0f} | {worst['flicker_max']:.2f} ({over}) "
-            f"| {worst['steady']:.2f} | {worst['leap']:.1f} | {worst['flicker_rms']:.3f} "
+            f"| {name} | {handles} of {count} | {worst['self_crossings']:.0f} | {worst.get('flicker', 0.0):.2f} ({over}) "
+            f"| {worst['steady']:.2f} | {worst['leap']:.1f} "
             f"| {worst.get('unfitted_fraction', 0.0):.3f} "
             f"| {worst['penetration_max']:.3f} | {worst['bone_penetration_max']:.3f} "
             f"| {worst['volume_error']:.0e} | {events['unresolved']} | {events['grazed']} | {events['held_back']} |",

@@ -50,7 +50,7 @@ class Faults:
         vertices, faces = surface.vertices, np.asarray(surface.faces)
         depth = surface_depth(vertices, probes, frame.poses)
         held = self.held if len(vertices) == len(self.held) else np.zeros(len(vertices), dtype=bool)
-        form = self.form.measure(surface)
+        form = self.form.measure(surface, same_faces=bool(self.rows))
         volume = mesh_volume(vertices, faces)
         away = 0.0
         if not self.rows:

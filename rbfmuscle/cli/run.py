@@ -141,6 +141,8 @@ def _run_scene(scene, output, *, as_json, **asked):
 
 def _print_summary(muscles, units):
     """The worst of each muscle over all frames; lengths in the scene's unit."""
+    from rbfmuscle.metrics.summary import shown_number
+
     muscles = {name: facts for name, facts in muscles.items() if any(key in facts for key in SHOWN)}
     if muscles:
         width = max(len(name) for name in muscles)
@@ -148,4 +150,4 @@ def _print_summary(muscles, units):
         print(" ".join([" " * width, *(f"{key:>22}" for key in SHOWN)]))
     for name, facts in muscles.items():
         worst = [abs(facts.get(key, {}).get("worst", math.nan)) for key in SHOWN]
-        print(" ".join([f"{name:{width}}", *(f"{value:22.3g}" for value in worst)]))
+        print(" ".join([f"{name:{width}}", *(f"{shown_number(value):>22}" for value in worst)]))

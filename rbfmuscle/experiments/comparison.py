@@ -59,11 +59,8 @@ MEASURES = {
     ),
     "components": Measure("pieces", "1", LAW, 0.0, "connected pieces of the surface, most in any frame"),
     "euler": Measure("Euler characteristic", "1", LAW, 0.0, "2 for a sphere, two less for a handle", 2.0),
-    "self_crossing": Measure("self-crossing", "1", LAW, 0.0, "triangles that cross others of the surface"),
-    "flicker_rms": Measure(
-        "flicker (RMS)", "length", LAW, 0.01, "surface against carried mesh, frame to frame"
-    ),
-    "flicker_max": Measure("flicker (greatest)", "length", LAW, 0.05, "the same, greatest"),
+    "self_crossings": Measure("self-crossing", "1", LAW, 0.0, "triangles that cross others of the surface"),
+    "flicker": Measure("flicker", "length", LAW, 0.05, "surface against carried mesh, frame to frame"),
     "tunnelled": Measure("tunnelled points", "1", LAW, 0.0, "points beyond a bone"),
     "return_rms": Measure(
         "return error (RMS)", "length", LAW, 0.02, "first pose before and after the motion"

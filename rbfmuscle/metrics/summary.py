@@ -228,9 +228,11 @@ def describe_verdict(table: Table, limits: Mapping[str, float]) -> str:
         text = "nothing was measured"
     elif not wrong:
         text = "every muscle is within all limits in every frame"
+    elif len(muscles) == 1:
+        text = f"{muscles[0]} is not within all limits"
     else:
-        named = _listed(wrong)
-        text = f"{len(muscles) - len(wrong)} of {len(muscles)} muscles are within all limits, not {named}"
+        right = len(muscles) - len(wrong)
+        text = f"{right} of {len(muscles)} muscles are within all limits, not {_listed(wrong)}"
     if not found:
         return text
     # The worst of each muscle first, then whatever else is beyond a limit.

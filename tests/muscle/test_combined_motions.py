@@ -31,7 +31,7 @@ def test_phantom_in_a_combined_motion(muscle):
     scene.set_motion(ramp=RAMP)
     run = rm.simulate(scene)
     check_shapes(run, muscle)
-    assert run.values(muscle, "flicker").max() < 1.0
+    assert run.values(muscle, "flicker").max() < 0.5
 
 
 @pytest.mark.filterwarnings("ignore:.*drives the bones into each other")
@@ -69,7 +69,7 @@ def test_gluteus_maximus_in_a_combined_motion(hip_scene):
     run = rm.simulate(scene)
     check_shapes(run, "gluteus_maximus")
     # Steps are four times as long as those of the page on reliability, where it is 0.1 mm.
-    assert run.values("gluteus_maximus", "flicker_rms").max() < 0.4
+    assert run.values("gluteus_maximus", "flicker").max() < 1.5
 
 
 def written_motions(source, folder):
