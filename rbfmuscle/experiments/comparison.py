@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from rbfmuscle.metrics.comparison_measures import MaterialProbe, array_bytes, curvature_variation
+from rbfmuscle.metrics.comparison_measures import MaterialProbe, curvature_variation
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.metrics.quantities import ALL, unit_text
 from rbfmuscle.output.runinfo import machine, versions
@@ -93,10 +93,9 @@ MEASURES = {
     ),
     "time_surface": Measure("surface", "s", COST, 0.0, "fit and extraction; median, sum over muscles"),
     "time_build": Measure("build", "s", COST, 0.0, "models of all muscles, once, with filled caches"),
-    "memory": Measure("memory", "MB", COST, 0.0, "arrays held by the models after the motion, summed"),
 }
 _FROM_METRICS = [name for name, m in MEASURES.items() if m.against in (LAW, MESH)]
-_SUMMED = ("time_solve", "time_surface", "memory")
+_SUMMED = ("time_solve", "time_surface")
 _TIE = 1.05
 
 
@@ -129,9 +128,6 @@ class ModelProbe:
             for name, surface in frame.surfaces.items():
                 variation = curvature_variation(surface.vertices, surface.faces)
                 self._worst(name, "curvature_variation", variation)
-        if frame.index == len(self.scene.motion) - 1:
-            for model in models:
-                self.found[model.name]["memory"] = array_bytes(model, without=[self.scene]) / 1e6
 
     def _worst(self, muscle, quantity, value):
         known = self.found[muscle]

@@ -1,9 +1,8 @@
-"""Measures that mean the same for every model, whatever its mesh: material points, curvature, bytes held."""
+"""Measures that mean the same for every model, whatever its mesh: material points, curvature."""
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -127,41 +126,3 @@ def _mean_curvature(points, normals, near, same_sheet):
     _, gu, gv, a, b, c = np.linalg.solve(matrix, right[:, :, None])[..., 0].T
     top = (1 + gv**2) * 2 * a - 2 * gu * gv * b + (1 + gu**2) * 2 * c
     return top / (2 * (1 + gu**2 + gv**2) ** 1.5) / scale[:, 0]
-
-
-def array_bytes(thing: Any, *, without: list[Any] | tuple[()] = ()) -> int:
-    """Bytes of all arrays that an object holds, in attributes and containers, each buffer once.
-
-    Parameters
-    ----------
-    thing : object
-    without : sequence of object
-        What these hold does not count.
-    """
-    theirs = _buffers(list(without))
-    return sum(size for key, size in _buffers([thing]).items() if key not in theirs)
-
-
-def _buffers(waiting):
-    """Dict of buffer to its bytes, for all arrays that can be reached."""
-    buffers, seen = {}, set()
-    while waiting:
-        item = waiting.pop()
-        if id(item) in seen or isinstance(item, (str, bytes, int, float, type, type(math))):
-            continue
-        seen.add(id(item))
-        if isinstance(item, np.ndarray):
-            base = item
-            while isinstance(base.base, np.ndarray):
-                base = base.base
-            buffers[id(base)] = base.nbytes
-        elif isinstance(item, dict):
-            waiting.extend(item.values())
-        elif isinstance(item, (list, tuple, set)):
-            waiting.extend(item)
-        elif not callable(item) or hasattr(item, "__dict__"):
-            waiting.extend(vars(item).values() if hasattr(item, "__dict__") else ())
-            slots = getattr(type(item), "__slots__", ())
-            names = [slots] if isinstance(slots, str) else slots
-            waiting.extend(getattr(item, name) for name in names if hasattr(item, name))
-    return buffers

@@ -69,14 +69,6 @@ class SavedRun:
             self.frames = [frame["frame"] for frame in self.info["frames"]]
 
     @cached_property
-    def path_bounds(self) -> np.ndarray:
-        """Box (2, 3) around all muscles in the first, middle and last frame [scene unit]."""
-        chosen = {self.frames[0], self.frames[len(self.frames) // 2], self.frames[-1]}
-        points = [self.surface(muscle, frame)[0] for frame in sorted(chosen) for muscle in self.muscles]
-        low, high = (np.array([end(p, axis=0) for p in points]) for end in (np.min, np.max))
-        return np.array([low.min(axis=0), high.max(axis=0)])
-
-    @cached_property
     def metrics(self) -> list[Row]:
         """Rows of ``metrics.csv``."""
         return [

@@ -12,7 +12,7 @@ from blend_model import BlendMuscle, arm_scene
 from rbfmuscle import compare
 from rbfmuscle.compare import compare_models
 from rbfmuscle.experiments.comparison import MEASURES, best_models, verdict
-from rbfmuscle.metrics.comparison_measures import MaterialProbe, array_bytes, curvature_variation
+from rbfmuscle.metrics.comparison_measures import MaterialProbe, curvature_variation
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report.comparison_page import map_limit
 from rbfmuscle.scene.phantom import phantom_scene
@@ -57,19 +57,6 @@ class TestCurvatureVariation:
     def test_thin_plates_are_measured_without_warnings(self):
         plate = trimesh.creation.box((40.0, 30.0, 0.01)).subdivide().subdivide()
         assert np.isfinite(curvature_variation(plate.vertices, plate.faces))
-
-
-class TestMemory:
-    def test_buffers_count_once_and_what_is_shared_not(self):
-        class Holder:
-            pass
-
-        attached_bone, shared = Holder(), np.zeros(1000)
-        attached_bone.a, attached_bone.views, attached_bone.shared = np.zeros(100), [], shared
-        attached_bone.views.append(attached_bone.a[:50])
-        attached_bone.me = attached_bone
-        assert array_bytes(attached_bone) == 8 * 1100
-        assert array_bytes(attached_bone, without=[shared]) == 800
 
 
 def results(**models):
