@@ -46,7 +46,7 @@ def simulate(
         Called as ``progress(done, total)`` after each frame; ``True`` shows on stderr what goes on, compiling and
         building included.
     fields : mapping of str to BoneField, optional
-        What tells the distance to each bone, by the bone's name; `BoneSDF` where not given.
+        Distance fields of the bones, by the bone's name; `BoneSDF` where not given.
 
     Returns
     -------
@@ -75,7 +75,7 @@ def simulate(
     if fields is not None and set(fields) != {bone.name for bone in scene.bones}:
         bones = ", ".join(bone.name for bone in scene.bones)
         raise UsageError(f"fields must name each bone ({bones}), got {', '.join(fields) or 'none'}")
-    options = _asked(model, settings, frames)
+    options = _options(model, settings, frames)
     recording, memory = Recording(scene, options=options, models_here=False, fields=fields), MemorySink()
     run = Run(recording, memory)
     try:
@@ -133,15 +133,15 @@ def stream_run(
     scene = configure_scene(scene, settings, model=model, frames=frames)
     limits = parse_limits(fail_on, scene)
     check_writable(directory)
-    recording = Recording(scene, options=_asked(model, settings, frames), models_here=watch is not None)
+    recording = Recording(scene, options=_options(model, settings, frames), models_here=watch is not None)
     with closing(recording):
         writer = RunWriter(directory, scene)
         recording.feed(writer, progress=progress, watch=watch)
     return _finish(recording, writer, limits, pictures)
 
 
-def _asked(model, settings, frames):
-    """What the caller asked for, as ``run.json`` tells it."""
+def _options(model, settings, frames):
+    """The caller's options, for ``run.json``."""
     return {"model": model, "frames": str(frames or ""), "settings": dict(settings or {})}
 
 

@@ -110,7 +110,7 @@ def end_groups(
 
 
 def split_ends(muscle: Any, joints: list[Any], moving: Collection[str] | None = None) -> list[Any]:
-    """The attachments of the origin and those of the insertion, as `end_groups` tells them apart."""
+    """The attachments of the origin and those of the insertion, as `end_groups` has them."""
     joint_of = {joint.child: joint for joint in joints}
 
     def body(bone):

@@ -29,7 +29,7 @@ class ContractionStudy:
     ----------
     rest : MuscleAtRest
         Its muscle has keys of contraction. Fibres are followed where the scene gives them; without any there is
-        nothing to tell of them.
+        nothing of them is measured.
     """
 
     def __init__(self, rest: MuscleAtRest) -> None:
@@ -139,7 +139,7 @@ def section_area(vertices: Floats, faces: Integers, axis: Any, height: Any, plac
 
 
 def _section(vertices, faces, height, place):
-    """Segments in which the surface meets a plane, from (s, 3) to (s, 3), all one way round."""
+    """Segments in which the surface meets a plane, from (s, 3) to (s, 3), all in one direction."""
     above = height[faces] > place
     crossed = above.any(axis=1) & ~above.all(axis=1)
     corners, above = faces[crossed], above[crossed]
@@ -168,14 +168,14 @@ def _thickness(section, axis):
     u /= np.linalg.norm(u)
     v = np.cross(axis, u)
     angle = np.pi * np.arange(CALIPERS) / CALIPERS
-    ways = np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v
-    return float(np.ptp(points @ ways.T, axis=0).min())
+    directions = np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v
+    return float(np.ptp(points @ directions.T, axis=0).min())
 
 
 def _kept_inside(lines, vertices, faces):
     """Lines whose points on or beyond the surface are put just below it, as only inner points can be carried.
 
-    Lines with a point for which there is no room, at a thin rim, are left out, unless that is all of them.
+    Lines with a point that cannot be put there, at a thin rim, are left out, unless that is all of them.
     """
     tree = ExactDistance(vertices, faces)
     points = lines.reshape(-1, 3).copy()

@@ -20,7 +20,7 @@ _HERE = np.eye(4)
 class MeshDistance:
     """Exact distance of points to a closed, outward mesh; negative inside.
 
-    What answers is built at the first question and kept: a bone is prepared once and asked in its own coordinates.
+    Its trees are built at the first call and kept, so that a bone's are built once, in the bone's own coordinates.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class MeshDistance:
 
     @property
     def layout(self) -> Layout | None:
-        """For the same faces at a later moment; None where no distance was asked for yet."""
+        """For the same faces at a later moment; None before the first distance."""
         return self._exact.layout if "_exact" in self.__dict__ else self._known_layout
 
     def inside(self, points: ArrayLike, *, pose: Floats = _HERE) -> Booleans:

@@ -173,7 +173,7 @@ def _strain_loop(vertices, edges, rest_lengths):
 def surface_distance(
     vertices: Floats, faces: Integers, other_vertices: Floats, other_faces: Integers
 ) -> tuple[float, float]:
-    """Distance between two surfaces, both ways, at their vertices.
+    """Distance between two surfaces, from the vertices of each to the other.
 
     Returns
     -------

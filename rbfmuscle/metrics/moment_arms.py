@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 # A slope is fitted over the frames within so many degrees, or millimetres of a shift, and over the frames next to it.
-# Of motions by one degree the ripple of the arms about smooth curves is then at most 0.3 mm RMS (docs/moment_arms.md).
+# In motions by one degree moment arms then ripple about smooth curves by at most 0.3 mm RMS (docs/moment_arms.md).
 REACH = 8.0
 # Coordinates that change by less [radian or scene unit] rest.
 _STILL = 1e-9
@@ -34,7 +34,8 @@ def moment_arms(
     Returns
     -------
     list of dict of str to float
-        For each frame the arm about each coordinate that moves alone before or after it [scene unit a radian, or 1].
+        For each frame the moment arm about each coordinate that moves alone before or after it
+        [scene unit per radian, or 1].
     """
     values, found = np.asarray(lengths, dtype=float), [dict[str, float]() for _ in path]
     for name, first, last in _single_motions(path, values):
@@ -54,12 +55,12 @@ def _single_motions(path, lengths):
     stretches = []
     for k, (before, after) in enumerate(itertools.pairwise(path)):
         moved = {n: after.get(n, 0.0) - before.get(n, 0.0) for n in {*before, *after}}
-        moved = {name: way for name, way in moved.items() if abs(way) > _STILL}
+        moved = {name: change for name, change in moved.items() if abs(change) > _STILL}
         if len(moved) != 1 or not np.isfinite(lengths[k : k + 2]).all():
             continue
-        ((name, way),) = moved.items()
-        if stretches and stretches[-1][:2] == (name, way > 0) and stretches[-1][3] == k:
+        ((name, change),) = moved.items()
+        if stretches and stretches[-1][:2] == (name, change > 0) and stretches[-1][3] == k:
             stretches[-1] = (*stretches[-1][:3], k + 1)
         else:
-            stretches.append((name, way > 0, k, k + 1))
+            stretches.append((name, change > 0, k, k + 1))
     return [(name, first, last) for name, _, first, last in stretches]

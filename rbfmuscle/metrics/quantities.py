@@ -24,7 +24,10 @@ QUANTITIES = {
         "greatest change, since the frame before, of the distance from the carried mesh to the surface",
     ),
     "tunnelled": ("1", "points that passed through a bone and were not brought back"),
-    "rest_error_rms": ("length", "distance between extracted surface and input mesh at rest, both ways"),
+    "rest_error_rms": (
+        "length",
+        "distance between extracted surface and input mesh at rest, in both directions",
+    ),
     "rest_error_max": ("length", "the same, greatest (Hausdorff)"),
     "thickness": ("length", "least width of the input mesh's greatest section across its line of action"),
     "initial_overlap": ("length", "deepest overlap of muscle and bones that is left at rest"),

@@ -40,7 +40,7 @@ def write_mesh(path: str | Path, vertices: ArrayLike, faces: ArrayLike) -> None:
 
 
 def read_mesh(path: str | Path) -> tuple[Floats, Integers]:
-    """Vertices and faces of a mesh file that a run has left.
+    """Vertices and faces of a mesh file of a run.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Reading back what a run left in a folder."""
+"""A saved run, read from its folder."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MOST_SHOWN = 4
 
 
 class SavedRun:
-    """A run in a folder; surfaces are read when asked for.
+    """A run in a folder; surfaces are read one by one.
 
     Of a run that was killed, or still goes on, the frames up to the last whole one are found on the disk.
 
@@ -117,7 +117,7 @@ class SavedRun:
             found.setdefault((row.muscle, row.quantity), []).append(row)
         return found
 
-    def arm_coordinates(self, muscle: str | None = None) -> list[str]:
+    def moment_arm_coordinates(self, muscle: str | None = None) -> list[str]:
         """The coordinates that a muscle, or any, has moment arms about, in their order in ``metrics.csv``."""
         rows = (r for r in self.metrics if r.quantity == "moment_arm" and muscle in (None, r.muscle))
         return list(dict.fromkeys(r.coordinate for r in rows))

@@ -212,7 +212,7 @@ class RunWriter:
     def _roll_back(self, frame):
         """Leave the folder as it was before a frame that could not be written.
 
-        What the disk still allows: nothing here can be told better than the first refusal.
+        As far as the disk allows; only its first refusal is reported.
         """
         self._failed = True
         for name, (_, file) in self._tables.items():

@@ -177,7 +177,7 @@ def _plots(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> str:
     axis, label = motion_axis(first)
     panels = [
         (f"Moment arm: {muscle}, {about}", arm_unit(first, about), lambda run, m=muscle, a=about: run.series(m, "moment_arm", a))
-        for muscle in first.muscles for about in first.arm_coordinates(muscle)
+        for muscle in first.muscles for about in first.moment_arm_coordinates(muscle)
     ]  # fmt: skip
     panels += [
         (f"Length: {muscle}", first.units, lambda run, m=muscle: run.series(m, "length"))

@@ -210,7 +210,7 @@ def _plots(saved: SavedRun) -> list[Section]:
     axis = motion_axis(saved)
     arms = [
         (f"Moment arm: {name}", "moment_arm", 1.0, arm_unit(saved, name), False, name)
-        for name in saved.arm_coordinates()
+        for name in saved.moment_arm_coordinates()
     ]
     mechanics, errors, flat = [], [], []
     for title, quantity, factor, unit, both, coordinate in [*arms, *((*panel, None) for panel in PANELS)]:

@@ -67,9 +67,9 @@ def test_each_row_of_the_table_is_kept_up_to_its_limit_and_broken_beyond(quantit
     ((muscle, name, worst, limit, _),) = exceeded(facts(beyond, units=units), limits)
     assert (muscle, name, limit) == ("psoas", quantity, pytest.approx(scale * LIMITS[quantity].value))
     assert worst == pytest.approx(scale * TABLE[quantity][1])
-    told = describe_verdict(facts(beyond, units=units), limits)
-    assert told.startswith("1 of 2 muscles are within all limits, not psoas. Worst: psoas, ")
-    assert LIMITS[quantity].remedy in told and shown_number(worst) in told
+    said = describe_verdict(facts(beyond, units=units), limits)
+    assert said.startswith("1 of 2 muscles are within all limits, not psoas. Worst: psoas, ")
+    assert LIMITS[quantity].remedy in said and shown_number(worst) in said
 
 
 def test_the_table_is_complete():
@@ -102,12 +102,12 @@ def test_not_a_number_is_beyond_every_limit():
 def test_the_worst_by_its_limit_is_named_first_and_bones_are_named_too():
     values = {"penetration_max": [0.2], "volume_error": [1e-6]}
     table = facts(values, teres={"flicker": [0.0, 3.0]}, **{ALL: {"joint_gap": [0.0, 8.0]}})
-    told = describe_verdict(table, {name: limit.value for name, limit in LIMITS.items()})
-    assert told.startswith(
+    said = describe_verdict(table, {name: limit.value for name, limit in LIMITS.items()})
+    assert said.startswith(
         "1 of 3 muscles are within all limits, not psoas, teres. Worst: psoas, volume error 1e-06 at frame 0 "
         "(limit 1e-09); teres, flicker 3 mm at frame 1 (limit 0.5); the bones, joint that opens 8 mm at frame 1"
     )
-    assert [told.count(LIMITS[name].remedy) for name in ("flicker", "joint_gap")] == [1, 1]
+    assert [said.count(LIMITS[name].remedy) for name in ("flicker", "joint_gap")] == [1, 1]
 
 
 def test_numbers_are_shown_as_people_read_them():
@@ -148,7 +148,9 @@ def test_overlap_and_ends_away_from_bones_are_seen_in_a_run(shift, quantity, lea
 def test_a_joint_that_opens_is_measured_and_one_that_is_apart_at_rest_is_not():
     scene = arm_scene()
     scene.joints.clear()
-    scene.add_joint("elbow", "upper", "fore", (0, 0, 30), {"flexion": (0, -1, 0)})  # far from where the bones meet
+    scene.add_joint(
+        "elbow", "upper", "fore", (0, 0, 30), {"flexion": (0, -1, 0)}
+    )  # far from where the bones meet
     rest = 4.0  # between the ends of the boxes
     (_, parent, child, closed), (*_, opened) = joint_gaps(scene, [0, 2])
     assert (parent, child, closed) == ("upper", "fore", 0.0)
@@ -164,5 +166,5 @@ def test_terminal_and_report_say_the_same(monkeypatch, tmp_path):
     use_blend_model(monkeypatch)
     info = stream_run(arm_scene(end=10), tmp_path, settings={"output.report": True}, pictures=False)
     page = re.sub(r"\s+", " ", (tmp_path / "report.html").read_text(encoding="utf-8"))
-    said = info["verdict"][1:]  # capitalised on the page
-    assert said.replace("<", "&lt;") in page
+    sentence = info["verdict"][1:]  # capitalised on the page
+    assert sentence.replace("<", "&lt;") in page

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
+from rbfmuscle.geometry.surfaces import edge_lengths, unique_edges
 from rbfmuscle.metrics.centreline import Centreline, MuscleAtRest, slice_operator, split_ends
 from rbfmuscle.metrics.columns import Columns
 from rbfmuscle.metrics.mesh_distance import MeshDistance
@@ -44,23 +44,6 @@ def blob():
     v = np.array(mesh.vertices)
     bump = 1 + 0.2 * np.sin(0.7 * v[:, 0]) * np.cos(0.5 * v[:, 1] + 0.3) + 0.1 * np.sin(0.9 * v[:, 2])
     return trimesh.Trimesh(v * bump[:, None] * [1.6, 1.0, 0.7], mesh.faces, process=False)
-
-
-class TestVolume:
-    def test_box_is_exact_far_from_the_origin(self):
-        vertices, faces = arrays(trimesh.creation.box((2, 3, 5)))
-        assert mesh_volume(vertices + 1e6, faces) == pytest.approx(30, rel=1e-9)
-
-    def test_ellipsoid_comes_near_the_formula_from_below(self):
-        vertices, faces = arrays(trimesh.creation.icosphere(subdivisions=5))
-        volume = mesh_volume(vertices * [4, 2, 1], faces)
-        exact = 4 / 3 * math.pi * 8
-        # An inscribed icosphere of 20480 faces lacks 0.07 %.
-        assert 0.999 * exact < volume < exact
-
-    def test_inward_faces_are_negative(self):
-        vertices, faces = arrays(trimesh.creation.box((1, 1, 1)))
-        assert mesh_volume(vertices, faces[:, ::-1]) == pytest.approx(-1)
 
 
 class TestColumns:

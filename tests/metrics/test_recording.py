@@ -1,4 +1,4 @@
-"""A run on its way to a sink: what it is told and when, and how it ends."""
+"""A run on its way to a sink: what it gets and when, and how it ends."""
 
 import warnings
 
@@ -14,10 +14,10 @@ class Kept:
     """A sink that keeps everything in memory."""
 
     def __init__(self):
-        self.told, self.frames, self.rows, self.closed = [], [], [], None
+        self.said, self.frames, self.rows, self.closed = [], [], [], None
 
     def write_info(self, info):
-        self.told.append((info["status"], info["message"], len(info["frames"])))
+        self.said.append((info["status"], info["message"], len(info["frames"])))
 
     def write(self, frame, rows):
         self.frames.append(frame)
@@ -41,19 +41,19 @@ def test_sink_hears_of_the_start_every_frame_and_the_end():
         watch=lambda models, frame: seen.append(frame),
     )
     count = len(scene.motion)
-    assert sink.told == [("running", "interrupted", 0), ("complete", "", count)]
+    assert sink.said == [("running", "interrupted", 0), ("complete", "", count)]
     assert [frame.index for frame in sink.frames] == list(range(count))
     assert seen[0] is None and seen[1::2] == sink.frames
     assert seen[2::2] == [(k + 1, count) for k in range(count)]
     assert sink.closed is not None
 
 
-def test_a_failure_closes_the_sink_and_is_told_with_the_frames_so_far(monkeypatch):
+def test_a_failure_closes_the_sink_and_is_said_with_the_frames_so_far(monkeypatch):
     use_blend_model(monkeypatch, fail_at=2)
     sink = Kept()
     with pytest.raises(SolveError, match="planted failure"):
         Recording(arm_scene(end=40)).feed(sink)
-    (_, _, none), (status, message, count) = sink.told
+    (_, _, none), (status, message, count) = sink.said
     assert (none, status) == (0, "failed") and "planted failure" in message
     assert count == len(sink.frames) >= 1 and sink.closed is not None
 
@@ -68,7 +68,7 @@ def test_a_disk_that_refuses_ends_the_run_as_failed_unless_all_was_written(at):
     sink = Full()
     with pytest.raises(SolveError, match="disk full"):
         Recording(arm_scene(end=10)).feed(sink)
-    assert at == "close" or sink.told[-1][0] == "failed"
+    assert at == "close" or sink.said[-1][0] == "failed"
 
 
 def test_notes_of_the_motion_are_warned_of():
@@ -77,9 +77,9 @@ def test_notes_of_the_motion_are_warned_of():
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
         Recording(scene)
-    told = [str(w.message) for w in heard if issubclass(w.category, SceneWarning)]
+    said = [str(w.message) for w in heard if issubclass(w.category, SceneWarning)]
     assert [f"motion: {note}" for note in scene.motion.notes] == [
-        line for line in told if line.startswith("motion: ")
+        line for line in said if line.startswith("motion: ")
     ]
 
 
@@ -87,6 +87,6 @@ def test_notes_of_the_motion_are_warned_of():
 def test_what_is_noted_of_the_motion_points_at_who_asked_for_the_run(way, tmp_path):
     scene = arm_scene(end=5)
     scene.motion.notes.append("it leaves its range")
-    with pytest.warns(SceneWarning, match="motion: it leaves its range") as told:
+    with pytest.warns(SceneWarning, match="motion: it leaves its range") as said:
         way(scene, tmp_path) if way is not simulate else simulate(scene)
-    assert [each.filename for each in told if "leaves" in str(each.message)] == [__file__]
+    assert [each.filename for each in said if "leaves" in str(each.message)] == [__file__]

@@ -1,11 +1,8 @@
-"""Animations of a run, by readers that are not ours: usd-core, trimesh, Blender, glTF to the letter."""
+"""Animations of a run, by readers that are not ours: usd-core, trimesh, glTF to the letter."""
 
 import json
-import os
 import struct
-import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -248,7 +245,7 @@ class TestAnimatedGlb:
 def test_a_page_of_a_run_says_frame_and_coordinates(folder, tmp_path):
     (path,) = export_run(folder, "html", output=tmp_path)
     text = path.read_text(encoding="utf-8")
-    assert path.suffix == ".html" and path.parent.name == "html" and '"frame 1: ' in text
+    assert path.suffix == ".html" and path.parent.name == "html" and '"frame 1, ' in text
     with pytest.raises(UsageError, match="html is in metres by its standard"):
         export_run(folder, "html", output=tmp_path, units="mm")
 
@@ -267,45 +264,3 @@ def test_times_of_a_motion_are_those_of_the_files(folder, tmp_path):
     tree, numbers = read_glb(next((tmp_path / "out" / "animated-glb").iterdir()))
     times = numbers(tree["animations"][0]["samplers"][0]["input"])[:, 0]
     np.testing.assert_allclose(times, [0.0, 0.25, 1.0])
-
-
-BLENDER = """
-import sys, bpy, numpy as np
-usd, glb, truth = sys.argv[1:4]
-truth = np.load(truth)
-for load, path in ((bpy.ops.wm.usd_import, usd), (bpy.ops.import_scene.gltf, glb)):
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    load(filepath=path)
-    corners = {}
-    for key in truth.files:
-        name, frame = key.rsplit(" ", 1)
-        bpy.context.scene.frame_set(int(frame))
-        shown = bpy.data.objects[name].evaluated_get(bpy.context.evaluated_depsgraph_get())
-        mesh = shown.to_mesh()
-        points = np.empty(3 * len(mesh.vertices), np.float32)
-        mesh.vertices.foreach_get("co", points)
-        place = np.array(shown.matrix_world)
-        world = points.reshape(-1, 3) @ place[:3, :3].T + place[:3, 3]
-        numbers = np.empty(len(mesh.loops), np.int32)
-        mesh.loops.foreach_get("vertex_index", numbers)
-        assert np.abs(world - truth[key]).max() < 1e-6, (path, key)
-        assert (corners.setdefault(name, numbers) == numbers).all(), (path, key)
-    bones = [bpy.data.objects[name] for name in ("upper", "fore")]
-    assert not any(bone.modifiers or bone.data.shape_keys for bone in bones), path
-print("as ours")
-"""
-
-
-def test_blender_shows_every_vertex_where_it_is(folder, truth, tmp_path):
-    """In a Python that has bpy: this one, or the one named by RBFMUSCLE_BPY_PYTHON."""
-    python = os.environ.get("RBFMUSCLE_BPY_PYTHON") or (sys.executable if find_spec("bpy") else None)
-    if python is None:
-        pytest.skip("no bpy here; RBFMUSCLE_BPY_PYTHON may name a Python that has it")
-    pytest.importorskip("pxr.UsdGeom")
-    usd, glb = export_run(folder, ["usd", "animated-glb"], output=tmp_path)
-    np.savez(tmp_path / "truth.npz", **{f"{name} {frame}": points for (name, frame), points in truth.items()})
-    (tmp_path / "look.py").write_text(BLENDER)
-    command = [python, tmp_path / "look.py", usd, glb, tmp_path / "truth.npz"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert done.stdout.rstrip().endswith("as ours")

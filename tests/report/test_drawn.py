@@ -132,7 +132,7 @@ def test_worst_of_several_muscles_is_the_greatest_in_size_with_its_sign(figures)
                 return np.array([0, 2, 4]), np.array(rows[muscle])
             return np.zeros(0, dtype=int), np.zeros(0)
 
-        def arm_coordinates(self, muscle=None):
+        def moment_arm_coordinates(self, muscle=None):
             return []
 
     titles = [title for title, _ in plot_models({"m": Run()})]

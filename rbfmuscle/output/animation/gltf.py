@@ -92,7 +92,7 @@ def _quaternions(rotations):
 
 
 class _File:
-    """A glTF file on its way: the binary part and the lists that describe it."""
+    """The content of a glTF file: the binary part and the lists that describe it."""
 
     def __init__(self) -> None:
         self.parts: list[bytes] = []

@@ -41,7 +41,7 @@ def write_usd(path: Path, run: MovingRun) -> None:
     Notes
     -----
     Time codes count 24 a second. A surface that keeps its vertices has its topology once and its points at every
-    time; another one has both at every time. Lengths stay in the run's unit, which ``metersPerUnit`` tells.
+    time; another one has both at every time. Lengths stay in the run's unit, named by ``metersPerUnit``.
     """
     check_usd()
     from pxr import Usd, UsdGeom
