@@ -21,7 +21,7 @@ class Event:
     is where the material is: it is stretched too far, an end is held inside the bone named, or sheets have met),
     ``"neighbours_let_in"`` (sliding neighbours on all sides left no surface, so it was fitted without them),
     ``"overlap_kept"`` or ``"overlap_resolved"`` (at rest, before the first frame), or, with no muscle,
-    ``"bones_overlap"`` (the motion drives two bones into each other).
+    ``"bones_overlap"`` (the motion drives two bones into each other) or ``"joint_opens"`` (those of a joint apart).
     """
 
     frame: int
