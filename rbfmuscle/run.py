@@ -127,8 +127,6 @@ def stream_run(
         If a frame cannot be solved or written; frames so far are kept.
     LimitExceededError
         If a limit of ``fail_on`` is exceeded; everything is written.
-    MissingPartError
-        If there are no graphics to draw with; everything else is written.
     """
     scene = configure_scene(scene, settings, model=model, frames=frames)
     limits = parse_limits(fail_on, scene)
@@ -146,21 +144,18 @@ def _options(model, settings, frames):
 
 
 def _finish(recording, writer, limits, pictures):
-    """Report and pictures, then the limits: a missing part must not hide a broken limit."""
+    """Report and pictures, then the limits."""
     output = recording.scene.output
-    missing = None
     with recording.timed("report"), stage("drawing pictures"):
         if output.report or output.preview:
             from rbfmuscle.report.report import write_report
 
-            missing = write_report(
+            write_report(
                 writer.directory, report=output.report, preview=output.preview and pictures, pictures=pictures
             )
     info = recording.info()
     writer.write_info(info)
     require_limits(recording.summary.table(), limits)
-    if missing is not None:
-        raise missing
     return info
 
 
@@ -232,8 +227,6 @@ class Run:
         ------
         UsageError
             If the folder cannot be written to.
-        MissingPartError
-            If there are no graphics to draw with; everything else is written.
         """
         writer = RunWriter(directory, self.scene)
         self._memory.replay(writer)

@@ -339,7 +339,8 @@ def describe(results: dict[str, Any], labels: dict[str, str], units: str) -> str
         for name, v in whole.items()
     }
     limit = KEPT_OUT / MM_PER_UNIT[units]
-    text = f"{labels[first]} {'keeps out of' if depth[first] <= limit else 'stands in'} bones ({depth[first]:.2g} {units})"
+    verb = "keeps out of" if depth[first] <= limit else "stands in"
+    text = f"{labels[first]} {verb} bones ({depth[first]:.2g} {units})"
     timed = [name for name in others if "time_frame" in whole[name] and "time_frame" in whole[first]]
     quick = min(timed, key=lambda name: whole[name]["time_frame"], default=None)
     if quick:

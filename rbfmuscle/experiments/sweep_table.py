@@ -15,6 +15,15 @@ from rbfmuscle.output.writer import write_json
 
 # The default may be this much worse than the front, in error and in time at once.
 NEAR = 1.1
+# In the scene's unit.
+LENGTHS = (
+    "error_rms",
+    "error_max",
+    "penetration_max",
+    "bone_penetration_max",
+    "solver_penetration_max",
+    "rest_error_rms",
+)
 
 
 def sweep_rows(
@@ -111,7 +120,7 @@ def _ratio(mine: float, other: float) -> float:
 def _figures(row: dict[str, Any], quantity: str) -> str:
     time = row["time_frame"]
     spent = f"{time:.2g} s" if time >= 1.0 else f"{1e3 * time:.2g} ms"
-    unit = f" {row['units']}" if quantity in ("error_rms", "error_max", "rest_error_rms") else ""
+    unit = f" {row['units']}" if quantity in LENGTHS else ""
     return f"{row[quantity]:.2g}{unit} at {spent} per frame"
 
 

@@ -11,7 +11,7 @@ from rbfmuscle.geometry.arrays import Floats
 
 BACKGROUND = "#ffffff"
 # From the subject to the camera; z is up, as in the medical axes (left, posterior, superior).
-VIEWS = {
+VIEWS: dict[str, tuple[tuple[float, float, float], str]] = {
     "front": ((0.0, -1.0, 0.12), "from -y"),
     "side": ((-1.0, -0.12, 0.12), "from -x"),
     "back": ((0.0, 1.0, 0.12), "from +y"),

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rbfmuscle.experiments.comparison import AGAINST, MEASURES, best_models
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.metrics.quantities import ALL
 from rbfmuscle.output.colours import MUSCLE_COLOURS
@@ -42,12 +44,10 @@ LIGHTS = ("volume_error", "penetration_max", "bone_penetration_max", "return_rms
 _AREA, _WHOLE, _FRAMES = 90_000, 400_000, 12
 # Distance maps: from the greatest distance of the models down to what leaves the map its colours.
 _MAP_SHARE = 0.25
-_READING = """<p>All models ran through the same frames and sub-steps of the same scene, one after another in one process,
-with the same bone fields, contact margin and number of threads, each after a warm-up that loads and compiles. <b>The time
-per frame</b> is the wall time of prediction, solution, contacts, tunnelling test and surface of all muscles; metrics, files
-and pictures are outside. <b>Solution</b> and <b>surface</b> are sums over muscles, which run side by side, and may exceed
-it. <b>Strain</b> is that of the same material points in all models. <b>Curvature variation</b> is high where a surface is
-creased or lumpy. The <b>distance to the first model</b> is no error: it says how far models differ, not which is right.</p>"""
+_READING = """<p>All models ran through the same frames and sub-steps, one after another in one process with the
+same bone fields and number of threads, each after a warm-up. <b>The time per frame</b> is the wall time of prediction,
+solution, contacts and surface of all muscles; <b>solution</b> and <b>surface</b> are sums over muscles, which run side
+by side, and may exceed it. The <b>distance to the first model</b> is no error: it says how far models differ.</p>"""
 
 
 def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) -> None:
@@ -147,7 +147,7 @@ def shown(found: dict[str, Any], quantity: str, value: float | None) -> str:
 
 
 def _measures(found: dict[str, Any]) -> str:
-    rows = []
+    rows: list[list[Cell | str]] = []
     for quantity, measure in MEASURES.items():
         values = [found["results"][name][ALL].get(quantity) for name in found["models"]]
         if all(value is None for value in values):
@@ -164,55 +164,66 @@ def _measures(found: dict[str, Any]) -> str:
 
 def _matrix(found: dict[str, Any]) -> str:
     labels = [found["labels"][name] for name in found["models"]]
-    rows = [
-        [label, *(Cell("" if i == j else number(value), value) for j, value in enumerate(line))]
-        for i, (label, line) in enumerate(zip(labels, found["distances"]))
-    ]
+    rows: list[list[Cell | str]] = []
+    for label, line in zip(labels, found["distances"]):
+        rows.append([label, *(Cell(number(value), value) for value in line)])
     return table(["", *labels], rows)
 
 
 def _plots(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> str:
     """Moment arms and lengths of each muscle, then the worst over muscles and the time, a line for each model."""
-    first = next(iter(runs.values()))
-    axis, label = motion_axis(first)
-    panels = [
-        (f"Moment arm: {muscle}, {about}", arm_unit(first, about), lambda run, m=muscle, a=about: run.series(m, "moment_arm", a))
-        for muscle in first.muscles for about in first.moment_arm_coordinates(muscle)
-    ]  # fmt: skip
-    panels += [
-        (f"Length: {muscle}", first.units, lambda run, m=muscle: run.series(m, "length"))
-        for muscle in first.muscles
-    ]
-    panels += [
-        (f"{MEASURES[q].title}, worst muscle", first.units, lambda run, q=q: worst_series(run, q))
-        for q in LIGHTS[1:3]
-    ]
-    panels.append(("Time per frame after the first", "ms", _times))
-    pictures = []
-    for title, unit, series in panels:
-        tracks = []
-        for k, (name, run) in enumerate(runs.items()):
-            frames, values = series(run)
-            if len(frames) and np.isfinite(values).any():
-                colour = MUSCLE_COLOURS[k % len(MUSCLE_COLOURS)]
-                tracks.append(
-                    Track(found["labels"][name], colour, np.array([axis[f] for f in frames]), values)
-                )
-        if tracks and any(np.ptp(track.y) > 0 for track in tracks):
-            pictures.append(line_plot(title, tracks, (label, unit), legend=True))
+    first, pictures = next(iter(runs.values())), []
+
+    def draw(title: str, unit: str, series: Callable[[SavedRun], tuple[Integers, Floats]]) -> None:
+        pictures.append(
+            _model_plot(found, runs, title, unit, {name: series(run) for name, run in runs.items()})
+        )
+
+    for muscle in first.muscles:
+        for about in first.arm_coordinates(muscle):
+            title = f"Moment arm: {muscle}, {about}"
+            draw(
+                title,
+                arm_unit(first, about),
+                partial(SavedRun.series, muscle=muscle, quantity="moment_arm", coordinate=about),
+            )
+    for muscle in first.muscles:
+        draw(f"Length: {muscle}", first.units, partial(SavedRun.series, muscle=muscle, quantity="length"))
+    for quantity in LIGHTS[1:3]:
+        draw(
+            f"{MEASURES[quantity].title}, worst muscle", first.units, partial(worst_series, quantity=quantity)
+        )
+    draw("Time per frame after the first", "s", _times)
     return f'<div class="plots">{"".join(pictures)}</div>'
 
 
-def _times(run: SavedRun) -> tuple[Floats, Floats]:
+def _model_plot(
+    found: dict[str, Any],
+    runs: Mapping[str, SavedRun],
+    title: str,
+    unit: str,
+    series: Mapping[str, tuple[Integers, Floats]],
+) -> str:
+    axis, label = motion_axis(next(iter(runs.values())))
+    tracks = [
+        Track(found["labels"][name], colour, np.array([axis[frame] for frame in frames]), values)
+        for (name, (frames, values)), colour in zip(series.items(), cycle(MUSCLE_COLOURS))
+        if np.isfinite(values).any()
+    ]
+    flat = all(np.ptp(track.y) == 0 for track in tracks)
+    return "" if flat else line_plot(title, tracks, (label, unit), legend=True)
+
+
+def _times(run: SavedRun) -> tuple[Integers, Floats]:
     frames, values = run.series(ALL, "time_frame")
-    return frames[1:], 1e3 * values[1:]
+    return frames[1:], values[1:]
 
 
-def worst_series(run: SavedRun, quantity: str) -> tuple[Floats, Floats]:
+def worst_series(run: SavedRun, quantity: str) -> tuple[Integers, Floats]:
     """Frames, and of each frame the value of greatest magnitude among the muscles."""
     found = [series for muscle in run.muscles if len((series := run.series(muscle, quantity))[0])]
     if not found:
-        return np.zeros(0), np.zeros(0)
+        return np.zeros(0, dtype=int), np.zeros(0)
     values = np.array([values for _, values in found])
     return found[0][0], values[np.argmax(np.abs(values), axis=0), np.arange(values.shape[1])]
 

@@ -29,11 +29,11 @@ COLUMNS = {
     "fit_time": ("fit [ms]", 1e3), "evaluation_time": ("20,000 values [ms]", 1e3), "note": ("note", 1.0),
 }  # fmt: skip
 _MOST_LIGHTS = 5
-_READING = """<p>Each kernel has the same number of centres; its shape parameter is chosen by the error at other points of
-the mesh. Distances are measured both ways between the mesh and the extracted surface, root mean square and greatest, normals
-by the field's gradient. The volume error is that of the level zero; a muscle's level is moved until its volume is right.
-Recommended is the quickest row (a fit and 20,000 values, processor time of one thread) that errs at most 5 % more than the
-best; of those alike in time one without a parameter, then the best-conditioned one.</p>"""
+_READING = """<p>Each kernel has the same number of centres; its shape parameter is chosen by the error at other points
+of the mesh. Distances are measured both ways between the mesh and the extracted surface, root mean square and greatest.
+The volume error is that of the level zero; a muscle's level is moved until its volume is right. Recommended is the
+quickest row (a fit and 20,000 values, processor time of one thread) that errs at most 5 % more than the best; of those
+alike in time one without a parameter, then the best-conditioned one.</p>"""
 
 
 def write_studies(
@@ -91,7 +91,7 @@ def _page(studies: Mapping[str, KernelStudy]) -> Page:
     units = next(iter(studies.values())).units
     surfaces = f"all {len(studies)} muscles" if several else next(iter(studies)).replace("_", " ")
     kernels = len({row["kernel"] for row in rows})
-    centres = ", ".join(str(count) for count in sorted({row["centres"] for row in rows}))
+    counts = ", ".join(map(str, sorted({row["centres"] for row in rows})))
     sections = [
         Section(
             f"Every row{f' of {name}' if several else ''}",
@@ -106,8 +106,8 @@ def _page(studies: Mapping[str, KernelStudy]) -> Page:
         f"Kernels for {surfaces}",
         [
             f"{kernels} kernels",
-            f"{centres} centres",
-            "named by --muscle" if not several else "--muscle for one",
+            f"{counts} centres",
+            "every muscle; --muscle for one" if several else "one surface",
         ],
         answer(studies),
         GOOD if found else BAD,

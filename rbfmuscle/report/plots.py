@@ -77,7 +77,13 @@ class _Axes:
         )
 
     def line(
-        self, x: Sequence[float], y: Sequence[float], colour: str, *, width: float = 1.8, more: str = ""
+        self,
+        x: Sequence[float] | Floats,
+        y: Sequence[float] | Floats,
+        colour: str,
+        *,
+        width: float = 1.8,
+        more: str = "",
     ) -> None:
         """Add a line through values; it is broken where one is no number."""
         path, pen = [], "M"
@@ -176,7 +182,7 @@ def front_plot(points: Sequence[Point], labels: tuple[str, str], *, groups: Mapp
     shown = [point for point in points if point.x > 0 and point.y > 0]
     if not shown:
         return ""
-    spans = [(min(p[k] for p in shown), max(p[k] for p in shown)) for k in (0, 1)]
+    spans = [(min(values), max(values)) for values in ([p.x for p in shown], [p.y for p in shown])]
     axes = _Axes((500, 370), spans, log=True)
     axes.frame("", labels)
     taken: list[tuple[float, float, float, float]] = []
@@ -214,8 +220,9 @@ def _label(axes: _Axes, point: Point, taken: list[tuple[float, float, float, flo
             if inside and not any(_overlap(box, other) for other in taken):
                 taken.append(box)
                 if far > 9:
+                    end = min(max(x, box[0]), box[2]), min(max(y, box[1]), box[3])
                     axes.parts.append(
-                        f'<path d="M{x:.1f} {y:.1f}L{min(max(x, box[0]), box[2]):.1f} {min(max(y, box[1]), box[3]):.1f}" '
+                        f'<path d="M{x:.1f} {y:.1f}L{end[0]:.1f} {end[1]:.1f}" '
                         f'stroke="{_SOFT}" stroke-width="0.6"/>'
                     )
                 axes.text(left, y + far * dy, point.label, colour=_INK, bold=point.star)

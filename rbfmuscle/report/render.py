@@ -101,7 +101,7 @@ def draw_preview(saved: SavedRun, path: Path) -> None:
     """Write the whole motion, seen in its plane and from the front, as an animation."""
     frames = chosen_frames(saved.frames, _PREVIEW_FRAMES)
     seen = muscle_path([saved], frames[:: max(1, len(frames) // 4)] + frames[-1:])
-    directions = [motion_direction([saved.poses[frame] for frame in frames]), VIEWS["front"][0]]
+    directions = [motion_direction([saved.poses[frame] for frame in frames]), np.array(VIEWS["front"][0])]
     size = fitted_size(directions[0], seen, _PREVIEW_AREA)
     panels = [Panel(saved, direction, size, seen) for direction in directions]
     save_images(draw_panels(panels, frames, ["plane of the motion", "front"], _chips(saved)), path, 4.0)

@@ -63,11 +63,10 @@ _MOST_POINTS, _MOST_EVENTS = 2_600_000, 60
 _WORK = ("solved", "carried", "skipped", "substeps")
 # Tables or plots of their own.
 _ELSEWHERE = ("volume", "moment_arm", "time_solve", "time_fit", "time_extract")
-_READING = """<p>Each muscle is one closed surface in each frame. Depths in bones are exact distances to the bone meshes;
-where the model cuts the bone out of the surface, the depth before the cut is given too. Limits are those of
-<code>run.json</code>; a row is amber from four fifths of its limit. The first frame may load and compile, so times are
-medians. Drag to turn the picture, scroll or pinch to zoom, drag with shift to move it; names below it switch muscles
-and their lines on and off.</p>"""
+_READING = """<p>Each muscle is one closed surface in each frame. Depths in bones are exact distances to the bone
+meshes; where the model cuts the bone out of the surface, the depth before the cut is given too. A row is amber from four
+fifths of its limit. Times are medians, as the first frame may load and compile. Drag to turn the picture, scroll or
+pinch to zoom, drag with shift to move it; names below it switch muscles and their lines on and off.</p>"""
 
 
 def write_report(
@@ -135,7 +134,7 @@ def _page(saved: SavedRun) -> Page:
     sections += [
         Section("Neighbours", _neighbours(saved)),
         Section("Events", _events(saved.events), f"{len(saved.events)}"),
-        Section("Time of each stage", _stages(saved), "milliseconds per frame: median and 95th percentile"),
+        Section("Time of each stage", _stages(saved), "median milliseconds per frame"),
         Section(
             "How to read this", _READING + definitions((n, meaning) for n, (_, meaning) in QUANTITIES.items())
         ),
@@ -287,33 +286,26 @@ def _cell(name: str, facts: Mapping[str, Any] | None, limit: float | None) -> Ce
 
 
 def _stages(saved: SavedRun) -> str:
-    """What each stage took of each muscle, the most expensive first, and in how many frames it was solved, and why."""
+    """What each stage took of each muscle, the most expensive first, and in how many frames it was solved."""
     stages, work = saved.info.get("stages") or {}, saved.info.get("work") or {}
     names = list(dict.fromkeys(key for found in stages.values() for key in found))
-    rows = []
-    for muscle, found in sorted(stages.items(), key=lambda row: -_median(row[1].get("time_frame"))):
-        cells: list[Cell | str] = [muscle]
-        for name in names:
-            facts = found.get(name)
-            text = f"{1e3 * facts['median']:.1f}, {1e3 * facts['p95']:.1f}" if _median(facts) >= 0 else "–"
-            cells.append(Cell(text, _median(facts)))
-        rows.append([*cells, *_work(work.get(muscle))])
-    head = ["muscle", *(name.removeprefix("time_") for name in names), *_WORK, "mostly for"]
-    return table(head, rows) if rows else ""
-
-
-def _median(facts: Mapping[str, float] | None) -> float:
-    """Median of a stage, -1 where there is none."""
-    return (
-        facts["median"] if facts and facts["median"] is not None and math.isfinite(facts["median"]) else -1.0
+    rows: list[list[Cell | str]] = []
+    for muscle, found in stages.items():
+        medians = [(found.get(name) or {}).get("median") for name in names]
+        done = work.get(muscle, {})
+        cells = [Cell(f"{1e3 * value:.1f}" if value is not None else "–", value) for value in medians]
+        cells += [Cell(str(done.get(name, "–")), done.get(name)) for name in _WORK]
+        rows.append(
+            [muscle, *cells, Cell(", ".join(f"{k}: {v}" for k, v in done.get("reasons", {}).items()))]
+        )
+    rows.sort(
+        key=lambda row: -max((cell.value or 0.0 for cell in row[1:] if isinstance(cell, Cell)), default=0.0)
     )
-
-
-def _work(done: Mapping[str, Any] | None) -> list[Cell | str]:
-    if not done:
-        return ["–"] * (len(_WORK) + 1)
-    most = max(done["reasons"], key=lambda state: done[state], default="")
-    return [*(Cell(str(done[name]), done[name]) for name in _WORK), done["reasons"].get(most, "")]
+    return (
+        table(["muscle", *(name.removeprefix("time_") for name in names), *_WORK, "why"], rows)
+        if rows
+        else ""
+    )
 
 
 def _neighbours(saved: SavedRun) -> str:
@@ -339,7 +331,7 @@ def _events(events: Iterable[Sequence[Any]]) -> str:
     parts = []
     for action, found in sorted(kinds.items(), key=lambda kind: -len(kind[1])):
         often = ", ".join(f"{name or 'bones'} {n}" for name, n in Counter(e[1] for e in found).most_common(6))
-        rows = [[str(value) for value in event[:4]] for event in found[:_MOST_EVENTS]]
+        rows = [[Cell(str(value)) for value in event[:4]] for event in found[:_MOST_EVENTS]]
         left = f"<p>and {len(found) - len(rows)} more in events.csv</p>" if len(found) > len(rows) else ""
         parts.append(f"<h4>{action}: {often}</h4>{table(['frame', 'muscle', 'bone', 'count'], rows)}{left}")
     return "".join(parts)

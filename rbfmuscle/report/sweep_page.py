@@ -6,17 +6,17 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from rbfmuscle.experiments.sweep_table import LENGTHS
 from rbfmuscle.report.appearance import MUSCLE_COLOURS
 from rbfmuscle.report.page import GOOD, NEAR, PLAIN, Cell, Light, Page, Section, number, table
 from rbfmuscle.report.plots import Point, front_plot
 
 SHOWN = ("error_rms", "error_max", "volume_error", "penetration_max", "bone_penetration_max", "time_frame")
-_READING = """<p><b>error_rms</b> is the distance between a point's surfaces and those of the <b>reference</b> at the same
-poses, both ways, root mean square over frames and muscles. It says how far a setting is from the reference, not how far the
-model is from a real muscle. A point is on the <b>front</b> if no other is as accurate in less time. Points that ran beside
-others share memory and caches with them.</p>"""
-_INSIDE = """<p>The reference is itself a point of the grid, so points near it err little by definition. Give a finer one
-(<code>--reference</code>) to judge the default.</p>"""
+_READING = """<p><b>error_rms</b> is the distance between a point's surfaces and those of the <b>reference</b> at the
+same poses, both ways, root mean square over frames and muscles: how far a setting is from the reference, not how far
+the model is from a real muscle. A point is on the <b>front</b> if no other is as accurate in less time.</p>"""
+_INSIDE = """<p>The reference is itself a point of the grid, so points near it err little by definition. Give a finer
+one (<code>--reference</code>) to judge the default.</p>"""
 
 
 def write_page(found: dict[str, Any], directory: str | Path) -> None:
@@ -70,10 +70,10 @@ def front_picture(rows: Iterable[dict[str, Any]], quantity: str) -> str:
     rows = [row for row in rows if row["role"] != "reference" and row["status"] == "done"]
     groups = list(dict.fromkeys(_group(row) for row in rows))
     colours = {group: MUSCLE_COLOURS[k % len(MUSCLE_COLOURS)] for k, group in enumerate(groups)}
-    points = [
-        Point(1e3 * row["time_frame"], row[quantity], _short(row), colours[_group(row)], row["role"] == "default", row["front"])
-        for row in rows
-    ]  # fmt: skip
+    points = []
+    for row in rows:
+        place, star = (1e3 * row["time_frame"], row[quantity]), row["role"] == "default"
+        points.append(Point(*place, _short(row), colours[_group(row)], star, row["front"]))
     labels = ("time per frame [ms]", quantity.replace("_", " "))
     return front_plot(points, labels, groups=colours if len(groups) > 1 else {})
 
@@ -93,31 +93,29 @@ def _short(row: dict[str, Any]) -> str:
 
 def _lights(rows: list[dict[str, Any]], verdicts: list[dict[str, Any]], quantity: str) -> list[Light]:
     """Of each default: itself, what is quicker, what is more accurate; then the two ends of the front."""
-    by_key, lights = {row["key"]: row for row in rows}, []
     front = sorted((row for row in rows if row["front"]), key=lambda row: row["time_frame"])
-    several = len(verdicts) > 1
-    chosen = [(f"default of {v['scene']}" if several else "default", v["default"], v) for v in verdicts]
-    for verdict in verdicts[:2]:
+    chosen: list[tuple[str, str | None, str]] = []
+    for verdict in verdicts:
+        state = PLAIN if inside_grid(rows) else GOOD if verdict["near"] else NEAR
+        name = f"default of {verdict['scene']}" if len(verdicts) > 1 else "default"
         chosen += [
-            ("as accurate, quicker", verdict["faster"], None),
-            ("as quick, more accurate", verdict["better"], None),
+            (name, verdict["default"], state),
+            ("as accurate, quicker", verdict["faster"], PLAIN),
+            ("as quick, more accurate", verdict["better"], PLAIN),
         ]
-    chosen += (
-        [("the quickest", front[0]["key"], None), ("the most accurate", front[-1]["key"], None)]
-        if front
-        else []
-    )
-    for title, key, verdict in chosen:
-        if key:
-            row = by_key[key]
-            state = PLAIN if verdict is None or inside_grid(rows) else GOOD if verdict["near"] else NEAR
-            unit = row["units"] if quantity in ("error_rms", "error_max", "rest_error_rms") else ""
-            cells = [
-                Cell(number(row[quantity], unit), row[quantity], state),
-                Cell(number(row["time_frame"], "s"), row["time_frame"]),
-            ]
-            lights.append(Light(title, cells, note="" if verdict else _short(row)))
-    return lights
+    if front:
+        chosen += [("the quickest", front[0]["key"], PLAIN), ("the most accurate", front[-1]["key"], PLAIN)]
+    by_key = {row["key"]: row for row in rows}
+    return [_light(by_key[key], title, quantity, state) for title, key, state in chosen if key]
+
+
+def _light(row: dict[str, Any], title: str, quantity: str, state: str) -> Light:
+    unit = row["units"] if quantity in LENGTHS else ""
+    cells = [
+        Cell(number(row[quantity], unit), row[quantity], state),
+        Cell(number(row["time_frame"], "s"), row["time_frame"]),
+    ]
+    return Light(title, cells, note="" if row["role"] == "default" else _short(row))
 
 
 def _points(rows: list[dict[str, Any]]) -> str:
@@ -125,20 +123,10 @@ def _points(rows: list[dict[str, Any]]) -> str:
     lines = []
     for row in rows:
         cells = [Cell(str(row["settings"].get(key, ""))) for key in settings]
-        values = [
+        cells += [Cell(row["role"]), Cell("yes" if row["front"] else "")]
+        cells += [
             Cell(number(row[name], "s" if name.startswith("time_") else ""), row[name]) for name in SHOWN
         ]
-        lines.append(
-            [
-                row["scene"],
-                *cells,
-                row["role"],
-                "yes" if row["front"] else "",
-                *values,
-                row["error"] or row["status"],
-            ]
-        )
-    return table(
-        ["scene", *settings, "role", "on the front", *(name.replace("_", " ") for name in SHOWN), "status"],
-        lines,
-    )
+        lines.append([row["scene"], *cells, Cell(row["error"] or row["status"])])
+    head = ["scene", *settings, "role", "front", *(name.replace("_", " ") for name in SHOWN), "status"]
+    return table(head, lines)

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from blend_model import arm_scene, use_blend_model
 from matplotlib.figure import Figure
+from rbfmuscle.report.comparison_plots import plot_models
 
 from rbfmuscle.metrics.quantities import ALL
 from rbfmuscle.output.runinfo import Stages
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.comparison_plots import plot_models
 from rbfmuscle.report.plots import plot_panels
 from rbfmuscle.run import simulate
 from rbfmuscle.simulation.rigid_transport import MuscleStatus
