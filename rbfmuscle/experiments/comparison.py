@@ -348,7 +348,8 @@ def describe(results: dict[str, Any], labels: dict[str, str], units: str) -> str
         text += f" at {ratio:.2g} times the time of {labels[quick]} ({depth[quick]:.2g} {units})"
     near = min(others, key=lambda name: whole[name].get("distance_rms", math.inf), default=None)
     if near and "distance_rms" in whole[near]:
-        text += f"; {labels[near]}, comes within {whole[near]['distance_rms']:.2g} {units} RMS of it"
+        comma = "," if "," in labels[near] else ""
+        text += f"; {labels[near]}{comma} comes within {whole[near]['distance_rms']:.2g} {units} RMS of it"
         if near in timed:
             text += f" at {whole[near]['time_frame'] / whole[first]['time_frame']:.2g} times its time"
     return f"{text}."

@@ -160,7 +160,7 @@ def render_run(
         [saved], sorted({saved.frames[0], saved.frames[len(saved.frames) // 2], saved.frames[-1]})
     )
     paint, chips = (
-        (_activation_paint(saved), _activation_chips()) if colour == "activation" else (None, _chips(saved))
+        (activation_paint(saved), _activation_chips()) if colour == "activation" else (None, _chips(saved))
     )
     panels = [
         Panel(saved, VIEWS[view][0], fitted_size(VIEWS[views[0]][0], seen, area), seen, paint)
@@ -184,7 +184,7 @@ def _activation_chips() -> dict[str, str]:
     return scale_chips([f"activation {share:g}" for share in np.linspace(0, 1, 5)])
 
 
-def _activation_paint(saved: SavedRun) -> Paint:
+def activation_paint(saved: SavedRun) -> Paint:
     """Each muscle by its activation, 0 where it does not contract."""
     known = activations(saved)
     return lambda _, muscle, frame, vertices: scale_colours(

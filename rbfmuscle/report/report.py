@@ -64,9 +64,9 @@ _WORK = ("solved", "carried", "skipped", "substeps")
 # Tables or plots of their own.
 _ELSEWHERE = ("volume", "moment_arm", "time_solve", "time_fit", "time_extract")
 _READING = """<p>Each muscle is one closed surface in each frame. Depths in bones are exact distances to the bone
-meshes; where the model cuts the bone out of the surface, the depth before the cut is given too. A row is amber from four
-fifths of its limit. Times are medians, as the first frame may load and compile. Drag to turn the picture, scroll or
-pinch to zoom, drag with shift to move it; names below it switch muscles and their lines on and off.</p>"""
+meshes; where the model cuts the bone out of the surface, the depth before the cut is given too. A row is amber from
+four fifths of its limit. Times are medians, as the first frame may load and compile. Drag to turn the picture, scroll
+or pinch to zoom, drag with shift to move it; names below it switch muscles and their lines on and off.</p>"""
 
 
 def write_report(
@@ -265,7 +265,7 @@ def _summary(saved: SavedRun) -> str:
         unit = next(found[name]["unit"] for found in muscles.values() if name in found)
         limit = "" if name not in limits else f" ({'≥' if name in LEAST else '≤'} {limits[name]:g})"
         head.append(f"{name.replace('_', ' ')}{'' if unit == '1' else f' [{unit}]'}{limit}")
-    rows = []
+    rows: list[tuple[int, list[Cell | str]]] = []
     for muscle, found in muscles.items():
         own = {name: muscle_limit(name, limits[name], found) for name in used if name in limits and name in found}
         cells = [_cell(name, found.get(name), own.get(name)) for name in used]
@@ -318,13 +318,14 @@ def _neighbours(saved: SavedRun) -> str:
         ]
         for pair in saved.info.get("neighbours") or []
     ]
-    return (
-        table(["pair", f"overlap [{saved.units}]", f"gap opened, RMS [{saved.units}]"], rows) if rows else ""
-    )
+    head = ["pair", f"overlap [{saved.units}]", f"gap opened, RMS [{saved.units}]"]
+    return table(head, rows) if rows else ""
 
 
 def _events(events: Iterable[Sequence[Any]]) -> str:
     """Events by action, the commonest first, with the muscles that have most of them."""
+    from markupsafe import escape
+
     kinds: dict[str, list[Sequence[Any]]] = {}
     for event in events:
         kinds.setdefault(event[4], []).append(event)
@@ -333,5 +334,6 @@ def _events(events: Iterable[Sequence[Any]]) -> str:
         often = ", ".join(f"{name or 'bones'} {n}" for name, n in Counter(e[1] for e in found).most_common(6))
         rows = [[Cell(str(value)) for value in event[:4]] for event in found[:_MOST_EVENTS]]
         left = f"<p>and {len(found) - len(rows)} more in events.csv</p>" if len(found) > len(rows) else ""
-        parts.append(f"<h4>{action}: {often}</h4>{table(['frame', 'muscle', 'bone', 'count'], rows)}{left}")
+        shown = table(["frame", "muscle", "bone", "count"], rows)
+        parts.append(f"<h4>{escape(f'{action}: {often}')}</h4>{shown}{left}")
     return "".join(parts)

@@ -249,7 +249,7 @@ class TestKilledRuns:
         assert code == 0, err
         assert len(list((killed / "export" / "stl").glob("biceps_*.stl"))) == 6
 
-    def test_it_is_rendered(self, killed, capsys, graphics):
+    def test_it_is_rendered(self, killed, capsys):
         code, _, err = call(capsys, "render", killed, "-o", killed / "last.png", "--view", "front")
         assert code == 0, err
         assert (killed / "last.png").read_bytes().startswith(b"\x89PNG")

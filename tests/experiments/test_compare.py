@@ -11,10 +11,10 @@ from blend_model import BlendMuscle, arm_scene
 
 from rbfmuscle import compare
 from rbfmuscle.compare import compare_models
-from rbfmuscle.experiments.comparison import MEASURES, best_models, verdict
+from rbfmuscle.experiments.comparison import MEASURES, best_models, describe
 from rbfmuscle.metrics.comparison_measures import MaterialProbe, curvature_variation
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.comparison_page import map_limit
+from rbfmuscle.report.comparison_page import map_limit, shown
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.validation import SolveError, UsageError
 
@@ -63,17 +63,27 @@ def results(**models):
     return {name: {"all": values} for name, values in models.items()}
 
 
-class TestVerdict:
-    def test_losing_is_said(self):
+class TestAnswer:
+    def test_says_what_the_first_keeps_at_which_price_and_who_comes_near(self):
         found = results(
-            a={"volume_error": 1e-3, "time_frame": 0.02, "strain_rms": 0.1},
-            b={"volume_error": -1e-9, "time_frame": 0.03, "strain_rms": 0.1},
+            rbf={"penetration_max": 0.0, "bone_penetration_max": 0.031, "time_frame": 0.074},
+            pbd={"penetration_max": 3.17, "time_frame": 0.02, "distance_rms": 31.0},
+            settled={"penetration_max": 3.2, "time_frame": 1.406, "distance_rms": 5.71},
         )
-        mine = verdict(found, "a", "mm")
-        assert mine["best"] == ["time_frame"]
-        assert mine["loses"] == [
-            {"quantity": "volume_error", "value": 1e-3, "other": "b", "other_value": -1e-9}
-        ]
+        labels = {"rbf": "RBF", "pbd": "PBD, 3 sweeps as in the paper", "settled": "PBD, converged"}
+        assert describe(found, labels, "mm") == (
+            "RBF keeps out of bones (0.031 mm) at 3.7 times the time of PBD, 3 sweeps as in the paper (3.2 mm); "
+            "PBD, converged, comes within 5.7 mm RMS of it at 19 times its time."
+        )
+        text = describe({name: found[name] for name in ("pbd", "rbf")}, labels, "mm")
+        assert text.startswith(
+            "PBD, 3 sweeps as in the paper stands in bones (3.2 mm) at 0.27 times the time of RBF"
+        )
+
+    def test_one_frame_has_no_price(self):
+        found = results(a={"penetration_max": 0.5}, b={"penetration_max": 0.1, "distance_rms": 2.0})
+        text = describe(found, {"a": "A", "b": "B"}, "cm")
+        assert text == "A stands in bones (0.5 cm); B comes within 2 cm RMS of it."
 
     def test_what_does_not_count_is_a_tie(self):
         found = results(a={"rest_error_rms": 0.0}, b={"rest_error_rms": 0.01}, c={"rest_error_rms": 0.5})
@@ -83,6 +93,25 @@ class TestVerdict:
     def test_colours_of_maps_end_at_round_numbers(self):
         table = {"results": results(a={}, b={"distance_max": 15.9})}
         assert map_limit(table) == 5.0
+
+    def test_values_have_their_unit(self):
+        units = {"time_frame": "s", "volume_error": "1", "penetration_max": "mm", "components": "1"}
+        table = {"units": "mm", "measures": {name: {"unit": unit} for name, unit in units.items()}}
+        assert shown(table, "time_frame", 0.0234) == "23.4 ms" and shown(table, "time_frame", None) == "–"
+        assert shown(table, "penetration_max", 1.234) == "1.2 mm" and shown(table, "components", 3.0) == "3"
+        assert shown(table, "penetration_max", 0.009) == "0 mm"  # below half of what counts
+
+
+def test_labels_say_what_ran():
+    scene = arm_scene()
+    settings = {"pbd:model.iterations": 7}
+    variants = compare._variants(scene, ["rbf", "pbd", "xpbd-converged"], {})
+    assert [compare._label(name, variant) for name, variant in variants.items()] == [
+        "RBF", "PBD, 3 sweeps as in the paper", "XPBD, converged"
+    ]  # fmt: skip
+    assert variants["xpbd-converged"].muscles[0].model == "xpbd"
+    many = compare._variants(scene, ["rbf", "pbd"], settings)["pbd"]
+    assert compare._label("pbd", many) == "PBD, 7 sweeps"
 
 
 @pytest.fixture(scope="module")
@@ -137,24 +166,26 @@ class TestComparison:
             assert float(row["value"]) == table["results"][row["model"]][row["muscle"]][row["quantity"]]
         assert {row["unit"] for row in rows if row["quantity"] == "curvature_variation"} == {"1/mm"}
 
-    def test_report_says_where_each_loses(self, compared):
+    def test_page_begins_with_the_answer_and_holds_every_measure(self, compared):
         folder, table = compared
         text = (folder / "report.html").read_text(encoding="utf-8")
-        assert "There are no pictures" in text and "<b>pbd</b> alone is best in" in text
-        lost = {entry["quantity"] for entry in table["verdicts"]["rbf"]["loses"]}
-        assert "rest_error_rms" in lost
-        assert all(MEASURES[quantity].title in text for quantity in lost)
+        assert table["answer"].startswith("RBF keeps out of bones") and table["answer"] in text
+        assert "No pictures: they were switched off." in text and text.index(table["answer"]) < text.index(
+            "<table"
+        )
+        assert all(MEASURES[quantity].title in text for quantity in table["results"]["pbd"]["all"])
 
 
-def test_pictures_show_every_model(tmp_path, graphics):
+def test_pictures_show_every_model(tmp_path):
     from PIL import Image
 
     compare_models(arm_scene(), tmp_path, ["pbd", "arap-volume"])
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert text.count("data:image/png") == 3 + 2
+    assert '"panels":["PBD, 3 sweeps as in the paper","arap-volume"]' in text and "Distance to PBD" in text
     with Image.open(tmp_path / "models.webp") as moving:
         assert moving.n_frames == 3
-        assert moving.width == 2 * 420
+        left, right = np.split(np.asarray(moving.convert("RGB"), dtype=int)[30:-40], 2, axis=1)
+        assert all((half[..., 0] > half[..., 1] + 50).mean() > 0.01 for half in (left, right))
 
 
 class TestFailure:
@@ -164,6 +195,7 @@ class TestFailure:
             (["rbf"], {}, "two or more"),
             (["rbf", "rbf"], {}, "two or more"),
             (["rbf", "pbd"], {"xpbd:model.sweeps": 2}, "not compared"),
+            (["rbf", "rbf-converged"], {}, "only mesh models have sweeps"),
         ):
             with pytest.raises(UsageError, match=words):
                 compare_models(arm_scene(), tmp_path, models, settings=settings)

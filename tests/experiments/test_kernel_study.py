@@ -15,9 +15,8 @@ from command_line import call
 import rbfmuscle as rm
 from rbfmuscle.experiments import kernel_study
 from rbfmuscle.experiments.kernel_judge import ReferenceSurface
-from rbfmuscle.experiments.kernel_study import recommend, row_name, row_toml
-from rbfmuscle.metrics.mesh_distance import MeshDistance
-from rbfmuscle.report.kernel_page import write_study
+from rbfmuscle.experiments.kernel_study import describe, recommend, row_toml
+from rbfmuscle.report.kernel_page import answer, write_studies
 from rbfmuscle.validation import MeshError, UsageError
 
 
@@ -146,27 +145,52 @@ def test_rows_that_err_more_than_the_coarsest_kernel_are_unfit():
     assert [one["unfit"] for one in rows] == ["", "an error of 0.9, beyond that of linear, 0.4", ""]
 
 
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ([row("cubic", 0.143, 2.0), row("quintic", 0.1407, 20.0), row("linear", 0.4, 1.0)],
+         "2 kernels tie within 2 %: use cubic with 80 centres, the quickest without a shape parameter to choose."),
+        ([row("quintic", 0.10, 20.0), row("cubic", 0.14, 2.0)],
+         "Use quintic with 80 centres, whose error is 29 % less than the next."),
+        ([row("cubic", 0.15, 2.0)], "Use cubic with 80 centres."),
+        ([row("gaussian", 0.05, 1.0, unfit="9 sheets")], "Every field is unfit; take more centres."),
+    ],
+)  # fmt: skip
+def test_answer_says_what_to_use_and_why(rows, words):
+    assert describe([one | {"centres": 80} for one in rows]) == words
+
+
 def test_files_hold_the_table(study, ellipsoid, tmp_path):
-    write_study(study, tmp_path, title="An ellipsoid", mesh=MeshDistance(ellipsoid.vertices, ellipsoid.faces))
+    write_studies({"egg": study}, tmp_path, {"egg": ellipsoid})
     kept = json.loads((tmp_path / "kernels.json").read_text())
     assert [row["kernel"] for row in kept["rows"]] == [row["kernel"] for row in study.rows]
     assert (tmp_path / "kernels.csv").read_text().count("\n") == len(study.rows) + 1
-    assert (tmp_path / "recommended.vtp").stat().st_size > 1000
+    assert (tmp_path / "recommended_egg.vtp").stat().st_size > 1000
     page = (tmp_path / "kernels.html").read_text()
-    assert "An ellipsoid" in page and "http" not in page.replace("http-equiv", "")
-    best = study.recommended
-    text = html.unescape(page.split("<h2>To paste</h2><pre>")[1].split("</pre>")[0])
-    assert tomllib.loads(text)["muscle"]["model"]["kernel"] == best["kernel"]
-    assert f"Recommended: <b>{html.escape(row_name(best))}</b>" in page
+    assert "Kernels for egg" in page and "http" not in page and html.escape(describe(study.rows)) in page
+    text = html.unescape(page.split("<pre>")[1].split("</pre>")[0])
+    assert tomllib.loads(text)["muscle"]["model"]["kernel"] == study.recommended["kernel"]
+    assert page.count("✓") >= 1 and study.recommended["kernel"] in page
+
+
+def test_several_surfaces_share_a_page_and_an_answer(study, ellipsoid, tmp_path):
+    studies = {"one": study, "two": study}
+    write_studies(studies, tmp_path, dict.fromkeys(studies, ellipsoid))
+    best = study.recommended["kernel"]
+    assert answer(studies).startswith(f"Use {best}: within 5 % of the least error on 2 of 2 muscles")
+    page = (tmp_path / "kernels.html").read_text()
+    assert "Kernels for all 2 muscles" in page and "Every row of two" in page
+    assert {path.name for path in tmp_path.glob("*.vtp")} == {"recommended_one.vtp", "recommended_two.vtp"}
 
 
 @pytest.mark.parametrize("left", [0, 1])
-def test_page_of_few_fit_rows_is_written(study, tmp_path, left):
+def test_page_of_few_fit_rows_is_written(study, ellipsoid, tmp_path, left):
     rows = [{**row, "unfit": "" if k < left else "too few centres"} for k, row in enumerate(study.rows)]
-    write_study(replace(study, rows=rows, recommended=recommend(rows)), tmp_path)
+    few = replace(study, rows=rows, recommended=recommend(rows))
+    write_studies({"egg": few}, tmp_path, {"egg": ellipsoid})
     page = (tmp_path / "kernels.html").read_text()
     assert page.count("too few centres") == len(rows) - left
-    assert ("every field is unfit" in page) is (left == 0)
+    assert ("Every field is unfit" in page) is (left == 0)
 
 
 def test_wrong_requests_are_answered(ellipsoid):
@@ -186,6 +210,6 @@ def test_command_ranks_and_prints(tmp_path, capsys):
     assert code == 0 and {row["kernel"] for row in json.loads(out)["rows"]} == {"cubic", "quintic"}
     assert (tmp_path / "k" / "kernels.html").exists()
     code, out, _ = call(capsys, "kernels", *words, "--resolution", "24", "-o", tmp_path / "k")
-    assert code == 0 and "recommended: " in out and "[muscle.model]" in out
+    assert code == 0 and "use " in out.lower() and "[muscle.model]" in out
     code, _, err = call(capsys, "kernels", "phantom", "--centres", "150,some", "-o", tmp_path)
     assert code == 2 and "--centres must be whole numbers of 8 and more, got '150 some'" in err

@@ -1,4 +1,4 @@
-"""Sweeps: the grid, the front, scenes apart, failures, and the same table however the points were run."""
+"""Sweeps: the grid, the front, failures, and the same table however the points were run."""
 
 import csv
 import json
@@ -21,12 +21,11 @@ from rbfmuscle.experiments.sweep import SweepPoint, parse_grid, plan_sweep, poin
 from rbfmuscle.experiments.sweep_run import SweepFolder, run_sweep
 from rbfmuscle.experiments.sweep_table import (
     mark_front,
-    outliers,
     pareto_front,
     sweep_rows,
     write_table,
 )
-from rbfmuscle.report.sweep_page import draw_front, write_page
+from rbfmuscle.report.sweep_page import front_picture, inside_grid, write_page
 from rbfmuscle.validation import UsageError
 
 GRID = ["model.centres=40,60", "model.resolution=16,24"]
@@ -114,9 +113,17 @@ class TestGrid:
 
 
 def row(error, time, role=""):
-    facts = {"scene": "s", "status": "done", "role": role, "reference": "r", "model": ""}
+    facts = {"scene": "s", "status": "done", "role": role, "reference": "r", "model": "", "units": "mm"}
     label = role or f"{error:g} {time:g}"
-    return {**facts, "label": label, "error_rms": error, "time_frame": time, "front": False}
+    return {
+        **facts,
+        "label": label,
+        "key": label,
+        "settings": {},
+        "error_rms": error,
+        "time_frame": time,
+        "front": False,
+    }
 
 
 class TestFront:
@@ -133,7 +140,7 @@ class TestFront:
         (verdict,) = mark_front(rows)
         assert verdict["factor"] == pytest.approx(factor)
         assert verdict["near"] is near
-        assert ("lies on the front" in verdict["text"]) is rows[2]["front"]
+        assert ("lies on the Pareto front" in verdict["text"]) is rows[2]["front"]
 
     @settings(deadline=None, derandomize=True)
     @given(st.lists(st.tuples(st.integers(0, 4), st.integers(1, 5)), min_size=2, max_size=8))
@@ -149,11 +156,26 @@ class TestFront:
         assert (verdict["faster"] and float(verdict["faster"].split()[1])) == (
             min(faster) if faster else None
         )
-        assert ("Quicker" in verdict["text"], "Better" in verdict["text"]) == (bool(faster), bool(better))
+        assert ("and quicker" in verdict["text"], "more accurate" in verdict["text"]) == (
+            bool(faster),
+            bool(better),
+        )
 
-    def test_picture_is_drawn_for_a_front(self):
-        rows = [row(0.5, 0.02), row(0.3, 0.03, "default"), row(np.nan, 0.5, "reference")]
-        assert draw_front(rows, "error_rms").startswith(b"\x89PNG")
+    def test_picture_marks_the_default_and_leaves_out_the_reference(self):
+        rows = [row(0.5, 0.02), row(0.3, 0.03, "default"), row(0.1, 0.5, "reference")]
+        mark_front(rows)
+        picture = front_picture(rows, "error_rms")
+        assert (picture.count("<circle"), picture.count("<polygon")) == (
+            1,
+            1,
+        ) and ">default</text>" in picture
+
+    def test_reference_within_its_own_grid_is_noticed(self):
+        points = [
+            {"role": role, "settings": {"a": a}} for role, a in (("", 1), ("default", 2), ("reference", 2))
+        ]
+        assert inside_grid(points)
+        assert not inside_grid([*points[:2], {"role": "reference", "settings": {"a": 3}}])
 
 
 def test_rows_are_those_of_their_points_in_order():
@@ -169,14 +191,6 @@ def test_rows_are_those_of_their_points_in_order():
     assert [r["label"] for r in rows] == ["default", "a=1", "a=2"]
     assert [r["error"] for r in rows] == ["", "no", ""] and rows[0]["units"] == "cm"
     np.testing.assert_array_equal([r["error_rms"] for r in rows], [0.25, np.nan, np.nan])
-
-
-def test_a_scene_apart_is_found_where_there_are_enough_others():
-    values = [(f"s{k}", "m", "length", 100.0 + k) for k in range(6)] + [("far", "m", "length", 160.0)]
-    values += [("few", "other", "length", 1.0), ("few2", "other", "length", 9.0)]
-    (found,) = outliers(values)
-    assert (found["scene"], found["median"]) == ("far", 103.0) and found["apart"] > 10
-    assert outliers(values[:6]) == []
 
 
 class TestRun:
@@ -210,7 +224,8 @@ class TestRun:
         points, folder = finished
         write_page(write_table(points, folder, {"arm": "mm"}), folder)
         page = (folder / "sweep.html").read_text()
-        assert "data:image/png;base64," in page and "http" not in page
+        assert "<svg" in page and "http" not in page and "the default lies" in page
+        assert (folder / "pareto.svg").read_text().startswith("<svg xmlns")
 
 
 def crash_or_run(scene, settings, frames):
@@ -287,9 +302,6 @@ class TestCommand:
         table = json.loads(capsys.readouterr().out)
         assert {r["scene"] for r in table["rows"]} == {scene_file.stem, "other"}
         assert table["done"] == len(table["rows"])
-        long = (tmp_path / "out" / "quantities.csv").read_text().splitlines()
-        assert long[0].startswith("scene,point,muscle,quantity,unit,count")
-        assert any(",volume_error," in line for line in long)
 
     def test_failed_points_end_with_five_and_are_run_again(self, scene_file, tmp_path, monkeypatch, capsys):
         base = ["sweep", str(scene_file), "-o", str(tmp_path / "out"), "--jobs", "1"]

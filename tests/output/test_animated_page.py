@@ -1,6 +1,5 @@
 """The page that turns and scrubs a run: by itself, and with every vertex where it belongs."""
 
-import base64
 import json
 import re
 import zlib
@@ -18,23 +17,27 @@ CAPTIONS = ["frame 0, knee 0°", "frame 1, knee 10°", "frame 2, knee 20°", "fr
 
 @pytest.fixture(scope="module")
 def moving():
-    """A muscle that changes its shape over four frames, a bone that turns and one that stands."""
-    ball, box = (
-        trimesh.creation.icosphere(subdivisions=2, radius=0.1),
-        trimesh.creation.box((0.05, 0.05, 0.3)),
-    )
+    """Two muscles over four frames, one with other triangles in the last two; a bone that turns and one that stands."""
+    ball, box = trimesh.creation.icosphere(subdivisions=2, radius=100), trimesh.creation.box((50, 50, 300))
     points, faces = np.array(ball.vertices), np.array(ball.faces)
-    shapes = [points * [1.0, 1.0 + 0.1 * k, 1.0 - 0.05 * k] + [0.0, 0.02 * k, 0.0] for k in range(4)]
+    shapes = [points * [1.0, 1.0 + 0.1 * k, 1.0 - 0.05 * k] + [0.0, 20.0 * k, 0.0] for k in range(4)]
+    cube = trimesh.creation.box((80, 80, 80))
+    other = [*shapes[:2], np.array(cube.vertices), np.array(cube.vertices) + 5.0]
+    kinds = [faces, faces, np.array(cube.faces), np.array(cube.faces)]
+    kinds[1], kinds[3] = kinds[0], kinds[2]
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, :3, :3] = Rotation.from_rotvec(np.radians([[10.0 * k, 0, 0] for k in range(4)])).as_matrix()
-    poses[:, :3, 3] = [[0.0, 0.01 * k, 0.0] for k in range(4)]
+    poses[:, :3, 3] = [[0.0, 10.0 * k, 0.0] for k in range(4)]
     red, white = np.array([0.7, 0.2, 0.2]), np.array([0.9, 0.9, 0.8])
     bones = [
         MovingBone("shin", white, np.array(box.vertices), np.array(box.faces), poses),
-        MovingBone("thigh", white, np.array(box.vertices) + 0.3, np.array(box.faces), poses[:1].repeat(4, 0)),
+        MovingBone("thigh", white, np.array(box.vertices) + 300, np.array(box.faces), poses[:1].repeat(4, 0)),
     ]
-    muscle = MovingMuscle("calf </script><b>", red, shapes, [faces] * 4)
-    return MovingRun("knee & calf", "m", np.array([2, 3, 4, 7]) / 24.0, False, [muscle], bones, "z")
+    muscles = [
+        MovingMuscle("calf </script><b>", red, shapes, [faces] * 4),
+        MovingMuscle("knee", red, other, kinds),
+    ]
+    return MovingRun("knee & calf", "mm", np.array([2, 3, 4, 7]) / 24.0, False, muscles, bones, "z")
 
 
 @pytest.fixture(scope="module")

@@ -1,10 +1,8 @@
-"""The report: whole, self-contained, honest about limits, and written even where nothing can be drawn."""
+"""The report: answer, moving scene and rows with limits first, whole, self-contained, honest about limits."""
 
-import base64
-import io
+import json
 import re
 from html.parser import HTMLParser
-from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,16 +11,14 @@ import trimesh
 from blend_model import arm_scene, use_blend_model
 from PIL import Image
 
-import rbfmuscle.report.render as render
-from rbfmuscle.metrics.summary import within
+from rbfmuscle.metrics.summary import describe_verdict, within
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report import labels
-from rbfmuscle.report.appearance import fitted_size, neighbour_colours
-from rbfmuscle.report.page import folded_events
-from rbfmuscle.report.plots import motion_axis, plot_panels
-from rbfmuscle.report.report import write_report
-from rbfmuscle.run import simulate, stream_run
-from rbfmuscle.validation import MissingPartError, UsageError
+from rbfmuscle.report import labels, render
+from rbfmuscle.report.appearance import muscle_colours, muscle_groups
+from rbfmuscle.report.page import Cell, limit_state, number, table
+from rbfmuscle.report.report import _events, _stages, write_report
+from rbfmuscle.run import simulate
+from rbfmuscle.validation import UsageError
 
 
 @pytest.fixture(scope="module")
@@ -35,84 +31,106 @@ def folder(tmp_path_factory):
     return place
 
 
-class Balance(HTMLParser):
-    """Checks that every element is closed and notes what is loaded."""
+class Outline(HTMLParser):
+    """Checks that every element is closed, and notes what is loaded, and the cells of the rows with lights."""
 
     def __init__(self):
         super().__init__()
-        self.open, self.sources = [], []
+        self.open, self.sources, self.lights = [], [], {}
 
     def handle_starttag(self, tag, attrs):
         self.sources += [value for name, value in attrs if name in ("src", "href")]
         if tag not in ("meta", "img", "br", "input"):
-            self.open.append(tag)
+            self.open.append((tag, dict(attrs)))
 
     def handle_endtag(self, tag):
-        assert self.open.pop() == tag
+        assert self.open.pop()[0] == tag
+
+    def handle_data(self, text):
+        inside = any(attrs.get("class") == "lights" for tag, attrs in self.open if tag == "table")
+        if inside and self.open[-1][0] == "th":
+            self.title = text
+        elif inside and self.open[-1][0] == "td" and self.open[-1][1].get("class"):
+            self.lights[self.title] = self.open[-1][1]["class"], text
 
 
-def read(folder):
-    text = (folder / "report.html").read_text(encoding="utf-8")
-    parser = Balance()
-    parser.feed(text)
-    assert parser.open == []
-    return text, parser.sources
+def read(folder, name="report.html"):
+    text = (folder / name).read_text(encoding="utf-8")
+    outline = Outline()
+    outline.feed(text)
+    assert outline.open == []
+    return text, outline
+
+
+def test_answer_picture_and_rows_come_before_what_is_folded(folder):
+    write_report(folder, preview=False)
+    text, outline = read(folder)
+    verdict = describe_verdict(SavedRun(folder).info["muscles"], SavedRun(folder).info["limits"])
+    order = [
+        verdict[1:],
+        'data-scene="scene"',
+        "Keeps its volume",
+        "<details>",
+        "Moment arms and lengths",
+        "How to read this",
+    ]
+    places = [text.index(part) for part in order]
+    assert places == sorted(places)
+    assert len(outline.lights) == 5 and outline.sources == [] and "http" not in text
+    assert len(text) < 6_000_000
+
+
+def test_lights_and_red_cells_are_those_beyond_their_limits(folder):
+    write_report(folder, preview=False, pictures=False)
+    text, outline = read(folder)
+    info = SavedRun(folder).info
+    found, limits = info["muscles"]["biceps"], info["limits"]
+    beyond = [n for n, limit in limits.items() if n in found and not within(n, found[n]["worst"], limit)]
+    assert beyond and "No pictures: they were switched off." in text
+    cells = re.findall(r"<td[^>]*>", text[text.index("Every quantity") :])
+    assert sum("bad" in cell for cell in cells) == len(beyond)
+    depth = max(abs(found[name]["worst"]) for name in ("penetration_max", "bone_penetration_max"))
+    kept_out = all(
+        n not in beyond for n in ("penetration_max", "bone_penetration_max", "solver_penetration_max")
+    )
+    assert (outline.lights["Stays out of bones"][0] == "bad") == (not kept_out)
+    assert kept_out or outline.lights["Stays out of bones"][1] == number(depth, "mm")
+
+
+def test_scene_holds_every_frame_and_colour_of_the_plots(folder):
+    write_report(folder, preview=False)
+    text, _ = read(folder)
+    facts = json.loads(re.search(r'<script id="scene"[^>]*>(.*?)</script>', text, re.S)[1])
+    assert len(facts["captions"]) == 7 and facts["captions"][6] == "frame 6, elbow.flexion 60°"
+    colours = {part["name"]: part["colour"] for part in facts["parts"]}
+    assert re.search(
+        rf'data-muscle="biceps"><title>biceps</title><path[^>]*stroke="{colours["biceps"]}"', text
+    )
+    np.testing.assert_allclose(np.abs(facts["direction"]), [0, 1, 0], atol=1e-9)  # the elbow's axis
 
 
 def colours_of(image):
     return np.asarray(image.convert("RGB"), dtype=int).reshape(-1, 3)
 
 
-def test_report_without_pictures_has_plots_and_says_so(folder):
-    (folder / "preview.webp").unlink(missing_ok=True)  # of a test before this one
-    assert write_report(folder, preview=False, pictures=False) is None
-    text, sources = read(folder)
-    assert "There are no pictures" in text
-    assert all(source.startswith("data:image/svg+xml") for source in sources)
-    assert len(sources) == len(plot_panels(SavedRun(folder))) >= 6
-    assert "http" not in re.sub(r"base64,[^\"]+", "", text)
-
-
-def test_red_cells_are_those_beyond_their_limits(folder):
-    write_report(folder, preview=False, pictures=False)
-    text, _ = read(folder)
-    info = SavedRun(folder).info
-    beyond = [
-        name
-        for name, limit in info["limits"].items()
-        if name in info["muscles"]["biceps"]
-        and not within(name, info["muscles"]["biceps"][name]["worst"], limit)
-    ]
-    assert beyond
-    assert text.count('<td class="bad">') == len(beyond)
-    for name in beyond:
-        assert f"biceps: {name}" in text
-
-
-def test_pictures_show_bone_and_muscle(folder, graphics):
-    assert write_report(folder) is None
-    _, sources = read(folder)
-    pictures = [s for s in sources if s.startswith("data:image/png")]
-    assert len(pictures) == 3
-    image = Image.open(io.BytesIO(base64.b64decode(pictures[1].split(",")[1])))
-    pixels = colours_of(image.crop((0, 30, image.width, image.height - 40)))
-    red = (pixels[:, 0] > pixels[:, 1] + 60).mean()
-    ivory = ((pixels.min(axis=1) > 90) & (pixels[:, 0] - pixels[:, 2] > 15) & (pixels[:, 0] < 254)).mean()
-    assert red > 0.02
-    assert ivory > 0.02
+def test_preview_shows_bone_and_muscle_move(folder):
+    write_report(folder, report=False)
     with Image.open(folder / "preview.webp") as preview:
         assert preview.n_frames == 7
-        first = colours_of(preview.crop((0, 30, preview.width, preview.height - 40)))
+        first = colours_of(preview)
         preview.seek(6)
-        last = colours_of(preview.crop((0, 30, preview.width, preview.height - 40)))
+        last = colours_of(preview)
+    for pixels in (first, last):
+        rose = pixels[:, 0] > pixels[:, 1] + 50
+        ivory = (pixels.min(axis=1) > 90) & (pixels[:, 0] - pixels[:, 2] > 12) & ~rose
+        assert rose.mean() > 0.02 and ivory.mean() > 0.02
     assert (np.abs(first - last).max(axis=1) > 60).mean() > 0.03  # the forearm has risen by 60 degrees
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.gif", "a.webp"])
-def test_render_writes_what_the_suffix_says(folder, tmp_path, graphics, name):
-    render.render_run(folder, tmp_path / name, views=["side"], size=(160, 200))
+def test_render_writes_what_the_suffix_says(folder, tmp_path, name):
+    render.render_run(folder, tmp_path / name, views=["side"], area=40_000)
     with Image.open(tmp_path / name) as image:
-        assert image.size[0] == 160
         assert getattr(image, "n_frames", 1) == (1 if name == "a.png" else 7)
 
 
@@ -121,43 +139,11 @@ def test_render_refuses_wrong_words(folder, tmp_path):
         {"output": "a.bmp"},
         {"output": "a.png", "views": ["top"]},
         {"output": "a.png", "frame": 99},
+        {"output": "a.png", "colour": "activation"},
     ):
         words = dict(wrong)
         with pytest.raises(UsageError):
             render.render_run(folder, tmp_path / words.pop("output"), **words)
-
-
-def test_missing_graphics_leave_the_report_and_say_why(folder, tmp_path, monkeypatch):
-    dead = SimpleNamespace(returncode=-6, stderr="noise\nbad X server connection\n", stdout="")
-    monkeypatch.setattr(render.subprocess, "run", lambda *args, **kwargs: dead)
-    missing = write_report(folder)
-    assert isinstance(missing, MissingPartError)
-    assert missing.exit_code == 7
-    text, _ = read(folder)
-    assert "bad X server connection" in text
-    use_blend_model(monkeypatch)
-    with pytest.raises(MissingPartError, match="OpenGL"):
-        stream_run(arm_scene(report=True, preview=True), tmp_path)
-    assert SavedRun(tmp_path).info["status"] == "complete"
-    assert (tmp_path / "report.html").is_file()
-
-
-def test_child_says_what_is_wrong_in_one_line(tmp_path):
-    with pytest.raises(MissingPartError, match="holds no run"):
-        render.draw(tmp_path, [])
-
-
-def test_axis_is_the_angle_where_one_coordinate_goes_one_way(folder):
-    places, label = motion_axis(SavedRun(folder))
-    assert label == "elbow.flexion [degree]"
-    assert places[6] == pytest.approx(60)
-
-
-def test_axis_is_the_frame_on_the_way_there_and_back():
-    rows = [{"frame": k, "coordinates": {"a.b": v}} for k, v in enumerate([0, 10, 0])]
-    places, label = motion_axis(SimpleNamespace(info={"frames": rows}, frames=[0, 1, 2]))
-    assert label == "frame"
-    assert places == {0: 0, 1: 1, 2: 2}
 
 
 @pytest.fixture(scope="module")
@@ -171,7 +157,6 @@ def crowd(tmp_path_factory):
         for k in range(1, 12):
             mesh = one.mesh.copy()
             mesh.apply_translation([0.0, 11.0 * k, 0.0])
-            # The last lies partly in a bone of its own.
             attach = [{"bone": a.bone, "vertices": np.asarray(a.vertices).tolist()} for a in one.attachments]
             scene.add_muscle(f"muscle_{k:02d}", mesh, attach=attach)
         # It runs through the seventh.
@@ -185,43 +170,98 @@ def crowd(tmp_path_factory):
 def test_dozens_of_muscles_have_a_row_each_the_worst_first(crowd):
     write_report(crowd, preview=False, pictures=False)
     text, _ = read(crowd)
-    table = text[text.index("<h2>Summary") : text.index("<h2>Events")]
-    names = re.findall(r"<tr><th>([a-z_0-9]+)</th>", table[table.index("</thead>") :])
-    assert len(names) == 12 and names[0] == "muscle_07"
-    assert 'class="find"' in table and 'class="sortable"' in table
-    red = [row.count('class="bad"') for row in table[table.index("</thead>") :].split("<tr>")[1:]]
+    start = text.index("Every quantity")
+    rows = text[text.index("<tbody>", start) : text.index("</tbody>", start)].split("<tr>")[1:]
+    assert len(rows) == 12 and "muscle_07" in rows[0] and 'class="find"' in text
+    red = [row.count("bad") for row in rows]
     assert red == sorted(red, reverse=True) and red[0] > red[1]
 
 
-def test_events_are_folded_by_kind():
-    events = [(k, "one", "bone", 1, "halved") for k in range(70)] + [(3, "", "bone", 1, "bones_overlap")]
-    text = folded_events(events, 60)
-    assert text.count("<details>") == 2 and "and 10 more" in text
-    assert text.index("halved") < text.index("bones_overlap") and "one 70" in text
-    assert text.count("<td>") == (60 + 1) * 4 and text.count("<th>") == 2 * 4, "a cell for each heading"
-    assert "<td>59</td><td>one</td><td>bone</td><td>1</td></tr>" in text
+def scene_info(attached, joints):
+    return {
+        "scene": {
+            "joints": [{"name": n, "parent": p, "child": c} for n, p, c in joints],
+            "muscles": [{"name": n, "attach": [{"bone": b} for b in bones]} for n, bones in attached.items()],
+        }
+    }
 
 
-def test_neighbours_of_many_have_different_colours(crowd):
-    colours = neighbour_colours(SavedRun(crowd))
-    names = sorted(name for name in colours if name.startswith("muscle"))
-    # They lie 11 mm apart and are 10 mm wide: each touches the next, none the one after.
-    assert all(colours[one] != colours[two] for one, two in pairwise(names))
-    assert len(set(colours.values())) > 4
+def test_muscles_are_grouped_by_the_joints_that_they_cross():
+    joints = [
+        ("hip", "pelvis", "femur"),
+        ("knee", "femur", "tibia"),
+        ("ankle", "tibia", "foot"),
+        ("cap", "femur", "patella"),
+    ]
+    attached = {
+        "gluteus": ("pelvis", "femur"),
+        "sartorius": ("pelvis", "tibia"),
+        "vastus": ("femur", "patella"),
+        "gastrocnemius": ("femur", "foot"),
+    }
+    assert muscle_groups(scene_info(attached, joints)) == {
+        "gluteus": "across hip",
+        "sartorius": "across hip, knee",
+        "vastus": "along femur",
+        "gastrocnemius": "across knee",
+    }
 
 
-@pytest.mark.parametrize(("spans", "taller"), [((10, 10, 100), True), ((100, 10, 20), False)])
-def test_panels_have_the_proportions_of_what_they_show(spans, taller):
-    bounds = np.array([[0.0, 0.0, 0.0], spans])
-    width, height = fitted_size(bounds, ["front", "side"], (330, 400))
-    assert (height > 2 * width) == taller and (height > width) == taller
-    assert width * height == pytest.approx(330 * 400, rel=0.02)
-    assert width % 2 == height % 2 == 0
+def test_few_muscles_have_a_colour_each_and_many_a_hue_for_each_group():
+    assert len(set(muscle_colours([str(k) for k in range(8)]).values())) == 8
+    names = [f"{group}{k}" for group in "abc" for k in range(5)]
+    colours = muscle_colours(names, {name: name[0] for name in names})
+    assert all(len({colours[f"{group}{k}"] for k in range(3)}) == 3 for group in "abc")
+    assert not {colours[f"a{k}"] for k in range(5)} & {colours[f"b{k}"] for k in range(5)}
+
+
+def test_events_are_listed_by_kind_and_names_stay_text():
+    events = [(k, "<b>one", "bone", 1, "halved") for k in range(70)] + [(3, "", "bone", 1, "bones_overlap")]
+    text = _events(events)
+    assert text.index("halved") < text.index("bones_overlap") and "and 10 more" in text
+    assert text.count("<tr>") == 60 + 1 + 2 and "<b>" not in text and "&lt;b&gt;one 70" in text
+
+
+def test_stages_are_milliseconds_with_counts_and_reasons():
+    work = {"solved": 17, "carried": 14, "skipped": 3, "substeps": 41, "reasons": {"solved": "femur turns"}}
+    info = {"stages": {"strap": {"time_solve": {"median": 0.0171}}}, "work": {"strap": work}}
+    cells = re.findall(r"<t[dh](?: [^>]*)?>(.*?)</t[dh]>", _stages(SimpleNamespace(info=info)))
+    head = ["muscle", "solve", "solved", "carried", "skipped", "substeps", "why"]
+    assert cells == [*head, "strap", "17.1", "17", "14", "3", "41", "solved: femur turns"]
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [(0.0234, "s", "23.4 ms"), (2.34, "s", "2.3 s"), (0.003, "mm", "< 0.01 mm"), (0.0, "mm", "0 mm"),
+     (1.234, "mm", "1.2 mm"), (-41.27, "mm", "-41.3 mm"), (7.1e-15, "1", "7e-15"), (3.0, "1", "3"), (None, "mm", "–"),
+     (12345.6, "", "12346"), (float("nan"), "1", "–")],
+)  # fmt: skip
+def test_numbers_have_the_digits_that_say_something(value, unit, text):
+    assert number(value, unit) == text
+
+
+def test_lights_are_green_amber_from_four_fifths_and_red_beyond():
+    assert [limit_state(v, 0.5) for v in (0.1, -0.4, 0.45, 0.5, -0.51, np.nan)] == [
+        "good",
+        "good",
+        "near",
+        "near",
+        "bad",
+        "bad",
+    ]
+    assert [limit_state(v, 1.0, count=True) for v in (1.0, 2.0)] == ["good", "bad"]
+    assert [limit_state(v, 2.0, least=True) for v in (2.0, 0.0)] == ["good", "bad"]
+    assert limit_state(5.0, None) == "plain"
+
+
+def test_tables_sort_by_value_and_names_stay_text():
+    text = table(["a", "b"], [["<i>x", Cell("1.2 mm", 1.2, "bad")], ["y", "n/a"]], find=True)
+    assert "&lt;i&gt;x" in text and 'data-value="1.2" class="bad">1.2 mm<' in text and "<input" in text
 
 
 @pytest.mark.parametrize("suffix", [".webp", ".gif"])
 def test_frames_of_different_heights_make_one_animation(tmp_path, suffix):
-    path = str(tmp_path / f"moving{suffix}")
+    path = tmp_path / f"moving{suffix}"
     images = [Image.new("RGB", (80, height), "#aa3333") for height in (60, 75, 60)]
     render.save_images(images, path, 1.0)
     with Image.open(path) as made:

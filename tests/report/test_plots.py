@@ -1,0 +1,158 @@
+"""Plots: each line holds the values of the quantity that its title names, in the unit of its axis."""
+
+import math
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from blend_model import arm_scene, use_blend_model
+
+from rbfmuscle.output.runinfo import Stages
+from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.report.comparison_page import worst_series
+from rbfmuscle.report.plots import Point, Track, front_plot, line_plot, motion_axis
+from rbfmuscle.report.report import _tracks
+from rbfmuscle.run import simulate
+from rbfmuscle.simulation.rigid_transport import MuscleStatus
+
+
+def texts_of(svg, anchor):
+    """Numbers of the axis whose labels have this anchor, with their places."""
+    found = re.findall(
+        rf'<text x="([\d.]+)" y="([\d.]+)" text-anchor="{anchor}"[^>]*>([-\d.e+]+)</text>', svg
+    )
+    return np.array(found, dtype=float)
+
+
+def drawn(svg):
+    """Values of the lines of a plot, read back by the numbers at its axes."""
+    x, y = texts_of(svg, "middle"), texts_of(svg, "end")
+    across, up = np.polyfit(x[:, 0], x[:, 2], 1), np.polyfit(y[:, 1], y[:, 2], 1)
+    paths = re.findall(r'<path d="(M[\d. L-]+)" fill="none"', svg)
+    found = []
+    for path in paths:
+        points = np.array(re.findall(r"[ML]([-\d.]+) ([-\d.]+)", path), dtype=float)
+        # The numbers stand 4 pixels below their lines.
+        found.append((np.polyval(across, points[:, 0]), np.polyval(up, points[:, 1] + 4.0)))
+    return found
+
+
+def test_lines_lie_where_the_numbers_at_the_axes_say():
+    x, y = np.arange(0.0, 90.0, 10.0), np.sin(np.arange(9)) * 30.0 + 7.0
+    svg = line_plot("a <title>", [Track("strap", "#cc6677", x, y)], ("angle", "mm"), limits=[50.0])
+    limit, line = sorted(drawn(svg), key=lambda found: len(found[0]))
+    # Places are written to a tenth of a pixel, of about 170 over 60 mm.
+    np.testing.assert_allclose(line[1], y, atol=0.06)
+    np.testing.assert_allclose(line[0], x, atol=0.06)
+    np.testing.assert_allclose(limit[1], 50.0, atol=0.06)
+    assert 'data-muscle="strap"' in svg and "a &lt;title&gt;" in svg
+
+
+def test_line_is_broken_where_there_is_no_number():
+    y = np.array([1.0, 2.0, np.nan, 4.0, 5.0])
+    path = re.search(
+        r'<path d="(M[^"]*)" fill="none"',
+        line_plot("a", [Track("m", "#000000", np.arange(5.0), y)], ("x", "y")),
+    )
+    assert path[1].count("M") == 2 and path[1].count("L") == 2
+
+
+def test_front_labels_the_front_and_the_default_and_no_label_covers_another():
+    rng = np.random.default_rng(1)
+    places = np.exp(rng.normal(size=(40, 2)))
+    points = [Point(x, y, f"point {k}", "#cc6677", k == 0, k % 2 == 0) for k, (x, y) in enumerate(places)]
+    svg = front_plot(points, ("ms", "mm"))
+    labels = re.findall(r'<text x="([\d.]+)" y="([\d.]+)"[^>]*>(point \d+)</text>', svg)
+    assert "point 0" in [label[2] for label in labels] and len(labels) > 10
+    assert all(int(label[2].split()[1]) % 2 == 0 for label in labels)
+    boxes = [(float(x), float(y) - 9, float(x) + 6.2 * len(text), float(y) + 4) for x, y, text in labels]
+    for i, a in enumerate(boxes):
+        for b in boxes[:i]:
+            # Places are written to a tenth of a pixel.
+            assert a[0] > b[2] - 0.2 or b[0] > a[2] - 0.2 or a[1] > b[3] - 0.2 or b[1] > a[3] - 0.2
+    assert svg.count("<polygon") == 1 and svg.count("<circle") == 39
+    assert front_plot([Point(1.0, 0.0, "exact", "#000000")], ("ms", "mm")) == ""
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    place = tmp_path_factory.mktemp("run")
+    with pytest.MonkeyPatch.context() as patch:
+        use_blend_model(patch)
+        simulate(arm_scene(end=60)).save(place)
+    return SavedRun(place)
+
+
+def test_tracks_are_the_series_of_the_run_and_times_leave_out_the_first_frame(saved):
+    axis, label = motion_axis(saved)
+    assert label == "elbow.flexion [degree]" and axis[6] == pytest.approx(60)
+    angles = [math.degrees(math.radians(row["coordinates"]["elbow.flexion"])) for row in saved.info["frames"]]
+    (track,) = _tracks(saved, "volume_error", 100.0, axis, None)
+    np.testing.assert_allclose(track.y, 100.0 * saved.series("biceps", "volume_error")[1], rtol=1e-12)
+    np.testing.assert_allclose(track.x, angles, rtol=1e-12)
+    (track,) = _tracks(saved, "time_frame", 1000.0, axis, None)
+    np.testing.assert_allclose(track.y, 1000.0 * saved.series("biceps", "time_frame")[1][1:], rtol=1e-12)
+
+
+def test_axis_is_the_frame_on_the_way_there_and_back():
+    rows = [{"frame": k, "coordinates": {"a.b": v}} for k, v in enumerate([0, 10, 0])]
+    places, label = motion_axis(SimpleNamespace(info={"frames": rows}, frames=[0, 1, 2]))
+    assert label == "frame"
+    assert places == {0: 0, 1: 1, 2: 2}
+
+
+def test_worst_of_several_muscles_is_the_greatest_in_size_with_its_sign():
+    rows = {"a": [0.1, -0.5, 0.2], "b": [-0.3, 0.4, 0.1]}
+    run = SimpleNamespace(
+        muscles=list(rows), series=lambda muscle, quantity: (np.array([0, 2, 4]), np.array(rows[muscle]))
+    )
+    frames, values = worst_series(run, "volume_error")
+    assert list(values) == [-0.3, -0.5, 0.2] and list(frames) == [0, 2, 4]
+
+
+def frame(index, times, *, state="solved", substeps=1, reason="bones turn", pairs=None, inner=None):
+    return SimpleNamespace(
+        index=index,
+        times={"a": times},
+        surfaces={} if inner is None else {"a": SimpleNamespace(quantities=inner)},
+        work={"a": MuscleStatus(state, substeps, reason)},
+        neighbours=pairs or {},
+    )
+
+
+FRAMES = [
+    frame(0, {"time_solve": 4.0, "n": 9}, inner={"time_fit": 0.5, "volume": 3.0}, pairs={("a", "b"): (0.1, 0.0)}),
+    frame(2, {"time_solve": 1.0}, substeps=3, pairs={("a", "b"): (0.4, 0.2), ("a", "c"): (0.5, 0.0)}),
+    frame(4, {"time_solve": 2.0}, state="carried", substeps=0, reason="moves with b", pairs={("a", "b"): (0.3, 0.7)}),
+    frame(6, {"time_solve": 3.0}, substeps=2, reason="touches", pairs={("a", "b"): (0.0, 0.1)}),
+    frame(8, {"time_solve": 5.0}, substeps=2, reason="touches"),
+]  # fmt: skip
+
+
+def test_stages_sum_times_and_work_and_keep_the_worst_of_neighbours():
+    stages = Stages()
+    for each in FRAMES:
+        stages.add(each)
+    table = stages.table()
+    assert set(table["a"]) == {"time_solve", "time_fit"}
+    assert table["a"]["time_solve"] == pytest.approx({"total": 15.0, "median": 3.0, "p95": 4.8, "first": 4.0})
+    assert table["a"]["time_fit"]["total"] == 0.5
+    work = stages.work()["a"]
+    assert [work[key] for key in ("solved", "carried", "skipped", "substeps")] == [4, 1, 0, 8]
+    assert work["reasons"] == {"solved": "bones turn", "carried": "moves with b"}
+    first, second = stages.neighbours()
+    assert first == {
+        "muscles": ["a", "c"],
+        "overlap_max": 0.5,
+        "overlap_frame": 2,
+        "gap_rms": 0.0,
+        "gap_frame": 2,
+    }
+    assert second == {
+        "muscles": ["a", "b"],
+        "overlap_max": 0.4,
+        "overlap_frame": 2,
+        "gap_rms": 0.7,
+        "gap_frame": 4,
+    }
