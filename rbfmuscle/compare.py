@@ -56,16 +56,14 @@ def compare_models(
     ----------
     scene : Scene
     directory : path
-        Takes ``comparison.json``, ``comparison.csv``, ``report.html``, ``models.webp`` and for each model a
-        folder that holds its run.
+        Takes ``comparison.json``, ``comparison.csv``, ``report.html``, ``models.webp`` and the run of each model.
     models : list of str
-        Distances are measured to the first. A mesh model with "-converged" after its name is solved until it no
-        longer changes. One that cannot be solved is left out, and named in the tables.
+        Distances are to the first. A mesh model with "-converged" after its name is solved until it no longer
+        changes. One that cannot be solved is left out, and named in the tables.
     frames : slice or str, optional
         Frames of the motion, a slice or "A:B:S".
     settings : dict, optional
-        Dotted keys with their values, for all models, or as "MODEL:KEY" for one. A whole ``model`` here is what
-        the scene file might have said: its own settings count where that model's turn comes.
+        Dotted keys with their values, for all models, or as "MODEL:KEY" for one.
     pictures : bool
     progress : callable, optional
         Called as ``progress(model, done, total)``.
@@ -79,8 +77,6 @@ def compare_models(
     ------
     UsageError
         On an unknown model or setting.
-    SceneError, MeshError
-        If the scene cannot be simulated.
     SolveError
         If no model could be solved.
 
@@ -159,7 +155,7 @@ def _variants(scene, models, settings):
 
 def _measure(name, scene, folder, poses, progress):
     """One model: warm up, run and watch, then there and back by coarser steps."""
-    _surfaces(_with_frames(scene, scene.motion.frames[:2]))
+    _surfaces(scene, scene.motion.frames[:2])
     probe = ModelProbe(scene, poses)
     report = None if progress is None else (lambda done, total: progress(name, done, total))
     stream_run(scene, folder, pictures=False, progress=report, watch=probe)
@@ -174,27 +170,16 @@ def _there_and_back(scene):
     frames = scene.motion.frames
     coarse = frames[:-1:COARSER]
     turn = len(coarse)
-    path = [*coarse, frames[-1], *coarse[::-1]]
-    build, shown = _surfaces(_with_frames(scene, path), (turn, 2 * turn))
-    found = {"build": build}
-    if turn:
-        found.update(turn=shown[0], end=shown[1])
-    return found
+    build, shown = _surfaces(scene, [*coarse, frames[-1], *coarse[::-1]])
+    return {"build": build} | ({"turn": shown[turn], "end": shown[2 * turn]} if turn else {})
 
 
-def _surfaces(scene, wanted=()):
-    """Time to build the models, and the surfaces of the frames ``wanted``; all frames are shown, as in the run."""
-    start = time.perf_counter()
-    models = build_models(scene)
-    build = time.perf_counter() - start
-    kept = {}
-    for frame in simulate_frames(scene, models):
-        if frame.index in wanted:
-            kept[frame.index] = {name: (s.vertices, s.faces) for name, s in frame.surfaces.items()}
-    return build, [kept[index] for index in wanted]
-
-
-def _with_frames(scene, frames):
+def _surfaces(scene, frames):
+    """Time to build the models, and the surfaces of all muscles in each of some frames."""
     changed = scene.copy()
     changed.motion = Motion(frames)
-    return changed
+    start = time.perf_counter()
+    models = build_models(changed)
+    build = time.perf_counter() - start
+    shown = [frame.surfaces for frame in simulate_frames(changed, models)]
+    return build, [{name: (s.vertices, s.faces) for name, s in surfaces.items()} for surfaces in shown]

@@ -55,41 +55,33 @@ MEASURES = {
     "penetration_max": Measure("surface in a bone", "length", LAW, 0.02, "deepest surface vertex in a bone"),
     "bone_penetration_max": Measure("bone in the muscle", "length", LAW, 0.02, "deepest bone vertex in it"),
     "solver_penetration_max": Measure(
-        "in a bone before the cut", "length", LAW, 0.02, "deepest point of the model"
+        "before the cut", "length", LAW, 0.02, "model in a bone before the cut"
     ),
     "components": Measure("pieces", "1", LAW, 0.0, "connected pieces of the surface, most in any frame"),
     "euler": Measure("Euler characteristic", "1", LAW, 0.0, "2 for a sphere, two less for a handle", 2.0),
-    "self_crossings": Measure("self-crossing", "1", LAW, 0.0, "triangles that cross others of the surface"),
+    "self_crossings": Measure("self-crossings", "1", LAW, 0.0, "triangles that cross others of the surface"),
     "flicker": Measure("flicker", "length", LAW, 0.05, "surface against carried mesh, frame to frame"),
     "tunnelled": Measure("tunnelled points", "1", LAW, 0.0, "points beyond a bone"),
     "return_rms": Measure(
         "return error (RMS)", "length", LAW, 0.02, "first pose before and after the motion"
     ),
     "return_max": Measure("return error (greatest)", "length", LAW, 0.1, "the same, greatest distance"),
-    "step_rms": Measure(
-        "step dependence (RMS)", "length", LAW, 0.02, "last pose by the scene's steps and coarser"
-    ),
+    "step_rms": Measure("step dependence (RMS)", "length", LAW, 0.02, "last pose by coarser steps"),
     "step_max": Measure("step dependence (greatest)", "length", LAW, 0.1, "the same, greatest distance"),
     "rest_error_rms": Measure("rest error (RMS)", "length", MESH, 0.02, "surface to input mesh at rest"),
     "rest_error_max": Measure("rest error (greatest)", "length", MESH, 0.1, "the same, greatest distance"),
-    "strain_rms": Measure(
-        "strain", "1", OWN, 0.002, "edges between the same 1200 material points of all models"
-    ),
+    "strain_rms": Measure("strain", "1", OWN, 0.002, "edges between the same 1200 points of the material"),
     "curvature_variation": Measure(
-        "curvature variation", "1/length", OWN, 0.0, "mean curvature among neighbours"
+        "curvature variation", "1/length", OWN, 0.0, "among neighbours, mean curvature"
     ),
     "distance_rms": Measure(
         "distance (RMS)", "length", FIRST, 0.0, "to the first model's surface, worst pose"
     ),
     "distance_max": Measure("distance (greatest)", "length", FIRST, 0.0, "the same, greatest distance"),
-    "time_frame": Measure(
-        "time per frame", "s", COST, 0.0, "median of all muscles together, surfaces included"
-    ),
-    "time_frame_p95": Measure(
-        "time per frame (95 %)", "s", COST, 0.0, "the same, exceeded by one frame in 20"
-    ),
+    "time_frame": Measure("time per frame", "s", COST, 0.0, "median of all muscles together, with surfaces"),
+    "time_frame_p95": Measure("time per frame (95 %)", "s", COST, 0.0, "exceeded by one frame in 20"),
     "time_solve": Measure(
-        "solution", "s", COST, 0.0, "prediction, solution, contacts; median, sum over muscles"
+        "solution", "s", COST, 0.0, "with prediction and contacts; median, sum over muscles"
     ),
     "time_surface": Measure("surface", "s", COST, 0.0, "fit and extraction; median, sum over muscles"),
     "time_build": Measure("build", "s", COST, 0.0, "models of all muscles, once, with filled caches"),

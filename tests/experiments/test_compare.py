@@ -219,13 +219,13 @@ class TestFailure:
         assert not math.isnan(table["results"]["pbd"]["all"]["volume_error"])
 
 
-def test_the_way_back_is_the_way_there_from_the_last_pose(monkeypatch):
+def test_the_path_back_is_the_path_there_from_the_last_pose(monkeypatch):
     scene, asked = arm_scene(end=60, step=5), []
-    monkeypatch.setattr(
-        compare, "_surfaces", lambda scene, at: (0.0, asked.append((scene.motion.frames, at)) or "ab")
-    )
+    monkeypatch.setattr(compare, "_surfaces", lambda scene, frames: (0.0, asked.extend(frames) or range(99)))
     found = compare._there_and_back(scene)
-    ((path, (turn, end)),) = asked
-    assert path == path[::-1] and path[0] == scene.motion.frames[0] == path[end] and end == len(path) - 1
-    assert path[turn] == scene.motion.frames[-1] and turn > 1
-    assert found == {"build": 0.0, "turn": "a", "end": "b"}
+    assert asked == asked[::-1] and asked[0] == scene.motion.frames[0] == asked[found["end"]]
+    assert (
+        asked[found["turn"]] == scene.motion.frames[-1]
+        and found["end"] == len(asked) - 1 == 2 * found["turn"]
+    )
+    assert found["build"] == 0.0 and found["turn"] > 1
