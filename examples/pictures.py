@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 from rbfmuscle.report.render import render_run
-from rbfmuscle.validation import MissingPartError
 
 _SAVED = {}  # runs that were drawn already, and their folders
 
@@ -20,16 +19,13 @@ def folder(name):
 
 
 def draw(run, file, *, frame=None, views=("side", "back")):
-    """Picture of a frame of a run, or of the folder of one; where there are no graphics a line says so."""
+    """Picture of a frame of a run, or of the folder of one."""
     file = Path(file)
     if not isinstance(run, Path) and id(run) not in _SAVED:
         _SAVED[id(run)] = run, file.parent / f"run_{file.stem}"
         run.save(_SAVED[id(run)][1], pictures=False)
     saved = run if isinstance(run, Path) else _SAVED[id(run)][1]
-    try:
-        render_run(saved, file, frame=frame, views=views)
-    except MissingPartError as error:
-        print(f"{file.name} not drawn: {error}")
+    render_run(saved, file, frame=frame, views=views)
 
 
 def plot(file, draw_axes, *, size=(7.0, 3.6)):

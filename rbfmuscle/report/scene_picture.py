@@ -9,7 +9,8 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.report.appearance import BACKGROUND, MUSCLE_COLOURS, VIEWS, mixed_colour, rgb
+from rbfmuscle.output.colours import MUSCLE_COLOURS, rgb
+from rbfmuscle.report.appearance import BACKGROUND, VIEWS, mixed_colour
 from rbfmuscle.report.labels import labelled
 from rbfmuscle.report.raster import Camera, Solid, aim, draw_solids
 

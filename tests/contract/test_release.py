@@ -37,12 +37,14 @@ def test_every_folder_with_modules_is_a_package():
             assert (folder / "__init__.py").exists(), folder
 
 
-def test_typed_marker_and_table_of_loops_travel_with_the_packages():
+def test_typed_marker_templates_and_scripts_travel_with_the_packages():
     data = PROJECT["tool"]["setuptools"]["package-data"]
-    assert data == {
-        "rbfmuscle": ["py.typed"],
-        "pbd_baseline": ["py.typed"],
-    }
+    for top in ("rbfmuscle", "pbd_baseline"):
+        packed = {path for pattern in data[top] for path in (ROOT / top).glob(pattern)}
+        here = {
+            path for path in (ROOT / top).rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")
+        }
+        assert packed == here
 
 
 def run(*command, **options):
