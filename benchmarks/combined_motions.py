@@ -159,8 +159,8 @@ def show(title: str, frames: int, rows: list[tuple], spent: float) -> None:
     print("|---" * 13 + "|")
     for name, handles, count, over, worst, events in rows:
         print(
-            f"| {name} | {handles} of {count} | {worst['self_crossings']:.0f} | {worst.get('flicker', 0.0):.2f} ({over}) "
-            f"| {worst['steady']:.2f} | {worst['leap']:.1f} "
+            f"| {name} | {handles} of {count} | {worst['self_crossings']:.0f} "
+            f"| {worst.get('flicker', 0.0):.2f} ({over}) | {worst['steady']:.2f} | {worst['leap']:.1f} "
             f"| {worst.get('unfitted_fraction', 0.0):.3f} "
             f"| {worst['penetration_max']:.3f} | {worst['bone_penetration_max']:.3f} "
             f"| {worst['volume_error']:.0e} | {events['unresolved']} | {events['grazed']} | {events['held_back']} |",

@@ -180,7 +180,7 @@ def _plots(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> str:
         )
 
     for muscle in first.muscles:
-        for about in first.arm_coordinates(muscle):
+        for about in first.moment_arm_coordinates(muscle):
             title = f"Moment arm: {muscle}, {about}"
             draw(
                 title,

@@ -267,7 +267,9 @@ def _summary(saved: SavedRun) -> str:
         head.append(f"{name.replace('_', ' ')}{'' if unit == '1' else f' [{unit}]'}{limit}")
     rows: list[tuple[int, list[Cell | str]]] = []
     for muscle, found in muscles.items():
-        own = {name: muscle_limit(name, limits[name], found) for name in used if name in limits and name in found}
+        own = {
+            name: muscle_limit(name, limits[name], found) for name in used if name in limits and name in found
+        }
         cells = [_cell(name, found.get(name), own.get(name)) for name in used]
         rows.append((-sum(cell.state == BAD for cell in cells), [muscle, *cells]))
     return table(head, [row for _, row in sorted(rows, key=lambda row: row[0])], find=len(rows) > 8)
@@ -310,7 +312,7 @@ def _stages(saved: SavedRun) -> str:
 
 def _neighbours(saved: SavedRun) -> str:
     """Pairs of muscles that slide on each other, the deepest overlap first."""
-    rows = [
+    rows: list[list[Cell | str]] = [
         [
             " and ".join(pair["muscles"]),
             Cell(f"{number(pair['overlap_max'])}, frame {pair['overlap_frame']}", pair["overlap_max"]),

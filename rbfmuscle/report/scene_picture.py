@@ -9,8 +9,8 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.output.colours import MUSCLE_COLOURS, rgb
-from rbfmuscle.report.appearance import BACKGROUND, VIEWS, mixed_colour
+from rbfmuscle.output.colours import MUSCLE_COLOURS, mixed_colour, rgb
+from rbfmuscle.report.appearance import BACKGROUND, VIEWS
 from rbfmuscle.report.labels import labelled
 from rbfmuscle.report.raster import Camera, Solid, aim, draw_solids
 

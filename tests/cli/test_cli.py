@@ -85,9 +85,7 @@ class TestRun:
         trimesh.Trimesh(vertices, mesh.faces, process=False).export(phantom_folder / "spike.ply")
         (phantom_folder / "spike.toml").write_text(SCENE.replace("adductor_posterior.ply", "spike.ply"))
         code, out, _ = call(capsys, "run", phantom_folder / "spike.toml", *command[2:])
-        assert code == 0 and re.search(
-            r"verdict: adductor is not within all limits. Worst: adductor, ", out
-        )
+        assert code == 0 and re.search(r"verdict: adductor is not within all limits. Worst: adductor, ", out)
 
     def test_json_is_all_there_is_on_stdout(self, phantom_folder, tmp_path, capsys):
         code, out, _ = call(

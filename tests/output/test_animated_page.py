@@ -1,5 +1,6 @@
 """The page that turns and scrubs a run: by itself, and with every vertex where it belongs."""
 
+import base64
 import json
 import re
 import zlib
