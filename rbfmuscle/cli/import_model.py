@@ -18,6 +18,7 @@ def import_(
     geometry: Annotated[list[Path] | None, Parameter(negative="")] = None,
     bodies: Annotated[list[str] | None, Parameter(negative="")] = None,
     motion: Path | None = None,
+    muscles: Annotated[bool, Parameter(negative="--no-muscles")] = True,
     force: Annotated[bool, Parameter(negative="")] = False,
 ) -> None:
     """Write a scene file and its meshes from an OpenSim model (.osim).
@@ -36,6 +37,8 @@ def import_(
         Take this body and what lies between it and the ground; repeatable, all by default.
     motion
         A .mot or .sto file for the scene's motion.
+    muscles
+        Make a tube of each muscle of the model, along its path.
     force
         Replace a scene file that exists.
     """
@@ -48,11 +51,11 @@ def import_(
     for folder in geometry or []:
         if not folder.is_dir():
             raise UsageError(f"--geometry {folder}: no such folder")
-    found = import_osim(model, units=units, geometry=geometry, bodies=bodies)
+    found = import_osim(model, units=units, geometry=geometry, bodies=bodies, muscles=muscles)
     written = write_scene(found, output, motion=motion)
     for note in found.notes:
         print(f"note: {note}")
     scene = found.scene
     counts = f"{len(scene.bones)} bones, {len(scene.links)} without a mesh, {len(scene.joints)} joints"
-    print(f"{written}: {counts}, {len(scene.couplings)} couplings")
-    print(f"next: add a [[muscle]] for each muscle (docs/scene_file.md), then rbfmuscle check {written}")
+    print(f"{written}: {counts}, {len(scene.couplings)} couplings, {len(scene.muscles)} muscles as tubes")
+    print(f"next: rbfmuscle check {written}, then rbfmuscle run {written} -o out")

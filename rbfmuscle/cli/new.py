@@ -25,21 +25,21 @@ def new(
         Folder with STL, OBJ, PLY, VTK or VTP files, one bone or muscle each (or in folders bones and muscles);
         or a segmentation: .nii, .nii.gz, .nrrd, or a folder with one mask a file.
     units
-        Unit of the meshes; label volumes say theirs and become millimetres.
+        Unit of the meshes, by the size of the bones where it is left out; label volumes become millimetres.
     labels
-        Names of a segmentation's labels: JSON, CSV, TSV or ITK-SNAP's descriptions.
+        Names of a segmentation's labels: JSON, CSV, TSV or ITK-SNAP's descriptions, or a known table, as
+        totalsegmentator, musclemap-thigh.
     output
         Scene file to write, scene.toml beside the meshes by default.
     force
         Replace a file that exists.
     """
     from rbfmuscle.importers.guess.guess import guess_scene, write_scene
+    from rbfmuscle.importers.guess.orientation import HEADER
 
     volume = _is_segmentation(source)
     if volume and units not in (None, "mm"):
         raise UsageError(f"{source}: a segmentation says its unit, its scene is in mm; leave --units out")
-    if not volume and units is None:
-        raise UsageError("--units is missing: give the unit of the meshes, mm, cm or m")
     if labels is not None and not volume:
         raise UsageError(f"--labels names the labels of a segmentation, {source} is a folder of meshes")
     folder = _beside(source, output) if volume else source
@@ -48,9 +48,11 @@ def new(
         raise UsageError(f"{output} exists; give another --output, or --force to replace it")
     if volume:
         folder = _write_surfaces(source, labels, folder)
-    guess = guess_scene(folder, units or "mm", output.parent)
+    guess = guess_scene(folder, "mm" if volume else units, output.parent, header=HEADER if volume else None)
     scene = write_scene(guess, output)
     print(f"{output} written; every guess in it is marked, look them over")
+    for note in guess.notes:
+        print(f"note: {note}")
     for doubt in guess.doubts():
         print(f"doubtful: {doubt}")
     for finding in scene.check():
@@ -79,7 +81,7 @@ def _beside(source, output):
 
 def _write_surfaces(source, labels, folder):
     """Surfaces of all labels as PLY beside the scene; their folder."""
-    from rbfmuscle.importers.guess.anatomy import bone_class, says_muscle
+    from rbfmuscle.importers.guess.names import name_facts
     from rbfmuscle.importers.labels.read import read_labels
     from rbfmuscle.importers.labels.surfaces import label_surface
     from rbfmuscle.progress import Progress
@@ -93,9 +95,11 @@ def _write_surfaces(source, labels, folder):
     values, files = volume.values(), set()
     with Progress("surfaces", "label") as progress:
         for done, label in enumerate(values, start=1):
-            name = volume.name(label)
-            several = bool(bone_class(name)) and not says_muscle(name)
-            surface = label_surface(volume, int(label), pieces=several)
+            tissue = name_facts(volume.name(label)).tissue
+            if tissue == "other":
+                print(f"{volume.name(label)}: neither bone nor muscle, left out")
+                continue
+            surface = label_surface(volume, int(label), pieces=tissue == "bone")
             file = re.sub(r"[^A-Za-z0-9_-]+", "_", surface.name)
             if file.lower() in files:  # two labels of one name are two parts
                 file = f"{file}_{int(label)}"

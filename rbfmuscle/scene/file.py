@@ -34,6 +34,7 @@ from rbfmuscle.scene.options import (
     Positive,
     SlidingOptions,
     Table,
+    Vector,
     check_plain,
     check_removed,
     describe_error,
@@ -51,6 +52,8 @@ class SceneTable(Table):
     format: Literal[1]
     name: str | None = None
     units: Literal["m", "cm", "mm"]
+    superior: Vector | None = None
+    anterior: Vector | None = None
 
 
 class BoneTable(Table):
@@ -175,6 +178,7 @@ def load_scene(cls: type[S], path: str | Path, *, skeleton: bool = False) -> S:
 
 
 def _fill(scene: SceneData, tables: SceneFile, folder: Path) -> None:
+    scene.superior, scene.anterior = tables.scene.superior, tables.scene.anterior
     for bone in tables.bone:
         if bone.mesh is None:
             add_link(scene, bone.name)

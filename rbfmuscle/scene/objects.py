@@ -131,6 +131,8 @@ class SceneData:
     output : OutputOptions
     path : pathlib.Path or None
         The file it was loaded from.
+    superior, anterior : list of float or None
+        Anatomical directions (3,) at rest, where the file gives them.
     """
 
     name: str = "scene"
@@ -147,6 +149,8 @@ class SceneData:
     detect: DetectOptions | None = None
     output: OutputOptions = field(default_factory=OutputOptions)
     path: Path | None = None
+    superior: list[float] | None = None
+    anterior: list[float] | None = None
 
     def __post_init__(self) -> None:
         if self.units not in MM_PER_UNIT:

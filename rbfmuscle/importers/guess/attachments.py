@@ -115,7 +115,7 @@ def _farthest(distance):
 
 
 def guess_attachments(
-    muscle: Any, bones: list[Any], bodies: dict[str, Any], millimetre: float, *, named: bool = True
+    muscle: Any, bones: list[Any], bodies: dict[int, int], millimetre: float, *, named: bool = True
 ) -> MuscleGuess:
     """Find the bones that hold a muscle and the vertices that they hold.
 
@@ -133,7 +133,7 @@ def guess_attachments(
     ends = Ends(muscle.mesh)
     distances = [signed_distances(muscle.points, bone.mesh) / millimetre for bone in bones]
     reasons: list[str] = []
-    places, confidence = [], 0.9
+    places, confidence = [], 0.0
     if named and muscle.facts is not None:
         places = _named_places(muscle, bones, distances, ends, reasons)
     if not places:
@@ -146,9 +146,25 @@ def guess_attachments(
     holds = _disjoint(
         [hold for hold in holds if len(hold.vertices)], {id(b): d for b, d in zip(bones, distances)}
     )
+    if not confidence:  # by name: the nearer its ends are to the bones, the surer
+        confidence = 1.0 - 0.4 * min(max((hold.gap for hold in holds), default=FAR) / FAR, 1.0)
+        _compare(holds, bones, bodies, distances, reasons)
+        confidence = 0.5 if reasons else confidence
     guess = MuscleGuess(muscle, holds, confidence, reasons)
     _doubt(guess, bones, bodies, len(muscle.points))
     return guess
+
+
+def _compare(holds, bones, bodies, distances, reasons):
+    """Name what names and distances say differently: a patch that touches another bone than that of its name."""
+    place = {id(bone): k for k, bone in enumerate(bones)}
+    named = {bodies[place[id(hold.bone)]] for hold in holds}
+    for hold in holds:
+        near = [float(distance[hold.vertices].min()) for distance in distances]
+        k = int(np.argmin(near))
+        if hold.gap > NEAR and near[k] < TOUCH and bodies[k] not in named:
+            away = f"by its name on the {hold.bone.name}, {hold.gap:.0f} mm away"
+            reasons.append(f"{away}, but it touches {bones[k].name}")
 
 
 def _named_places(muscle, bones, distances, ends, reasons):
@@ -198,8 +214,8 @@ def _nearest_places(muscle, bones, bodies, distances, ends):
         score = np.where(near < NEAR, near / NEAR - 1.0, aim)
         wishes.append((float(np.min(score)), end, np.argsort(score, kind="stable")))
     for _, end, order in sorted(wishes, key=lambda wish: wish[0]):
-        taken = {bodies.get(k, k) for k, _ in places}
-        other = [int(k) for k in order if bodies.get(int(k), int(k)) not in taken]
+        taken = {bodies[k] for k, _ in places}
+        other = [int(k) for k in order if bodies[int(k)] not in taken]
         places.append(((other or [int(order[0])])[0], end))
     return places
 
@@ -249,7 +265,7 @@ def _disjoint(holds, distances):
 def _doubt(guess, bones, bodies, count):
     """Lower the confidence, or say that the muscle cannot be run."""
     place = {id(bone): k for k, bone in enumerate(bones)}
-    moving = {bodies.get(place[id(hold.bone)], place[id(hold.bone)]) for hold in guess.holds}
+    moving = {bodies[place[id(hold.bone)]] for hold in guess.holds}
     far = [hold for hold in guess.holds if hold.gap > FAR]
     for hold in far:
         guess.reasons.append(f"its end is {hold.gap:.0f} mm from the {hold.bone.name}: a tendon is missing")

@@ -11,13 +11,13 @@ import numpy as np
 
 from rbfmuscle.importers.guess.attachments import MuscleGuess, guess_attachments
 from rbfmuscle.importers.guess.joints import JointGuess, guess_joints
-from rbfmuscle.importers.guess.parts import Part, read_parts
+from rbfmuscle.importers.guess.orientation import Orientation, find_orientation
+from rbfmuscle.importers.guess.parts import MILLIMETRE, Part, guess_units, read_parts
 from rbfmuscle.importers.guess.tendons import guess_tendons, write_stubs
 from rbfmuscle.importers.guess.text import scene_text
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MeshError, SceneError, UsageError
 
-MILLIMETRE = {"mm": 1.0, "cm": 0.1, "m": 0.001}
 # Below this confidence a guess is listed on the terminal.
 DOUBTFUL = 0.6
 
@@ -37,6 +37,11 @@ class SceneGuess:
         The bone that stands still.
     joints : list of JointGuess
     muscles : list of MuscleGuess
+    orientation : Orientation or None
+    unusable : dict of str to str
+        Why a bone or a muscle is not in the scene, by file.
+    notes : list of str
+        What was left out, taken for something, made coarser, and the unit where it was guessed.
     """
 
     title: str
@@ -46,10 +51,15 @@ class SceneGuess:
     root: Part
     joints: list[JointGuess]
     muscles: list[MuscleGuess] = field(default_factory=list)
+    orientation: Orientation | None = None
+    unusable: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
 
     def doubts(self) -> list[str]:
         """One line for each guess that wants a look, the least sure first."""
         rows = [(0.3, f"bone {bone.name}: {bone.reason}") for bone in self.bones if not bone.sure]
+        rows += [(0.0, f"{file} cannot be used: {reason}") for file, reason in self.unusable.items()]
+        rows += [(0.1, doubt) for doubt in (self.orientation.doubts if self.orientation else ())]
         for joint in self.joints:
             if joint.confidence < DOUBTFUL:
                 rows.append((joint.confidence, f"joint of {joint.child.name}: {joint.reason}"))
@@ -60,30 +70,42 @@ class SceneGuess:
         return [text for _, text in sorted(rows, key=lambda row: row[0])]
 
 
-def guess_scene(folder: Path, units: str, base: Path) -> SceneGuess:
+def guess_scene(
+    folder: Path, units: str | None, base: Path, *, header: Orientation | None = None
+) -> SceneGuess:
     """Guess a scene from the meshes of a folder.
 
     Parameters
     ----------
     folder : Path
         Meshes, or folders ``bones`` and ``muscles`` with them.
-    units : str
-        ``"mm"``, ``"cm"`` or ``"m"``.
+    units : str or None
+        ``"mm"``, ``"cm"`` or ``"m"``; by the size of the bones where it is not given.
     base : Path
         Folder that the scene's paths are relative to.
+    header : Orientation, optional
+        Anatomical directions where they are known.
 
     Raises
     ------
     UsageError
-        If the folder is missing or holds no bone or no muscle.
-    MeshError
-        If a mesh cannot be read, or a muscle is open.
+        If the folder is missing, holds no bone or no muscle, or is of no known unit.
     """
-    bones, muscles = read_parts(folder, base)
+    found = read_parts(folder, base)
+    bones, muscles, notes = found.bones, found.muscles, found.notes
+    if found.left_out:
+        notes.append(f"left out, neither bone nor muscle: {', '.join(found.left_out)}")
+    if units is None:
+        units, reason = guess_units(bones)
+        notes.append(f"units are {units}: {reason}")
     millimetre = MILLIMETRE[units]
-    root, joints = guess_joints(bones, millimetre)
+    orientation = find_orientation(bones, header)
+    for bone in bones:  # what its shape shows counts where its name says nothing
+        bone.side = bone.side or (orientation.sides.get(id(bone), "") if orientation else "")
+    root, joints = guess_joints(bones, millimetre, orientation)
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", folder.resolve().name) or "scene"
     guess = SceneGuess(f"the meshes in {folder.name or folder}", name, units, bones, root, joints)
+    guess.orientation, guess.unusable, guess.notes = orientation, found.unusable, notes
     bodies = _bodies(bones, joints)
     guess.muscles = [guess_attachments(muscle, bones, bodies, millimetre) for muscle in muscles]
     # Where the bones that names ask for are not here, what is there is taken.
@@ -130,6 +152,7 @@ def write_scene(guess: SceneGuess, path: Path) -> Scene:
     folder = path.parent / "attachments"
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        _write_coarse(guess, path.parent)
         for muscle in guess.muscles:
             for hold in muscle.holds:
                 np.savetxt(folder / hold_file(muscle, hold), _in_file(muscle.muscle, hold.vertices), fmt="%d")
@@ -144,6 +167,16 @@ def write_scene(guess: SceneGuess, path: Path) -> Scene:
                 _comment_out(guess, error)
     except OSError as error:
         raise UsageError(f"cannot write {path}: {error.strerror}; choose another --output") from None
+
+
+def _write_coarse(guess, folder):
+    """Meshes that were made coarser, beside the scene."""
+    for part in [*guess.bones, *(m.muscle for m in guess.muscles)]:
+        if part.coarse:
+            (folder / "coarse").mkdir(exist_ok=True)
+            part.file = f"coarse/{part.name}.ply"
+            part.mesh.export(folder / part.file)
+            part.read.vertex_map = np.arange(len(part.points))
 
 
 def hold_file(muscle: Any, hold: Any) -> str:

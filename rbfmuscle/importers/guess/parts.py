@@ -1,4 +1,4 @@
-"""The meshes of a folder, sorted into bones and muscles."""
+"""The meshes of a folder, sorted into bones and muscles; the unit of their lengths."""
 
 from __future__ import annotations
 
@@ -12,13 +12,19 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.importers.guess.anatomy import bone_class, muscle_facts, says_muscle, side_of
-from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, read_mesh
+from rbfmuscle.importers.guess.names import MuscleFacts, name_facts
+from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, ReadMesh, prepare_mesh, read_arrays
 from rbfmuscle.validation import MeshError, UsageError
 
 # Folders below the one that is given, as people sort their meshes.
 BONE_FOLDERS = ("bones", "bone", "knochen", "os")
 MUSCLE_FOLDERS = ("muscles", "muscle", "muskeln")
+MILLIMETRE = {"mm": 1.0, "cm": 0.1, "m": 0.001}
+# Length of a bone [mm] by its class, and of the largest one where none is known, from child to large adult.
+LENGTHS = {"femur": (200, 600), "tibia": (150, 500), "humerus": (120, 420), "pelvis": (100, 450)}
+LARGEST_BONE = (90, 900)
+# Meshes of more triangles are made coarser, to about as many.
+MOST_TRIANGLES = 400_000
 
 
 @dataclass
@@ -33,12 +39,15 @@ class Part:
         Path as the scene file gives it.
     read : ReadMesh
     kind : str
-        Class of bone, or the name of the muscle in the table; empty where the name tells nothing.
+        Class of bone, or the name of the muscle in the table; empty where the name says nothing.
     side : str
         ``"l"``, ``"r"`` or empty.
     reason : str
         Why it is a bone or a muscle.
     sure : bool
+    facts : MuscleFacts or None
+    coarse : bool
+        The mesh was made coarser than its file.
     """
 
     name: str
@@ -48,7 +57,8 @@ class Part:
     side: str = ""
     reason: str = "by its name"
     sure: bool = True
-    facts: Any = field(default=None, repr=False)
+    facts: MuscleFacts | None = field(default=None, repr=False)
+    coarse: bool = False
 
     @property
     def mesh(self) -> Any:
@@ -66,7 +76,29 @@ class Part:
         return cKDTree(self.read.mesh.triangles_center)
 
 
-def read_parts(folder: Path, base: Path) -> tuple[list[Part], list[Part]]:
+@dataclass
+class Sorted:
+    """What is in a folder.
+
+    Attributes
+    ----------
+    bones, muscles : list of Part
+    left_out : list of str
+        Files of other tissue.
+    unusable : dict of str to str
+        Reason by file of a bone or muscle.
+    notes : list of str
+        Misspelt names, meshes made coarser.
+    """
+
+    bones: list[Part] = field(default_factory=list)
+    muscles: list[Part] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+    unusable: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+def read_parts(folder: Path, base: Path) -> Sorted:
     """Bones and muscles of a folder, and of its folders ``bones`` and ``muscles`` where it has them.
 
     Parameters
@@ -79,40 +111,45 @@ def read_parts(folder: Path, base: Path) -> tuple[list[Part], list[Part]]:
     ------
     UsageError
         If the folder is missing or holds no bone or no muscle.
-    MeshError
-        If a mesh cannot be read, or a muscle is open.
     """
-    paths = find_meshes(folder)
-    names: set[str] = set()
-    bones, muscles, unknown = [], [], []
-    for path in paths:
-        part = _read_part(path, base, names)
-        parent = path.parent.name.lower()
-        if path.parent != folder and parent in BONE_FOLDERS + MUSCLE_FOLDERS:
+    found, unknown, names = Sorted(), [], set()
+    for path in find_meshes(folder):
+        facts, parent = name_facts(path.stem), path.parent.name.lower()
+        by_folder = path.parent != folder
+        file = os.path.relpath(path, base).replace(os.sep, "/")
+        if facts.tissue == "other":
+            found.left_out.append(path.name)
+            continue
+        bone = parent in BONE_FOLDERS if by_folder else facts.tissue == "bone"
+        try:
+            part = _read_part(
+                path, file, names, facts, found.notes, closed=facts.tissue == "muscle" and not bone
+            )
+        except MeshError as error:
+            found.unusable[path.name] = str(error).removeprefix(f"{path}: ")
+            continue
+        if by_folder:
             part.reason = f"by its folder, {path.parent.name}"
-            (bones if parent in BONE_FOLDERS else muscles).append(part)
-        elif says_muscle(part.name):
-            muscles.append(part)
-        elif bone_class(part.name):
-            bones.append(part)
-        else:
-            unknown.append(part)
-    _sort_by_size(unknown, bones, muscles)
-    if not bones or not muscles:
-        kind, other = ("bone", "muscles") if not bones else ("muscle", "bones")
-        listed = ", ".join(part.file for part in (bones if bones else muscles))
+        if facts.spelling:
+            found.notes.append(f"{path.name}: {facts.spelling}")
+        group = found.bones if bone else found.muscles if by_folder or facts.tissue == "muscle" else unknown
+        group.append(part)
+    _sort_by_size(unknown, found)
+    _check_both(folder, found)
+    return found
+
+
+def _check_both(folder, found):
+    for part in [part for part in found.muscles if not part.mesh.is_watertight]:
+        found.muscles.remove(part)
+        found.unusable[part.file] = "the surface is open; a muscle must be closed"
+    if not found.bones or not found.muscles:
+        kind, other = ("bone", "muscles") if not found.bones else ("muscle", "bones")
+        listed = ", ".join([part.file for part in found.bones or found.muscles] + list(found.unusable))
         raise UsageError(
-            f"{folder} holds no {kind} (all are {other} by their names or sizes: {listed}); "
+            f"{folder} holds no {kind} (all are {other} by their names or sizes, or cannot be used: {listed}); "
             "name the files after what they are, or sort them into folders bones and muscles"
         )
-    for part in bones:
-        part.kind = bone_class(part.name)
-    for part in muscles:
-        part.facts = muscle_facts(part.name)
-        part.kind = part.facts.name if part.facts else ""
-        if not part.mesh.is_watertight:
-            raise MeshError(f"{part.file}: the surface is open; a muscle must be closed")
-    return bones, muscles
 
 
 def find_meshes(folder: Path) -> list[Path]:
@@ -125,37 +162,65 @@ def find_meshes(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise UsageError(f"{folder} is no folder; give the folder of the meshes")
-    places = [
-        folder,
-        *(p for p in sorted(folder.iterdir()) if p.name.lower() in BONE_FOLDERS + MUSCLE_FOLDERS),
+    sorted_in = [
+        p for p in sorted(folder.iterdir()) if p.name.lower() in BONE_FOLDERS + MUSCLE_FOLDERS and p.is_dir()
     ]
-    paths = [
-        path
-        for place in places
-        if place.is_dir()
-        for path in sorted(place.iterdir())
-        if path.suffix.lower() in MESH_SUFFIXES
-    ]
+    files = [path for place in [folder, *sorted_in] for path in sorted(place.iterdir())]
+    paths = [path for path in files if path.suffix.lower() in MESH_SUFFIXES]
     if len(paths) < 2:
         kinds = " ".join(MESH_SUFFIXES)
         raise UsageError(f"{folder} holds {len(paths)} meshes ({kinds}); a scene needs bones and muscles")
     return paths
 
 
-def _read_part(path, base, names):
+def _read_part(path, file, names, facts, notes, *, closed):
     name = re.sub(r"[^a-z0-9_-]+", "_", path.stem.lower()).strip("_") or "part"
     while name in names:
         name += "_2"
     names.add(name)
-    file = os.path.relpath(path, base).replace(os.sep, "/")
-    return Part(name, file, read_mesh(path, may_be_open=True), side=side_of(path.stem))
+    vertices, faces = read_arrays(path)
+    coarse = len(faces) > MOST_TRIANGLES
+    if coarse:
+        notes.append(f"{path.name}: {len(faces)} triangles, made coarser to about {MOST_TRIANGLES}")
+        vertices, faces = clustered(vertices, faces, MOST_TRIANGLES)
+    read: ReadMesh = prepare_mesh(vertices, faces, place=str(path), name=path.stem, may_be_open=not closed)
+    kind = facts.bone or (facts.muscle.name if facts.muscle else "")
+    return Part(name, file, read, kind, facts.side, facts=facts.muscle, coarse=coarse)
 
 
-def _sort_by_size(unknown, bones, muscles):
+def clustered(vertices: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """A mesh of about as many triangles as wanted: the vertices of each cell of a grid become their mean.
+
+    Rossignac and Borrel 1993, "Multi-resolution 3D approximations for rendering complex scenes".
+    """
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+    cells = np.floor((vertices - vertices.min(axis=0)) / np.sqrt(2.0 * area / count)).astype(np.int64)
+    size = cells.max(axis=0) + 1
+    keys = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
+    _, place, members = np.unique(keys, return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(place, vertices[:, k]) / members for k in range(3)], axis=1)
+    new = place[faces]
+    return means, new[(new != np.roll(new, 1, axis=1)).all(axis=1)]
+
+
+def guess_units(bones: list[Part]) -> tuple[str, str]:
+    """The unit in which bones have the size that they have in people, and the reason; a UsageError where none fits."""
+    known = [bone for bone in bones if bone.kind in LENGTHS]
+    bone = max(known or bones, key=lambda bone: float(np.linalg.norm(bone.mesh.extents)))
+    low, high = LENGTHS.get(bone.kind, LARGEST_BONE)
+    size = float(np.linalg.norm(bone.mesh.extents))
+    for units, millimetre in MILLIMETRE.items():
+        if low <= size / millimetre <= high:
+            return units, f"{bone.name} is {size:.4g} {units} long"
+    raise UsageError(f"{bone.file} is {size:.4g} across, which is no bone in mm, cm or m; give --units")
+
+
+def _sort_by_size(unknown, found):
     """What no name tells: the largest are bones until there are two, the others muscles."""
     unknown.sort(key=lambda part: -np.linalg.norm(part.mesh.extents))
     for part in unknown:
-        is_bone = len(bones) < 2 or not part.mesh.is_watertight
+        is_bone = len(found.bones) < 2 or not part.mesh.is_watertight
         part.sure = False
         part.reason = f"{'a bone' if is_bone else 'a muscle'} by its size, as its name tells nothing"
-        (bones if is_bone else muscles).append(part)
+        (found.bones if is_bone else found.muscles).append(part)

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from rbfmuscle.importers.guess.attachments import FAR
 
@@ -34,7 +33,7 @@ class TendonGuess:
     guide : Part
         The bone that the end slides against.
     joint : JointGuess
-        The hinge whose angle drives it.
+        The hinge, or the path of the patella, whose angle drives it.
     direction : (3,) ndarray
         Unit, from the end to the bone.
     place : (3,) ndarray
@@ -94,7 +93,7 @@ def _tendon(guess, muscle, hold):
     k = min(beside, key=lambda k: float(((path[k].points - end) ** 2).sum(axis=1).min()))
     crossed = [_between(guess.joints, a, b) for a, b in itertools.pairwise(path[: k + 1])]
     moving = [joint for joint in crossed if joint.kind != "fixed"]
-    if len(moving) != 1 or moving[0].kind != "hinge":
+    if len(moving) != 1 or moving[0].kind not in ("hinge", "custom"):
         return None
     target = hold.bone.points[np.argmin(((hold.bone.points - end) ** 2).sum(axis=1))]
     way = target - end
@@ -107,9 +106,9 @@ def _tendon(guess, muscle, hold):
 
 
 def _excursion(end, target, joint, angle):
-    """Length from the end to where its bone takes the tendon at an angle [degree] of the hinge."""
-    turn = Rotation.from_rotvec(np.radians(angle) * np.asarray(joint.axis))
-    return float(np.linalg.norm(turn.apply(target - joint.centre) + joint.centre - end))
+    """Length from the end to where its bone takes the tendon at an angle [degree] from rest of the hinge."""
+    pose = joint.pose(angle)
+    return float(np.linalg.norm(pose[:3, :3] @ target + pose[:3, 3] - end))
 
 
 def _between(joints, one, other):

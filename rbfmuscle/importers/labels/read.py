@@ -7,6 +7,7 @@ order and the signs of the voxels' axes; NRRD files in LPS are turned.
 import csv
 import json
 import re
+import tomllib
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -265,17 +266,20 @@ def _check_affine(affine, path):
 
 
 def read_names(path: Path) -> dict[int, str]:
-    """Names of labels from a table.
+    """Names of labels from a file, or from a known table by its name.
 
     Raises
     ------
     UsageError
         If the file cannot be read or names nothing.
     """
+    known = known_tables()
+    if not path.exists() and path.name in known:
+        return known[path.name]
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
-        raise UsageError(f"cannot read {path}: {error.strerror}") from None
+        raise UsageError(f"cannot read {path}: {error.strerror}; known tables: {', '.join(known)}") from None
     names: dict[int, str] = {}
     if path.suffix.lower() == ".json":
         names = _json_names(text, path)
@@ -294,13 +298,25 @@ def read_names(path: Path) -> dict[int, str]:
     return names
 
 
+def known_tables() -> dict[str, dict[int, str]]:
+    """Names of labels by number, of segmentation programs, from ``tables.toml``."""
+    with (Path(__file__).parent / "tables.toml").open("rb") as file:
+        tables = tomllib.load(file)
+    return {name: dict(enumerate(words.split(), start=1)) for name, words in tables.items()}
+
+
 def _json_names(text, path):
     try:
         table = json.loads(text)
     except (ValueError, RecursionError):
         raise UsageError(f"{path} is no JSON") from None
-    if isinstance(table, dict) and isinstance(table.get("labels"), dict):
+    if isinstance(table, dict) and isinstance(table.get("labels"), (dict, list)):
         table = table["labels"]
+    if isinstance(table, list):  # as MuscleMap writes it
+        rows = [row for row in table if isinstance(row, dict) and isinstance(row.get("value"), int)]
+        return {
+            r["value"]: f"{r.get('anatomy') or r.get('structure')} {r.get('side', '')}".strip() for r in rows
+        }
     if not isinstance(table, dict):
         raise UsageError(f"{path}: give an object of number and name")
     names = {}

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rbfmuscle.importers.opensim.muscles import ModelMuscle
 from rbfmuscle.scene.joints.joint import KINDS, Coordinate, Coupling, Joint, TransformAxis
 from rbfmuscle.scene.joints.skeleton import ordered
 from rbfmuscle.validation import SceneError
@@ -78,6 +79,7 @@ class OsimModel:
     joints: list[ModelJoint] = field(default_factory=list)
     couplings: list[Coupling] = field(default_factory=list)
     meshes: list[ModelMesh] = field(default_factory=list)
+    muscles: list[ModelMuscle] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     def coordinates(self) -> dict[str, Coordinate]:

@@ -16,6 +16,7 @@ from rbfmuscle.importers.opensim.model import (
     joint_motion,
     motion_kinds,
 )
+from rbfmuscle.importers.opensim.muscles import read_muscles
 from rbfmuscle.importers.opensim.xml import read_xml
 from rbfmuscle.scene.joints.functions import Linear, scaled
 from rbfmuscle.scene.joints.joint import Coordinate, Coupling, TransformAxis, frame_at
@@ -75,6 +76,7 @@ def _read_model(root, path):
     else:
         _read_old(model, bodies)
     _read_constraints(model, node)
+    model.muscles = read_muscles(model, node, bodies, frames)
     return finish(model)
 
 

@@ -9,12 +9,13 @@ import numpy as np
 
 from rbfmuscle.importers.opensim.geometry import body_meshes
 from rbfmuscle.importers.opensim.model import OsimModel
+from rbfmuscle.importers.opensim.muscles import bone_distances, make_tube
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.scene.joints.functions import Function
 from rbfmuscle.scene.joints.joint import Coordinate, Coupling, Joint, TransformAxis
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.validation import SceneError, did_you_mean
+from rbfmuscle.validation import MeshError, SceneError, did_you_mean
 
 
 @dataclass
@@ -24,7 +25,6 @@ class Imported:
     Attributes
     ----------
     scene : Scene
-        Without muscles.
     model : OsimModel
     places : dict of str to (4, 4) ndarray
         From every body of the model to the scene, rest pose [scene unit], by the model's names.
@@ -32,6 +32,8 @@ class Imported:
         The scene's name of every body.
     notes : list of str
         What was not taken, or taken otherwise than one may expect.
+    lost : dict of str to str
+        Why a muscle is not in the scene, by name.
     """
 
     scene: Scene
@@ -39,10 +41,16 @@ class Imported:
     places: dict[str, np.ndarray]
     names: dict[str, str]
     notes: list[str] = field(default_factory=list)
+    lost: dict[str, str] = field(default_factory=dict)
 
 
 def import_osim(
-    path: Path | str, *, units: str = "m", geometry: list[Path] | None = None, bodies: list[str] | None = None
+    path: Path | str,
+    *,
+    units: str = "m",
+    geometry: list[Path] | None = None,
+    bodies: list[str] | None = None,
+    muscles: bool = True,
 ) -> Imported:
     """Make a scene of an OpenSim model.
 
@@ -59,6 +67,8 @@ def import_osim(
         Folders with meshes, after the model's own and its ``Geometry``.
     bodies : list of str, optional
         Take these and what lies between them and the ground; all where not given.
+    muscles : bool
+        Make a tube of each of the model's muscles.
 
     Returns
     -------
@@ -89,7 +99,25 @@ def import_osim(
             scene.add_link(names[body])
     places = {body: scaled(place, metre) for body, place in ground.items()}
     _add_joints(scene, model, places, names, metre, notes)
-    return Imported(scene, model, places, names, notes)
+    scene.superior, scene.anterior = [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]
+    found = Imported(scene, model, places, names, notes)
+    if muscles:
+        _add_muscles(found, metre)
+    return found
+
+
+def _add_muscles(found, metre):
+    """A tube for each muscle of the model."""
+    scene, distances = found.scene, bone_distances(found.scene)
+    for muscle in found.model.muscles:
+        name = clean_name(muscle.name, {other.name for other in scene.muscles})
+        try:
+            tube = make_tube(muscle, found.places, found.names, distances, metre)
+            attach: Any = [{"bone": bone, "vertices": held.tolist()} for bone, held in tube.held.items()]
+            scene.add_muscle(name, (tube.vertices, tube.faces), attach=attach)
+        except (SceneError, MeshError) as error:
+            found.lost[name] = str(error)
+            found.notes.append(f"muscle {name!r} is not taken: {error}")
 
 
 def scaled(transform: np.ndarray, metre: float) -> np.ndarray:
@@ -124,6 +152,7 @@ def _keep(model, bodies):
     model.bodies = [body for body in model.bodies if body in kept]
     model.joints = [joint for joint in model.joints if {joint.parent, joint.child} <= kept]
     model.meshes = [mesh for mesh in model.meshes if mesh.body in kept]
+    model.muscles = [m for m in model.muscles if all(body in kept for body, _ in m.points)]
     known = model.coordinates()
     model.couplings = [c for c in model.couplings if all(n in known for n in (c.coordinate, *c.of))]
 

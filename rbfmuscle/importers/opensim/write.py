@@ -12,7 +12,7 @@ from rbfmuscle.scene.options import MotionOptions
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import UsageError
 
-BONES = "bones"
+BONES, MUSCLES, ATTACHMENTS = "bones", "muscles", "attachments"
 
 
 def write_scene(found: Imported, directory: Path, *, motion: Path | None = None) -> Path:
@@ -35,19 +35,40 @@ def write_scene(found: Imported, directory: Path, *, motion: Path | None = None)
     """
     directory = Path(directory)
     target, options = directory / "scene.toml", None
-    if motion is not None:
-        options = MotionOptions(file=os.path.relpath(Path(motion).resolve(), directory.resolve()))
-        found.scene.motion = found.scene.motion_from(options, folder=directory)
-        found.notes += found.scene.motion.notes
     try:
-        meshes = write_meshes(found.scene, directory)
-        parts = [skeleton_text(found.scene, head_text(found), meshes)]
+        directory.mkdir(parents=True, exist_ok=True)
+        if motion is not None:
+            options = MotionOptions(file=os.path.relpath(Path(motion).resolve(), directory.resolve()))
+            found.scene.motion = found.scene.motion_from(options, folder=directory)
+            found.notes += found.scene.motion.notes
+        parts = [skeleton_text(found.scene, head_text(found), write_meshes(found.scene, directory))]
+        parts += _muscle_texts(found.scene, directory)
         if options is not None:
             parts.append(table_text("[motion]", {"file": options.file}))
         target.write_text("\n".join(parts), encoding="utf-8")
     except OSError as error:
         raise UsageError(f"cannot write to {directory}: {error.strerror}; choose another --output") from None
     return target
+
+
+def _muscle_texts(scene, directory):
+    """The tables of the muscles, their meshes and attachments written."""
+    parts = []
+    for folder in (MUSCLES, ATTACHMENTS) if scene.muscles else ():
+        (directory / folder).mkdir(exist_ok=True)
+    for muscle in scene.muscles:
+        write_ply(directory / MUSCLES / f"{muscle.name}.ply", muscle.mesh.vertices, muscle.mesh.faces)
+        rows = []
+        for held in muscle.attachments:
+            file = f"{ATTACHMENTS}/{muscle.name}_{held.bone}.txt"
+            np.savetxt(directory / file, held.vertices, fmt="%d")
+            rows.append({"bone": held.bone, "vertices": file})
+        head = (
+            "[[muscle]]   # a tube along the model's path, of its fibres' volume; put a mesh of your own here"
+        )
+        mesh = f"{MUSCLES}/{muscle.name}.ply"
+        parts.append(table_text(head, {"name": muscle.name, "mesh": mesh, "attach": rows}))
+    return parts
 
 
 def head_text(found: Imported) -> str:
@@ -117,7 +138,10 @@ def skeleton_text(scene: Scene, head: str, meshes: dict[str, str]) -> str:
     meshes : dict of str to str
         File of every bone's mesh, relative to the scene file.
     """
-    parts = [head, table_text("[scene]", {"format": 1, "name": scene.name, "units": scene.units})]
+    parts = [
+        head,
+        table_text("[scene]", {"format": 1, "name": scene.name, "units": scene.units, **_directions(scene)}),
+    ]
     for bone in scene.bones:
         parts.append(table_text("[[bone]]", {"name": bone.name, "mesh": meshes[bone.name]}))
     for link in scene.links:
@@ -125,6 +149,10 @@ def skeleton_text(scene: Scene, head: str, meshes: dict[str, str]) -> str:
     parts += [joint_text(joint_row(joint)) for joint in scene.joints]
     parts += [table_text("[[coupling]]", coupling_row(c, scene.joints)) for c in scene.couplings]
     return "\n".join(parts)
+
+
+def _directions(scene):
+    return {} if scene.superior is None else {"superior": scene.superior, "anterior": scene.anterior}
 
 
 def write_meshes(scene: Scene, directory: Path) -> dict[str, str]:

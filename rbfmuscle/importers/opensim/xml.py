@@ -66,6 +66,18 @@ class _Builder(ElementTree.TreeBuilder):
         return super().end(tag)
 
 
+def _as_utf8(data):
+    """The bytes of a file that says UTF-8, or nothing, and is in Latin-1 as UTF-8: OpenSim reads these too."""
+    declared = re.match(rb"\s*<\?xml[^>]*encoding=[\"']([^\"']+)", data)
+    if declared and declared[1].lower() not in (b"utf-8", b"utf8"):
+        return data
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("latin-1").encode("utf-8")
+    return data
+
+
 def read_xml(path: Path) -> Node:
     """Return the root element of an XML file; two colons in a name, which XML forbids, become two underscores.
 
@@ -80,7 +92,7 @@ def read_xml(path: Path) -> Node:
         if len(data) > MOST_BYTES:
             raise SceneError(f"{path}: more than {MOST_BYTES / 1e6:.0f} MB, this is no OpenSim model")
         parser = ElementTree.XMLParser(target=_Builder(path))
-        parser.feed(data.replace(b"::", b"__"))  # nine published models have such names
+        parser.feed(_as_utf8(data).replace(b"::", b"__"))  # nine published models have such names
         root = parser.close()
     except OSError as error:
         raise SceneError(f"{path}: cannot read the model: {error.strerror}") from None

@@ -16,6 +16,7 @@ TWISTED_NOTED = 0.005  # of the area
 MOST_TWISTED = 0.3  # of the area: of more it cannot be said what is inside
 WINDING_SAMPLES = 1500  # triangles asked, before and behind them by a small share of their size:
 WINDING_STEP = 1e-3
+MOST_DROPPED = 0.01  # of the triangles of a bone, at edges that cannot be mended
 CRUMB_LIMIT = 0.01  # of the largest part's area: smaller loose parts are dropped
 
 
@@ -62,7 +63,11 @@ def repair(vertices: Floats, faces: Integers, *, place: str, may_be_open: bool =
     state.vertices, state.faces, new, _ = igl.remove_unreferenced(vertices, state.faces)
     state.vertex_map = new[state.vertex_map]
     if not _is_closed(state.faces):
+        if may_be_open:
+            _drop_few(state, (_uses_of_sides(state.faces) > 2).any(axis=1), "at edges of more than two triangles")
         _fill_holes(state, place)
+    if may_be_open:
+        _cut_one_sided(state)
     _orient(state, place)
     _check_closed(state, place, may_be_open)
     return state
@@ -217,6 +222,30 @@ def _drop_crumbs(state, *, keep_parts):
         state.notes.append(f"{int((~large).sum())} loose parts of less than 1 % of the surface dropped")
     if keep_parts and large.sum() > 1:
         state.notes.append(f"the surface has {int(large.sum())} parts")
+
+
+def _uses_of_sides(faces):
+    """How many faces use the edge (m, 3) at each side of a face."""
+    _, count, sides = _edges(faces)
+    return count[sides]
+
+
+def _drop_few(state, which, words):
+    """Drop triangles of a bone where these are few."""
+    if which.any() and which.mean() < MOST_DROPPED:
+        state.faces = state.faces[~which]
+        state.notes.append(f"{int(which.sum())} triangles {words} dropped")
+
+
+def _cut_one_sided(state):
+    """Drop the triangles of a bone at edges where no consistent orientation exists, where these are few."""
+    import igl
+
+    oriented = igl.bfs_orient(np.ascontiguousarray(state.faces))[0]
+    sides = oriented * (int(oriented.max()) + 1) + np.roll(oriented, -1, axis=1)
+    _, inverse, count = np.unique(sides, return_inverse=True, return_counts=True)
+    again = (count[inverse.reshape(-1, 3)] > 1).any(axis=1)
+    _drop_few(state, again, "where the surface has one side only")
 
 
 def _fill_holes(state, place):

@@ -1,0 +1,194 @@
+"""What names of meshes and labels say: bone, muscle or other tissue, which one, and of which side.
+
+A name is split at capitals, digits and signs; words are brought to one form, those written together are taken apart,
+and unknown ones may be misspelt. The table is ``names.toml``, with its sources.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+# Words of this length may differ from a known one by one letter, words of that length by two.
+ONE_LETTER, TWO_LETTERS = 5, 8
+MIDLINE = ("sacrum", "vertebra", "sternum", "skull", "mandible")
+_SIGNS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss", "é": "e", "è": "e", "ô": "o", "â": "a"})
+
+
+@dataclass(frozen=True)
+class MuscleFacts:
+    """What a muscle's name says.
+
+    Attributes
+    ----------
+    name : str
+        As the table has it.
+    origin, insertion : tuple of (tuple of str, bool)
+        Classes of bone that may stand for one attachment, the best first; whether the muscle must be held there.
+    """
+
+    name: str
+    origin: tuple
+    insertion: tuple
+
+
+@dataclass(frozen=True)
+class NameFacts:
+    """What a name says.
+
+    Attributes
+    ----------
+    tissue : str
+        ``"bone"``, ``"muscle"``, ``"other"``, or empty where the name says nothing.
+    bone : str
+        Class of bone.
+    muscle : MuscleFacts or None
+    side : str
+        ``"l"``, ``"r"`` or empty.
+    spelling : str
+        What misspelt words were taken for; empty where there are none.
+    """
+
+    tissue: str = ""
+    bone: str = ""
+    muscle: MuscleFacts | None = None
+    side: str = ""
+    spelling: str = ""
+
+
+class _Table:
+    """The file, as sets of words."""
+
+    def __init__(self) -> None:
+        with (Path(__file__).parent / "names.toml").open("rb") as file:
+            table: dict[str, Any] = tomllib.load(file)
+        self.sides = {form: side for side, forms in table["sides"].items() for form in forms.split()}
+        self.forms = {form: word for word, forms in table["words"].items() for form in forms.split()}
+        self.other = {word for words in table["other"].values() for word in words.split()}
+        self.bones = {
+            self._key(name): kind for kind, names in table["bones"].items() for name in names.split(",")
+        }
+        self.muscles = {}
+        for line in table["muscles"]["table"].strip().splitlines():
+            names, origin, insertion = (part.strip() for part in line.split(";"))
+            for name in names.split(","):
+                facts = MuscleFacts(name.strip(), _places(origin), _places(insertion))
+                self.muscles[self._key(name)] = facts
+        words = {word for key in (*self.bones, *self.muscles) for word in key}
+        self.known = words | self.other | set(self.forms) | set(table["words"]) | {"compartment"}
+
+    def _key(self, name):
+        return tuple(self.forms.get(word, word) for word in name.split())
+
+
+@cache
+def _table():
+    return _Table()
+
+
+def _places(text):
+    found = re.findall(r"\(?[a-z|]+\)?", text)
+    return tuple((tuple(word.strip("()").split("|")), not word.startswith("(")) for word in found)
+
+
+@cache
+def name_facts(name: str) -> NameFacts:
+    """What a name says, of a file (without suffix) or of a label."""
+    table = _table()
+    words, side, spelling = _read_words(name)
+    bone, muscle = _longest(words, table.bones), _longest(words, table.muscles)
+    used = set(muscle or ()) | set(bone or ())
+    if any(word in table.other and word not in (muscle or ()) for word in words):
+        return NameFacts("other", side=side)
+    says_bone, says_muscle = "bone" in words, "muscle" in words
+    if muscle is not None and not (says_bone and bone is not None) and _beats(muscle, bone, says_muscle):
+        bone = None
+    elif bone is not None and not says_muscle:
+        muscle = None
+    tissue = "muscle" if muscle or says_muscle else "bone" if bone or says_bone else ""
+    used = set(muscle or bone or ())
+    kind = table.bones[bone] if bone is not None and tissue == "bone" else ""
+    shown = ", ".join(f"{wrong!r} read as {right!r}" for wrong, right in spelling.items() if right in used)
+    return NameFacts(
+        tissue, kind, table.muscles[muscle] if muscle else None, "" if kind in MIDLINE else side, shown
+    )
+
+
+def _beats(muscle, bone, says_muscle):
+    return bone is None or says_muscle or len(muscle) > len(bone) or not set(bone) - set(muscle)
+
+
+def _longest(words, table):
+    """The entry whose words all occur; of several the one with most words, then with the longest."""
+    present = set(words)
+    fitting = [key for key in table if present.issuperset(key)]
+    return max(fitting, key=lambda key: (len(key), sum(map(len, key)))) if fitting else None
+
+
+def _read_words(name):
+    """Words in their one form, the side, and what misspelt words were taken for."""
+    table, words, sides, spelling = _table(), [], set(), {}
+    text = re.sub(r"([LTCS])\d{1,2}(?![0-9])", " ", name)  # vertebrae are no sides
+    text = re.sub(r"(?<=[a-zäöüß])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", text)
+    for word in re.split(r"[^a-z]+", text.lower().translate(_SIGNS)):
+        if word in table.sides:
+            sides.add(table.sides[word])
+            continue
+        parts = [word] if word in table.known else _taken_apart(word)
+        if not parts:
+            near = _nearest(word)
+            parts = [near or word]
+            if near:
+                spelling[word] = table.forms.get(near, near)
+        words += [table.forms.get(part, part) for part in parts if part]
+    return words, sides.pop() if len(sides) == 1 else "", spelling
+
+
+def _taken_apart(word):
+    """Known words that a word is written together of, none where it is not; the fewest, of three letters or more."""
+    known, best = _table().known | set(_table().sides), {0: []}
+    for end in range(3, len(word) + 1):
+        for start in list(best):
+            part = word[start:end]
+            if len(part) >= 3 and part in known:
+                parts = [*best[start], part]
+                if end not in best or len(parts) < len(best[end]):
+                    best[end] = parts
+    return best.get(len(word), []) if len(word) >= 6 else []
+
+
+def _nearest(word):
+    """The only known word that differs by a letter, or by two of a long one."""
+    allowed = 2 if len(word) >= TWO_LETTERS else 1 if len(word) >= ONE_LETTER else 0
+    if not allowed:
+        return ""
+    near = [
+        (_distance(word, known), known) for known in _table().known if abs(len(known) - len(word)) <= allowed
+    ]
+    near = sorted(pair for pair in near if pair[0] <= allowed and len(pair[1]) >= ONE_LETTER)
+    if not near or (len(near) > 1 and near[1][0] == near[0][0] and not _one_form(near)):
+        return ""
+    return near[0][1]
+
+
+def _one_form(near):
+    forms = _table().forms
+    return len({forms.get(word, word) for distance, word in near if distance == near[0][0]}) == 1
+
+
+def _distance(one, two):
+    """Letters to change, add, drop or swap with the next (Damerau-Levenshtein)."""
+    rows = [list(range(len(two) + 1))]
+    for i, a in enumerate(one, start=1):
+        row = [i]
+        for j, b in enumerate(two, start=1):
+            cost = min(rows[-1][j] + 1, row[-1] + 1, rows[-1][j - 1] + (a != b))
+            if i > 1 and j > 1 and a == two[j - 2] and one[i - 2] == b:
+                cost = min(cost, rows[-2][j - 2] + 1)
+            row.append(cost)
+        rows.append(row)
+    return rows[-1][-1]
