@@ -184,12 +184,7 @@ def _read_trimesh(content, kind):
         # Positions and corners alone: numbers of textures and normals would split vertices.
         rows = [re.sub(rb"#.*|/\S*", b"", line).split() for line in content.splitlines()]
         rows = [row for row in rows if row[:1] in ([b"v"], [b"f"])]
-        kinds, counts_back = (
-            [row[0] for row in rows],
-            any(b"-" in b"".join(row) for row in rows if row[0] == b"f"),
-        )
-        if counts_back and b"v" in kinds[kinds.index(b"f") :]:
-            raise ValueError("faces count back from vertices that stand between them")
+        _count_from_first(rows)
         content = b"\n".join(map(b" ".join, rows))
         content.decode("ascii")  # trimesh leaves out what is not
     options = {"process": False, "force": "mesh", "skip_materials": True, "maintain_order": True}
@@ -208,9 +203,24 @@ def _read_trimesh(content, kind):
 def _unique_rows(vertices):
     """First index of each different row, and the number of each row; by hashes, which sort faster than rows."""
     bits = np.ascontiguousarray(vertices + 0.0).view(np.uint64)
-    keys = (bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)).sum(axis=1)
+    keys = (bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)).sum(
+        axis=1
+    )
     keys ^= keys >> np.uint64(29)
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
     if (vertices[first[inverse]] != vertices).any():  # two rows with one hash, or not a number
         _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
     return first, inverse.ravel()
+
+
+def _count_from_first(rows: list[list[bytes]]) -> None:
+    """Replace the vertex numbers of faces that count back from the last vertex so far, in place."""
+    count = 0
+    for row in rows:
+        count += row[0] == b"v"
+        for k, word in enumerate(row):
+            if row[0] == b"f" and word.startswith(b"-"):
+                number = int(word) + count + 1
+                if number < 1:
+                    raise ValueError(f"a face counts back by {int(word)}, {count} vertices stand before it")
+                row[k] = b"%d" % number
