@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.importers.opensim.frames import Frames
 from rbfmuscle.importers.opensim.functions import find_function, numbers, read_function, truth, vector
 from rbfmuscle.importers.opensim.xml import Node
@@ -188,7 +189,8 @@ def make_tube(
     radius = share * np.sqrt(muscle.volume * metre**3 / (np.pi * length * np.mean(share**2)))
     wraps = [(wrap, places[wrap.body] @ _in_units(wrap.frame, metre), metre) for wrap in muscle.wraps]
     line = _clear_line(line, fixed, radius, wraps, list(bones.values()))
-    vertices, faces = _skin(line, radius)
+    volume = mesh_volume(*_skin(line, radius))  # as its square, but for where sections run into each other
+    vertices, faces = _skin(line, radius * np.sqrt(muscle.volume * metre**3 / volume))
     held = _held(muscle, names, fixed, len(line), bones)
     return Tube(vertices, faces, held)
 

@@ -1,0 +1,78 @@
+"""Tubes of a model's muscles: volume, path, wrapping, what holds them."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.importers.opensim.muscles import ModelMuscle, WrapShape, make_tube
+from rbfmuscle.importers.opensim.read import read_osim
+from rbfmuscle.importers.opensim.scene import import_osim
+from rbfmuscle.importers.opensim.write import write_scene
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.validation import SceneError
+
+PLACES = {"a": np.eye(4), "b": np.eye(4), "c": np.eye(4)}
+NAMES = {"a": "a", "b": "b", "c": "c"}
+
+
+def _bones(*names):
+    small = trimesh.creation.icosphere(radius=0.001)
+    small.apply_translation([5.0, 5.0, 5.0])
+    return {name: ExactDistance(small.vertices, small.faces) for name in names}
+
+
+def _tube(points, **more):
+    muscle = ModelMuscle("m", points, volume=1e-4, **more)
+    return make_tube(muscle, PLACES, NAMES, _bones("a", "b", "c"), 1.0)
+
+
+def test_straight_tube_is_closed_has_its_volume_and_is_held_at_its_ends():
+    tube = _tube([("a", np.zeros(3)), ("b", np.array([0.0, 0.0, 0.3]))])
+    mesh = trimesh.Trimesh(tube.vertices, tube.faces, process=False)
+    assert mesh.is_watertight and mesh.volume > 0
+    assert mesh.volume == pytest.approx(1e-4, rel=1e-9)
+    assert tube.vertices[tube.held["a"], 2].max() < 0.03 and tube.vertices[tube.held["b"], 2].min() > 0.27
+    assert not set(tube.held["a"]) & set(tube.held["b"])
+
+
+def test_tube_goes_through_its_points_and_another_body_holds_it_there():
+    tube = _tube([("a", np.zeros(3)), ("c", np.array([0.04, 0.0, 0.15])), ("b", np.array([0.0, 0.0, 0.3]))])
+    assert np.linalg.norm(tube.vertices[tube.held["c"]].mean(axis=0) - [0.04, 0.0, 0.15]) < 0.012
+
+
+@pytest.mark.parametrize(("quadrant", "side"), [("", 1.0), ("-x", -1.0), ("x", 1.0)])
+def test_path_goes_around_a_cylinder_on_the_side_that_it_says(quadrant, side):
+    frame = np.eye(4)  # its axis along y
+    frame[:3, :3] = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    frame[:3, 3] = [-0.002, 0.0, 0.15]
+    wrap = WrapShape("w", "a", frame, np.array([0.03, 0.03, 0.1]), "WrapCylinder", quadrant)
+    tube = _tube([("a", np.zeros(3)), ("b", np.array([0.0, 0.0, 0.3]))], wraps=[wrap])
+    middles = tube.vertices[:-2].reshape(-1, 12, 3).mean(axis=1)
+    away = np.hypot(middles[:, 0] + 0.002, middles[:, 2] - 0.15)
+    assert away.min() > 0.0298 and side * middles[len(middles) // 2, 0] > 0.02
+
+
+def test_muscle_without_a_bone_to_hold_it_is_named():
+    muscle = ModelMuscle("m", [("a", np.zeros(3)), ("b", np.ones(3))], volume=1e-4)
+    with pytest.raises(SceneError, match="body 'b' has no mesh"):
+        make_tube(muscle, PLACES, NAMES, _bones("a"), 1.0)
+
+
+def test_muscles_of_published_models_are_written_and_load(osim_data, tmp_path):
+    path = osim_data / "leg6dof9musc" / "leg6dof9musc.osim"
+    model = read_osim(path)
+    assert len(model.muscles) == 9
+    found = import_osim(path, units="mm")
+    scene = Scene.load(write_scene(found, tmp_path, motion=path.parent / "leg69_IK_swing.mot"))
+    assert len(scene.muscles) == 9 and not found.lost and scene.superior == [0.0, 1.0, 0.0]
+    assert all(finding.level != "error" for finding in scene.check())
+    for known, muscle in zip(model.muscles, scene.muscles):
+        assert muscle.mesh.volume == pytest.approx(known.volume * 1e9), known.name
+
+
+def test_latin_1_is_read_as_opensim_reads_it(tmp_path):
+    text = '<?xml version="1.0" encoding="UTF-8"?><OpenSimDocument Version="40000"><Model name="{}"/></OpenSimDocument>'
+    for encoding in ("utf-8", "latin-1"):
+        (tmp_path / "m.osim").write_bytes(text.format("Köln").encode(encoding))
+        assert read_osim(tmp_path / "m.osim").name == "Köln"
