@@ -12,10 +12,11 @@ def inside_test(vertices: Floats, faces: Integers) -> Callable[[Floats], Boolean
     """``inside(points) -> (n,) bool`` by fast generalised winding numbers (Barill 2018), for meshes with holes too."""
     import igl
 
-    vertices, faces = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
+    tree = igl.FastWindingNumberBVH()
+    tree.init(np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64), 2)
 
     def inside(points: Floats) -> Booleans:
-        return igl.fast_winding_number(vertices, faces, np.ascontiguousarray(points)) > 0.5
+        return tree.winding_number(np.ascontiguousarray(points)) > 0.5
 
     return inside
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.validation import MeshError
 
 MERGE_TOLERANCE = 1e-7  # of the diagonal: float32 files repeat vertices to about this
@@ -16,7 +16,7 @@ TWISTED_NOTED = 0.005  # of the area
 MOST_TWISTED = 0.3  # of the area: of more it cannot be said what is inside
 WINDING_SAMPLES = 1500  # triangles asked, before and behind them by a small share of their size:
 WINDING_STEP = 1e-3
-MOST_DROPPED = 0.01  # of the triangles of a bone, at edges that cannot be mended
+MOST_WRONG = 0.01  # of the triangles of a bone, dropped where no surface can be made of them
 CRUMB_LIMIT = 0.01  # of the largest part's area: smaller loose parts are dropped
 
 
@@ -64,10 +64,11 @@ def repair(vertices: Floats, faces: Integers, *, place: str, may_be_open: bool =
     state.vertex_map = new[state.vertex_map]
     if not _is_closed(state.faces):
         if may_be_open:
-            _drop_few(state, (_uses_of_sides(state.faces) > 2).any(axis=1), "at edges of more than two triangles")
+            _, count, used = _edges(state.faces)
+            _drop_few(state, (count[used] > 2).any(axis=1), "at edges of more than two triangles")
         _fill_holes(state, place)
     if may_be_open:
-        _cut_one_sided(state)
+        _drop_few(state, _one_sided(state.faces), "where the surface has one side only")
     _orient(state, place)
     _check_closed(state, place, may_be_open)
     return state
@@ -224,30 +225,6 @@ def _drop_crumbs(state, *, keep_parts):
         state.notes.append(f"the surface has {int(large.sum())} parts")
 
 
-def _uses_of_sides(faces):
-    """How many faces use the edge (m, 3) at each side of a face."""
-    _, count, sides = _edges(faces)
-    return count[sides]
-
-
-def _drop_few(state, which, words):
-    """Drop triangles of a bone where these are few."""
-    if which.any() and which.mean() < MOST_DROPPED:
-        state.faces = state.faces[~which]
-        state.notes.append(f"{int(which.sum())} triangles {words} dropped")
-
-
-def _cut_one_sided(state):
-    """Drop the triangles of a bone at edges where no consistent orientation exists, where these are few."""
-    import igl
-
-    oriented = igl.bfs_orient(np.ascontiguousarray(state.faces))[0]
-    sides = oriented * (int(oriented.max()) + 1) + np.roll(oriented, -1, axis=1)
-    _, inverse, count = np.unique(sides, return_inverse=True, return_counts=True)
-    again = (count[inverse.reshape(-1, 3)] > 1).any(axis=1)
-    _drop_few(state, again, "where the surface has one side only")
-
-
 def _fill_holes(state, place):
     """Close each hole whose rim is short, or of one or two missing triangles, by a fan about its centre."""
     edges, count, _ = _edges(state.faces)
@@ -271,6 +248,23 @@ def _fill_holes(state, place):
         filled += 1
     if filled:
         state.notes.append(f"{filled} small holes closed")
+
+
+def _drop_few(state, wrong, what):
+    """Drop wrong triangles of a bone where they are few; its inside is then found by winding numbers."""
+    if wrong.any() and wrong.mean() < MOST_WRONG:
+        state.faces = state.faces[~wrong]
+        state.notes.append(f"{int(wrong.sum())} triangles {what} dropped")
+
+
+def _one_sided(faces: Integers) -> Booleans:
+    """Triangles at edges that no consistent orientation uses once in either direction."""
+    import igl
+
+    oriented, _ = igl.bfs_orient(np.ascontiguousarray(faces))
+    sides = oriented * (int(faces.max()) + 1) + np.roll(oriented, -1, axis=1)
+    _, place, count = np.unique(sides, return_inverse=True, return_counts=True)
+    return np.asarray((count[place.reshape(-1, 3)] > 1).any(axis=1))
 
 
 def _rims(faces: Integers) -> list[Integers]:
