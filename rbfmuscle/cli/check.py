@@ -69,6 +69,7 @@ def _draw(scene, path):
 
 
 def _findings(path):
+    from rbfmuscle.importers.guess.orientation import orient_scene
     from rbfmuscle.models import check_models
     from rbfmuscle.scene.attachments import ExactMeshes
     from rbfmuscle.scene.check import Finding, check_scene
@@ -76,6 +77,7 @@ def _findings(path):
     from rbfmuscle.simulation.substeps import check_substeps
 
     loaded = load_scene(path, skeleton=True)
+    orient_scene(loaded)
     check_models(loaded)
     exact = ExactMeshes()
     with stage("fields of the bones"):
@@ -127,6 +129,9 @@ def _describe_field(name, found, units):
 
 def _print_scene(scene):
     print(f"{scene.name}: {len(scene.motion)} frames, lengths in {scene.units}")
+    if scene.superior is not None:
+        up, front = (", ".join(f"{x:.3g}" for x in v) for v in (scene.superior, scene.anterior))
+        print(f"  superior is ({up}), anterior ({front})")
     for bone in scene.bones:
         print(f"  bone {bone.name}: {len(bone.mesh.vertices)} vertices, {len(bone.mesh.faces)} triangles")
     for joint in scene.joints:

@@ -103,19 +103,17 @@ def find_orientation(bones: list[Any], header: Orientation | None = None) -> Ori
     )
 
 
-def scene_orientation(scene: Any) -> Orientation | None:
-    """Anatomical directions of a loaded scene: those of its file, else from its bones and their names."""
+def orient_scene(scene: Any) -> None:
+    """Give a loaded scene the directions that its bones show, by their names and shapes, where its file has none."""
     if scene.superior is not None and scene.anterior is not None:
-        right = np.cross(scene.anterior, scene.superior)
-        return Orientation(np.array(scene.superior), np.array(scene.anterior), right, "the scene file")
+        return
     bones = []
     for bone in scene.bones:
-        facts = name_facts(bone.name)
-        points = np.asarray(bone.mesh.vertices)
-        bones.append(
-            SimpleNamespace(name=bone.name, mesh=bone.mesh, points=points, kind=facts.bone, side=facts.side)
-        )
-    return find_orientation(bones)
+        facts, points = name_facts(bone.name), np.asarray(bone.mesh.vertices)
+        bones.append(SimpleNamespace(mesh=bone.mesh, points=points, kind=facts.bone, side="", name=bone.name))
+    found = find_orientation(bones)
+    if found is not None:
+        scene.superior, scene.anterior = found.superior.tolist(), found.anterior.tolist()
 
 
 def neighbours(bone: Any, bones: list[Any], table: dict[str, tuple[str, ...]]) -> list[Any]:
