@@ -96,7 +96,7 @@ def run_sweep(
     cluster: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> int:
-    """Run the points that the folder does not hold done: the references first, then all others.
+    """Run the points that the folder does not hold done, references first; how many were run.
 
     Parameters
     ----------
@@ -111,11 +111,6 @@ def run_sweep(
         Address of a Dask scheduler whose workers see the folder.
     progress : callable, optional
         ``progress(done, total)``.
-
-    Returns
-    -------
-    int
-        How many points were run.
     """
     from joblib import parallel_config
 

@@ -145,7 +145,7 @@ def _digits(value: float) -> str:
     if not math.isfinite(value) or value == 0.0:
         return f"{value:g}"
     if 1e-3 <= size < 1e5:
-        return f"{value:.0f}" if size >= 100 else f"{value:.3g}" if size >= 10 else f"{value:.2g}"
+        return f"{value:.0f}" if size >= 100 else f"{value:.3g}" if size >= 1 else f"{value:.2g}"
     return f"{value:.0e}".replace("e-0", "e-").replace("e+0", "e+")
 
 

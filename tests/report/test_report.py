@@ -230,8 +230,8 @@ def test_stages_are_milliseconds_with_counts_and_reasons():
 
 @pytest.mark.parametrize(
     ("value", "unit", "text"),
-    [(0.0234, "s", "23.4 ms"), (2.34, "s", "2.3 s"), (0.003, "mm", "< 0.01 mm"), (0.0, "mm", "0 mm"),
-     (1.234, "mm", "1.2 mm"), (-41.27, "mm", "-41.3 mm"), (7.1e-15, "1", "7e-15"), (3.0, "1", "3"), (None, "mm", "–"),
+    [(0.0234, "s", "23.4 ms"), (2.34, "s", "2.34 s"), (0.003, "mm", "< 0.01 mm"), (0.0, "mm", "0 mm"),
+     (1.234, "mm", "1.23 mm"), (-41.27, "mm", "-41.3 mm"), (7.1e-15, "1", "7e-15"), (3.0, "1", "3"), (None, "mm", "–"),
      (12345.6, "", "12346"), (float("nan"), "1", "–")],
 )  # fmt: skip
 def test_numbers_have_the_digits_that_say_something(value, unit, text):

@@ -229,7 +229,7 @@ class Scene {
       gl.viewport(...place); gl.scissor(...place);
       gl.clearColor(1, 1, 1, 1); gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
       if (titles[k]) Object.assign(titles[k].style, {left: `${x}px`, top: `${y}px`});
-      this.panel(k, w, h, 0.47 * size);
+      this.panel(k, w, h, 0.44 * size);
     }
   }
 
