@@ -12,9 +12,10 @@ from blend_model import arm_scene, use_blend_model
 from PIL import Image
 
 from rbfmuscle.metrics.summary import describe_verdict, within
+from rbfmuscle.output.colours import muscle_colours
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report import labels, render
-from rbfmuscle.report.appearance import muscle_colours, muscle_groups
+from rbfmuscle.report.appearance import muscle_groups
 from rbfmuscle.report.page import Cell, limit_state, number, table
 from rbfmuscle.report.report import _events, _stages, write_report
 from rbfmuscle.run import simulate
