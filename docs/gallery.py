@@ -24,7 +24,7 @@ EXAMPLES = (
 # The Python reference: public names by topic.
 TOPICS = {
     "Scenes": ("Scene", "phantom_scene"),
-    "Running and comparing": ("simulate", "Run", "compare_models"),
+    "Running and comparing": ("simulate", "Run", "compare_models", "show"),
     "Fields and kernels": ("RBFField", "study_kernels", "reach_error"),
     "Muscles and bones": ("RBFMuscle", "BoneSDF"),
     "Errors and warnings": (

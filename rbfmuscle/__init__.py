@@ -27,6 +27,7 @@ _HOME = {
     "compare_models": "rbfmuscle.compare",
     "phantom_scene": "rbfmuscle.scene.phantom",
     "reach_error": "rbfmuscle.experiments.wanted_error",
+    "show": "rbfmuscle.viewer.page",
     "simulate": "rbfmuscle.run",
     "study_kernels": "rbfmuscle.experiments.kernel_study",
 }

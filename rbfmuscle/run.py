@@ -3,6 +3,7 @@
 Both are one run, a generator of frames, and differ in the sink that takes them.
 """
 
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from typing import Any
@@ -13,6 +14,7 @@ from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.metrics.summary import parse_limits, require_limits
 from rbfmuscle.models import configure_scene
+from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.sinks import MemorySink
 from rbfmuscle.output.writer import RunWriter, check_writable
 from rbfmuscle.progress import Progress, stage
@@ -228,10 +230,21 @@ class Run:
         UsageError
             If the folder cannot be written to.
         """
+        _finish(self._recording, self._write(directory), {}, pictures)
+
+    def show(self) -> Any:
+        """Show the frames in a browser or a notebook; see `rbfmuscle.show`."""
+        import rbfmuscle
+
+        self._shown = tempfile.TemporaryDirectory()
+        self._write(self._shown.name)
+        return rbfmuscle.show(SavedRun(self._shown.name))
+
+    def _write(self, directory: Any) -> RunWriter:
         writer = RunWriter(directory, self.scene)
         self._memory.replay(writer)
         writer.write_info(self._recording.info())
-        _finish(self._recording, writer, {}, pictures)
+        return writer
 
     def __repr__(self) -> str:
         return f"<Run of {self.scene.name!r}: {len(self.frames)} frames>"

@@ -1,78 +1,78 @@
-"""``rbfmuscle view``: a window on a scene that is moved by hand, or on a saved run."""
+"""``rbfmuscle view``: a scene that is moved by hand, or a saved run, in the browser; or one picture of it."""
 
 from __future__ import annotations
 
-import sys
+import tempfile
+import threading
+import webbrowser
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 from rbfmuscle.cli.scenes import load_scene
 from rbfmuscle.progress import Progress, stage
-from rbfmuscle.validation import UsageError
+from rbfmuscle.validation import UsageError, did_you_mean
 
-# What each quality changes in a muscle's model table; "as given" changes nothing.
-QUALITIES = {
-    "as given": {},
-    "fast": {"rbf": {"resolution": 32, "samples": 1000}},
-    "fine": {"rbf": {"resolution": 64}},
-}
+if TYPE_CHECKING:
+    from rbfmuscle.output.saved import SavedRun
+    from rbfmuscle.scene.scene import Scene
 
 
 def view(
     scene: Annotated[Path, Parameter(name=["scene", "--scene"])],
     *,
     model: str | None = None,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("view"),
-    colour: str = "nothing",
     at: Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)] = None,
+    colour: Literal["group", "activation", "stretch", "penetration", "distance"] = "group",
+    browser: bool = True,
+    port: int = 0,
     screenshot: Path | None = None,
 ) -> None:
-    """Open a window: a slider for each joint coordinate, or for the frames of a saved run.
+    """Show a scene or a run in the browser, with a slider for each joint coordinate or for the frames.
 
     Parameters
     ----------
     scene
-        Scene file (TOML), "phantom" for the embedded hip, or the folder of a run.
+        Scene file (TOML), "phantom" for the embedded hip, or the folder of a run or of a comparison.
     model
         Model to begin with, in place of the scene's.
-    output
-        Folder for screenshots and exported surfaces.
-    colour
-        nothing, penetration, distance (to the bones), stretch or volume.
     at
         COORDINATE=DEGREES to begin at, for instance hip.flexion=60; may be repeated. Of a saved run: frame=N.
+    colour
+        What muscles are coloured by at first.
+    browser
+        Open the browser; without, the address is printed only.
+    port
+        Of the address, on this machine alone; any free one by default.
     screenshot
-        Write the window to this PNG as soon as it stands at --at, and close it.
+        Draw this PNG at --at, without a display, and open nothing.
     """
-    from rbfmuscle.output.saved import SavedRun
-    from rbfmuscle.report.viewer.viewer import COLOURINGS
-    from rbfmuscle.report.viewer.window import Window, require_display
-
-    stops = [_parse_stop(text) for text in at or []]
-    if colour not in COLOURINGS:
-        raise UsageError(f"unknown colouring {colour!r}; known: {', '.join(COLOURINGS)}")
-    # A wrong path is told before a display is asked for.
-    opened = SavedRun(scene) if scene.is_dir() else load_scene(str(scene))
-    require_display()
+    stops = dict(_parse_stop(text) for text in at or [])
     with Progress(f"view {scene.name}"):
-        viewer, motion, title = _open_saved(opened) if scene.is_dir() else _open_scene(opened, model)
-        viewer.colour_by(colour)
+        opened = _open_runs(scene) if scene.is_dir() else load_scene(str(scene))
+        if screenshot is not None:
+            with stage("drawing the picture"):
+                _draw(opened, model, stops, screenshot, colour)
+            print(screenshot)
+            return
+        from rbfmuscle.viewer.page import Page
+        from rbfmuscle.viewer.sources import LiveSource, SavedSource
+
         with stage("building"):
-            _begin_at(viewer, stops)
-    window = Window(viewer, output, motion=motion, title=title)
-    window.open(until_closed=screenshot is None)
-    if screenshot is not None:
-        while window.tick():
-            pass
-        screenshot.parent.mkdir(parents=True, exist_ok=True)
-        window.write_picture(screenshot)
-        window.close()
-        print(screenshot)
+            source = SavedSource(opened) if isinstance(opened, dict) else LiveSource(opened, model)
+            _check_stops(stops, source.controls)
+            page = Page(source, at=stops, colour=colour, port=port)
+    print(f"{page.address}  (Ctrl-C ends)", flush=True)
+    if browser:
+        webbrowser.open(page.address)
+    try:
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        page.close()
 
 
-def _parse_stop(text):
+def _parse_stop(text: str) -> tuple[str, float]:
     name, _, value = text.partition("=")
     try:
         return name, float(value)
@@ -80,44 +80,55 @@ def _parse_stop(text):
         raise UsageError(f"--at {text!r} is not COORDINATE=DEGREES, for instance hip.flexion=60") from None
 
 
-def _begin_at(viewer, stops):
-    from rbfmuscle.validation import did_you_mean
-
-    for name, value in stops:
-        known = list(viewer.coordinates) if viewer.live else ["frame"]
+def _check_stops(stops: dict[str, float], known: Any) -> None:
+    for name in stops:
         if name not in known:
-            raise UsageError(f"--at: unknown coordinate {name!r}, {did_you_mean(name, known)}")
-        if viewer.live:
-            viewer.set(name, value)
-        else:
-            viewer.scrub(viewer.place_of(value))
+            raise UsageError(f"--at: unknown coordinate {name!r}, {did_you_mean(name, list(known))}")
 
 
-def _open_saved(run):
-    from rbfmuscle.report.viewer.saved import SavedViewer
+def _open_runs(folder: Path) -> dict[str, SavedRun]:
+    """The run in a folder, or those of the models of a comparison."""
+    from rbfmuscle.output.saved import SavedRun
 
-    return SavedViewer(run), None, f"rbfmuscle: {run.directory}"
+    inside = sorted(path.parent for path in folder.glob("*/run.json"))
+    if (folder / "run.json").exists() or not inside:
+        return {folder.name or "run": SavedRun(folder)}
+    return {path.name: SavedRun(path) for path in inside}
 
 
-def _open_scene(loaded, model):
-    from rbfmuscle.models import build_models, configure_scene
-    from rbfmuscle.report.viewer.live import LiveViewer
-    from rbfmuscle.scene.motion import shown_value
-    from rbfmuscle.simulation.live import LiveSession
+def _draw(
+    opened: Scene | dict[str, SavedRun], model: str | None, stops: dict[str, float], path: Path, colour: str
+) -> None:
+    """Draw a run's frame, or a scene's pose after a run to it, in the way `rbfmuscle render` does."""
+    from rbfmuscle.report.render import render_run
 
-    scene = configure_scene(loaded, model=model)
-    scene.validate()
-    print(f"rbfmuscle: preparing {scene.name}", file=sys.stderr)
-    models = [scene.muscles[0].model]
-    models += [name for name in ("rbf", "pbd", "xpbd", "arap-volume") if name not in models]
+    if colour not in ("group", "activation"):
+        raise UsageError("--screenshot colours muscles by group or activation")
+    colour = "muscle" if colour == "group" else colour
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if isinstance(opened, dict):
+        _check_stops(stops, ["frame"])
+        frame = stops.get("frame")
+        saved = next(iter(opened.values()))
+        render_run(
+            saved.directory, path, frame=saved.frames[0] if frame is None else int(frame), colour=colour
+        )
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        _run_to(opened, model, stops, folder)
+        render_run(folder, path, colour=colour)
 
-    def build(name, quality):
-        changed = QUALITIES[quality].get(name, {})
-        chosen = scene if name == models[0] else scene.with_options(model=name)
-        settings = {f"model.{key}": value for key, value in changed.items()}
-        return build_models(chosen.with_options(settings))
 
-    viewer = LiveViewer(LiveSession(scene), build, models, list(QUALITIES))
-    free = viewer.coordinates
-    motion = [{k: shown_value(scene, k, v) for k, v in q.items() if k in free} for q in scene.motion.frames]
-    return viewer, motion, f"rbfmuscle: {scene.name}"
+def _run_to(scene: Scene, model: str | None, stops: dict[str, float], folder: str) -> None:
+    """Run a scene from rest to one pose, and write that frame."""
+    from rbfmuscle.run import stream_run
+    from rbfmuscle.scene.motion import inner_value, rest_coordinates
+    from rbfmuscle.scene.objects import Motion
+    from rbfmuscle.simulation.live import coordinate_limits
+
+    _check_stops(stops, coordinate_limits(scene))
+    rest = rest_coordinates(scene)
+    scene = scene.copy()
+    scene.motion = Motion([rest, rest | {name: inner_value(scene, name, x) for name, x in stops.items()}])
+    settings = {"output.report": False, "output.preview": False, "output.metrics": False}
+    stream_run(scene, folder, model=model, settings=settings, pictures=False)

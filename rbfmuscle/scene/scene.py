@@ -1,5 +1,7 @@
 """`Scene`: the data of a scene with the functions that load, build, check and change it as methods."""
 
+from typing import Any
+
 from rbfmuscle.scene import build
 from rbfmuscle.scene.check import check_scene
 from rbfmuscle.scene.file import describe_scene, load_scene
@@ -40,3 +42,9 @@ class Scene(SceneData):
     check = check_scene
     with_options = change_scene
     resolved = describe_scene
+
+    def show(self, *, model: str | None = None) -> Any:
+        """Show the scene in a browser or a notebook, to be moved by hand; see `rbfmuscle.show`."""
+        import rbfmuscle  # Scenes know nothing of viewers; the facade does.
+
+        return rbfmuscle.show(self, model=model)

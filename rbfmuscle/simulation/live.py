@@ -105,13 +105,15 @@ class LiveSession:
             abs(value - active[name]) < 1e-9 for name, value in self.activation.items()
         )
 
-    def advance(self, stride: float = math.inf) -> Frame:
+    def advance(self, stride: float = math.inf, *, surfaces: bool = True) -> Frame:
         """Move towards the target and return the frame reached.
 
         Parameters
         ----------
         stride : float
             Greatest change of a coordinate [radian]. If finite, no activation changes by more than one sub-step's.
+        surfaces : bool
+            Whether the frame has surfaces in addition to the material.
 
         Returns
         -------
@@ -127,6 +129,7 @@ class LiveSession:
         step = {k: self.here[k] + share * (self.target[k] - self.here[k]) for k in self.target}
         if self._loop is None:
             self._loop = FrameLoop(_wide_scene(self.scene), self.models, fields=self.fields)
+        self._loop.surfaces = surfaces
         active = self._loop.activations
         reach = 1.0 if stride == math.inf else STEP
         for name, wanted in self.activation.items():

@@ -254,6 +254,13 @@ class TestKilledRuns:
         assert code == 0, err
         assert (killed / "last.png").read_bytes().startswith(b"\x89PNG")
 
+    def test_it_is_scrubbed_in_the_viewer(self, killed):
+        from rbfmuscle.viewer.sources import SavedFigure
+
+        figure = SavedFigure(SavedRun(killed))
+        figure.set("frame", 5)
+        assert figure.advance().text.startswith("frame 5")
+
     def test_what_was_cut_short_is_left_out(self, killed):
         poses = (killed / "poses.csv").read_text()
         (killed / "poses.csv").write_text(poses[: poses.rindex("\n", 0, -1) + 30])  # within the last line

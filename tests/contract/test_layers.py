@@ -35,6 +35,7 @@ ALLOWED = {
     "rbfmuscle.output": (*CORE, "rbfmuscle.metrics", "rbfmuscle.output"),
     "rbfmuscle.experiments": MEASURED,
     "rbfmuscle.report": ABOVE,
+    "rbfmuscle.viewer": (*ABOVE, "rbfmuscle.models", "rbfmuscle.viewer"),
     "rbfmuscle.sharing": (*ABOVE, "rbfmuscle.models", "rbfmuscle.sharing"),
     "rbfmuscle.recording": (*ABOVE, "rbfmuscle.sharing"),
     "rbfmuscle.run": (*ABOVE, "rbfmuscle.models", "rbfmuscle.recording"),
@@ -45,6 +46,7 @@ ALLOWED = {
         "rbfmuscle.models",
         "rbfmuscle.run",
         "rbfmuscle.compare",
+        "rbfmuscle.viewer",
         "rbfmuscle.cli",
     ),
 }

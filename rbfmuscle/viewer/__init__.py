@@ -1,0 +1,1 @@
+"""A scene or a saved run in a browser or a notebook."""

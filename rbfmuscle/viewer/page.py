@@ -1,0 +1,218 @@
+"""The page in the browser, and the thread that keeps its picture up to date."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import threading
+import time
+from typing import Any
+
+import numpy as np
+
+from rbfmuscle.metrics.penetration import BoneProbe
+from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.validation import RBFMuscleError, SolveError
+from rbfmuscle.viewer.panel import VIEWS, Panel
+from rbfmuscle.viewer.server import open_server
+from rbfmuscle.viewer.side import Side
+from rbfmuscle.viewer.sources import LiveSource, SavedSource
+
+COSTLY = 0.1  # While controls are moved, a picture that takes longer [s] is drawn coarse.
+MOVED = 0.25  # A control counts as moved for so long [s].
+PACE = 0.04  # Least time of a picture while a motion is played [s].
+FIELD_OF_VIEW = 0.5
+# Where the camera stands, of `VIEWS` and at first; as in the medical axes (left, posterior, superior).
+STANDS = dict(zip(VIEWS, ((0, -1, 0), (0, 1, 0), (1, 0, 0), (-1, 0, 0), (0, 0, 1), (0, 0, -1))))
+FIRST = (-1.4, 1.6, 0.5)
+
+
+def show(shown: Scene | SavedRun, *, model: str | None = None) -> Page:
+    """Show a scene or a saved run in a browser or a notebook.
+
+    Parameters
+    ----------
+    shown : Scene or SavedRun
+    model : str, optional
+        To begin with, in place of the scene's own.
+
+    Returns
+    -------
+    Page
+        Shown by a notebook as the last value of a cell; elsewhere open its ``address``. ``close()`` ends it.
+
+    Examples
+    --------
+    >>> from rbfmuscle import phantom_scene, show
+    >>> page = show(phantom_scene(end=0.0), model="pbd")
+    >>> page.address.startswith("http://127.0.0.1:")
+    True
+    >>> page.close()
+    """
+    return Page(SavedSource({"run": shown}) if isinstance(shown, SavedRun) else LiveSource(shown, model))
+
+
+class Page:
+    """A scene or saved runs in a browser; a notebook shows it where it is the value of a cell.
+
+    Parameters
+    ----------
+    source : LiveSource or SavedSource
+    at : dict of str to float, optional
+        Controls that begin elsewhere than at rest.
+    colour : str
+        Of `COLOURINGS`, to begin with.
+    port : int
+        Of the server; any free one for 0.
+
+    Attributes
+    ----------
+    address : str
+        What the browser opens; it holds a secret token.
+    """
+
+    def __init__(
+        self, source: LiveSource | SavedSource, *, at: dict[str, float] | None = None,
+        colour: str = "group", port: int = 0,
+    ) -> None:  # fmt: skip
+        import trimesh
+
+        self.source, (self.server, self.address) = source, open_server(port)
+        self._probes = [BoneProbe(n, trimesh.Trimesh(*m, process=False)) for n, m in source.bones.items()]
+        self._wake, self._closed, self._resting = threading.Event(), False, False
+        self._moved, self._cost, self._message, self._shown, self._place = 0.0, 0.0, "", [], 0
+        self.sides = [Side(self.server, f"/{name}", source) for name in ("first", "second")]
+        self.panel = Panel(self.server, source, at or {}, colour, self._touch)
+        self.panel.rest.on_click(lambda _: self._touch(rest=True))
+        self.panel.view.on_click(lambda event: self._aim(STANDS[event.target.value], event.client.camera))
+        self._aim(FIRST, self.server.initial_camera)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+        self._touch()
+
+    def close(self) -> None:
+        """Stop the server."""
+        self._closed = True
+        self._wake.set()
+        self._thread.join()
+        for side in self.sides:
+            side.close()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.stop()
+
+    def __repr__(self) -> str:
+        return f"<Page of {self.source.title!r} at {self.address}>"
+
+    def _repr_html_(self) -> str:
+        return f'<iframe src="{self.address}" width="100%" height="640" style="border:0"></iframe>'
+
+    def _touch(self, *, rest: bool = False) -> None:
+        self._moved, self._resting = time.perf_counter(), self._resting or rest
+        self._wake.set()
+
+    def _aim(self, direction: tuple[float, ...], camera: Any) -> None:
+        """Let a camera look at everything; models then stand side by side across its direction."""
+        meshes = (self.source.bones | self.source.muscles).values()
+        points = (0.001 / self.source.millimetre) * np.concatenate([vertices for vertices, _ in meshes])
+        middle, size = (points.min(axis=0) + points.max(axis=0)) / 2, np.ptp(points, axis=0)
+        ahead = np.asarray(direction) / np.linalg.norm(direction)
+        up = np.array([0.0, -1.0, 0.0] if abs(ahead[2]) > 0.9 else [0.0, 0.0, 1.0])
+        right = np.cross(up, ahead) / np.linalg.norm(np.cross(up, ahead))
+        wide, tall, deep = (float(np.abs(axis) @ size) for axis in (right, np.cross(ahead, right), ahead))
+        both = self.panel.models[1].value != "none"
+        apart = 1.1 * max(wide, 0.7 * tall) * right
+        self.sides[1].frame.position = apart
+        middle = middle + both * apart / 2
+        away = 0.55 * max(tall, wide + both * np.linalg.norm(apart)) / math.tan(FIELD_OF_VIEW / 2) + deep / 2
+        with self.server.atomic():
+            setattr(camera, "up_direction" if hasattr(camera, "up_direction") else "up", up)
+            camera.fov, camera.position = FIELD_OF_VIEW, middle + away * ahead
+            camera.look_at = middle  # a camera that is moved takes along what it looks at
+
+    def _run(self) -> None:
+        while True:
+            self._wake.wait()
+            self._wake.clear()
+            if self._closed:
+                return
+            start = time.perf_counter()
+            try:
+                more = self._turn()
+            except SolveError as error:
+                more = self._rest(f"Back to rest: {error}")
+            except RBFMuscleError as error:
+                more, self._message = False, str(error)
+                self._write()
+            self.server.flush()
+            if more:
+                time.sleep(max(0.0, PACE - (time.perf_counter() - start)) if self.panel.play.value else 0.0)
+                self._wake.set()
+
+    def _turn(self) -> bool:
+        """Show the next picture if there is a new one; returns whether more follow."""
+        panel = self.panel
+        changed = [side.choose(model.value) for side, model in zip(self.sides, panel.models)]
+        if changed[1]:
+            for client in self.server.get_clients().values():
+                self._aim(FIRST, client.camera)
+        sides = [side for side in self.sides if side.figure is not None]
+        if self._resting:
+            self._rest("")
+        self._follow_motion(not any(side.figure.pending for side in sides))
+        for side in sides:
+            for name, control in panel.controls.items():
+                side.figure.set(name, control.value)
+        start = time.perf_counter()
+        coarse = self._cost > COSTLY and start - self._moved < MOVED
+        waiting = [side for side in sides if side.figure.pending]
+        for side in waiting:
+            side.picture = side.figure.advance(coarse=coarse)
+        if waiting and not coarse:
+            self._cost = time.perf_counter() - start
+        if waiting or panel.look() != self._shown:
+            self._shown = panel.look()
+            self._draw(sides)
+        return panel.play.value or any(side.figure.pending for side in sides)
+
+    def _follow_motion(self, arrived: bool) -> None:
+        """Set the controls to the frame of the motion where the play bar is."""
+        frame = self.panel.frame
+        if self.panel.play.value and arrived:
+            frame.value = (frame.value + 1) % len(self.source.motion)
+        if frame.value != self._place:
+            self._place = frame.value
+            self.panel.move_to(self.source.motion[frame.value])
+
+    def _rest(self, message: str) -> bool:
+        """Set controls and models to rest; returns that no picture has to follow by itself."""
+        self._resting, self._message, self.panel.play.value = False, message, False
+        self.panel.move_to({name: control.value for name, control in self.source.controls.items()})
+        for side in self.sides:
+            if side.figure is not None:
+                side.figure.rest()
+        return False
+
+    def _draw(self, sides: list[Side]) -> None:
+        panel, cut = self.panel, None
+        if panel.cut.value != "none":
+            axis = "xyz".index(panel.cut.value)
+            points = np.concatenate([vertices[:, axis] for vertices, _ in self.source.muscles.values()])
+            cut = axis, float(points.min() + panel.place.value * np.ptp(points))
+        hidden = {name for name, eye in panel.eyes.items() if not eye.value}
+        with self.server.atomic():
+            for side, other in zip(sides, sides[::-1] if len(sides) > 1 else [None]):
+                beside = None if other is None else other.picture
+                side.draw(panel.colour.value, self._probes, beside, hidden, cut)
+            self._write()
+            panel.plot_on(sides)
+
+    def _write(self) -> None:
+        sides = [side for side in self.sides if side.picture is not None]
+        texts = [
+            self._message,
+            *(side.picture.text for side in sides),
+            f"{1e3 * self._cost:.0f} ms per picture",
+        ]
+        self.panel.write(sides, texts)

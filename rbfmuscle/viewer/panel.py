@@ -1,0 +1,148 @@
+"""The controls of the page, of viser's own elements; values are read from these when they are needed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from rbfmuscle.viewer.colours import COLOURINGS, legend
+from rbfmuscle.viewer.side import Side
+from rbfmuscle.viewer.sources import LiveSource, SavedSource
+
+VIEWS = ("Front", "Back", "Left", "Right", "Top", "Bottom")
+WIDTH = 350  # [pixel]
+HISTORY, LINES = 200, 8  # Pictures and lines in a plot.
+
+
+class Panel:
+    """Sliders by joint, play bar, choices, numbers and plot.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+    source : LiveSource or SavedSource
+    at : dict of str to float
+        Controls that begin elsewhere than at rest.
+    colour : str
+        Of `COLOURINGS`, to begin with.
+    touch : callable
+        Called whenever something was changed.
+    """
+
+    def __init__(
+        self, server: Any, source: LiveSource | SavedSource, at: dict[str, float], colour: str,
+        touch: Callable[[], None],
+    ) -> None:  # fmt: skip
+        self.gui, self.source, self._touch = server.gui, source, touch
+        self.gui.configure_theme(show_logo=False, show_share_button=False)
+        self.gui.main_panel.dock_right()
+        self.gui.main_panel.set_width(WIDTH)
+        self._numbers, tabs = self.gui.add_html(""), self.gui.add_tab_group()
+        with tabs.add_tab("Move"):
+            self._add_controls(at)
+        with tabs.add_tab("Show"):
+            self._add_choices(colour)
+        with tabs.add_tab("Plot") as self._tab:
+            quantities = (
+                "none",
+                "volume error [%]",
+                f"depth in bones [{source.units}]",
+                "mean of the colour",
+            )
+            self.quantity = self._watch(self.gui.add_dropdown("Quantity", quantities))
+            self._plot: Any = None
+            self._lines, self._history = [], []
+
+    def _watch(self, element: Any) -> Any:
+        element.on_update(lambda _: self._touch())
+        return element
+
+    def _add_controls(self, at: dict[str, float]) -> None:
+        last, folders = len(self.source.motion) - 1, {}
+        self.frame = self._watch(self.gui.add_slider("Frame", 0, max(last, 1), 1, 0, visible=last > 0))
+        self.play = self._watch(self.gui.add_checkbox("Play", False))
+        self.rest, self.controls = self.gui.add_button("Rest"), {}
+        for name, (group, label, *limits, value) in self.source.controls.items():
+            if group not in folders:
+                folders[group] = self.gui.add_folder(group)
+            with folders[group]:
+                low, high = map(float, limits)
+                step = 10.0 ** math.floor(math.log10(max(high - low, 1e-9) / 50.0))
+                value = min(max(float(at.get(name, value)), low), high)
+                marks = tuple((end, f"{end:.4g}") for end in (low, high))
+                slider = self.gui.add_slider(label, low, high, step, value, marks=marks)
+                self.controls[name] = self._watch(slider)
+
+    def _add_choices(self, colour: str) -> None:
+        gui, choices = self.gui, self.source.choices
+        self.models = [
+            self._watch(gui.add_dropdown("Model", choices)),
+            self._watch(gui.add_dropdown("Beside it", ("none", *choices))),
+        ]
+        self.colour = self._watch(gui.add_dropdown("Colour", tuple(COLOURINGS), initial_value=colour))
+        self.view = gui.add_button_group("View", VIEWS)
+        self.cut = self._watch(gui.add_dropdown("Cut along", ("none", "x", "y", "z")))
+        self.place = self._watch(gui.add_slider("Cut at", 0.0, 1.0, 0.01, 0.5))
+        self.eyes = {}
+        for title, names in (("Muscles", self.source.muscles), ("Bones", self.source.bones)):
+            with gui.add_folder(title, expand_by_default=False):
+                self.eyes |= {name: self._watch(gui.add_checkbox(name, True)) for name in names}
+
+    def look(self) -> list[Any]:
+        """All that decides how a picture is shown."""
+        elements = (*self.eyes.values(), *self.models, self.colour, self.cut, self.place, self.quantity)
+        return [element.value for element in elements]
+
+    def move_to(self, values: dict[str, float]) -> None:
+        """Set controls."""
+        for name, value in values.items():
+            self.controls[name].value = value
+
+    def write(self, sides: list[Side], texts: list[str]) -> None:
+        """Write the scale of the colours, the numbers of all muscles and texts."""
+        colouring, units = COLOURINGS[self.colour.value], self.source.units
+        bar = "" if colouring is None else legend(colouring, units, self.source.millimetre)
+        head = (" / ".join(side.choice for side in sides), "volume [%]", f"in bones [{units}]")
+        rows = [f"<tr><th style='text-align:left'>{'</th><th>'.join(head)}</th></tr>"]
+        for name, colour in sides[0].colours.items() if sides else ():
+            cells = [f"<span style='color:{colour}'>■</span> {name}"]
+            for key, digits in (("volume", 3), ("depth", 2)):
+                # 0.0 is added so that no -0 is shown.
+                numbers = (f"{round(side.numbers[name][key], digits) + 0.0:.{digits}f}" for side in sides)
+                cells.append(" / ".join(numbers).replace("nan", "–"))
+            rows.append(f"<tr><td style='text-align:left'>{'</td><td>'.join(cells)}</td></tr>")
+        self._numbers.content = (
+            f"<div style='padding:4px 12px;font-size:12px'>{bar}<div style='max-height:170px;overflow:auto'>"
+            "<table style='width:100%;text-align:right;white-space:nowrap;line-height:1.25'>"
+            f"{''.join(rows)}</table></div>{'<br>'.join(text for text in texts if text)}</div>"
+        )
+
+    def plot_on(self, sides: list[Side]) -> None:
+        """Go on with the plot of the quantity; begin anew where other lines are asked for."""
+        from viser import uplot
+
+        key = self.quantity.value.partition(" ")[0]
+        shown = [(s, name) for s in sides for name in s.colours if self.eyes[name].value][:LINES]
+        row = [side.numbers[name][key] for side, name in shown if key != "none"]
+        if not row or not np.isfinite(row).all():
+            return
+        lines = [key, self.colour.value, *((side.choice, name) for side, name in shown)]
+        if lines != self._lines:
+            self._lines, self._history = lines, []
+        self._history = [*self._history[1 - HISTORY :], row]
+        data = (np.arange(float(len(self._history))), *np.array(self._history).T)
+        if len(self._history) > 1:
+            self._plot.data = data
+            return
+        if self._plot is not None:
+            self._plot.remove()
+        series = [uplot.Series(label="picture")]
+        for side, name in shown:
+            dash = [] if side is sides[0] else [6, 4]
+            label = f"{name} {side.choice}" if len(sides) > 1 else name
+            series.append(uplot.Series(label=label, stroke=side.colours[name], width=2, dash=dash))
+        with self._tab:
+            self._plot = self.gui.add_uplot(data, tuple(series), height=260, scales={"x": {"time": False}})

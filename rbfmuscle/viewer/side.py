@@ -1,0 +1,138 @@
+"""One of the models that stand beside each other: its bones and muscles in the browser's scene."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from rbfmuscle.geometry.surfaces import mesh_volume
+from rbfmuscle.metrics.penetration import BoneProbe
+from rbfmuscle.output.animation.moving import linear_rgb
+from rbfmuscle.report.appearance import BONE_COLOUR, muscle_colours
+from rbfmuscle.viewer.colours import COLOURINGS, shades, vertex_values
+from rbfmuscle.viewer.sources import LiveSource, Mesh, Picture, SavedSource
+
+BONE_TRIANGLES = 6000  # Software drawing pays for each of them in every picture.
+
+
+class Side:
+    """A model, or a run, under a node of a viser server; in metres, as the browser shows nothing far away.
+
+    Attributes
+    ----------
+    choice : str
+        Which of the source's models or runs; "none" for none.
+    figure : LiveFigure, SavedFigure or None
+        The one chosen.
+    picture : Picture or None
+        What is shown of it.
+    numbers : dict of str to dict of str to float
+        Volume error [%], depth in bones and mean of the coloured quantity of each muscle, NaN where not known.
+    """
+
+    def __init__(self, server: Any, root: str, source: LiveSource | SavedSource) -> None:
+        self.server, self.root, self.source, self.choice = server, root, source, "none"
+        self.figure: Any = None
+        self.picture: Any = None
+        self.numbers: dict[str, dict[str, float]] = {}
+        self.colours = muscle_colours(list(source.muscles))
+        self.frame = server.scene.add_frame(root, show_axes=False, visible=False)
+        self._bones = {name: _decimated(mesh) for name, mesh in source.bones.items()}
+        self._volumes = {name: mesh_volume(*mesh) for name, mesh in source.muscles.items()}
+        self._nodes: dict[str, Any] = {}
+        self._painted: list[Any] = []
+
+    def choose(self, choice: str) -> bool:
+        """Show another model or run, or none; returns whether it is another."""
+        if choice == self.choice:
+            return False
+        figure = None if choice == "none" else self.source.figure(choice)
+        self.close()
+        self.choice, self.figure, self.picture = choice, figure, None
+        self.frame.visible = figure is not None
+        return True
+
+    def draw(
+        self, colour: str, probes: list[BoneProbe], other: Picture | None, hidden: set[str],
+        cut: tuple[int, float] | None,
+    ) -> None:  # fmt: skip
+        """Show the picture.
+
+        Parameters
+        ----------
+        colour : str
+            Of `COLOURINGS`.
+        probes : list of BoneProbe
+        other : Picture or None
+            Of the model beside this one.
+        hidden : set of str
+            Muscles and bones that are not shown.
+        cut : (int, float) or None
+            Axis and place [scene unit] beyond which nothing is shown.
+        """
+        for name, (vertices, faces) in self._bones.items():
+            pose = self.picture.poses[name]
+            mesh = self._part((vertices @ pose[:3, :3].T + pose[:3, 3], faces), cut)
+            self._show(name, mesh, BONE_COLOUR, visible=name not in hidden)
+        painted, colouring = [], COLOURINGS[colour]
+        for name, mesh in self.picture.surfaces.items():
+            values = vertex_values(colour, name, self.picture, probes, other)
+            error = 100.0 * (mesh_volume(*mesh) / self._volumes[name] - 1.0)
+            depth = self.picture.depth.get(name, math.nan)
+            self.numbers[name] = {"volume": error, "depth": depth, "mean": float(values.mean())}
+            part, shown = self._part(mesh, cut), name not in hidden
+            self._show(name, part, self.colours[name], visible=shown and colouring is None)
+            if shown and colouring is not None:
+                painted.append((*part, linear_rgb(shades(colouring, values, self.source.millimetre))))
+        self._paint(painted)
+
+    def _part(self, mesh: Mesh, cut: tuple[int, float] | None) -> Mesh:
+        """The part of a mesh that is shown, in metres."""
+        vertices, faces = mesh
+        if cut is not None:
+            faces = faces[(vertices[:, cut[0]] <= cut[1])[faces].all(axis=1)]
+        return vertices * (0.001 / self.source.millimetre), faces
+
+    def _show(self, name: str, mesh: Mesh, colour: str, *, visible: bool) -> None:
+        """Show a mesh in one colour."""
+        if name not in self._nodes:
+            look: dict[str, Any] = {"color": tuple(bytes.fromhex(colour[1:])), "side": "double"}
+            self._nodes[name] = self.server.scene.add_mesh_simple(f"{self.root}/{name}", *mesh, **look)
+        node = self._nodes[name]
+        node.visible = visible
+        if visible:
+            node.vertices, node.faces = mesh
+
+    def _paint(self, painted: list[Any]) -> None:
+        """Show meshes (vertices, faces, colours) as glTF, the only form in which viser takes vertices' colours.
+
+        The browser needs a moment to read it, so what was shown before stays until the next picture.
+        """
+        import trimesh
+
+        while len(self._painted) > bool(painted):
+            self._painted.pop(0).remove()
+        if painted:
+            counts = [len(vertices) for vertices, _, _ in painted]
+            vertices, faces, colours = (np.concatenate(parts) for parts in zip(*painted))
+            starts = np.repeat(np.cumsum([0, *counts[:-1]]), [len(part) for _, part, _ in painted])
+            mesh = trimesh.Trimesh(vertices, faces + starts[:, None], vertex_colors=colours, process=False)
+            free = "a" if self._painted and self._painted[0].name.endswith("b") else "b"
+            glb = mesh.export(file_type="glb")
+            self._painted.append(self.server.scene.add_glb(f"{self.root}/painted_{free}", glb))
+
+    def close(self) -> None:
+        """End the figure's threads."""
+        if self.figure is not None:
+            self.figure.close()
+
+
+def _decimated(mesh: Mesh) -> Mesh:
+    import pyvista
+
+    data = pyvista.make_tri_mesh(*mesh)
+    if data.n_cells > BONE_TRIANGLES:
+        data = data.decimate(1.0 - BONE_TRIANGLES / data.n_cells)
+    return np.asarray(data.points), np.asarray(data.regular_faces)

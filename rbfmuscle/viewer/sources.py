@@ -1,0 +1,193 @@
+"""What a viewer shows: a scene moved by hand, or saved runs scrubbed by frame; no browser here."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.models import MODEL_NAMES, build_models, configure_scene
+from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.report.labels import caption
+from rbfmuscle.scene.motion import inner_value, shown_value, unit_sign
+from rbfmuscle.scene.objects import MM_PER_UNIT
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.live import LiveSession, live_fields
+from rbfmuscle.validation import UsageError
+
+Mesh = tuple[Floats, Integers]
+ACTIVATION = "activation "  # what the name of a muscle's control begins with
+
+
+class Control(NamedTuple):
+    """A number set by hand [degree, scene unit, activation or frame]: its group, label, limits and first value."""
+
+    group: str
+    label: str
+    low: float
+    high: float
+    value: float
+
+
+class Picture(NamedTuple):
+    """One picture's content, by bone or muscle.
+
+    ``material`` is a mesh of constant topology where one is known: vertices, vertices at rest, faces. ``depth`` in
+    the bones [scene unit] and ``activation`` are there for the muscles that have them.
+    """
+
+    poses: dict[str, Floats]
+    surfaces: dict[str, Mesh]
+    material: dict[str, tuple[Floats, Floats, Integers]]
+    activation: dict[str, float]
+    depth: dict[str, float]
+    text: str
+
+
+class LiveSource:
+    """A scene whose coordinates and activations are set by hand, by its own model or the one named.
+
+    Attributes
+    ----------
+    choices : list of str
+        Models.
+    bones, muscles : dict of str to (vertices, faces)
+        At rest.
+    controls : dict of str to Control
+    motion : list of dict of str to float
+        What the controls are set to in each frame of the scene's motion.
+    """
+
+    def __init__(self, scene: Scene, model: str | None = None) -> None:
+        self.scene = scene = configure_scene(scene, model=model).validate()
+        self.title, self.units, self.millimetre = scene.name, scene.units, scene.length(1.0)
+        first = scene.muscles[0].model
+        self.choices = [first, *(name for name in MODEL_NAMES if name != first)]
+        self.bones, self.muscles = (
+            {item.name: (np.asarray(item.mesh.vertices), np.asarray(item.mesh.faces)) for item in items}
+            for items in (scene.bones, scene.muscles)
+        )
+        self.fields = live_fields(scene)
+        session = LiveSession(scene, fields=self.fields)
+        self.controls = {
+            name: _coordinate(scene, name, (*limits, session.rest[name]))
+            for name, limits in session.limits.items()
+        } | {ACTIVATION + name: Control("Activation", name, 0.0, 1.0, 0.0) for name in session.activation}
+        self.motion = [
+            {name: shown_value(scene, name, x) for name, x in frame.items() if name in session.limits}
+            for frame in scene.motion.frames
+        ]
+
+    def figure(self, choice: str) -> LiveFigure:
+        """A model of every muscle, at rest."""
+        scene = self.scene if choice == self.choices[0] else self.scene.with_options(model=choice)
+        return LiveFigure(LiveSession(scene, fields=self.fields), build_models(scene))
+
+
+def _coordinate(scene: Scene, name: str, numbers: tuple[float, ...]) -> Control:
+    group, _, label = name.rpartition(".")
+    unit = unit_sign(scene, name).strip()
+    numbers = tuple(round(shown_value(scene, name, number), 9) for number in numbers)
+    return Control(group, f"{label} [{unit}]" if unit else label, *numbers)
+
+
+class LiveFigure:
+    """New models of a session's muscles that follow coordinates set by hand."""
+
+    def __init__(self, session: LiveSession, models: list[Any]) -> None:
+        self.session, self._unfinished = session, True
+        self.stride = math.radians(session.scene.contact.substep_angle)
+        session.use(models)
+        self._rest = {model.name: model.material_mesh() for model in models}
+
+    def set(self, name: str, value: float) -> None:
+        """Give a control a new target."""
+        if name in self.session.limits:
+            self.session.set(name, inner_value(self.session.scene, name, value))
+        else:
+            self.session.activate(name.removeprefix(ACTIVATION), value)
+
+    def rest(self) -> None:
+        """Put models and bones back to rest; the target stays."""
+        self.session.reset()
+        self._unfinished = True
+
+    @property
+    def pending(self) -> bool:
+        """Whether there is something new to show."""
+        return self._unfinished or not self.session.arrived
+
+    def advance(self, *, coarse: bool = False) -> Picture:
+        """Go one sub-step further; coarse shows the material where it is and leaves fit and cut for later."""
+        frame = self.session.advance(self.stride, surfaces=not coarse)
+        self._unfinished = coarse
+        drawn = frame.surfaces.items()
+        surfaces = {n: (s.vertices, s.faces) for n, s in drawn} or frame.carried
+        material = {n: (frame.carried[n][0], *mesh) for n, mesh in self._rest.items()}
+        key = "solver_penetration_max"
+        depth = {n: s.quantities[key] for n, s in drawn if key in s.quantities}
+        return Picture(frame.poses, surfaces, material, frame.activations, depth, "")
+
+    def close(self) -> None:
+        """End the session's threads."""
+        self.session.close()
+
+
+class SavedSource:
+    """Saved runs of one scene by name, scrubbed by frame; attributes as of `LiveSource`.
+
+    Raises
+    ------
+    UsageError
+        If one holds no surfaces.
+    """
+
+    def __init__(self, runs: dict[str, SavedRun]) -> None:
+        for saved in runs.values():
+            if not saved.has_surfaces():
+                raise UsageError(f"{saved.directory} has no surfaces to show; run it with output.surfaces")
+        self.runs, self.choices, first = runs, list(runs), next(iter(runs.values()))
+        self.title, self.units = str(first.directory), first.units
+        self.millimetre = 1.0 / MM_PER_UNIT[first.units]
+        self.bones = {name: first.bone(name) for name in first.bones}
+        self.muscles = {name: first.surface(name, first.frames[0]) for name in first.muscles}
+        self.motion = [{"frame": float(frame)} for frame in first.frames]
+        self.controls = {"frame": Control("Run", "frame", first.frames[0], first.frames[-1], first.frames[0])}
+
+    def figure(self, choice: str) -> SavedFigure:
+        """A run at its first frame."""
+        return SavedFigure(self.runs[choice])
+
+
+class SavedFigure:
+    """A saved run at one of its frames."""
+
+    def __init__(self, saved: SavedRun) -> None:
+        self.saved, self.frame, self.pending = saved, saved.frames[0], True
+        self._rest = {name: saved.surface(name, self.frame) for name in saved.muscles}
+
+    def set(self, name: str, value: float) -> None:
+        """Go to the frame nearest to a number."""
+        frame = min(self.saved.frames, key=lambda known: abs(known - value))
+        self.pending, self.frame = self.pending or frame != self.frame, frame
+
+    def rest(self) -> None:
+        """Nothing: a frame does not depend on those before."""
+
+    def advance(self, *, coarse: bool = False) -> Picture:
+        """Read the frame."""
+        saved, frame, self.pending = self.saved, self.frame, False
+        surfaces = {name: saved.surface(name, frame) for name in saved.muscles}
+        rest = {n: mesh for n, mesh in self._rest.items() if np.array_equal(mesh[1], surfaces[n][1])}
+        material = {n: (surfaces[n][0], *mesh) for n, mesh in rest.items()}
+        activation, depth = (self._known(quantity) for quantity in ("activation", "penetration_max"))
+        return Picture(saved.poses[frame], surfaces, material, activation, depth, caption(saved, frame))
+
+    def _known(self, quantity: str) -> dict[str, float]:
+        series = {name: self.saved.series(name, quantity) for name in self.saved.muscles}
+        return {n: float(x[k == self.frame][0]) for n, (k, x) in series.items() if (k == self.frame).any()}
+
+    def close(self) -> None:
+        """Nothing is held open."""

@@ -1,0 +1,258 @@
+"""The page in a real browser, and the gate before its server."""
+
+import http.client
+import shutil
+import socket
+import sys
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+import rbfmuscle as rm
+
+pytest.importorskip("viser")
+from browser import Browser, wait_for
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from rbfmuscle.viewer.page import Page
+from rbfmuscle.viewer.sources import LiveSource
+
+FRAME, FLEXION = 0, 1  # sliders in their order
+SLOW = 60  # A busy machine may take this long [s].
+
+
+@pytest.fixture(scope="module")
+def page():
+    scene = rm.phantom_scene(end=8.0, step=2.0, spacing=6.0)
+    made = Page(LiveSource(scene, "pbd"))
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    if shutil.which("chromium") is None:
+        pytest.skip("no chromium to open the page in")
+    made = Browser()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def tab(page, chromium):
+    made = chromium.open(page.address)
+    wait_for(lambda: "extensor" in made.text() and made.slider(FLEXION), SLOW)
+    yield made
+    page.panel.play.value = False
+    page._touch(rest=True)
+    wait_for(lambda: page.panel.controls["hip.flexion"].value == 0 and arrived(page), SLOW)
+
+
+def arrived(page):
+    figure = page.sides[0].figure
+    return figure is not None and not figure.pending and not page._resting
+
+
+def canvas(tab):
+    """The picture left of the controls, once it stands still."""
+    shown = [tab.picture()]
+
+    def still():
+        shown.append(tab.picture())
+        return np.array_equal(shown[-1], shown[-2])
+
+    wait_for(still, SLOW)
+    return shown[-1][:, :700].astype(int)
+
+
+def changed(one, two):
+    """Share of the pixels that differ visibly."""
+    return float((np.abs(one - two).max(axis=2) > 8).mean())
+
+
+def degrees(page):
+    return float(np.degrees(page.sides[0].figure.session.here["hip.flexion"]))
+
+
+def test_page_shows_bones_muscles_and_numbers(tab):
+    picture = canvas(tab)
+    assert 0.03 < (picture.min(axis=2) < 200).mean() < 0.6  # neither empty nor filled
+    text = tab.text()
+    assert "in bones [mm]" in text and "ms per picture" in text and "flexion [°]" in text
+
+
+def test_dragging_a_slider_moves_number_muscles_and_picture(page, tab):
+    before = canvas(tab)
+    tab.drag(FLEXION, 0.9)
+    value = wait_for(lambda: tab.slider(FLEXION)[0], SLOW)
+    assert 15 < value <= 30
+    wait_for(lambda: abs(degrees(page) - tab.slider(FLEXION)[0]) < 1e-6, SLOW)
+    assert changed(before, canvas(tab)) > 0.01
+
+
+def test_play_goes_through_the_motion_and_stops(page, tab):
+    tab.tick("Play")
+    wait_for(lambda: tab.slider(FRAME)[0] >= 2 and degrees(page) > 1.0, SLOW)
+    tab.tick("Play")
+    wait_for(lambda: not page.panel.play.value and arrived(page), SLOW)
+    frame = page.panel.frame.value
+    assert degrees(page) == pytest.approx(2.0 * frame)
+
+
+def test_two_browsers_show_the_same(page, tab, chromium):
+    other = chromium.open(page.address)
+    wait_for(lambda: other.slider(FLEXION), SLOW)
+    tab.drag(FLEXION, 0.2)
+    value = wait_for(lambda: tab.slider(FLEXION)[0], SLOW)
+    wait_for(lambda: other.slider(FLEXION)[0] == value, SLOW)
+
+
+def test_reload_keeps_the_pose(page, tab):
+    tab.drag(FLEXION, 0.8)
+    value = wait_for(lambda: tab.slider(FLEXION)[0], SLOW)
+    wait_for(lambda: abs(degrees(page) - value) < 1e-6, SLOW)
+    tab.call("Page.reload")
+    wait_for(lambda: (tab.slider(FLEXION) or [None])[0] == value and "extensor" in tab.text(), SLOW)
+
+
+def test_colouring_shows_its_scale_and_changes_the_picture(page, tab):
+    before = canvas(tab)
+    page.panel.colour.value = "penetration"
+    wait_for(lambda: "Depth in a bone [mm]" in tab.text(), SLOW)
+    wait_for(lambda: changed(before, canvas(tab)) > 0.01, SLOW)
+    page.panel.colour.value = "group"
+    wait_for(lambda: changed(before, canvas(tab)) < 0.002, SLOW)
+
+
+def test_hidden_muscles_and_cut_leave_less(page, tab):
+    before = canvas(tab)
+    for name in ("extensor", "abductor"):
+        page.panel.eyes[name].value = False
+    wait_for(lambda: changed(before, canvas(tab)) > 0.01, SLOW)
+    hidden = canvas(tab)
+    for name in ("extensor", "abductor"):
+        page.panel.eyes[name].value = True
+    page.panel.cut.value = "z"
+    wait_for(lambda: changed(hidden, canvas(tab)) > 0.01, SLOW)
+    page.panel.cut.value = "none"
+    wait_for(lambda: changed(before, canvas(tab)) < 0.002, SLOW)
+
+
+def test_second_model_follows_the_same_slider(page, tab):
+    before = canvas(tab)
+    page.panel.models[1].value = "xpbd"
+    wait_for(lambda: "pbd / xpbd" in tab.text(), SLOW)
+    assert changed(before, canvas(tab)) > 0.02
+    page.panel.colour.value = "distance"
+    page.panel.quantity.value = "mean of the colour"
+    page.panel.controls["hip.flexion"].value = 6.0
+    wait_for(lambda: all(side.figure.session.arrived for side in page.sides), SLOW)
+    here = [side.figure.session.here["hip.flexion"] for side in page.sides]
+    assert np.degrees(here) == pytest.approx([6.0, 6.0])
+    wait_for(lambda: len(page.panel._history) > 2, SLOW)
+    assert 0.0 < max(page.panel._history[-1]) < 5.0
+    for element, value in (
+        (page.panel.models[1], "none"),
+        (page.panel.colour, "group"),
+        (page.panel.quantity, "none"),
+    ):
+        element.value = value
+    wait_for(lambda: page.sides[1].figure is None, SLOW)
+
+
+def test_buttons_turn_the_camera_of_their_own_browser(page, tab):
+    client = max(page.server.get_clients().values(), key=lambda client: client.client_id)
+    tab.click("Show")
+    tab.click("Top")
+    wait_for(lambda: client.camera.position[2] - client.camera.look_at[2] > 0.5, SLOW)
+    ahead = client.camera.position - client.camera.look_at
+    assert np.abs(ahead[:2]).max() < 0.02 * ahead[2]
+
+
+def test_solve_error_sets_controls_to_rest_and_says_so(page, tab):
+    model = page.sides[0].figure.session.models[0]
+    healthy = model.solve
+
+    def broken(contacts):
+        raise np.linalg.LinAlgError("planted")
+
+    model.solve = broken
+    page.panel.controls["hip.flexion"].value = 6.0
+    wait_for(lambda: page.panel.controls["hip.flexion"].value == 0.0, SLOW)
+    model.solve = healthy
+    page._touch()
+    wait_for(lambda: "planted" in tab.text(), SLOW)
+
+
+def status(page, path, host=None):
+    place = urlsplit(page.address).netloc
+    client = http.client.HTTPConnection(place, timeout=20)
+    client.request("GET", path, headers={"Host": host or place})
+    return client.getresponse().status
+
+
+def test_page_is_given_for_the_token_alone(page):
+    right = urlsplit(page.address).path
+    assert status(page, right) == 200
+    for wrong in ("/", "/index.html", right[:-2] + "/", right.replace("/", "/x", 1), "/?" + right):
+        assert status(page, wrong) == 403
+
+
+def test_foreign_host_name_is_refused(page):
+    port = urlsplit(page.address).port
+    right = urlsplit(page.address).path
+    assert status(page, right, f"localhost:{port}") == 200
+    assert status(page, right, f"rebound.example:{port}") == 403
+
+
+@pytest.mark.parametrize(
+    ("origin", "path", "opens"),
+    [
+        ("own", "right", True), ("own", "wrong", False), ("http://evil.example", "right", False),
+        ("null", "right", False), (None, "right", False),
+    ],
+)  # fmt: skip
+def test_websocket_opens_for_the_own_page_alone(page, origin, path, opens):
+    import viser
+
+    parts = urlsplit(page.address)
+    origin = f"http://{parts.netloc}" if origin == "own" else origin
+    target = f"ws://{parts.netloc}{parts.path.rstrip('/')}{'' if path == 'right' else 'x'}"
+
+    def try_it():
+        with connect(target, origin=origin, subprotocols=[f"viser-v{viser.__version__}"]) as socket:
+            assert socket.recv(timeout=20)
+
+    if opens:
+        try_it()
+    else:
+        with pytest.raises(InvalidStatus) as refused:
+            try_it()
+        assert refused.value.response.status_code == 403
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems have one loopback address")
+def test_server_listens_on_one_address(page):
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.2", urlsplit(page.address).port), timeout=5)
+
+
+def test_two_servers_have_two_tokens():
+    from rbfmuscle.viewer.server import open_server
+
+    servers, addresses = zip(open_server(), open_server())
+    assert len({urlsplit(address).path for address in addresses}) == 2
+    for server in servers:
+        server.stop()
+
+
+def test_notebook_shows_a_scene_and_a_run():
+    shown = rm.simulate(rm.phantom_scene(end=0.0, spacing=6.0), model="pbd").show()
+    try:
+        assert f'<iframe src="{shown.address}"' in shown._repr_html_()
+        wait_for(lambda: shown.sides[0].picture, SLOW)
+        assert set(shown.sides[0].numbers) == {muscle.name for muscle in rm.phantom_scene().muscles}
+    finally:
+        shown.close()

@@ -1,0 +1,209 @@
+"""What a viewer shows of scenes and saved runs, without a browser."""
+
+import numpy as np
+import pytest
+import toy_scene
+
+import rbfmuscle as rm
+from rbfmuscle.metrics.penetration import BoneProbe
+from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.run import stream_run
+from rbfmuscle.simulation.live import LiveSession, coordinate_limits
+from rbfmuscle.validation import SolveError, UsageError
+from rbfmuscle.viewer.colours import COLOURINGS, legend, shades, vertex_values
+from rbfmuscle.viewer.sources import LiveFigure, LiveSource, Picture, SavedSource
+
+
+@pytest.fixture
+def figure():
+    scene, fields = toy_scene.hinged_scene([0, 20, 40])
+    made = LiveFigure(
+        LiveSession(scene, fields=fields), [toy_scene.ToyMuscle(m, scene) for m in scene.muscles]
+    )
+    yield made
+    made.close()
+
+
+def go(figure, *, coarse=False):
+    count, picture = 0, None
+    while figure.pending:
+        picture, count = figure.advance(coarse=coarse and not figure.session.arrived), count + 1
+    return picture, count
+
+
+def strap(picture):
+    return picture.surfaces["strap"][0]
+
+
+def test_limits_hold_the_motion_and_30_degrees():
+    scene, _ = toy_scene.hinged_scene([0, 20, 70])
+    assert np.degrees(coordinate_limits(scene)["hinge.bend"]) == pytest.approx((-30, 70))
+
+
+def test_control_moves_the_muscle_by_sub_steps(figure):
+    start, _ = go(figure)
+    figure.set("hinge.bend", 21.0)
+    assert figure.pending
+    picture, count = go(figure)
+    assert count == 11  # two degrees a picture
+    assert not np.allclose(strap(picture), strap(start))
+    assert np.degrees(figure.session.here["hinge.bend"]) == pytest.approx(21.0)
+
+
+def test_newest_value_wins(figure):
+    go(figure)
+    figure.set("hinge.bend", 40.0)
+    figure.advance()
+    figure.set("hinge.bend", -4.0)
+    _, count = go(figure)
+    assert count == 3  # from 2 degrees to -4
+    assert np.degrees(figure.session.here["hinge.bend"]) == pytest.approx(-4.0)
+
+
+def test_live_equals_a_run(figure):
+    from rbfmuscle.simulation.frame_loop import simulate_frames
+
+    scene, fields = toy_scene.hinged_scene([0, 2, 4, 6])
+    models = [toy_scene.ToyMuscle(m, scene) for m in scene.muscles]
+    run = list(simulate_frames(scene, models, fields=fields))
+    go(figure)
+    figure.set("hinge.bend", 6.0)
+    picture, _ = go(figure)
+    np.testing.assert_allclose(strap(picture), run[-1].surfaces["strap"].vertices, atol=1e-9)
+
+
+def test_coarse_pictures_show_the_material_and_end_with_a_full_one(figure):
+    go(figure)
+    figure.set("hinge.bend", 10.0)
+    coarse = figure.advance(coarse=True)
+    np.testing.assert_array_equal(strap(coarse), coarse.material["strap"][0])
+    assert coarse.depth == {}  # of the surface, which was not made
+    full, _ = go(figure, coarse=True)
+    assert set(full.depth) == {"strap"}
+    assert np.degrees(figure.session.here["hinge.bend"]) == pytest.approx(10.0)
+
+
+def test_coarse_picture_alone_is_not_the_last(figure):
+    go(figure)
+    figure.set("hinge.bend", 1.0)
+    figure.advance(coarse=True)
+    assert figure.session.arrived and figure.pending
+    figure.advance()
+    assert not figure.pending
+
+
+def test_rest_leads_back_to_the_same_shape(figure):
+    start, _ = go(figure)
+    figure.set("hinge.bend", 10.0)
+    go(figure)
+    figure.set("hinge.bend", 0.0)
+    figure.rest()
+    again, count = go(figure)
+    assert count == 1
+    np.testing.assert_array_equal(strap(again), strap(start))
+
+
+def test_muscle_that_cannot_be_solved_can_go_on_from_rest(figure):
+    go(figure)
+    model = figure.session.models[0]
+    healthy = model.solve
+
+    def broken(contacts):
+        raise np.linalg.LinAlgError("planted")
+
+    figure.set("hinge.bend", 10.0)
+    model.solve = broken
+    with pytest.raises(SolveError, match="planted"):
+        figure.advance()
+    model.solve = healthy
+    figure.rest()
+    go(figure)
+    assert np.degrees(figure.session.here["hinge.bend"]) == pytest.approx(10.0)
+
+
+def picture_of(vertices, faces, *, rest=None, activation=0.5):
+    material = {} if rest is None else {"ball": (vertices, rest, faces)}
+    return Picture({"bone": np.eye(4)}, {"ball": (vertices, faces)}, material, {"ball": activation}, {}, "")
+
+
+@pytest.fixture(scope="module")
+def ball():
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=10.0)
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+def test_stretch_of_a_ball_that_grew(ball):
+    vertices, faces = ball
+    values = vertex_values("stretch", "ball", picture_of(1.2 * vertices, faces, rest=vertices), [], None)
+    np.testing.assert_allclose(values, 0.2, atol=1e-12)
+
+
+def test_depth_in_a_box(ball):
+    import trimesh
+
+    vertices, faces = ball
+    bone = trimesh.creation.box(extents=(100.0, 100.0, 100.0))
+    bone.apply_translation((0.0, 0.0, 58.0))  # its lower face cuts the ball 2 below the top
+    values = vertex_values(
+        "penetration", "ball", picture_of(vertices, faces), [BoneProbe("bone", bone)], None
+    )
+    np.testing.assert_allclose(values, np.maximum(vertices[:, 2] - 8.0, 0.0), atol=1e-9)
+
+
+def test_distance_to_the_other_model(ball):
+    vertices, faces = ball
+    moved = picture_of(vertices + [0.0, 0.0, 1.0], faces)
+    values = vertex_values("distance", "ball", picture_of(vertices, faces), [], moved)
+    # A chord of the polyhedron lies up to 0.05 inside the sphere of radius 10.
+    np.testing.assert_allclose(values.max(), 1.0, atol=0.05)
+    assert np.isnan(vertex_values("distance", "ball", picture_of(vertices, faces), [], None)).all()
+
+
+def test_colours_go_from_end_to_end_and_grey_is_unknown():
+    colouring = COLOURINGS["penetration"]
+    low, high, beyond, unknown = shades(colouring, np.array([0.0, 2.0, 9.0, np.nan]), 1.0)
+    np.testing.assert_allclose(beyond, high)
+    assert not np.allclose(low, high)
+    assert np.ptp(unknown) < 1e-9
+    # 2 mm are 0.2 cm.
+    np.testing.assert_allclose(shades(colouring, np.array([0.2]), 0.1)[0], high)
+    assert "<span>0.2</span>" in legend(colouring, "cm", 0.1)
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    scene = rm.phantom_scene(end=8.0, step=2.0, spacing=6.0)
+    stream_run(scene, folder, model="pbd", frames="0:4:2", pictures=False)
+    return folder
+
+
+def test_saved_run_is_scrubbed(run_folder):
+    source = SavedSource({"run": SavedRun(run_folder)})
+    assert source.motion == [{"frame": 0.0}, {"frame": 1.0}]
+    figure = source.figure("run")
+    first = figure.advance()
+    assert not figure.pending
+    figure.set("frame", 0.9)
+    assert figure.pending
+    last = figure.advance()
+    assert not np.allclose(first.surfaces["extensor"][0], last.surfaces["extensor"][0])
+    assert "frame 1" in last.text and set(last.depth) == set(last.surfaces)
+    assert np.abs(vertex_values("stretch", "extensor", last, [], None)).max() > 0.01
+
+
+def test_run_without_surfaces_is_refused(tmp_path):
+    scene = rm.phantom_scene(end=0.0, spacing=6.0)
+    settings = {"output.surfaces": False}
+    stream_run(scene, tmp_path, model="pbd", settings=settings, pictures=False)
+    with pytest.raises(UsageError, match="no surfaces"):
+        SavedSource({"run": SavedRun(tmp_path)})
+
+
+def test_controls_of_the_phantom_have_joint_unit_and_limits():
+    source = LiveSource(rm.phantom_scene(end=60.0, spacing=6.0), "pbd")
+    assert source.controls["hip.flexion"] == ("hip", "flexion [°]", -30.0, 60.0, 0.0)
+    assert source.choices[0] == "pbd" and len(set(source.choices)) == len(source.choices)
+    assert source.motion[-1]["hip.flexion"] == pytest.approx(60.0)
