@@ -3,6 +3,8 @@
 Both are one run, a generator of frames, and differ in the sink that takes them.
 """
 
+import atexit
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -236,9 +238,10 @@ class Run:
         """Show the frames in a browser or a notebook; see `rbfmuscle.show`."""
         import rbfmuscle
 
-        self._shown = tempfile.TemporaryDirectory()
-        self._write(self._shown.name)
-        return rbfmuscle.show(SavedRun(self._shown.name))
+        folder = tempfile.mkdtemp(prefix="rbfmuscle")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        self._write(folder)
+        return rbfmuscle.show(SavedRun(folder))
 
     def _write(self, directory: Any) -> RunWriter:
         writer = RunWriter(directory, self.scene)

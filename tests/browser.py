@@ -11,12 +11,19 @@ import urllib.request
 
 import numpy as np
 
-SIZE = (1100, 700)
+SIZE = (750, 500)
 # Drawing in software, so that it works where there is no graphics card; root may not use the sandbox.
 OPTIONS = (
     "--headless=new", "--no-sandbox", "--remote-debugging-port=0", "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader", "--disable-dev-shm-usage", "--no-first-run", "about:blank",
 )  # fmt: skip
+
+
+# The page warns where drawing is in software, over the picture.
+NO_NOTES = (
+    "addEventListener('DOMContentLoaded', () => document.head.insertAdjacentHTML('beforeend',"
+    "'<style>.mantine-Notifications-root{display:none}</style>'))"
+)
 
 
 class Browser:
@@ -65,6 +72,7 @@ class Tab:
             mobile=False,
         )
         self.call("Page.enable")
+        self.call("Page.addScriptToEvaluateOnNewDocument", source=NO_NOTES)
         self.call("Page.navigate", url=address)
 
     def call(self, method, **parameters):
@@ -91,6 +99,14 @@ class Tab:
             "return [r.x + r.width / 2, r.y + r.height / 2] })()"
         )
 
+    def to_front(self):
+        """Only the tab in front takes input and draws."""
+        self.call("Page.bringToFront")
+
+    def close(self):
+        self.call("Page.close")
+        self.socket.close()
+
     def mouse(self, kind, place):
         self.call("Input.dispatchMouseEvent", type=kind, x=place[0], y=place[1], button="left", clickCount=1)
 
@@ -102,7 +118,7 @@ class Tab:
 
     def tick(self, label):
         """Click on the checkbox in the row of a label."""
-        row = f"e.type == 'checkbox' && e.closest('.mantine-Flex-root').innerText.trim() == {label!r}"
+        row = f"e.type == 'checkbox' && e.closest('.mantine-Flex-root')?.innerText.trim() == {label!r}"
         place = wait_for(lambda: self.place(row), 20)
         self.mouse("mousePressed", place)
         self.mouse("mouseReleased", place)

@@ -66,10 +66,7 @@ def view(
     print(f"{page.address}  (Ctrl-C ends)", flush=True)
     if browser:
         webbrowser.open(page.address)
-    try:
-        threading.Event().wait()
-    except KeyboardInterrupt:
-        page.close()
+    threading.Event().wait()
 
 
 def _parse_stop(text: str) -> tuple[str, float]:

@@ -20,7 +20,7 @@ from rbfmuscle.viewer.page import Page
 from rbfmuscle.viewer.sources import LiveSource
 
 FRAME, FLEXION = 0, 1  # sliders in their order
-SLOW = 60  # A busy machine may take this long [s].
+SLOW = 120  # A busy machine may take this long [s].
 
 
 @pytest.fixture(scope="module")
@@ -40,11 +40,18 @@ def chromium():
     made.close()
 
 
-@pytest.fixture
-def tab(page, chromium):
+@pytest.fixture(scope="module")
+def opened(page, chromium):
     made = chromium.open(page.address)
     wait_for(lambda: "extensor" in made.text() and made.slider(FLEXION), SLOW)
     yield made
+    made.close()
+
+
+@pytest.fixture
+def tab(page, opened):
+    """The page's tab, which is at rest before and after."""
+    yield opened
     page.panel.play.value = False
     page._touch(rest=True)
     wait_for(lambda: page.panel.controls["hip.flexion"].value == 0 and arrived(page), SLOW)
@@ -53,6 +60,15 @@ def tab(page, chromium):
 def arrived(page):
     figure = page.sides[0].figure
     return figure is not None and not figure.pending and not page._resting
+
+
+def drag(tab, share):
+    """Drag the slider of flexion; the number that it comes to."""
+    tab.drag(FLEXION, share)
+    # -30 to 30 degrees; the handle is as wide as 2 degrees.
+    return wait_for(
+        lambda: abs(tab.slider(FLEXION)[0] - (60 * share - 30)) < 3 and tab.slider(FLEXION)[0], SLOW
+    )
 
 
 def canvas(tab):
@@ -64,7 +80,7 @@ def canvas(tab):
         return np.array_equal(shown[-1], shown[-2])
 
     wait_for(still, SLOW)
-    return shown[-1][:, :700].astype(int)
+    return shown[-1][:, :400].astype(int)
 
 
 def changed(one, two):
@@ -85,10 +101,9 @@ def test_page_shows_bones_muscles_and_numbers(tab):
 
 def test_dragging_a_slider_moves_number_muscles_and_picture(page, tab):
     before = canvas(tab)
-    tab.drag(FLEXION, 0.9)
-    value = wait_for(lambda: tab.slider(FLEXION)[0], SLOW)
-    assert 15 < value <= 30
-    wait_for(lambda: abs(degrees(page) - tab.slider(FLEXION)[0]) < 1e-6, SLOW)
+    value = drag(tab, 0.9)
+    assert 21 < value < 27
+    wait_for(lambda: abs(degrees(page) - value) < 1e-6, SLOW)
     assert changed(before, canvas(tab)) > 0.01
 
 
@@ -104,14 +119,15 @@ def test_play_goes_through_the_motion_and_stops(page, tab):
 def test_two_browsers_show_the_same(page, tab, chromium):
     other = chromium.open(page.address)
     wait_for(lambda: other.slider(FLEXION), SLOW)
-    tab.drag(FLEXION, 0.2)
-    value = wait_for(lambda: tab.slider(FLEXION)[0], SLOW)
-    wait_for(lambda: other.slider(FLEXION)[0] == value, SLOW)
+    value = drag(other, 0.2)
+    assert -21 < value < -15
+    other.close()
+    tab.to_front()
+    wait_for(lambda: tab.slider(FLEXION)[0] == value, SLOW)
 
 
 def test_reload_keeps_the_pose(page, tab):
-    tab.drag(FLEXION, 0.8)
-    value = wait_for(lambda: tab.slider(FLEXION)[0], SLOW)
+    value = drag(tab, 0.8)
     wait_for(lambda: abs(degrees(page) - value) < 1e-6, SLOW)
     tab.call("Page.reload")
     wait_for(lambda: (tab.slider(FLEXION) or [None])[0] == value and "extensor" in tab.text(), SLOW)
@@ -148,9 +164,12 @@ def test_second_model_follows_the_same_slider(page, tab):
     page.panel.colour.value = "distance"
     page.panel.quantity.value = "mean of the colour"
     page.panel.controls["hip.flexion"].value = 6.0
-    wait_for(lambda: all(side.figure.session.arrived for side in page.sides), SLOW)
-    here = [side.figure.session.here["hip.flexion"] for side in page.sides]
-    assert np.degrees(here) == pytest.approx([6.0, 6.0])
+
+    def both_there():
+        here = [side.figure.session.here["hip.flexion"] for side in page.sides]
+        return np.abs(np.degrees(here) - 6.0).max() < 1e-6
+
+    wait_for(both_there, SLOW)
     wait_for(lambda: len(page.panel._history) > 2, SLOW)
     assert 0.0 < max(page.panel._history[-1]) < 5.0
     for element, value in (
@@ -164,7 +183,8 @@ def test_second_model_follows_the_same_slider(page, tab):
 
 def test_buttons_turn_the_camera_of_their_own_browser(page, tab):
     client = max(page.server.get_clients().values(), key=lambda client: client.client_id)
-    tab.click("Show")
+    # A click while the page is drawn anew may be lost.
+    wait_for(lambda: tab.click("Show") or "Beside it" in tab.text(), SLOW)
     tab.click("Top")
     wait_for(lambda: client.camera.position[2] - client.camera.look_at[2] > 0.5, SLOW)
     ahead = client.camera.position - client.camera.look_at
@@ -190,7 +210,10 @@ def status(page, path, host=None):
     place = urlsplit(page.address).netloc
     client = http.client.HTTPConnection(place, timeout=20)
     client.request("GET", path, headers={"Host": host or place})
-    return client.getresponse().status
+    try:
+        return client.getresponse().status
+    finally:
+        client.close()
 
 
 def test_page_is_given_for_the_token_alone(page):

@@ -1,0 +1,95 @@
+"""The command ``view``: the address it prints, and pictures without a display."""
+
+import signal
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import call
+
+import rbfmuscle as rm
+from rbfmuscle.report.render import render_run
+from rbfmuscle.run import stream_run
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    scene = rm.phantom_scene(end=40.0, step=20.0, spacing=6.0)
+    stream_run(scene, folder, model="pbd", pictures=False)
+    return folder
+
+
+def image(path):
+    from PIL import Image
+
+    return np.asarray(Image.open(path).convert("RGB")).astype(int)
+
+
+def test_picture_is_of_the_frame_asked_for(run_folder, tmp_path, capsys, graphics):
+    code, out, err = call(capsys, "view", run_folder, "--at", "frame=2", "--screenshot", tmp_path / "a.png")
+    assert code == 0, err
+    assert Path(out.strip()) == tmp_path / "a.png"
+    for frame in (0, 2):
+        render_run(run_folder, tmp_path / f"{frame}.png", frame=frame)
+    asked, first, third = (image(tmp_path / f"{name}.png") for name in ("a", "0", "2"))
+    np.testing.assert_array_equal(asked, third)
+    assert (asked != first).any(axis=2).mean() > 0.01
+
+
+def test_picture_of_a_scene_is_of_the_pose_asked_for(tmp_path, capsys, graphics):
+    common = ("view", "phantom", "--model", "pbd", "--screenshot")
+    for name, degrees in (("rest", 0), ("bent", 10)):
+        code, _, err = call(capsys, *common, tmp_path / f"{name}.png", "--at", f"hip.flexion={degrees}")
+        assert code == 0, err
+    assert (image(tmp_path / "rest.png") != image(tmp_path / "bent.png")).any(axis=2).mean() > 0.01
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--at", "hip.flexion"], "COORDINATE=DEGREES"),
+        (["--at", "hip.flexion=3"], "unknown coordinate 'hip.flexion'"),
+        (["--at", "frame=7", "--screenshot", "x.png"], "was not written"),
+        (["--at", "hip.flexion=3", "--screenshot", "x.png"], "unknown coordinate 'hip.flexion'"),
+        (["--colour", "stretch", "--screenshot", "x.png"], "group or activation"),
+    ],
+)
+def test_wrong_use_is_one_line(run_folder, capsys, arguments, says):
+    code, _, err = call(capsys, "view", run_folder, *arguments)
+    assert code == 2 and says in err.splitlines()[-1]
+
+
+def test_missing_viser_is_one_line(run_folder, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    code, _, err = call(capsys, "view", run_folder, "--no-browser")
+    assert code == 7
+    lines = [line for line in err.splitlines() if line.startswith("rbfmuscle:")]
+    assert len(lines) == 1 and "pip install -e '.[web]'" in lines[0]
+
+
+def test_address_is_printed_and_answers_until_interrupted(run_folder):
+    pytest.importorskip("viser")
+    with subprocess.Popen(
+        [sys.executable, "-m", "rbfmuscle", "view", run_folder, "--no-browser"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        address = process.stdout.readline().split()[0]
+        with urllib.request.urlopen(address) as answer:
+            assert b"<html" in answer.read()
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "Traceback" not in err and out == ""
+
+
+def test_runs_of_a_comparison_are_offered_by_model(run_folder, tmp_path):
+    from rbfmuscle.cli.view import _open_runs
+
+    for model in ("rbf", "pbd"):
+        (tmp_path / model).symlink_to(run_folder)
+    assert list(_open_runs(tmp_path)) == ["pbd", "rbf"]
+    assert list(_open_runs(run_folder)) == [run_folder.name]
