@@ -83,6 +83,8 @@ class Page:
         self._probes = [BoneProbe(n, trimesh.Trimesh(*m, process=False)) for n, m in source.bones.items()]
         self._wake, self._closed, self._resting = threading.Event(), False, False
         self._moved, self._cost, self._message, self._shown, self._place = 0.0, 0.0, "", [], 0
+        # Software drawing takes long for shadows.
+        self.server.scene.configure_default_lights(cast_shadow=False)
         self.sides = [Side(self.server, f"/{name}", source) for name in ("first", "second")]
         self.panel = Panel(self.server, source, at or {}, colour, self._touch)
         self.panel.rest.on_click(lambda _: self._touch(rest=True))

@@ -107,7 +107,7 @@ class Panel:
         bar = "" if colouring is None else legend(colouring, units, self.source.millimetre)
         head = (" / ".join(side.choice for side in sides), "volume [%]", f"in bones [{units}]")
         rows = [f"<tr><th style='text-align:left'>{'</th><th>'.join(head)}</th></tr>"]
-        for name, colour in sides[0].colours.items() if sides else ():
+        for name, colour in self.source.colours.items() if sides else ():
             cells = [f"<span style='color:{colour}'>■</span> {name}"]
             for key, digits in (("volume", 3), ("depth", 2)):
                 # 0.0 is added so that no -0 is shown.
@@ -125,7 +125,7 @@ class Panel:
         from viser import uplot
 
         key = self.quantity.value.partition(" ")[0]
-        shown = [(s, name) for s in sides for name in s.colours if self.eyes[name].value][:LINES]
+        shown = [(s, name) for s in sides for name in self.source.colours if self.eyes[name].value][:LINES]
         row = [side.numbers[name][key] for side, name in shown if key != "none"]
         if not row or not np.isfinite(row).all():
             return
@@ -143,6 +143,6 @@ class Panel:
         for side, name in shown:
             dash = [] if side is sides[0] else [6, 4]
             label = f"{name} {side.choice}" if len(sides) > 1 else name
-            series.append(uplot.Series(label=label, stroke=side.colours[name], width=2, dash=dash))
+            series.append(uplot.Series(label=label, stroke=self.source.colours[name], width=2, dash=dash))
         with self._tab:
             self._plot = self.gui.add_uplot(data, tuple(series), height=260, scales={"x": {"time": False}})

@@ -10,7 +10,7 @@ import numpy as np
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.metrics.penetration import BoneProbe
 from rbfmuscle.output.animation.moving import linear_rgb
-from rbfmuscle.report.appearance import BONE_COLOUR, muscle_colours
+from rbfmuscle.report.appearance import BONE_COLOUR
 from rbfmuscle.viewer.colours import COLOURINGS, shades, vertex_values
 from rbfmuscle.viewer.sources import LiveSource, Mesh, Picture, SavedSource
 
@@ -37,7 +37,6 @@ class Side:
         self.figure: Any = None
         self.picture: Any = None
         self.numbers: dict[str, dict[str, float]] = {}
-        self.colours = muscle_colours(list(source.muscles))
         self.frame = server.scene.add_frame(root, show_axes=False, visible=False)
         self._bones = {name: _decimated(mesh) for name, mesh in source.bones.items()}
         self._volumes = {name: mesh_volume(*mesh) for name, mesh in source.muscles.items()}
@@ -72,10 +71,15 @@ class Side:
         cut : (int, float) or None
             Axis and place [scene unit] beyond which nothing is shown.
         """
+        from viser.transforms import SO3
+
         for name, (vertices, faces) in self._bones.items():
             pose = self.picture.poses[name]
-            mesh = self._part((vertices @ pose[:3, :3].T + pose[:3, 3], faces), cut)
-            self._show(name, mesh, BONE_COLOUR, visible=name not in hidden)
+            _, kept = self._part((vertices @ pose[:3, :3].T + pose[:3, 3], faces), cut)
+            self._show(name, self._part((vertices, kept), None), BONE_COLOUR, visible=name not in hidden)
+            node = self._nodes[name]
+            node.position = pose[:3, 3] * (0.001 / self.source.millimetre)
+            node.wxyz = SO3.from_matrix(pose[:3, :3]).wxyz
         painted, colouring = [], COLOURINGS[colour]
         for name, mesh in self.picture.surfaces.items():
             values = vertex_values(colour, name, self.picture, probes, other)
@@ -83,7 +87,7 @@ class Side:
             depth = self.picture.depth.get(name, math.nan)
             self.numbers[name] = {"volume": error, "depth": depth, "mean": float(values.mean())}
             part, shown = self._part(mesh, cut), name not in hidden
-            self._show(name, part, self.colours[name], visible=shown and colouring is None)
+            self._show(name, part, self.source.colours[name], visible=shown and colouring is None)
             if shown and colouring is not None:
                 painted.append((*part, linear_rgb(shades(colouring, values, self.source.millimetre))))
         self._paint(painted)

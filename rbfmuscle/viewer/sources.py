@@ -10,6 +10,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.models import MODEL_NAMES, build_models, configure_scene
 from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.report.appearance import muscle_colours, muscle_groups
 from rbfmuscle.report.labels import caption
 from rbfmuscle.scene.motion import inner_value, shown_value, unit_sign
 from rbfmuscle.scene.objects import MM_PER_UNIT
@@ -69,6 +70,7 @@ class LiveSource:
             {item.name: (np.asarray(item.mesh.vertices), np.asarray(item.mesh.faces)) for item in items}
             for items in (scene.bones, scene.muscles)
         )
+        self.colours = muscle_colours(list(self.muscles), muscle_groups({"scene": scene.resolved()}))
         self.fields = live_fields(scene)
         session = LiveSession(scene, fields=self.fields)
         self.controls = {
@@ -153,6 +155,7 @@ class SavedSource:
         self.millimetre = 1.0 / MM_PER_UNIT[first.units]
         self.bones = {name: first.bone(name) for name in first.bones}
         self.muscles = {name: first.surface(name, first.frames[0]) for name in first.muscles}
+        self.colours = muscle_colours(first.muscles, muscle_groups(first.info))
         self.motion = [{"frame": float(frame)} for frame in first.frames]
         self.controls = {"frame": Control("Run", "frame", first.frames[0], first.frames[-1], first.frames[0])}
 

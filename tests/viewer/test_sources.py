@@ -207,3 +207,16 @@ def test_controls_of_the_phantom_have_joint_unit_and_limits():
     assert source.controls["hip.flexion"] == ("hip", "flexion [°]", -30.0, 60.0, 0.0)
     assert source.choices[0] == "pbd" and len(set(source.choices)) == len(source.choices)
     assert source.motion[-1]["hip.flexion"] == pytest.approx(60.0)
+
+
+def test_activation_of_a_muscle_is_set_and_coloured():
+    scene = rm.phantom_scene(end=4.0, step=2.0, spacing=6.0)
+    scene.muscles = [scene.muscle("extensor")]
+    source = LiveSource(scene.with_options({"activation": 0.0}), "arap-volume")
+    assert source.controls["activation extensor"] == ("Activation", "extensor", 0.0, 1.0, 0.0)
+    figure = source.figure("arap-volume")
+    figure.set("activation extensor", 0.35)
+    picture, _ = go(figure)
+    values = vertex_values("activation", "extensor", picture, [], None)
+    np.testing.assert_allclose(values, 0.35)
+    figure.close()
