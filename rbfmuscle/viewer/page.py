@@ -116,8 +116,7 @@ class Page:
 
     def _aim(self, direction: tuple[float, ...], camera: Any) -> None:
         """Let a camera look at everything; models then stand side by side across its direction."""
-        meshes = (self.source.bones | self.source.muscles).values()
-        points = (0.001 / self.source.millimetre) * np.concatenate([vertices for vertices, _ in meshes])
+        points = (0.001 / self.source.millimetre) * np.concatenate(self.sides[0].points())
         middle, size = (points.min(axis=0) + points.max(axis=0)) / 2, np.ptp(points, axis=0)
         ahead = np.asarray(direction) / np.linalg.norm(direction)
         up = np.array([0.0, -1.0, 0.0] if abs(ahead[2]) > 0.9 else [0.0, 0.0, 1.0])

@@ -9,8 +9,7 @@ import numpy as np
 
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.metrics.penetration import BoneProbe
-from rbfmuscle.output.animation.moving import linear_rgb
-from rbfmuscle.report.appearance import BONE_COLOUR
+from rbfmuscle.output.colours import BONE_COLOUR, linear_rgb
 from rbfmuscle.viewer.colours import COLOURINGS, shades, vertex_values
 from rbfmuscle.viewer.sources import LiveSource, Mesh, Picture, SavedSource
 
@@ -126,6 +125,14 @@ class Side:
             free = "a" if self._painted and self._painted[0].name.endswith("b") else "b"
             glb = mesh.export(file_type="glb")
             self._painted.append(self.server.scene.add_glb(f"{self.root}/painted_{free}", glb))
+
+    def points(self) -> list[Any]:
+        """Vertices (n, 3) of bones and muscles, where they are shown; at rest before the first picture."""
+        if self.picture is None:
+            return [vertices for vertices, _ in (self.source.bones | self.source.muscles).values()]
+        poses = [(vertices, self.picture.poses[name]) for name, (vertices, _) in self._bones.items()]
+        bones = [vertices @ pose[:3, :3].T + pose[:3, 3] for vertices, pose in poses]
+        return bones + [vertices for vertices, _ in self.picture.surfaces.values()]
 
     def close(self) -> None:
         """End the figure's threads."""

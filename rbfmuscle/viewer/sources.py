@@ -9,9 +9,9 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.models import MODEL_NAMES, build_models, configure_scene
+from rbfmuscle.output.colours import muscle_colours
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.appearance import muscle_colours, muscle_groups
-from rbfmuscle.report.labels import caption
+from rbfmuscle.report.appearance import muscle_groups
 from rbfmuscle.scene.motion import inner_value, shown_value, unit_sign
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
@@ -186,7 +186,7 @@ class SavedFigure:
         rest = {n: mesh for n, mesh in self._rest.items() if np.array_equal(mesh[1], surfaces[n][1])}
         material = {n: (surfaces[n][0], *mesh) for n, mesh in rest.items()}
         activation, depth = (self._known(quantity) for quantity in ("activation", "penetration_max"))
-        return Picture(saved.poses[frame], surfaces, material, activation, depth, caption(saved, frame))
+        return Picture(saved.poses[frame], surfaces, material, activation, depth, saved.caption(frame))
 
     def _known(self, quantity: str) -> dict[str, float]:
         series = {name: self.saved.series(name, quantity) for name in self.saved.muscles}
