@@ -43,7 +43,7 @@ class ARAP:
     quaternions : (n, 4) ndarray
         Rotation of each vertex, (w, x, y, z); identity at rest.
     laplacian : (n, n) scipy.sparse.csc_matrix
-        Cotangent weights clamped from below: a long mesh has 22 % negative ones.
+        Cotangent weights, clamped from below.
     """
 
     def __init__(self, vertices: Floats, topology: Topology, *, stiffer: Floats | float = 1.0) -> None:
@@ -63,19 +63,11 @@ class ARAP:
         rings = t.ring_start, t.ring, t.ring_edge, t.edges
         _rotation_loop(points, rings, self.rest, self.weights, self.quaternions, steps)
 
-    def energy(self, points: Floats) -> float:
-        """E with the present rotations [unit^2, as the cotangents have none]."""
-        return _energy_loop(points, self.topology.edges, self.rest, self.weights, self.quaternions)
-
     def targets(self) -> Floats:
         """Right side (n, 3) of the global step: sum_j w_ij (R_i + R_j) E_ij / 2."""
         out = np.zeros((len(self.quaternions), 3))
         _target_loop(self.topology.edges, self.rest, self.weights, self.quaternions, out)
         return out
-
-    def gradient(self, points: Floats) -> Floats:
-        """Gradient (n, 3) of E with the rotations frozen; the full one where they are optimal."""
-        return self.laplacian @ points - self.targets()
 
 
 def _laplacian(topology, weights):
@@ -96,18 +88,16 @@ class ARAPConstraint:
     Parameters
     ----------
     arap : ARAP
-    compliance : float
-        Factor of 1 / w_ij; over the time of the step.
     """
 
-    def __init__(self, arap: ARAP, *, compliance: float = 1.0) -> None:
+    def __init__(self, arap: ARAP) -> None:
         self.arap = arap
         edges = arap.topology.edges
         order, self.colours = colour(edges, arap.topology.vertex_count)
         self.order = order
         self.edges = np.ascontiguousarray(edges[order])
         self.rest = np.ascontiguousarray(arap.rest[order])
-        self.compliance = compliance / arap.weights[order]
+        self.compliance = 1.0 / arap.weights[order]
         self.multiplier = np.zeros((len(order), 3))
 
     def reset(self) -> None:
@@ -179,18 +169,6 @@ def _turn_towards(moment, q):
         ox, oy, oz = ox / np.sqrt(square), oy / np.sqrt(square), oz / np.sqrt(square)
     turn_quaternion(q, 0.5 * ox, 0.5 * oy, 0.5 * oz)
     return square
-
-
-@compiled
-def _energy_loop(points, edges, rest, weights, quaternions):
-    total = 0.0
-    for c in range(len(edges)):
-        i, j = edges[c, 0], edges[c, 1]
-        one, two = rotate(quaternions[i], rest[c]), rotate(quaternions[j], rest[c])
-        for k in range(3):
-            e = points[i, k] - points[j, k]
-            total += weights[c] * ((e - one[k]) ** 2 + (e - two[k]) ** 2)
-    return 0.25 * total
 
 
 @compiled

@@ -179,10 +179,7 @@ def _edge_loop(points, inverse_mass, edges, rest, limits, stiffness, compliance,
 
 @compiled
 def _volume_gradient_loop(points, faces, out):
-    """A third of the area vector of each face, summed at its vertices.
-
-    On a closed mesh this equals the sum of b x c / 6, without the cancellation far from the origin.
-    """
+    """Add a third of the area vector of each face at its vertices, on a closed mesh the same as b x c / 6."""
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]

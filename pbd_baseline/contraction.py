@@ -1,15 +1,16 @@
-"""Mesh muscles that contract: rest lengths along and across the fibres follow the law of the fibres."""
+"""Rest lengths of edges along and across the fibres: slack fibres of a passive muscle, active ones, tendon."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from pbd_baseline.rest import RestState
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.jit import compiled
+from rbfmuscle.scene.activation.keys import Contraction
 from rbfmuscle.scene.activation.law import FibreLaw
 from rbfmuscle.scene.activation.resolve import resolve_contraction
+from rbfmuscle.scene.objects import Muscle
 
 # Weight of tendon edges in the ARAP energy. Beside a belly that shortens by a fifth tendon keeps its length within
 # 0.6 %; at 100 it takes up so little in an iteration that a belly between fixed bones ends 8 % too long.
@@ -20,21 +21,25 @@ class MeshFibres:
     """Fibres of a mesh muscle: a frame along the fibre at each edge, and what the edge should be in it.
 
     An edge with the rest vector E, the fibre direction a and the target stretches t along and s across (means of its
-    two vertices) is wanted as T E, T = t aaᵀ + s (1 - aaᵀ): the frames of the RBF model, on edges.
+    two vertices) is wanted as T E, T = t aaᵀ + s (1 - aaᵀ). A passive fibre may have any stretch t from 1 / slack to 1,
+    with s = t^(-1/2).
 
     Parameters
     ----------
     muscle : Muscle
-    rest : pbd_baseline.rest.Rest
-    hold : float
-        Share by which a passive fibre is pulled back: 1, as the mesh models know no other passive fibre.
+    rest : RestState
+    slack : float
+        Of the passive fibres where the muscle gives none of its own, 1 or more.
     """
 
-    def __init__(self, muscle: Any, rest: Any, *, hold: float = 1.0) -> None:
-        contraction = resolve_contraction(muscle)
+    def __init__(self, muscle: Muscle, rest: RestState, *, slack: float) -> None:
         count = len(rest.vertices)
-        tendon = np.zeros(count, dtype=bool) if contraction is None else contraction.tendon[rest.order]
-        self.law = FibreLaw(tendon, contraction, hold=hold)
+        given = resolve_contraction(muscle)
+        if given is None:
+            given = Contraction(1.0, 1.0, np.zeros(len(rest.vertices), dtype=bool), 0.0)
+        tendon = np.asarray(given.tendon)[rest.order]
+        self.slack = 1.0 if given.slack else slack
+        self.law = FibreLaw(tendon, given, hold=1.0)
         edges = rest.topology.edges
         self.edges = edges
         self.tendon = tendon[edges].all(axis=1)
@@ -48,18 +53,25 @@ class MeshFibres:
         self.along = along[:, None] * axis
         square = np.einsum("ij,ij->i", self.vectors, self.vectors)
         self.lengths = np.sqrt(square)
-        # How much an edge tells of the stretch along the fibre: the fourth power of the cosine between them.
-        self.says = (along**2 / np.maximum(square, 1e-300)) ** 2
+        # Weight of an edge in the stretch along the fibre: the fourth power of the cosine between them.
+        self.weights = (along**2 / np.maximum(square, 1e-300)) ** 2
         self.stretch = np.ones(count)
+        self.activate(0.0)
+
+    def activate(self, activation: float) -> None:
+        """Take an activation, 0 to 1."""
+        self.law.activate(activation)
+        belly = ~self.law.tendon
+        self.law.lower[belly] -= (1.0 - activation) * (1.0 - 1.0 / self.slack)
 
     @property
-    def activation(self) -> Any:
+    def activation(self) -> float:
         """Present activation, 0 to 1."""
         return self.law.activation
 
-    def targets(self, points: Floats) -> Any:
+    def targets(self, points: Floats) -> Floats:
         """Wanted vectors of the edges (e, 3) in the rest frame, for the present points (n, 3)."""
-        _stretch_loop(points, self.edges, self.lengths, self.says, self.stretch)
+        _stretch_loop(points, self.edges, self.lengths, self.weights, self.stretch)
         along, across = self.law.goal(self.stretch)
         t = 0.5 * (along[self.edges[:, 0]] + along[self.edges[:, 1]])[:, None]
         s = 0.5 * (across[self.edges[:, 0]] + across[self.edges[:, 1]])[:, None]
@@ -68,18 +80,18 @@ class MeshFibres:
 
 
 @compiled(error_model="numpy")
-def _stretch_loop(points, edges, lengths, says, stretch):
+def _stretch_loop(points, edges, lengths, weights, stretch):
     """Stretch along the fibre at each vertex: mean ratio of its edges, by how much they lie along the fibre."""
-    weight = np.full(len(stretch), 1e-9)
+    total = np.full(len(stretch), 1e-9)
     stretch[:] = 1e-9
     for c in range(len(edges)):
         i, j = edges[c, 0], edges[c, 1]
         square = 0.0
         for k in range(3):
             square += (points[i, k] - points[j, k]) ** 2
-        ratio = says[c] * np.sqrt(square) / lengths[c]
+        ratio = weights[c] * np.sqrt(square) / lengths[c]
         stretch[i] += ratio
         stretch[j] += ratio
-        weight[i] += says[c]
-        weight[j] += says[c]
-    stretch /= weight
+        total[i] += weights[c]
+        total[j] += weights[c]
+    stretch /= total

@@ -1,9 +1,8 @@
-"""Which way fibres run at an edge, how soft that makes it, and how thick the muscle is there."""
+"""Directions of the fibres, softness of edges along them, and thickness of the muscle."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
@@ -12,8 +11,11 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.harmonic import cotangent_laplacian
+from rbfmuscle.geometry.surfaces import vertex_areas
 
-# Pieces of polyline that speak for one place.
+# Distance over which the thickness is smoothed, and falls to 0 at held vertices, as a share of the diagonal.
+SMOOTHING = 0.04
+# Nearest pieces of the polylines whose directions are averaged.
 NEAREST = 6
 
 
@@ -33,7 +35,7 @@ def fibre_directions(
     Returns
     -------
     (n, 3) ndarray
-        Zero where no direction can be told.
+        Zero where there is no direction.
     """
     if not fibres:
         return _normalised(along)
@@ -66,19 +68,14 @@ def edge_stiffness(vertices: Floats, edges: Integers, directions: Floats, expone
     return np.clip(1.0 - aligned, 0.0, 1.0) ** exponent
 
 
-def swelling_room(vertices: Floats, faces: Integers, normals: Floats, held: Booleans, share: float) -> Any:
+def swelling_room(vertices: Floats, faces: Integers, normals: Floats, held: Booleans) -> Floats:
     """How far the surface moves at each vertex when the muscle swells: its local half thickness.
-
-    A uniform offset would turn thin rims inside out; in proportion to the thickness it is a change of
-    thickness by the same factor everywhere, as an incompressible body would thin when it is stretched.
 
     Parameters
     ----------
     vertices, faces, normals : ndarray
     held : (n,) ndarray of bool
         Vertices that do not move.
-    share : float
-        Distance over which the thickness is smoothed, and falls to 0 at held vertices, as a share of the diagonal.
 
     Returns
     -------
@@ -86,7 +83,7 @@ def swelling_room(vertices: Floats, faces: Integers, normals: Floats, held: Bool
         Smooth, [unit of the vertices], 0 at held vertices.
     """
     radius = _inner_balls(vertices, normals)
-    reach = share * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    reach = SMOOTHING * float(np.linalg.norm(np.ptp(vertices, axis=0)))
     area = vertex_areas(vertices, faces)
     free = np.flatnonzero(~held)
     room = np.zeros(len(vertices))
@@ -95,14 +92,6 @@ def swelling_room(vertices: Floats, faces: Integers, normals: Floats, held: Bool
         matrix = (cotangent_laplacian(vertices, faces) + sparse.diags(mass)).tocsc()
         room[free] = spsolve(matrix[free][:, free], (mass * radius)[free])
     return np.maximum(room, 0.0)
-
-
-def vertex_areas(vertices: Floats, faces: Integers) -> Floats:
-    """A third of the area of the faces around each vertex, (n,)."""
-    area = np.zeros(len(vertices))
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    np.add.at(area, faces, np.linalg.norm(np.cross(b - a, c - a), axis=1)[:, None] / 6.0)
-    return area
 
 
 def _inner_balls(vertices, normals, rounds=12):

@@ -4,31 +4,27 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from rbfmuscle.scene.options import Fraction, NotNegative, Positive, Table
+from rbfmuscle.scene.options import NotNegative, Table
 
 
 class PBDOptions(Table):
     """``[muscle.model]`` of the mesh models.
 
-    ``iterations`` sweeps a solve (0: the method's own number). ``edge`` and ``bending`` are PBD stiffnesses,
-    ``edge_compliance`` and ``bending_compliance`` those of XPBD, ``arap_compliance`` of the ARAP constraint,
-    all over a time that passes by one for each two degrees of motion. ``arap_reach`` is how far one global
-    step carries, as a share of the muscle's diagonal; ``swelling_reach``, another such share, over which the freedom
-    to swell falls to nothing at held vertices. ``fibre_exponent`` is a of k = (1 - |cos|)^a. ``contact``: bones are
-    met by the vertices alone, or by the middles of edges and faces too, for ridges between vertices. ``sound``
-    keeps the surface one that could be a muscle's: held ends, too, give way to bones, faces to the vertices of bones,
-    the sides of what is pressed on a bone stay apart, and what crosses itself is smoothed; several times the time.
+    Each solve makes ``iterations`` sweeps (0: the method's own number). With a ``tolerance`` above 0 sweeps go on until
+    none moves a vertex by more than this share of the muscle's size, ``iterations`` at most (0: 2,000).
+    ``bending`` is the stiffness of dihedral angles in PBD, 0 to 1; ``edge_compliance`` and ``bending_compliance`` are
+    those of XPBD, over a time that passes by one for each two degrees of motion. ``fibre_exponent`` is a of
+    k = (1 - |cos|)^a. Fibres shorten without resistance from their length in the scan to 1 / ``slack`` of it (1: no
+    slack; `pbd-paper` has none). With ``self_collision`` held vertices leave bones, and triangles that cross
+    others are smoothed apart after each solve, at two to three times the time.
     """
 
     method: Literal["pbd", "pbd-paper", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved"] = "pbd"
     iterations: Annotated[int, Field(ge=0, le=10_000)] = 0
+    tolerance: Annotated[float, Field(ge=0.0, le=0.1)] = 0.0
     fibre_exponent: NotNegative = 0.5
-    edge: Fraction = 1.0
-    bending: Fraction = 0.9
+    bending: Annotated[float, Field(ge=0.0, le=1.0)] = 0.9
     edge_compliance: NotNegative = 0.2
     bending_compliance: NotNegative = 0.2
-    arap_compliance: Positive = 1.0
-    arap_reach: Positive = 0.03
-    swelling_reach: Positive = 0.04
-    sound: bool = False
-    contact: Literal["vertices", "faces"] = "vertices"
+    slack: Annotated[float, Field(ge=1.0, le=5.0)] = 1.6
+    self_collision: bool = False

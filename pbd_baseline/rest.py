@@ -14,12 +14,13 @@ from pbd_baseline.weights import even_weights
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.harmonic import surface_gradient
+from rbfmuscle.geometry.surfaces import edge_lengths, vertex_normals
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import SceneError
 
 # Raise it when weights or room are computed in another way: entries of the cache are then not found.
-VERSION = 2
+VERSION = 3
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class RestState:
         Bones that hold the muscle.
     weights : (n, len(bones)) ndarray
         Weights of their motions, 1 on a bone's own vertices.
-    holder : (n,) ndarray of int
+    attached_bone : (n,) ndarray of int
         Position in ``bones`` of the bone that holds a vertex, -1 where it is free.
     inverse_mass : (n,) ndarray
         0 where held, else 1.
@@ -81,9 +82,7 @@ class RestState:
         topology = Topology.from_mesh(vertices, faces)
         volume = VolumeConstraint(vertices, faces)
         inverse_mass = np.where(attached_bone < 0, 1.0, 0.0)
-        weights, room = _weights_and_room(
-            vertices, faces, attached_bone, len(bones), volume, options.swelling_reach
-        )
+        weights, room = _weights_and_room(vertices, faces, attached_bone, len(bones))
         along = surface_gradient(vertices, faces, weights[:, -1])
         fibres = fibre_directions(vertices, along, muscle.fibres)
         return cls(
@@ -92,19 +91,11 @@ class RestState:
 
     def edge(self) -> float:
         """Median length of the edges [scene unit]."""
-        one, two = self.vertices[self.topology.edges[:, 0]], self.vertices[self.topology.edges[:, 1]]
-        return float(np.median(np.linalg.norm(one - two, axis=1)))
+        return float(np.median(edge_lengths(self.vertices, self.topology.edges)))
 
     def relative_lengths(self) -> Floats:
-        """Length of each edge in units of the median one.
-
-        A piece of an elastic sheet is the softer the longer it is. With one stiffness for all edges the
-        shortest ones of an uneven mesh take up the whole stretch: twelvefold on the hip, against twofold.
-        """
-        one, two = self.vertices[self.topology.edges[:, 0]], self.vertices[self.topology.edges[:, 1]]
-        length = np.linalg.norm(one - two, axis=1)
-        median = np.median(length)
-        return np.maximum(length / median, 1e-3)
+        """Length of each edge in units of the median one."""
+        return np.maximum(edge_lengths(self.vertices, self.topology.edges) / self.edge(), 1e-3)
 
 
 def _renumbered(muscle):
@@ -120,22 +111,15 @@ def _renumbered(muscle):
     return order, vertices, faces, bones, attached_bone
 
 
-def _weights_key(vertices, faces, attached_bone, swelling_reach):
-    return content_key(vertices, faces, ("mesh muscle", VERSION, swelling_reach, attached_bone.tolist()))
-
-
-def _weights_and_room(vertices, faces, attached_bone, bones, volume, swelling_reach):
+def _weights_and_room(vertices, faces, attached_bone, bones):
     """What takes nearly all the time of the build, from the cache on disk where it is known."""
-    key = _weights_key(vertices, faces, attached_bone, swelling_reach)
+    key = content_key(vertices, faces, ("mesh muscle", VERSION, attached_bone.tolist()))
     known = load_arrays(key)
     if known is None or not {"weights", "room"} <= known.keys():
-        normals = volume.gradient(vertices)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        groups = [np.flatnonzero(attached_bone == b) for b in range(bones)]
         known = {
-            "weights": even_weights(
-                vertices, faces, [np.flatnonzero(attached_bone == b) for b in range(bones)]
-            ),
-            "room": swelling_room(vertices, faces, normals, attached_bone >= 0, swelling_reach),
+            "weights": even_weights(vertices, faces, groups),
+            "room": swelling_room(vertices, faces, vertex_normals(vertices, faces), attached_bone >= 0),
         }
         store_arrays(key, known)
     return known["weights"], known["room"]

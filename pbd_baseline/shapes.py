@@ -1,9 +1,4 @@
-"""What gives a mesh muscle its shape: one class for each way of the paper, all swept in the same manner.
-
-A shape offers ``sweep(points, time)``: one iteration, in place, that keeps held vertices where they are. The
-muscle around it adds contact after each, and the volume in the shape's own way. ``contract(fibres, points)`` takes
-rest lengths from the fibres of a muscle that contracts; ``stiffer`` multiplies the weights of edges (of tendon).
-"""
+"""What gives a mesh muscle its shape: one class for each method of the paper."""
 
 from __future__ import annotations
 
@@ -18,23 +13,29 @@ from pbd_baseline.constraints import EdgeConstraint
 from pbd_baseline.contact import ContactConstraint
 from pbd_baseline.contraction import TENDON_WEIGHT, MeshFibres
 from pbd_baseline.factor import SymmetricFactor
-from pbd_baseline.fibres import edge_stiffness, vertex_areas
+from pbd_baseline.fibres import edge_stiffness
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.rest import RestState
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rotations import turned_quaternions
+from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.jit import compiled
 
+# How far one global step of ARAP carries, as a share of the muscle's diagonal.
+STEP_REACH = 0.03
 # Edges shorter or longer than these multiples of their rest length are hard in any case.
 LIMITS = 0.6, 2.2
 
 
 class Shape:
-    """What all ways have in common: how the volume comes back, and what a snapshot holds.
+    """What all methods have in common: how the volume is restored, and what a snapshot holds.
 
     Parameters
     ----------
-    rest : Rest
+    rest : RestState
+    options : PBDOptions
+    stiffer : float or (e,) ndarray
+        Factor of the edges' weights, of use to the ARAP models.
 
     Attributes
     ----------
@@ -44,7 +45,7 @@ class Shape:
 
     volume_in_sweeps = True
 
-    def __init__(self, rest: RestState) -> None:
+    def __init__(self, rest: RestState, options: PBDOptions, stiffer: Floats | float = 1.0) -> None:
         self.volume, self.room, self.inverse_mass = rest.volume, rest.room, rest.inverse_mass
 
     def sweep(self, points: np.ndarray, time: float) -> None:
@@ -85,14 +86,14 @@ class PBDShape(Shape):
     soft_length = 0.3
     limits = LIMITS
 
-    def __init__(self, rest: RestState, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
-        super().__init__(rest)
+    def __init__(self, rest: RestState, options: PBDOptions, stiffer: Floats | float = 1.0) -> None:
+        super().__init__(rest, options, stiffer)
         stiffness = edge_stiffness(rest.vertices, rest.topology.edges, rest.fibres, options.fibre_exponent)
         stiffness = stiffness * np.minimum(1.0, self.soft_length / rest.relative_lengths())
         self.edges = EdgeConstraint(
-            rest.vertices, rest.topology.edges, stiffness=options.edge * stiffness, limits=self.limits
+            rest.vertices, rest.topology.edges, stiffness=stiffness, limits=self.limits
         )
-        self.passive, self.stiffest = self.edges.stiffness, options.edge
+        self.passive = self.edges.stiffness
         self.bending = BendingConstraint(
             rest.vertices, rest.topology.edges, rest.topology.wings, stiffness=options.bending
         )
@@ -101,7 +102,7 @@ class PBDShape(Shape):
         """Take rest lengths and stiffnesses from the fibres: an active fibre is as stiff along as across."""
         self.edges.rest = np.linalg.norm(fibres.targets(points), axis=1)[self.edges.order]
         share = np.where(fibres.tendon, 1.0, fibres.activation)[self.edges.order]
-        self.edges.stiffness = self.passive + share * (self.stiffest - self.passive)
+        self.edges.stiffness = self.passive + share * (1.0 - self.passive)
 
     def sweep(self, points: Floats, time: float) -> None:
         """One Gauss-Seidel sweep; PBD knows no time."""
@@ -119,13 +120,11 @@ class PaperShape(PBDShape):
 class XPBDShape(Shape):
     """The same constraints with compliances, one iteration in each of many small steps (Macklin 2019).
 
-    A muscle without inertia relaxes by c dx/dt = -grad E, so the implicit step is that of XPBD with the
-    compliance over the time instead of its square: more and smaller steps, or larger motions at once, end in
-    the same place.
+    A muscle without inertia relaxes by c dx/dt = -grad E, so the compliance is divided by the time, not by its square.
     """
 
-    def __init__(self, rest: RestState, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
-        super().__init__(rest)
+    def __init__(self, rest: RestState, options: PBDOptions, stiffer: Floats | float = 1.0) -> None:
+        super().__init__(rest, options, stiffer)
         softness = edge_stiffness(rest.vertices, rest.topology.edges, rest.fibres, options.fibre_exponent)
         self.edges = EdgeConstraint(rest.vertices, rest.topology.edges, limits=LIMITS)
         self.bending = BendingConstraint(rest.vertices, rest.topology.edges, rest.topology.wings)
@@ -156,8 +155,8 @@ class XPBDShape(Shape):
 class RotatingShape(Shape):
     """A shape whose neighbourhoods have rotations (`ARAP`), which it remembers from sweep to sweep."""
 
-    def __init__(self, rest: RestState, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
-        super().__init__(rest)
+    def __init__(self, rest: RestState, options: PBDOptions, stiffer: Floats | float = 1.0) -> None:
+        super().__init__(rest, options, stiffer)
         self.arap = ARAP(rest.vertices, rest.topology, stiffer=stiffer)
 
     def transform(self, motion: np.ndarray) -> None:
@@ -176,9 +175,9 @@ class RotatingShape(Shape):
 class ARAPShape(RotatingShape):
     """The ARAP energy as PBD constraints: the paper's section 6.2, first option."""
 
-    def __init__(self, rest: RestState, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
+    def __init__(self, rest: RestState, options: PBDOptions, stiffer: Floats | float = 1.0) -> None:
         super().__init__(rest, options, stiffer)
-        self.constraint = ARAPConstraint(self.arap, compliance=options.arap_compliance)
+        self.constraint = ARAPConstraint(self.arap)
 
     def contract(self, fibres: MeshFibres, points: np.ndarray) -> None:
         """Take rest vectors from the fibres."""
@@ -200,11 +199,11 @@ class GlobalARAPShape(RotatingShape):
     muscle is pulled through the bone that it wraps. A free fixed point is the same for any l.
     """
 
-    def __init__(self, rest: RestState, options: PBDOptions, stiffer: np.ndarray | float = 1.0) -> None:
+    def __init__(self, rest: RestState, options: PBDOptions, stiffer: Floats | float = 1.0) -> None:
         super().__init__(rest, options, stiffer)
         self.free = np.flatnonzero(rest.inverse_mass > 0.0)
         self.held = np.flatnonzero(rest.inverse_mass == 0.0)
-        reach = options.arap_reach * float(np.linalg.norm(np.ptp(rest.vertices, axis=0)))
+        reach = STEP_REACH * float(np.linalg.norm(np.ptp(rest.vertices, axis=0)))
         self.mass = vertex_areas(rest.vertices, rest.topology.faces)[self.free, None] / reach**2
         rows = self.arap.laplacian[self.free]
         self.factor = SymmetricFactor(rows[:, self.free] + sparse.diags(self.mass[:, 0]))
@@ -238,7 +237,7 @@ class InterleavedARAPShape(GlobalARAPShape):
 
 
 class Method(NamedTuple):
-    """All that is said of one way: its shape, and its sweeps a solve.
+    """One method: its shape and its number of sweeps per solve.
 
     Attributes
     ----------
@@ -262,11 +261,6 @@ METHODS = {
     "arap-volume": Method(GlobalARAPShape, 6),
     "arap-interleaved": Method(InterleavedARAPShape, 6),
 }
-
-
-def sweeps(options: PBDOptions) -> int:
-    """Sweeps a solve: those of the options, or the method's own number."""
-    return options.iterations or METHODS[options.method].sweeps
 
 
 @compiled

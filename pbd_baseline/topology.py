@@ -151,9 +151,6 @@ def _colour_loop(members, taken, colours):
 def cache_order(faces: Integers, count: int) -> Integers:
     """Order of vertices in which neighbours lie near each other in memory (reverse Cuthill and McKee 1969).
 
-    It follows from the connections alone, so a mesh that is moved, turned or scaled keeps its order of sweeps
-    and with it its result.
-
     Parameters
     ----------
     faces : (m, 3) ndarray of int

@@ -1,8 +1,6 @@
-"""Weights between the bones' motions that stretch the surface evenly: harmonic ones, made flatter.
+"""Weights between the bones' motions that stretch the surface evenly: they minimise the integral of |grad w|^4.
 
-A harmonic function is singular at the rim of a small patch that is held: a prediction by it stretches edges
-there fivefold, and local sweeps cannot take that back. The p-Laplace equation, minimising the integral of
-|grad w|^p, spreads the gradient over the whole length; p = 4 nearly halves the worst stretch on the hip.
+Harmonic weights (p = 2) are singular at the rim of a small patch that is held, and stretch edges there fivefold.
 """
 
 from __future__ import annotations

@@ -22,17 +22,27 @@ class _Home(NamedTuple):
 
 _RBF = "rbfmuscle.muscle", "RBFMuscle", "RBFOptions"
 _PBD = "pbd_baseline", "PBDMuscle", "PBDOptions"
+# Sweeps of the converged mesh models go on until none moves a vertex by more than this share of the muscle's size.
+CONVERGED = 5e-6
 _HOME = {
     "rbf": _Home(*_RBF, {}),
     **{
         name: _Home(*_PBD, {"method": name})
         for name in ("pbd", "pbd-paper", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
     },
+    **{
+        f"{name}-converged": _Home(*_PBD, {"method": name, "tolerance": CONVERGED})
+        for name in ("pbd", "xpbd", "arap-pbd", "arap-volume")
+    },
 }
 
 MODEL_NAMES = tuple(_HOME)
-# What is compared where no models are named: all but the historical one.
-COMPARED = tuple(name for name in MODEL_NAMES if name != "pbd-paper")
+# What is compared where no models are named: all but the historical one, PBD with few sweeps and with many.
+COMPARED = tuple(
+    name
+    for name in MODEL_NAMES
+    if name == "pbd-converged" or (not name.endswith("-converged") and name != "pbd-paper")
+)
 
 
 def build_model(muscle: Muscle, scene: Scene, name: str | None = None) -> MuscleModel:

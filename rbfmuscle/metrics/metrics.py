@@ -26,7 +26,14 @@ if TYPE_CHECKING:
 
 Values = dict[str, float]
 
-_FROM_MODEL = ("solver_penetration_max", "unfitted_fraction", "condition", "time_fit", "time_extract")
+_FROM_MODEL = (
+    "solver_penetration_max",
+    "sweeps",
+    "unfitted_fraction",
+    "condition",
+    "time_fit",
+    "time_extract",
+)
 
 # Events whose points stayed beyond a bone; those turned back or halved away are in events.csv only.
 _THROUGH = ("reported", "unresolved")

@@ -12,6 +12,7 @@ QUANTITIES = {
     "penetration_fraction": ("1", "share of surface vertices inside a bone"),
     "bone_penetration_max": ("length", "deepest bone vertex inside the muscle"),
     "solver_penetration_max": ("length", "deepest point inside a bone before the bone is cut away"),
+    "sweeps": ("1", "sweeps of the last solve of a mesh model"),
     "components": ("1", "closed pieces of the surface"),
     "euler": ("1", "Euler characteristic of the surface: 2 for a sphere, two less for each handle"),
     "self_crossings": ("1", "triangles of the surface that cross others of it"),

@@ -67,7 +67,7 @@ class TestInterrupts:
         place = {
             "import": "import cyclopts",
             "load": "from rbfmuscle.scene.meshes import repair as m; name = 'repair'",
-            "build": "import pbd_baseline.muscle as m; name = '_contact_carriers'",
+            "build": "import pbd_baseline.muscle as m; name = '_bone_numbers'",
             "run": "import rbfmuscle.output.writer as m; name = 'write_mesh'",
         }[moment]
         code = (

@@ -57,10 +57,8 @@ MODELS = {
     "pbd": (
         PBDOptions,
         {
-            "iterations": 2, "fibre_exponent": 1.0, "edge": 0.9, "bending": 0.8,
-            "edge_compliance": 0.1, "bending_compliance": 0.1,
-            "arap_compliance": 0.5, "arap_reach": 0.05, "swelling_reach": 0.05,
-            "contact": "faces", "sound": True,
+            "iterations": 2, "tolerance": 1e-3, "fibre_exponent": 1.0, "bending": 0.8,
+            "edge_compliance": 0.1, "bending_compliance": 0.1, "slack": 1.2, "self_collision": True,
         },
     ),
 }  # fmt: skip
@@ -161,14 +159,14 @@ def test_a_whole_model_comes_before_its_settings_whatever_the_order(scene_file, 
 def test_compare_takes_a_whole_model_as_the_file_would_give_it(scene_file, tmp_path, capsys):
     code, _, err = call(
         capsys, "compare", scene_file, "-o", tmp_path, "--models", "pbd,xpbd", "--no-pictures", "--frames",
-        "0:2", "--set", 'model={name = "xpbd", iterations = 4}', "--set", "pbd:model.edge=0.9",
+        "0:2", "--set", 'model={name = "xpbd", iterations = 4}', "--set", "pbd:model.bending=0.8",
     )  # fmt: skip
     assert code == 0, err
     found = {
         name: json.loads((tmp_path / name / "run.json").read_text())["scene"]["muscles"][0]["model"]
         for name in ("pbd", "xpbd")
     }
-    assert found == {"pbd": {"name": "pbd", "edge": 0.9}, "xpbd": {"name": "xpbd", "iterations": 4}}
+    assert found == {"pbd": {"name": "pbd", "bending": 0.8}, "xpbd": {"name": "xpbd", "iterations": 4}}
 
 
 def test_the_name_of_a_model_decides_its_method(scene_file, tmp_path, capsys):

@@ -1,6 +1,5 @@
 """The page that turns and scrubs a run: by itself, and every vertex of every frame unpacked to its place."""
 
-import base64
 import json
 import re
 import shutil

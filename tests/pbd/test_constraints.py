@@ -41,15 +41,6 @@ def test_each_undirected_edge_is_found_once_with_its_two_wings(body):
             assert tuple(np.roll(face, -int(np.argmin(face)))) in triangles
 
 
-def test_one_rings_agree_with_edges(body):
-    _, _, topology = body
-    for i in range(0, topology.vertex_count, 37):
-        span = slice(topology.ring_start[i], topology.ring_start[i + 1])
-        expected = {int(b if a == i else a) for a, b in topology.edges if i in (a, b)}
-        assert set(topology.ring[span].tolist()) == expected
-        assert all(i in topology.edges[c] for c in topology.ring_edge[span])
-
-
 def test_open_mesh_is_refused():
     vertices, faces = ellipsoid(1)
     with pytest.raises(MeshError, match="not a closed"):
@@ -64,19 +55,6 @@ def test_constraints_of_one_colour_share_no_vertex(body):
     for low, high in itertools.pairwise(start):
         used = members[order[low:high]].ravel()
         assert len(np.unique(used)) == len(used)
-
-
-def test_order_within_a_colour_changes_nothing(body, rng):
-    vertices, _, topology = body
-    start = vertices + 0.1 * rng.normal(size=vertices.shape)
-    constraint = EdgeConstraint(vertices, topology.edges)
-    one, two, mass = start.copy(), start.copy(), np.ones(len(start))
-    constraint.project(one, mass)
-    for low, high in itertools.pairwise(constraint.colours):
-        constraint.edges[low:high] = constraint.edges[low:high][::-1].copy()
-        constraint.rest[low:high] = constraint.rest[low:high][::-1].copy()
-    constraint.project(two, mass)
-    assert np.array_equal(one, two)
 
 
 def numerical_gradient(value, points, members, step):
@@ -123,14 +101,6 @@ def test_projection_follows_the_gradient(body, rng, family, number):
     expected = -constraint.values(points)[0] * gradient / (gradient**2).sum()
     # central differences of step 2e-5 on values of order one
     np.testing.assert_allclose((moved - points)[members], expected, atol=1e-7)
-
-
-def test_dihedral_angle_is_positive_on_a_convex_edge():
-    vertices, faces = ellipsoid(1, axes=(1, 1, 1))
-    topology = Topology.from_mesh(vertices, faces)
-    rest = BendingConstraint(vertices, topology.edges, topology.wings).rest
-    assert (rest[:, 1] > 0).all()
-    np.testing.assert_allclose((rest**2).sum(axis=1), 1.0)
 
 
 def test_collapsed_and_folded_elements_stay_finite(body):

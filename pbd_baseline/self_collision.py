@@ -1,4 +1,4 @@
-"""What crosses itself in a mesh muscle is smoothed until it does not."""
+"""Self-collision of a mesh muscle: the surface is smoothed where it crosses itself, until it does not."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Callable
 import numpy as np
 
 from pbd_baseline.rest import RestState
-from pbd_baseline.self_collision.ridges import faces_of
 from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.rigid import smooth_displacement
@@ -24,15 +23,12 @@ MOST, SWELL = 0.5, 0.6
 CALM = (30, 120, 500, 2000)
 
 
-class Untangling:
-    """Looks for what crosses, and smooths it in a region that grows until nothing does.
-
-    Smoothing draws thin places together, where sheets then cross again: what was smoothed is swollen by what it
-    lost, and by a little more in each round, so that the two sides of what was pressed flat come apart.
+class SelfCollision:
+    """Finds triangles that cross others, and smooths around them in a region that grows until none does.
 
     Parameters
     ----------
-    rest : Rest
+    rest : RestState
     """
 
     def __init__(self, rest: RestState) -> None:
@@ -82,7 +78,7 @@ class Untangling:
             marked = np.zeros(len(points), dtype=np.bool_)
             marked[faces[bad].ravel()] = True
             region = self.around(marked, 1 + turn // GROWTH)
-            among = faces_of(region, faces)
+            among = region[faces].any(axis=1)
             self._smooth(points, np.flatnonzero(region), SWELL * self.edge * turn / ROUNDS)
             settle()
         return int(self.tree.crossing(points).sum())

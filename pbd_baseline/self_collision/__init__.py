@@ -1,1 +1,0 @@
-"""Self-collision of mesh muscles."""
