@@ -42,7 +42,7 @@ class RBFOptions(Table):
 
     centres: Annotated[int, Field(ge=0, le=20_000)] = 0
     rest_error: NotNegative = 0.0
-    samples: Annotated[int, Field(ge=50, le=200_000)] = 2000
+    samples: Annotated[int, Field(ge=50, le=200_000)] = 4000
     nodes: Annotated[int, Field(ge=30, le=3000)] = 150
     iterations: Annotated[int, Field(ge=1, le=1000)] = 24
     slack: Annotated[float, Field(ge=1.0, le=5.0)] = 1.6

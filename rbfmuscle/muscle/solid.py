@@ -32,6 +32,7 @@ from rbfmuscle.geometry.rest_frame import RestFrame, diameter
 from rbfmuscle.geometry.rotations import turned_quaternions
 from rbfmuscle.implicit.placement.lattice import Lattice
 from rbfmuscle.muscle.anderson import Anderson
+from rbfmuscle.muscle.inversion import STIFFNESS, unfold_loop
 from rbfmuscle.muscle.solid_contact import NearPoints, SolidContact
 from rbfmuscle.muscle.solid_loops import (
     Fibres,
@@ -144,6 +145,7 @@ class EmbeddedSolid:
         self.fibres = Fibres(axis, 0.0 * one, 0.0 * one, one, one, one)
         self.quaternion, self.stretch = np.tile([1.0, 0.0, 0.0, 0.0], (len(one), 1)), one.copy()
         self.f, self.target = np.empty((2, len(one), 3, 3))
+        self.stiffened = np.zeros(len(one), dtype=bool)
         self._number_regions(lattice.regions(max(1, len(lattice.rest) // NODES_PER_REGION)))
         self._assemble(lattice)
         self.contact = SolidContact(self, area, bones)
@@ -162,24 +164,33 @@ class EmbeddedSolid:
 
     def _assemble(self, lattice: Lattice) -> None:
         """Matrix of the energy for frozen targets, with its springs; its inverse; the weights of the bones."""
-        size, rows = len(self.rest), np.arange(len(self.weights))[:, None]
-        matrix = GHOST * self.side * lattice.second_differences()
-        for axis in range(3):
-            full = np.zeros((len(self.weights), size))
-            np.add.at(full, (rows, self.quad_columns), self.slopes[:, :, axis])
-            matrix += (full * self.weights[:, None]).T @ full
+        size = len(self.rest)
+        matrix = GHOST * self.side * lattice.second_differences() + self._stiffness(
+            np.arange(len(self.weights))
+        )
         hangs = np.zeros((size, len(self.held)))
         np.add.at(hangs, (self.columns[self.held].T, np.arange(len(self.held))), self.shares[self.held].T)
         self.spring = HOLD * self.side * hangs
         self.without_springs, self.without_fibres = matrix, matrix + self.spring @ hangs.T
-        self._invert(self.without_fibres)
+        self.matrix = self.without_fibres
+        self._invert()
         own = self.owner[self.held]
         self.bones = sorted(set(own.tolist()))
         weights = np.stack([self.inverse @ self.spring[:, own == bone].sum(axis=1) for bone in self.bones], 1)
         self.motion_weights = weights / weights.sum(axis=1, keepdims=True)
 
-    def _invert(self, matrix: Floats) -> None:
-        inverse = np.linalg.inv(matrix)
+    def _stiffness(self, which: Integers) -> Floats:
+        """Matrix (N, N) of Σ w |F|² over some quadrature points."""
+        found, rows = np.zeros((len(self.rest), len(self.rest))), np.arange(len(which))[:, None]
+        for axis in range(3):
+            full = np.zeros((len(which), len(self.rest)))
+            np.add.at(full, (rows, self.quad_columns[which]), self.slopes[which, :, axis])
+            found += (full * self.weights[which, None]).T @ full
+        return found
+
+    def _invert(self) -> None:
+        matrix, stiff = self.matrix, np.flatnonzero(self.stiffened)
+        inverse = np.linalg.inv(matrix + STIFFNESS * self._stiffness(stiff) if len(stiff) else matrix)
         self.inverse = np.ascontiguousarray(0.5 * (inverse + inverse.T))
 
     def _number_regions(self, region: Integers) -> None:
@@ -213,18 +224,23 @@ class EmbeddedSolid:
     def take_fibres(self, fibres: Fibres) -> None:
         """Take springs along the fibres; their stiffness becomes part of the matrix."""
         self.fibres, stiff = fibres, fibres.passive + fibres.active
-        if not stiff.any():
-            self._invert(self.without_fibres)
-            return
-        along = np.zeros((len(self.weights), len(self.rest)))
-        slopes = np.einsum("qka,qa->qk", self.slopes, fibres.direction)
-        np.add.at(along, (np.arange(len(self.weights))[:, None], self.quad_columns), slopes)
-        self._invert(self.without_fibres + (along * (stiff * self.weights)[:, None]).T @ along)
+        self.matrix = self.without_fibres
+        if stiff.any():
+            along = np.zeros((len(self.weights), len(self.rest)))
+            slopes = np.einsum("qka,qa->qk", self.slopes, fibres.direction)
+            np.add.at(along, (np.arange(len(self.weights))[:, None], self.quad_columns), slopes)
+            self.matrix = self.without_fibres + (along * (stiff * self.weights)[:, None]).T @ along
+        self._invert()
+
+    def mobility(self) -> Floats:
+        """Motion (n,) of each contact point for a unit force at it."""
+        out = np.empty(len(self.points))
+        mobility_loop(self.columns, self.shares, self.inverse, out)
+        return out
 
     def attach_immobile(self) -> None:
         """Count free contact points that a force hardly moves to the bone of the nearest attached one."""
-        mobility = np.empty(len(self.points))
-        mobility_loop(self.columns, self.shares, self.inverse, mobility)
+        mobility = self.mobility()
         free, fixed = self.owner < 0, np.flatnonzero(self.owner >= 0)
         stuck = np.flatnonzero(free & (mobility < MOBILE * np.median(mobility[free])))
         for point in stuck:
@@ -328,8 +344,7 @@ class EmbeddedSolid:
             If the iteration diverges.
         """
         self.history, self._pull = [], self.spring @ self.anchor
-        self.localise()
-        self._find_responses()
+        self._begin()
         near = self.contact.near(contacts, None)
         rounds, settled = (ROUNDS_STILL, SETTLED_STILL) if self.still else (1, SETTLED)
         mixer, least = Anderson(MEMORY, self.y.size), np.inf
@@ -353,7 +368,10 @@ class EmbeddedSolid:
             if moved < settled * self.scale or len(self.history) == self.iterations * rounds:
                 break
             self.y, self.pressure = self._mixed(mixer, new, pressure)
-            self.localise()
+            if self.localise():
+                self._invert()
+                self._find_responses()
+                mixer.restart()
             if np.abs(self.y - near.y).max() > 0.4 * near.reach:
                 near = self.contact.near(contacts, near)
         self.y, self.pressure = new, pressure
@@ -361,6 +379,14 @@ class EmbeddedSolid:
         self.forces[near.which] = near.forces
         self.shown = self.contact.lifted(near)
         self._note_trend()
+
+    def _begin(self) -> None:
+        """Forces and responses for the nodes that a solve starts from, with the points that are squeezed there."""
+        before = bool(self.stiffened.any())
+        self.stiffened[:] = False
+        if self.localise() or before:
+            self._invert()
+        self._find_responses()
 
     def _mixed(self, mixer: Anderson, new: Floats, pressure: Floats) -> tuple[Floats, Floats]:
         """Nodes and pressures to go on from, after an iteration has brought the present ones to ``new``."""
@@ -384,10 +410,16 @@ class EmbeddedSolid:
         beyond = along - np.clip(along, given.lower, given.upper)
         springs = given.passive * beyond**2 + given.active * (along - given.content) ** 2
         tone = -TONE * (self.stretch - 1.0) ** 2
-        return 0.5 * float(self.weights @ ((gap**2).sum(axis=(1, 2)) + springs + tone))
+        return 0.5 * float(self.weights @ ((gap**2).sum(axis=(1, 2)) + springs + tone)) + self.squeezed
 
-    def localise(self) -> None:
-        """Find deformation gradients, targets, volumes and forces for the present nodes."""
+    def localise(self) -> bool:
+        """Find deformation gradients, targets, volumes and forces for the present nodes.
+
+        Returns
+        -------
+        bool
+            Whether points are squeezed that the matrix does not know of yet.
+        """
         target_loop(
             self.y, self.quad_columns, self.slopes, self.fibres.direction, self.fibres.lower, TONE,
             self.quaternion, self.stretch, self.f, self.target,
@@ -397,6 +429,10 @@ class EmbeddedSolid:
             self.f, self.target, self.fibres, self.weights, self.quad_columns, self.slopes, self.region,
             self.slot, self.right, self.gradient, self.volumes,
         )  # fmt: skip
+        joined, self.squeezed = unfold_loop(
+            self.f, self.stiffened, self.weights, self.quad_columns, self.slopes, self.right
+        )
+        return bool(joined)
 
     def _find_responses(self) -> None:
         """Motion of the nodes for a unit pressure of each region: the metric of this solve's corrections."""

@@ -262,7 +262,7 @@ def solve_contact_forces(gram, need, force, sweeps, tolerance, most):
     sweeps : int
     tolerance : float
         Stop when no gap moves by more.
-    most : float
+    most : (c,) ndarray
     """
     for _ in range(sweeps):
         largest = 0.0
@@ -270,7 +270,7 @@ def solve_contact_forces(gram, need, force, sweeps, tolerance, most):
             residual = need[c]
             for d in range(len(need)):
                 residual -= gram[c, d] * force[d]
-            new = min(max(0.0, force[c] + residual / gram[c, c]), most)
+            new = min(max(0.0, force[c] + residual / gram[c, c]), most[c])
             largest = max(largest, abs(new - force[c]) * gram[c, c])
             force[c] = new
         if largest < tolerance:
@@ -366,7 +366,7 @@ def contact_loop(
         _answers_loop(index[chosen], columns, shares, inverse, answers)
         gram = _pairs_loop(index[chosen], normal[chosen], rows, answers, columns, shares, yielding)
         strength = force[chosen]
-        solve_contact_forces(gram, need[chosen], strength, sweeps, 0.1 * tolerance, most)
+        solve_contact_forces(gram, need[chosen], strength, sweeps, 0.1 * tolerance, most[index[chosen]])
         for k in range(len(chosen)):
             force[chosen[k]] = strength[k]
         _push_loop(normal[chosen], strength, rows, answers, response, push, taken)

@@ -64,7 +64,7 @@ def system(rng):
 def test_one_contact_takes_its_share_up_to_the_greatest_force():
     for need, expected in ((2.0, 1.0), (-3.0, 0.0), (3.0, 1.2)):
         force = np.zeros(1)
-        solve_contact_forces(np.array([[2.0]]), np.array([need]), force, 60, 1e-12, 1.2)
+        solve_contact_forces(np.array([[2.0]]), np.array([need]), force, 60, 1e-12, np.array([1.2]))
         assert force[0] == expected
 
 
@@ -72,7 +72,7 @@ def test_complementarity_stops_early_only_when_it_is_done(rng):
     root = rng.normal(size=(6, 6))
     gram, need = root @ root.T + 3.0 * np.eye(6), rng.normal(size=6)
     force = np.zeros(6)
-    solve_contact_forces(gram, need, force, 1000, 1e-12, np.inf)
+    solve_contact_forces(gram, need, force, 1000, 1e-12, np.full(6, np.inf))
     slack = gram @ force - need
     assert slack.min() > -1e-10 and force.min() >= 0.0 and abs(slack @ force) < 1e-10
 
@@ -253,7 +253,7 @@ def test_contact_meets_the_laws_and_keeps_every_region(rng, system, batch, yield
     for _ in range(2):  # from nothing, and from the forces of the first time
         contact_loop(
             s.index, s.gap, s.normal, s.source, system.motion, system.inverse, system.columns, system.shares,
-            response, table, (batch, 12, 400, 1e-10), (yielding, np.inf), push, taken,
+            response, table, (batch, 12, 400, 1e-10), (yielding, np.full(POINTS, np.inf)), push, taken,
         )  # fmt: skip
         force = table[s.index, s.source]
         # A contact gives way by its force; the matrix carries 1e-7 of its diagonal.

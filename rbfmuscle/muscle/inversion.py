@@ -1,0 +1,73 @@
+"""What keeps the material of a muscle's solid from being turned inside out where bones squeeze it.
+
+A quadrature point whose volume det F falls below `LEAST` of that at rest is pulled to the nearest deformation that
+has it: the energy gains μ Σ_q w_q `STIFFNESS` min over G of |F_q - G|² with det G >= `LEAST`, nothing for all other
+points. Its matrix, as for the other terms, is constant, but has only the points that need it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rbfmuscle.jit import compiled
+
+LEAST = 0.5  # det F that a point keeps
+STIFFNESS = 100.0  # over 2 μ
+SMALLEST = 0.1  # stretch that the search for the nearest deformation starts with at least
+ROUNDS = 10  # of that search
+
+
+@compiled(error_model="numpy")
+def nearest_volume(f, out):
+    """The nearest matrix to ``f`` (3, 3) with a determinant of at least `LEAST`: squared distance, and ``out``."""
+    u, s, vt = np.linalg.svd(f)
+    if np.linalg.det(u) * np.linalg.det(vt) < 0.0:
+        s[2], u[:, 2] = -s[2], -u[:, 2]
+    d = np.maximum(s, SMALLEST)
+    if s[0] * s[1] * s[2] >= LEAST:
+        d[:] = s
+    else:
+        # Each round goes to the foot of the perpendicular on the tangent plane of d0 d1 d2 = LEAST.
+        for _ in range(ROUNDS):
+            g = np.array([d[1] * d[2], d[0] * d[2], d[0] * d[1]])
+            lacking = LEAST - d[0] * d[1] * d[2] + g @ (d - s)
+            d = s + lacking / (g @ g) * g
+    away = 0.0
+    for k in range(3):
+        away += (d[k] - s[k]) ** 2
+    for a in range(3):
+        for b in range(3):
+            out[a, b] = u[a, 0] * d[0] * vt[0, b] + u[a, 1] * d[1] * vt[1, b] + u[a, 2] * d[2] * vt[2, b]
+    return away
+
+
+@compiled(error_model="numpy")
+def unfold_loop(f, stiffened, weights, columns, slopes, out):
+    """Add what pulls squeezed points apart to the right side ``out`` (N, 3).
+
+    Points that are squeezed join those ``stiffened`` (Q,); returns how many did, and the energy over 2 μ.
+    """
+    joined, energy = 0, 0.0
+    goal = np.empty((3, 3))
+    for i in range(len(f)):
+        m = f[i]
+        det = (
+            m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])
+            - m[0, 1] * (m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0])
+            + m[0, 2] * (m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0])
+        )
+        if not stiffened[i]:
+            if det >= LEAST or not np.isfinite(det):
+                continue
+            stiffened[i] = True
+            joined += 1
+        goal[:] = m
+        if det < LEAST:
+            energy += 0.5 * weights[i] * STIFFNESS * nearest_volume(m, goal)
+        share = STIFFNESS * weights[i]
+        for k in range(columns.shape[1]):
+            for a in range(3):
+                out[columns[i, k], a] += share * (
+                    goal[a, 0] * slopes[i, k, 0] + goal[a, 1] * slopes[i, k, 1] + goal[a, 2] * slopes[i, k, 2]
+                )
+    return joined, energy
