@@ -339,9 +339,11 @@ def describe(results: dict[str, Any], labels: dict[str, str], units: str) -> str
         ratio = whole[first]["time_frame"] / whole[quick]["time_frame"]
         text += f" at {ratio:.2g} times the time of {labels[quick]} ({depth[quick]:.2g} {units})"
     near = min(others, key=lambda name: whole[name].get("distance_rms", math.inf), default=None)
-    if near and "distance_rms" in whole[near]:
-        comma = "," if "," in labels[near] else ""
-        text += f"; {labels[near]}{comma} comes within {whole[near]['distance_rms']:.2g} {units} RMS of it"
+    away = f"{whole[near]['distance_rms']:.2g} {units} RMS" if near and "distance_rms" in whole[near] else ""
+    if near and near == quick:
+        text += f"; the two lie {away} apart" if len(others) == 1 else f", which comes nearest to it ({away})"
+    elif near and away:
+        text += f"; {labels[near]}{',' if ',' in labels[near] else ''} comes within {away} of it"
         if near in timed:
             text += f" at {whole[near]['time_frame'] / whole[first]['time_frame']:.2g} times its time"
     return f"{text}."

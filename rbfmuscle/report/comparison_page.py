@@ -125,10 +125,9 @@ def _light(found: dict[str, Any], runs: Mapping[str, SavedRun], quantity: str) -
         cells.append(Cell(shown(found, quantity, value), value, state))
     if all(cell.value is None for cell in cells):
         return None
-    measure = MEASURES[quantity]
-    return Light(
-        measure.title, cells, "" if limit is None else f"≤ {shown(found, quantity, limit)}", measure.meaning
-    )
+    # A column of limits would be off a phone's screen.
+    note = MEASURES[quantity].meaning if limit is None else f"limit {shown(found, quantity, limit)}"
+    return Light(MEASURES[quantity].title, cells, note=note)
 
 
 def shown(found: dict[str, Any], quantity: str, value: float | None) -> str:
