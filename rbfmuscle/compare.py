@@ -31,19 +31,15 @@ if TYPE_CHECKING:
 
 # The motion is repeated with steps this many times as long.
 COARSER = 5
-# After a model's name: solved until it no longer changes.
-CONVERGED = "-converged"
-_SETTLED = {"model.iterations": 600}
+_CONVERGED = "-converged"
 NAMES = {"rbf": "RBF", "pbd": "PBD", "pbd-paper": "PBD of the paper", "xpbd": "XPBD"}
 _PAPER_SWEEPS = 3
-# Beside the mesh model of few sweeps the same one converged.
-DEFAULT = ("rbf", "pbd", "pbd-converged", *(name for name in COMPARED if name not in ("rbf", "pbd")))
 
 
 def compare_models(
     scene: Scene,
     directory: str | Path,
-    models: Sequence[str] = DEFAULT,
+    models: Sequence[str] = COMPARED,
     *,
     frames: Any = None,
     settings: dict[str, Any] | None = None,
@@ -58,8 +54,7 @@ def compare_models(
     directory : path
         Takes ``comparison.json``, ``comparison.csv``, ``report.html``, ``models.webp`` and the run of each model.
     models : list of str
-        Distances are to the first. A mesh model with "-converged" after its name is solved until it no longer
-        changes. One that cannot be solved is left out, and named in the tables.
+        Distances are to the first. One that cannot be solved is left out, and named in the tables.
     frames : slice or str, optional
         Frames of the motion, a slice or "A:B:S".
     settings : dict, optional
@@ -116,7 +111,7 @@ def compare_models(
 
 def _label(name: str, scene: Scene) -> str:
     """What a model is called, from the settings that it ran with."""
-    base = name.removesuffix(CONVERGED)
+    base = name.removesuffix(_CONVERGED)
     title, sweeps = NAMES.get(base, base), scene.muscles[0].options.get("iterations", 0)
     if name != base:
         return f"{title}, converged"
@@ -130,23 +125,21 @@ def _variants(scene, models, settings):
     if len(models) < 2 or len(set(models)) < len(models):
         raise UsageError(f"give two or more different models, got {', '.join(models) or 'none'}")
     for name in models:
-        base = check_model_name(name.removesuffix(CONVERGED))
-        if base == "rbf" and name != base:
-            raise UsageError(f"{name}: only mesh models have sweeps; give rbf")
+        check_model_name(name)
     for key in settings:
         model = key.rpartition(":")[0]
         if model and model not in models:
             raise UsageError(f"{key}: model {model!r} is not compared; models: {', '.join(models)}")
     variants = {}
     for name in models:
-        mine = dict(_SETTLED) if name.endswith(CONVERGED) else {}
+        mine = {}
         for key, value in settings.items():
             if key.rpartition(":")[0] in ("", name):
                 mine[key.rpartition(":")[2]] = value
         # As in the scene file, a model given for all is the model whose settings these are; each then takes its turn.
         whole = {key: value for key, value in mine.items() if chooses_model(key)}
         own = {key: value for key, value in mine.items() if not chooses_model(key)}
-        variant = configure_scene(scene, whole).with_options(model=name.removesuffix(CONVERGED))
+        variant = configure_scene(scene, whole).with_options(model=name)
         variant = configure_scene(variant, own).validate()
         variant.output = OutputOptions(report=False, preview=False)
         variants[name] = variant

@@ -37,12 +37,8 @@ _HOME = {
 }
 
 MODEL_NAMES = tuple(_HOME)
-# What is compared where no models are named: all but the historical one, PBD with few sweeps and with many.
-COMPARED = tuple(
-    name
-    for name in MODEL_NAMES
-    if name == "pbd-converged" or (not name.endswith("-converged") and name != "pbd-paper")
-)
+# The default of `compare`: all but the historical model, and PBD converged.
+COMPARED = ("rbf", "pbd", "pbd-converged", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
 
 
 def build_model(muscle: Muscle, scene: Scene, name: str | None = None) -> MuscleModel:

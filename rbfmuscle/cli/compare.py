@@ -47,8 +47,8 @@ def compare(
     output
         Folder for the results; each model's run is in a folder of its own there.
     models
-        Names with commas between; distances are measured to the first. A mesh model with "-converged" after its
-        name is solved until it no longer changes. All models, and pbd-converged, by default.
+        Names with commas between; distances are measured to the first. The sweeps of a mesh model with "-converged"
+        after its name go on until no vertex moves.
     settings
         KEY=VALUE as for run, for all models; MODEL:KEY=VALUE for one. May be repeated.
     frames
@@ -59,11 +59,12 @@ def compare(
         Print JSON and nothing else.
     """
     from rbfmuscle import interruption
-    from rbfmuscle.compare import DEFAULT, compare_models
+    from rbfmuscle.compare import compare_models
+    from rbfmuscle.models import COMPARED
     from rbfmuscle.output.writer import json_text
     from rbfmuscle.scene.settings import parse_settings
 
-    names = [name.strip() for name in (models or "").split(",") if name.strip()] or list(DEFAULT)
+    names = [name.strip() for name in (models or "").split(",") if name.strip()] or list(COMPARED)
     changes = parse_settings(settings)
     with Progress("compare") as progress, interruption.keeping(lambda: output.exists()):
 
