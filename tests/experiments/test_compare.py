@@ -109,7 +109,7 @@ def test_labels_say_what_ran():
     assert [compare._label(name, variant) for name, variant in variants.items()] == [
         "RBF", "PBD, 3 sweeps as in the paper", "XPBD, converged"
     ]  # fmt: skip
-    assert variants["xpbd-converged"].muscles[0].model == "xpbd"
+    assert variants["xpbd-converged"].muscles[0].model == "xpbd-converged"
     many = compare._variants(scene, ["rbf", "pbd"], settings)["pbd"]
     assert compare._label("pbd", many) == "PBD, 7 sweeps"
 
@@ -195,7 +195,7 @@ class TestFailure:
             (["rbf"], {}, "two or more"),
             (["rbf", "rbf"], {}, "two or more"),
             (["rbf", "pbd"], {"xpbd:model.sweeps": 2}, "not compared"),
-            (["rbf", "rbf-converged"], {}, "only mesh models have sweeps"),
+            (["rbf", "rbf-converged"], {}, "unknown model"),
         ):
             with pytest.raises(UsageError, match=words):
                 compare_models(arm_scene(), tmp_path, models, settings=settings)
