@@ -179,7 +179,7 @@ def _read_part(path, file, names, facts, notes, *, closed):
         name += "_2"
     names.add(name)
     vertices, faces = read_arrays(path)
-    coarse = len(faces) > MOST_TRIANGLES
+    coarse = len(faces) > MOST_TRIANGLES and not closed  # cells of thin walls may open a surface
     if coarse:
         notes.append(f"{path.name}: {len(faces)} triangles, made coarser to about {MOST_TRIANGLES}")
         vertices, faces = clustered(vertices, faces, MOST_TRIANGLES)

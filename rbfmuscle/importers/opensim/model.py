@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rbfmuscle.importers.opensim.muscles import ModelMuscle
+from rbfmuscle.importers.opensim.muscle_paths import ModelMuscle
 from rbfmuscle.scene.joints.joint import KINDS, Coordinate, Coupling, Joint, TransformAxis
 from rbfmuscle.scene.joints.skeleton import ordered
 from rbfmuscle.validation import SceneError

@@ -6,8 +6,8 @@ middle line is the model's path in its default pose, over its wrapping objects, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -15,12 +15,11 @@ from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.importers.opensim.frames import Frames
 from rbfmuscle.importers.opensim.functions import find_function, numbers, read_function, truth, vector
+from rbfmuscle.importers.opensim.model import OsimModel
+from rbfmuscle.importers.opensim.muscle_paths import ModelMuscle, WrapShape
 from rbfmuscle.importers.opensim.xml import Node
 from rbfmuscle.scene.joints.joint import frame_at
 from rbfmuscle.validation import SceneError
-
-if TYPE_CHECKING:
-    from rbfmuscle.importers.opensim.model import OsimModel
 
 # Force per area of muscle [N/m2] (Arnold et al. 2010, Ann Biomed Eng 38: 269; Rajagopal et al. 2016 have 60 N/cm2).
 SPECIFIC_TENSION = 61e4
@@ -28,44 +27,6 @@ SPECIFIC_TENSION = 61e4
 SECTIONS, CORNERS, END_RADIUS, HELD = 28, 12, 0.3, 0.06
 # Rounds in which the middle line is drawn straight and put out of what is in its way.
 ROUNDS = 60
-
-
-@dataclass
-class WrapShape:
-    """A cylinder (z), ellipsoid or sphere that a path goes around, in a frame (4, 4) of a body [metre]."""
-
-    name: str
-    body: str
-    frame: np.ndarray
-    radii: np.ndarray  # of the ellipsoid; of a cylinder two radii and half the length
-    kind: str
-    quadrant: str
-
-    def put_out(self, points: np.ndarray) -> np.ndarray:
-        """Points (n, 3) in the shape's frame, those inside moved to its surface."""
-        count = 2 if self.kind == "WrapCylinder" else 3
-        scaled = points[:, :count] / self.radii[:count]
-        inside = (np.linalg.norm(scaled, axis=1) < 1.0) & (
-            (count == 3) | (np.abs(points[:, 2]) <= self.radii[2])
-        )
-        if len(self.quadrant) and "xyz".find(self.quadrant[-1]) in range(count):
-            axis, sign = "xyz".find(self.quadrant[-1]), -1.0 if self.quadrant[0] == "-" else 1.0
-            scaled[:, axis] = np.where(inside & (sign * scaled[:, axis] < 0.0), 0.0, scaled[:, axis])
-            scaled[:, axis] += sign * 1e-3 * inside
-        size = np.maximum(np.linalg.norm(scaled, axis=1), 1e-9)
-        out = points.copy()
-        out[inside, :count] = (scaled / size[:, None] * self.radii[:count])[inside]
-        return out
-
-
-@dataclass
-class ModelMuscle:
-    """A muscle of the model: points by body in their frames [metre], shapes it wraps around, volume [m3]."""
-
-    name: str
-    points: list[tuple[str, np.ndarray]]
-    wraps: list[WrapShape] = field(default_factory=list)
-    volume: float = 0.0
 
 
 def read_muscles(model: OsimModel, node: Node, bodies: list[Node], frames: Frames) -> list[ModelMuscle]:
@@ -187,7 +148,7 @@ def make_tube(
     length = np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
     share = END_RADIUS + (1.0 - END_RADIUS) * np.sin(np.pi * np.linspace(0.0, 1.0, len(line)))
     radius = share * np.sqrt(muscle.volume * metre**3 / (np.pi * length * np.mean(share**2)))
-    wraps = [(wrap, places[wrap.body] @ _in_units(wrap.frame, metre), metre) for wrap in muscle.wraps]
+    wraps = [(wrap, places[wrap.body] @ scaled(wrap.frame, metre), metre) for wrap in muscle.wraps]
     line = _clear_line(line, fixed, radius, wraps, list(bones.values()))
     volume = mesh_volume(*_skin(line, radius))  # as its square, but for where sections run into each other
     vertices, faces = _skin(line, radius * np.sqrt(muscle.volume * metre**3 / volume))
@@ -195,8 +156,9 @@ def make_tube(
     return Tube(vertices, faces, held)
 
 
-def _in_units(frame, metre):
-    out = frame.copy()
+def scaled(transform: np.ndarray, metre: float) -> np.ndarray:
+    """Return a rigid (4, 4) transform with its shift in other units."""
+    out = transform.copy()
     out[:3, 3] *= metre
     return out
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from rbfmuscle.importers.opensim.geometry import body_meshes
 from rbfmuscle.importers.opensim.model import OsimModel
-from rbfmuscle.importers.opensim.muscles import bone_distances, make_tube
+from rbfmuscle.importers.opensim.muscles import bone_distances, make_tube, scaled
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.scene.joints.functions import Function
 from rbfmuscle.scene.joints.joint import Coordinate, Coupling, Joint, TransformAxis
@@ -118,13 +118,6 @@ def _add_muscles(found, metre):
         except (SceneError, MeshError) as error:
             found.lost[name] = str(error)
             found.notes.append(f"muscle {name!r} is not taken: {error}")
-
-
-def scaled(transform: np.ndarray, metre: float) -> np.ndarray:
-    """Return a rigid (4, 4) transform with its shift in other units."""
-    out = transform.copy()
-    out[:3, 3] *= metre
-    return out
 
 
 def clean_name(name: str, taken: set[str]) -> str:

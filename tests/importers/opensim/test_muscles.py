@@ -5,7 +5,8 @@ import pytest
 import trimesh
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.importers.opensim.muscles import ModelMuscle, WrapShape, make_tube
+from rbfmuscle.importers.opensim.muscle_paths import ModelMuscle, WrapShape
+from rbfmuscle.importers.opensim.muscles import make_tube
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.scene import import_osim
 from rbfmuscle.importers.opensim.write import write_scene
