@@ -22,7 +22,7 @@ from rbfmuscle.simulation.frame import FinishedDrawing, ModelSurface
 # Bones are looked for within this distance [mm] of the vertices as predicted, and as swept.
 REACH = 6.0
 FINISHING_REACH = 2.0
-# Sweeps after which bones and fibres are asked again.
+# Sweeps after which bones are asked again, and the fibres of a muscle that does not contract.
 FRESH = 10
 # Sweeps at most where a tolerance ends them.
 MOST_SWEEPS = 2000
@@ -104,10 +104,11 @@ class PBDMuscle:
         if self.self_collision is not None:
             self.contact.free_held(contacts, self.points)
         for k in range(self.most_sweeps):
-            if k % FRESH == 0:
+            fresh = k % FRESH == 0
+            if fresh:
                 self.contact.find(contacts, self.points)
-                if self.fibres is not None:
-                    self.shape.contract(self.fibres, self.points)
+            if self.fibres is not None and (fresh or not self.fibres.law.passive):
+                self.shape.contract(self.fibres, self.points)
             self.swept = k + 1
             if self._sweep() < self.still:
                 break

