@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 # Newton steps for the rotations: warm starts need one or two, a turn by 30 degrees at once four.
 ROTATION_STEPS = 8
 ROTATION_ERROR = 1e-12
+LEAST_WEIGHT = 1e-9
 
 
 class ARAP:
@@ -97,7 +98,8 @@ class ARAPConstraint:
         self.order = order
         self.edges = np.ascontiguousarray(edges[order])
         self.rest = np.ascontiguousarray(arap.rest[order])
-        self.compliance = 1.0 / arap.weights[order]
+        # a mesh whose median cotangent is 0 has weights of 0
+        self.compliance = 1.0 / np.maximum(arap.weights[order], LEAST_WEIGHT)
         self.multiplier = np.zeros((len(order), 3))
 
     def reset(self) -> None:

@@ -75,6 +75,13 @@ def test_edges_in_turn_bring_a_shape_back_and_leave_what_is_held(rest):
     assert energy(arap, points) < 1e-3 * before
 
 
+def test_an_edge_of_weight_zero_leaves_points_finite_and_near(rest):
+    arap, points = ARAP(*rest), 1.1 * rest[0]
+    arap.weights[3] = 0.0
+    ARAPConstraint(arap).project(points, np.ones(len(points)))
+    assert np.abs(points - rest[0]).max() < 0.5
+
+
 class Floor:
     """Every point sees the plane z = 0."""
 
