@@ -9,18 +9,16 @@ volumes kept. The next sub-step starts from the settled shape, not from the lift
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.fields import BoneField
+from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.muscle.rounded_bones import RoundedField, bone_thickness
 from rbfmuscle.muscle.solid_loops import carry_loop, contact_loop
 from rbfmuscle.simulation.contact import BoneContacts, HalfSpaces
-
-if TYPE_CHECKING:
-    from rbfmuscle.muscle.solid import EmbeddedSolid
 
 TOLERANCE = 2e-5  # violation of a contact that is left, of the muscle's size
 REACH_MARGIN = 0.003  # of the muscle's size
@@ -34,6 +32,26 @@ YIELDING, MOST_CONTACT_PRESSURE = 1e-4, 40.0
 ROUNDING = 1.7
 LEAST_ROUNDING = 0.1  # of that
 LIFTS = 3  # linear steps, at most, that lift what is left in a bone out of it
+
+
+class Solid(Protocol):
+    """What contact needs of an `EmbeddedSolid`; attributes as there."""
+
+    scale: float
+    frame: RestFrame
+    rest: Floats
+    y: Floats
+    points: Floats
+    owner: Integers
+    columns: Integers
+    shares: Floats
+    inverse: Floats
+    response: Floats
+    pressure: Floats
+    forces: Floats
+
+    def mobility(self) -> Floats:
+        """Motion (n,) of each contact point for a unit force at it."""
 
 
 class NearPoints(NamedTuple):
@@ -78,16 +96,14 @@ class SolidContact:
 
     Parameters
     ----------
-    solid : EmbeddedSolid
+    solid : Solid
     area : float
         Area of the surface per sample [scene unit squared].
     bones : mapping of str to (vertices, faces)
         Meshes of the bones.
     """
 
-    def __init__(
-        self, solid: EmbeddedSolid, area: float, bones: Mapping[str, tuple[Floats, Integers]]
-    ) -> None:
+    def __init__(self, solid: Solid, area: float, bones: Mapping[str, tuple[Floats, Integers]]) -> None:
         self.bones = bones
         self.solid, self.reach = solid, NEAR * solid.scale
         self.tolerance, self.margin = TOLERANCE * solid.scale, REACH_MARGIN * solid.scale
