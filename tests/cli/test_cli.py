@@ -311,7 +311,7 @@ class TestOtherCommands:
         code, out, _ = call(capsys, "new", tmp_path, "--units", "mm", "-o", target)
         assert code == 0 and str(target) in out
         text = target.read_text()
-        assert 'name = "femur_joint"' in text and "GUESS" in text
+        assert 'name = "hip"' in text and "GUESS" in text
         bones = [line.split('"')[1] for line in text.splitlines() if line.startswith("  { bone")]
         assert bones == ["pelvis", "femur"] * 4  # the origin, on the bone that stands still, comes first
         code, _, err = call(capsys, "new", tmp_path, "--units", "mm", "-o", target)

@@ -8,9 +8,8 @@ import trimesh
 from blend_model import arm_scene
 
 import rbfmuscle as rm
-from rbfmuscle.metrics.summary import require_limits
 from rbfmuscle.scene.check import check_centre, check_extents, check_scene
-from rbfmuscle.validation import LimitExceededError, MeshError, SceneError
+from rbfmuscle.validation import MeshError, SceneError
 
 
 class TestFindings:
@@ -62,26 +61,3 @@ class TestFindings:
         with pytest.raises(SceneError, match=r"joint 'elbow': centre .* lies 5e\+06 mm away from all bones"):
             check_centre(scene, "elbow", centre)
         check_centre(scene, "elbow", high.max(axis=0) + 1.0)
-
-
-class TestLimits:
-    def test_exceeded_limit_names_value_limit_and_frame(self):
-        facts = {
-            "strap": {
-                "volume_error": {"worst": -0.0345, "worst_frame": 7},
-                "penetration_max": {"worst": 0.5, "worst_frame": 3},
-                "components": {"worst": 2.0, "worst_frame": 11},
-            },
-            "all": {"volume_error": {"worst": 9.0, "worst_frame": 1}},
-        }
-        limits = {"volume_error": 0.02, "penetration_max": 0.5, "components": 1.0}
-        with pytest.raises(LimitExceededError) as caught:
-            require_limits(facts, limits)
-        assert str(caught.value) == (
-            "strap: volume_error = -0.0345 > 0.02 at frame 7; strap: components = 2 > 1 at frame 11"
-        )
-        require_limits(facts, {"volume_error": 0.0345, "penetration_max": 0.5, "components": 2.0})
-
-    def test_missing_value_exceeds_its_limit(self):
-        with pytest.raises(LimitExceededError, match="nan"):
-            require_limits({"strap": {"volume_error": {}}}, {"volume_error": 1.0})

@@ -4,6 +4,7 @@ import importlib
 import inspect
 import json
 import pkgutil
+import re
 
 import pytest
 from blend_model import arm_files
@@ -183,7 +184,8 @@ def test_flag_without_a_negative_is_off_by_default():
     for module in pkgutil.walk_packages(cli.__path__, cli.__name__ + "."):
         for name, function in inspect.getmembers(importlib.import_module(module.name), inspect.isfunction):
             for key, parameter in inspect.signature(function).parameters.items():
-                if "negative=" in str(parameter.annotation) and isinstance(parameter.default, bool):
+                bare = re.search(r"negative=(''|\"\"|\(\))", str(parameter.annotation))
+                if bare and isinstance(parameter.default, bool):
                     found.append((name, key))
                     assert parameter.default is False, (name, key)
     assert len(found) >= 8, found

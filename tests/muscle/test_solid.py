@@ -57,8 +57,8 @@ def test_shape_functions_reproduce_linear_maps():
     found = lattice.embed(inside)
     turn = rng.normal(size=(3, 3))
     there = lattice.rest @ turn.T
-    assert np.allclose(np.einsum("nk,nka->na", found.shares, there[found.columns]), inside @ turn.T)
-    slopes = np.einsum("nka,nkb->nab", there[found.columns], found.slopes)
+    assert np.allclose(np.einsum("nk,nka->na", found.weights, there[found.indices]), inside @ turn.T)
+    slopes = np.einsum("nka,nkb->nab", there[found.indices], found.slopes)
     assert np.allclose(slopes, turn)
     # What carries empty cells resists no linear map.
     assert np.abs(lattice.second_differences() @ there).max() < 1e-9

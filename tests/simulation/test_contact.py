@@ -151,7 +151,7 @@ def test_point_with_no_direction_still_gets_one():
 
 
 def test_wrong_input_is_refused():
-    with pytest.raises(ValueError, match="one field a bone"):
+    with pytest.raises(ValueError, match="one field per bone"):
         BoneContacts(["a", "b"], [None])
     contacts, poses = _pair(contact_bone=np.full(10, -1))
     with pytest.raises(ValueError, match="all 10 contact points"):
