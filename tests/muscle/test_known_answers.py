@@ -154,13 +154,6 @@ class TestStretchedBar:
         assert abs(fine["radius_ends"]) < 0.65 * abs(coarse["radius_ends"])
         assert fine["waviness"] < 0.002
 
-    def test_pbd_leaves_the_middle_what_its_ends_do_not_thin(self, study):
-        """Near held ends the volume correction fades over ``swelling_reach`` of the diagonal."""
-        far, near = (
-            study.stretched(1.2, {"name": "pbd", "swelling_reach": reach}, 2.0) for reach in (0.04, 0.01)
-        )
-        assert abs(near["radius_ends"]) < 0.01 < abs(far["radius_ends"]) < 0.014
-
 
 class TestBentBar:
     def test_rbf(self, study):
@@ -170,14 +163,10 @@ class TestBentBar:
         assert abs(found["arc"]) < 0.006
         assert abs(found["radius"]) < 0.01
 
-    @pytest.mark.parametrize("name", ["pbd", "arap-volume"])
-    def test_mesh_models_need_to_settle(self, study, name):
-        settled = {
-            "pbd": {"fibre_exponent": 0.0, "iterations": 1000},
-            "arap-volume": {"arap_reach": 1.0, "iterations": 30},
-        }[name]
-        assert abs(study.bent({"name": name, **settled}, 4.0)["path"]) < 0.006
-        assert study.bent({"name": name}, 4.0)["path"] > 0.05
+    def test_mesh_models_need_to_settle(self, study):
+        settled = {"name": "pbd", "fibre_exponent": 0.0, "iterations": 1000}
+        assert abs(study.bent(settled, 4.0)["path"]) < 0.006
+        assert study.bent({"name": "pbd"}, 4.0)["path"] > 0.05
 
 
 class TestWrappedStrip:

@@ -156,7 +156,7 @@ def test_what_goes_wrong_in_a_helper_is_told_as_what_it_is(raised, told):
         "from rbfmuscle.sharing import helper\n"
         "from rbfmuscle.validation import SolveError\n"
         f"def share(*given, **options): raise {raised}\n"
-        "helper.Share = share\n"
+        "helper.MuscleGroup = share\n"
         "helper.main()"
     )
     job = pickle.dumps((None, []))
