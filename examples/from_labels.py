@@ -39,8 +39,9 @@ for number, part in enumerate(parts, start=1):
     places = low + VOXEL * (first + np.stack(np.indices(box.shape), axis=-1).reshape(-1, 3))
     inside = rm.BoneSDF.from_mesh(part.mesh).distance(places).reshape(box.shape) < 0.0
     box[inside & (box == 0)] = number
-affine = np.diag([VOXEL, VOXEL, VOXEL, 1.0])
-affine[:3, 3] = low
+# NIfTI's axes point to the right, to the front and up; those of the phantom to the left, to the back and up.
+affine = np.diag([-VOXEL, -VOXEL, VOXEL, 1.0])
+affine[:3, 3] = low * [-1.0, -1.0, 1.0]
 nibabel.save(nibabel.Nifti1Image(labels, affine), out / "hip.nii.gz")
 names = {str(number): part.name for number, part in enumerate(parts, start=1)}
 (out / "names.json").write_text(json.dumps(names))
