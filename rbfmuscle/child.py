@@ -1,7 +1,6 @@
-"""Processes of ours beside this one: how they are started, how they listen and answer.
+"""Child processes: start them, send them messages, receive theirs.
 
-They are started by command, not forked or spawned by Python's own means, so that a script needs no guard of its main
-part and no thread is cut in two.
+They are started by command and not by `multiprocessing`, so that a script needs no guard of its main part.
 """
 
 from __future__ import annotations
@@ -20,33 +19,33 @@ from rbfmuscle.validation import SolveError
 
 
 def start_child(module: str, threads: int) -> subprocess.Popen[bytes]:
-    """A process that runs one of our modules, spoken to by its pipes, whose loops and BLAS use so many threads.
+    """Start a process that runs a module of ours, with pipes, and with ``threads`` threads for loops and BLAS.
 
-    Nothing that lies in the present folder takes the place of a module there.
+    Modules in the present folder are not imported.
     """
     places = [str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(place for place in places if place)}
     counts = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     environment |= dict.fromkeys(counts, str(threads))
     command, pipe = [sys.executable, "-P", "-m", module], subprocess.PIPE
-    # A group of its own: an interrupt is for this process, which ends the child.
+    # A process group of its own: an interrupt reaches this process, which ends the child.
     return subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, process_group=0)
 
 
 def send(pipe: BinaryIO | Any, what: Any) -> None:
-    """Pickle something straight into a pipe: large arrays are not held twice."""
+    """Pickle an object into a pipe."""
     pickle.dump(what, pipe, protocol=pickle.HIGHEST_PROTOCOL)
     pipe.flush()
 
 
 def how_it_ended(process: subprocess.Popen[bytes]) -> str:
-    """In what way a process is gone that should be there."""
+    """Describe how a process ended."""
     code = process.wait()
     return f" by signal {-code}" if code < 0 else f" (exit code {code})"
 
 
 def gone(how: str) -> SolveError:
-    """What is raised where a process is gone."""
+    """Return the error for a process that ended unexpectedly."""
     return SolveError(
         f"a helper process was ended{how}; memory may have run out: with NUMBA_NUM_THREADS=1 set, one process does "
         "it all"
@@ -54,7 +53,7 @@ def gone(how: str) -> SolveError:
 
 
 class Outbox:
-    """A child's standard output, for messages alone: what else is printed goes to standard error."""
+    """A child's standard output, for messages only; other output goes to standard error."""
 
     def __init__(self) -> None:
         self.file = os.fdopen(os.dup(1), "wb")
@@ -62,7 +61,7 @@ class Outbox:
         self._lock = threading.Lock()
 
     def put(self, what: Any) -> None:
-        """Give a message, whole; where nobody takes it any more, end at once."""
+        """Send a message; end the process where nobody reads."""
         try:
             with self._lock:
                 send(self.file, what)
@@ -74,7 +73,7 @@ class Outbox:
 
 
 def listen() -> queue.Queue[Any]:
-    """What a child is told on its standard input; when there is nobody left to tell more, it ends at once."""
+    """Return a queue of the messages on standard input; the process ends when its parent does."""
     words: queue.Queue[Any] = queue.Queue()
     threading.Thread(target=_listen, args=(words,), daemon=True).start()
     return words

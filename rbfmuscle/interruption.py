@@ -1,6 +1,6 @@
-"""What an interrupt does, from the first import on: end at once, or first finish what is being kept.
+"""Handling of SIGINT and SIGTERM: end at once, or first finish what is being written.
 
-Imports nothing but the standard library's lightest parts: it must stand before anything else is loaded.
+Imports only light parts of the standard library, because it is installed before anything else is loaded.
 """
 
 import atexit
@@ -18,7 +18,7 @@ _SHOW_CURSOR = b"\x1b[?25h"  # a progress bar may have hidden it
 
 
 class _State:
-    """Of this process: there is one, as there is one set of signal handlers."""
+    """State of this process."""
 
     asked = False
     has_kept: Callable[[], bool] | None = None
@@ -49,7 +49,7 @@ def install(*, as_json: bool = False, watch: bool = False) -> None:
 
 @contextlib.contextmanager
 def keeping(has_kept: Callable[[], bool]) -> Iterator[None]:
-    """While inside, and once ``has_kept()``, an interrupt is a KeyboardInterrupt, and what is kept is finished.
+    """While inside, and once ``has_kept()``, an interrupt raises KeyboardInterrupt, so that output can be finished.
 
     A second interrupt ends the process at once. Compiled code and callbacks may lose the exception: :func:`check`
     raises it again, and so does leaving.
@@ -64,13 +64,13 @@ def keeping(has_kept: Callable[[], bool]) -> Iterator[None]:
 
 
 def check() -> None:
-    """Raise KeyboardInterrupt if one was asked for and got lost."""
+    """Raise KeyboardInterrupt if an earlier one was lost."""
     if _State.asked:
         raise KeyboardInterrupt
 
 
 def _ignore():
-    """Everything is done and only Python's own end is left, in which signals would have no handler: the code stands."""
+    """Ignore signals while Python exits, so that the exit code stays."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
 
@@ -96,7 +96,7 @@ def _listen(reader):
 
 
 def _end():
-    """Leave without unwinding: whatever is under way would go on until it is done."""
+    """Exit without unwinding."""
     if not _ENDING.acquire(blocking=False):  # the other of the handler and the listener is at it
         signal.pause()
     with contextlib.suppress(OSError):

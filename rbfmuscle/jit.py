@@ -1,7 +1,7 @@
-"""How a loop is declared, and where its compiled code is kept.
+"""Declaration of compiled loops, and the cache of their code.
 
 Each module that declares loops has a folder named by a digest of its source and of the sources that it imports.
-Numba's own cache misses an edit of what a loop of another file inlines, and in it processes may take each other's code.
+Numba's own cache misses edits of functions that are inlined from other files, and is unsafe for concurrent processes.
 """
 
 import contextlib
@@ -29,8 +29,8 @@ _IMPORT = re.compile(r"^(?:from\s+([\w.]+)\s+)?import\s+(\([^)]*\)|.*)", re.MULT
 def compiled(function: Callable | None = None, **options: object) -> Callable:
     """Declare a loop: compiled or loaded at its first call; the function itself where ``NUMBA_DISABLE_JIT`` is set.
 
-    It takes arrays, numbers and NamedTuples of these; options are those of ``numba.njit``. ``nogil=False`` suits what
-    takes microseconds and is called often: with muscles on two threads, handing the interpreter over may take longer.
+    It takes arrays, numbers and NamedTuples of these; options are those of ``numba.njit``. ``nogil=False`` suits short
+    loops that are called often, because releasing the interpreter's lock takes longer than they do.
     """
     if function is None:
         return lambda inner: compiled(inner, **options)
@@ -141,7 +141,7 @@ def _note_use(folder: Path) -> None:
 
 @contextlib.contextmanager
 def _no_collection():
-    """None of numba's many objects is garbage; looking for it takes a seventh of the time of compiling."""
+    """Switch the garbage collector off, which takes a seventh of the time of compiling."""
     was_on = gc.isenabled()
     gc.disable()
     try:

@@ -1,4 +1,4 @@
-"""Model name -> model, loaded on demand: the only file that names both models."""
+"""Model names and their classes, loaded on demand; the only module that knows both models."""
 
 import importlib
 from collections.abc import Collection, Mapping
@@ -12,7 +12,7 @@ from rbfmuscle.validation import SceneError, UsageError, did_you_mean, shown
 
 
 class _Home(NamedTuple):
-    """Where a model lives: its package, the names in it, and the options that its own name stands for."""
+    """A model's package, the names in it, and the options that its name implies."""
 
     package: str
     muscle: str

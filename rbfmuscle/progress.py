@@ -1,4 +1,4 @@
-"""What a command does, on stderr: a bar on a terminal, else a line per stage and now and then one for the count."""
+"""Progress of a command on stderr: a bar on a terminal, else a line per stage and some for the count."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FIRST, EVERY = 2.0, 10.0  # Time before the first line for a count, and then bet
 
 
 class Progress:
-    """Context manager; call it with (done, total). What is inside another is shown under the title of that one.
+    """Context manager; call it with (done, total). A nested one is shown under the title of the outer one.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class Progress:
         return self
 
     def __call__(self, done: int, total: int) -> None:
-        """Show how much is done."""
+        """Show the count."""
         shown = Progress.shown or self
         if shown.bar is not None or done == total or time.monotonic() - shown.last > EVERY:
             shown.show(f"{self.what} {done} of {total}", done, total)
@@ -67,7 +67,7 @@ class Progress:
 
 @contextlib.contextmanager
 def stage(text: str) -> Iterator[None]:
-    """Show what goes on, where something is shown."""
+    """Show a stage where progress is shown."""
     if Progress.shown is not None:
         Progress.shown.show(text)
     yield

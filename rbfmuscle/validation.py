@@ -1,6 +1,6 @@
 """Checks at the public edges, and the errors that the command line turns into exit codes.
 
-The one module that every room may import; it imports nothing of ours.
+Every package may import this module; it imports nothing of ours.
 """
 
 import difflib
@@ -66,7 +66,7 @@ class NotFiniteError(ValueError):
 
 
 class SceneWarning(UserWarning):
-    """A scene asks for something that cannot be had as it stands, as bones driven into each other."""
+    """A scene asks for something impossible, for instance bones moved into each other."""
 
 
 class NumericalWarning(UserWarning):

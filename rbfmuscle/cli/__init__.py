@@ -1,4 +1,4 @@
-"""Where the command line begins: light, so that an interrupt is heeded before anything heavy is loaded."""
+"""Entry point of the command line; light, so that interrupts work before anything heavy is loaded."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""The commands as one: reads the arguments, runs a command, turns errors into one line and an exit code.
+"""The command line: reads the arguments, runs a command, turns errors into one line and an exit code.
 
 0 done; 2 wrong usage; 3 bad scene; 4 unusable mesh; 5 solve failed, frames so far kept; 6 a ``--fail-on``
 limit exceeded; 7 an optional part missing; 130 interrupted, frames so far kept.
@@ -52,7 +52,7 @@ app.command(paths)
 
 
 def run_command(arguments: list[str]) -> int:
-    """Run one command; the process's exit code, all errors told in one line."""
+    """Run one command and return the exit code; errors are one line."""
     sys.excepthook = _report_bug
     warnings.showwarning = _show_warning
     logging.lastResort = _LogLines(logging.WARNING)
@@ -95,13 +95,13 @@ def _run(arguments, as_json):
 
 
 def _describe_os_error(error):
-    """What the system refused; that of a stream without a name is standard output."""
+    """Describe an error of the operating system; a stream without a name is standard output."""
     what = f"{error.filename}" if error.filename else "standard output or a file of the command"
     return f"cannot read or write {what}: {error.strerror or one_line(error)}; free or choose another place"
 
 
 def _drop_output():
-    """Nothing more can be written: what is still held back goes nowhere, so that leaving raises no second error."""
+    """Discard buffered output, so that exiting raises no second error."""
     with contextlib.suppress(OSError):  # of a caller in Python, whose stream has no file
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
@@ -114,7 +114,7 @@ def _fail(message, code, as_json, *, hint=""):
 
 
 def one_line(error: object) -> str:
-    """Return a message without line breaks, cut where it is longer than any that is meant."""
+    """Return a message as one line, shortened if it is very long."""
     text = " ".join(str(error).split())
     return text if len(text) <= LONGEST_LINE else f"{text[: LONGEST_LINE - 60]} ... {text[-50:]}"
 
@@ -128,14 +128,14 @@ def _show_warning(message, category, filename, lineno, file=None, line=None):
 
 
 class _LogLines(logging.Handler):
-    """What the library logs, where nobody has set up logging, as the warnings are told."""
+    """Prints log records as warnings where logging is not configured."""
 
     def emit(self, record):
         print(f"rbfmuscle: warning: {one_line(record.getMessage())}", file=sys.stderr)
 
 
 def _report_bug(kind, error, trace):
-    """What is left is a bug: say where, without a traceback unless one is asked for."""
+    """Report an unexpected error with its place; the traceback only where it is asked for."""
     if os.environ.get("RBFMUSCLE_TRACEBACK"):
         sys.__excepthook__(kind, error, trace)
         return

@@ -60,7 +60,7 @@ def check(
 
 
 def _draw(scene, path):
-    """Draw a scene beside its file; where that is and what is marked."""
+    """Draw a scene beside its file; return the file and what is marked."""
     from rbfmuscle.report.scene_picture import draw_scene
 
     file = path.with_suffix(".png")
@@ -87,14 +87,14 @@ def _findings(path):
     except SceneError as error:
         findings.append(Finding("error", loaded.name, str(error)))
     if not any(finding.level == "error" for finding in findings):
-        with stage("looking ahead along the motion"):
+        with stage("checking the motion"):
             findings += motion_findings(loaded, exact)
     order = {"error": 0, "warning": 1, "note": 2}
     return loaded, sorted(findings, key=lambda finding: order[finding.level])
 
 
 def _field_notes(scene):
-    """What the distance fields of the bones have to say: open meshes, meshes that intersect themselves."""
+    """Notes of the bones' distance fields: open meshes, meshes that intersect themselves."""
     from rbfmuscle.bones.sdf import BoneSDF
     from rbfmuscle.scene.check import Finding
 

@@ -1,4 +1,4 @@
-"""``rbfmuscle plan``: what a scene will build and do, before it is run."""
+"""``rbfmuscle plan``: what a run of a scene would build and solve."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``rbfmuscle export`` and ``rbfmuscle render``: what a run left, in other forms."""
+"""``rbfmuscle export`` and ``rbfmuscle render``: other formats and pictures of a run."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Arithmetic on arrays that every room may use: triangles, nearest points, weights, frames. A leaf."""
+"""Functions of arrays for every package: triangles, nearest points, weights, rotations."""

@@ -1,1 +1,1 @@
-"""The muscles of a run, dealt out to processes where they are many."""
+"""The muscles of a run, distributed to processes where there are many."""

@@ -1,7 +1,7 @@
-"""A run's muscles on several processes: a share of them in each, put together frame by frame.
+"""A run's muscles on several processes, merged frame by frame.
 
-Two threads of one interpreter hand its lock to and fro and get 1.2 to 1.35 times as much done as one, two processes 1.7
-times (docs/speed.md).
+Two threads of one interpreter share its lock and do 1.2 to 1.35 times the work of one, two processes 1.7 times
+(docs/speed.md).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ AHEAD = 1
 
 
 class WorkerPool:
-    """Stands in for a `MuscleGroup` of all muscles: same frames, to the last digit.
+    """Several `MuscleGroup` in processes, with the frames of one of all muscles, to the last digit.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class WorkerPool:
             self._next(helper)
 
     def frames(self) -> Iterator[Solved]:
-        """As of a `MuscleGroup`."""
+        """See `MuscleGroup.frames`."""
         for helper in self._helpers:
             helper.begin()
         with stage("solving the first frame"):
@@ -77,12 +77,12 @@ class WorkerPool:
             parts = [self._next(helper) for helper in self._helpers]
 
     def close(self) -> None:
-        """End the helpers, whatever they are at."""
+        """End the workers."""
         for helper in self._helpers:
             helper.close()
 
     def _next(self, helper):
-        """What a helper has to give; what it has to say on the way is said here."""
+        """The next frame of a worker; its warnings and log records are repeated here."""
         while True:
             kind, what = helper.take()
             if kind == "done":
@@ -101,7 +101,7 @@ class WorkerPool:
 
 
 class _Worker:
-    """One process, seen from here: its messages are taken by a thread, so that it need not wait for ours."""
+    """One process; a thread reads its messages."""
 
     def __init__(self, job: Any, threads: int) -> None:
         self.process = start_child("rbfmuscle.sharing.helper", threads)
@@ -114,7 +114,7 @@ class _Worker:
         self._thread.start()
 
     def begin(self) -> None:
-        """Let it go through the motion."""
+        """Start the motion."""
         with contextlib.suppress(OSError):  # it is gone: the inbox says so
             send(self.process.stdin, "begin")
 
@@ -152,7 +152,7 @@ class _Worker:
 
 
 def _dealt(names, hands):
-    """Muscles in turn: neighbours in a scene's list are often alike in size."""
+    """Distribute muscles in turn: neighbours in a scene's list are often alike in size."""
     return [names[k::hands] for k in range(hands)]
 
 

@@ -19,7 +19,7 @@ from rbfmuscle.validation import RBFMuscleError
 
 
 class _Outbox(Outbox):
-    """Messages of a kind, each with the helper's clock."""
+    """Messages of a kind, each with the worker's times."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -31,7 +31,7 @@ class _Outbox(Outbox):
 
 
 class _Forward(logging.Handler):
-    """What the library logs is said where the run was asked for."""
+    """Sends log records to the process that started the run."""
 
     def __init__(self, outbox: _Outbox) -> None:
         super().__init__()
@@ -43,7 +43,7 @@ class _Forward(logging.Handler):
 
 
 def main() -> None:
-    """Build, wait for the word, go through the motion."""
+    """Build the models, wait for the start, solve the motion."""
     outbox, words = _Outbox(), listen()
     scene, names = words.get()
     warnings.simplefilter("always")
@@ -55,7 +55,7 @@ def main() -> None:
         outbox.say("failed", error)
     except Exception:  # noqa: BLE001 - whatever it is, it is told where the run was asked for
         outbox.say("failed", RuntimeError(traceback.format_exc()))
-    # Not by Python's own end, which would wait for the thread that listens.
+    # Python's normal exit would wait for the listening thread.
     os._exit(0)
 
 

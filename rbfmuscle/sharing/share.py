@@ -1,4 +1,4 @@
-"""Muscles of a scene that one process builds, brings through the motion and measures."""
+"""Muscles of a scene that one process builds, solves and measures."""
 
 from __future__ import annotations
 
