@@ -20,7 +20,7 @@ from evidence import write_evidence
 import rbfmuscle as rm
 
 ROOT = Path(__file__).resolve().parent.parent
-MODELS = ("rbf", "pbd", "pbd-converged")
+MODELS = ("rbf", "pbd")  # pbd-converged takes half an hour
 STEPS = (2.0, 5.0, 10.0, 30.0)
 WORST = (
     "volume_error", "penetration_max", "bone_penetration_max", "solver_penetration_max", "rest_error_rms",

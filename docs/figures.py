@@ -55,7 +55,7 @@ def headline_table(facts):
         ("surface inside a bone (mm)", lambda r: bound(r["penetration_max"], 2)),
         ("bone vertices inside a muscle (mm)", lambda r: bound(r["bone_penetration_max"], 2)),
         ("distance from the scan at rest, RMS (mm)", lambda r: bound(r["rest_error_rms"], 2)),
-        ("flicker (mm)", lambda r: bound(r["flicker"], 2)),
+        ("flicker (mm); a mesh has none", lambda r: "–" if r["flicker"] is None else bound(r["flicker"], 2)),
         ("centreline over shortest path", lambda r: f"{r['slack']:.2f}"),
         ("triangles that cross others", lambda r: f"{r['self_crossings']:.0f}"),
         ("one pose in steps of 2 to 30 degrees, RMS (mm)", lambda r: bound(r["steps_apart"], 2)),
