@@ -52,3 +52,15 @@ def test_meshes_become_a_report_by_the_lines_of_the_readme(tmp_path, monkeypatch
         assert code == 0, err
     assert "verdict: " in out
     assert "gluteus_maximus" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+def test_python_of_the_readme_runs_as_it_stands(tmp_path):
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True,
+        text=True, timeout=600, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.split()[1] == "True"
+    assert (tmp_path / "out" / "report.html").exists()
