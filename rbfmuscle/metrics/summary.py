@@ -256,7 +256,7 @@ def _describe_excess(row, table):
     value = f"{shown_number(worst)}{'' if unit == '1' else f' {unit}'}"
     place = "the bones" if muscle == ALL else muscle
     title = LIMITS[quantity].title if quantity in LIMITS else quantity
-    return f"{place}, {title} {value} at frame {frame} (limit {limit:g})"
+    return f"{place}, {title} {value} at frame {frame} (limit {limit:.3g})"
 
 
 def shown_number(value: float) -> str:

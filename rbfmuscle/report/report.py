@@ -190,7 +190,7 @@ def _light(saved: SavedRun, title: str, quantities: Sequence[str]) -> Light | No
     sign = "≥" if name in LEAST else "≤"
     state = limit_state(worst, limit, least=name in LEAST, count=name in COUNTS)
     note = f"{name}: {muscle}, frame {facts.get('worst_frame', '–')}".replace("_", " ")
-    shown = f"{sign} {limit:g}{'' if unit == '1' else ' ' + unit}"
+    shown = f"{sign} {limit:.3g}{'' if unit == '1' else ' ' + unit}"
     return Light(
         title, [Cell(number(worst, unit), worst, state)], shown, note if worst else name.replace("_", " ")
     )
