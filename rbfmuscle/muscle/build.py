@@ -24,7 +24,7 @@ def build_solid(
     ----------
     muscle : Muscle
     scene : Scene
-    rest : Rest
+    rest : RestState
     options : RBFOptions
     """
     frame, faces = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)), np.asarray(muscle.mesh.faces)

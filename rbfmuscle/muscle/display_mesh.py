@@ -45,7 +45,7 @@ class DisplayMesh:
     Parameters
     ----------
     muscle : Muscle
-    rest : Rest
+    rest : RestState
     options : RBFOptions
 
     Attributes

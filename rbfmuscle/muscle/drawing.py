@@ -75,7 +75,7 @@ class SurfaceBuilder:
     ----------
     muscle : Muscle
     scene : Scene
-    rest : Rest
+    rest : RestState
     options : RBFOptions
 
     Attributes
@@ -99,7 +99,7 @@ class SurfaceBuilder:
         ----------
         fit : callable
             Gives the field.
-        now : Moment
+        now : Configuration
         contacts : BoneContacts
             What cuts the surface.
 
@@ -252,7 +252,7 @@ class RBFDrawing:
     Parameters
     ----------
     drawer : SurfaceBuilder
-    now : Moment
+    now : Configuration
     contacts : BoneContacts
         As they stand.
     """

@@ -31,7 +31,7 @@ class RBFMuscle:
     ----------
     points : (K, 3) ndarray
         The centres now.
-    rest : Rest
+    rest : RestState
     solid : EmbeddedSolid
         The elastic solid that carries the free centres.
     law : FibrePull or None

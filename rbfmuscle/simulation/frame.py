@@ -78,7 +78,7 @@ class Frame:
         Time for all muscles together [s], since the frame before.
     activations : dict of str to float
         Of the muscles that contract.
-    work : dict of str to Work
+    work : dict of str to MuscleStatus
         Whether each muscle was solved, moved rigidly or skipped, and why.
     neighbours : dict of (str, str) to (float, float)
         For each pair that slides: overlap, and RMS gap opened where they touched at rest.

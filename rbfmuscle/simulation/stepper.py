@@ -97,9 +97,9 @@ class MuscleStepper:
 
     Attributes
     ----------
-    carrier : Carrier or None
+    carrier : RigidTransport or None
         Moves the muscle rigidly where it need not be solved; set by the frame loop.
-    work : Work
+    work : MuscleStatus
         How the muscle came to the last frame.
     """
 

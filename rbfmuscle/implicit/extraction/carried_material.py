@@ -31,7 +31,7 @@ class CarriedMaterial:
     vertices : (n, 3) ndarray
         Where the material carries them [scene unit].
     field : Field or None
-    cut : Cut or None
+    cut : ClipDistance or None
     level : float
 
     Attributes
