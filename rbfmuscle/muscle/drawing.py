@@ -12,7 +12,7 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.fields import ClipDistance, LevelField
 from rbfmuscle.implicit.extraction.material import FittedMesh, carry_material, project_to_level_set
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
-from rbfmuscle.implicit.extraction.obstacles import Obstacles
+from rbfmuscle.implicit.extraction.obstacles import Obstacles, PointGrid
 from rbfmuscle.implicit.extraction.surface import ExtractedSurface, extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.muscle.display_mesh import DisplayMesh
@@ -88,7 +88,7 @@ class SurfaceBuilder:
 
     def __init__(self, muscle: Muscle, scene: Scene, rest: RestState, options: RBFOptions) -> None:
         self.name, self.rest, self.options = muscle.name, rest, options
-        self._bones = [np.asarray(bone.mesh.vertices, dtype=float) for bone in scene.bones]
+        self._bones = [PointGrid(np.asarray(bone.mesh.vertices, dtype=float)) for bone in scene.bones]
         self.level = 0.0
         self.shown = DisplayMesh(muscle, rest, options) if options.surface == "material" else None
 
@@ -220,7 +220,7 @@ class SurfaceBuilder:
         found = [(self._bones[b], contacts.poses[contacts.names[b]]) for b in contacts.reached]
         points = contacts.neighbour_points() if neighbours else np.zeros((0, 3))
         # A neighbour thinner than the surface's edges would stick through its faces: their corners alone are cut.
-        return [*found, (points, np.eye(4))] if len(points) else found
+        return [*found, (PointGrid(points), np.eye(4))] if len(points) else found
 
     def _cause(self, now: Configuration, contacts: BoneContacts) -> tuple[str, str]:
         """Bone and cause of a surface that cannot be fitted: a held end in a bone, stretch, or sheets that met."""

@@ -12,6 +12,7 @@ import trimesh
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction import surface as extraction
 from rbfmuscle.implicit.extraction.marching import Band, Grid
+from rbfmuscle.implicit.extraction.obstacles import PointGrid
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.sampling import sample_surface
 
@@ -191,7 +192,7 @@ def test_chords_do_not_cut_across_a_convex_bone():
     ball = trimesh.creation.icosphere(4, radius=15.0).apply_translation(CENTRE + [50.0, 0, 0])
     bone = sphere(15.0, CENTRE + [50.0, 0, 0])
     depths = []
-    for obstacles in (None, [(np.array(ball.vertices), np.eye(4))]):
+    for obstacles in (None, [(PointGrid(np.array(ball.vertices)), np.eye(4))]):
         surface = extract_surface(
             sphere(), points=on_sphere(), cut=bone, obstacles=obstacles, volume=5e5, resolution=32
         )

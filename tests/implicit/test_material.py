@@ -8,6 +8,7 @@ from rbfmuscle.geometry.crossing import FaceTree, crossing_faces
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction.material import _Fitting, carry_material, project_to_level_set
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh, _edges_loop
+from rbfmuscle.implicit.extraction.obstacles import PointGrid
 from rbfmuscle.implicit.extraction.projection import Projector
 
 BALL = trimesh.creation.icosphere(3)
@@ -106,7 +107,7 @@ def test_bone_vertices_end_up_outside():
     spike = (middle - 0.1 * edge * BALL.face_normals[0])[None]
     found = project_to_level_set(
         mesh_of(), np.asarray(BALL.vertices), Sphere(), volume=0.97 * VOLUME,
-        obstacles=[(spike, np.eye(4))],
+        obstacles=[(PointGrid(spike), np.eye(4))],
     )  # fmt: skip
     depth = trimesh.proximity.signed_distance(trimesh.Trimesh(found.vertices, found.faces), spike)
     # A hundredth of an edge is the tolerance; 0.12 without being pushed.
@@ -243,7 +244,7 @@ def test_what_is_known_of_the_cut_changes_nothing(shift):
     asked.steepest = np.inf
     carried = np.asarray(BALL.vertices) + [shift, 0.0, 0.0]
     spike = np.array([[0.6 + 1e-3, 0.0, 0.0], [0.62, 0.02, 0.01]])
-    bones = [(spike, np.eye(4))]
+    bones = [(PointGrid(spike), np.eye(4))]
     found = [
         project_to_level_set(mesh_of(), carried, Sphere(), volume=VOLUME, cut=each, obstacles=bones)
         for each in (cut, asked)

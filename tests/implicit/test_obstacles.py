@@ -4,19 +4,35 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.implicit.extraction.obstacles import NEAR, points_near_faces
+from rbfmuscle.implicit.extraction.obstacles import PointGrid, near_triangles
 
 
-def test_points_near_faces_are_those_found_one_by_one():
+def test_points_near_triangles_are_those_found_one_by_one():
     rng = np.random.default_rng(0)
     ball = trimesh.creation.icosphere(2, radius=5.0)
+    vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)[ball.triangles_center[:, 0] > 0.0]
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec([-0.5, 0.4, 0.1]).as_matrix(), [0.3, 0.2, -0.1]
     points = rng.uniform(-8.0, 8.0, (700, 3))
-    faces = np.asarray(ball.faces)[ball.triangles_center[:, 0] > 0.0]
-    found = points_near_faces([(points, pose), (points[:0], pose)], np.asarray(ball.vertices), faces, 0.8)
+    found = near_triangles(
+        [(PointGrid(points), pose), (PointGrid(points[:0]), pose)], vertices, faces, margin=0.4
+    )
+    corners = ((vertices - pose[:3, 3]) @ pose[:3, :3])[faces]
+    low, high = corners.min(axis=1) - 0.4, corners.max(axis=1) + 0.4
+    inside = ((points[:, None] >= low) & (points[:, None] <= high)).all(axis=2)
+    rows = np.flatnonzero(inside.any(axis=1))
+    assert 30 < len(rows) < 400
     world = points @ pose[:3, :3].T + pose[:3, 3]
-    away = np.linalg.norm(world[:, None] - ball.vertices[faces].mean(axis=1), axis=2).min(axis=1)
-    expected = world[away < NEAR * 0.8]
-    assert 30 < len(expected) < 400
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    order = [int(np.argmin(np.linalg.norm(world[rows] - point, axis=1))) for point in found.points]
+    np.testing.assert_allclose(found.points, world[rows][order], atol=1e-12)
+    for p, row in enumerate(rows[order]):
+        near = found.faces[found.first[p] : found.first[p + 1]]
+        np.testing.assert_array_equal(near, np.flatnonzero(inside[row]))
+
+
+def test_points_of_a_plane_of_a_line_and_alone_have_a_grid():
+    line = np.array([[float(k), 0.0, 0.0] for k in range(9)])
+    for points in (line, line[:1], np.concatenate([line, line + [0.0, 1.0, 0.0]])):
+        grid = PointGrid(points)
+        assert grid.start[-1] == len(points)
+        assert grid.shape.prod() <= 100 * len(points)

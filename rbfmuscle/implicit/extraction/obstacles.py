@@ -2,54 +2,121 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.jit import compiled
 
-# Points with their pose (4, 4) to the world.
-Obstacles = list[tuple[Floats, Floats]]
-
-# A chord is never farther from its surface than this share of a cell.
-CHORD = 0.35
-# The middle of a triangle right above or below a point is less than so many cells away; so many of them are looked at.
-NEAR, TRIANGLES = 1.3, 16
+# A chord is never farther from its surface than this share of a cell, and triangles are looked for this far around.
+CHORD, MARGIN = 0.35, 0.5
+# Room for pairs of a point and a triangle near it, at first, for each triangle.
+PAIRS = 4
 
 
-def points_near_faces(obstacles: Obstacles, vertices: Floats, faces: Integers, spacing: float) -> Floats:
-    """Obstacle points near triangles.
+class PointGrid:
+    """Points sorted by the cells of a grid, as many cells as points.
 
     Parameters
     ----------
-    obstacles : list of pairs of (k, 3) and (4, 4) ndarrays
+    points : (k, 3) ndarray
+
+    Attributes
+    ----------
+    points : (k, 3) ndarray
+        Cell by cell.
+    start : (c + 1,) ndarray of int
+        First point of each cell.
+    low, edge, shape : (3,) ndarray, float, (3,) ndarray of int
+        Corner, edge length and number of cells.
+    """
+
+    def __init__(self, points: Floats) -> None:
+        self.low = points.min(axis=0) if len(points) else np.zeros(3)
+        extent = points.max(axis=0) - self.low if len(points) else np.zeros(3)
+        size = float(extent.max()) or 1.0
+        sides = np.maximum(extent / size, 1e-2)
+        self.edge = size * float(sides.prod() / max(len(points), 1)) ** (1.0 / 3.0)
+        self.shape = (extent / self.edge).astype(np.int64) + 1
+        cell = ((points - self.low) / self.edge).astype(np.int64) @ (
+            self.shape[1] * self.shape[2],
+            self.shape[2],
+            1,
+        )
+        order = np.argsort(cell, kind="stable")
+        self.points = np.ascontiguousarray(points[order])
+        self.start = np.searchsorted(cell[order], np.arange(int(self.shape.prod()) + 1))
+
+
+# Points with their pose (4, 4) to the world.
+Obstacles = list[tuple[PointGrid, Floats]]
+
+
+class NearTriangles(NamedTuple):
+    """Obstacle points that triangles are near, and which.
+
+    Attributes
+    ----------
+    points : (p, 3) ndarray
+        In the world.
+    first : (p + 1,) ndarray of int
+        Where the triangles of each point begin in ``faces``.
+    faces : (k,) ndarray of int
+    """
+
+    points: Floats
+    first: Integers
+    faces: Integers
+
+    def only(self, which: Booleans) -> NearTriangles:
+        """Those of some points, by a mask (p,)."""
+        count = np.diff(self.first)
+        first = np.concatenate([[0], np.cumsum(count[which])])
+        return NearTriangles(self.points[which], first, self.faces[np.repeat(which, count)])
+
+
+def near_triangles(obstacles: Obstacles, vertices: Floats, faces: Integers, margin: float) -> NearTriangles:
+    """Obstacle points in the boxes around triangles.
+
+    Parameters
+    ----------
+    obstacles : list of pairs of PointGrid and (4, 4) ndarray
         Points, and the pose that takes them to the world.
     vertices : (n, 3) ndarray
     faces : (m, 3) ndarray of int
-    spacing : float
-        No corner is farther than this from its triangle's middle, nearly [scene unit].
-
-    Returns
-    -------
-    (p, 3) ndarray
-        In the world, in the order given.
+    margin : float
+        By which the boxes are larger than the triangles, in the obstacle's axes [scene unit].
     """
-    middle = vertices[faces].mean(axis=1)
-    reach = NEAR * spacing
-    found = [np.zeros((0, 3))]
-    for points, pose in obstacles:
-        local = (middle - pose[:3, 3]) @ pose[:3, :3]
-        rows = np.arange(len(points))
-        for axis, along in enumerate(local.T):
-            x = points[rows, axis]
-            rows = rows[(x >= along.min() - reach) & (x <= along.max() + reach)]
-        found.append(points[rows] @ pose[:3, :3].T + pose[:3, 3])
-    near = np.concatenate(found)
-    return near[np.isfinite(cKDTree(middle).query(near, distance_upper_bound=reach)[0])]
+    points, counts, near = [np.zeros((0, 3))], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    for grid, pose in obstacles:
+        local = np.ascontiguousarray((vertices - pose[:3, 3]) @ pose[:3, :3])
+        count, found = _in_boxes(local, faces, margin, grid)
+        rows = np.flatnonzero(count)
+        points.append(grid.points[rows] @ pose[:3, :3].T + pose[:3, 3])
+        counts.append(count[rows])
+        near.append(found)
+    first = np.concatenate([[0], np.cumsum(np.concatenate(counts))])
+    return NearTriangles(np.concatenate(points), first, np.concatenate(near))
+
+
+def _in_boxes(vertices: Floats, faces: Integers, margin: float, grid: PointGrid) -> tuple[Integers, Integers]:
+    """Number of boxes (k,) that hold each point of a grid, and their triangles, point by point."""
+    cells = grid.points, grid.start, grid.low, grid.edge, grid.shape
+    room = PAIRS * len(faces)
+    while True:
+        count, pairs = np.zeros(len(grid.points), dtype=np.int64), np.empty((room, 2), dtype=np.int64)
+        met = _boxes_loop(vertices, faces, margin, cells, count, pairs)
+        if met <= room:
+            break
+        room = met
+    found, place = np.empty(met, dtype=np.int64), np.cumsum(count) - count
+    _sort_loop(pairs[:met], place, found)
+    return count, found
 
 
 def push_off_points(
-    vertices: Floats, faces: Integers, points: Floats, spacing: float, tolerance: float, rounds: int = 4
+    vertices: Floats, faces: Integers, near: NearTriangles, spacing: float, tolerance: float, rounds: int = 4
 ) -> Booleans:
     """Move the vertices of triangles that obstacle points have come through, into the surface.
 
@@ -63,10 +130,10 @@ def push_off_points(
         Changed in place [scene unit].
     faces : (m, 3) ndarray
         Outward.
-    points : (k, 3) ndarray
+    near : NearTriangles
         Points that must stay outside.
     spacing : float
-        As for `points_near_faces`.
+        Length of the triangles' edges [scene unit].
     tolerance : float
         [scene unit]
 
@@ -76,26 +143,62 @@ def push_off_points(
         Vertices that were moved.
     """
     moved = np.zeros(len(vertices), dtype=np.bool_)
-    if len(points) == 0:
-        return moved
-    tree = cKDTree(vertices[faces].mean(axis=1))
-    near = tree.query(points, k=np.arange(1, TRIANGLES + 1), distance_upper_bound=NEAR * spacing)[1]
     for _ in range(rounds):
-        if not _push_loop(vertices, faces, points, near, spacing, tolerance, moved):
+        if not _push_loop(vertices, faces, near, spacing, tolerance, moved):
             break
     return moved
 
 
 @compiled(error_model="numpy")
-def _push_loop(vertices, faces, points, near, spacing, tolerance, moved):
-    """One pass over the points; returns whether any had to be pushed off. ``near`` ends at the number of faces."""
+def _boxes_loop(vertices, faces, margin, cells, count, pairs):
+    """Pairs of a point and a triangle whose box holds it; how many there are, also beyond the room for them."""
+    points, start, low, edge, shape = cells
+    least, most = np.empty(3), np.empty(3)
+    begin, end, met = np.empty(3, np.int64), np.empty(3, np.int64), 0
+    for f in range(len(faces)):
+        empty = False
+        for a in range(3):
+            x, y, z = vertices[faces[f, 0], a], vertices[faces[f, 1], a], vertices[faces[f, 2], a]
+            least[a], most[a] = min(x, y, z) - margin, max(x, y, z) + margin
+            empty |= not (most[a] >= low[a] and least[a] <= low[a] + edge * shape[a])
+        if empty:
+            continue
+        for a in range(3):
+            begin[a] = np.int64(max(np.floor((least[a] - low[a]) / edge), 0.0))
+            end[a] = min(np.int64(np.floor((most[a] - low[a]) / edge)), shape[a] - 1)
+        for i in range(begin[0], end[0] + 1):
+            for j in range(begin[1], end[1] + 1):
+                row = (i * shape[1] + j) * shape[2]
+                for p in range(start[row + begin[2]], start[row + end[2] + 1]):
+                    inside = True
+                    for a in range(3):
+                        inside &= points[p, a] >= least[a] and points[p, a] <= most[a]
+                    if inside:
+                        if met < len(pairs):
+                            pairs[met, 0], pairs[met, 1] = p, f
+                        count[p] += 1
+                        met += 1
+    return met
+
+
+@compiled(error_model="numpy")
+def _sort_loop(pairs, place, found):
+    """Triangles of the pairs by point, whose first is at ``place``."""
+    for k in range(len(pairs)):
+        p = pairs[k, 0]
+        found[place[p]] = pairs[k, 1]
+        place[p] += 1
+
+
+@compiled(error_model="numpy")
+def _push_loop(vertices, faces, near_points, spacing, tolerance, moved):
+    """One pass over the points; returns whether any had to be pushed off."""
+    points, first, near = near_points
     pushed = False
     for p in range(len(points)):
         x, y, z = points[p, 0], points[p, 1], points[p, 2]
         best, least, signed = -1, spacing, -spacing
-        for f in near[p]:
-            if f == len(faces):
-                break
+        for f in near[first[p] : first[p + 1]]:
             depth = _depth_behind(vertices, faces, f, x, y, z)
             if abs(depth) < least:
                 best, least, signed = f, abs(depth), depth

@@ -7,7 +7,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.fields import ClipDistance, Field
 from rbfmuscle.geometry.surfaces import volume_cubic
-from rbfmuscle.implicit.extraction.obstacles import CHORD, Obstacles, points_near_faces, push_off_points
+from rbfmuscle.implicit.extraction.obstacles import CHORD, MARGIN, Obstacles, near_triangles, push_off_points
 from rbfmuscle.jit import compiled
 
 # What is no deeper in the cut than this share of a cell counts as out of it.
@@ -216,18 +216,18 @@ class Projector:
         ----------
         faces : (m, 3) ndarray of int
             Triangles that are looked at.
-        obstacles : list of pairs of (k, 3) and (4, 4) ndarrays
+        obstacles : list of pairs of PointGrid and (4, 4) ndarray
         level : float
             Of the field.
         spacing, tolerance : float
             As for `push_off_points`.
         """
         pushed = np.zeros(len(self.vertices), dtype=np.bool_)
-        points = points_near_faces(obstacles, self.vertices, faces, spacing)
-        if self._field is not None and len(points):
-            points = points[self._field(points) - level < CHORD * spacing]
+        near = near_triangles(obstacles, self.vertices, faces, MARGIN * spacing)
+        if self._field is not None and len(near.points):
+            near = near.only(self._field(near.points) - level < CHORD * spacing)
         for _ in range(2):
-            rows = np.flatnonzero(push_off_points(self.vertices, faces, points, spacing, tolerance))
+            rows = np.flatnonzero(push_off_points(self.vertices, faces, near, spacing, tolerance))
             pushed[rows] = True
             self.hold(rows)
             if self._cut is None or len(rows) == 0:

@@ -77,7 +77,7 @@ def extract_surface(
         Level of the field, or the first guess of it.
     axes : (3, 3) array_like, optional
         Rotation whose rows are the grid's axes. In a frame that moves with the scene the mesh does too.
-    obstacles : list of pairs of (k, 3) and (4, 4) ndarrays, optional
+    obstacles : list of pairs of PointGrid and (4, 4) ndarray, optional
         Vertices of the bones behind ``cut``, each bone in its own coordinates with its pose: triangles whose
         chords cut across a convex bone are moved until no vertex is inside the mesh by more than 1 % of a cell.
 
