@@ -303,23 +303,32 @@ def _finish(count, data, found, square):
 
 
 @compiled(error_model="numpy")
-def query_loop(points, pose, reach, distance, gradient, data):
-    """Distances (n,) and gradients (n, 3), world axes, of points in world coordinates; ``gradient`` may be empty."""
+def query_loop(points, pose, reach, size, distance, gradient, data):
+    """Distances (n,) and gradients (n, 3), world axes, of points in world coordinates; ``gradient`` may be empty.
+
+    ``pose`` takes local units to the world, one of which is ``size`` long; ``reach`` (n,) is in the world's.
+    """
     found = Found(
         np.empty((STAGE, 3)), np.empty(STAGE, np.int32), np.empty(STAGE, np.int32), np.empty((STAGE, 3))
     )
     least = ROUNDING * data.grid[UNIT]
+    near = np.empty(STAGE)
     for start in range(0, len(points), STAGE):
         end = min(start + STAGE, len(points))
-        some, near, d = points[start:end], reach[start:end], distance[start:end]
-        _stage(some, pose, near, data, found, d)
+        some, d = points[start:end], distance[start:end]
+        for n in range(len(some)):
+            # Not below zero, as cells inside the bone have zero for a bound.
+            near[n] = max(reach[start + n], 0.0) / size
+        _stage(some, pose, near[: len(some)], data, found, d)
         _finish(len(some), data, found, d)
         if len(gradient) > 0:
-            _turn(len(some), pose, least, found, d, data.records, gradient[start:end])
+            _turn(len(some), pose, size, least, found, d, data.records, gradient[start:end])
+        for n in range(len(some)):
+            d[n] *= size
 
 
 @compiled(error_model="numpy")
-def _turn(count, pose, least, found, distance, records, gradient):
+def _turn(count, pose, size, least, found, distance, records, gradient):
     """Gradients in world axes; zero where the bone is out of reach."""
     best, offset = found.best, found.offset
     for n in range(count):
@@ -328,4 +337,4 @@ def _turn(count, pose, least, found, distance, records, gradient):
             du, dv, dw = offset[n, 0], offset[n, 1], offset[n, 2]
             gx, gy, gz = _unit_gradient(best[n], distance[n], du, dv, dw, least, records)
         for k in range(3):
-            gradient[n, k] = pose[k, 0] * gx + pose[k, 1] * gy + pose[k, 2] * gz
+            gradient[n, k] = size * (pose[k, 0] * gx + pose[k, 1] * gy + pose[k, 2] * gz)

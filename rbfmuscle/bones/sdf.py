@@ -186,16 +186,13 @@ class BoneSDF:
     def _query(self, points, pose, reach, *, gradient):
         points, pose = check_points(points), _check_pose(pose)
         placed, size = self._frame.placed(pose), self._frame.size
-        # Not below zero, as cells inside the bone have zero for a bound.
-        reach = np.broadcast_to(np.maximum(reach, 0.0) / size, len(points)).copy()
+        reach = np.full(len(points), reach) if np.ndim(reach) == 0 else np.asarray(reach, dtype=np.float64)
         distance, slope = np.empty(len(points)), np.empty((len(points) if gradient else 0, 3))
 
         def work(a, b):
-            query_loop(points[a:b], placed, reach[a:b], distance[a:b], slope[a:b], self.data)
+            query_loop(points[a:b], placed, reach[a:b], size, distance[a:b], slope[a:b], self.data)
 
         in_chunks(len(points), work, least=4096)
-        distance *= size
-        slope *= size
         return distance, slope
 
 
@@ -284,7 +281,7 @@ def _measure(mesh, data, exact, band, region):
         return 0.0
     points = points_near(mesh.vertices, faces, PROBES, band)
     distance = np.empty(len(points))
-    query_loop(points, IDENTITY, np.full(PROBES, np.inf), distance, NO_GRADIENT, data)
+    query_loop(points, IDENTITY, np.full(PROBES, np.inf), 1.0, distance, NO_GRADIENT, data)
     difference = np.abs(distance) - np.abs(exact.signed_distance(points))
     return float(np.sqrt(np.mean(difference**2)))
 

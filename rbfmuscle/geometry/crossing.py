@@ -44,18 +44,22 @@ class FaceTree:
         ----------
         vertices : (n, 3) ndarray
         among : (m,) ndarray of bool, optional
-            Only pairs with one of these triangles.
+            Only pairs with one of these triangles, or with one at a corner whose triangles do not lie side by side.
         """
         vertices = np.ascontiguousarray(vertices, dtype=np.float64)
         faces, count = self._corners, len(self._corners)
-        box, node = np.empty((self.leaves, 6, LEAF)), np.empty((2 * self.leaves, 6))
-        _boxes_loop(vertices, faces, box, self.leaves, node)
-        asked = np.ones(count, dtype=np.bool_) if among is None else among[self.order]
-        wanted = np.zeros(2 * self.leaves, dtype=np.bool_)
-        _wanted_loop(asked, self.leaves, wanted)
         plain = np.full(len(vertices), self.closed, dtype=np.bool_)
         if self.closed:
             _plain_loop(vertices, faces, np.zeros_like(vertices), np.zeros(len(vertices), np.int64), plain)
+        asked = np.ones(count, dtype=np.bool_)
+        if among is not None:
+            asked = among[self.order] | ~plain[faces].all(axis=1)
+            if not asked.any():
+                return np.zeros(count, dtype=np.bool_)
+        box, node = np.empty((self.leaves, 6, LEAF)), np.empty((2 * self.leaves, 6))
+        _boxes_loop(vertices, faces, box, self.leaves, node)
+        wanted = np.zeros(2 * self.leaves, dtype=np.bool_)
+        _wanted_loop(asked, self.leaves, wanted)
         found = np.zeros(count, dtype=np.bool_)
         _cross_loop(vertices, faces, (self._pairs(node, wanted), box), (asked, plain), found)
         marked = np.zeros(count, dtype=np.bool_)

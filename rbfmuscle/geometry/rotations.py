@@ -52,35 +52,49 @@ def turn_quaternion(q, x, y, z):
         q[k] /= size
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", fastmath={"contract"})
 def rotation_loop(m, q):
-    """Turn the unit quaternion q in place towards the rotational part of the 3x3 matrix m (Müller 2016)."""
+    """Turn the unit quaternion q in place to the rotational part of the 3x3 matrix m, by Newton's method.
+
+    The torque that aligns R with m is the skew part of P = m Rᵀ, and tr(P) I - P its change with the angle. Where
+    that is not positive definite, as far from the solution, steps are those of Müller et al. (2016).
+    """
     for _ in range(20):
         w, x, y, z = q[0], q[1], q[2], q[3]
         (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = quaternion_matrix(q)
-        # Sum of cross products of the columns of R and of m: the torque that aligns them.
-        ox = r10 * m[2, 0] - r20 * m[1, 0] + r11 * m[2, 1] - r21 * m[1, 1] + r12 * m[2, 2] - r22 * m[1, 2]
-        oy = r20 * m[0, 0] - r00 * m[2, 0] + r21 * m[0, 1] - r01 * m[2, 1] + r22 * m[0, 2] - r02 * m[2, 2]
-        oz = r00 * m[1, 0] - r10 * m[0, 0] + r01 * m[1, 1] - r11 * m[0, 1] + r02 * m[1, 2] - r12 * m[0, 2]
-        trace = (
-            r00 * m[0, 0] + r10 * m[1, 0] + r20 * m[2, 0] + r01 * m[0, 1] + r11 * m[1, 1] + r21 * m[2, 1]
-        ) + (r02 * m[0, 2] + r12 * m[1, 2] + r22 * m[2, 2])
-        scale = 1.0 / (abs(trace) + 1e-12)
-        ox, oy, oz = ox * scale, oy * scale, oz * scale
-        angle = np.sqrt(ox * ox + oy * oy + oz * oz)
-        if angle < 1e-8:
-            break
-        half = 0.125 * angle * angle
-        if angle < 1e-2:
-            # Series that are exact to rounding: the angles are small but for the first of them.
-            s, c = 0.5 - half * (1.0 - 0.1 * half) / 6.0, 1.0 - half * (1.0 - half / 6.0)
+        p00 = m[0, 0] * r00 + m[0, 1] * r01 + m[0, 2] * r02
+        p01 = m[0, 0] * r10 + m[0, 1] * r11 + m[0, 2] * r12
+        p02 = m[0, 0] * r20 + m[0, 1] * r21 + m[0, 2] * r22
+        p10 = m[1, 0] * r00 + m[1, 1] * r01 + m[1, 2] * r02
+        p11 = m[1, 0] * r10 + m[1, 1] * r11 + m[1, 2] * r12
+        p12 = m[1, 0] * r20 + m[1, 1] * r21 + m[1, 2] * r22
+        p20 = m[2, 0] * r00 + m[2, 1] * r01 + m[2, 2] * r02
+        p21 = m[2, 0] * r10 + m[2, 1] * r11 + m[2, 2] * r12
+        p22 = m[2, 0] * r20 + m[2, 1] * r21 + m[2, 2] * r22
+        ox, oy, oz = p21 - p12, p02 - p20, p10 - p01
+        a, b, c = p11 + p22, p00 + p22, p00 + p11
+        d, e, f = -0.5 * (p01 + p10), -0.5 * (p02 + p20), -0.5 * (p12 + p21)
+        ab, ac, bc = e * f - d * c, d * f - b * e, d * e - a * f
+        det = a * (b * c - f * f) + d * ab + e * ac
+        newton = a > 0.0 and a * b > d * d and det > 1e-9 * (a + b + c) ** 3
+        if newton:
+            t = 1.0 / det
+            vx = t * ((b * c - f * f) * ox + ab * oy + ac * oz)
+            vy = t * (ab * ox + (a * c - e * e) * oy + bc * oz)
+            vz = t * (ac * ox + bc * oy + (a * b - d * d) * oz)
         else:
-            s, c = np.sin(0.5 * angle) / angle, np.cos(0.5 * angle)
-        dx, dy, dz = ox * s, oy * s, oz * s
-        q[0] = c * w - dx * x - dy * y - dz * z
-        q[1] = c * x + dx * w + dy * z - dz * y
-        q[2] = c * y - dx * z + dy * w + dz * x
-        q[3] = c * z + dx * y - dy * x + dz * w
-        norm = 1.0 / np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
-        for k in range(4):
-            q[k] *= norm
+            t = 1.0 / (abs(p00 + p11 + p22) + 1e-12)
+            vx, vy, vz = t * ox, t * oy, t * oz
+        square = vx * vx + vy * vy + vz * vz
+        if square < 1e-16:
+            break
+        if square > 1.0:
+            t = 1.0 / np.sqrt(square)
+            vx, vy, vz = t * vx, t * vy, t * vz
+        vx, vy, vz = 0.5 * vx, 0.5 * vy, 0.5 * vz
+        q0, q1 = w - vx * x - vy * y - vz * z, x + vx * w + vy * z - vz * y
+        q2, q3 = y - vx * z + vy * w + vz * x, z + vx * y - vy * x + vz * w
+        t = 1.0 / np.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
+        q[0], q[1], q[2], q[3] = q0 * t, q1 * t, q2 * t, q3 * t
+        if newton and square < 1e-8:
+            break  # the next step would be of the order of its square

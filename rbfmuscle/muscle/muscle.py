@@ -61,12 +61,20 @@ class RBFMuscle:
         numbers = np.array([names.index(bone) for bone in self.rest.bones])
         self.contact_bone = np.where(self.solid.owner < 0, -1, numbers[self.solid.owner])
         self.points = self.rest.centres.copy()
+        # Contact points, and the centres and nodes that they belong to.
+        self._placed: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def contact_points(self) -> np.ndarray:
         """Centres, then surface samples, (K + S, 3)."""
-        points = self.solid.carry()
-        points[: len(self.points)] = self.points
-        return points
+        if (
+            self._placed is None
+            or self._placed[0] is not self.points
+            or self._placed[1] is not self.solid.shown
+        ):
+            points = self.solid.carry()
+            points[: len(self.points)] = self.points
+            self._placed = self.points, self.solid.shown, points
+        return self._placed[2].copy()
 
     def material_mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """The samples and their triangulation: a material surface of constant topology."""
@@ -118,13 +126,7 @@ class RBFMuscle:
 
     def normals(self) -> np.ndarray:
         """Unit normals at the centres, turned with the local deformation by its cofactor, (K, 3)."""
-        f = self.solid.deformation()
-        n = self.rest.normals
-        helper = np.where(np.abs(n[:, :1]) < 0.6, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-        u = np.cross(n, helper)
-        v = np.cross(n, u)
-        turned = np.cross(np.einsum("kab,kb->ka", f, u), np.einsum("kab,kb->ka", f, v))
-        return turned / np.linalg.norm(turned, axis=1, keepdims=True)
+        return self.solid.turned_normals(self.rest.normals)
 
     def field(self) -> RBFField:
         """The RBF field through the present centres."""

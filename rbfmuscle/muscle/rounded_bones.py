@@ -18,7 +18,8 @@ from rbfmuscle.jit import compiled
 
 SIDE = 4  # cells along a block
 WIDE = SIDE + 3  # nodes along it, those of the splines that reach into it too
-MOST = 1 << 20  # blocks along an axis: beyond any bone
+MOST = 1 << 20  # blocks along an axis in either direction: beyond any bone
+SHIFTS = np.array([42, 21, 0])  # bits of a block's three numbers in its key
 PROBES, STEPS_IN = 300, 12  # paths into a bone that tell how thick it is, and places along each
 LEAST_SLOPE = 0.3  # where the distance's slope is less, inside a thin bone, the exact one answers
 
@@ -46,40 +47,37 @@ class RoundedField:
     ) -> tuple[Floats, Floats]:
         """Distance (n,) and its unit gradient (n, 3), as `BoneSDF.distance_and_gradient` gives them.
 
-        Points beyond ``reach`` keep what that gives.
+        Only where that answers in its place is ``reach`` of use.
         """
-        distance, gradient = self.field.distance_and_gradient(points, pose=pose, reach=reach)
-        near = np.flatnonzero(distance < reach)
-        if len(near) == 0:
-            return distance, gradient
-        axes = self.frame.axes @ pose[:3, :3].T
+        axes = np.ascontiguousarray(self.frame.axes @ pose[:3, :3].T)
         origin = pose[:3, :3] @ self.frame.origin + pose[:3, 3]
-        local = np.ascontiguousarray((points[near] - origin) @ axes.T) / self.edge
-        value, slope = np.empty(len(near)), np.empty((len(near), 3))
-        cell = np.floor(local).astype(np.int64)
-        _spline_loop(local, cell, self._blocks(cell // SIDE), self.nodes, value, slope)
-        steep = np.linalg.norm(slope, axis=1)
-        good = steep > LEAST_SLOPE
-        near, steep = near[good], steep[good]
-        distance[near] = value[good] / steep * self.edge
-        gradient[near] = (slope[good] / steep[:, None]) @ axes
+        row, distance, gradient = (
+            np.empty(len(points), np.int64),
+            np.empty(len(points)),
+            np.empty((len(points), 3)),
+        )
+        if _rows_loop(points, axes, origin, self.edge, self.keys, row):
+            self._fill(np.unique(-1 - row[row < 0]))
+            _rows_loop(points, axes, origin, self.edge, self.keys, row)
+        if _spline_loop(points, axes, origin, self.edge, row, self.nodes, distance, gradient):
+            flat = np.flatnonzero(np.isnan(distance))
+            limit = reach if np.ndim(reach) == 0 else np.asarray(reach)[flat]
+            distance[flat], gradient[flat] = self.field.distance_and_gradient(
+                points[flat], pose=pose, reach=limit
+            )
         return distance, gradient
 
-    def _blocks(self, block: Integers) -> Integers:
-        """Rows of ``nodes`` for blocks (n, 3) of the lattice; those that are new are filled."""
-        key = ((block[:, 0] + MOST) * 2 * MOST + block[:, 1] + MOST) * 2 * MOST + block[:, 2] + MOST
-        wanted, first = np.unique(key, return_index=True)
-        new = ~np.isin(wanted, self.keys)
-        if new.any():
-            grid = np.stack(np.meshgrid(*[np.arange(WIDE) - 1] * 3, indexing="ij"), -1).reshape(-1, 3)
-            nodes = block[first[new]][:, None, :] * SIDE + grid
-            places = self.frame.origin + nodes.reshape(-1, 3) * self.edge @ self.frame.axes
-            found = self.field.distance(places) / self.edge
-            keys = np.concatenate([self.keys, wanted[new]])
-            order = np.argsort(keys, kind="stable")
-            filled = np.concatenate([self.nodes, found.reshape(-1, WIDE, WIDE, WIDE)])
-            self.keys, self.nodes = keys[order], np.ascontiguousarray(filled[order])
-        return np.searchsorted(self.keys, key)
+    def _fill(self, new: Integers) -> None:
+        """Find the distances of blocks of the lattice, by their keys (n,)."""
+        block = (new[:, None] >> SHIFTS & 2 * MOST - 1) - MOST
+        grid = np.stack(np.meshgrid(*[np.arange(WIDE) - 1] * 3, indexing="ij"), -1).reshape(-1, 3)
+        nodes = block[:, None, :] * SIDE + grid
+        places = self.frame.origin + nodes.reshape(-1, 3) * self.edge @ self.frame.axes
+        found = self.field.distance(places) / self.edge
+        keys = np.concatenate([self.keys, new])
+        order = np.argsort(keys, kind="stable")
+        filled = np.concatenate([self.nodes, found.reshape(-1, WIDE, WIDE, WIDE)])
+        self.keys, self.nodes = keys[order], np.ascontiguousarray(filled[order])
 
 
 def bone_thickness(field: BoneField, vertices: Floats, faces: Integers, most: float) -> float:
@@ -109,12 +107,43 @@ def bone_thickness(field: BoneField, vertices: Floats, faces: Integers, most: fl
 
 
 @compiled(error_model="numpy")
-def _spline_loop(local, cell, row, nodes, value, slope):
-    """Values and slopes of the splines at places in units of a cell."""
+def _rows_loop(points, axes, origin, edge, keys, row):
+    """Row of the block that holds each point, -1 less its key where that is lacking; returns whether one is."""
+    lacking = False
+    for n in range(len(points)):
+        key = 0
+        for a in range(3):
+            place = 0.0
+            for b in range(3):
+                place += (points[n, b] - origin[b]) * axes[a, b]
+            key += (np.int64(np.floor(place / edge / SIDE)) + MOST) << SHIFTS[a]
+        k = np.searchsorted(keys, key)
+        row[n] = k
+        if k == len(keys) or keys[k] != key:
+            row[n], lacking = -1 - key, True
+    return lacking
+
+
+@compiled(error_model="numpy")
+def _spline_loop(points, axes, origin, edge, row, nodes, distance, gradient):
+    """Distances and gradients by the splines; NaN where these are flat, and returns whether they are anywhere."""
     weight, lean = np.empty((3, 4)), np.empty((3, 4))
-    first = np.empty(3, np.int64)
-    for n in range(len(local)):
+    first, flat = np.empty(3, np.int64), False
+    for n in range(len(points)):
         for k in range(3):
-            bspline_weights(local[n, k] - cell[n, k], weight[k], lean[k])
-            first[k] = cell[n, k] - SIDE * (cell[n, k] // SIDE)
-        value[n], slope[n, 0], slope[n, 1], slope[n, 2] = bspline_sum(nodes[row[n]], first, weight, lean)
+            place = 0.0
+            for b in range(3):
+                place += (points[n, b] - origin[b]) * axes[k, b]
+            place /= edge
+            cell = np.int64(np.floor(place))
+            bspline_weights(place - cell, weight[k], lean[k])
+            first[k] = cell - SIDE * np.int64(np.floor(place / SIDE))
+        value, x, y, z = bspline_sum(nodes[row[n]], first, weight, lean)
+        steep = np.sqrt(x * x + y * y + z * z)
+        if steep > LEAST_SLOPE:
+            distance[n] = value / steep * edge
+            for b in range(3):
+                gradient[n, b] = (x * axes[0, b] + y * axes[1, b] + z * axes[2, b]) / steep
+        else:
+            distance[n], flat = np.nan, True
+    return flat

@@ -32,18 +32,10 @@ from rbfmuscle.geometry.rest_frame import RestFrame, diameter
 from rbfmuscle.geometry.rotations import turned_quaternions
 from rbfmuscle.implicit.placement.lattice import Lattice
 from rbfmuscle.muscle.anderson import Anderson
-from rbfmuscle.muscle.inversion import STIFFNESS, unfold_loop
+from rbfmuscle.muscle.inversion import STIFFNESS
 from rbfmuscle.muscle.solid_contact import NearPoints, SolidContact
-from rbfmuscle.muscle.solid_loops import (
-    Fibres,
-    carry_loop,
-    mobility_loop,
-    press_loop,
-    respond_loop,
-    stress_loop,
-    swell_loop,
-    target_loop,
-)
+from rbfmuscle.muscle.solid_loops import Fibres, carry_loop, mobility_loop, normals_loop, respond_loop
+from rbfmuscle.muscle.solid_step import global_loop, local_loop, pressure_loop
 from rbfmuscle.simulation.contact import BoneContacts
 
 MEMORY = 5  # steps that Anderson acceleration combines
@@ -150,6 +142,7 @@ class EmbeddedSolid:
         self._assemble(lattice)
         self.contact = SolidContact(self, area, bones)
         self.y, self.pressure = self.rest.copy(), np.zeros(len(self.rest_volumes))
+        self.right, self.squeezed = np.empty_like(self.y), 0.0
         self.shown, self.forces = self.y, np.zeros((len(points), 1))
         self.anchor, self.history, self.still = points[held], [0.0], False
         self.trend: tuple[Floats, Floats, Floats] | None = None
@@ -270,10 +263,11 @@ class EmbeddedSolid:
         out[self.free] = free
         return out
 
-    def deformation(self) -> Floats:
-        """Deformation gradient (K, 3, 3) at the centres."""
-        at = slice(0, self.count)
-        return np.einsum("nka,nkb->nab", self.shown[self.columns[at]], self.slopes_at[at])
+    def turned_normals(self, normals: Floats) -> Floats:
+        """Unit normals (K, 3) of the surface at the centres, from those at rest."""
+        out = np.empty_like(normals)
+        normals_loop(self.shown, self.columns, self.slopes_at, normals, out)
+        return out
 
     # --- motion -----------------------------------------------------------------------------------------------
 
@@ -347,10 +341,10 @@ class EmbeddedSolid:
         self._begin()
         near = self.contact.near(contacts, None)
         rounds, settled = (ROUNDS_STILL, SETTLED_STILL) if self.still else (1, SETTLED)
-        mixer, least = Anderson(MEMORY, self.y.size), np.inf
+        size = self.y.size
+        mixer, least = Anderson(MEMORY, size + len(self.pressure), size), np.inf
         while True:
-            new, pressure = self._iterate(near)
-            moved = float(np.sqrt(((new - self.y) ** 2).sum(axis=1).max()))
+            new, pressure, moved = self._iterate(near)
             if not np.isfinite(moved):
                 raise FloatingPointError("the solid does not settle")
             self.history.append(moved)
@@ -360,14 +354,16 @@ class EmbeddedSolid:
             least = min(least, moved)
             if moved > LONGEST * self.scale:
                 part = LONGEST * self.scale / moved
-                new, pressure = (
-                    self.y + part * (new - self.y),
-                    self.pressure + part * (pressure - self.pressure),
-                )
+                new = self.y + part * (new - self.y)
+                pressure = self.pressure + part * (pressure - self.pressure)
                 mixer.restart()
             if moved < settled * self.scale or len(self.history) == self.iterations * rounds:
                 break
-            self.y, self.pressure = self._mixed(mixer, new, pressure)
+            state, image = (
+                np.concatenate((y.ravel(), p)) for y, p in ((self.y, self.pressure), (new, pressure))
+            )
+            mixed = mixer.mix(state, image)
+            self.y, self.pressure = mixed[:size].reshape(-1, 3), mixed[size:]
             if self.localise():
                 self._invert()
                 self._find_responses()
@@ -387,13 +383,6 @@ class EmbeddedSolid:
         if self.localise() or before:
             self._invert()
         self._find_responses()
-
-    def _mixed(self, mixer: Anderson, new: Floats, pressure: Floats) -> tuple[Floats, Floats]:
-        """Nodes and pressures to go on from, after an iteration has brought the present ones to ``new``."""
-        size = self.y.size
-        state, image = (np.concatenate([y.ravel(), p]) for y, p in ((self.y, self.pressure), (new, pressure)))
-        mixed = mixer.mix(state, image)
-        return mixed[:size].reshape(-1, 3).copy(), mixed[size:].copy()
 
     def _note_trend(self) -> None:
         if self.begun is not None:
@@ -420,18 +409,11 @@ class EmbeddedSolid:
         bool
             Whether points are squeezed that the matrix does not know of yet.
         """
-        target_loop(
-            self.y, self.quad_columns, self.slopes, self.fibres.direction, self.fibres.lower, TONE,
-            self.quaternion, self.stretch, self.f, self.target,
+        cells = self.quad_columns, self.slopes, self.weights, self.region, self.slot
+        joined, self.squeezed = local_loop(
+            self.y, cells, self.fibres, TONE, self.stiffened, (self.quaternion, self.stretch), self.f, self.target,
+            self.right, self.gradient, self.volumes,
         )  # fmt: skip
-        self.right = np.empty_like(self.y)
-        stress_loop(
-            self.f, self.target, self.fibres, self.weights, self.quad_columns, self.slopes, self.region,
-            self.slot, self.right, self.gradient, self.volumes,
-        )  # fmt: skip
-        joined, self.squeezed = unfold_loop(
-            self.f, self.stiffened, self.weights, self.quad_columns, self.slopes, self.right
-        )
         return bool(joined)
 
     def _find_responses(self) -> None:
@@ -444,22 +426,14 @@ class EmbeddedSolid:
         white = solve_triangular(self.factor, response.reshape(count, -1), lower=True, check_finite=False)
         self.response = np.ascontiguousarray(white.reshape(response.shape))
 
-    def _iterate(self, near: NearPoints) -> tuple[Floats, Floats]:
-        """One global step with volumes and contacts: nodes (N, 3) and pressures (M,)."""
-        right = self.right
-        press_loop(self.pressure, self.start, self.touched, self.gradient, right)
-        free = self.inverse @ (right + self._pull)
-        part = 1.0 / max(1.0, float(np.abs(self.pressure).max(initial=0.0)) / CALM_PRESSURE)
-        free = self.y + part * (free - self.y)
-        swollen = np.empty(len(self.pressure))
-        swell_loop(free - self.y, self.start, self.touched, self.gradient, swollen)
-        excess = self.volumes - self.rest_volumes * (1.0 - self.pressure / BULK) + swollen
-        change = -solve_triangular(self.factor, excess, lower=True, check_finite=False)
-        step = free + np.tensordot(change, self.response, 1).T
+    def _iterate(self, near: NearPoints) -> tuple[Floats, Floats, float]:
+        """One global step with volumes and contacts: nodes (N, 3), pressures (M,), greatest motion of a node."""
+        step, change, pressure = np.empty_like(self.y), np.empty(len(self.pressure)), self.pressure.copy()
+        regions = self.start, self.touched, self.gradient, self.volumes, self.rest_volumes
+        part = global_loop(
+            self.y, self.right + self._pull, self.inverse, regions, pressure, (BULK, CALM_PRESSURE), self.response,
+            self.factor, step, change,
+        )  # fmt: skip
         push, taken = self.contact.push(near, self.y, step, part)
-        change -= taken
-        pressure = (
-            self.pressure
-            + solve_triangular(self.factor, change, lower=True, trans=1, check_finite=False) / part
-        )
-        return step + push, np.clip(pressure, -MOST_PRESSURE, MOST_PRESSURE)
+        moved = pressure_loop(self.y, step, push, change, taken, self.factor, part, MOST_PRESSURE, pressure)
+        return step, pressure, float(moved)

@@ -18,6 +18,7 @@ from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.muscle.rounded_bones import RoundedField, bone_thickness
 from rbfmuscle.muscle.solid_loops import carry_loop, contact_loop
+from rbfmuscle.muscle.solid_step import ways_loop
 from rbfmuscle.simulation.contact import BoneContacts, HalfSpaces
 
 TOLERANCE = 2e-5  # violation of a contact that is left, of the muscle's size
@@ -171,11 +172,11 @@ class SolidContact:
         taken : (M,) ndarray
             What the contacts take from the whitened pressures.
         """
-        here = near.carry(y)
-        motion = near.carry(step) - here
+        here, motion = np.empty((2, len(near.which), 3))
+        reach = np.empty(len(near.which))
         # Contacts that push now push in the next iteration too: where the points will then go decides what they meet.
-        ahead = near.carry(step + self._last_push) - here
-        spaces = near.contacts.half_spaces(here, 1.5 * np.sqrt((ahead**2).sum(axis=1)) + self.margin)
+        ways_loop(y, step, self._last_push, near.columns, near.shares, self.margin, here, motion, reach)
+        spaces = near.contacts.half_spaces(here, reach)
         push, taken = self._touch(near, spaces, motion, near.forces, self.yielding / part, near.most * part)
         self._last_push = push
         return push, taken

@@ -187,6 +187,30 @@ def carry_loop(y, columns, shares, out):
 
 
 @compiled(error_model="numpy")
+def normals_loop(y, columns, slopes, normals, out):
+    """Unit normals of the deformed surface: the cofactor of the deformation gradient times those at rest."""
+    f = np.empty((3, 3))
+    for s in range(len(normals)):
+        f[:] = 0.0
+        for k in range(columns.shape[1]):
+            j = columns[s, k]
+            for a in range(3):
+                for b in range(3):
+                    f[a, b] += y[j, a] * slopes[s, k, b]
+        square = 0.0
+        for a in range(3):
+            p, q = (a + 1) % 3, (a + 2) % 3
+            value = 0.0
+            for b in range(3):
+                u, v = (b + 1) % 3, (b + 2) % 3
+                value += (f[p, u] * f[q, v] - f[p, v] * f[q, u]) * normals[s, b]
+            out[s, a] = value
+            square += value * value
+        for a in range(3):
+            out[s, a] /= np.sqrt(square)
+
+
+@compiled(error_model="numpy")
 def _rows_loop(index, normal, response, columns, shares, rows):
     """Motion along its normal that each contact makes for a unit of each region's whitened pressure."""
     for c in range(len(index)):

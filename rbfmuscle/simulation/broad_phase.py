@@ -38,15 +38,21 @@ def closer_loop(distance, direction, smallest, gradient):
 
 
 @compiled(error_model="numpy", nogil=False)
-def remember_loop(points, pose, near, distance, anchor, bound):
-    """Store where points were queried, in bone coordinates, and a lower bound of their distance there."""
+def answer_loop(points, pose, box, near, distance, gradient, anchor, bound):
+    """Normalise the gradients at the points ``near`` in place; store where they were queried, and bounds there.
+
+    ``anchor`` (n, 3) is in bone coordinates, ``bound`` (n,) a lower bound of the distance.
+    """
+    at = np.empty((len(near), 3))
     for n in range(len(near)):
         i = near[n]
+        at[n] = points[i]
         bound[i] = TRUSTED_SHARE * distance[n]
         for k in range(3):
             anchor[i, k] = 0.0
             for j in range(3):
                 anchor[i, k] += pose[j, k] * (points[i, j] - pose[j, 3])
+    direction_loop(at, gradient, pose, box)
 
 
 @compiled(error_model="numpy", nogil=False)

@@ -15,11 +15,11 @@ from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.simulation.broad_phase import (
+    answer_loop,
     apart_loop,
     closer_loop,
     direction_loop,
     near_loop,
-    remember_loop,
     take_contacts_loop,
 )
 from rbfmuscle.validation import check_points
@@ -291,7 +291,8 @@ class BoneContacts:
 
     def _ask(self, points, near, b, reach):
         """Distances and directions of some of the contact points to bone b; stored as bounds for later queries."""
-        distance, direction = self._query(points[near], b, reach)
-        known = (part[self._row[b]] for part in self.known(len(points)))
-        remember_loop(points, self.poses[self.names[b]], near, distance, *known)
-        return distance, direction
+        pose, row = self.poses[self.names[b]], self._row[b]
+        distance, gradient = self.fields[b].distance_and_gradient(points[near], pose=pose, reach=reach)
+        anchor, bound = self.known(len(points))
+        answer_loop(points, pose, self.boxes[row], near, distance, gradient, anchor[row], bound[row])
+        return distance, gradient

@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.implicit.extraction.obstacles import PointGrid, near_triangles
+from rbfmuscle.implicit.extraction.obstacles import BESIDE, CELLS, PointGrid, near_triangles
 
 
 def test_points_near_triangles_are_those_found_one_by_one():
@@ -15,11 +15,19 @@ def test_points_near_triangles_are_those_found_one_by_one():
     pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec([-0.5, 0.4, 0.1]).as_matrix(), [0.3, 0.2, -0.1]
     points = rng.uniform(-8.0, 8.0, (700, 3))
     found = near_triangles(
-        [(PointGrid(points), pose), (PointGrid(points[:0]), pose)], vertices, faces, margin=0.4
+        [(PointGrid(points), pose), (PointGrid(points[:0]), pose)], vertices, faces, margin=0.8
     )
     corners = ((vertices - pose[:3, 3]) @ pose[:3, :3])[faces]
-    low, high = corners.min(axis=1) - 0.4, corners.max(axis=1) + 0.4
-    inside = ((points[:, None] >= low) & (points[:, None] <= high)).all(axis=2)
+    inside = np.zeros((len(points), len(faces)), dtype=bool)
+    for f, (a, b, c) in enumerate(corners):
+        normal = np.cross(b - a, c - a)
+        along = np.linalg.solve(
+            np.column_stack([b - a, c - a, normal / np.linalg.norm(normal)]), (points - a).T
+        )
+        beside = np.minimum(np.minimum(along[0], along[1]), 1.0 - along[0] - along[1])
+        low, high = corners[f].min(axis=0) - 0.8, corners[f].max(axis=0) + 0.8
+        boxed = ((points >= low) & (points <= high)).all(axis=1)
+        inside[:, f] = boxed & (np.abs(along[2]) <= 0.8) & (beside >= -BESIDE)
     rows = np.flatnonzero(inside.any(axis=1))
     assert 30 < len(rows) < 400
     world = points @ pose[:3, :3].T + pose[:3, 3]
@@ -35,4 +43,4 @@ def test_points_of_a_plane_of_a_line_and_alone_have_a_grid():
     for points in (line, line[:1], np.concatenate([line, line + [0.0, 1.0, 0.0]])):
         grid = PointGrid(points)
         assert grid.start[-1] == len(points)
-        assert grid.shape.prod() <= 100 * len(points)
+        assert grid.shape.prod() <= 100 * CELLS * len(points)

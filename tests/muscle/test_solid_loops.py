@@ -83,7 +83,7 @@ def test_acceleration_solves_a_linear_map_in_few_steps(rng, measured):
     basis = np.linalg.qr(rng.normal(size=(12, 12)))[0]
     m = basis @ np.diag(np.repeat([0.9, 0.5, -0.4, 0.1], 3)) @ basis.T
     b = rng.normal(size=12)
-    x, mixer = np.zeros(12), Anderson(4, measured)
+    x, mixer = np.zeros(12), Anderson(4, 12, measured)
     for _ in range(7):
         x = mixer.mix(x, m @ x + b)
     # The normal equations carry 1e-8 of their diagonal.
@@ -91,8 +91,8 @@ def test_acceleration_solves_a_linear_map_in_few_steps(rng, measured):
 
 
 def test_without_memory_and_after_a_restart_steps_are_plain(rng):
-    image, mixer = np.arange(12.0), Anderson(3, 12)
-    np.testing.assert_array_equal(Anderson(0, 12).mix(np.ones(12), image), image)
+    image, mixer = np.arange(12.0), Anderson(3, 12, 12)
+    np.testing.assert_array_equal(Anderson(0, 12, 12).mix(np.ones(12), image), image)
     for _ in range(3):
         mixer.mix(rng.normal(size=12), rng.normal(size=12))
     mixer.restart()

@@ -11,6 +11,8 @@ from rbfmuscle.implicit.extraction.projection import CutBounds, Projector
 
 # What is within this many mean edges of the bones may come to lie on them.
 NEAR_CUT = 1.5
+# Greatest bound of the distance from them that is kept, in mean edges.
+FAR = 100.0
 # A triangle none of whose corners is so many spacings near a bone has no bone vertex behind it by a chord: no point
 # of it is farther from a corner than its longest side over the root of three.
 NEAR_BONE = 1.5
@@ -42,8 +44,9 @@ class CarriedMaterial:
         Holds the vertices where they are now.
     edge : float
         Mean length of an edge [scene unit].
-    sunk, outside, pushed : (n,) ndarray of bool
-        What the material takes deep into a bone, what it leaves outside all bones, what a bone's vertex pushed off.
+    sunk, outside, pushed, left : (n,) ndarray of bool
+        What the material takes deep into a bone, what it leaves outside all bones, what a bone's vertex pushed off, and
+        what was kept from a level set far from where the material takes it.
     """
 
     def __init__(
@@ -57,7 +60,7 @@ class CarriedMaterial:
         self.mesh, self.carried, self.level = mesh, np.ascontiguousarray(vertices, dtype=np.float64), level
         self.field, self.cut = field, cut
         self.edge = mesh.edge(self.carried)
-        self.sunk, self.pushed = np.zeros((2, len(vertices)), dtype=np.bool_)
+        self.sunk, self.pushed, self.left = np.zeros((3, len(vertices)), dtype=np.bool_)
         self.outside = np.ones(len(vertices), dtype=np.bool_)
         self._start(cut)
 
@@ -72,7 +75,9 @@ class CarriedMaterial:
         near, self.outside = distance < limit, distance >= 0.0
         self.projector = Projector(self.field, cut if near.any() else None, vertices, self.edge, near)
         if np.isfinite(cut.steepest):
-            self.projector.bounds = CutBounds(self.carried, np.minimum(distance, limit), cut.steepest)
+            self.projector.bounds = CutBounds(
+                self.carried, np.minimum(distance, FAR * self.edge), cut.steepest
+            )
         if near.any():
             self.projector.clearance = self._clearance(near, distance, outward)
 

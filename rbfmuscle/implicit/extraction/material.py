@@ -130,7 +130,6 @@ class _Fitting(CarriedMaterial):
         level: float,
     ) -> None:
         super().__init__(mesh, vertices, field, cut, level)
-        self.left = np.zeros(len(vertices), dtype=np.bool_)
         self.reach_of = None
         if mesh.slope is not None and field is not None:
             self.projector.known = field.value_and_gradient(self.carried)

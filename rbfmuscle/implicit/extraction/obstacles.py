@@ -9,14 +9,17 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.jit import compiled
 
-# A chord is never farther from its surface than this share of a cell, and triangles are looked for this far around.
-CHORD, MARGIN = 0.35, 0.5
+# A chord is never farther from its surface than this share of a cell. As vertices move while points are pushed off,
+# points are looked for so far above and below triangles, and so far beside them in barycentric coordinates.
+CHORD, MARGIN, BESIDE = 0.35, 0.5, 0.3
 # Room for pairs of a point and a triangle near it, at first, for each triangle.
-PAIRS = 4
+PAIRS = 2
+# Cells of a grid for each point.
+CELLS = 5
 
 
 class PointGrid:
-    """Points sorted by the cells of a grid, as many cells as points.
+    """Points sorted by the cells of a grid, some times as many cells as points: those of a surface leave most empty.
 
     Parameters
     ----------
@@ -37,7 +40,7 @@ class PointGrid:
         extent = points.max(axis=0) - self.low if len(points) else np.zeros(3)
         size = float(extent.max()) or 1.0
         sides = np.maximum(extent / size, 1e-2)
-        self.edge = size * float(sides.prod() / max(len(points), 1)) ** (1.0 / 3.0)
+        self.edge = size * float(sides.prod() / (CELLS * max(len(points), 1))) ** (1.0 / 3.0)
         self.shape = (extent / self.edge).astype(np.int64) + 1
         cell = ((points - self.low) / self.edge).astype(np.int64) @ (
             self.shape[1] * self.shape[2],
@@ -77,7 +80,7 @@ class NearTriangles(NamedTuple):
 
 
 def near_triangles(obstacles: Obstacles, vertices: Floats, faces: Integers, margin: float) -> NearTriangles:
-    """Obstacle points in the boxes around triangles.
+    """Obstacle points right above or below triangles, or nearly.
 
     Parameters
     ----------
@@ -86,12 +89,12 @@ def near_triangles(obstacles: Obstacles, vertices: Floats, faces: Integers, marg
     vertices : (n, 3) ndarray
     faces : (m, 3) ndarray of int
     margin : float
-        By which the boxes are larger than the triangles, in the obstacle's axes [scene unit].
+        Greatest height above or below a triangle [scene unit].
     """
     points, counts, near = [np.zeros((0, 3))], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for grid, pose in obstacles:
         local = np.ascontiguousarray((vertices - pose[:3, 3]) @ pose[:3, :3])
-        count, found = _in_boxes(local, faces, margin, grid)
+        count, found = _near_grid(local, faces, margin, grid)
         rows = np.flatnonzero(count)
         points.append(grid.points[rows] @ pose[:3, :3].T + pose[:3, 3])
         counts.append(count[rows])
@@ -100,13 +103,15 @@ def near_triangles(obstacles: Obstacles, vertices: Floats, faces: Integers, marg
     return NearTriangles(np.concatenate(points), first, np.concatenate(near))
 
 
-def _in_boxes(vertices: Floats, faces: Integers, margin: float, grid: PointGrid) -> tuple[Integers, Integers]:
-    """Number of boxes (k,) that hold each point of a grid, and their triangles, point by point."""
+def _near_grid(
+    vertices: Floats, faces: Integers, margin: float, grid: PointGrid
+) -> tuple[Integers, Integers]:
+    """Number of triangles (k,) near each point of a grid, and these triangles, point by point."""
     cells = grid.points, grid.start, grid.low, grid.edge, grid.shape
     room = PAIRS * len(faces)
     while True:
         count, pairs = np.zeros(len(grid.points), dtype=np.int64), np.empty((room, 2), dtype=np.int64)
-        met = _boxes_loop(vertices, faces, margin, cells, count, pairs)
+        met = _near_loop(vertices, faces, margin, cells, count, pairs)
         if met <= room:
             break
         room = met
@@ -150,8 +155,8 @@ def push_off_points(
 
 
 @compiled(error_model="numpy")
-def _boxes_loop(vertices, faces, margin, cells, count, pairs):
-    """Pairs of a point and a triangle whose box holds it; how many there are, also beyond the room for them."""
+def _near_loop(vertices, faces, margin, cells, count, pairs):
+    """Pairs of a point and a triangle near it; how many there are, also beyond the room for them."""
     points, start, low, edge, shape = cells
     least, most = np.empty(3), np.empty(3)
     begin, end, met = np.empty(3, np.int64), np.empty(3, np.int64), 0
@@ -170,10 +175,15 @@ def _boxes_loop(vertices, faces, margin, cells, count, pairs):
             for j in range(begin[1], end[1] + 1):
                 row = (i * shape[1] + j) * shape[2]
                 for p in range(start[row + begin[2]], start[row + end[2] + 1]):
-                    inside = True
-                    for a in range(3):
-                        inside &= points[p, a] >= least[a] and points[p, a] <= most[a]
-                    if inside:
+                    x, y, z = points[p, 0], points[p, 1], points[p, 2]
+                    if not (
+                        (least[0] <= x) & (x <= most[0]) & (least[1] <= y) & (y <= most[1])
+                        & (least[2] <= z) & (z <= most[2])
+                    ):  # fmt: skip
+                        continue
+                    _, _, _, square, height, at_b, at_c = _shadow(vertices, faces, f, x, y, z)
+                    beside = min(at_b, at_c, square - at_b - at_c)
+                    if height * height <= margin * margin * square and beside >= -BESIDE * square:
                         if met < len(pairs):
                             pairs[met, 0], pairs[met, 1] = p, f
                         count[p] += 1

@@ -9,6 +9,8 @@ from rbfmuscle.implicit.extraction.carried_material import CarriedMaterial
 UNTANGLE, GROWTH = 24, 4
 # Rounds before them in which what crosses is taken back to where the material is, by this share of the way.
 RETURN, BACK = 12, 0.15
+# The share of its slope at rest below which a field may show two sheets.
+SUNK_SLOPE = 0.7
 # What is sunk in a bone, or what a bone sent so many mean edges away, is drawn as a skin over the place where it goes
 # in: so many sweeps of smoothing first, and in each of some rounds after, each followed by the way out of the bone.
 STRAYED = 1.5
@@ -38,7 +40,7 @@ def untangle(material: CarriedMaterial) -> int:
     """Smooth what crosses itself; return how many vertices were moved for it."""
     projector, faces = material.projector, material.mesh.faces
     touched = np.zeros(len(material.carried), dtype=np.bool_)
-    among: Booleans | None = None
+    among = _suspicious(material)
     for turn in range(0 if material.field is None else -RETURN, UNTANGLE + 1):
         # What was not moved does not begin to cross.
         bad = material.mesh.tree.crossing(projector.vertices, among)
@@ -54,6 +56,19 @@ def untangle(material: CarriedMaterial) -> int:
         else:
             _smooth(material, np.flatnonzero(region), material.field is not None and turn < UNTANGLE // 2)
     return int(touched.sum())
+
+
+def _suspicious(material: CarriedMaterial) -> Booleans | None:
+    """Mask of the triangles that may cross others without being folded at a corner; None where it can be any.
+
+    These are where the field's slope has sunk, as between sheets that met, and what was held back, sunk or pushed.
+    """
+    projector, rest = material.projector, material.mesh.slope
+    if material.field is None or rest is None:
+        return None
+    odd = material.sunk | material.pushed | material.left | (SUNK_SLOPE * projector.slope * rest >= 1.0)
+    found: Booleans = np.asarray(odd[material.mesh.faces].any(axis=1), dtype=np.bool_)
+    return found
 
 
 def _return(material: CarriedMaterial, rows: Integers) -> None:
