@@ -12,6 +12,18 @@ LEAF, BITS = 4, 10
 WAITING = 512
 
 
+def morton_order(points: Floats) -> Integers:
+    """Order (n,) of points (n, 3) in which near ones are mostly near each other: by Morton code."""
+    low = points.min(axis=0)
+    size = max(float((points.max(axis=0) - low).max()), np.finfo(float).tiny)
+    cell = np.minimum((points - low) * ((1 << BITS) / size), (1 << BITS) - 1).astype(np.int64)
+    code = np.zeros(len(points), dtype=np.int64)
+    for bit in range(BITS):
+        for axis in range(3):
+            code |= (cell[:, axis] >> bit & 1) << (3 * bit + axis)
+    return np.argsort(code, kind="stable")
+
+
 class FaceTree:
     """Boxes around the triangles of a mesh, by nearness at one moment; good for later ones with the same faces.
 
@@ -24,14 +36,7 @@ class FaceTree:
     def __init__(self, vertices: Floats, faces: Integers) -> None:
         self.faces = np.ascontiguousarray(faces, dtype=np.int64)
         middle = (vertices[self.faces[:, 0]] + vertices[self.faces[:, 1]] + vertices[self.faces[:, 2]]) / 3.0
-        low = middle.min(axis=0)
-        size = max(float((middle.max(axis=0) - low).max()), np.finfo(float).tiny)
-        cell = np.minimum((middle - low) * ((1 << BITS) / size), (1 << BITS) - 1).astype(np.int64)
-        code = np.zeros(len(self.faces), dtype=np.int64)
-        for bit in range(BITS):
-            for axis in range(3):
-                code |= (cell[:, axis] >> bit & 1) << (3 * bit + axis)
-        self.order = np.argsort(code, kind="stable")
+        self.order = morton_order(middle)
         self._corners = self.faces[self.order]
         self.leaves = 1 << max(int(np.ceil(len(self.faces) / LEAF)) - 1, 0).bit_length()
         self.closed = _is_closed(self.faces)

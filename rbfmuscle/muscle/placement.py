@@ -10,6 +10,7 @@ import numpy as np
 
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.crossing import morton_order
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.geometry.surfaces import mesh_volume
@@ -36,8 +37,8 @@ REST_ERROR, REST_SHARE = 0.5, 0.1
 FALL, TRIALS, MOST_CENTRES = 1.2, 5, 4.0
 # What is aimed at, in what is wanted: the shown mesh adds its own.
 AIM = 0.97
-# Part of the name under which samples are cached: raise it when they are made in another way.
-SAMPLING = 1
+# Parts of the names under which samples and numbers of centres are cached: raise one when these are found anew.
+SAMPLING, SEARCH = 3, 1
 
 
 def default_centres(area: float, scene: Scene) -> int:
@@ -88,7 +89,7 @@ def choose_centres(muscle: Muscle, scene: Scene, options: RBFOptions, *, known_o
     usual, wanted = default_centres(muscle.mesh.area, scene), wanted_error(muscle, scene, options)
     frame, faces = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)), np.asarray(muscle.mesh.faces)
     fit = (options.kernel, options.epsilon, options.condition, options.placement, options.seed)
-    key = content_key(frame.local, faces, ("centres", SAMPLING, usual, round(wanted / frame.size, 9), *fit))
+    key = content_key(frame.local, faces, ("centres", SEARCH, usual, round(wanted / frame.size, 9), *fit))
     found = load_arrays(key)
     if found is None and known_only:
         return Chosen(usual, np.nan, "by its area; more where the rest error asks for them")
@@ -249,14 +250,20 @@ def _fit_centres(
 def cached_sample(
     vertices: np.ndarray, faces: np.ndarray, count: int, *, seed: int, placement: str
 ) -> SurfaceSample:
-    """`sample_surface` of a muscle's mesh, from the cache on disk by content: greedy placement takes a second."""
+    """`sample_surface` of a muscle's mesh, from the cache on disk by content: greedy placement takes a second.
+
+    Points are in an order in which near ones are mostly near each other, except for greedy placement.
+    """
     key = _sample_key(vertices, faces, count, seed, placement)
     arrays = load_arrays(key)
-    if arrays is not None:
-        return SurfaceSample(**arrays)
-    sample = sample_surface(vertices, faces, count, seed=seed, placement=placement)
-    store_arrays(key, asdict(sample))
-    return sample
+    if arrays is None:
+        arrays = asdict(sample_surface(vertices, faces, count, seed=seed, placement=placement))
+        if placement != "greedy":
+            order = morton_order(arrays["points"])
+            corners = np.argsort(order)[arrays.pop("control_faces")]
+            arrays = {name: part[order] for name, part in arrays.items()} | {"control_faces": corners}
+        store_arrays(key, arrays)
+    return SurfaceSample(**arrays)
 
 
 def _sample_key(vertices: Floats, faces: Integers, count: int, seed: int, placement: str) -> str:

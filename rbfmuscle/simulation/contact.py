@@ -158,7 +158,7 @@ class BoneContacts:
         smallest = np.full(len(points), beyond)
         for b in near:
             pose = self.poses[self.names[b]]
-            distance = self.fields[b].distance(points, pose=pose, reach=reach)
+            distance = self.fields[b].distance(points, pose=pose, reach=np.minimum(smallest, reach))
             np.minimum(smallest, distance, out=smallest)
         for neighbour in self.cuts if neighbours else ():
             np.minimum(smallest, neighbour.cut(points), out=smallest)
@@ -175,10 +175,11 @@ class BoneContacts:
         points = check_points(points)
         near, beyond = self._within(points, limit)
         smallest, gradient = np.full(len(points), beyond), np.zeros((len(points), 3))
-        answers = [self._query(points, b, limit) for b in near]
-        answers += [neighbour.cut_with_gradient(points) for neighbour in self.cuts if neighbours]
-        for distance, direction in answers:
-            closer_loop(distance, direction, smallest, gradient)
+        for b in near:
+            # No farther than what was found: elsewhere a lower bound will do.
+            closer_loop(*self._query(points, b, np.minimum(smallest, limit)), smallest, gradient)
+        for neighbour in self.cuts if neighbours else ():
+            closer_loop(*neighbour.cut_with_gradient(points), smallest, gradient)
         return smallest, gradient
 
     def neighbour_points(self) -> Floats:
