@@ -3,12 +3,13 @@
 With y the nodes of a `Lattice` and F = Σ y_k ∇N_k the deformation gradient at its quadrature points q, the nodes
 minimise
 
-    E(y) = μ Σ_q w_q min over R, t of (|F_q - R D(t)|² - b (1 - t)² + c (|F_q a| - t)²),
-    D(t) = t aaᵀ + t^(-1/2) (I - aaᵀ),    1 / slack <= t <= 1,
+    E(y) = μ Σ_q w_q min over R, t of (|F_q - R D(t)|² + c (|F_q a| - t)²) - μ b V (1 - t̄)²,
+    D(t) = t aaᵀ + t^(-1/2) (I - aaᵀ),    1 / slack <= t <= 1,    t̄ = Σ_q w_q t_q / V,
 
 subject to the volumes of the regions r of the lattice, V_r(y) = Σ_{q in r} w_q det F_q, and to the contacts. R is a
-rotation and a the fibre direction. Between 1 / slack and 1 a fibre shortens without resistance while
-the section thickens, and bears a small tension, 2 μ b (1 - t), which keeps a slack muscle straight;
+rotation, a the fibre direction and V the volume. Between 1 / slack and 1 a fibre shortens without resistance while
+the section thickens, and bears a small tension, 2 μ b (1 - t̄), which keeps a slack muscle straight. It is the same in
+all of a muscle: one that grew with the fibre's own shortening would draw all shortening into one place;
 c = 3/2 (fibre_ratio - 1) stiffens fibres that are longer or shorter than that.
 For small stretches beyond the slack band and more and more nodes this is the incompressible solid of shear modulus μ,
 Young's modulus 3 μ across and 3 μ · fibre_ratio along the fibres.
@@ -31,19 +32,17 @@ from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.geometry.rest_frame import RestFrame, diameter
 from rbfmuscle.geometry.rotations import turned_quaternions
 from rbfmuscle.implicit.placement.lattice import Lattice
-from rbfmuscle.muscle.anderson import Anderson
 from rbfmuscle.muscle.inversion import STIFFNESS
 from rbfmuscle.muscle.solid_contact import NearPoints, SolidContact
 from rbfmuscle.muscle.solid_loops import Fibres, carry_loop, mobility_loop, normals_loop, respond_loop
-from rbfmuscle.muscle.solid_step import global_loop, local_loop, pressure_loop
+from rbfmuscle.muscle.solid_step import Anderson, global_loop, local_loop, pressure_loop
 from rbfmuscle.simulation.contact import BoneContacts
 
 MEMORY = 5  # steps that Anderson acceleration combines
 HOLD = 25.0  # stiffness of the spring at a held point, relative to that of a cell
 GHOST = 1e-3  # stiffness of second differences, relative to a cell: for nodes that hold hardly any material
-# b: the tension of a slack fibre grows to 0.23 μ at a slack of 1.6; at full activation it is 30 μ. Without it a muscle
-# is bent where its ends turn while they approach each other; with 0.6 it does not return to its shape at rest.
-TONE = 0.3
+# b: where all fibres have a slack of 1.6 they bear 0.75 μ; at full activation they bear 30 μ.
+TONE = 1.0
 # Bulk modulus and greatest pressure of a region, over 2 μ: a muscle that bones squeeze yields in volume. The surface
 # is drawn at the volume at rest in any case.
 BULK, MOST_PRESSURE = 50.0, 3.0
@@ -398,8 +397,12 @@ class EmbeddedSolid:
         along = np.linalg.norm(np.einsum("qab,qb->qa", self.f, given.direction), axis=1)
         beyond = along - np.clip(along, given.lower, given.upper)
         springs = given.passive * beyond**2 + given.active * (along - given.content) ** 2
-        tone = -TONE * (self.stretch - 1.0) ** 2
-        return 0.5 * float(self.weights @ ((gap**2).sum(axis=(1, 2)) + springs + tone)) + self.squeezed
+        tone = TONE * float(self.weights.sum()) * self._shortened() ** 2
+        return 0.5 * (float(self.weights @ ((gap**2).sum(axis=(1, 2)) + springs)) - tone) + self.squeezed
+
+    def _shortened(self) -> float:
+        """Mean shortening of the fibres against rest, 1 - t̄."""
+        return 1.0 - float(self.weights @ self.stretch) / float(self.weights.sum())
 
     def localise(self) -> bool:
         """Find deformation gradients, targets, volumes and forces for the present nodes.
@@ -410,9 +413,10 @@ class EmbeddedSolid:
             Whether points are squeezed that the matrix does not know of yet.
         """
         cells = self.quad_columns, self.slopes, self.weights, self.region, self.slot
+        state, tension = (self.quaternion, self.stretch), TONE * self._shortened()
         joined, self.squeezed = local_loop(
-            self.y, cells, self.fibres, TONE, self.stiffened, (self.quaternion, self.stretch), self.f, self.target,
-            self.right, self.gradient, self.volumes,
+            self.y, cells, self.fibres, tension, self.stiffened, state, self.f, self.target, self.right,
+            self.gradient, self.volumes,
         )  # fmt: skip
         return bool(joined)
 

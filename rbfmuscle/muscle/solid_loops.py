@@ -32,10 +32,10 @@ class Fibres(NamedTuple):
 
 
 @compiled(error_model="numpy")
-def target_loop(y, columns, slopes, fibre, least, tone, q, t, f, target):
+def target_loop(y, columns, slopes, fibre, least, tension, q, t, f, target):
     """Deformation gradients F and their targets R (t aaᵀ + t^(-1/2) (I - aaᵀ)) at all points.
 
-    R is the rotation of F D(t) for the last t, then t minimises |RᵀF - D(t)|² - tone (1 - t)² in [least, 1] by
+    R is the rotation of F D(t) for the last t, then t minimises |RᵀF - D(t)|² + 2 tension t in [least, 1] by
     Newton's method; over the iterations both converge.
     """
     fd = np.empty((3, 3))
@@ -74,8 +74,8 @@ def target_loop(y, columns, slopes, fibre, least, tone, q, t, f, target):
             v = t[i]
             for _ in range(4):
                 v15 = v * np.sqrt(v)
-                g = v - 1.0 / (v * v) - s + 0.5 * m / v15 - tone * (v - 1.0)
-                h = 1.0 + 2.0 / (v * v * v) - 0.75 * m / (v15 * v) - tone
+                g = v - 1.0 / (v * v) - s + 0.5 * m / v15 + tension
+                h = 1.0 + 2.0 / (v * v * v) - 0.75 * m / (v15 * v)
                 v = min(max(v - g / max(h, 0.5), least[i]), 1.0)
             t[i] = v
             u = 1.0 / np.sqrt(v)

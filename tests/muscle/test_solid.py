@@ -225,14 +225,16 @@ def test_target_is_the_nearest_admissible_deformation():
     for _ in range(50):
         solid.localise()
 
+    tension = TONE * (1.0 - np.average(solid.stretch, weights=solid.weights))
+
     def cost(f, rotation, t):
         d = np.diag([t, t**-0.5, t**-0.5])
-        return ((f - rotation @ d) ** 2).sum() - TONE * (t - 1.0) ** 2
+        return ((f - rotation @ d) ** 2).sum() + 2.0 * tension * t
 
     whole = np.flatnonzero(solid.weights > 0.5 * solid.weights.max())
     for q in rng.choice(whole, 20, replace=False):
         f, t = solid.f[q], solid.stretch[q]
-        best = ((f - solid.target[q]) ** 2).sum() - TONE * (t - 1.0) ** 2
+        best = ((f - solid.target[q]) ** 2).sum() + 2.0 * tension * t
         u, _, vt = np.linalg.svd(f @ np.diag([t, t**-0.5, t**-0.5]))
         for other in np.clip(t + rng.normal(0, 0.1, 20), 1 / 1.6, 1.0):
             turn = rotation_about(rng.normal(size=3), rng.normal(0, 0.1), np.zeros(3))[:3, :3]

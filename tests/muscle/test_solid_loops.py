@@ -5,7 +5,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.rotations import quaternion_matrix, rotation_loop
-from rbfmuscle.muscle.anderson import Anderson
 from rbfmuscle.muscle.solid_loops import (
     Fibres,
     carry_loop,
@@ -18,6 +17,7 @@ from rbfmuscle.muscle.solid_loops import (
     swell_loop,
     target_loop,
 )
+from rbfmuscle.muscle.solid_step import Anderson
 from rbfmuscle.simulation.contact import HalfSpaces
 
 CENTRES, POINTS = 7, 9
