@@ -3,7 +3,7 @@
 import itertools
 from dataclasses import dataclass
 from pathlib import Path
-from xml.sax.saxutils import escape
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -11,6 +11,8 @@ import numpy as np
 ARM_WEIGHT = 1.0 / 3.0
 # OpenSim's function takes up to six coordinates.
 MOST_COORDINATES = 6
+# Parts of the poses that are left out in turn to choose the order.
+FOLDS = 5
 
 
 @dataclass(frozen=True)
@@ -35,17 +37,11 @@ class FittedPath:
 
     def length(self, values: np.ndarray) -> np.ndarray:
         """Length (n,) at coordinates (n, d)."""
-        return (
-            _terms(np.asarray(values, float), exponents(len(self.coordinates), self.order))
-            @ self.coefficients
-        )
+        return _rows(values, self.order)[0] @ self.coefficients
 
     def arms(self, values: np.ndarray) -> np.ndarray:
         """Moment arms (n, d) at coordinates (n, d)."""
-        values, powers = np.asarray(values, float), exponents(len(self.coordinates), self.order)
-        return np.stack(
-            [-_slopes(values, powers, axis) @ self.coefficients for axis in range(values.shape[1])], axis=1
-        )
+        return (_rows(values, self.order)[1:] @ self.coefficients).T
 
 
 def exponents(dimension: int, order: int) -> np.ndarray:
@@ -54,14 +50,16 @@ def exponents(dimension: int, order: int) -> np.ndarray:
     return np.array([power for power in powers if sum(power) <= order])
 
 
-def _terms(values, powers):
-    return np.prod(values[:, None, :] ** powers[None], axis=2)
-
-
-def _slopes(values, powers, axis):
-    lower = powers.copy()
-    lower[:, axis] = np.maximum(lower[:, axis] - 1, 0)
-    return powers[:, axis] * _terms(values, lower)
+def _rows(values, order):
+    """Terms (1 + d, n, m) of the length, then of the moment arm of each coordinate."""
+    values = np.asarray(values, dtype=float)
+    powers = exponents(values.shape[1], order)
+    rows = [np.prod(values[:, None, :] ** powers, axis=2)]
+    for axis in range(values.shape[1]):
+        lower = powers.copy()
+        lower[:, axis] = np.maximum(lower[:, axis] - 1, 0)
+        rows.append(-powers[:, axis] * np.prod(values[:, None, :] ** lower, axis=2))
+    return np.array(rows)
 
 
 def fit_path(
@@ -79,6 +77,8 @@ def fit_path(
 
     Parameters
     ----------
+    muscle : str
+    coordinates : tuple of str
     values : (n, d) ndarray
         Coordinates [radian or scene unit].
     lengths : (n,) ndarray
@@ -87,57 +87,28 @@ def fit_path(
         Highest order tried; there are always more equations than terms.
     """
     count, dimension = values.shape
-    best = None
+    weights = np.r_[1.0, np.full(dimension, ARM_WEIGHT)][:, None]
+    wanted = weights * np.vstack([lengths, arms.T])
+    group, best = np.arange(count) % FOLDS, None
     for order in range(1, most + 1):
-        if 1.5 * len(exponents(dimension, order)) > 0.8 * count * (1 + dimension):
+        if order > 1 and 1.5 * len(exponents(dimension, order)) > 0.8 * count * (1 + dimension):
             break
-        error = _left_out(values, lengths, arms, order)
+        rows = weights[:, :, None] * _rows(values, order)
+        error = 0.0
+        for fold in range(FOLDS):
+            out = group == fold
+            left_out = rows[:, out] @ _solve(rows[:, ~out], wanted[:, ~out])
+            error += np.sum((left_out - wanted[:, out]) ** 2)
         if best is None or error < best[0]:
-            best = (error, order)
-    order = best[1] if best is not None else 1
-    return FittedPath(muscle, coordinates, order, _solve(values, lengths, arms, order))
+            best = (error, order, _solve(rows, wanted))
+    return FittedPath(muscle, coordinates, *best[1:])
 
 
-def _left_out(values, lengths, arms, order):
-    group, total = np.arange(len(values)) % 5, 0.0
-    for fold in range(5):
-        out = group == fold
-        made = FittedPath(
-            "", ("",) * values.shape[1], order, _solve(values[~out], lengths[~out], arms[~out], order)
-        )
-        total += np.sum((made.length(values[out]) - lengths[out]) ** 2)
-        total += ARM_WEIGHT**2 * np.sum((made.arms(values[out]) - arms[out]) ** 2)
-    return total
-
-
-def _solve(values, lengths, arms, order):
-    """Coefficients by least squares in coordinates from -1 to 1, written out in the coordinates themselves."""
-    powers = exponents(values.shape[1], order)
-    low, high = values.min(axis=0), values.max(axis=0)
-    middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low), 1e-9)
-    scaled = (values - middle) / half
-    rows, right = [_terms(scaled, powers)], [lengths]
-    for axis in range(values.shape[1]):
-        rows.append(-ARM_WEIGHT * _slopes(scaled, powers, axis) / half[axis])
-        right.append(ARM_WEIGHT * arms[:, axis])
-    solution = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0]
-    return _written_out(solution, powers, middle, half)
-
-
-def _written_out(coefficients, powers, middle, half):
-    """Coefficients for ``x`` from those for ``(x - middle) / half``."""
-    order = int(powers.sum(axis=1).max())
-    cube = np.zeros((order + 1,) * powers.shape[1])
-    cube[tuple(powers.T)] = coefficients
-    for axis in range(powers.shape[1]):
-        shift = np.zeros(
-            (order + 1, order + 1)
-        )  # from the power of the scaled coordinate to those of the plain one
-        for k in range(order + 1):
-            plain = np.polynomial.polynomial.polypow([-middle[axis] / half[axis], 1.0 / half[axis]], k)
-            shift[: len(plain), k] = plain
-        cube = np.moveaxis(np.tensordot(shift, cube, axes=(1, axis)), 0, axis)
-    return cube[tuple(powers.T)]
+def _solve(rows, wanted):
+    """Coefficients by least squares; columns are scaled, as powers of coordinates differ by orders of magnitude."""
+    matrix = rows.reshape(-1, rows.shape[2])
+    size = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
+    return np.linalg.lstsq(matrix / size, wanted.ravel(), rcond=None)[0] / size
 
 
 def write_paths(file: Path, fitted: list[FittedPath], metre: float, turning: dict[str, bool]) -> None:
@@ -152,25 +123,28 @@ def write_paths(file: Path, fitted: list[FittedPath], metre: float, turning: dic
     turning : dict of str to bool
         Whether a coordinate is no shift: shifts are in metres there.
     """
-    parts = [
-        '<?xml version="1.0" encoding="UTF-8" ?>',
-        '<OpenSimDocument Version="40600">',
-        "<Set_FunctionBasedPath_>",
-    ]
-    parts.append("<objects>")
+    root = ElementTree.Element("OpenSimDocument", Version="40600")
+    paths = ElementTree.SubElement(root, "Set_FunctionBasedPath_")
+    objects = ElementTree.SubElement(paths, "objects")
+    ElementTree.SubElement(paths, "groups")
     for path in fitted:
-        powers = exponents(len(path.coordinates), path.order)
         units = np.array([1.0 if turning[name] else metre for name in path.coordinates])
+        powers = exponents(len(path.coordinates), path.order)
         numbers = path.coefficients * np.prod(units**powers, axis=1) / metre
-        names = " ".join("/jointset/" + name.replace(".", "/", 1) for name in path.coordinates)
-        parts += [
-            f'<FunctionBasedPath name="/forceset/{escape(path.muscle)}">',
-            f"<coordinate_paths>{escape(names)}</coordinate_paths>",
-            "<length_function><MultivariatePolynomialFunction>",
-            f"<coefficients>{' '.join(repr(float(value)) for value in numbers)}</coefficients>",
-            f"<dimension>{len(path.coordinates)}</dimension><order>{path.order}</order>",
-            "</MultivariatePolynomialFunction></length_function>",
-            "</FunctionBasedPath>",
-        ]
-    parts += ["</objects>", "<groups />", "</Set_FunctionBasedPath_>", "</OpenSimDocument>"]
-    file.write_text("\n".join(parts) + "\n", encoding="utf-8")
+        item = ElementTree.SubElement(objects, "FunctionBasedPath", name=f"/forceset/{path.muscle}")
+        function = ElementTree.SubElement(
+            ElementTree.SubElement(item, "length_function"), "MultivariatePolynomialFunction"
+        )
+        for owner, tag, words in (
+            (
+                item,
+                "coordinate_paths",
+                ["/jointset/" + name.replace(".", "/", 1) for name in path.coordinates],
+            ),
+            (function, "coefficients", [repr(float(value)) for value in numbers]),
+            (function, "dimension", [str(len(path.coordinates))]),
+            (function, "order", [str(path.order)]),
+        ):
+            ElementTree.SubElement(owner, tag).text = " ".join(words)
+    ElementTree.indent(root)
+    ElementTree.ElementTree(root).write(file, encoding="UTF-8", xml_declaration=True)

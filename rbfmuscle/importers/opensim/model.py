@@ -1,52 +1,31 @@
-"""An OpenSim model as read: bodies, joints, couplings and meshes, in metres and radians."""
+"""An OpenSim model as read: bodies, joints, couplings, meshes and muscles, in metres and radians."""
 
-import math
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from rbfmuscle.importers.opensim.muscle_paths import ModelMuscle
-from rbfmuscle.scene.joints.joint import KINDS, Coordinate, Coupling, Joint, TransformAxis
+from rbfmuscle.scene.joints.joint import Coordinate, Coupling, Joint
 from rbfmuscle.scene.joints.skeleton import ordered
 from rbfmuscle.validation import SceneError
 
 GROUND = "ground"
-# What OpenSim calls a joint -> kind in our table, where the coordinates are in the same order.
-JOINT_KINDS = {
-    "WeldJoint": "fixed",
-    "PinJoint": "hinge",
-    "SliderJoint": "slider",
-    "UniversalJoint": "universal",
-    "BallJoint": "ball",
-    "GimbalJoint": "ball",
-    "PlanarJoint": "planar",
-    "FreeJoint": "free",
-    "CustomJoint": "custom",
-}
 
 
 @dataclass
-class ModelJoint:
-    """A joint between two bodies: ``X_child = X_parent P J(q) C^-1``.
+class ModelJoint(Joint):
+    """A joint between two bodies: ``X_child = X_parent P J(q) C^-1``; its own ``frame`` is the identity.
 
     Attributes
     ----------
-    parent, child : str
     parent_frame, child_frame : (4, 4) ndarray
         P and C: the joint's frames in their bodies.
-    moves : Joint
-        The motion J itself, its frame the identity.
     """
 
-    name: str
-    kind: str
-    parent: str
-    child: str
-    parent_frame: np.ndarray
-    child_frame: np.ndarray
-    moves: Joint
+    parent_frame: np.ndarray = field(default_factory=lambda: np.eye(4))
+    child_frame: np.ndarray = field(default_factory=lambda: np.eye(4))
 
 
 @dataclass
@@ -55,9 +34,29 @@ class ModelMesh:
 
     file: str
     body: str
-    scale: tuple[float, float, float]
+    scale: tuple[float, ...]
     transform: np.ndarray
-    visible: bool = True
+
+
+@dataclass
+class WrapShape:
+    """A cylinder (z), ellipsoid or sphere that a path goes around, in a frame (4, 4) of a body [metre]."""
+
+    body: str
+    frame: np.ndarray
+    radii: np.ndarray  # of the ellipsoid; of a cylinder two radii and half the length
+    kind: str
+    quadrant: str
+
+
+@dataclass
+class ModelMuscle:
+    """A muscle of the model: points by body in their frames [metre], shapes it wraps around, volume [m3]."""
+
+    name: str
+    points: list[tuple[str, np.ndarray]]
+    wraps: list[WrapShape] = field(default_factory=list)
+    volume: float = 0.0
 
 
 @dataclass
@@ -84,7 +83,7 @@ class OsimModel:
 
     def coordinates(self) -> dict[str, Coordinate]:
         """Every coordinate by its bare name, which is unique in a model."""
-        return {name: facts for joint in self.joints for name, facts in joint.moves.coordinates.items()}
+        return {name: facts for joint in self.joints for name, facts in joint.coordinates.items()}
 
     def resolve(self, values: dict[str, float] | None = None) -> dict[str, float]:
         """Return the value of every coordinate when some are set: locks, clamps and couplings honoured.
@@ -106,10 +105,7 @@ class OsimModel:
         A joint between two bodies that are both reached already closes a loop and is left out.
         """
         reached, waiting = {GROUND}, list(self.joints)
-        while waiting:
-            ready = next((j for j in waiting if (j.parent in reached) != (j.child in reached)), None)
-            if ready is None:
-                return
+        while ready := next((j for j in waiting if (j.parent in reached) != (j.child in reached)), None):
             waiting.remove(ready)
             backward = ready.child in reached
             reached |= {ready.parent, ready.child}
@@ -124,109 +120,48 @@ class OsimModel:
             As for `resolve`.
         """
         resolved = self.resolve(values)
-        found = {GROUND: np.eye(4)}
+        found = {body: np.eye(4) for body in self.bodies}
         for joint, backward in self.tree():
-            moved = joint.moves.displacement({n: resolved[n] for n in joint.moves.coordinates})
-            across = joint.parent_frame @ (np.eye(4) if moved is None else moved)
+            moved = joint.displacement(resolved)
+            across = joint.parent_frame if moved is None else joint.parent_frame @ moved
             across = across @ np.linalg.inv(joint.child_frame)
             if backward:
                 found[joint.parent] = found[joint.child] @ np.linalg.inv(across)
             else:
                 found[joint.child] = found[joint.parent] @ across
-        return {body: found.get(body, np.eye(4)) for body in self.bodies}
+        return found
 
 
 def finish(model: OsimModel) -> OsimModel:
-    """Check what was read, note what hangs loose, and return the model.
+    """Check what was read, note what is not connected, and return the model.
 
     Raises
     ------
     SceneError
-        If two bodies or two coordinates share a name, or a joint names a body that is not there.
+        If two bodies or two coordinates share a name, or a joint or a coupling names what is not there.
     """
-    for what, names in (
-        ("bodies", model.bodies),
-        ("joints", [joint.name for joint in model.joints]),
-        ("coordinates", [name for joint in model.joints for name in joint.moves.coordinates]),
-    ):
-        for name in names:
-            if names.count(name) > 1:
+    coordinates = [name for joint in model.joints for name in joint.coordinates]
+    joints = [joint.name for joint in model.joints]
+    for what, names in (("bodies", model.bodies), ("joints", joints), ("coordinates", coordinates)):
+        for name, count in Counter(names).items():
+            if count > 1:
                 raise SceneError(f"two {what} are named {name!r}; rename one")
     for joint in model.joints:
         for body in (joint.parent, joint.child):
             if body not in model.bodies:
-                raise SceneError(
-                    f"joint {joint.name!r}: there is no body {body!r}; correct the joint's frames"
-                )
-    used = [joint for joint, _ in model.tree()]
+                raise SceneError(f"joint {joint.name!r}: there is no body {body!r}; correct its frames")
+    for coupling in model.couplings:
+        for name in (coupling.coordinate, *coupling.of):
+            if name not in coordinates:
+                raise SceneError(f"a coupling names coordinate {name!r}, which no joint has; correct it")
+    model.couplings = ordered(model.couplings)
+    used = [joint.name for joint, _ in model.tree()]
     for joint in model.joints:
-        if joint not in used:
-            model.notes.append(
-                f"joint {joint.name!r} ({joint.parent} to {joint.child}) closes a loop or hangs on nothing: not taken"
-            )
-    held = {GROUND, *(joint.parent for joint in used), *(joint.child for joint in used)}
+        if joint.name not in used:
+            ends = f"({joint.parent} to {joint.child})"
+            model.notes.append(f"joint {joint.name!r} {ends} closes a loop or is not connected: not taken")
+    held = {GROUND} | {b for j in model.joints if j.name in used for b in (j.parent, j.child)}
     for body in model.bodies:
         if body not in held:
-            model.notes.append(f"body {body!r} has no joint to the ground: it stands where its file puts it")
-    known = model.coordinates()
-    for coupling in list(model.couplings):
-        lost = [name for name in (coupling.coordinate, *coupling.of) if name not in known]
-        if lost:
-            raise SceneError(
-                f"a coupling names coordinate {lost[0]!r}, which no joint has; correct the constraint"
-            )
-    model.couplings = ordered(model.couplings)
+            model.notes.append(f"body {body!r} has no joint to the ground: it stays where its file puts it")
     return model
-
-
-def joint_motion(
-    name: str, kind: str, coordinates: dict[str, Coordinate], axes: dict[str, TransformAxis]
-) -> Joint:
-    """Return the motion J of a joint, in its own frame.
-
-    Parameters
-    ----------
-    kind : str
-        A key of `KINDS`.
-    coordinates : dict of str to Coordinate
-        In the order of the file.
-    axes : dict of str to TransformAxis
-        ``rotation1`` ... ``translation3`` of a custom joint; else empty.
-    """
-    facts = KINDS[kind]
-    if kind == "custom":
-        rotations = tuple(axes[f"rotation{k}"] for k in (1, 2, 3) if f"rotation{k}" in axes)
-        translations = tuple(axes[f"translation{k}"] for k in (1, 2, 3) if f"translation{k}" in axes)
-    else:
-        names = list(coordinates)
-        count = len(facts.rotations)
-        rotations = tuple(TransformAxis(a, (n,)) for a, n in zip(facts.rotations, names))
-        translations = tuple(TransformAxis(a, (n,)) for a, n in zip(facts.translations, names[count:]))
-    return Joint(name, "", "", np.eye(4), coordinates, rotations, translations, kind)
-
-
-def motion_kinds(kind: str, names: list[str], axes: dict[str, TransformAxis], slopes: dict) -> list[str]:
-    """Return what each coordinate of a joint is, by OpenSim's rule.
-
-    In a custom joint a coordinate is an angle or a length where it drives an axis of that sort by a linear function
-    of slope 1 or -1, the last such axis deciding; else it is coupled.
-
-    Parameters
-    ----------
-    slopes : dict of str to float
-        Slope of each axis whose function is a plain linear one.
-    """
-    facts = KINDS[kind]
-    if kind != "custom":
-        return (["rotation"] * len(facts.rotations) + ["translation"] * len(facts.translations))[: len(names)]
-    found = dict.fromkeys(names, "coupled")
-    for slot in ("rotation", "translation"):
-        for k in (1, 2, 3):
-            axis = axes.get(f"{slot}{k}")
-            if (
-                axis is not None
-                and math.fabs(slopes.get(f"{slot}{k}", 0.0)) == 1.0
-                and len(axis.coordinates) == 1
-            ):
-                found[axis.coordinates[0]] = slot
-    return [found[name] for name in names]

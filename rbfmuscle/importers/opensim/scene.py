@@ -1,18 +1,20 @@
 """A scene from an OpenSim model: bodies as bones where the default pose puts them, joints as they are."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.importers.opensim.geometry import body_meshes
 from rbfmuscle.importers.opensim.model import OsimModel
-from rbfmuscle.importers.opensim.muscles import bone_distances, make_tube, scaled
 from rbfmuscle.importers.opensim.read import read_osim
+from rbfmuscle.importers.opensim.tubes import make_tube, scaled
 from rbfmuscle.scene.joints.functions import Function
-from rbfmuscle.scene.joints.joint import Coordinate, Coupling, Joint, TransformAxis
+from rbfmuscle.scene.joints.joint import Coupling, Joint, TransformAxis
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MeshError, SceneError, did_you_mean
@@ -82,12 +84,10 @@ def import_osim(
     model = read_osim(path)
     if bodies:
         _keep(model, bodies)
-    scene = Scene(clean_name(model.name or Path(path).stem, set()), units=units)
+    scene = Scene(_clean_name(model.name or Path(path).stem, ()), units=units)
     metre = 1000.0 / MM_PER_UNIT[units]
-    names = {}
-    for body in model.bodies:
-        names[body] = clean_name(body, set(names.values()))
     ground = model.transforms()
+    names = _clean_names(model.bodies)
     meshes, notes = body_meshes(model, ground, metre, list(geometry or []))
     notes = [*model.notes, *notes]
     notes += [f"body {body!r} is named {names[body]!r} here" for body in model.bodies if names[body] != body]
@@ -97,10 +97,9 @@ def import_osim(
             notes += [f"body {body!r}: {note}" for note in meshes[body].notes]
         else:
             scene.add_link(names[body])
-    places = {body: scaled(place, metre) for body, place in ground.items()}
-    _add_joints(scene, model, places, names, metre, notes)
+    found = Imported(scene, model, {body: scaled(t, metre) for body, t in ground.items()}, names, notes)
+    _add_joints(found, metre)
     scene.superior, scene.anterior = [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]
-    found = Imported(scene, model, places, names, notes)
     if muscles:
         _add_muscles(found, metre)
     return found
@@ -108,25 +107,38 @@ def import_osim(
 
 def _add_muscles(found, metre):
     """A tube for each muscle of the model."""
-    scene, distances = found.scene, bone_distances(found.scene)
+    scene, meshes = found.scene, {bone.name: bone.mesh for bone in found.scene.bones}
+    bones = {
+        body: ExactDistance(meshes[name].vertices, meshes[name].faces)
+        for body, name in found.names.items()
+        if name in meshes
+    }
     for muscle in found.model.muscles:
-        name = clean_name(muscle.name, {other.name for other in scene.muscles})
+        name = _clean_name(muscle.name, [other.name for other in scene.muscles])
         try:
-            tube = make_tube(muscle, found.places, found.names, distances, metre)
-            attach: Any = [{"bone": bone, "vertices": held.tolist()} for bone, held in tube.held.items()]
+            tube = make_tube(muscle, found.places, bones, metre)
+            attach: Any = [{"bone": found.names[b], "vertices": v.tolist()} for b, v in tube.held.items()]
             scene.add_muscle(name, (tube.vertices, tube.faces), attach=attach)
         except (SceneError, MeshError) as error:
             found.lost[name] = str(error)
             found.notes.append(f"muscle {name!r} is not taken: {error}")
 
 
-def clean_name(name: str, taken: set[str]) -> str:
+def _clean_name(name: str, taken: Sequence[str]) -> str:
     """Return a name of letters, digits, ``_`` and ``-`` that is not taken yet."""
     base = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_") or "body"
     made, number = base, 2
     while made in taken:
         made, number = f"{base}_{number}", number + 1
     return made
+
+
+def _clean_names(names):
+    """The clean name of each name."""
+    found: dict[str, str] = {}
+    for name in names:
+        found[name] = _clean_name(name, list(found.values()))
+    return found
 
 
 def _keep(model, bodies):
@@ -150,49 +162,47 @@ def _keep(model, bodies):
     model.couplings = [c for c in model.couplings if all(n in known for n in (c.coordinate, *c.of))]
 
 
-def _add_joints(scene, model, places, names, metre, notes):
-    factor = {n: metre if c.motion == "translation" else 1.0 for n, c in model.coordinates().items()}
-    titles, full, taken = {}, {}, set()
-    for joint, backward in model.tree():
-        name = clean_name(joint.name, taken)
-        taken.add(name)
-        own = {}
-        for coordinate in joint.moves.coordinates:
-            own[coordinate] = clean_name(coordinate, set(own.values()))
-            full[coordinate] = f"{name}.{own[coordinate]}"
-            if own[coordinate] != coordinate:
-                notes.append(f"coordinate {coordinate!r} is named {own[coordinate]!r} here")
-        titles[joint.name] = name
-        ends = (joint.child, joint.parent) if backward else (joint.parent, joint.child)
-        frame = places[joint.parent] @ scaled(joint.parent_frame, metre)
-        moves = joint.moves
-        scene.place_joint(
-            Joint(
-                name, names[ends[0]], names[ends[1]], frame,
-                {own[n]: _scaled_coordinate(c, factor[n]) for n, c in moves.coordinates.items()},
-                tuple(_scaled_axis(axis, own, factor, 1.0) for axis in moves.rotations),
-                tuple(_scaled_axis(axis, own, factor, metre) for axis in moves.translations),
-                moves.kind, backward,
+def _add_joints(found, metre):
+    """The joints and couplings of the tree, in the scene's units and under clean names."""
+    scene, model, names = found.scene, found.model, found.names
+    used = list(model.tree())
+    titles = _clean_names([joint.name for joint, _ in used])
+    factors, full = {}, {}
+    for joint, backward in used:
+        own = _clean_names(joint.coordinates)
+        found.notes += [
+            f"coordinate {name!r} is named {own[name]!r} here" for name in own if own[name] != name
+        ]
+        coordinates = {}
+        for name, facts in joint.coordinates.items():
+            factors[name] = factor = metre if facts.motion == "translation" else 1.0
+            full[name] = f"{titles[joint.name]}.{own[name]}"
+            limits = None if facts.range is None else tuple(factor * end for end in facts.range)
+            coordinates[own[name]] = replace(facts, rest=facts.rest * factor, range=limits)
+        axes = [
+            tuple(
+                TransformAxis(
+                    axis.direction,
+                    tuple(own[name] for name in axis.coordinates),
+                    _rescaled(axis.function, axis.coordinates, factors, output),
+                )
+                for axis in group
             )
-        )  # fmt: skip
-    known = {n for joint, _ in model.tree() for n in joint.moves.coordinates}
+            for group, output in ((joint.rotations, 1.0), (joint.translations, metre))
+        ]
+        ends = [names[joint.parent], names[joint.child]]
+        frame = found.places[joint.parent] @ scaled(joint.parent_frame, metre)
+        parent, child = reversed(ends) if backward else ends
+        scene.place_joint(
+            Joint(titles[joint.name], parent, child, frame, coordinates, *axes, joint.kind, backward)
+        )
     for coupling in model.couplings:
-        if {coupling.coordinate, *coupling.of} <= known:
-            function = _rescaled(coupling.function, coupling.of, factor, factor[coupling.coordinate])
+        if all(name in full for name in (coupling.coordinate, *coupling.of)):
+            function = _rescaled(coupling.function, coupling.of, factors, factors[coupling.coordinate])
             of = tuple(full[name] for name in coupling.of)
             scene.place_coupling(Coupling(full[coupling.coordinate], of, function))
 
 
-def _scaled_coordinate(facts: Coordinate, factor: float) -> Coordinate:
-    limits: Any = None if facts.range is None else tuple(end * factor for end in facts.range)
-    return replace(facts, rest=facts.rest * factor, range=limits)
-
-
-def _scaled_axis(axis, own, factor, output):
-    function = _rescaled(axis.function, axis.coordinates, factor, output)
-    return TransformAxis(axis.direction, tuple(own[name] for name in axis.coordinates), function)
-
-
-def _rescaled(function: Function, of: Any, factor: Any, output: Any) -> Function:
-    inputs = [factor[name] for name in of]
-    return function if output == 1.0 and all(f == 1.0 for f in inputs) else function.rescaled(inputs, output)
+def _rescaled(function: Function, of: Sequence[str], factors: dict[str, float], output: float) -> Function:
+    inputs = [factors[name] for name in of]
+    return function if {output, *inputs} == {1.0} else function.rescaled(inputs, output)

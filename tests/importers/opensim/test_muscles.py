@@ -5,16 +5,15 @@ import pytest
 import trimesh
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.importers.opensim.muscle_paths import ModelMuscle, WrapShape
-from rbfmuscle.importers.opensim.muscles import make_tube
+from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.scene import import_osim
+from rbfmuscle.importers.opensim.tubes import make_tube
 from rbfmuscle.importers.opensim.write import write_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import SceneError
 
 PLACES = {"a": np.eye(4), "b": np.eye(4), "c": np.eye(4)}
-NAMES = {"a": "a", "b": "b", "c": "c"}
 
 
 def _bones(*names):
@@ -25,7 +24,7 @@ def _bones(*names):
 
 def _tube(points, **more):
     muscle = ModelMuscle("m", points, volume=1e-4, **more)
-    return make_tube(muscle, PLACES, NAMES, _bones("a", "b", "c"), 1.0)
+    return make_tube(muscle, PLACES, _bones("a", "b", "c"), 1.0)
 
 
 def test_straight_tube_is_closed_has_its_volume_and_is_held_at_its_ends():
@@ -47,7 +46,7 @@ def test_path_goes_around_a_cylinder_on_the_side_that_it_says(quadrant, side):
     frame = np.eye(4)  # its axis along y
     frame[:3, :3] = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     frame[:3, 3] = [-0.002, 0.0, 0.15]
-    wrap = WrapShape("w", "a", frame, np.array([0.03, 0.03, 0.1]), "WrapCylinder", quadrant)
+    wrap = WrapShape("a", frame, np.array([0.03, 0.03, 0.1]), "WrapCylinder", quadrant)
     tube = _tube([("a", np.zeros(3)), ("b", np.array([0.0, 0.0, 0.3]))], wraps=[wrap])
     middles = tube.vertices[:-2].reshape(-1, 12, 3).mean(axis=1)
     away = np.hypot(middles[:, 0] + 0.002, middles[:, 2] - 0.15)
@@ -57,7 +56,7 @@ def test_path_goes_around_a_cylinder_on_the_side_that_it_says(quadrant, side):
 def test_muscle_without_a_bone_to_hold_it_is_named():
     muscle = ModelMuscle("m", [("a", np.zeros(3)), ("b", np.ones(3))], volume=1e-4)
     with pytest.raises(SceneError, match="body 'b' has no mesh"):
-        make_tube(muscle, PLACES, NAMES, _bones("a"), 1.0)
+        make_tube(muscle, PLACES, _bones("a"), 1.0)
 
 
 def test_muscles_of_published_models_are_written_and_load(osim_data, tmp_path):

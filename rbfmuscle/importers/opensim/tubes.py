@@ -1,0 +1,184 @@
+"""Muscles without meshes: tapered tubes along the paths of a model.
+
+A tube has the volume of its fibres: maximum isometric force times optimal fibre length over the specific tension. Its
+middle line is the model's path in its default pose, over its wrapping objects, kept out of the bones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.surfaces import mesh_volume
+from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
+from rbfmuscle.validation import SceneError
+
+# Sections along a tube and corners of each; radius at the ends against the middle; share of the length held at an end.
+SECTIONS, CORNERS, END_RADIUS, HELD = 28, 12, 0.3, 0.06
+# Rounds in which the middle line is drawn straight and put out of what is in its way.
+ROUNDS = 60
+
+
+@dataclass
+class Tube:
+    """A tube: vertices [scene unit], triangles, and the vertices that each bone holds."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    held: dict[str, np.ndarray]
+
+
+def make_tube(
+    muscle: ModelMuscle, places: dict[str, np.ndarray], bones: dict[str, ExactDistance], metre: float
+) -> Tube:
+    """The tube of a muscle in the scene.
+
+    Parameters
+    ----------
+    muscle : ModelMuscle
+    places : dict of str to (4, 4) ndarray
+        From every body of the model to the scene [scene unit].
+    bones : dict of str to ExactDistance
+        Of the bodies that have a mesh in the scene.
+    metre : float
+        Scene units in a metre.
+
+    Raises
+    ------
+    SceneError
+        If a body that holds an end has no mesh, or the path has no length or no volume.
+    """
+    bodies = [body for body, _ in muscle.points]
+    if len(set(bodies[:1] + bodies[-1:])) < 2 or muscle.volume <= 0.0:
+        raise SceneError(f"muscle {muscle.name!r}: it has no two bodies, or no volume")
+    for body in (bodies[0], bodies[-1]):
+        if body not in bones:
+            raise SceneError(f"muscle {muscle.name!r}: body {body!r} has no mesh to hold it")
+    volume = muscle.volume * metre**3
+    points = np.array([places[body][:3, :3] @ at * metre + places[body][:3, 3] for body, at in muscle.points])
+    line, fixed = _middle_line(points)
+    length = np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
+    share = END_RADIUS + (1.0 - END_RADIUS) * np.sin(np.pi * np.linspace(0.0, 1.0, len(line)))
+    radius = share * np.sqrt(volume / (np.pi * length * np.mean(share**2)))
+    wraps = [(wrap, places[wrap.body] @ scaled(wrap.frame, metre)) for wrap in muscle.wraps]
+    line = _clear_line(line, fixed, radius, wraps, metre, list(bones.values()))
+    found = mesh_volume(*_skin(line, radius))  # as its square, but for where sections run into each other
+    vertices, faces = _skin(line, radius * np.sqrt(volume / found))
+    return Tube(vertices, faces, _held(bodies, fixed, bones))
+
+
+def scaled(transform: np.ndarray, metre: float) -> np.ndarray:
+    """Return a rigid (4, 4) transform with its shift in other units."""
+    out = transform.copy()
+    out[:3, 3] *= metre
+    return out
+
+
+def _middle_line(points):
+    """Points (n, 3) evenly along a path, and the place in them of each of its points."""
+    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
+    along /= max(along[-1], 1e-300)
+    marks = np.linspace(0.0, 1.0, SECTIONS)
+    line = np.column_stack([np.interp(marks, along, points[:, k]) for k in range(3)])
+    return line, np.rint(along * (SECTIONS - 1)).astype(int)
+
+
+def _clear_line(line, fixed, radius, wraps, metre, bones):
+    """The line drawn straight between its points, out of wrapping shapes and, by its radius, out of bones."""
+    line, start = line.copy(), line.copy()
+    middle = np.arange(3, len(line) - 3)
+    for number in range(ROUNDS):
+        line[1:-1] = 0.25 * (line[:-2] + 2.0 * line[1:-1] + line[2:])
+        line[fixed] = 0.5 * (line[fixed] + start[fixed])
+        for wrap, frame in wraps:
+            back = np.linalg.inv(frame)
+            local = (line @ back[:3, :3].T + back[:3, 3]) / metre
+            line = (_out_of_shape(wrap, local) * metre) @ frame[:3, :3].T + frame[:3, 3]
+        if number % 10 == 9:
+            for bone in bones:
+                line[middle] = _out_of_bone(bone, line[middle], 0.8 * radius[middle])
+    line[[0, -1]] = start[[0, -1]]
+    return line
+
+
+def _out_of_shape(wrap: WrapShape, points: Any) -> Any:
+    """Points (n, 3) in a shape's frame [metre], those inside moved to its surface, in its quadrant."""
+    count = 2 if wrap.kind == "WrapCylinder" else 3
+    unit = points[:, :count] / wrap.radii[:count]
+    inside = np.linalg.norm(unit, axis=1) < 1.0
+    if count == 2:
+        inside &= np.abs(points[:, 2]) <= wrap.radii[2]
+    axis = "xyz".find(wrap.quadrant[-1:] or "?")
+    if 0 <= axis < count:
+        sign = -1.0 if wrap.quadrant[0] == "-" else 1.0
+        unit[:, axis] = np.where(inside & (sign * unit[:, axis] < 0.0), 0.0, unit[:, axis])
+        unit[:, axis] += sign * 1e-3 * inside
+    size = np.maximum(np.linalg.norm(unit, axis=1), 1e-9)
+    out = points.copy()
+    out[inside, :count] = (unit / size[:, None] * wrap.radii[:count])[inside]
+    return out
+
+
+def _out_of_bone(bone, points, reach):
+    distance = bone.signed_distance(points, reach=float(reach.max()))
+    near = np.isfinite(distance) & (distance < reach)
+    if not near.any():
+        return points
+    closest = bone.closest_point(points[near])
+    away = (points[near] - closest) * np.where(distance[near] < 0.0, -1.0, 1.0)[:, None]
+    size = np.maximum(np.linalg.norm(away, axis=1), 1e-12)[:, None]
+    out = points.copy()
+    out[near] = closest + away / size * reach[near][:, None]
+    return out
+
+
+def _skin(line, radius):
+    """Vertices and triangles of a tube about a line, closed at both ends; sections turn as little as they can."""
+    tangent = np.gradient(line, axis=0)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1), 1e-12)[:, None]
+    side = np.cross(tangent[0], np.eye(3)[np.argmin(np.abs(tangent[0]))])
+    angle = np.linspace(0.0, 2.0 * np.pi, CORNERS, endpoint=False)
+    rings = []
+    for point, along, r in zip(line, tangent, radius):
+        side = side - side @ along * along
+        side = side / np.linalg.norm(side)
+        circle = np.outer(np.cos(angle), side) + np.outer(np.sin(angle), np.cross(along, side))
+        rings.append(point + r * circle)
+    k = np.arange(CORNERS)
+    following, count = np.roll(k, -1), len(line) * CORNERS
+    a = CORNERS * np.arange(len(line) - 1)[:, None]
+    this, beside = a + k, a + following
+    pairs = [
+        np.stack([this, beside, this + CORNERS], 2),
+        np.stack([beside, beside + CORNERS, this + CORNERS], 2),
+    ]
+    sides = np.stack(pairs, axis=1)
+    last = count - CORNERS
+    caps = [
+        (following, k, np.full(CORNERS, count)),
+        (last + k, last + following, np.full(CORNERS, count + 1)),
+    ]
+    faces = np.vstack([np.column_stack(caps[0]), sides.reshape(-1, 3), np.column_stack(caps[1])])
+    return np.vstack([*rings, line[:1], line[-1:]]), faces
+
+
+def _held(bodies, fixed, bones):
+    """Vertices by bone: both ends with the points that follow on their body, a section at each point on another."""
+    few = max(1, round(HELD * SECTIONS))
+    first = next(k for k, body in enumerate(bodies) if body != bodies[0])
+    last = len(bodies) - next(k for k, body in enumerate(reversed(bodies)) if body != bodies[-1])
+    start = min(max(few, fixed[first - 1]), SECTIONS // 3)
+    end = max(min(SECTIONS - 1 - few, fixed[last]), SECTIONS - 1 - SECTIONS // 3)
+    sections = dict.fromkeys(range(start + 1), bodies[0]) | dict.fromkeys(range(end, SECTIONS), bodies[-1])
+    for place, body in zip(fixed[first:last].tolist(), bodies[first:last]):
+        if body in bones:
+            sections.setdefault(place, body)
+    held = {body: [] for body in sections.values()}
+    for k, body in sections.items():
+        held[body].append(np.arange(k * CORNERS, (k + 1) * CORNERS))
+    for k in (0, -1):
+        held[bodies[k]].append(np.array([SECTIONS * CORNERS - k]))
+    return {body: np.sort(np.concatenate(rows)) for body, rows in held.items()}

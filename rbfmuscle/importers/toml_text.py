@@ -1,0 +1,56 @@
+"""Tables of a scene file as TOML that a person can read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+
+def value_text(value: Any) -> str:
+    """Return a value as TOML on one line; numbers to 13 digits."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return f"{value + 0.0:.13g}"  # no -0
+    if isinstance(value, str):
+        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+        return '"' + "".join(c if c.isprintable() else " " for c in escaped) + '"'
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{_key(k)} = {value_text(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(value_text, value)) + "]"
+    return str(value)
+
+
+def _key(key):
+    bare = key.replace("_", "").replace("-", "")
+    return key if bare.isascii() and bare.isalnum() else value_text(key)
+
+
+def table_text(
+    head: str, row: Mapping[str, Any], comments: Mapping[str, str | list[str]] | None = None
+) -> str:
+    """Return a table as TOML, lists of tables with one a line.
+
+    Parameters
+    ----------
+    head : str
+        The first line, as ``[[bone]]``.
+    row : dict
+    comments : dict of str to str or list of str
+        After the line of a key, or after each table of its list.
+    """
+    lines = [head]
+    for key, value in row.items():
+        said = (comments or {}).get(key, "")
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            words = said if isinstance(said, list) else [""] * len(value)
+            rows = [_commented(f"  {value_text(item)},", text) for item, text in zip(value, words)]
+            lines += [f"{_key(key)} = [", *rows, "]"]
+        else:
+            lines.append(_commented(f"{_key(key)} = {value_text(value)}", str(said)))
+    return "\n".join(lines) + "\n"
+
+
+def _commented(line, text):
+    return f"{line}   # {text}" if text else line
