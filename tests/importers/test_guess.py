@@ -13,9 +13,10 @@ from conftest import ROOT
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.cli.app import run_command
-from rbfmuscle.importers.guess.attachments import AttachmentGuess, Ends, MuscleGuess
+from rbfmuscle.importers.guess.anatomy import JointGuess
+from rbfmuscle.importers.guess.attachments import AttachmentGuess, Ends, MuscleGuess, _best_of
 from rbfmuscle.importers.guess.guess import guess_scene, write_scene
-from rbfmuscle.importers.guess.joints import JointGuess, fit_ball, fit_hinge, guess_joints
+from rbfmuscle.importers.guess.joints import Face, fit_ball, fit_hinge, guess_joints
 from rbfmuscle.importers.guess.landmarks import CONDYLE, fit_condyles
 from rbfmuscle.importers.guess.names import name_facts
 from rbfmuscle.importers.guess.orientation import HEADER, find_orientation
@@ -53,6 +54,7 @@ from rbfmuscle.validation import UsageError
         ("Großer Gesäßmuskel", "muscle", "grosser gesaessmuskel", ""),
         ("VHM_Left_Cartilage_TibialMedial_smooth", "other", "", "l"),
         ("quadriceps_tendon", "other", "", ""),
+        ("Lig. collaterale fibulare", "other", "", ""),
         ("iliac_artery_left", "other", "", "l"),
         ("Segment_1", "", "", ""),
     ],
@@ -73,26 +75,14 @@ def test_misspelt_names_are_named_and_known_words_are_never_taken_for_others():
     assert name_facts("Qwertz").tissue == ""
 
 
-def _facing(points, normals):
-    weights = np.ones(len(points))
-    mean = normals.mean(axis=0) / np.linalg.norm(normals.mean(axis=0))
-    near = normals @ mean > 0.8
-    return SimpleNamespace(
-        points=points,
-        normals=normals,
-        weights=weights,
-        dome=lambda: (points[near], normals[near], weights[near]),
-    )
-
-
 def test_ball_is_found_from_a_cap():
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(500, 3))
     normals = normals[normals[:, 2] > 0]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    centre, radius, misfit, cover = fit_ball(_facing(normals * 23.0 + [1, 2, 3], normals))
-    assert centre == pytest.approx([1, 2, 3], abs=1e-9)
-    assert radius == pytest.approx(23.0, abs=1e-9) and misfit < 1e-9 and cover > 0
+    fit = fit_ball(Face(normals * 23.0 + [1, 2, 3], normals, np.ones(len(normals))))
+    assert fit.centre == pytest.approx([1, 2, 3], abs=1e-9)
+    assert fit.radius == pytest.approx(23.0, abs=1e-9) and fit.misfit < 1e-9 and fit.cover > 0
 
 
 def test_hinge_is_found_from_a_dome():
@@ -102,10 +92,10 @@ def test_hinge_is_found_from_a_dome():
     angle = rng.uniform(-1.0, 1.0, 400)
     normals = np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v
     points = 20.0 * normals + rng.uniform(-15, 15, 400)[:, None] * axis + [5, -4, 2]
-    centre, found, radius, misfit = fit_hinge(_facing(points, normals))
-    assert abs(found @ axis) == pytest.approx(1.0, abs=1e-6)
-    assert radius == pytest.approx(20.0, abs=1e-3) and misfit < 1e-3
-    away = centre - [5, -4, 2]
+    fit = fit_hinge(Face(points, normals, np.ones(400)))
+    assert abs(fit.axis @ axis) == pytest.approx(1.0, abs=1e-6)
+    assert fit.radius == pytest.approx(20.0, abs=1e-3) and fit.misfit < 1e-3
+    away = fit.centre - [5, -4, 2]
     assert np.linalg.norm(away - away @ axis * axis) < 1e-3
 
 
@@ -229,7 +219,7 @@ def test_joints_of_the_leg_however_it_lies(leg, how):
     joints = {joint.name: joint for joint in guess_joints(bones, millimetre, orientation)[1]}
     linear = transform[:3, :3] / millimetre
     hand = np.sign(np.linalg.det(linear))
-    assert set(orientation.sides.values()) == {"r" if hand > 0 else "l"}
+    assert bones[1].frame.side == bones[1].side == ("r" if hand > 0 else "l")
     assert (
         orientation.superior @ linear @ [0, 0, 1] > 0.95 and orientation.anterior @ linear @ [0, -1, 0] > 0.95
     )
@@ -266,8 +256,8 @@ def test_patella_follows_the_table_that_was_computed_for_the_leg(leg):
 
 def test_a_condyle_larger_than_anatomy_has_is_refused_and_named(leg):
     bones, _ = _leg_bones(leg, np.diag([2.5, 2.5, 2.5, 1.0]))
-    femur = bones[1]
-    fit = fit_condyles(femur, find_orientation(bones).frames[id(femur)], 1.0)
+    find_orientation(bones)
+    fit = fit_condyles(bones[1], bones[1].frame, 1.0)
     assert fit.wrong and f"anatomy has {CONDYLE[0]:g} to {CONDYLE[1]:g}" in fit.wrong
 
 
@@ -297,19 +287,11 @@ def test_muscles_of_the_leg_hang_on_the_right_bones_at_the_right_places(leg_gues
     assert {name for name in last if last[name] != first[name]} == {"hip.flexion"} and not scene.motion.notes
 
 
-def test_side_of_the_body_is_kept(tmp_path):
-    mesh = phantom_scene().bones[0].mesh
-    for name in ("femur_l", "femur_r", "pelvis"):
-        mesh.export(tmp_path / f"{name}.ply")
-    from rbfmuscle.scene.meshes.read import read_mesh
-
-    bones = [
-        Part(n, n, read_mesh(tmp_path / f"{n}.ply"), kind="femur", side=n[-1]) for n in ("femur_l", "femur_r")
-    ]
-    from rbfmuscle.importers.guess.attachments import _best_of
-
-    muscle = SimpleNamespace(side="r")
-    assert _best_of(("femur",), muscle, bones, [np.zeros(3), np.ones(3)]) == 1
+def test_side_of_the_body_is_kept():
+    bones = [Part(f"femur_{side}", "", None, kind="femur", side=side) for side in "lr"]
+    distances = {bones[0]: np.zeros(3), bones[1]: np.ones(3)}
+    assert _best_of(("femur",), Part("m", "", None, side="r"), distances) is bones[1]
+    assert _best_of(("femur",), Part("m", "", None), distances) is bones[0]
 
 
 def test_muscles_without_the_bones_of_their_names_still_make_a_scene(tmp_path):

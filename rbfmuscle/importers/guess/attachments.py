@@ -7,17 +7,19 @@ the belly stops short of its bone, the patch is the cap of the end that points t
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from itertools import combinations
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from rbfmuscle.scene.attachments import signed_distances
+from rbfmuscle.importers.guess.landmarks import unit
+from rbfmuscle.importers.guess.parts import Part
+from rbfmuscle.scene.attachments import ExactMeshes
 
 if TYPE_CHECKING:
     import trimesh
-
 
 # A bone nearer than this [mm] is touched; the patch is what lies within TOUCH of the nearest.
 NEAR, TOUCH = 6.0, 3.0
@@ -51,7 +53,7 @@ class AttachmentGuess:
         What carries an end far from its bone.
     """
 
-    bone: Any
+    bone: Part
     vertices: np.ndarray
     gap: float
     reason: str
@@ -70,20 +72,44 @@ class MuscleGuess:
     Attributes
     ----------
     muscle : Part
-    holds : list of Hold
+    holds : list of AttachmentGuess
     confidence : float
-        0 to 1; below 0.5 it wants a look.
+        0 to 1.
     reasons : list of str
         Why the confidence is not higher.
     wrong : str
         Why the muscle cannot be run as guessed; empty where it can.
     """
 
-    muscle: Any
-    holds: list
+    muscle: Part
+    holds: list[AttachmentGuess]
     confidence: float
-    reasons: list = field(default_factory=list)
+    reasons: list[str] = field(default_factory=list)
     wrong: str = ""
+
+    def doubt(self, confidence: float, reason: str) -> None:
+        """Add a reason why the confidence is at most so much."""
+        self.confidence = min(self.confidence, confidence)
+        self.reasons.append(reason)
+
+
+class Skeleton(NamedTuple):
+    """What muscles are held by.
+
+    Attributes
+    ----------
+    bones : list of Part
+    bodies : dict of Part to Part
+        Of bones that move as one the one that stands for all.
+    exact : ExactMeshes
+    millimetre : float
+        Length of a millimetre in scene units.
+    """
+
+    bones: list[Part]
+    bodies: dict[Part, Part]
+    exact: ExactMeshes
+    millimetre: float
 
 
 class Ends:
@@ -95,192 +121,162 @@ class Ends:
     """
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
-        edges, lengths, count = mesh.edges_unique, mesh.edges_unique_length, len(mesh.vertices)
-        rows, cols = np.r_[edges[:, 0], edges[:, 1]], np.r_[edges[:, 1], edges[:, 0]]
-        graph = coo_matrix((np.r_[lengths, lengths], (rows, cols)), shape=(count, count)).tocsr()
-        first = _farthest(dijkstra(graph, indices=0))
-        away = dijkstra(graph, indices=first)
-        self.tips = (first, _farthest(away))
-        self.away = (away, dijkstra(graph, indices=self.tips[1]))
-        self.length = float(away[self.tips[1]])
+        count = len(mesh.vertices)
+        graph = coo_matrix((mesh.edges_unique_length, mesh.edges_unique.T), shape=(count, count)).tocsr()
 
-    def along(self, end: Any) -> Any:
+        def away_from(vertex):
+            distance = dijkstra(graph, directed=False, indices=vertex)
+            return distance, int(np.argmax(np.where(np.isfinite(distance), distance, -1.0)))
+
+        first = away_from(0)[1]
+        away, second = away_from(first)
+        self.tips, self.away = (first, second), (away, away_from(second)[0])
+        self.length = float(away[second])
+
+    def along(self, end: int) -> np.ndarray:
         """Place of each vertex between an end (0) and the other one (1)."""
-        total = np.maximum(self.away[0] + self.away[1], 1e-300)
-        return self.away[end] / total
+        return self.away[end] / np.maximum(self.away[0] + self.away[1], 1e-300)
 
 
-def _farthest(distance):
-    return int(np.argmax(np.where(np.isfinite(distance), distance, -1.0)))
-
-
-def guess_attachments(
-    muscle: Any, bones: list[Any], bodies: dict[int, int], millimetre: float, *, named: bool = True
-) -> MuscleGuess:
+def guess_attachments(muscle: Part, skeleton: Skeleton, *, named: bool = True) -> MuscleGuess:
     """Find the bones that hold a muscle and the vertices that they hold.
 
     Parameters
     ----------
     muscle : Part
-    bones : list of Part
-    bodies : dict of int to int
-        Which bones move as one: the body of each bone, by its place in the list.
-    millimetre : float
-        Length of a millimetre in scene units.
+    skeleton : Skeleton
     named : bool
         Look at what the muscle's name tells; the nearest bones where it tells nothing.
     """
-    ends = Ends(muscle.mesh)
-    distances = [signed_distances(muscle.points, bone.mesh) / millimetre for bone in bones]
-    reasons: list[str] = []
-    places, confidence = [], 0.0
-    if named and muscle.facts is not None:
-        places = _named_places(muscle, bones, distances, ends, reasons)
-    if not places:
-        places = _nearest_places(muscle, bones, bodies, distances, ends)
+    bones, ends = skeleton.bones, Ends(muscle.mesh)
+    distances = {b: skeleton.exact.distances(muscle.points, b.mesh) / skeleton.millimetre for b in bones}
+    guess = MuscleGuess(muscle, [], 1.0)
+    places = _named_places(guess, distances, ends) if named and muscle.facts is not None else []
+    by_name = bool(places)
+    if not by_name:
+        places = _nearest_places(muscle, skeleton.bodies, distances, ends)
         known = muscle.facts is not None
-        told = "the bones of its name are not here" if known else "its name tells nothing"
-        reasons[:] = [f"{told}; the bones are the nearest to its two ends"]
-        confidence = 0.2 if known else 0.4
-    holds = [_hold(bones[k], distances[k], ends, end, millimetre) for k, end in places]
-    holds = _disjoint(
-        [hold for hold in holds if len(hold.vertices)], {id(b): d for b, d in zip(bones, distances)}
-    )
-    if not confidence:  # by name: the nearer its ends are to the bones, the surer
-        confidence = 1.0 - 0.4 * min(max((hold.gap for hold in holds), default=FAR) / FAR, 1.0)
-        _compare(holds, bones, bodies, distances, reasons)
-        confidence = 0.5 if reasons else confidence
-    guess = MuscleGuess(muscle, holds, confidence, reasons)
-    _doubt(guess, bones, bodies, len(muscle.points))
+        why = "the bones of its name are not here" if known else "its name tells nothing"
+        guess.reasons = []
+        guess.doubt(0.2 if known else 0.4, f"{why}; the bones are the nearest to its two ends")
+    holds = [_hold(bone, distances[bone], ends, end, skeleton.millimetre) for bone, end in places]
+    guess.holds = _disjoint(holds, distances)
+    if by_name:  # the nearer its ends are to the bones, the surer
+        worst = max((hold.gap for hold in guess.holds), default=FAR)
+        guess.confidence = 1.0 - 0.4 * min(worst / FAR, 1.0)
+        _compare(guess, skeleton.bodies, distances)
+        guess.confidence = 0.5 if guess.reasons else guess.confidence
+    _doubt(guess, skeleton.bodies)
     return guess
 
 
-def _compare(holds, bones, bodies, distances, reasons):
+def _compare(guess, bodies, distances):
     """Name what names and distances say differently: a patch that touches another bone than that of its name."""
-    place = {id(bone): k for k, bone in enumerate(bones)}
-    named = {bodies[place[id(hold.bone)]] for hold in holds}
-    for hold in holds:
-        near = [float(distance[hold.vertices].min()) for distance in distances]
-        k = int(np.argmin(near))
-        if hold.gap > NEAR and near[k] < TOUCH and bodies[k] not in named:
+    named = {bodies[hold.bone] for hold in guess.holds}
+    for hold in guess.holds:
+        near = {bone: float(distance[hold.vertices].min()) for bone, distance in distances.items()}
+        nearest = min(near, key=near.__getitem__)
+        if hold.gap > NEAR and near[nearest] < TOUCH and bodies[nearest] not in named:
             away = f"by its name on the {hold.bone.name}, {hold.gap:.0f} mm away"
-            reasons.append(f"{away}, but it touches {bones[k].name}")
+            guess.reasons.append(f"{away}, but it touches {nearest.name}")
 
 
-def _named_places(muscle, bones, distances, ends, reasons):
+def _named_places(guess, distances, ends):
     """(bone, end) for the bones that anatomy names: origins at one end, insertions at the other."""
-    groups = []
-    for listed in (muscle.facts.origin, muscle.facts.insertion):
+    groups, facts = [], guess.muscle.facts
+    for listed in (facts.origin, facts.insertion):
         chosen = []
         for kinds, must in listed:
-            k = _best_of(kinds, muscle, bones, distances)
-            if k is None and must:
-                reasons.append(f"no bone here is its {' or '.join(kinds)}")
-            if k is not None and (must or distances[k].min() < MAYBE):
-                chosen.append(k)
+            bone = _best_of(kinds, guess.muscle, distances)
+            if bone is None and must:
+                guess.reasons.append(f"no bone here is its {' or '.join(kinds)}")
+            if bone is not None and (must or distances[bone].min() < MAYBE):
+                chosen.append(bone)
         groups.append(chosen)
-    cost = [sum(_tip_cost(groups, distances, ends, way)) for way in (0, 1)]
-    way = int(np.argmin(cost))
-    places = [(k, way) for k in groups[0]] + [(k, 1 - way) for k in groups[1] if k not in groups[0]]
-    return places
+
+    def cost(first):
+        tips = ends.tips[first], ends.tips[1 - first]
+        return sum(max(distances[bone][tip], 0.0) for group, tip in zip(groups, tips) for bone in group)
+
+    first = min((0, 1), key=cost)
+    insertions = [(bone, 1 - first) for bone in groups[1] if bone not in groups[0]]
+    return [(bone, first) for bone in groups[0]] + insertions
 
 
-def _best_of(kinds, muscle, bones, distances):
-    """Place of the bone to hold at: of the first class that is there, on the muscle's side, the nearest."""
+def _best_of(kinds, muscle, distances):
+    """The bone to hold at: of the first class that is there, on the muscle's side, the nearest."""
     for kind in kinds:
-        fitting = [k for k, bone in enumerate(bones) if bone.kind == kind and _same_side(bone, muscle)]
+        here = [bone for bone in distances if bone.kind == kind]
+        fitting = [bone for bone in here if not bone.side or not muscle.side or bone.side == muscle.side]
         if fitting:
-            return min(fitting, key=lambda k: distances[k].min())
+            return min(fitting, key=lambda bone: distances[bone].min())
     return None
 
 
-def _same_side(bone, muscle):
-    return not bone.side or not muscle.side or bone.side == muscle.side
-
-
-def _tip_cost(groups, distances, ends, way):
-    for group, end in zip(groups, (way, 1 - way)):
-        for k in group:
-            yield max(distances[k][ends.tips[end]], 0.0)
-
-
-def _nearest_places(muscle, bones, bodies, distances, ends):
+def _nearest_places(muscle, bodies, distances, ends):
     """(bone, end) without names: what an end touches, else what it points to; not twice the same body."""
     places, wishes = [], []
     for end in (0, 1):
         cap = ends.along(end) < CAP_SHARE
-        near = np.array([distance[cap].min() for distance in distances])
-        aim = np.array([_aim(muscle.points, ends, end, bone) for bone in bones])
-        score = np.where(near < NEAR, near / NEAR - 1.0, aim)
-        wishes.append((float(np.min(score)), end, np.argsort(score, kind="stable")))
+        score = {}
+        for bone, distance in distances.items():
+            near = distance[cap].min()
+            score[bone] = near / NEAR - 1.0 if near < NEAR else _aim(muscle.points, ends.along(end), bone)
+        order = sorted(score, key=score.__getitem__)
+        wishes.append((score[order[0]], end, order))
     for _, end, order in sorted(wishes, key=lambda wish: wish[0]):
-        taken = {bodies[k] for k, _ in places}
-        other = [int(k) for k in order if bodies[int(k)] not in taken]
-        places.append(((other or [int(order[0])])[0], end))
+        taken = {bodies[bone] for bone, _ in places}
+        places.append((next((bone for bone in order if bodies[bone] not in taken), order[0]), end))
     return places
 
 
-def _aim(points, ends, end, bone):
+def _aim(points, along, bone):
     """How far an end is from a bone in the direction that it points to; what lies aside counts as farther."""
-    along = ends.along(end)
     tip = points[along < 0.03].mean(axis=0)
-    back = points[(along > 0.1) & (along < 0.25)].mean(axis=0)
-    direction = (tip - back) / max(float(np.linalg.norm(tip - back)), 1e-300)
-    way = bone.points - tip
-    distance = np.maximum(np.linalg.norm(way, axis=1), 1e-300)
-    return float((distance * (1.0 + ASIDE * (1.0 - way @ direction / distance))).min())
+    direction = unit(tip - points[(along > 0.1) & (along < 0.25)].mean(axis=0))
+    away = bone.points - tip
+    distance = np.maximum(np.linalg.norm(away, axis=1), 1e-300)
+    return float((distance * (1.0 + ASIDE * (1.0 - away @ direction / distance))).min())
 
 
 def _hold(bone, distance, ends, end, millimetre):
     """What a bone holds of an end."""
-    least, along = float(distance.min()), ends.along(end)
-    at_end = along <= REACH
-    if least < NEAR and (at_end & (distance <= NEAR)).any():
-        limit = max(float(distance[at_end].min()), 0.0) + TOUCH
+    at_end = ends.along(end) <= REACH
+    least = float(distance[at_end].min())
+    if least <= NEAR:
+        limit = max(least, 0.0) + TOUCH
         chosen = np.flatnonzero(at_end & (distance <= limit))
-        reason = f"lies within {limit:.3g} mm"
         if len(chosen) >= FEWEST:
-            return AttachmentGuess(bone, chosen, float(distance[chosen].min()), reason)
-    length = min(CAP * millimetre, max(CAP_SHARE * ends.length, 1e-300))
-    chosen = np.flatnonzero(ends.away[end] <= length)
+            return AttachmentGuess(bone, chosen, least, f"lies within {limit:.3g} mm")
+    chosen = np.flatnonzero(ends.away[end] <= min(CAP * millimetre, CAP_SHARE * ends.length))
     if len(chosen) < FEWEST:
-        chosen = np.argsort(ends.away[end], kind="stable")[:FEWEST]
+        chosen = np.sort(np.argsort(ends.away[end], kind="stable")[:FEWEST])
     gap = float(distance[chosen].min())
-    return AttachmentGuess(bone, np.sort(chosen), gap, f"the end that points there, {gap:.3g} mm short of it")
+    return AttachmentGuess(bone, chosen, gap, f"the end that points there, {gap:.3g} mm short of it")
 
 
 def _disjoint(holds, distances):
     """Each vertex is held by one bone: the one that it lies nearer to, as its patch sees it."""
-    for i, first in enumerate(holds):
-        for second in holds[:i]:
-            shared = np.intersect1d(first.vertices, second.vertices)
-            if len(shared) == 0:
-                continue
-            nearer = distances[id(first.bone)][shared] < distances[id(second.bone)][shared]
-            first.vertices = np.setdiff1d(first.vertices, shared[~nearer])
-            second.vertices = np.setdiff1d(second.vertices, shared[nearer])
+    for second, first in combinations(holds, 2):
+        shared = np.intersect1d(first.vertices, second.vertices)
+        nearer = distances[first.bone][shared] < distances[second.bone][shared]
+        first.vertices = np.setdiff1d(first.vertices, shared[~nearer])
+        second.vertices = np.setdiff1d(second.vertices, shared[nearer])
     return [hold for hold in holds if len(hold.vertices)]
 
 
-def _doubt(guess, bones, bodies, count):
+def _doubt(guess, bodies):
     """Lower the confidence, or say that the muscle cannot be run."""
-    place = {id(bone): k for k, bone in enumerate(bones)}
-    moving = {bodies[place[id(hold.bone)]] for hold in guess.holds}
-    far = [hold for hold in guess.holds if hold.gap > FAR]
-    for hold in far:
-        guess.reasons.append(f"its end is {hold.gap:.0f} mm from the {hold.bone.name}: a tendon is missing")
-    if far:
-        guess.confidence = min(guess.confidence, 0.5)
+    for hold in guess.holds:
+        if hold.gap > FAR:
+            away = f"{hold.gap:.0f} mm from the {hold.bone.name}"
+            guess.doubt(0.5, f"its end is {away}: a tendon is missing")
     if not guess.muscle.sure:
         guess.confidence = min(guess.confidence, 0.3)
-    held = sum(len(hold.vertices) for hold in guess.holds)
-    if held > LARGEST * count:
-        guess.reasons.append(f"bones hold {100 * held / count:.0f} % of its vertices")
-        guess.confidence = min(guess.confidence, 0.4)
+    share = sum(len(hold.vertices) for hold in guess.holds) / len(guess.muscle.points)
+    if share > LARGEST:
+        guess.doubt(0.4, f"bones hold {100 * share:.0f} % of its vertices")
     if len(guess.holds) < 2:
-        guess.wrong = "only one bone is near it"
-    elif len(moving) < 2:
-        guess.reasons.append("all that holds it moves as one")
-        guess.confidence = min(guess.confidence, 0.4)
-    if guess.wrong:
-        guess.confidence = 0.0
+        guess.wrong, guess.confidence = "only one bone is near it", 0.0
+    elif len({bodies[hold.bone] for hold in guess.holds}) < 2:
+        guess.doubt(0.4, "all that holds it moves as one")

@@ -5,16 +5,17 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from rbfmuscle.importers.guess.attachments import MuscleGuess, guess_attachments
-from rbfmuscle.importers.guess.joints import JointGuess, guess_joints
+from rbfmuscle.importers.guess.anatomy import JointGuess
+from rbfmuscle.importers.guess.attachments import MuscleGuess, Skeleton, guess_attachments
+from rbfmuscle.importers.guess.joints import guess_joints
 from rbfmuscle.importers.guess.orientation import Orientation, find_orientation
 from rbfmuscle.importers.guess.parts import MILLIMETRE, Part, guess_units, read_parts
 from rbfmuscle.importers.guess.tendons import guess_tendons, write_stubs
-from rbfmuscle.importers.guess.text import scene_text
+from rbfmuscle.importers.guess.text import hold_file, scene_text
+from rbfmuscle.scene.attachments import ExactMeshes
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MeshError, SceneError, UsageError
 
@@ -36,12 +37,12 @@ class SceneGuess:
     root : Part
         The bone that stands still.
     joints : list of JointGuess
-    muscles : list of MuscleGuess
     orientation : Orientation or None
     unusable : dict of str to str
         Why a bone or a muscle is not in the scene, by file.
     notes : list of str
         What was left out, taken for something, made coarser, and the unit where it was guessed.
+    muscles : list of MuscleGuess
     """
 
     title: str
@@ -50,24 +51,21 @@ class SceneGuess:
     bones: list[Part]
     root: Part
     joints: list[JointGuess]
-    muscles: list[MuscleGuess] = field(default_factory=list)
     orientation: Orientation | None = None
     unusable: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    muscles: list[MuscleGuess] = field(default_factory=list)
 
     def doubts(self) -> list[str]:
         """One line for each guess that wants a look, the least sure first."""
         rows = [(0.3, f"bone {bone.name}: {bone.reason}") for bone in self.bones if not bone.sure]
         rows += [(0.0, f"{file} cannot be used: {reason}") for file, reason in self.unusable.items()]
         rows += [(0.1, doubt) for doubt in (self.orientation.doubts if self.orientation else ())]
-        for joint in self.joints:
-            if joint.confidence < DOUBTFUL:
-                rows.append((joint.confidence, f"joint of {joint.child.name}: {joint.reason}"))
+        rows += [(joint.confidence, f"joint of {joint.child.name}: {joint.reason}") for joint in self.joints]
         for muscle in self.muscles:
-            reasons = [muscle.wrong, *muscle.reasons] if muscle.wrong else muscle.reasons
-            if muscle.wrong or muscle.confidence < DOUBTFUL:
-                rows.append((muscle.confidence, f"muscle {muscle.muscle.name}: {'; '.join(reasons)}"))
-        return [text for _, text in sorted(rows, key=lambda row: row[0])]
+            reasons = "; ".join(filter(None, [muscle.wrong, *muscle.reasons]))
+            rows.append((muscle.confidence, f"muscle {muscle.muscle.name}: {reasons}"))
+        return [text for sure, text in sorted(rows, key=lambda row: row[0]) if sure < DOUBTFUL]
 
 
 def guess_scene(
@@ -92,42 +90,30 @@ def guess_scene(
         If the folder is missing, holds no bone or no muscle, or is of no known unit.
     """
     found = read_parts(folder, base)
-    bones, muscles, notes = found.bones, found.muscles, found.notes
-    if found.left_out:
-        notes.append(f"left out, neither bone nor muscle: {', '.join(found.left_out)}")
+    bones, notes = found.bones, found.notes
     if units is None:
         units, reason = guess_units(bones)
         notes.append(f"units are {units}: {reason}")
     millimetre = MILLIMETRE[units]
     orientation = find_orientation(bones, header)
-    for bone in bones:  # what its shape shows counts where its name says nothing
-        bone.side = bone.side or (orientation.sides.get(id(bone), "") if orientation else "")
     root, joints = guess_joints(bones, millimetre, orientation)
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", folder.resolve().name) or "scene"
-    guess = SceneGuess(f"the meshes in {folder.name or folder}", name, units, bones, root, joints)
-    guess.orientation, guess.unusable, guess.notes = orientation, found.unusable, notes
-    bodies = _bodies(bones, joints)
-    guess.muscles = [guess_attachments(muscle, bones, bodies, millimetre) for muscle in muscles]
-    # Where the bones that names ask for are not here, what is there is taken.
-    if all(muscle.wrong for muscle in guess.muscles):
-        guess.muscles = [
-            guess_attachments(muscle, bones, bodies, millimetre, named=False) for muscle in muscles
-        ]
-    guess_tendons(guess, millimetre)
-    rank = {id(joint.child): k for k, joint in enumerate(joints, start=1)}
-    for muscle in guess.muscles:  # from the bone that stands still outwards
-        muscle.holds.sort(key=lambda hold: rank.get(id(hold.bone), 0))
-    return guess
-
-
-def _bodies(bones, joints):
-    """Which bones move as one: place in the list -> place of the bone that it is fixed to."""
-    place = {id(bone): k for k, bone in enumerate(bones)}
-    bodies = {k: k for k in range(len(bones))}
+    title = f"the meshes in {folder.name or folder}"
+    guess = SceneGuess(title, name, units, bones, root, joints, orientation, found.unusable, notes)
+    bodies = {bone: bone for bone in bones}
     for joint in joints:  # parents come before their children
         if joint.kind == "fixed":
-            bodies[place[id(joint.child)]] = bodies[place[id(joint.parent)]]
-    return bodies
+            bodies[joint.child] = bodies[joint.parent]
+    skeleton = Skeleton(bones, bodies, ExactMeshes(), millimetre)
+    guess.muscles = [guess_attachments(muscle, skeleton) for muscle in found.muscles]
+    # Where the bones that names ask for are not here, what is there is taken.
+    if all(muscle.wrong for muscle in guess.muscles):
+        guess.muscles = [guess_attachments(muscle, skeleton, named=False) for muscle in found.muscles]
+    guess_tendons(guess, millimetre)
+    order = [root, *(joint.child for joint in joints)]
+    for muscle in guess.muscles:  # from the bone that stands still outwards
+        muscle.holds.sort(key=lambda hold: order.index(hold.bone) if hold.bone in order else 0)
+    return guess
 
 
 def write_scene(guess: SceneGuess, path: Path) -> Scene:
@@ -149,16 +135,16 @@ def write_scene(guess: SceneGuess, path: Path) -> Scene:
     UsageError
         If nothing can be written there, or no muscle can be held.
     """
-    folder = path.parent / "attachments"
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         _write_coarse(guess, path.parent)
         for muscle in guess.muscles:
             for hold in muscle.holds:
-                np.savetxt(folder / hold_file(muscle, hold), _in_file(muscle.muscle, hold.vertices), fmt="%d")
+                file = path.parent / hold_file(muscle, hold)
+                file.parent.mkdir(parents=True, exist_ok=True)
+                np.savetxt(file, _in_file(muscle.muscle, hold.vertices), fmt="%d")
         write_stubs(guess, path.parent, MILLIMETRE[guess.units])
         while True:
-            path.write_text(scene_text(guess, hold_file), encoding="utf-8")
+            path.write_text(scene_text(guess), encoding="utf-8")
             if all(muscle.wrong for muscle in guess.muscles):
                 raise UsageError(f"{path}: no muscle can be held by two bones ({guess.muscles[0].wrong})")
             try:
@@ -173,15 +159,10 @@ def _write_coarse(guess, folder):
     """Meshes that were made coarser, beside the scene."""
     for part in [*guess.bones, *(m.muscle for m in guess.muscles)]:
         if part.coarse:
-            (folder / "coarse").mkdir(exist_ok=True)
+            (folder / "coarse").mkdir(parents=True, exist_ok=True)
             part.file = f"coarse/{part.name}.ply"
             part.mesh.export(folder / part.file)
             part.read.vertex_map = np.arange(len(part.points))
-
-
-def hold_file(muscle: Any, hold: Any) -> str:
-    """Name of the file of a hold's vertices."""
-    return f"{muscle.muscle.name}_{hold.bone.name}.txt"
 
 
 def _in_file(part, vertices):
@@ -194,7 +175,7 @@ def _in_file(part, vertices):
 
 
 def _comment_out(guess, error):
-    """Mark the muscle that an error names as wrong; an error that names none is nobody's guess."""
+    """Mark the muscle that an error names as wrong; an error that names none is raised."""
     for muscle in guess.muscles:
         if not muscle.wrong and f"{muscle.muscle.name!r}" in str(error):
             muscle.wrong, muscle.confidence = str(error), 0.0

@@ -1,4 +1,4 @@
-"""Axes of the knee and of the ankle from the shapes of the bones.
+"""Directions of bones, and axes of the knee and of the ankle, from the shapes of the bones.
 
 Knee: the line through the centres of spheres fitted to the posterior part of both condyles (Kurosawa et al. 1985;
 Iwaki et al. 2000; the cylindrical axis of Eckhoff et al. 2005). Ankle: the cylinder of the talar dome, fitted with the
@@ -8,16 +8,15 @@ tibial plafond above it, each with its own radius (Singh et al. 1992; Siegler et
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial import ConvexHull
 
+from rbfmuscle.importers.guess.parts import Part
+
 # Radii that anatomy allows [mm]: head of the femur, posterior condyle, talar dome, all from child to large adult.
 HEAD, CONDYLE, DOME = (12.0, 35.0), (11.0, 30.0), (11.0, 27.0)
-# Fewest triangles that a fit takes its points from.
-FEWEST = 3000
 # Share of the femur's length that holds an end, and its condyles.
 END, CONDYLES = 0.12, 0.16
 # Normals of a condyle that count: from above (-) to below the backward direction [degree], greatest cosine sideways.
@@ -28,31 +27,47 @@ ARC, BAND, RADIAL = 45.0, 8.0, 0.95
 
 @dataclass
 class Frame:
-    """Directions of a long bone, unit (3,): ``superior`` along its shaft, ``anterior``, ``right``; and its middle."""
+    """Directions of a body or of a long bone, unit (3,).
+
+    Attributes
+    ----------
+    superior, anterior : (3,) ndarray
+    side : str
+        Side of the body that the bone's shape is of, ``"l"`` or ``"r"``.
+    """
 
     superior: np.ndarray
     anterior: np.ndarray
-    right: np.ndarray
-    middle: np.ndarray
+    side: str = ""
+
+    @property
+    def right(self) -> np.ndarray:
+        """To the body's right, unit (3,)."""
+        return np.cross(self.anterior, self.superior)
 
 
 @dataclass
 class AxisFit:
-    """An axis: point on it, unit direction, radii and misfit (RMS) [scene unit]; why it is refused, if it is."""
+    """An axis: point on it, unit direction to the body's right, radii and misfit (RMS) [scene unit].
+
+    ``wrong`` says why it is refused; empty where it is not.
+    """
 
     centre: np.ndarray
     axis: np.ndarray
-    radii: tuple
+    radii: np.ndarray
     misfit: float
     wrong: str = ""
 
 
-def _faces(part):
-    """Middles, normals and areas of the triangles; those of a coarse mesh are divided."""
-    mesh = part.mesh
-    while len(mesh.faces) < FEWEST:
-        mesh = mesh.subdivide()
-    return np.asarray(mesh.triangles_center), np.asarray(mesh.face_normals), np.asarray(mesh.area_faces)
+def across(vectors: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Part of vectors (3,) or (n, 3) that is across a unit axis."""
+    return vectors - np.multiply.outer(vectors @ axis, axis)
+
+
+def unit(vector: np.ndarray) -> np.ndarray:
+    """A vector at length one."""
+    return vector / np.linalg.norm(vector)
 
 
 def main_axes(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -62,62 +77,43 @@ def main_axes(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.n
     return middle, np.linalg.eigh((away * weights[:, None]).T @ away)[1]
 
 
-def long_axis(part: Any, below: list[Any], above: list[Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Middle and direction (up) of a long bone; up is away from the bones ``below``, or towards those ``above``."""
-    points, _, areas = _faces(part)
+def long_axis(bone: Part, below: list[Part], above: list[Part]) -> np.ndarray:
+    """Direction (3,) up a long bone: from the bones ``below`` to those ``above``, else from its broad end."""
+    points, _, areas = bone.faces
     middle, axes = main_axes(points, areas)
     up = axes[:, 2]
-    others = [
-        (other.points.mean(axis=0) - middle) @ up * sign
-        for group, sign in ((below, -1), (above, 1))
-        for other in group
-    ]
-    if others:
-        return middle, up * np.sign(sum(others) or 1.0)
-    along = points @ up
-    low, high = along.min(), along.max()
-    width = END * (high - low)  # the broad end: condyles of the femur
-    return middle, up if areas[along < low + width].sum() > areas[along > high - width].sum() else -up
+    rise = sum((b.points.mean(axis=0) - middle) @ up for b in above)
+    rise -= sum((b.points.mean(axis=0) - middle) @ up for b in below)
+    if not rise:
+        share = (points @ up - (points @ up).min()) / np.ptp(points @ up)
+        rise = areas[share < END].sum() - areas[share > 1.0 - END].sum()
+    return up if rise >= 0.0 else -up
 
 
-def femur_frame(femur: Any, below: list[Any], above: list[Any]) -> Frame:
-    """Directions of a femur by its own shape: shaft, breadth of the condyles, which lie behind the shaft."""
-    points, _, areas = _faces(femur)
-    _, up = long_axis(femur, below, above)
-    along = points @ up
-    low, length = along.min(), np.ptp(along)
-    shaft = (along > low + 0.3 * length) & (along < low + 0.7 * length)
+def femur_frame(femur: Part, below: list[Part], above: list[Part]) -> Frame:
+    """Directions of a femur by its own shape: shaft; breadth of the condyles, which lie behind it; head inwards."""
+    points, _, areas = femur.faces
+    up = long_axis(femur, below, above)
+    share = (points @ up - (points @ up).min()) / np.ptp(points @ up)
+    shaft, end, top = (share > 0.3) & (share < 0.7), share < 0.1, share > 1.0 - END
     middle, axes = main_axes(points[shaft], areas[shaft])
     up = axes[:, 2] * np.sign(axes[:, 2] @ up)
-    end = along < low + 0.1 * length
-    across = points[end] - middle
-    across = across - np.outer(across @ up, up)
-    behind, axes = main_axes(across, areas[end])
-    anterior = np.cross(up, axes[:, 2])
-    anterior *= -np.sign(anterior @ behind) / np.linalg.norm(anterior)
-    return Frame(up, anterior, np.cross(anterior, up), middle)
-
-
-def femur_side(femur: Any, frame: Frame) -> str:
-    """``"l"`` or ``"r"``: the head lies to the body's middle."""
-    points, _, areas = _faces(femur)
-    along = points @ frame.superior
-    top = along > along.max() - END * np.ptp(along)
-    return (
-        "r" if (np.average(points[top], axis=0, weights=areas[top]) - frame.middle) @ frame.right < 0 else "l"
-    )
+    behind, axes = main_axes(across(points[end] - middle, up), areas[end])
+    anterior = unit(np.cross(up, axes[:, 2]))
+    frame = Frame(up, anterior * -np.sign(anterior @ behind))
+    head = np.average(points[top], axis=0, weights=areas[top]) - middle
+    frame.side = "r" if head @ frame.right < 0 else "l"
+    return frame
 
 
 def sole_direction(points: np.ndarray, right: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Direction (3,) forwards on the sole of a foot: the longest side below its outline, seen from the side."""
-    top = up - up @ right * right
-    top = top / np.linalg.norm(top)
-    front = np.cross(top, right)
-    flat = np.column_stack([points @ front, points @ top])
+    top = unit(across(up, right))
+    plane = np.stack([np.cross(top, right), top])
+    flat = points @ plane.T
     corners = flat[ConvexHull(flat).vertices]  # in the plane, against the clock: forwards below
     sides = np.roll(corners, -1, axis=0) - corners
-    longest = sides[np.argmax(np.where(sides[:, 0] > 0.0, np.hypot(*sides.T), 0.0))]
-    return longest[0] * front + longest[1] * top
+    return sides[np.argmax(np.where(sides[:, 0] > 0.0, np.hypot(*sides.T), 0.0))] @ plane
 
 
 def fit_sphere(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float]:
@@ -129,32 +125,30 @@ def fit_sphere(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, flo
     return middle + x, float(np.sqrt(max(last + np.dot(x, x), 0.0)))
 
 
-def fit_condyles(femur: Any, frame: Frame, millimetre: float) -> AxisFit | None:
-    """The knee's axis, pointing to the body's right; None where a condyle has too few triangles."""
-    points, normals, areas = _faces(femur)
+def fit_condyles(femur: Part, frame: Frame, millimetre: float) -> AxisFit | None:
+    """The knee's axis; None where a condyle has too few triangles."""
+    points, right = femur.faces[0], frame.right
     along = points @ frame.superior
     near = along < along.min() + CONDYLES * np.ptp(along)
-    points, normals, areas, right = points[near], normals[near], areas[near], frame.right
+    points, normals, areas = (values[near] for values in femur.faces)
     for _ in range(12):
-        anterior = np.cross(frame.superior, right)
-        anterior /= np.linalg.norm(anterior)
+        anterior = unit(np.cross(frame.superior, right))
         angle = np.degrees(np.arctan2(-normals @ np.cross(right, anterior), -normals @ anterior))
         chosen = (np.abs(normals @ right) < SIDEWAYS) & (angle > POSTERIOR[0]) & (angle < POSTERIOR[1])
         if chosen.sum() < 24:
             return None
-        side = points @ right - 0.5 * sum(f(points[chosen] @ right) for f in (np.min, np.max))
-        groups = [chosen & (side < 0), chosen & (side > 0)]
+        place = points @ right
+        middle = 0.5 * (place[chosen].min() + place[chosen].max())
+        groups = [chosen & (place < middle), chosen & (place > middle)]
         if min(group.sum() for group in groups) < 12:
             return None
         fits = [_fit_condyle(points[g], normals[g], areas[g], millimetre) for g in groups]
-        before, right = right, fits[1][0] - fits[0][0]
-        right = right / np.linalg.norm(right)
+        before, right = right, unit(fits[1][0] - fits[0][0])
         if right @ before > 1.0 - 1e-9:
             break
-    radii = tuple(fit[1] for fit in fits)
-    misfit = float(np.sqrt(np.mean([fit[2] ** 2 for fit in fits])))
-    wrong = _refused("condyle", radii, CONDYLE, millimetre)
-    return AxisFit(0.5 * (fits[0][0] + fits[1][0]), right, radii, misfit, wrong)
+    centres, radii, misfits = (np.array(values) for values in zip(*fits))
+    misfit, wrong = float(np.sqrt(np.mean(misfits**2))), _refused("condyle", radii, CONDYLE, millimetre)
+    return AxisFit(centres.mean(axis=0), right, radii, misfit, wrong)
 
 
 def _fit_condyle(points, normals, areas, millimetre):
@@ -175,8 +169,10 @@ def _refused(what, radii, allowed, millimetre):
     return f"a {what} of radius {bad[0]:.3g} mm, anatomy has {low:g} to {high:g}" if bad else ""
 
 
-def fit_dome(talus: Any, tibia: Any, up: np.ndarray, right: np.ndarray, millimetre: float) -> AxisFit | None:
-    """The ankle's axis, pointing to the body's right; None where talus and tibia show no dome.
+def fit_dome(
+    talus: Part, tibia: Part, up: np.ndarray, right: np.ndarray, millimetre: float
+) -> AxisFit | None:
+    """The ankle's axis; None where talus and tibia show no dome and plafond.
 
     Parameters
     ----------
@@ -185,65 +181,48 @@ def fit_dome(talus: Any, tibia: Any, up: np.ndarray, right: np.ndarray, millimet
         Along the tibia.
     right : (3,) ndarray
         About along the axis.
+    millimetre : float
+        Length of a millimetre in scene units.
     """
-    patches = [_near_faces(talus, tibia, millimetre, 1.0), _near_faces(tibia, talus, millimetre, -1.0)]
-    right = right - right @ up * up
-    right = right / np.linalg.norm(right)
+    patches = []
+    for part, other, sign in ((talus, tibia, 1.0), (tibia, talus, -1.0)):
+        points, normals, areas = part.faces
+        distance, _ = other.tree.query(points)
+        near = distance < distance.min() + BAND * millimetre
+        patches.append((points[near], sign * normals[near], areas[near]))
+    right = unit(across(right, up))
     points, normals, areas = patches[0]
     top = normals @ up > 0.8
     if top.sum() < 6:
         return None
-    radii = np.array([20.0, 23.0]) * millimetre
-    centre, before = np.average(points[top], axis=0, weights=areas[top]) - radii[0] * up, None
+    radii, before = np.array([20.0, 23.0]) * millimetre, np.empty(0)
+    centre = np.average(points[top], axis=0, weights=areas[top]) - radii[0] * up
     for _ in range(40):
-        chosen = [_on_cylinder(patch, centre, right, up, radius) for patch, radius in zip(patches, radii)]
-        if len(chosen) == 2 and chosen[1].sum() < 8:  # no plafond: the dome alone
-            patches, radii, chosen, before = patches[:1], radii[:1], chosen[:1], None
-        if chosen[0].sum() < 8:
+        chosen = [_on_cylinder(*patch[:2], centre, right, up, r) for patch, r in zip(patches, radii)]
+        if min(c.sum() for c in chosen) < 8:
             return None
-        used = [(patch[0][c], patch[2][c]) for patch, c in zip(patches, chosen)]
-        centre, right, radii, misfit = fit_coaxial(used, centre, right, up, radii, 0.5 * millimetre)
-        key = np.concatenate(chosen)
-        if before is not None and (key == before).all():
+        if np.array_equal(before, before := np.concatenate(chosen)):
             break
-        before = key
-    middle = used[0][0] @ right
-    centre = centre + (middle.mean() - centre @ right) * right
-    return AxisFit(
-        centre, right, tuple(radii.tolist()), misfit, _refused("talar dome", radii[:1], DOME, millimetre)
-    )
+        used = [(patch[0][c], patch[2][c]) for patch, c in zip(patches, chosen)]
+        centre, right, radii, misfit = fit_coaxial(used, centre, right, radii, 0.5 * millimetre)
+    centre = centre + ((used[0][0] - centre) @ right).mean() * right
+    return AxisFit(centre, right, radii, misfit, _refused("talar dome", radii[:1], DOME, millimetre))
 
 
-def _near_faces(part, other, millimetre, sign):
-    points, normals, areas = _faces(part)
-    distance, _ = other.tree.query(points)
-    near = distance < distance.min() + BAND * millimetre
-    return points[near], sign * normals[near], areas[near]
-
-
-def _on_cylinder(patch, centre, right, up, radius):
+def _on_cylinder(points, normals, centre, right, up, radius):
     """Which faces lie on a cylinder, about its top."""
-    points, normals, _ = patch
-    top = up - up @ right * right
-    away = points - centre
-    away = away - np.outer(away @ right, right)
+    away = across(points - centre, right)
     distance = np.maximum(np.linalg.norm(away, axis=1), 1e-12)
-    cosine = away @ top / (distance * np.linalg.norm(top))
     radial = np.einsum("ij,ij->i", normals, away) / distance
+    upper = away @ unit(across(up, right)) / distance > np.cos(np.radians(ARC))
     level = np.abs(normals @ right) < SIDEWAYS
-    return (
-        level
-        & (cosine > np.cos(np.radians(ARC)))
-        & (radial > RADIAL)
-        & (np.abs(distance - radius) < 0.25 * radius)
-    )
+    return level & upper & (radial > RADIAL) & (np.abs(distance - radius) < 0.25 * radius)
 
 
 def fit_coaxial(
-    patches: list[tuple],
+    patches: list[tuple[np.ndarray, np.ndarray]],
     centre: np.ndarray,
-    right: np.ndarray,
-    up: np.ndarray,
+    axis: np.ndarray,
     radii: np.ndarray,
     soft: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
@@ -253,34 +232,24 @@ def fit_coaxial(
     ----------
     patches : list of (points, weights)
         One cylinder each.
-    up : (3,) ndarray
-        Any direction across the axis.
+    centre, axis : (3,) ndarray
+    radii : (k,) ndarray
     soft : float
         Distance from which on a point loses its weight.
     """
-    top = up - up @ right * right
-    top = top / np.linalg.norm(top)
-    front, unit = np.cross(top, right), float(radii[0])
-    roots = [np.sqrt(weights / weights.sum() / len(patches)) for _, weights in patches]
+    plane, size = np.linalg.svd(axis[None])[2][1:], float(radii[0])
+    roots = [np.sqrt(weights / weights.mean() / len(patches)) for _, weights in patches]
+
+    def line(x):
+        return unit(axis + x[:2] @ plane), centre + size * x[2:4] @ plane
 
     def residual(x):
-        axis = right + x[0] * front + x[1] * top
-        axis = axis / np.linalg.norm(axis)
-        rows = []
-        for k, ((points, _), root) in enumerate(zip(patches, roots)):
-            away = points - centre - unit * (x[2] * front + x[3] * top)
-            rows.append(np.linalg.norm(away - np.outer(away @ axis, axis), axis=1) / unit - x[4 + k])
-            rows[-1] *= root * np.sqrt(len(root))
-        return np.concatenate(rows)
+        turned, at = line(x)
+        rows = [np.linalg.norm(across(points - at, turned), axis=1) / size for points, _ in patches]
+        return np.concatenate([root * (row - radius) for root, row, radius in zip(roots, rows, x[4:])])
 
-    found = least_squares(
-        residual, np.r_[0.0, 0.0, 0.0, 0.0, radii / unit], loss="soft_l1", f_scale=soft / unit, max_nfev=200
-    )
-    axis = right + found.x[0] * front + found.x[1] * top
-    centre = centre + unit * (found.x[2] * front + found.x[3] * top)
-    misfit = np.sqrt(
-        np.sum(
-            [np.average(r**2) for r in np.split(residual(found.x), np.cumsum([len(r) for r in roots])[:-1])]
-        )
-    )
-    return centre, axis / np.linalg.norm(axis), found.x[4:] * unit, float(misfit) * unit
+    start = np.r_[np.zeros(4), radii / size]
+    x = least_squares(residual, start, loss="soft_l1", f_scale=soft / size, max_nfev=200).x
+    parts = np.split(residual(x) * size, np.cumsum([len(root) for root in roots])[:-1])
+    misfit = float(np.sqrt(sum(np.mean(part**2) for part in parts)))
+    return line(x)[1], line(x)[0], x[4:] * size, misfit

@@ -11,7 +11,7 @@ import tomllib
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 # Words of this length may differ from a known one by one letter, words of that length by two.
 ONE_LETTER, TWO_LETTERS = 5, 8
@@ -60,34 +60,35 @@ class NameFacts:
     spelling: str = ""
 
 
-class _Table:
-    """The file, as sets of words."""
+class _Table(NamedTuple):
+    """The file, as sets of words: sides and forms by word, names of bones and muscles as tuples of words."""
 
-    def __init__(self) -> None:
-        with (Path(__file__).parent / "names.toml").open("rb") as file:
-            table: dict[str, Any] = tomllib.load(file)
-        self.sides = {form: side for side, forms in table["sides"].items() for form in forms.split()}
-        self.forms = {form: word for word, forms in table["words"].items() for form in forms.split()}
-        self.other = {word for words in table["other"].values() for word in words.split()}
-        self.bones = {
-            self._key(name): kind for kind, names in table["bones"].items() for name in names.split(",")
-        }
-        self.muscles = {}
-        for line in table["muscles"]["table"].strip().splitlines():
-            names, origin, insertion = (part.strip() for part in line.split(";"))
-            for name in names.split(","):
-                facts = MuscleFacts(name.strip(), _places(origin), _places(insertion))
-                self.muscles[self._key(name)] = facts
-        words = {word for key in (*self.bones, *self.muscles) for word in key}
-        self.known = words | self.other | set(self.forms) | set(table["words"]) | {"compartment"}
-
-    def _key(self, name):
-        return tuple(self.forms.get(word, word) for word in name.split())
+    sides: dict[str, str]
+    forms: dict[str, str]
+    other: set[str]
+    bones: dict[tuple, str]
+    muscles: dict[tuple, MuscleFacts]
+    known: set[str]
 
 
 @cache
 def _table():
-    return _Table()
+    table = tomllib.loads((Path(__file__).parent / "names.toml").read_text(encoding="utf-8"))
+    sides = {form: side for side, forms in table["sides"].items() for form in forms.split()}
+    forms = {form: word for word, forms in table["words"].items() for form in forms.split()}
+    other = {word for words in table["other"].values() for word in words.split()}
+
+    def key(name):
+        return tuple(forms.get(word, word) for word in name.split())
+
+    bones = {key(name): kind for kind, names in table["bones"].items() for name in names.split(",")}
+    muscles = {}
+    for line in table["muscles"]["table"].strip().splitlines():
+        names, *places = (part.strip() for part in line.split(";"))
+        for name in names.split(","):
+            muscles[key(name)] = MuscleFacts(name.strip(), *map(_places, places))
+    known = {word for name in (*bones, *muscles) for word in name} | other | {*forms, *table["words"]}
+    return _Table(sides, forms, other, bones, muscles, known)
 
 
 def _places(text):
@@ -101,32 +102,24 @@ def name_facts(name: str) -> NameFacts:
     table = _table()
     words, side, spelling = _read_words(name)
     bone, muscle = _longest(words, table.bones), _longest(words, table.muscles)
-    used = set(muscle or ()) | set(bone or ())
     if any(word in table.other and word not in (muscle or ()) for word in words):
         return NameFacts("other", side=side)
     says_bone, says_muscle = "bone" in words, "muscle" in words
-    if muscle is not None and not (says_bone and bone is not None) and _beats(muscle, bone, says_muscle):
-        bone = None
-    elif bone is not None and not says_muscle:
-        muscle = None
+    if bone is not None and muscle is not None:
+        more = says_muscle or len(muscle) > len(bone) or set(bone) <= set(muscle)
+        bone, muscle = (None, muscle) if more and not says_bone else (bone, None)
     tissue = "muscle" if muscle or says_muscle else "bone" if bone or says_bone else ""
-    used = set(muscle or bone or ())
     kind = table.bones[bone] if bone is not None and tissue == "bone" else ""
+    used = muscle or bone or ()
     shown = ", ".join(f"{wrong!r} read as {right!r}" for wrong, right in spelling.items() if right in used)
-    return NameFacts(
-        tissue, kind, table.muscles[muscle] if muscle else None, "" if kind in MIDLINE else side, shown
-    )
-
-
-def _beats(muscle, bone, says_muscle):
-    return bone is None or says_muscle or len(muscle) > len(bone) or not set(bone) - set(muscle)
+    side = "" if kind in MIDLINE else side
+    return NameFacts(tissue, kind, table.muscles[muscle] if muscle else None, side, shown)
 
 
 def _longest(words, table):
     """The entry whose words all occur; of several the one with most words, then with the longest."""
-    present = set(words)
-    fitting = [key for key in table if present.issuperset(key)]
-    return max(fitting, key=lambda key: (len(key), sum(map(len, key)))) if fitting else None
+    fitting = [key for key in table if set(words).issuperset(key)]
+    return max(fitting, key=lambda key: (len(key), sum(map(len, key))), default=None)
 
 
 def _read_words(name):
@@ -162,22 +155,15 @@ def _taken_apart(word):
 
 
 def _nearest(word):
-    """The only known word that differs by a letter, or by two of a long one."""
-    allowed = 2 if len(word) >= TWO_LETTERS else 1 if len(word) >= ONE_LETTER else 0
-    if not allowed:
-        return ""
-    near = [
-        (_distance(word, known), known) for known in _table().known if abs(len(known) - len(word)) <= allowed
-    ]
-    near = sorted(pair for pair in near if pair[0] <= allowed and len(pair[1]) >= ONE_LETTER)
-    if not near or (len(near) > 1 and near[1][0] == near[0][0] and not _one_form(near)):
-        return ""
-    return near[0][1]
-
-
-def _one_form(near):
-    forms = _table().forms
-    return len({forms.get(word, word) for distance, word in near if distance == near[0][0]}) == 1
+    """The only known word that differs by a letter, or by two of a long one; empty where there is none."""
+    table, allowed = _table(), (len(word) >= ONE_LETTER) + (len(word) >= TWO_LETTERS)
+    near = {}
+    for known in table.known:
+        if len(known) >= ONE_LETTER and abs(len(known) - len(word)) <= allowed:
+            near.setdefault(_distance(word, known), []).append(known)
+    least = min(near, default=allowed + 1)
+    forms = {table.forms.get(known, known) for known in near.get(least, ())}
+    return min(near[least]) if least <= allowed and len(forms) == 1 else ""
 
 
 def _distance(one, two):

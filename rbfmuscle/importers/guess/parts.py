@@ -12,22 +12,22 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.importers.guess.names import MuscleFacts, name_facts
-from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, ReadMesh, prepare_mesh, read_arrays
+from rbfmuscle.importers.guess.names import MuscleFacts, NameFacts, name_facts
+from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, prepare_mesh, read_arrays
 from rbfmuscle.validation import MeshError, UsageError
 
 # Folders below the one that is given, as people sort their meshes.
-BONE_FOLDERS = ("bones", "bone", "knochen", "os")
-MUSCLE_FOLDERS = ("muscles", "muscle", "muskeln")
+FOLDERS = {"bones": "bone", "bone": "bone", "knochen": "bone", "os": "bone"}
+FOLDERS |= {"muscles": "muscle", "muscle": "muscle", "muskeln": "muscle"}
 MILLIMETRE = {"mm": 1.0, "cm": 0.1, "m": 0.001}
 # Length of a bone [mm] by its class, and of the largest one where none is known, from child to large adult.
 LENGTHS = {"femur": (200, 600), "tibia": (150, 500), "humerus": (120, 420), "pelvis": (100, 450)}
 LARGEST_BONE = (90, 900)
-# Meshes of more triangles are made coarser, to about as many.
-MOST_TRIANGLES = 400_000
+# Meshes of more triangles are made coarser, to about as many; fits take their points from no fewer.
+MOST_TRIANGLES, FEWEST = 400_000, 3000
 
 
-@dataclass
+@dataclass(eq=False)
 class Part:
     """One mesh and what is believed of it.
 
@@ -39,7 +39,7 @@ class Part:
         Path as the scene file gives it.
     read : ReadMesh
     kind : str
-        Class of bone, or the name of the muscle in the table; empty where the name says nothing.
+        Class of bone, empty where the name says none.
     side : str
         ``"l"``, ``"r"`` or empty.
     reason : str
@@ -48,6 +48,8 @@ class Part:
     facts : MuscleFacts or None
     coarse : bool
         The mesh was made coarser than its file.
+    frame : Frame or None
+        Directions of a femur.
     """
 
     name: str
@@ -55,50 +57,56 @@ class Part:
     read: Any
     kind: str = ""
     side: str = ""
-    reason: str = "by its name"
+    reason: str = ""
     sure: bool = True
-    facts: MuscleFacts | None = field(default=None, repr=False)
+    facts: MuscleFacts | None = None
     coarse: bool = False
+    frame: Any = None
 
     @property
     def mesh(self) -> Any:
         """The mended mesh, trimesh.Trimesh [scene unit]."""
         return self.read.mesh
 
-    @property
+    @cached_property
     def points(self) -> np.ndarray:
         """Vertices (n, 3)."""
-        return np.asarray(self.read.mesh.vertices, dtype=np.float64)
+        return np.asarray(self.mesh.vertices, dtype=np.float64)
+
+    @cached_property
+    def faces(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Middles, normals and areas of the triangles; those of a coarse mesh are divided."""
+        mesh = self.mesh
+        while len(mesh.faces) < FEWEST:
+            mesh = mesh.subdivide()
+        return np.array(mesh.triangles_center), np.array(mesh.face_normals), np.array(mesh.area_faces)
 
     @cached_property
     def tree(self) -> Any:
         """Tree over the middles of the faces."""
-        return cKDTree(self.read.mesh.triangles_center)
+        return cKDTree(self.faces[0])
 
 
 @dataclass
-class Sorted:
+class Parts:
     """What is in a folder.
 
     Attributes
     ----------
     bones, muscles : list of Part
-    left_out : list of str
-        Files of other tissue.
     unusable : dict of str to str
         Reason by file of a bone or muscle.
     notes : list of str
-        Misspelt names, meshes made coarser.
+        What was left out, misspelt names, meshes made coarser.
     """
 
     bones: list[Part] = field(default_factory=list)
     muscles: list[Part] = field(default_factory=list)
-    left_out: list[str] = field(default_factory=list)
     unusable: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
 
-def read_parts(folder: Path, base: Path) -> Sorted:
+def read_parts(folder: Path, base: Path) -> Parts:
     """Bones and muscles of a folder, and of its folders ``bones`` and ``muscles`` where it has them.
 
     Parameters
@@ -112,37 +120,30 @@ def read_parts(folder: Path, base: Path) -> Sorted:
     UsageError
         If the folder is missing or holds no bone or no muscle.
     """
-    found, unknown, names = Sorted(), [], set()
-    for path in find_meshes(folder):
-        facts, parent = name_facts(path.stem), path.parent.name.lower()
-        by_folder = path.parent != folder
-        file = os.path.relpath(path, base).replace(os.sep, "/")
+    found, unknown, names, left_out = Parts(), [], set(), []
+    for path in _find_meshes(folder):
+        facts = name_facts(path.stem)
         if facts.tissue == "other":
-            found.left_out.append(path.name)
+            left_out.append(path.name)
             continue
-        bone = parent in BONE_FOLDERS if by_folder else facts.tissue == "bone"
+        sorted_in = path.parent != folder
+        tissue = FOLDERS[path.parent.name.lower()] if sorted_in else facts.tissue
         try:
-            part = _read_part(
-                path, file, names, facts, found.notes, closed=facts.tissue == "muscle" and not bone
-            )
+            part = _read_part(path, base, names, facts, found.notes, closed=tissue == "muscle")
         except MeshError as error:
             found.unusable[path.name] = str(error).removeprefix(f"{path}: ")
             continue
-        if by_folder:
-            part.reason = f"by its folder, {path.parent.name}"
         if facts.spelling:
             found.notes.append(f"{path.name}: {facts.spelling}")
-        group = found.bones if bone else found.muscles if by_folder or facts.tissue == "muscle" else unknown
-        group.append(part)
-    _sort_by_size(unknown, found)
-    _check_both(folder, found)
-    return found
-
-
-def _check_both(folder, found):
-    for part in [part for part in found.muscles if not part.mesh.is_watertight]:
-        found.muscles.remove(part)
-        found.unusable[part.file] = "the surface is open; a muscle must be closed"
+        {"bone": found.bones, "muscle": found.muscles, "": unknown}[tissue].append(part)
+    # What no name tells: the largest are bones until there are two, the others muscles.
+    for part in sorted(unknown, key=lambda part: -np.linalg.norm(part.mesh.extents)):
+        is_bone = len(found.bones) < 2 or not part.mesh.is_watertight
+        part.sure = False
+        part.reason = f"{'a bone' if is_bone else 'a muscle'} by its size, as its name tells nothing"
+        (found.bones if is_bone else found.muscles).append(part)
+    if left_out:
+        found.notes.append(f"left out, neither bone nor muscle: {', '.join(left_out)}")
     if not found.bones or not found.muscles:
         kind, other = ("bone", "muscles") if not found.bones else ("muscle", "bones")
         listed = ", ".join([part.file for part in found.bones or found.muscles] + list(found.unusable))
@@ -150,22 +151,15 @@ def _check_both(folder, found):
             f"{folder} holds no {kind} (all are {other} by their names or sizes, or cannot be used: {listed}); "
             "name the files after what they are, or sort them into folders bones and muscles"
         )
+    return found
 
 
-def find_meshes(folder: Path) -> list[Path]:
-    """Mesh files of a folder and of its folders for bones and muscles, in order.
-
-    Raises
-    ------
-    UsageError
-        If the folder is missing or holds fewer than two.
-    """
+def _find_meshes(folder):
+    """Mesh files of a folder and of its folders for bones and muscles, in order."""
     if not folder.is_dir():
         raise UsageError(f"{folder} is no folder; give the folder of the meshes")
-    sorted_in = [
-        p for p in sorted(folder.iterdir()) if p.name.lower() in BONE_FOLDERS + MUSCLE_FOLDERS and p.is_dir()
-    ]
-    files = [path for place in [folder, *sorted_in] for path in sorted(place.iterdir())]
+    inner = [path for path in sorted(folder.iterdir()) if path.name.lower() in FOLDERS and path.is_dir()]
+    files = [path for place in [folder, *inner] for path in sorted(place.iterdir())]
     paths = [path for path in files if path.suffix.lower() in MESH_SUFFIXES]
     if len(paths) < 2:
         kinds = " ".join(MESH_SUFFIXES)
@@ -173,7 +167,7 @@ def find_meshes(folder: Path) -> list[Path]:
     return paths
 
 
-def _read_part(path, file, names, facts, notes, *, closed):
+def _read_part(path, base, names, facts: NameFacts, notes, *, closed):
     name = re.sub(r"[^a-z0-9_-]+", "_", path.stem.lower()).strip("_") or "part"
     while name in names:
         name += "_2"
@@ -183,9 +177,9 @@ def _read_part(path, file, names, facts, notes, *, closed):
     if coarse:
         notes.append(f"{path.name}: {len(faces)} triangles, made coarser to about {MOST_TRIANGLES}")
         vertices, faces = clustered(vertices, faces, MOST_TRIANGLES)
-    read: ReadMesh = prepare_mesh(vertices, faces, place=str(path), name=path.stem, may_be_open=not closed)
-    kind = facts.bone or (facts.muscle.name if facts.muscle else "")
-    return Part(name, file, read, kind, facts.side, facts=facts.muscle, coarse=coarse)
+    read = prepare_mesh(vertices, faces, place=str(path), name=path.stem, may_be_open=not closed)
+    file = os.path.relpath(path, base).replace(os.sep, "/")
+    return Part(name, file, read, facts.bone, facts.side, facts=facts.muscle, coarse=coarse)
 
 
 def clustered(vertices: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -196,8 +190,7 @@ def clustered(vertices: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.n
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
     cells = np.floor((vertices - vertices.min(axis=0)) / np.sqrt(2.0 * area / count)).astype(np.int64)
-    size = cells.max(axis=0) + 1
-    keys = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
+    keys = np.ravel_multi_index(cells.T, cells.max(axis=0) + 1)
     _, place, members = np.unique(keys, return_inverse=True, return_counts=True)
     means = np.stack([np.bincount(place, vertices[:, k]) / members for k in range(3)], axis=1)
     new = place[faces]
@@ -214,13 +207,3 @@ def guess_units(bones: list[Part]) -> tuple[str, str]:
         if low <= size / millimetre <= high:
             return units, f"{bone.name} is {size:.4g} {units} long"
     raise UsageError(f"{bone.file} is {size:.4g} across, which is no bone in mm, cm or m; give --units")
-
-
-def _sort_by_size(unknown, found):
-    """What no name tells: the largest are bones until there are two, the others muscles."""
-    unknown.sort(key=lambda part: -np.linalg.norm(part.mesh.extents))
-    for part in unknown:
-        is_bone = len(found.bones) < 2 or not part.mesh.is_watertight
-        part.sure = False
-        part.reason = f"{'a bone' if is_bone else 'a muscle'} by its size, as its name tells nothing"
-        (found.bones if is_bone else found.muscles).append(part)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from rbfmuscle.importers.guess.patella import FLEXIONS
+from rbfmuscle.importers.guess.anatomy import JointGuess, rounded
+from rbfmuscle.importers.guess.attachments import AttachmentGuess, MuscleGuess
 from rbfmuscle.importers.guess.tendons import ANGLES, stub_file, tendons_of
+from rbfmuscle.importers.toml_text import table_text
 
 _TAIL = """[contact]
 initial = "resolve"   # muscles that start inside a bone are pushed out; or "keep", "error"
@@ -21,23 +22,19 @@ surfaces = { format = "pvd" }   # or vtp, ply, stl, obj, glb
 """
 
 
-def scene_text(guess: Any, hold_file: Callable[..., Any]) -> str:
-    """Text of the scene file.
-
-    Parameters
-    ----------
-    guess : SceneGuess
-    hold_file : callable
-        Name of the file of a muscle's hold.
-    """
+def scene_text(guess: Any) -> str:
+    """Text of the scene file of a `SceneGuess`."""
     tendons = tendons_of(guess)
-    parts = [_head(guess), *(_bone(bone) for bone in guess.bones), *(_stub(tendon) for tendon in tendons)]
-    parts += [_joint(joint) for joint in guess.joints] + [_slider(tendon) for tendon in tendons]
+    parts = [_head(guess)]
+    for bone in guess.bones:
+        row = {"name": bone.name, "mesh": bone.file}
+        parts.append(table_text("[[bone]]", row, {} if bone.sure else {"name": f"GUESS: {bone.reason}"}))
+    parts += [_stub(tendon) for tendon in tendons] + [_joint(joint) for joint in guess.joints]
+    parts += [_slider(tendon) for tendon in tendons]
     movable = [joint for joint in guess.joints if joint.axes and not joint.follows]
     if movable:
-        parts.append(_motion(movable))
-    parts += [_muscle(muscle, hold_file) for muscle in guess.muscles]
-    return "\n".join([*parts, _TAIL])
+        parts.append(_motion(movable[0]))
+    return "\n".join([*parts, *(_muscle(muscle) for muscle in guess.muscles), _TAIL])
 
 
 def _head(guess):
@@ -45,113 +42,65 @@ def _head(guess):
         f"# Scene guessed from {guess.title}. Lines marked GUESS want a look; the number is how sure it is, of 1.",
         "# All keys: docs/scene_file.md. Then: rbfmuscle check --picture, rbfmuscle run.",
         *(f"# NOT USED: {file}: {reason}" for file, reason in guess.unusable.items()),
-        f'[scene]\nformat = 1\nname = "{guess.name}"',
-        f'units = "{guess.units}"   # of every length here; a mesh in another unit takes scale = ...',
     ]
-    if guess.orientation is not None:
-        for word in ("superior", "anterior"):
-            direction = _vector(getattr(guess.orientation, word), 5)
-            lines.append(f"{word} = {direction}   # by {guess.orientation.source}")
-    return "\n".join(
-        [*lines, '\n[defaults]\nmodel = "rbf"   # or a table: { name = "rbf", centres = 300 }\n']
-    )
+    row = {"format": 1, "name": guess.name, "units": guess.units}
+    comments = {"units": "of every length here; a mesh in another unit takes scale = ..."}
+    for word in ("superior", "anterior") if guess.orientation is not None else ():
+        row[word] = rounded(getattr(guess.orientation, word), 5)
+        comments[word] = f"by {guess.orientation.source}"
+    scene = table_text("[scene]", row, comments)
+    models = {"model": 'or a table: { name = "rbf", centres = 300 }'}
+    return "\n".join([*lines, scene, table_text("[defaults]", {"model": "rbf"}, models)])
 
 
-def _bone(bone):
-    mark = "" if bone.sure else f"   # GUESS: {bone.reason}"
-    return f'[[bone]]\nname = "{bone.name}"{mark}\nmesh = "{bone.file}"\n'
-
-
-def _vector(values, digits):
-    return "[" + ", ".join(f"{round(float(value), digits) + 0.0:g}" for value in values) + "]"
-
-
-def _joint(joint):
-    lines = [
-        f"[[joint]]   # GUESS {joint.confidence:.1f}: {joint.reason}",
-        f'name = "{joint.name}"',
-        f'parent = "{joint.parent.name}"',
-        f'child = "{joint.child.name}"',
-        f'type = "{joint.kind}"',
-    ]
-    if joint.kind != "fixed":
-        lines.append(f"centre = {_vector(joint.centre, 6)}")
-    if joint.path is not None:
-        return "\n".join([*lines, *_path(joint), ""])
-    if joint.axes:
-        if not joint.ranges:
-            lines.append("# GUESS: rename and turn the axes where angles should have the other sign")
-        axes = ", ".join(f"{name} = {_vector(axis, 5)}" for name, axis in joint.axes.items())
-        lines.append(f"axes = {{ {axes} }}   # angles follow the right-hand rule")
-    for k, (name, ends) in enumerate(joint.ranges.items()):
-        rest = f"rest = {joint.rest:g}, " if k == 0 and joint.rest else ""
-        lines.append(f"coordinates.{name} = {{ {rest}range = {_vector(ends, 1)} }}")
-    return "\n".join([*lines, ""])
-
-
-def _path(joint):
-    """The patella's custom joint by tables against the knee's flexion, which it follows."""
-    path = joint.path
-    x = _vector(joint.rest + np.array(FLEXIONS), 3)
-
-    def axis(direction, values):
-        spline = f"natural_spline = {{ x = {x}, y = {_vector(values, 4)} }}"
-        return f'  {{ axis = {_vector(direction, 6)}, coordinates = ["flexion"], {spline} }},'
-
-    knee = next(coordinate for coordinate in joint.follows)
-    return [
-        "rotations = [",
-        axis(path.axis, path.turns),
-        "]",
-        "translations = [",
-        axis(path.front, path.shifts[:, 0]),
-        axis(path.down, path.shifts[:, 1]),
-        "]",
-        f'coordinates.flexion = {{ motion = "rotation", rest = {joint.rest:g} }}\n',
-        f'[[coupling]]\ncoordinate = "{joint.coordinate}"\nof = ["{knee}"]\nlinear = [1, 0]',
-    ]
+def _joint(joint: JointGuess) -> str:
+    comments = {"axes": "angles follow the right-hand rule"}
+    if not joint.ranges:
+        comments["axes"] += "; GUESS: rename and turn them where angles should have the other sign"
+    text = table_text(f"[[joint]]   # GUESS {joint.confidence:.1f}: {joint.reason}", joint.row(), comments)
+    if joint.follows:
+        row = {"coordinate": joint.coordinate, "of": list(joint.follows), "linear": [1, 0]}
+        text += "\n" + table_text("[[coupling]]", row)
+    return text
 
 
 def _stub(tendon):
-    return (
-        f"[[bone]]   # GUESS: holds an end that stops short of its bone; a stub put aside, where nothing meets it\n"
-        f'name = "{tendon.name}"\nmesh = "{stub_file(tendon)}"\n'
-    )
+    head = "[[bone]]   # GUESS: holds an end that stops short of its bone; a stub put aside, where nothing meets it"
+    return table_text(head, {"name": tendon.name, "mesh": stub_file(tendon)})
 
 
 def _slider(tendon):
     """The joint of a tendon's stub, and what drives it."""
     hinge = tendon.joint.coordinate
-    angles = _vector(tendon.joint.rest + np.array(ANGLES), 3)
-    points = f"{{ x = {angles}, y = [{', '.join(f'{slide:.6g}' for slide in tendon.slides)}] }}"
-    return (
-        f"[[joint]]   # GUESS: slides along the missing tendon as {hinge} changes its length, straight to its bone\n"
-        f'name = "{tendon.name}"\nparent = "{tendon.guide.name}"\nchild = "{tendon.name}"\ntype = "slider"\n'
-        f"centre = {_vector(tendon.place, 6)}\naxes = {{ slide = {_vector(tendon.direction, 6)} }}\n\n"
-        f'[[coupling]]\ncoordinate = "{tendon.name}.slide"\nof = ["{hinge}"]\nnatural_spline = {points}\n'
-    )
+    why = f"slides along the missing tendon as {hinge} changes its length, straight to its bone"
+    row = {"name": tendon.name, "parent": tendon.guide.name, "child": tendon.name, "type": "slider"}
+    row |= {"centre": rounded(tendon.place, 6), "axes": {"slide": rounded(tendon.direction, 6)}}
+    points = {"x": rounded(tendon.joint.rest + np.array(ANGLES), 3), "y": rounded(tendon.slides, 6)}
+    coupling = {"coordinate": f"{tendon.name}.slide", "of": [hinge], "natural_spline": points}
+    return table_text(f"[[joint]]   # GUESS: {why}", row) + "\n" + table_text("[[coupling]]", coupling)
 
 
-def _motion(movable):
-    """A ramp of the first coordinate, within its range."""
-    joint = movable[0]
+def _motion(joint):
+    """A ramp of the joint's first coordinate, within its range."""
     _, high = joint.ranges.get(next(iter(joint.axes)), (0.0, joint.rest + 30.0))
     end = min(joint.rest + 30.0, high) if high > joint.rest else joint.rest
-    ramp = f'{{ "{joint.coordinate}" = {{ from = {joint.rest:g}, to = {end:g}, step = 2 }} }}'
-    return f"[motion]   # degrees\nramp = {ramp}   # GUESS\n"
+    ramp = {joint.coordinate: {"from": joint.rest, "to": end, "step": 2}}
+    return table_text("[motion]   # degrees", {"ramp": ramp}, {"ramp": "GUESS"})
 
 
-def _muscle(guess, hold_file):
-    part = guess.muscle
-    mark = "" if part.sure else f"   # GUESS: {part.reason}"
-    lines = ["[[muscle]]", f'name = "{part.name}"{mark}', f'mesh = "{part.file}"', "attach = ["]
+def hold_file(muscle: MuscleGuess, hold: AttachmentGuess) -> str:
+    """File of a hold's vertices, relative to the scene's folder."""
+    return f"attachments/{muscle.muscle.name}_{hold.bone.name}.txt"
+
+
+def _muscle(guess: MuscleGuess) -> str:
+    part, said = guess.muscle, []
+    row: dict[str, Any] = {"name": part.name, "mesh": part.file, "attach": []}
     for hold in guess.holds:
-        entry = f'{{ bone = "{hold.attached_bone}", vertices = "attachments/{hold_file(guess, hold)}" }}'
-        lines.append(
-            f"  {entry},   # GUESS {guess.confidence:.1f}: {len(hold.vertices)} vertices, {hold.reason}"
-        )
-    lines.append("]")
-    lines[1:1] = [f"# {reason}" for reason in guess.reasons]
+        row["attach"].append({"bone": hold.attached_bone, "vertices": hold_file(guess, hold)})
+        said.append(f"GUESS {guess.confidence:.1f}: {len(hold.vertices)} vertices, {hold.reason}")
+    comments = {"attach": said} | ({} if part.sure else {"name": f"GUESS: {part.reason}"})
+    text = table_text("\n".join(["[[muscle]]", *(f"# {reason}" for reason in guess.reasons)]), row, comments)
     if guess.wrong:
-        lines = [f"# {line}" for line in [f"NOT RUN: {guess.wrong}", *lines]]
-    return "\n".join([*lines, ""])
+        text = "".join(f"# {line}\n" for line in [f"NOT RUN: {guess.wrong}", *text.splitlines()])
+    return text

@@ -16,21 +16,13 @@ import numpy as np
 
 from rbfmuscle.validation import MeshError, MissingPartError, UsageError
 
-VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".seg.nrrd")
+VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd")
 # Stated limits: bytes of one volume once unpacked, labels, and the edge of a voxel [mm].
 MOST_BYTES = 2_000_000_000
 MOST_LABELS = 512
 VOXEL_RANGE = (0.02, 20.0)
-_TO_MM = {
-    "mm": 1.0,
-    "meter": 1000.0,
-    "m": 1000.0,
-    "micron": 0.001,
-    "um": 0.001,
-    "cm": 10.0,
-    "unknown": 1.0,
-    "": 1.0,
-}
+_TO_MM = {"meter": 1000.0, "m": 1000.0, "cm": 10.0, "micron": 0.001, "um": 0.001, "mm": 1.0, "unknown": 1.0}
+_UNREADABLE = (OSError, EOFError, ValueError, KeyError, zlib.error, OverflowError)
 
 
 @dataclass
@@ -50,7 +42,7 @@ class LabelVolume:
 
     labels: np.ndarray
     affine: np.ndarray
-    names: dict
+    names: dict[int, str]
     source: str
 
     @property
@@ -93,164 +85,120 @@ def read_labels(path: Path, *, names: Path | None = None) -> LabelVolume:
     volume = _read_folder(path) if path.is_dir() else _read_file(path)
     if names is not None:
         volume.names.update(read_names(names))
-    count = len(volume.values())
-    if count and not (volume.values() % 256).any():
+    values, image = volume.values(), "is it the image instead of its segmentation?"
+    if len(values) == 0:
+        raise MeshError(f"{path}: no voxel has a label; {image}")
+    if not (values % 256).any():
         raise MeshError(f"{path}: all labels are multiples of 256, so its bytes are swapped; export it again")
-    if count == 0:
-        raise MeshError(f"{path}: no voxel has a label; is it the image instead of its segmentation?")
-    if count > MOST_LABELS:
-        raise MeshError(
-            f"{path}: {count} labels, at most {MOST_LABELS}; is it the image instead of its segmentation?"
-        )
-    if count == 1:
-        raise MeshError(
-            f"{path}: only one label, {volume.name(volume.values()[0])!r}; a scene needs bones and muscles"
-        )
+    if len(values) > MOST_LABELS:
+        raise MeshError(f"{path}: {len(values)} labels, at most {MOST_LABELS}; {image}")
+    if len(values) == 1:
+        only = volume.name(values[0])
+        raise MeshError(f"{path}: only one label, {only!r}; a scene needs bones and muscles")
     return volume
+
+
+def _read_folder(path):
+    """One mask a file: the label's name is the file's."""
+    files = sorted(file for file in path.iterdir() if is_volume(file))
+    if not 0 < len(files) <= MOST_LABELS:
+        raise MeshError(f"{path}: {len(files)} masks ({' '.join(VOLUME_SUFFIXES)}), 1 to {MOST_LABELS}")
+    first = _read_file(files[0])
+    together = LabelVolume(np.zeros_like(first.labels), first.affine, {}, str(path))
+    for number, file in enumerate(files, start=1):
+        mask = _read_file(file)
+        if mask.labels.shape != first.labels.shape or not np.allclose(mask.affine, first.affine, atol=1e-3):
+            raise MeshError(f"{file}: its grid differs from that of {files[0].name}; resample it")
+        together.labels[mask.labels > 0] = number
+        together.names[number] = re.sub(r"(\.seg)?(\.nii(\.gz)?|\.nrrd)$", "", file.name, flags=re.IGNORECASE)
+    return together
 
 
 def _read_file(path):
     if not path.exists():
         raise UsageError(f"{path} does not exist; give a label volume or a folder")
-    reader = _read_nrrd if path.name.lower().endswith(".nrrd") else _read_nifti
-    data, affine, names = reader(path)
+    kind, read = ("NRRD", _read_nrrd) if path.name.lower().endswith(".nrrd") else ("NIfTI", _read_nifti)
+    try:
+        data, affine, unit, names = read(path)
+    except ImportError as error:
+        needed = f"reading {kind} needs {error.name}"
+        raise MissingPartError(f"{needed}: pip install -e '.[labels]' in rbfmuscle's folder") from None
+    except MeshError:
+        raise
+    except _UNREADABLE as error:
+        why = " ".join(str(error).split())[:120] or type(error).__name__
+        raise MeshError(f"{path}: no readable {kind} volume ({why}); export it again") from None
+    if unit not in _TO_MM:
+        raise MeshError(f"{path}: unknown unit of length {unit!r} in its header")
+    affine[:3] *= _TO_MM[unit]
     return LabelVolume(_check_labels(data, path), _check_affine(affine, path), names, str(path))
 
 
-def _read_folder(path):
-    """One mask a file: the label's name is the file's."""
-    files = sorted(p for p in path.iterdir() if is_volume(p))
-    if len(files) > MOST_LABELS:
-        raise MeshError(f"{path}: {len(files)} masks, at most {MOST_LABELS}")
-    together = None
-    for number, file in enumerate(files, start=1):
-        mask = _read_file(file)
-        if together is None:
-            together = LabelVolume(np.zeros(mask.labels.shape, np.int32), mask.affine, {}, str(path))
-        same = mask.labels.shape == together.labels.shape and np.allclose(
-            mask.affine, together.affine, atol=1e-3
-        )
-        if not same:
-            raise MeshError(
-                f"{file}: its grid differs from that of {files[0].name}; resample the masks to one grid"
-            )
-        together.labels[mask.labels > 0] = number
-        together.names[number] = re.sub(r"(\.seg)?(\.nii(\.gz)?|\.nrrd)$", "", file.name, flags=re.IGNORECASE)
-    if together is None:
-        raise UsageError(f"{path} holds no mask ({' '.join(VOLUME_SUFFIXES)})")
-    return together
-
-
 def _read_nifti(path):
-    try:
-        import nibabel
-        from nibabel.filebasedimages import ImageFileError
-    except ImportError:
-        raise MissingPartError(
-            "reading .nii needs nibabel: pip install -e '.[labels]' in rbfmuscle's folder"
-        ) from None
+    """Voxels, affine (4, 4), its unit, and names that segmentation programs leave in the header as XML."""
+    import nibabel
+
     try:
         image = nibabel.load(path)
-        shape, itemsize = image.shape, image.get_data_dtype().itemsize
-        unit = image.header.get_xyzt_units()[0]
-        data = np.asanyarray(image.dataobj) if _check_size(shape, itemsize, path) else None
-    except MeshError:
-        raise
-    except (ImageFileError, OSError, EOFError, ValueError, KeyError, zlib.error, OverflowError) as error:
-        raise MeshError(f"{path}: no readable NIfTI volume ({_first_line(error)}); export it again") from None
-    factor = _TO_MM.get(unit)
-    if factor is None:
-        raise MeshError(f"{path}: unknown unit of length {unit!r} in its header")
-    affine = np.array(image.affine, dtype=np.float64)
-    affine[:3] *= factor
-    return data, affine, _names_in_extensions(image)
-
-
-def _names_in_extensions(image):
-    """Names that segmentation programs leave in the header: JSON or the XML of a label table."""
+    except nibabel.filebasedimages.ImageFileError as error:
+        raise ValueError(str(error)) from None
+    _check_size(image.shape, image.get_data_dtype().itemsize, path)
     names = {}
     for extension in getattr(image.header, "extensions", []):
         content = extension.get_content()
         text = content.decode("utf-8", "ignore") if isinstance(content, bytes) else str(content)
         for number, name in re.findall(r'<Label[^>]*?Key="(\d+)"[^>]*?>(?:<!\[CDATA\[)?([^<\]]+)', text):
             names[int(number)] = name.strip()
-    return names
+    unit = image.header.get_xyzt_units()[0]
+    return np.asanyarray(image.dataobj), np.array(image.affine, dtype=np.float64), unit, names
 
 
 def _read_nrrd(path):
+    """Voxels, affine (4, 4), its unit, and the names that Slicer writes for segments."""
+    import nrrd
+
     try:
-        import nrrd
-    except ImportError:
-        raise MissingPartError(
-            "reading .nrrd needs pynrrd: pip install -e '.[labels]' in rbfmuscle's folder"
-        ) from None
-    try:
-        header = nrrd.read_header(str(path))
-        shape = tuple(int(size) for size in header["sizes"])
-        data, header = nrrd.read(str(path)) if _check_size(shape, 8, path) else (None, header)
-    except MeshError:
-        raise
-    except (nrrd.NRRDError, OSError, EOFError, ValueError, KeyError, zlib.error, OverflowError) as error:
-        raise MeshError(f"{path}: no readable NRRD volume ({_first_line(error)}); export it again") from None
-    affine = np.eye(4)
+        _check_size(tuple(int(size) for size in nrrd.read_header(str(path))["sizes"]), 8, path)
+        data, header = nrrd.read(str(path))
+    except nrrd.NRRDError as error:
+        raise ValueError(str(error)) from None
     directions = np.asarray(header.get("space directions", np.eye(3)), dtype=np.float64)
     if directions.shape != (3, 3):
         raise MeshError(f"{path}: its directions are not those of three axes; export one label map in 3-D")
-    affine[:3, :3] = directions.T
-    affine[:3, 3] = np.asarray(header.get("space origin", np.zeros(3)), dtype=np.float64)
-    unit = (header.get("space units") or ["mm"])[0]
-    affine[:3] *= _TO_MM.get(str(unit).strip('"').lower(), 1.0)
-    if str(header.get("space", "left-posterior-superior")).lower() in ("left-posterior-superior", "lps"):
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = directions.T, header.get("space origin", np.zeros(3))
+    if str(header.get("space", "lps")).lower() in ("left-posterior-superior", "lps"):
         affine[:2] *= -1.0
-    return data, affine, _slicer_names(header)
-
-
-def _slicer_names(header):
     names = {}
     for key, value in header.items():
         segment = re.fullmatch(r"Segment(\d+)_Name", str(key))
         if segment:
             names[int(header.get(f"Segment{segment[1]}_LabelValue", int(segment[1]) + 1))] = str(value)
-    return names
-
-
-def _first_line(error):
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:120]
+    unit = str((header.get("space units") or ["mm"])[0]).strip('"').lower()
+    return data, affine, unit or "mm", names
 
 
 def _check_size(shape, itemsize, path):
-    """True, or MeshError where a volume has not three axes or is too large; nothing is unpacked for it."""
-    if (
-        len([size for size in shape if size > 1]) != 3
-        or len(shape) < 3
-        or any(size > 1 for size in shape[3:])
-    ):
+    """MeshError where a volume has not three axes or is too large; nothing is unpacked for it."""
+    if len(shape) < 3 or min(shape[:3]) < 2 or any(size > 1 for size in shape[3:]):
         raise MeshError(f"{path}: a volume of shape {tuple(shape)}; give one label map with three axes")
     size = int(np.prod([int(size) for size in shape], dtype=object)) * itemsize
     if size > MOST_BYTES:
         raise MeshError(f"{path}: {size:,} bytes unpacked, at most {MOST_BYTES:,}; crop it or split it")
-    return True
 
 
 def _check_labels(data, path):
     """Whole numbers from 0 on, (i, j, k) of int32."""
-    data = np.asarray(data).reshape(np.asarray(data).shape[:3])
+    data = data.reshape(data.shape[:3])
     if not np.issubdtype(data.dtype, np.number) or np.iscomplexobj(data):
         raise MeshError(f"{path}: voxels of type {data.dtype}; labels are whole numbers")
-    if np.issubdtype(data.dtype, np.floating):
-        if not np.isfinite(data).all():
-            raise MeshError(
-                f"{path}: {int((~np.isfinite(data)).sum()):,} voxels are not finite; labels are whole numbers"
-            )
-        if not (data == np.rint(data)).all():
-            raise MeshError(
-                f"{path}: voxels between whole numbers; is it the image instead of its segmentation?"
-            )
+    if not np.isfinite(data).all():
+        raise MeshError(f"{path}: some voxels are not finite; labels are whole numbers")
+    if not (data == np.rint(data)).all():
+        raise MeshError(f"{path}: voxels between whole numbers; is it the image instead of its segmentation?")
     low, high = float(data.min()), float(data.max())
     if low < 0 or high > 65535:
-        raise MeshError(
-            f"{path}: labels from {low:g} to {high:g}, allowed are 0 to 65535; is its byte order right?"
-        )
+        raise MeshError(f"{path}: labels from {low:g} to {high:g}, allowed are 0 to 65535")
     return np.ascontiguousarray(data, dtype=np.int32)
 
 
@@ -273,56 +221,43 @@ def read_names(path: Path) -> dict[int, str]:
     UsageError
         If the file cannot be read or names nothing.
     """
-    known = known_tables()
-    if not path.exists() and path.name in known:
-        return known[path.name]
+    tables = tomllib.loads((Path(__file__).parent / "tables.toml").read_text(encoding="utf-8"))
+    if not path.exists() and path.name in tables:
+        return dict(enumerate(tables[path.name].split(), start=1))
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
+        names = _json_names(json.loads(text)) if path.suffix.lower() == ".json" else _row_names(text)
     except OSError as error:
-        raise UsageError(f"cannot read {path}: {error.strerror}; known tables: {', '.join(known)}") from None
-    names: dict[int, str] = {}
-    if path.suffix.lower() == ".json":
-        names = _json_names(text, path)
-    else:
-        for line in text.splitlines():
-            if line.lstrip().startswith("#"):
-                continue
-            words = next(csv.reader([line.replace("\t", ",")], skipinitialspace=True), [])
-            snap = re.match(r'\s*(\d+)\s+.*"([^"]+)"\s*$', line)
-            if snap:
-                names[int(snap[1])] = snap[2]
-            elif len(words) >= 2 and words[0].strip().isdigit():
-                names[int(words[0])] = words[1].strip()
+        known = ", ".join(tables)
+        raise UsageError(f"cannot read {path}: {error.strerror}; known tables: {known}") from None
+    except (ValueError, RecursionError):
+        raise UsageError(f"{path} is no JSON") from None
     if not names:
         raise UsageError(f"{path} names no label; write lines of number and name, or JSON")
     return names
 
 
-def known_tables() -> dict[str, dict[int, str]]:
-    """Names of labels by number, of segmentation programs, from ``tables.toml``."""
-    with (Path(__file__).parent / "tables.toml").open("rb") as file:
-        tables = tomllib.load(file)
-    return {name: dict(enumerate(words.split(), start=1)) for name, words in tables.items()}
+def _row_names(text):
+    """Names of lines of number and name: CSV, TSV, or ITK-SNAP's descriptions with the name in quotes at the end."""
+    names = {}
+    for line in text.splitlines():
+        snap = re.match(r'\s*(\d+)\s+.*"([^"]+)"\s*$', line)
+        words = next(csv.reader([line.replace("\t", ",")], skipinitialspace=True), [])
+        if snap:
+            names[int(snap[1])] = snap[2]
+        elif len(words) >= 2 and words[0].strip().isdigit():
+            names[int(words[0])] = words[1].strip()
+    return names
 
 
-def _json_names(text, path):
-    try:
-        table = json.loads(text)
-    except (ValueError, RecursionError):
-        raise UsageError(f"{path} is no JSON") from None
+def _json_names(table):
+    """Names of a JSON table: number to name, name to number, or a list of rows as MuscleMap writes it."""
     if isinstance(table, dict) and isinstance(table.get("labels"), (dict, list)):
         table = table["labels"]
-    if isinstance(table, list):  # as MuscleMap writes it
+    if isinstance(table, list):
         rows = [row for row in table if isinstance(row, dict) and isinstance(row.get("value"), int)]
-        return {
-            r["value"]: f"{r.get('anatomy') or r.get('structure')} {r.get('side', '')}".strip() for r in rows
-        }
-    if not isinstance(table, dict):
-        raise UsageError(f"{path}: give an object of number and name")
-    names = {}
-    for key, value in table.items():
-        if str(key).isdigit():
-            names[int(key)] = str(value)
-        elif isinstance(value, int):
-            names[value] = str(key)
-    return names
+        parts = {row["value"]: (row.get("anatomy") or row.get("structure"), row.get("side")) for row in rows}
+        return {number: " ".join(filter(None, words)) for number, words in parts.items()}
+    pairs = table.items() if isinstance(table, dict) else ()
+    names = {int(key): str(value) for key, value in pairs if str(key).isdigit()}
+    return names | {value: str(key) for key, value in pairs if isinstance(value, int) and not key.isdigit()}
