@@ -21,6 +21,14 @@ VIEWS: dict[str, tuple[tuple[float, float, float], str]] = {
 USUAL_VIEWS = ("front", "side", "back")
 
 
+def body_axes(superior: Sequence[float], anterior: Sequence[float]) -> Floats:
+    """Left, posterior and superior (3, 3) of a body with these directions."""
+    up = np.asarray(superior, dtype=float) / np.linalg.norm(superior)
+    left = np.cross(up, anterior)
+    left /= np.linalg.norm(left)
+    return np.stack([left, np.cross(up, left), up])
+
+
 def muscle_groups(info: Mapping[str, Any]) -> dict[str, str]:
     """Group of each muscle by the joints that it crosses.
 

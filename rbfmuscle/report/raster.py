@@ -49,9 +49,14 @@ def view_axes(direction: Sequence[float] | Floats) -> Floats:
     return np.stack([right, np.cross(ahead, right), ahead])
 
 
-def aim(direction: Sequence[float] | Floats, points: Floats, size: tuple[int, int]) -> Camera:
-    """A camera that sees all points (n, 3) from a direction, as large as a picture of ``size`` holds them."""
-    axes = view_axes(direction)
+def aim(
+    direction: Sequence[float] | Floats, points: Floats, size: tuple[int, int], body: Floats | None = None
+) -> Camera:
+    """A camera that sees all points (n, 3) from a direction, as large as a picture of ``size`` holds them.
+
+    ``body`` (3, 3) holds the axes that the direction is given in; those of the points where it is None.
+    """
+    axes = view_axes(direction) if body is None else view_axes(direction) @ body
     seen = points @ axes.T
     low, high = seen.min(axis=0), seen.max(axis=0)
     wide, tall, _ = np.maximum(high - low, 1e-9)

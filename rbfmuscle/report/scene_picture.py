@@ -10,7 +10,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.output.colours import MUSCLE_COLOURS, mixed_colour, rgb
-from rbfmuscle.report.appearance import BACKGROUND, VIEWS
+from rbfmuscle.report.appearance import BACKGROUND, VIEWS, body_axes
 from rbfmuscle.report.labels import labelled
 from rbfmuscle.report.raster import Camera, Solid, aim, draw_solids
 
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 # A patch farther than this [mm] from its bone is a far end; a muscle deeper than this in a bone overlaps it.
 FAR, DEEP = 6.0, 1.0
 SIZE = (480, 860)
+# What `VIEWS` are where the body's directions are known.
+_SIDES = {"front": "from the front", "side": "from the right", "back": "from behind", "far": "from the left"}
 _MUSCLE, _OPACITY, _FAR_END, _OVERLAP, _AXIS = "#9a8f8f", 0.4, "#111111", "#e3001b", "#0057d9"
 _PALE, _MOST_NAMED = 0.72, 6
 
@@ -46,7 +48,7 @@ class Overlap(NamedTuple):
 
 
 def draw_scene(scene: Scene, path: str | Path) -> dict[str, int]:
-    """Draw a scene in its rest pose to a PNG file.
+    """Draw a scene in its rest pose to a PNG file, from the body's sides where its directions are known.
 
     Parameters
     ----------
@@ -63,9 +65,11 @@ def draw_scene(scene: Scene, path: str | Path) -> dict[str, int]:
     solids = [Solid(*_mesh(bone), rgb(mixed_colour(colours[bone.name], _PALE))) for bone in scene.bones]
     solids += [solid for muscle in scene.muscles for solid in _muscle_solids(muscle, colours)]
     points = np.concatenate([solid.vertices for solid in solids])
-    images = []
+    images, body, titles = [], None, {view: title for view, (_, title) in VIEWS.items()}
+    if scene.superior is not None and scene.anterior is not None:
+        body, titles = body_axes(scene.superior, scene.anterior), _SIDES
     for direction, _ in VIEWS.values():
-        camera = aim(direction, points, SIZE)
+        camera = aim(direction, points, SIZE, body)
         images.append(_marked(draw_solids(solids, camera, rgb(BACKGROUND)), camera, scene, far, overlaps))
     chips = {**colours, "joint centres and axes": _AXIS}
     if far:
@@ -75,7 +79,7 @@ def draw_scene(scene: Scene, path: str | Path) -> dict[str, int]:
     text = ", ".join(
         [f"{scene.name}: held patches in the colour of their bone", *_notes(scene, far, overlaps)]
     )
-    labelled(np.concatenate(images, axis=1), text, [title for _, title in VIEWS.values()], chips).save(path)
+    labelled(np.concatenate(images, axis=1), text, list(titles.values()), chips).save(path)
     return {"far_ends": len(far), "overlaps": len(overlaps)}
 
 
