@@ -66,13 +66,10 @@ class JointGuess:
         Axis of each coordinate.
     confidence : float
         0 to 1: one minus half the misfit over the greatest allowed, where something was fitted.
-    reason : str
-    name : str
-        Of the joint in the scene.
-    ranges : dict of str to (float, float)
-        Of coordinates [degree].
-    rest : float
-        Value of the first coordinate in the pose of the meshes [degree].
+    reason, name : str
+        Why; of the joint in the scene.
+    ranges, rest : dict of str to (float, float), float
+        Of coordinates; the value of the first one in the pose of the meshes [degree].
     tables : dict
         ``rotations`` and ``translations`` of a custom joint, as the scene file has them.
     follows : tuple of str
@@ -127,4 +124,4 @@ class JointGuess:
 
 def rounded(values: ArrayLike, digits: int) -> list[float]:
     """Numbers rounded for the scene file."""
-    return [float(value) for value in np.round(values, digits)]
+    return np.round(np.asarray(values, dtype=float), digits).tolist()

@@ -39,18 +39,9 @@ FAR = 25.0
 
 @dataclass
 class AttachmentGuess:
-    """Vertices of a muscle that a bone holds.
+    """Vertices of a muscle's mended mesh that a bone holds, their least distance to it [mm], and why.
 
-    Attributes
-    ----------
-    bone : Part
-    vertices : (n,) ndarray of int
-        Of the mended mesh.
-    gap : float
-        Least distance of the patch to the bone [mm].
-    reason : str
-    tendon : TendonGuess or None
-        What carries an end far from its bone.
+    ``tendon`` is what carries an end far from its bone.
     """
 
     bone: Part
@@ -67,18 +58,9 @@ class AttachmentGuess:
 
 @dataclass
 class MuscleGuess:
-    """A muscle, what holds it and how far to believe it.
+    """A muscle, what holds it, how far to believe it (0 to 1), and why not more.
 
-    Attributes
-    ----------
-    muscle : Part
-    holds : list of AttachmentGuess
-    confidence : float
-        0 to 1.
-    reasons : list of str
-        Why the confidence is not higher.
-    wrong : str
-        Why the muscle cannot be run as guessed; empty where it can.
+    ``wrong`` says why the muscle cannot be run as guessed; empty where it can.
     """
 
     muscle: Part
@@ -94,17 +76,7 @@ class MuscleGuess:
 
 
 class Skeleton(NamedTuple):
-    """What muscles are held by.
-
-    Attributes
-    ----------
-    bones : list of Part
-    bodies : dict of Part to Part
-        Of bones that move as one the one that stands for all.
-    exact : ExactMeshes
-    millimetre : float
-        Length of a millimetre in scene units.
-    """
+    """What muscles are held by; ``bodies`` gives of bones that move as one the one that stands for all."""
 
     bones: list[Part]
     bodies: dict[Part, Part]
@@ -113,12 +85,7 @@ class Skeleton(NamedTuple):
 
 
 class Ends:
-    """The two ends of a closed surface: the points farthest apart along it.
-
-    Parameters
-    ----------
-    mesh : trimesh.Trimesh
-    """
+    """The two ends of a closed surface: the points farthest apart along it."""
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         count = len(mesh.vertices)
@@ -139,15 +106,7 @@ class Ends:
 
 
 def guess_attachments(muscle: Part, skeleton: Skeleton, *, named: bool = True) -> MuscleGuess:
-    """Find the bones that hold a muscle and the vertices that they hold.
-
-    Parameters
-    ----------
-    muscle : Part
-    skeleton : Skeleton
-    named : bool
-        Look at what the muscle's name tells; the nearest bones where it tells nothing.
-    """
+    """Find the bones that hold a muscle, by its name where ``named``, else the nearest, and the vertices they hold."""
     bones, ends = skeleton.bones, Ends(muscle.mesh)
     distances = {b: skeleton.exact.distances(muscle.points, b.mesh) / skeleton.millimetre for b in bones}
     guess = MuscleGuess(muscle, [], 1.0)

@@ -27,22 +27,9 @@ DOUBTFUL = 0.6
 class SceneGuess:
     """What was guessed of a folder.
 
-    Attributes
-    ----------
-    title : str
-        What the comment at the top calls the source.
-    name, units : str
-        Of the scene.
-    bones : list of Part
-    root : Part
-        The bone that stands still.
-    joints : list of JointGuess
-    orientation : Orientation or None
-    unusable : dict of str to str
-        Why a bone or a muscle is not in the scene, by file.
-    notes : list of str
-        What was left out, taken for something, made coarser, and the unit where it was guessed.
-    muscles : list of MuscleGuess
+    ``title`` is what the comment at the top of the file calls the source, ``root`` the bone that stands still,
+    ``unusable`` says why a bone or a muscle is not in the scene, by file; ``notes`` what was left out, taken for
+    something or made coarser, and the unit where it was guessed.
     """
 
     title: str

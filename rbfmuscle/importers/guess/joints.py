@@ -55,16 +55,7 @@ class Fit(NamedTuple):
 
 
 def find_face(first: Part, second: Part, millimetre: float, band: float = BAND) -> Face | None:
-    """Faces of one bone that look at another nearby, None where it is far away.
-
-    Parameters
-    ----------
-    first, second : Part
-    millimetre : float
-        Length of a millimetre in scene units.
-    band : float
-        Beyond the least gap [mm].
-    """
+    """Faces of one bone that look at another nearby within a band [mm] beyond the least gap, None if it is far away."""
     reach = (FARTHEST + band) * millimetre
     points, normals, areas = first.faces
     low, high = np.asarray(second.mesh.bounds)
@@ -86,13 +77,7 @@ def guess_joints(
 ) -> tuple[Part, list[JointGuess]]:
     """The bone that stands still, and a joint for every other bone that has one.
 
-    Parameters
-    ----------
-    bones : list of Part
-    millimetre : float
-        Length of a millimetre in scene units.
-    orientation : Orientation, optional
-        Gives axes their signs; without it there are balls and hinges of any sign.
+    Without an orientation there are balls and hinges of any sign. ``millimetre`` is the length of one in scene units.
     """
     areas: dict[tuple[Part, Part], float] = {}
     for first, second in combinations(bones, 2):

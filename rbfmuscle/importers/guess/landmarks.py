@@ -27,14 +27,7 @@ ARC, BAND, RADIAL = 45.0, 8.0, 0.95
 
 @dataclass
 class Frame:
-    """Directions of a body or of a long bone, unit (3,).
-
-    Attributes
-    ----------
-    superior, anterior : (3,) ndarray
-    side : str
-        Side of the body that the bone's shape is of, ``"l"`` or ``"r"``.
-    """
+    """Directions of a body or of a long bone, unit (3,); the side, ``"l"`` or ``"r"``, that the bone's shape is of."""
 
     superior: np.ndarray
     anterior: np.ndarray
@@ -174,15 +167,7 @@ def fit_dome(
 ) -> AxisFit | None:
     """The ankle's axis; None where talus and tibia show no dome and plafond.
 
-    Parameters
-    ----------
-    talus, tibia : Part
-    up : (3,) ndarray
-        Along the tibia.
-    right : (3,) ndarray
-        About along the axis.
-    millimetre : float
-        Length of a millimetre in scene units.
+    ``up`` (3,) is the direction along the tibia, ``right`` (3,) about that of the axis.
     """
     patches = []
     for part, other, sign in ((talus, tibia, 1.0), (tibia, talus, -1.0)):
@@ -228,14 +213,7 @@ def fit_coaxial(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Centre, axis, radii and misfit (RMS) of cylinders with one axis, from a start on.
 
-    Parameters
-    ----------
-    patches : list of (points, weights)
-        One cylinder each.
-    centre, axis : (3,) ndarray
-    radii : (k,) ndarray
-    soft : float
-        Distance from which on a point loses its weight.
+    ``patches`` holds points and weights of each cylinder; from the distance ``soft`` on a point loses its weight.
     """
     plane, size = np.linalg.svd(axis[None])[2][1:], float(radii[0])
     roots = [np.sqrt(weights / weights.mean() / len(patches)) for _, weights in patches]

@@ -21,14 +21,10 @@ _SIGNS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss", "é": "e
 
 @dataclass(frozen=True)
 class MuscleFacts:
-    """What a muscle's name says.
+    """What a muscle's name says: its name as the table has it, and where it is held.
 
-    Attributes
-    ----------
-    name : str
-        As the table has it.
-    origin, insertion : tuple of (tuple of str, bool)
-        Classes of bone that may stand for one attachment, the best first; whether the muscle must be held there.
+    ``origin`` and ``insertion`` list attachments: classes of bone that may stand for one, the best first, and whether
+    the muscle must be held there.
     """
 
     name: str
@@ -40,17 +36,8 @@ class MuscleFacts:
 class NameFacts:
     """What a name says.
 
-    Attributes
-    ----------
-    tissue : str
-        ``"bone"``, ``"muscle"``, ``"other"``, or empty where the name says nothing.
-    bone : str
-        Class of bone.
-    muscle : MuscleFacts or None
-    side : str
-        ``"l"``, ``"r"`` or empty.
-    spelling : str
-        What misspelt words were taken for; empty where there are none.
+    ``tissue`` is ``"bone"``, ``"muscle"``, ``"other"`` or empty; ``bone`` the class of bone;
+    ``side`` is ``"l"``, ``"r"`` or empty; ``spelling`` says what misspelt words were taken for.
     """
 
     tissue: str = ""
@@ -75,7 +62,8 @@ class _Table(NamedTuple):
 def _table():
     table = tomllib.loads((Path(__file__).parent / "names.toml").read_text(encoding="utf-8"))
     sides = {form: side for side, forms in table["sides"].items() for form in forms.split()}
-    forms = {form: word for word, forms in table["words"].items() for form in forms.split()}
+    words = dict(entry.strip().split(": ") for entry in table["words"]["table"].split(";"))
+    forms = {form: word for word, forms in words.items() for form in forms.split()}
     other = {word for words in table["other"].values() for word in words.split()}
 
     def key(name):
@@ -87,7 +75,7 @@ def _table():
         names, *places = (part.strip() for part in line.split(";"))
         for name in names.split(","):
             muscles[key(name)] = MuscleFacts(name.strip(), *map(_places, places))
-    known = {word for name in (*bones, *muscles) for word in name} | other | {*forms, *table["words"]}
+    known = {word for name in (*bones, *muscles) for word in name} | other | {*forms, *words}
     return _Table(sides, forms, other, bones, muscles, known)
 
 

@@ -25,14 +25,7 @@ _BELOW = {
 
 @dataclass
 class Orientation(Frame):
-    """Anatomical directions of a scene.
-
-    Attributes
-    ----------
-    source : str
-        What they were found from.
-    doubts : list of str
-    """
+    """Anatomical directions of a scene, what they were found from, and what speaks against them."""
 
     source: str = "the shapes of the bones"
     doubts: list[str] = field(default_factory=list)
@@ -45,12 +38,7 @@ HEADER = Orientation(np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), sourc
 def find_orientation(bones: list[Part], header: Orientation | None = None) -> Orientation | None:
     """Anatomical directions, None where no bone shows them; femora get their ``frame``, and a side if they have none.
 
-    Parameters
-    ----------
-    bones : list of Part
-        With their class in ``kind``.
-    header : Orientation, optional
-        Known directions, which count; the bones are held against them.
+    Directions of a ``header`` count; the bones are held against them.
     """
     femora = [bone for bone in bones if bone.kind == "femur"]
     doubts = []

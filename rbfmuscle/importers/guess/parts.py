@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.importers.guess.names import MuscleFacts, NameFacts, name_facts
+from rbfmuscle.importers.guess.names import MuscleFacts, name_facts
 from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, prepare_mesh, read_arrays
 from rbfmuscle.validation import MeshError, UsageError
 
@@ -33,18 +33,15 @@ class Part:
 
     Attributes
     ----------
-    name : str
-        In the scene.
-    file : str
-        Path as the scene file gives it.
+    name, file : str
+        In the scene; path as the scene file gives it.
     read : ReadMesh
     kind : str
         Class of bone, empty where the name says none.
     side : str
         ``"l"``, ``"r"`` or empty.
     reason : str
-        Why it is a bone or a muscle.
-    sure : bool
+        Why it is a bone or a muscle, where that is not ``sure``.
     facts : MuscleFacts or None
     coarse : bool
         The mesh was made coarser than its file.
@@ -91,13 +88,7 @@ class Part:
 class Parts:
     """What is in a folder.
 
-    Attributes
-    ----------
-    bones, muscles : list of Part
-    unusable : dict of str to str
-        Reason by file of a bone or muscle.
-    notes : list of str
-        What was left out, misspelt names, meshes made coarser.
+    ``unusable`` gives reasons by file; ``notes`` name what was left out, misspelt or made coarser.
     """
 
     bones: list[Part] = field(default_factory=list)
@@ -107,19 +98,7 @@ class Parts:
 
 
 def read_parts(folder: Path, base: Path) -> Parts:
-    """Bones and muscles of a folder, and of its folders ``bones`` and ``muscles`` where it has them.
-
-    Parameters
-    ----------
-    folder : Path
-    base : Path
-        Folder that paths are given relative to.
-
-    Raises
-    ------
-    UsageError
-        If the folder is missing or holds no bone or no muscle.
-    """
+    """Bones and muscles of a folder, and of its folders ``bones`` and ``muscles``; files relative to ``base``."""
     found, unknown, names, left_out = Parts(), [], set(), []
     for path in _find_meshes(folder):
         facts = name_facts(path.stem)
@@ -148,8 +127,8 @@ def read_parts(folder: Path, base: Path) -> Parts:
         kind, other = ("bone", "muscles") if not found.bones else ("muscle", "bones")
         listed = ", ".join([part.file for part in found.bones or found.muscles] + list(found.unusable))
         raise UsageError(
-            f"{folder} holds no {kind} (all are {other} by their names or sizes, or cannot be used: {listed}); "
-            "name the files after what they are, or sort them into folders bones and muscles"
+            f"{folder} holds no {kind} (by names or sizes all are {other}, or cannot be used: {listed or 'no files'}); "
+            f"name files ({' '.join(MESH_SUFFIXES)}) after what they are, or sort them into folders bones and muscles"
         )
     return found
 
@@ -160,14 +139,10 @@ def _find_meshes(folder):
         raise UsageError(f"{folder} is no folder; give the folder of the meshes")
     inner = [path for path in sorted(folder.iterdir()) if path.name.lower() in FOLDERS and path.is_dir()]
     files = [path for place in [folder, *inner] for path in sorted(place.iterdir())]
-    paths = [path for path in files if path.suffix.lower() in MESH_SUFFIXES]
-    if len(paths) < 2:
-        kinds = " ".join(MESH_SUFFIXES)
-        raise UsageError(f"{folder} holds {len(paths)} meshes ({kinds}); a scene needs bones and muscles")
-    return paths
+    return [path for path in files if path.suffix.lower() in MESH_SUFFIXES]
 
 
-def _read_part(path, base, names, facts: NameFacts, notes, *, closed):
+def _read_part(path, base, names, facts, notes, *, closed):
     name = re.sub(r"[^a-z0-9_-]+", "_", path.stem.lower()).strip("_") or "part"
     while name in names:
         name += "_2"

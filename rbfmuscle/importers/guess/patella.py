@@ -38,16 +38,7 @@ class PatellaPath(NamedTuple):
 def patella_path(
     femur: Part, tibia: Part, patella: Part, knee: JointGuess, millimetre: float
 ) -> PatellaPath | None:
-    """The path of a patella, None where its groove or its ligament is not found.
-
-    Parameters
-    ----------
-    femur, tibia, patella : Part
-    knee : JointGuess
-        With its axis, flexion positive, and its flexion at rest.
-    millimetre : float
-        Length of a millimetre in scene units.
-    """
+    """The path of a patella, None where its groove or its ligament is not found; ``knee`` has its axis and rest."""
     axis = knee.axis
     down = unit(across(-femur.frame.superior, axis))
     front = np.cross(down, axis)

@@ -34,18 +34,7 @@ EDGE, UNTANGLE = 2.2, 20
 
 @dataclass
 class LabelSurface:
-    """The surface of one label.
-
-    Attributes
-    ----------
-    name : str
-    mesh : trimesh.Trimesh
-        Closed, outward [mm].
-    volume : float
-        Of the label's voxels [mm3].
-    notes : list of str
-        Islands that were left out, holes that were filled.
-    """
+    """A label's surface, closed and outward [mm], the volume of its voxels [mm3], and what was left out or filled."""
 
     name: str
     mesh: Any
@@ -54,19 +43,9 @@ class LabelSurface:
 
 
 def label_surface(volume: LabelVolume, label: int, *, pieces: bool = False) -> LabelSurface:
-    """Smooth surface of a label.
+    """Smooth surface of a label, or MeshError where it has too few voxels for one.
 
-    Parameters
-    ----------
-    volume : LabelVolume
-    label : int
-    pieces : bool
-        Keep every piece of a hundredth of the whole or more (bones of several parts), not the largest alone.
-
-    Raises
-    ------
-    MeshError
-        If the label has too few voxels for a surface.
+    With ``pieces`` (bones of several parts) every piece of a hundredth or more is kept, not the largest alone.
     """
     import igl
     import trimesh

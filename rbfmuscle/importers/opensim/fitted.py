@@ -89,7 +89,7 @@ def fit_path(
     count, dimension = values.shape
     weights = np.r_[1.0, np.full(dimension, ARM_WEIGHT)][:, None]
     wanted = weights * np.vstack([lengths, arms.T])
-    group, best = np.arange(count) % FOLDS, None
+    group, best = np.arange(count) % FOLDS, (np.inf, 1, np.empty(0))
     for order in range(1, most + 1):
         if order > 1 and 1.5 * len(exponents(dimension, order)) > 0.8 * count * (1 + dimension):
             break
@@ -99,7 +99,7 @@ def fit_path(
             out = group == fold
             left_out = rows[:, out] @ _solve(rows[:, ~out], wanted[:, ~out])
             error += np.sum((left_out - wanted[:, out]) ** 2)
-        if best is None or error < best[0]:
+        if error < best[0]:
             best = (error, order, _solve(rows, wanted))
     return FittedPath(muscle, coordinates, *best[1:])
 

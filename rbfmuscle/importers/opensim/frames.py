@@ -12,13 +12,7 @@ _DEEPEST = 50
 
 
 class Frames:
-    """Every frame of a model by its absolute path.
-
-    Parameters
-    ----------
-    model : Node
-        The element ``<Model>``.
-    """
+    """Every frame of a model (the element ``<Model>``) by its absolute path."""
 
     def __init__(self, model: Node) -> None:
         self.bodies = {"/ground": "ground"}
@@ -27,13 +21,7 @@ class Frames:
         self.offsets = {node.path: node for node in found}
 
     def place(self, name: str, *, inside: str = "/") -> tuple[str, np.ndarray]:
-        """Body and frame in it (4, 4) of a name, absolute or relative to the component ``inside``.
-
-        Raises
-        ------
-        SceneError
-            If nothing has that name, or frames are offset from each other in a ring.
-        """
+        """Body and frame in it (4, 4) of a name, absolute or relative to the component ``inside``."""
         transform, path = np.eye(4), self._find(name, inside)
         for _ in range(_DEEPEST):
             if path in self.bodies:

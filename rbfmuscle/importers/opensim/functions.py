@@ -20,13 +20,7 @@ BESIDE = ("coordinates", "axis", "scale")
 
 
 def read_function(node: Node | None) -> Function | None:
-    """The function in an element, directly or in its child ``function``; None where there is none.
-
-    Raises
-    ------
-    SceneError
-        If it is of a kind that the table of functions lacks, or its numbers are wrong.
-    """
+    """The function in an element, directly or in its child ``function``; None where there is none."""
     holder = node.child("function") if node is not None else None
     inside = node if holder is None else holder
     found = [inner for inner in inside.nodes() if inner.tag not in BESIDE] if inside is not None else []

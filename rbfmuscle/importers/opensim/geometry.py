@@ -14,10 +14,7 @@ NARROWEST = 0.002
 
 
 def find_mesh(name: str, folders: list[Path]) -> Path | None:
-    """Return the first file of that name in some folders, or None.
-
-    A name in the wrong case, or without its suffix, is found too, after the exact ones.
-    """
+    """Return the first file of that name in some folders, or None; exact names before others in case or suffix."""
     plain = name.replace("\\", "/")
     for folder in folders:
         if (folder / plain).is_file():

@@ -16,12 +16,9 @@ GROUND = "ground"
 
 @dataclass
 class ModelJoint(Joint):
-    """A joint between two bodies: ``X_child = X_parent P J(q) C^-1``; its own ``frame`` is the identity.
+    """A joint between two bodies: ``X_child = X_parent P J(q) C^-1``, with P and C the joint's frames (4, 4) in them.
 
-    Attributes
-    ----------
-    parent_frame, child_frame : (4, 4) ndarray
-        P and C: the joint's frames in their bodies.
+    Its own ``frame`` is the identity.
     """
 
     parent_frame: np.ndarray = field(default_factory=lambda: np.eye(4))
@@ -61,14 +58,9 @@ class ModelMuscle:
 
 @dataclass
 class OsimModel:
-    """All that is taken from an ``.osim`` file.
+    """All that is taken from an ``.osim`` file; ``bodies`` begin with ``"ground"``.
 
-    Attributes
-    ----------
-    bodies : list of str
-        ``"ground"`` first.
-    notes : list of str
-        What is in the file and is not taken, or taken otherwise than a user may expect.
+    ``notes`` say what is in the file and is not taken, or taken otherwise than a user may expect.
     """
 
     name: str
@@ -86,13 +78,7 @@ class OsimModel:
         return {name: facts for joint in self.joints for name, facts in joint.coordinates.items()}
 
     def resolve(self, values: dict[str, float] | None = None) -> dict[str, float]:
-        """Return the value of every coordinate when some are set: locks, clamps and couplings honoured.
-
-        Parameters
-        ----------
-        values : dict of str to float, optional
-            Bare names [radian, metre]; absent ones keep their default.
-        """
+        """Value of every coordinate when some are set [radian, metre]: locks, clamps and couplings honoured."""
         values = values or {}
         found = {n: c.honoured(values[n]) if n in values else c.rest for n, c in self.coordinates().items()}
         for coupling in self.couplings:
@@ -112,13 +98,7 @@ class OsimModel:
             yield ready, backward
 
     def transforms(self, values: dict[str, float] | None = None) -> dict[str, np.ndarray]:
-        """Return the (4, 4) transform from every body to the ground [metre].
-
-        Parameters
-        ----------
-        values : dict of str to float, optional
-            As for `resolve`.
-        """
+        """The (4, 4) transform from every body to the ground [metre], with values as for `resolve`."""
         resolved = self.resolve(values)
         found = {body: np.eye(4) for body in self.bodies}
         for joint, backward in self.tree():

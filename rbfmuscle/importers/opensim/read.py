@@ -8,7 +8,7 @@ from rbfmuscle.importers.opensim.frames import Frames, socket
 from rbfmuscle.importers.opensim.functions import read_function
 from rbfmuscle.importers.opensim.model import GROUND, ModelJoint, ModelMesh, OsimModel, finish
 from rbfmuscle.importers.opensim.muscles import read_muscles
-from rbfmuscle.importers.opensim.xml import Node, read_xml
+from rbfmuscle.importers.opensim.xml import read_xml
 from rbfmuscle.scene.joints.functions import Constant, Linear, scaled
 from rbfmuscle.scene.joints.joint import KINDS, Coordinate, Coupling, TransformAxis, frame_at
 from rbfmuscle.validation import SceneError
@@ -194,16 +194,10 @@ def _custom_axes(node, names):
 
 
 def motion_of(name: str, axes: dict[str, tuple[TransformAxis, ...]]) -> str:
-    """What a coordinate is, by OpenSim's rule.
+    """What a coordinate is, by OpenSim's rule; ``axes`` are those for ``rotation`` and for ``translation``.
 
     It is an angle or a length where it alone drives an axis of that sort by a plain linear function of slope 1 or -1,
     the last such axis deciding; else it is coupled.
-
-    Parameters
-    ----------
-    name : str
-    axes : dict of str to tuple of TransformAxis
-        ``rotation`` and ``translation``.
     """
     found = "coupled"
     for slot in ("rotation", "translation"):
@@ -233,7 +227,7 @@ def _coordinate(node, motion, model):
     return Coordinate(motion, rest, None, limits, clamped, node.truth("locked"))
 
 
-def _read_couplings(model, node: Node):
+def _read_couplings(model, node):
     coordinates = model.coordinates()
     for constraint in node.objects("ConstraintSet"):
         if constraint.tag != "CoordinateCouplerConstraint":

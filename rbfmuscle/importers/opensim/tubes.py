@@ -34,7 +34,7 @@ class Tube:
 def make_tube(
     muscle: ModelMuscle, places: dict[str, np.ndarray], bones: dict[str, ExactDistance], metre: float
 ) -> Tube:
-    """The tube of a muscle in the scene.
+    """The tube of a muscle in the scene, or SceneError where no two bodies with a mesh hold it.
 
     Parameters
     ----------
@@ -45,11 +45,6 @@ def make_tube(
         Of the bodies that have a mesh in the scene.
     metre : float
         Scene units in a metre.
-
-    Raises
-    ------
-    SceneError
-        If a body that holds an end has no mesh, or the path has no length or no volume.
     """
     bodies = [body for body, _ in muscle.points]
     if len(set(bodies[:1] + bodies[-1:])) < 2 or muscle.volume <= 0.0:

@@ -22,13 +22,6 @@ def write_scene(found: Imported, directory: Path, *, motion: Path | None = None)
         Made where it is missing.
     motion : path, optional
         A motion file that the scene shall follow; checked against its coordinates.
-
-    Raises
-    ------
-    SceneError
-        If the motion file does not fit.
-    UsageError
-        If the folder cannot be written to.
     """
     directory, scene = Path(directory), found.scene
     target = directory / "scene.toml"

@@ -119,13 +119,11 @@ class _Builder(ElementTree.TreeBuilder):
 
 def _as_utf8(data):
     """The bytes of a file that says UTF-8, or nothing, and is in Latin-1 as UTF-8: OpenSim reads these too."""
-    declared = re.match(rb"\s*<\?xml[^>]*encoding=[\"']([^\"']+)", data)
-    if declared and declared[1].lower() not in (b"utf-8", b"utf8"):
-        return data
     try:
         data.decode("utf-8")
     except UnicodeDecodeError:
-        return data.decode("latin-1").encode("utf-8")
+        if not re.match(rb"\s*<\?xml[^>]*encoding=[\"'](?!utf-?8)", data, flags=re.IGNORECASE):
+            return data.decode("latin-1").encode("utf-8")
     return data
 
 
