@@ -120,12 +120,7 @@ def _phantom_meshes(folder, *, scale=1.0, mirror=False, plain_names=False):
 
 @pytest.mark.parametrize(
     ("units", "options"),
-    [
-        ("mm", {}),
-        ("m", {"scale": 1e-3}),
-        ("mm", {"mirror": True}),
-        ("mm", {"plain_names": True}),
-    ],
+    [("mm", {}), ("m", {"scale": 1e-3}), ("mm", {"mirror": True}), ("mm", {"plain_names": True})],
 )
 def test_what_is_written_loads_and_has_the_phantoms_joint(tmp_path, units, options):
     _phantom_meshes(tmp_path, **options)

@@ -13,10 +13,7 @@ from rbfmuscle.importers.guess.parts import Part
 
 # Directions of bones and header that differ by more than this [degree] are named.
 AGREE = 45.0
-_ABOVE = {
-    "femur": ("pelvis", "ilium", "sacrum"),
-    "tibia": ("femur", "patella"),
-}
+_ABOVE = {"femur": ("pelvis", "ilium", "sacrum"), "tibia": ("femur", "patella")}
 _BELOW = {
     "femur": ("tibia", "patella", "fibula", "talus", "calcaneus", "foot"),
     "tibia": ("talus", "calcaneus", "foot"),
