@@ -53,6 +53,7 @@ def _take(joint, fit, method, name, direction):
     joint.reason = f"{method}, radii {radii}, misfit {fit.misfit:.2g}"
     joint.centre, joint.axes = fit.centre, {coordinate: fit.axis * np.sign(fit.axis @ direction)}
     joint.confidence = max(1.0 - 0.5 * fit.misfit / (MISFIT * min(fit.radii)), 0.1)
+    joint.confidence -= 0.2 * (len(fit.radii) < 2)  # one surface alone shows the direction less well
     if fit.wrong:
         joint.reason, joint.confidence = f"{joint.reason}; {fit.wrong}: refused, correct it", 0.1
 

@@ -1,4 +1,4 @@
-"""What hangs on what, about what it turns and how far; and a joint as guessed."""
+"""Parents of bones, the joints between them and their ranges; and a joint as guessed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from rbfmuscle.importers.guess.parts import Part
 from rbfmuscle.scene.joints.tables import JointTable
 
-# Class of bone: those that it may hang on, the likeliest first, and the kind of joint between.
+# Class of bone: its possible parents, the likeliest first, and the kind of joint between.
 PARENTS = {
     "ilium": (("pelvis", "fixed"), ("sacrum", "fixed")),
     "ischium": (("ilium", "fixed"), ("pelvis", "fixed")),
@@ -34,7 +34,7 @@ PARENTS = {
     "hand": (("radius", "ball"), ("ulna", "ball"), ("hand", "fixed")),
 }
 ROOTS = ("pelvis", "ilium", "sacrum", "scapula", "rib", "vertebra", "femur", "humerus", "tibia")
-# Class of the child: name of its joint where it hangs on one of its parents.
+# Class of the child: name of its joint with one of its parents above.
 JOINTS = {
     "femur": "hip",
     "tibia": "knee",
@@ -54,7 +54,7 @@ COORDINATES = {
 
 @dataclass
 class JointGuess:
-    """A joint and how far to believe it.
+    """A joint as guessed.
 
     Attributes
     ----------

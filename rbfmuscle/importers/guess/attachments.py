@@ -58,7 +58,7 @@ class AttachmentGuess:
 
 @dataclass
 class MuscleGuess:
-    """A muscle, what holds it, how far to believe it (0 to 1), and why not more.
+    """A muscle, its attachments, its confidence (0 to 1), and the reasons why that is not higher.
 
     ``wrong`` says why the muscle cannot be run as guessed; empty where it can.
     """
@@ -115,7 +115,7 @@ def guess_attachments(muscle: Part, skeleton: Skeleton, *, named: bool = True) -
     if not by_name:
         places = _nearest_places(muscle, skeleton.bodies, distances, ends)
         known = muscle.facts is not None
-        why = "the bones of its name are not here" if known else "its name tells nothing"
+        why = "the bones of its name are not here" if known else "its name is not known"
         guess.reasons = []
         guess.doubt(0.2 if known else 0.4, f"{why}; the bones are the nearest to its two ends")
     holds = [_hold(bone, distances[bone], ends, end, skeleton.millimetre) for bone, end in places]

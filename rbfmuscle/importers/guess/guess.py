@@ -128,7 +128,8 @@ def write_scene(guess: SceneGuess, path: Path) -> Scene:
             for hold in muscle.holds:
                 file = path.parent / hold_file(muscle, hold)
                 file.parent.mkdir(parents=True, exist_ok=True)
-                np.savetxt(file, _in_file(muscle.muscle, hold.vertices), fmt="%d")
+                in_file = np.isin(muscle.muscle.read.vertex_map, hold.vertices)
+                np.savetxt(file, np.flatnonzero(in_file), fmt="%d")
         write_stubs(guess, path.parent, MILLIMETRE[guess.units])
         while True:
             path.write_text(scene_text(guess), encoding="utf-8")
@@ -150,15 +151,6 @@ def _write_coarse(guess, folder):
             part.file = f"coarse/{part.name}.ply"
             part.mesh.export(folder / part.file)
             part.read.vertex_map = np.arange(len(part.points))
-
-
-def _in_file(part, vertices):
-    """Numbers of a mended mesh's vertices in its file."""
-    numbers = np.full(len(part.points), -1)
-    mapped = part.read.vertex_map[::-1]  # of several in the file that became one, the first
-    numbers[mapped[mapped >= 0]] = np.arange(len(mapped))[::-1][mapped >= 0]
-    found = numbers[vertices]
-    return found[found >= 0]
 
 
 def _comment_out(guess, error):

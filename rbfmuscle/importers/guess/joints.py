@@ -1,4 +1,4 @@
-"""Which bone hangs on which, and about what it turns: from the faces that look at each other.
+"""The tree of the bones and their joints, from the parts of their surfaces that face each other.
 
 A joint is where two bones face each other closely. The bones' tree is the one with the greatest facing area.
 A ball fits where the normals of the convex face meet in one point; a hinge where they meet one line, found as
@@ -36,7 +36,7 @@ DOME = 0.8
 
 
 class Face(NamedTuple):
-    """Faces of a bone that look at another: middles (n, 3), normals (n, 3), areas (n,), and the least gap [mm]."""
+    """Triangles of a bone that face another: middles (n, 3), normals (n, 3), areas (n,), and the least gap [mm]."""
 
     points: np.ndarray
     normals: np.ndarray
@@ -55,7 +55,7 @@ class Fit(NamedTuple):
 
 
 def find_face(first: Part, second: Part, millimetre: float, band: float = BAND) -> Face | None:
-    """Faces of one bone that look at another nearby within a band [mm] beyond the least gap, None if it is far away."""
+    """Triangles of a bone that face another within a band [mm] beyond the least gap, None if it is far away."""
     reach = (FARTHEST + band) * millimetre
     points, normals, areas = first.faces
     low, high = np.asarray(second.mesh.bounds)
@@ -107,13 +107,13 @@ def guess_joints(
 
 
 def _root(bones):
-    """By name what the limb hangs on, else the largest."""
+    """The bone that stands still: by its name, else the largest."""
     named = ([bone for bone in bones if bone.kind == kind] for kind in ROOTS)
     return max(next(filter(None, named), bones), key=lambda bone: bone.mesh.area)
 
 
 def _likelihood(parent, child):
-    """How much more a link counts for what the names of its bones tell."""
+    """Factor on the facing area of two bones, by their names."""
     if parent.side and child.side and parent.side != child.side:
         return 1.0 if parent.kind == child.kind == "pelvis" else 1e-3
     wanted = [kind for kind, _ in PARENTS.get(child.kind, ())]

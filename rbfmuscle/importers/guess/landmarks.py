@@ -165,7 +165,7 @@ def _refused(what, radii, allowed, millimetre):
 def fit_dome(
     talus: Part, tibia: Part, up: np.ndarray, right: np.ndarray, millimetre: float
 ) -> AxisFit | None:
-    """The ankle's axis; None where talus and tibia show no dome and plafond.
+    """The ankle's axis; None where talus and tibia show no dome.
 
     ``up`` (3,) is the direction along the tibia, ``right`` (3,) about that of the axis.
     """
@@ -184,7 +184,9 @@ def fit_dome(
     centre = np.average(points[top], axis=0, weights=areas[top]) - radii[0] * up
     for _ in range(40):
         chosen = [_on_cylinder(*patch[:2], centre, right, up, r) for patch, r in zip(patches, radii)]
-        if min(c.sum() for c in chosen) < 8:
+        if chosen[-1].sum() < 8 and len(chosen) == 2:  # no plafond: the dome alone
+            patches, radii, chosen = patches[:1], radii[:1], chosen[:1]
+        if chosen[0].sum() < 8:
             return None
         if np.array_equal(before, before := np.concatenate(chosen)):
             break

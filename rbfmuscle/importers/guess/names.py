@@ -1,4 +1,4 @@
-"""What names of meshes and labels say: bone, muscle or other tissue, which one, and of which side.
+"""What names of meshes and labels mean: bone, muscle or other tissue, which one, and of which side.
 
 A name is split at capitals, digits and signs; words are brought to one form, those written together are taken apart,
 and unknown ones may be misspelt. The table is ``names.toml``, with its sources.

@@ -29,7 +29,7 @@ MOST_TRIANGLES, FEWEST = 400_000, 3000
 
 @dataclass(eq=False)
 class Part:
-    """One mesh and what is believed of it.
+    """One mesh and what it is taken for.
 
     Attributes
     ----------
@@ -115,11 +115,11 @@ def read_parts(folder: Path, base: Path) -> Parts:
         if facts.spelling:
             found.notes.append(f"{path.name}: {facts.spelling}")
         {"bone": found.bones, "muscle": found.muscles, "": unknown}[tissue].append(part)
-    # What no name tells: the largest are bones until there are two, the others muscles.
+    # Of names that are not known: the largest are bones until there are two, the others muscles.
     for part in sorted(unknown, key=lambda part: -np.linalg.norm(part.mesh.extents)):
         is_bone = len(found.bones) < 2 or not part.mesh.is_watertight
         part.sure = False
-        part.reason = f"{'a bone' if is_bone else 'a muscle'} by its size, as its name tells nothing"
+        part.reason = f"{'a bone' if is_bone else 'a muscle'} by its size, as its name is not known"
         (found.bones if is_bone else found.muscles).append(part)
     if left_out:
         found.notes.append(f"left out, neither bone nor muscle: {', '.join(left_out)}")

@@ -27,17 +27,9 @@ _UNREADABLE = (OSError, EOFError, ValueError, KeyError, zlib.error, OverflowErro
 
 @dataclass
 class LabelVolume:
-    """Labels on a regular grid.
+    """Labels (i, j, k) on a regular grid, 0 for what belongs to nothing.
 
-    Attributes
-    ----------
-    labels : (i, j, k) ndarray of int
-        0 is what belongs to nothing.
-    affine : (4, 4) ndarray
-        Voxel index to position [mm, RAS].
-    names : dict of int to str
-        Of the labels that have one.
-    source : str
+    ``affine`` (4, 4) takes voxel indices to positions [mm, RAS]; ``names`` are those of the labels that have one.
     """
 
     labels: np.ndarray
@@ -214,13 +206,7 @@ def _check_affine(affine, path):
 
 
 def read_names(path: Path) -> dict[int, str]:
-    """Names of labels from a file, or from a known table by its name.
-
-    Raises
-    ------
-    UsageError
-        If the file cannot be read or names nothing.
-    """
+    """Names of labels from a file, or from a known table by its name."""
     tables = tomllib.loads((Path(__file__).parent / "tables.toml").read_text(encoding="utf-8"))
     if not path.exists() and path.name in tables:
         return dict(enumerate(tables[path.name].split(), start=1))

@@ -17,17 +17,10 @@ FOLDS = 5
 
 @dataclass(frozen=True)
 class FittedPath:
-    """A polynomial for a muscle's length; minus its derivatives are the moment arms.
+    """A polynomial for a muscle's length over coordinates (full names); minus its derivatives are the moment arms.
 
-    Attributes
-    ----------
-    muscle : str
-    coordinates : tuple of str
-        Full names, the order of the polynomial's arguments.
-    order : int
-        Largest sum of exponents.
-    coefficients : (m,) ndarray
-        Of the terms in `exponents`, for coordinates in radians or scene units [scene unit].
+    ``order`` is the largest sum of exponents; ``coefficients`` are those of the terms in `exponents`, for coordinates
+    in radians or scene units [scene unit].
     """
 
     muscle: str
@@ -114,14 +107,7 @@ def _solve(rows, wanted):
 def write_paths(file: Path, fitted: list[FittedPath], metre: float, turning: dict[str, bool]) -> None:
     """Write paths as the set of ``FunctionBasedPath`` that OpenSim loads.
 
-    Parameters
-    ----------
-    file : path
-    fitted : list of FittedPath
-    metre : float
-        Scene units in a metre.
-    turning : dict of str to bool
-        Whether a coordinate is no shift: shifts are in metres there.
+    ``metre`` is its length in scene units; ``turning`` says which coordinates are no shifts, which are in metres there.
     """
     root = ElementTree.Element("OpenSimDocument", Version="40600")
     paths = ElementTree.SubElement(root, "Set_FunctionBasedPath_")

@@ -94,7 +94,11 @@ def _read_sockets(model, node, frames):
             ends.append(frames.place(name, inside=joint.path))
         model.joints.append(_joint(joint, ends, "coordinates", model))
     for attached in node.iter("attached_geometry"):
-        body, transform = frames.place(attached.owner.path)
+        owner = attached.owner
+        if owner.path not in (*frames.bodies, *frames.offsets):
+            model.notes.append(f"{owner.place}: geometry of a {owner.tag} is not taken")
+            continue
+        body, transform = frames.place(owner.path)
         for shape in attached.nodes():
             if shape.tag != "Mesh":
                 what = f"geometry {shape.name or shape.tag!r} is a {shape.tag}"
