@@ -139,9 +139,9 @@ def test_what_is_written_loads_and_has_the_phantoms_joint(tmp_path, units, optio
     assert Scene.load(tmp_path / "scene.toml").units == units
 
 
-def test_a_folder_of_one_mesh_is_refused(tmp_path):
+def test_a_folder_without_muscles_is_refused(tmp_path):
     phantom_scene().bones[0].mesh.export(tmp_path / "femur.ply")
-    with pytest.raises(UsageError, match="1 meshes"):
+    with pytest.raises(UsageError, match="holds no muscle"):
         guess_scene(tmp_path, "mm", tmp_path)
 
 
