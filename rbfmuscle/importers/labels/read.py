@@ -21,7 +21,8 @@ VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd")
 MOST_BYTES = 2_000_000_000
 MOST_LABELS = 512
 VOXEL_RANGE = (0.02, 20.0)
-_TO_MM = {"meter": 1000.0, "m": 1000.0, "cm": 10.0, "micron": 0.001, "um": 0.001, "mm": 1.0, "unknown": 1.0}
+_TO_MM = {"mm": 1.0, "millimeter": 1.0, "unknown": 1.0, "cm": 10.0, "m": 1000.0, "meter": 1000.0}
+_TO_MM |= {"um": 0.001, "micron": 0.001}
 _UNREADABLE = (OSError, EOFError, ValueError, KeyError, zlib.error, OverflowError)
 
 
