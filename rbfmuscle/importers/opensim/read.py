@@ -10,7 +10,7 @@ from rbfmuscle.importers.opensim.model import GROUND, ModelJoint, ModelMesh, Osi
 from rbfmuscle.importers.opensim.muscles import read_muscles
 from rbfmuscle.importers.opensim.xml import read_xml
 from rbfmuscle.scene.joints.functions import Constant, Linear, scaled
-from rbfmuscle.scene.joints.joint import KINDS, Coordinate, Coupling, TransformAxis, frame_at
+from rbfmuscle.scene.joints.joint import KINDS, Coordinate, Coupling, TransformAxis, frame_at, motion_of
 from rbfmuscle.validation import SceneError
 
 # From this version on joints stand in a set of their own and name their frames.
@@ -166,7 +166,12 @@ def _joint(node, ends, holder, model):
             "rotation": tuple(TransformAxis(axis, (name,)) for axis, name in zip(turns, names)),
             "translation": tuple(TransformAxis(a, (n,)) for a, n in zip(shifts, names[len(turns) :])),
         }
-    coordinates = {inner.name: _coordinate(inner, motion_of(inner.name, axes), model) for inner in found}
+    slopes = [
+        (sort, axis.coordinates, axis.function.slopes[0] if isinstance(axis.function, Linear) else 0.0)
+        for sort, group in axes.items()
+        for axis in group
+    ]
+    coordinates = {inner.name: _coordinate(inner, motion_of(inner.name, slopes), model) for inner in found}
     return ModelJoint(
         node.name, parent, child, np.eye(4), coordinates, axes["rotation"], axes["translation"], kind,
         parent_frame=first, child_frame=second,
@@ -195,20 +200,6 @@ def _custom_axes(node, names):
         axes[axis.name] = TransformAxis(tuple((direction / np.linalg.norm(direction)).tolist()), of, function)
     slots = ("rotation", "translation")
     return {slot: tuple(axes[f"{slot}{k}"] for k in (1, 2, 3) if f"{slot}{k}" in axes) for slot in slots}
-
-
-def motion_of(name: str, axes: dict[str, tuple[TransformAxis, ...]]) -> str:
-    """What a coordinate is, by OpenSim's rule; ``axes`` are those for ``rotation`` and for ``translation``.
-
-    It is an angle or a length where it alone drives an axis of that sort by a plain linear function of slope 1 or -1,
-    the last such axis deciding; else it is coupled.
-    """
-    found = "coupled"
-    for slot in ("rotation", "translation"):
-        for axis in axes[slot]:
-            linear = isinstance(axis.function, Linear) and axis.function.slopes in ((1.0,), (-1.0,))
-            found = slot if linear and axis.coordinates == (name,) else found
-    return found
 
 
 def _check_count(function, count, node):

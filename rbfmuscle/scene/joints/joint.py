@@ -6,14 +6,15 @@ there are, and that each follows one coordinate.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
 from rbfmuscle.scene.joints.functions import Function, Linear
 
+MotionKind: TypeAlias = Literal["rotation", "translation", "coupled"]
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 
@@ -63,7 +64,7 @@ class Coordinate:
         Stays at ``rest`` whatever is asked of it.
     """
 
-    motion: Literal["rotation", "translation", "coupled"] = "rotation"
+    motion: MotionKind = "rotation"
     rest: float = 0.0
     default: float | None = None
     range: tuple[float, float] | None = None
@@ -187,6 +188,25 @@ class Coupling:
     coordinate: str
     of: tuple[str, ...]
     function: Function
+
+
+def motion_of(name: str, axes: Iterable[tuple[MotionKind, Sequence[str], float]]) -> MotionKind:
+    """What a coordinate of a custom joint is, by OpenSim's rule.
+
+    It is an angle or a length where it alone drives an axis of that sort with a slope of 1 or -1, the last such axis
+    deciding; else it is coupled.
+
+    Parameters
+    ----------
+    name : str
+    axes : iterable of (str, sequence of str, float)
+        Sort of each axis, its coordinates, and the first slope of its function where that is linear, else 0.
+    """
+    found: MotionKind = "coupled"
+    for sort, coordinates, slope in axes:
+        if list(coordinates) == [name] and abs(slope) == 1.0:
+            found = sort
+    return found
 
 
 def rotation_about(axis: np.ndarray, angle: float, centre: np.ndarray) -> np.ndarray:

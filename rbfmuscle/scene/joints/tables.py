@@ -20,6 +20,7 @@ from rbfmuscle.scene.joints.joint import (
     TransformAxis,
     frame_angles,
     frame_at,
+    motion_of,
 )
 from rbfmuscle.scene.joints.skeleton import all_coordinates
 from rbfmuscle.scene.options import Axis, Finite, Table, Vector
@@ -64,6 +65,11 @@ class FunctionTable(Table):
         if found == IDENTITY and inputs == [output]:
             return found
         return found.rescaled([FACTORS[motion] for motion in inputs], FACTORS[output])
+
+    def slope(self) -> float:
+        """The first slope of a linear function, 0 of any other."""
+        plain = all(getattr(self, name) is None for name in FUNCTIONS)
+        return 1.0 if plain else (self.linear or [0.0])[0]
 
     def _plain(self, kind, count, place):
         if kind == "constant":
@@ -191,17 +197,10 @@ class JointTable(Table):
         return coordinates, tuple(made["rotation"]), tuple(made["translation"])
 
     def _motion_of(self, name, tables):
-        """A coordinate that is itself an angle or a shift along some axis is a rotation or a translation."""
         declared = self.coordinates.get(name)
         if declared is not None and declared.motion is not None:
             return declared.motion
-        found = "coupled"
-        for motion, table in tables:
-            plain = not any(getattr(table, key) is not None for key in FUNCTIONS)
-            slope = 1.0 if plain else (table.linear or [0.0])[0]
-            if table.coordinates == [name] and abs(slope) == 1.0:
-                found = motion
-        return found
+        return motion_of(name, [(motion, table.coordinates, table.slope()) for motion, table in tables])
 
     def _check_known(self, used, place):
         for name in self.coordinates:

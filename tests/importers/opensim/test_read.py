@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 import rbfmuscle as rm
-from rbfmuscle.importers.opensim.read import motion_of, read_osim
+from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.scene import import_osim
 from rbfmuscle.importers.opensim.write import write_scene
-from rbfmuscle.scene.joints.functions import Linear
-from rbfmuscle.scene.joints.joint import TransformAxis, frame_at, rotation_about
+from rbfmuscle.scene.joints.joint import frame_at, motion_of, rotation_about
 from rbfmuscle.scene.joints.skeleton import all_coordinates
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.validation import SceneError
@@ -177,16 +176,13 @@ def test_a_body_keeps_the_meshes_that_can_be_read_beside_one_that_cannot(small):
     assert not import_osim(small).scene.bones
 
 
-@pytest.mark.parametrize("slot", ["rotation", "translation"])
+@pytest.mark.parametrize("sort", ["rotation", "translation"])
 @pytest.mark.parametrize("place", [0, 1, 2])
-def test_a_coordinate_is_what_it_drives_alone_with_a_slope_of_one_on_any_axis(slot, place):
+def test_a_coordinate_is_what_it_drives_alone_with_a_slope_of_one_on_any_axis(sort, place):
     def found(slope, of=("q",)):
-        axes = {
-            "rotation": [TransformAxis((0.0, 0.0, 1.0))] * 3,
-            "translation": [TransformAxis((0.0, 0.0, 1.0))] * 3,
-        }
-        axes[slot][place] = TransformAxis((0.0, 0.0, 1.0), of, Linear((slope,)))
+        axes = [("rotation", (), 0.0), ("translation", (), 0.0)] * 3
+        axes[2 * place + (sort == "translation")] = (sort, of, slope)
         return [motion_of(name, axes) for name in "qp"]
 
-    assert found(-1.0) == [slot, "coupled"]
+    assert found(-1.0) == [sort, "coupled"]
     assert found(0.5) == found(1.0, ("q", "p")) == ["coupled", "coupled"]
