@@ -18,6 +18,8 @@ import numpy as np
 from evidence import write_evidence
 
 import rbfmuscle as rm
+from rbfmuscle.models import build_models
+from rbfmuscle.simulation.frame_loop import simulate_frames
 
 ROOT = Path(__file__).resolve().parent.parent
 MODELS = ("rbf", "pbd")  # pbd-converged takes half an hour
@@ -46,8 +48,8 @@ def vertices(frame):
 
 def timed(path, model):
     """Processor time per frame [s], without the first frame."""
-    run, stamps = rm.Scene.load(path).with_options({"output.metrics": False}), []
-    rm.simulate(run, model=model, progress=lambda done, total: stamps.append(time.process_time()))
+    scene = rm.Scene.load(path).with_options(model=model)
+    stamps = [time.process_time() for _ in simulate_frames(scene, build_models(scene))]
     return (stamps[-1] - stamps[0]) / (len(stamps) - 1)
 
 
@@ -55,18 +57,14 @@ def measure(path, model):
     """One row: the worst of each quantity, distances between paths, and the time."""
     scene = rm.Scene.load(path)
     ((name, ramp),) = scene.resolved()["motion"]["ramp"].items()
-    quiet = {"output.metrics": False}
     runs = {
-        step: rm.simulate(
-            rm.Scene.load(path).with_options({"motion.step": step, **({} if step == STEPS[0] else quiet)}),
-            model=model,
-        )
+        step: rm.simulate(rm.Scene.load(path).with_options({"motion.step": step}), model=model)
         for step in STEPS
     }
     ends = [vertices(run.frames[-1]) for run in runs.values()]
     first = ramp.get("from", 0.0)
     scene.set_motion(waypoints=[{name: first}, {name: ramp["to"]}, {name: first}], step=STEPS[0])
-    back = rm.simulate(scene.with_options(quiet), model=model).frames
+    back = rm.simulate(scene, model=model).frames
     return {
         **{quantity: worst(runs[STEPS[0]], quantity) for quantity in WORST},
         "steps_apart": max(apart(one, two) for one in ends for two in ends),

@@ -7,8 +7,6 @@ import numpy as np
 from pbd_baseline.rest import RestState
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.jit import compiled
-from rbfmuscle.scene.activation.keys import Contraction
-from rbfmuscle.scene.activation.law import FibreLaw
 from rbfmuscle.scene.activation.resolve import resolve_contraction
 from rbfmuscle.scene.objects import Muscle
 
@@ -21,8 +19,15 @@ class MeshFibres:
     """Fibres of a mesh muscle: a frame along the fibre at each edge, and what the edge should be in it.
 
     An edge with the rest vector E, the fibre direction a and the target stretches t along and s across (means of its
-    two vertices) is wanted as T E, T = t aaᵀ + s (1 - aaᵀ). A passive fibre may have any stretch t from 1 / slack to 1,
-    with s = t^(-1/2).
+    two vertices) is wanted as T E, T = t aaᵀ + s (1 - aaᵀ). With λ the stretch against the scan and a the activation,
+
+        t = min(max(λ, lower), upper),    s = (t + a (λ - t))^(-1/2).
+
+    A passive fibre is slack, where nothing pulls, between its stretch in the scan, 1, and 1 / stretch_at_rest (or
+    1 / slack, where the scene does not say). Activation moves both ends of this band in proportion towards the stretch
+    at which a fully active fibre has no tension. An active fibre pulls along itself alone: with the girth of t it would
+    push outwards too, and the widest place of a belly would take all the shortening. Tendon keeps its length, but may
+    stretch by its strain at full activation.
 
     Parameters
     ----------
@@ -34,15 +39,12 @@ class MeshFibres:
 
     def __init__(self, muscle: Muscle, rest: RestState, *, slack: float) -> None:
         count = len(rest.vertices)
-        given = resolve_contraction(muscle)
-        if given is None:
-            given = Contraction(1.0, 1.0, np.zeros(len(rest.vertices), dtype=bool), 0.0)
-        tendon = np.asarray(given.tendon)[rest.order]
-        self.slack = 1.0 if given.slack else slack
-        self.law = FibreLaw(tendon, given, hold=1.0)
+        self.given = resolve_contraction(muscle)
+        self.at_tendon = self.given.tendon[rest.order]
+        self.slack = 1.0 if self.given.slack else slack
         edges = rest.topology.edges
         self.edges = edges
-        self.tendon = tendon[edges].all(axis=1)
+        self.tendon = self.at_tendon[edges].all(axis=1)
         self.vectors = rest.vertices[edges[:, 0]] - rest.vertices[edges[:, 1]]
         one, other = rest.fibres[edges[:, 0]], rest.fibres[edges[:, 1]]
         axis = one + np.where(np.einsum("ij,ij->i", one, other) < 0.0, -1.0, 1.0)[:, None] * other
@@ -60,19 +62,25 @@ class MeshFibres:
 
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1."""
-        self.law.activate(activation)
-        belly = ~self.law.tendon
-        self.law.lower[belly] -= (1.0 - activation) * (1.0 - 1.0 / self.slack)
+        given, self.activation = self.given, float(activation)
+        least, most = min(1.0, 1.0 / given.stretch_at_rest), max(1.0, 1.0 / given.stretch_at_rest)
+        passive = (1.0 - activation) * (1.0 - 1.0 / self.slack)
+        lower = least + activation * (given.shortest - least) - passive
+        upper = most + activation * (given.shortest - most)
+        self.lower = np.where(self.at_tendon, 1.0, lower)
+        self.upper = np.where(self.at_tendon, 1.0 + activation * given.tendon_strain, upper)
+        self.active = np.where(self.at_tendon, 0.0, activation)
 
     @property
-    def activation(self) -> float:
-        """Present activation, 0 to 1."""
-        return self.law.activation
+    def passive(self) -> bool:
+        """Whether the fibres are those of a muscle that does not contract."""
+        return self.activation == 0.0 and self.given.stretch_at_rest == 1.0 and not self.at_tendon.any()
 
     def targets(self, points: Floats) -> Floats:
         """Wanted vectors of the edges (e, 3) in the rest frame, for the present points (n, 3)."""
         _stretch_loop(points, self.edges, self.lengths, self.weights, self.stretch)
-        along, across = self.law.goal(self.stretch)
+        along = np.minimum(np.maximum(self.stretch, self.lower), self.upper)
+        across = (along + self.active * (self.stretch - along)) ** -0.5
         t = 0.5 * (along[self.edges[:, 0]] + along[self.edges[:, 1]])[:, None]
         s = 0.5 * (across[self.edges[:, 0]] + across[self.edges[:, 1]])[:, None]
         t, s = np.where(self.known, t, 1.0), np.where(self.known, s, 1.0)

@@ -107,7 +107,7 @@ class PBDMuscle:
             fresh = k % FRESH == 0
             if fresh:
                 self.contact.find(contacts, self.points)
-            if self.fibres is not None and (fresh or not self.fibres.law.passive):
+            if self.fibres is not None and (fresh or not self.fibres.passive):
                 self.shape.contract(self.fibres, self.points)
             self.swept = k + 1
             if self._sweep() < self.still:

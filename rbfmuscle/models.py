@@ -27,7 +27,7 @@ CONVERGED = 5e-6
 _HOME = {
     "rbf": _Home(*_RBF, {}),
     **{
-        name: _Home(*_PBD, {"method": name})
+        name: _Home(*_PBD, {"method": name, "tolerance": 0.0})
         for name in ("pbd", "pbd-paper", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
     },
     **{

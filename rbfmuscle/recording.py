@@ -134,11 +134,9 @@ class Recording:
             events, together = self._skeleton.get(frame.index, ([], {}))
             frame.events.extend(events)
             self.stages.add(frame)
-            rows: list[Row] = []
-            if self.scene.output.metrics:
-                before = next(reversed(self._path.values()), None)
-                rows = frame_rows(self.scene, frame, before, {**measured, ALL: together})
-                self.summary.add(rows)
+            before = next(reversed(self._path.values()), None)
+            rows = frame_rows(self.scene, frame, before, {**measured, ALL: together})
+            self.summary.add(rows)
             self._path[frame.index] = dict(frame.coordinates)
             yield frame, rows
 

@@ -68,7 +68,7 @@ def simulate(
     Examples
     --------
     >>> from rbfmuscle import phantom_scene
-    >>> run = simulate(phantom_scene(end=4.0), model="pbd", settings={"output.metrics": False})
+    >>> run = simulate(phantom_scene(end=4.0), model="pbd")
     >>> len(run.frames)
     3
     """

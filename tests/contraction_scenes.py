@@ -218,7 +218,6 @@ def panel_scene(stretch, *, panel=PANEL, spacing=4.0, frames=5, model="rbf"):
         model=model,
         fibres=fibres,
         activation=[0, 1],
-        shortening=stretch,
     )
     shortened = math.sqrt((panel.fibre * stretch) ** 2 - panel.height**2)
     return with_frames(scene, np.linspace(0.0, lean - shortened, frames + 1), panel.length)

@@ -127,5 +127,5 @@ def _run_to(scene: Scene, model: str | None, stops: dict[str, float], folder: st
     rest = rest_coordinates(scene)
     scene = scene.copy()
     scene.motion = Motion([rest, rest | {name: inner_value(scene, name, x) for name, x in stops.items()}])
-    settings = {"output.report": False, "output.preview": False, "output.metrics": False}
+    settings = {"output.report": False, "output.preview": False}
     stream_run(scene, folder, model=model, settings=settings, pictures=False)

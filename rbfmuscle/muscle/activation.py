@@ -2,7 +2,7 @@
 
 A fibre that is stretched by λ against the scan bears, beside the tension of the passive solid,
 
-    a d PEAK μ (λ - l) / (1/s - l),   l = shortening / s,
+    a d PEAK μ (λ - l) / (1/s - l),   l = 0.5 / s,
 
 with a the activation, s the stretch in the scan, l the stretch at which active fibres bear nothing and d the number of
 fibres through a unit area, 1 where the belly is widest: fibres run from end to end, so where it narrows each area bears
@@ -63,7 +63,7 @@ class FibrePull:
         if activation == self.activation:
             return
         self.activation, given = float(activation), self.given
-        slack, content = 1.0 / given.stretch_at_rest, given.shortening / given.stretch_at_rest
+        slack, content = 1.0 / given.stretch_at_rest, given.shortest
         active = self.density * self.activation * 0.5 * PEAK / max(slack - content, 0.05)
         active[self.tendon] = 0.0
         passive, strain = self.passive.passive.copy(), max(given.tendon_strain, LEAST_STRAIN)

@@ -37,7 +37,7 @@ class RBFOptions(Table):
     ``surface`` is shown by a mesh of the ``material`` that is brought onto the level set, or by ``marching`` cubes;
     ``resolution`` is the number of edges or cells along the longest side, 0 for as many as the muscle's thickness
     wants. ``placement`` of the centres: ``greedy`` where a fit misses the surface, or ``fitted`` beside it so that all
-    of it is met, for slower fits; ``seed`` of the random numbers.
+    of it is met, for slower fits.
     """
 
     centres: Annotated[int, Field(ge=0, le=20_000)] = 0
@@ -53,4 +53,3 @@ class RBFOptions(Table):
     condition: Annotated[NotNegative, AfterValidator(_known_bound)] = 0.0
     placement: Literal["greedy", "fitted"] = "greedy"
     fibre_ratio: Annotated[float, Field(ge=1.0, le=1e4)] = 1.0
-    seed: int = 0

@@ -39,6 +39,7 @@ FALL, TRIALS, MOST_CENTRES = 1.2, 5, 4.0
 AIM = 0.97
 # Parts of the names under which samples and numbers of centres are cached: raise one when these are found anew.
 SAMPLING, SEARCH = 3, 1
+SEED = 0
 
 
 def default_centres(area: float, scene: Scene) -> int:
@@ -88,7 +89,7 @@ def choose_centres(muscle: Muscle, scene: Scene, options: RBFOptions, *, known_o
         return Chosen(options.centres, np.nan, "as given")
     usual, wanted = default_centres(muscle.mesh.area, scene), wanted_error(muscle, scene, options)
     frame, faces = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)), np.asarray(muscle.mesh.faces)
-    fit = (options.kernel, options.epsilon, options.condition, options.placement, options.seed)
+    fit = (options.kernel, options.epsilon, options.condition, options.placement, SEED)
     key = content_key(frame.local, faces, ("centres", SEARCH, usual, round(wanted / frame.size, 9), *fit))
     found = load_arrays(key)
     if found is None and known_only:
@@ -158,8 +159,8 @@ def place_points(
     """
     fitted = options.placement == FITTED
     faces = np.asarray(muscle.mesh.faces)
-    centres = cached_sample(frame.local, faces, count, seed=options.seed, placement="greedy")
-    samples = cached_sample(frame.local, faces, options.samples, seed=options.seed, placement="even")
+    centres = cached_sample(frame.local, faces, count, seed=SEED, placement="greedy")
+    samples = cached_sample(frame.local, faces, options.samples, seed=SEED, placement="even")
     surface = frame, faces
     fit = _choose_fit(muscle.name, surface, options, centres, samples)
     if fitted:
@@ -244,7 +245,7 @@ def _fit_centres(
             f"muscle {name!r}: placement {FITTED!r} needs a C2 kernel, got {fit.kernel.name!r}; take placement 'greedy'"
         )
     local = replace(fit, epsilon=fit.epsilon * frame.size)
-    return fit_sample(centres, frame.local, faces, fit=local, seed=options.seed)
+    return fit_sample(centres, frame.local, faces, fit=local, seed=SEED)
 
 
 def cached_sample(

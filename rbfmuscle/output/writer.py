@@ -26,9 +26,11 @@ if TYPE_CHECKING:
     from rbfmuscle.simulation.frame import Frame
 
 
-METRICS_COLUMNS = ("frame", "coordinate", "angle", "muscle", "quantity", "value", "unit")
-EVENTS_COLUMNS = ("frame", "muscle", "bone", "count", "action")
-POSES_COLUMNS = ("frame", "bone", *(f"m{i}{j}" for i in range(4) for j in range(4)))
+TABLES = {
+    "metrics.csv": ("frame", "coordinate", "angle", "muscle", "quantity", "value", "unit"),
+    "events.csv": ("frame", "muscle", "bone", "count", "action"),
+    "poses.csv": ("frame", "bone", *(f"m{i}{j}" for i in range(4) for j in range(4))),
+}
 
 # Of an earlier run in the same folder.
 _OLD_FILES = (
@@ -85,7 +87,7 @@ class RunWriter:
         self._light: dict[str, tuple[Floats, Integers]] = {}
         try:
             self._clear()
-            self._tables = {name: self._table(name, columns) for name, columns in _tables(output)}
+            self._tables = {name: self._table(name, columns) for name, columns in TABLES.items()}
             names = ("surfaces", "bones") if self.format == "pvd" else ()
             self._collections = {name: Collection(self.directory / f"{name}.pvd") for name in names}
         except OSError as error:
@@ -164,10 +166,9 @@ class RunWriter:
         self._add_rows(rows)
 
     def _add_rows(self, rows):
-        if self.scene.output.metrics:
-            metrics, file = self._tables["metrics.csv"]
-            metrics.writerows(rows)
-            file.flush()
+        metrics, file = self._tables["metrics.csv"]
+        metrics.writerows(rows)
+        file.flush()
 
     def _write_surfaces(self, frame):
         """Surfaces of a frame, side by side: most of the time goes into packing them."""
@@ -251,14 +252,6 @@ class RunWriter:
         writer.writerow(columns)
         file.flush()
         return writer, file
-
-
-def _tables(output):
-    """Name and columns of each table that a run writes."""
-    found = [("poses.csv", POSES_COLUMNS), ("events.csv", EVENTS_COLUMNS)]
-    if output.metrics:
-        found.append(("metrics.csv", METRICS_COLUMNS))
-    return found
 
 
 def _degrees(coordinates):

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import MeshLike
 from rbfmuscle.scene.activation.curve import activation_curve
-from rbfmuscle.scene.activation.resolve import contraction_keys, resolve_contraction
+from rbfmuscle.scene.activation.keys import contraction_keys
+from rbfmuscle.scene.activation.resolve import resolve_contraction
 from rbfmuscle.scene.attachments import AttachTable, resolve_attachments
 from rbfmuscle.scene.fibres import read_fibres
 from rbfmuscle.scene.joints.joint import Coupling, Joint
@@ -22,9 +23,6 @@ from rbfmuscle.scene.motion import make_motion
 from rbfmuscle.scene.objects import Attachment, Bone, Muscle, SceneData, find_named
 from rbfmuscle.scene.options import MotionOptions
 from rbfmuscle.validation import SceneError, did_you_mean, shown
-
-if TYPE_CHECKING:
-    pass
 
 S = TypeVar("S", bound=SceneData)
 MeshInput: TypeAlias = str | Path | ReadMesh | MeshLike
@@ -151,7 +149,7 @@ def add_muscle(
     scale : float
         Factor from the mesh's unit to the scene's; fibres are scaled alike.
     **contraction
-        ``activation``, ``fibre_stretch_at_rest``, ``optimal_fibre_length``, ``shortening``, ``tendon``.
+        ``activation``, ``fibre_stretch_at_rest``, ``tendon``.
     """
     check_new_name(scene.muscles, name, "muscle")
     read = as_mesh(mesh, name, scale, may_be_open=False)
@@ -166,9 +164,16 @@ def add_muscle(
 
 
 def set_motion(scene: S, *, folder: Path | None = None, **options: Any) -> S:
-    """Set the motion from the keys of ``[motion]`` (angles in degrees) and return the scene."""
-    table = MotionOptions.build(options, place="[motion] ")
-    scene.motion = make_motion(scene, table, folder=folder)
+    """Set the motion from the keys of ``[motion]`` (angles in degrees) and return the scene.
+
+    Parameters
+    ----------
+    folder : path, optional
+        What a relative ``file`` is relative to.
+    **options
+        ``ramp``, ``waypoints`` with ``step``, or ``file``.
+    """
+    scene.motion = make_motion(scene, MotionOptions.build(options, place="[motion] ", folder=folder))
     return scene
 
 

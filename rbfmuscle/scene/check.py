@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TypeAlias
 
 import numpy as np
 
@@ -14,13 +14,12 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.attachments import ExactMeshes
 from rbfmuscle.scene.build import validate
+from rbfmuscle.scene.meshes.read import ReadMesh
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.objects import Bone, Muscle, SceneData
 from rbfmuscle.validation import MeshError, RBFMuscleError, SceneError
 
-if TYPE_CHECKING:
-    import trimesh
-
+Item: TypeAlias = Bone | Muscle | ReadMesh
 
 SMALLEST_MM = 2.0  # across: the bones of a mouse
 LARGEST_MM = 3000.0  # across: a person with arms raised
@@ -77,31 +76,31 @@ def check_scene(scene: SceneData, exact: ExactMeshes | None = None) -> list[Find
 
 def check_extents(scene: SceneData) -> None:
     """Raise MeshError for a mesh whose size or place shows a wrong unit or another frame."""
-    for kind, items in (("bone", scene.bones), ("muscle", scene.muscles)):
-        for item in items:
-            check_size(scene, kind, item.name, item.mesh, item.source)
+    for bone in scene.bones:
+        check_size(scene, "bone", bone.name, bone)
     for muscle in scene.muscles:
-        check_place(scene, muscle.name, muscle.mesh, muscle.source)
+        check_size(scene, "muscle", muscle.name, muscle)
+        check_place(scene, muscle.name, muscle)
 
 
-def check_size(scene: SceneData, kind: str, name: str, mesh: trimesh.Trimesh, source: str) -> None:
+def check_size(scene: SceneData, kind: str, name: str, item: Item) -> None:
     """Raise MeshError for a mesh smaller than a mouse's or larger than a person's."""
-    size = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
+    size = np.linalg.norm(np.ptp(item.mesh.vertices, axis=0))
     millimetres = size / scene.length(1.0)
     if not SMALLEST_MM <= millimetres <= LARGEST_MM:
         raise MeshError(
-            f"{kind} {name!r} ({source or 'built in code'}) is {size:.4g} {scene.units} across, which cannot be "
-            f"right; correct the scene's units, or set its scale ({_likely_scale(millimetres)})"
+            f"{kind} {name!r} ({item.source or 'built in code'}) is {size:.4g} {scene.units} across, which "
+            f"cannot be right; correct the scene's units, or set its scale ({_likely_scale(millimetres)})"
         )
 
 
-def check_place(scene: SceneData, name: str, mesh: trimesh.Trimesh, source: str) -> None:
+def check_place(scene: SceneData, name: str, muscle: Item) -> None:
     """Raise MeshError for a muscle that lies far away from all bones."""
-    away, size = _away_from_bones(scene, *mesh.bounds)
+    away, size = _away_from_bones(scene, *muscle.mesh.bounds)
     if away > FAR_AWAY * size:
         raise MeshError(
-            f"muscle {name!r} ({source or 'built in code'}) lies {away:.4g} {scene.units} away from all bones; "
-            "bring the meshes into one frame and unit (scale)"
+            f"muscle {name!r} ({muscle.source or 'built in code'}) lies {away:.4g} {scene.units} away from "
+            "all bones; bring the meshes into one frame and unit (scale)"
         )
 
 

@@ -11,8 +11,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from pydantic import Field, ValidationError, field_validator
 
-from rbfmuscle.scene.activation.keys import KEYS
-from rbfmuscle.scene.activation.resolve import contraction_keys
+from rbfmuscle.scene.activation.keys import KEYS, ContractionTable
 from rbfmuscle.scene.attachments import AttachTable
 from rbfmuscle.scene.build import add_bone, add_link, add_muscle, place_coupling, place_joint, validate
 from rbfmuscle.scene.check import check_centre, check_place, check_size
@@ -29,6 +28,7 @@ from rbfmuscle.scene.objects import Bone, Muscle, SceneData
 from rbfmuscle.scene.options import (
     ContactOptions,
     DetectOptions,
+    FileName,
     MotionOptions,
     OutputOptions,
     Positive,
@@ -60,22 +60,17 @@ class BoneTable(Table):
     """``[[bone]]``."""
 
     name: str
-    mesh: str | None = None
+    mesh: FileName | None = None
     scale: Positive = 1.0
 
 
-class DefaultsTable(Table):
+class DefaultsTable(ContractionTable):
     """``[defaults]``: any key of a muscle, for all that do not give it themselves."""
 
     model: Any = "rbf"
     scale: Positive = 1.0
     attach: list[AttachTable] = Field(default_factory=list)
-    fibres: str | None = None
-    activation: Any = None
-    fibre_stretch_at_rest: Any = None
-    optimal_fibre_length: Any = None
-    shortening: Any = None
-    tendon: Any = None
+    fibres: FileName | None = None
 
     @field_validator("model")
     @classmethod
@@ -89,7 +84,7 @@ class MuscleTable(DefaultsTable):
     """``[[muscle]]``."""
 
     name: str
-    mesh: str
+    mesh: FileName
 
 
 class SceneFile(Table):
@@ -109,7 +104,7 @@ class SceneFile(Table):
 
 
 def read_scene_file(path: Path) -> SceneFile:
-    """Return the checked SceneFile of a TOML file, paths as written.
+    """Return the checked SceneFile of a TOML file; relative names of files become relative to its folder.
 
     Raises
     ------
@@ -120,7 +115,7 @@ def read_scene_file(path: Path) -> SceneFile:
     check_plain(data, place=f"{path}: ")
     check_removed(data, place=f"{path}: ")
     try:
-        return SceneFile.model_validate(data)
+        return SceneFile.model_validate(data, context={"folder": path.parent})
     except ValidationError as error:
         raise SceneError(
             describe_error(error, root=str(path), name_row=lambda at: _place(at, data))
@@ -171,20 +166,20 @@ def load_scene(cls: type[S], path: str | Path, *, skeleton: bool = False) -> S:
     tables = read_scene_file(path)
     scene = cls(tables.scene.name or path.stem, units=tables.scene.units, path=path)
     try:
-        _fill(scene, tables, path.parent)
+        _fill(scene, tables)
         return scene if skeleton and not scene.muscles else validate(scene)
     except (SceneError, MeshError) as error:
         raise type(error)(f"{path}: {error}") from None
 
 
-def _fill(scene: SceneData, tables: SceneFile, folder: Path) -> None:
+def _fill(scene: SceneData, tables: SceneFile) -> None:
     scene.superior, scene.anterior = tables.scene.superior, tables.scene.anterior
     for bone in tables.bone:
         if bone.mesh is None:
             add_link(scene, bone.name)
             continue
-        read = read_mesh(folder / bone.mesh, name=bone.name, scale=bone.scale, may_be_open=True)
-        check_size(scene, "bone", bone.name, read.mesh, read.source)
+        read = read_mesh(bone.mesh, name=bone.name, scale=bone.scale, may_be_open=True)
+        check_size(scene, "bone", bone.name, read)
         add_bone(scene, bone.name, read)
     for joint in tables.joint:
         place_joint(scene, joint.joint())
@@ -192,34 +187,32 @@ def _fill(scene: SceneData, tables: SceneFile, folder: Path) -> None:
     for coupling in tables.coupling:
         place_coupling(scene, make_coupling(coupling, scene.joints))
     for muscle in tables.muscle:
-        _add_muscle(scene, muscle, tables.defaults, folder)
-    scene.motion = make_motion(scene, tables.motion, folder=folder)
+        _add_muscle(scene, muscle, tables.defaults)
+    scene.motion = make_motion(scene, tables.motion)
     scene.contact = tables.contact
     scene.sliding = tables.sliding
     scene.detect = tables.detect
     scene.output = tables.output
 
 
-def _add_muscle(scene, muscle, defaults, folder):
+def _add_muscle(scene, muscle, defaults):
     given = {key: getattr(muscle, key) for key in muscle.model_fields_set}
     for key in defaults.model_fields_set:
         given.setdefault(key, getattr(defaults, key))
     scale = given.get("scale", 1.0)
-    fibres = given.get("fibres")
-    read = read_mesh(folder / muscle.mesh, name=muscle.name, scale=scale)
-    check_size(scene, "muscle", muscle.name, read.mesh, read.source)
-    check_place(scene, muscle.name, read.mesh, read.source)
+    read = read_mesh(muscle.mesh, name=muscle.name, scale=scale)
+    check_size(scene, "muscle", muscle.name, read)
+    check_place(scene, muscle.name, read)
     add_muscle(
         scene,
         muscle.name,
         read,
-        attach=[_from_folder(entry, folder) for entry in given.get("attach", [])],
+        attach=[_from_folder(entry, scene.path.parent) for entry in given.get("attach", [])],
         model=_merge_model(given.get("model", "rbf"), defaults.model),
-        fibres=str(folder / fibres) if fibres is not None else None,
+        fibres=given.get("fibres"),
         scale=scale,
+        **{key: given[key] for key in KEYS if key in given},
     )
-    contraction = {key: given[key] for key in KEYS if key in given}
-    scene.muscles[-1].contraction = contraction_keys(contraction, muscle=muscle.name, folder=folder)
 
 
 def _merge_model(model, default):
@@ -258,7 +251,7 @@ def _place(location, data):
 def describe_scene(scene: SceneData) -> dict[str, Any]:
     """Return the scene as plain data for ``run.json``: names, counts, options, sources and hashes."""
     units = {name: unit_sign(scene, name) for name in coordinate_names(scene.joints)}
-    motion = scene.motion.options.model_dump(by_alias=True, exclude_none=True)
+    motion = scene.motion.options.model_dump(mode="json", by_alias=True, exclude_none=True)
     times = {} if scene.motion.times is None else {"times": scene.motion.times}
     return {
         "name": scene.name,
@@ -285,7 +278,7 @@ def _describe_muscle(muscle: Muscle) -> dict[str, Any]:
         "model": {"name": muscle.model, **muscle.options},
         "attach": [{"bone": a.bone, "vertices": len(a.vertices)} for a in muscle.attachments],
         "fibres": len(muscle.fibres) if muscle.fibres else 0,
-        **({} if keys is None else keys.model_dump(by_alias=True, exclude_none=True)),
+        **({} if keys is None else keys.model_dump(mode="json", by_alias=True, exclude_none=True)),
         **_describe_mesh(muscle),
     }
 

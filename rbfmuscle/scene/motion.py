@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 
@@ -29,15 +28,13 @@ SHIFT_LEVER = 50.0
 NOT_MOVED = 1e-9  # A locked coordinate may be given, at its rest value.
 
 
-def make_motion(scene: SceneData, options: MotionOptions, *, folder: str | Path | None = None) -> Motion:
+def make_motion(scene: SceneData, options: MotionOptions) -> Motion:
     """Return the motion that ``[motion]`` asks of a scene's joints.
 
     Parameters
     ----------
     scene : SceneData
     options : MotionOptions
-    folder : path, optional
-        What a relative ``file`` is relative to.
 
     Raises
     ------
@@ -48,8 +45,7 @@ def make_motion(scene: SceneData, options: MotionOptions, *, folder: str | Path 
     followers = {coupling.coordinate for coupling in scene.couplings}
     times, notes = None, []
     if options.file is not None:
-        path = Path(folder or ".") / options.file
-        frames, times, notes = read_motion_file(path, facts, followers, metre=scene.length(1000.0))
+        frames, times, notes = read_motion_file(options.file, facts, followers, metre=scene.length(1000.0))
     else:
         frames = _asked_frames(options, facts)
         _refuse_followers(frames, followers, facts)

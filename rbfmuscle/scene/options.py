@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     ValidationError,
+    ValidationInfo,
     model_validator,
 )
 from pydantic_core import PydanticCustomError
@@ -32,6 +35,7 @@ MAX_FRAMES = 100_000
 # The table is deleted at 1.0.
 REMOVED_KEYS: dict[str, str] = {
     "contact.from_rest": "delete the key: solve_pose(scene, models, coordinates) in Python solves a pose from rest",
+    "contact.margin": "delete the key: contact begins at the surface of the bone",
     "contact.detector": "delete the key; for other fields call simulate(scene, fields={bone: field}) in Python",
     "contact.tolerance": "delete the key: a bone's field errs by 0.4 % of the mean edge of its mesh",
     "contact.still_angle": "delete the key: a muscle is solved whenever its bones move against each other",
@@ -44,10 +48,14 @@ REMOVED_KEYS: dict[str, str] = {
     "motion.max_substeps": "delete the key: a motion may take 100000 sub-steps",
     "activation.from": "use a list of numbers, spread over the motion: [from, to]",
     "activation.to": "use a list of numbers, spread over the motion: [from, to]",
+    "shortening": "delete the key: a fully active fibre has no tension at half its slack length",
+    "optimal_fibre_length": "use fibre_stretch_at_rest: the mean length of the fibres in the scan over it",
     "tendon.share": "give the share alone: tendon = 0.2",
     "joint.rotations.scale": "multiply the numbers of the function by it",
     "joint.translations.scale": "multiply the numbers of the function by it",
     "coupling.scale": "multiply the numbers of the function by it",
+    "model.seed": "delete the key: samples and centres are always the same",
+    "model.tolerance": 'use a model whose sweeps go on until none moves a vertex, for instance "pbd-converged"',
     "model.across": "delete the key: the muscle is an elastic solid, set its model.nodes",
     "model.across_weight": "delete the key: the muscle is an elastic solid, set its model.nodes",
     "model.acceleration": "delete the key: each solve combines five iterations",
@@ -68,6 +76,7 @@ REMOVED_KEYS: dict[str, str] = {
     "model.sound": "use model.self_collision",
     "model.response": 'use model = "pbd-paper", or delete the key: ways out of several bones are added up',
     "model.derivatives": "delete the key: up to 200 centres, and fitted ones, meet all derivatives",
+    "output.metrics": "delete the key: every run is measured",
     "output.fibres": "delete the key: fibres of a run are no longer followed; those of a scene still steer its muscles",
     "output.moment_arms": "delete the key: moment arms are measured along every motion, about what moves alone",
     "opensim": "delete the table: runs are no longer compared with the muscle paths of an OpenSim model",
@@ -80,6 +89,18 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 
 
+def _in_folder(name: object, info: ValidationInfo) -> Path:
+    if isinstance(name, Path):
+        return name
+    if not isinstance(name, str):
+        raise ValueError("must be the name of a file")
+    return ((info.context or {}).get("folder") or Path()) / name
+
+
+# A file: relative to the scene file, where there is one.
+FileName = Annotated[Path, BeforeValidator(_in_folder)]
+
+
 def _check_length(vector):
     if not any(vector):
         raise ValueError("must not be the zero vector")
@@ -89,24 +110,19 @@ def _check_length(vector):
 Axis = Annotated[Vector, AfterValidator(_check_length)]
 
 
-def check_plain(value: object, *, place: str) -> None:
+def check_plain(value: object, *, place: str, depth: int = 0) -> None:
     """Raise SceneError where TOML holds what no key can mean: deep nesting, vast integers, nan or inf."""
-    open_parts = [(value, place, 0)]
-    while open_parts:
-        part, where, depth = open_parts.pop()
-        if isinstance(part, (dict, list)):
-            if depth >= DEEPEST:
-                raise SceneError(f"{shown(where)}: tables or lists are nested more than {DEEPEST} deep")
-            items = part.items() if isinstance(part, dict) else enumerate(part, 1)
-            open_parts += [
-                (item, f"{where}{'' if depth == 0 else '.'}{shown(str(key))}", depth + 1)
-                for key, item in items
-                if not (isinstance(item, int) and abs(item) <= LARGEST_INTEGER) and not isinstance(item, str)
-            ]
-        elif isinstance(part, int) and not isinstance(part, bool) and abs(part) > LARGEST_INTEGER:
-            raise SceneError(f"{where}: a whole number must be at most 2^53 in size, got {shown(part)}")
-        elif isinstance(part, float) and not math.isfinite(part):
-            raise SceneError(f"{where}: must be a finite number, got {part}")
+    if depth > DEEPEST:
+        raise SceneError(f"{shown(place)}: tables or lists are nested more than {DEEPEST} deep")
+    if isinstance(value, (dict, list)):
+        dot = "." if depth else ""
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value, 1):
+            if not isinstance(item, str):
+                check_plain(item, place=f"{place}{dot}{shown(str(key))}", depth=depth + 1)
+    elif isinstance(value, int) and abs(value) > LARGEST_INTEGER:
+        raise SceneError(f"{place}: a whole number must be at most 2^53 in size, got {shown(value)}")
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise SceneError(f"{place}: must be a finite number, got {value}")
 
 
 def check_removed(values: object, *, place: str, prefix: str = "") -> None:
@@ -143,24 +159,33 @@ class Table(BaseModel):
         return data
 
     @classmethod
-    def build(cls, values: dict[str, Any], *, place: str) -> Any:
-        """Return the table made from a dict, or raise SceneError that begins with ``place``."""
+    def build(cls, values: Mapping[str, Any], *, place: str, folder: Path | None = None) -> Self:
+        """Return the table made from a mapping, or raise SceneError that begins with ``place``.
+
+        Relative names of files are relative to ``folder``.
+        """
         try:
-            return cls.model_validate(values)
+            return cls.model_validate(values, context={"folder": folder})
         except ValidationError as error:
             raise SceneError(f"{place}{describe_error(error)}") from None
 
-    def changed(self, key: str, value: Any, *, place: str) -> ContactOptions | DetectOptions | OutputOptions:
+    def changed(self, key: str, value: object, *, place: str, folder: Path | None = None) -> Self:
         """Return a copy with the dotted ``key`` set to ``value``, checked again."""
         values = self.model_dump(by_alias=True, exclude_unset=True)
-        table = values
-        *parents, last = key.split(".")
-        for parent in parents:
-            table = table.setdefault(parent, {})
-            if not isinstance(table, dict):
-                raise SceneError(f"{place}{key}: {parent!r} is not a table")
-        table[last] = value
-        return type(self).build(values, place=place)
+        set_dotted(values, key, value, place=place)
+        return type(self).build(values, place=f"{place}: ", folder=folder)
+
+
+def set_dotted(table: dict[str, Any], key: str, value: object, *, place: str) -> None:
+    """Set the dotted ``key`` of nested tables, in place; ``place`` begins the message where a value is no table."""
+    *parents, last = key.split(".")
+    for parent in parents:
+        inner = table.get(parent, {})
+        if not isinstance(inner, dict):
+            raise SceneError(f"{place}: {parent!r} is not a table")
+        table[parent] = dict(inner)
+        table = table[parent]
+    table[last] = value
 
 
 def describe_error(error: Any, *, root: str = "", name_row: Callable[..., Any] | None = None) -> str:
@@ -184,7 +209,6 @@ class ContactOptions(Table):
 
     initial: Literal["resolve", "keep", "error"] = "resolve"
     substep_angle: Annotated[float, Field(gt=0, le=90)] = 2.0
-    margin: NotNegative = 0.0
 
 
 class SlidingOptions(Table):
@@ -219,7 +243,6 @@ class OutputOptions(Table):
     """``[output]``: which files a run writes."""
 
     surfaces: SurfaceOptions | Literal[False] = SurfaceOptions()
-    metrics: bool = True
     report: bool = True
     preview: bool = True
 
@@ -238,7 +261,7 @@ class MotionOptions(Table):
     ramp: dict[str, RampOptions] | None = None
     waypoints: Annotated[list[dict[str, Finite]], Field(min_length=1)] | None = None
     step: Positive | None = None
-    file: str | None = None
+    file: FileName | None = None
 
     @model_validator(mode="after")
     def _check_one_source(self):

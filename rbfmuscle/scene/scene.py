@@ -5,7 +5,6 @@ from typing import Any
 from rbfmuscle.scene import build
 from rbfmuscle.scene.check import check_scene
 from rbfmuscle.scene.file import describe_scene, load_scene
-from rbfmuscle.scene.motion import make_motion
 from rbfmuscle.scene.objects import SceneData
 from rbfmuscle.scene.settings import change_scene
 
@@ -37,7 +36,6 @@ class Scene(SceneData):
     place_coupling = build.place_coupling
     add_muscle = build.add_muscle
     set_motion = build.set_motion
-    motion_from = make_motion
     validate = build.validate
     check = check_scene
     with_options = change_scene

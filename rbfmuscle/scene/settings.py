@@ -8,12 +8,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from rbfmuscle.scene.activation.keys import KEYS
-from rbfmuscle.scene.activation.resolve import contraction_keys
+from rbfmuscle.scene.activation.keys import KEYS, contraction_keys
 from rbfmuscle.scene.build import split_model
 from rbfmuscle.scene.motion import make_motion, slice_motion
 from rbfmuscle.scene.objects import Muscle, SceneData
-from rbfmuscle.scene.options import DetectOptions, SlidingOptions, check_plain, check_removed
+from rbfmuscle.scene.options import DetectOptions, SlidingOptions, check_plain, check_removed, set_dotted
 from rbfmuscle.validation import SceneError, UsageError, did_you_mean
 
 S = TypeVar("S", bound=SceneData)
@@ -102,7 +101,7 @@ def _apply(scene, key, value):
         _set_motion(scene, rest, value, key)
     else:
         table = getattr(scene, head) or {"sliding": SlidingOptions, "detect": DetectOptions}[head]()
-        setattr(scene, head, table.changed(rest, value, place=f"{key}: "))
+        setattr(scene, head, table.changed(rest, value, place=key))
 
 
 def parse_setting(text: str) -> tuple[Any, ...]:
@@ -171,27 +170,18 @@ def _set_model(muscles, rest, value, key):
         _set_models(muscles, value)
         return
     for muscle in muscles:
-        options = muscle.options = dict(muscle.options)
-        *parents, last = rest.split(".")
-        for parent in parents:
-            inner = options.get(parent, {})
-            if not isinstance(inner, dict):
-                raise SceneError(f"{key}: {parent!r} is not a table")
-            options[parent] = dict(inner)
-            options = options[parent]
-        options[last] = value
+        muscle.options = dict(muscle.options)
+        set_dotted(muscle.options, rest, value, place=key)
 
 
 def _set_contraction(muscles, scene, key, rest, value):
-    folder = scene.path.parent if scene.path else None
     for muscle in muscles:
         table = muscle.contraction
         given = {} if table is None else table.model_dump(by_alias=True, exclude_unset=True)
-        if rest:
-            inner = given.get(key)
-            given[key] = {**(inner if isinstance(inner, dict) else {}), rest: value}
-        else:
-            given[key] = value
+        if rest and not isinstance(given.get(key), dict):
+            given[key] = {}
+        set_dotted(given, f"{key}.{rest}" if rest else key, value, place=key)
+        folder = scene.path.parent if scene.path else None
         muscle.contraction = contraction_keys(given, muscle=muscle.name, folder=folder)
 
 
@@ -209,5 +199,5 @@ def _set_motion(scene, rest, value, key):
         ramps[name][last] = value
     else:
         values[rest] = value
-    table = type(options).build(values, place=f"{key}: motion ")
-    scene.motion = make_motion(scene, table, folder=scene.path.parent if scene.path else None)
+    folder = scene.path.parent if scene.path else None
+    scene.motion = make_motion(scene, type(options).build(values, place=f"{key}: motion ", folder=folder))

@@ -65,7 +65,7 @@ class MuscleGroup:
         self.times: dict[str, float] = {}
         self.models = build_models(scene, names)
         carried = {model.name: model.material_mesh() for model in self.models}
-        self._measures = MuscleMeasures(scene, carried) if scene.output.metrics else None
+        self._measures = MuscleMeasures(scene, carried)
 
     def frames(self) -> Iterator[Solved]:
         """The frames as they are solved and measured.
@@ -75,8 +75,7 @@ class MuscleGroup:
         SolveError
             If a muscle cannot be solved, naming muscle, frame and coordinates.
         """
-        wanted = bool(self.scene.output.surfaces) or self._measures is not None
-        frames = simulate_frames(self.scene, self.models, fields=self._fields, surfaces=wanted)
+        frames = simulate_frames(self.scene, self.models, fields=self._fields)
         first = True
         while True:
             with timed(self.times, "simulate"):
@@ -84,10 +83,8 @@ class MuscleGroup:
             first = False
             if frame is None:
                 return
-            measured: dict[str, Values] = {}
-            if self._measures is not None:
-                with timed(self.times, "metrics"):
-                    measured = self._measures.measure(frame)
+            with timed(self.times, "metrics"):
+                measured = self._measures.measure(frame)
             yield Solved(frame, measured)
 
     def close(self) -> None:

@@ -303,10 +303,10 @@ def _obstacles(scene, models, fields):
     if regions is not None:
         met = {bone for muscle, bone in regions if muscle in here}
         fields = build_fields(scene, {pair: box for pair, box in regions.items() if pair[1] in met})
-    names, margin = [bone.name for bone in scene.bones], scene.contact.margin
+    names = [bone.name for bone in scene.bones]
     for model in models:
         reached = [fields.get(n) if regions is None or (model.name, n) in regions else None for n in names]
-        yield BoneContacts(names, reached, contact_bone=model.contact_bone, margin=margin)
+        yield BoneContacts(names, reached, contact_bone=model.contact_bone)
 
 
 def _sliding(scene, steppers):

@@ -133,7 +133,7 @@ class RigidTransport:
         muscle = next(muscle for muscle in scene.muscles if muscle.name == stepper.name)
         self.own, self.stepper = OwnBones(muscle, scene), stepper
         self.muscle, self.never = muscle, why_never(muscle, scene)
-        self.clear = scene.length(CLEAR) + scene.contact.margin
+        self.clear = scene.length(CLEAR)
         contacts = stepper.contacts
         self.others = [b for b in contacts.reached if contacts.names[b] not in self.own.names]
         self.solved: Mapping[str, Floats] | None = None

@@ -23,7 +23,6 @@ TABLES = {
         {
             "initial": "keep",
             "substep_angle": 4.0,
-            "margin": 0.05,
         },
     ),
     "sliding": (
@@ -40,8 +39,7 @@ TABLES = {
     "output": (
         options.OutputOptions,
         {
-            "surfaces": {"format": "ply"}, "metrics": False,
-            "report": False, "preview": False,
+            "surfaces": {"format": "ply"}, "report": False, "preview": False,
         },
     ),
 }  # fmt: skip
@@ -52,13 +50,13 @@ MODELS = {
             "centres": 60, "samples": 300, "iterations": 3, "nodes": 60, "resolution": 16, "kernel": "quintic",
             "epsilon": 0.02, "slack": 1.3, "placement": "fitted",
             "surface": "marching",
-            "fibre_ratio": 2.0, "condition": 1e12, "seed": 3, "rest_error": 0.4,
+            "fibre_ratio": 2.0, "condition": 1e12, "rest_error": 0.4,
         },
     ),
     "pbd": (
         PBDOptions,
         {
-            "iterations": 2, "tolerance": 1e-3, "fibre_exponent": 1.0, "bending": 0.8,
+            "iterations": 2, "fibre_exponent": 1.0, "bending": 0.8,
             "edge_compliance": 0.1, "bending_compliance": 0.1, "slack": 1.2, "self_collision": True,
         },
     ),
@@ -66,7 +64,7 @@ MODELS = {
 # Where a motion comes from: a file has one of them, and another cannot stand beside it.
 SOURCES = {"waypoints", "file"}
 # The name of the model decides it, so it is no key of the scene's.
-IMPLIED = {"method"}
+IMPLIED = {"method", "tolerance"}
 
 OTHERS = [
     ("model", "xpbd", ["xpbd", "xpbd"]),

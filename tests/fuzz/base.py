@@ -128,6 +128,6 @@ def base_scene() -> dict:
             }
         ],
         "contact": {"initial": "resolve", "substep_angle": 3.0},
-        "detect": {"tunnelling": {"angle": 135.0, "action": "substep"}},
+        "detect": {"tunnelling": {"action": "substep"}},
         "output": {"report": False, "preview": False},
     }

@@ -156,8 +156,7 @@ def _attach(scene, rng):
 
 OPTIONS = (
     "centres", "samples", "iterations", "nodes", "slack", "fibre_ratio", "epsilon",
-    "placement", "seed", "kernel", "edge", "bending",
-    "arap_compliance", "contact", "fibre_exponent",
+    "placement", "kernel", "bending", "fibre_exponent",
 )  # fmt: skip
 # What an option may be set to: out of its range, or in it and quick. What is allowed and slow is not an error.
 SETTINGS = (
@@ -184,15 +183,13 @@ def _tables(scene, rng):
         rng,
         [
             ("contact", "substep_angle", [1e-300, 1e-9, 1e-3, 0.5, 90, 91, 0, -1]),
-            ("contact", "tolerance", [1e-300, 1e-9, 1e-3, 0.5, 1e9, 0]),
-            ("contact", "margin", [0, 1e-3, 5.0, 1e9, -1]),
             ("contact", "initial", ["keep", "error", "resolv"]),
             ("sliding", "threshold", [1e-300, 0.5, 1e300, -1]),
             ("sliding", "pairs", [[], [["muscle", "muscle"]], [["a", "b"]], [["muscle"]], 1]),
             (
                 "detect",
                 "tunnelling",
-                [{}, {"angle": 1e-300}, {"action": "rotate"}, 1],
+                [{}, {"swept": False}, {"action": "rotate"}, 1],
             ),
             ("output", "surfaces", [False, True, {"format": "stl"}, {"format": "glb"}, {"format": "x"}]),
             ("scene", "units", ["m", "cm", "km", 1]),

@@ -18,7 +18,7 @@ def test_motion_file_honours_in_degrees(tmp_path, degrees, factor):
     name = next(iter(joint.axes))
     text = f"m\nversion=1\nnRows=2\nnColumns=2\ninDegrees={degrees}\nendheader\ntime\t{name}\n0\t0\n1\t0.75\n"
     (tmp_path / "a.mot").write_text(text)
-    motion = make_motion(scene, MotionOptions(file="a.mot"), folder=tmp_path)
+    motion = make_motion(scene, MotionOptions(file=tmp_path / "a.mot"))
     assert [frame[f"{joint.name}.{name}"] for frame in motion.frames] == pytest.approx([0.0, 0.75 * factor])
 
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from contraction_scenes import MUSCLE, spindle_scene
 
+from rbfmuscle.models import build_model
 from rbfmuscle.scene.activation.curve import SETTLING, STEP, Activations, activation_curve
-from rbfmuscle.scene.activation.keys import Contraction
-from rbfmuscle.scene.activation.law import FibreLaw
 from rbfmuscle.scene.activation.resolve import resolve_contraction
 from rbfmuscle.validation import SceneError
 
@@ -17,45 +16,20 @@ def scene(**keys):
     return spindle_scene(frames=4, spacing=6.0, **keys)
 
 
-def law(tendon=(False, True), *, hold=0.3, **keys):
-    given = {"stretch_at_rest": 1.0, "shortening": 0.5, "tendon_strain": 0.05, **keys}
-    return FibreLaw(np.array(tendon), Contraction(tendon=np.array(tendon), **given), hold=hold)
-
-
-def test_law_at_rest_is_that_of_a_passive_muscle_to_the_last_digit():
-    stretch = np.random.default_rng(0).uniform(0.5, 2.0, 200)
-    passive = FibreLaw(np.zeros(200, bool), None, hold=0.3)
-    active = law(np.zeros(200, bool))
-    active.activate(1.0)
-    active.activate(0.0)
-    old = 1.0 + (1.0 - 0.3) * (stretch - 1.0)
-    for made in (passive, active):
-        assert made.passive
-        along, across = made.goal(stretch)
-        assert np.array_equal(along, old)
-        assert np.array_equal(across, old**-0.5)
-
-
-def test_fully_active_fibre_pulls_to_its_shortening_and_not_outwards():
-    made = law(stretch_at_rest=1.25)
-    made.activate(1.0)
-    along, across = made.goal(np.array([0.8, 0.8]))
-    assert along[0] == pytest.approx(0.5 / 1.25)
-    assert across[0] == pytest.approx(0.8**-0.5)
-
-
-def test_stretched_fibre_is_slack_down_to_its_slack_length():
-    made = law((False,) * 3, stretch_at_rest=1.25)
-    along, _ = made.goal(np.array([0.9, 0.8, 0.7]))
-    assert along == pytest.approx([0.9, 0.8, 0.8 + 0.7 * (0.7 - 0.8)])
-
-
-def test_tendon_yields_by_its_strain_and_no_more():
-    made = law()
-    assert made.goal(np.array([1.1, 1.1]))[0][1] == 1.0
-    made.activate(1.0)
-    assert made.goal(np.array([1.1, 1.03]))[0][1] == pytest.approx(1.03)
-    assert made.goal(np.array([1.1, 1.1]))[0][1] == pytest.approx(1.05)
+def test_fibres_of_a_mesh_are_slack_pull_or_yield_by_the_law():
+    made = scene(fibre_stretch_at_rest=1.25, tendon={"length": 100.0, "strain": 0.05}, model="pbd")
+    fibres = build_model(made.muscle(MUSCLE), made).fibres
+    belly = ~fibres.at_tendon
+    assert belly.any() and fibres.at_tendon.any()
+    for activation, (low, high), strain in (
+        (0.0, (0.8, 1.0), 0.0),
+        (0.5, (0.6, 0.7), 0.025),
+        (1.0, (0.4, 0.4), 0.05),
+    ):
+        fibres.activate(activation)
+        assert fibres.lower[belly] == pytest.approx(low) and fibres.upper[belly] == pytest.approx(high)
+        assert (fibres.active[belly] == activation).all() and (fibres.active[~belly] == 0.0).all()
+        assert (fibres.lower[~belly] == 1.0).all() and fibres.upper[~belly] == pytest.approx(1.0 + strain)
 
 
 @pytest.mark.parametrize(
@@ -125,13 +99,6 @@ def test_tendon_by_share_length_and_vertices_agree():
     assert np.array_equal(one, tendon & (x < 0))
 
 
-def test_optimal_fibre_length_gives_the_stretch_at_rest():
-    made = scene(optimal_fibre_length=256.0)
-    lines = made.muscle(MUSCLE).fibres
-    length = np.mean([np.linalg.norm(np.diff(line, axis=0), axis=1).sum() for line in lines])
-    assert resolve_contraction(made.muscle(MUSCLE)).stretch_at_rest == pytest.approx(length / 256.0)
-
-
 @pytest.mark.parametrize(
     ("keys", "words"),
     [
@@ -144,9 +111,7 @@ def test_optimal_fibre_length_gives_the_stretch_at_rest():
         ({"tendon": {"length": 5.0, "at": "insertoin"}}, "did you mean 'insertion'"),
         ({"tendon": {"vertices": [10**6]}}, "out of range"),
         ({"tendon": {"length": 5.0, "vertices": [1]}}, "one of length and vertices"),
-        ({"fibre_stretch_at_rest": 1.1, "optimal_fibre_length": 100.0}, "not both"),
-        ({"optimal_fibre_length": 10.0}, "check the unit"),
-        ({"shortenning": 0.5}, "did you mean 'shortening'"),
+        ({"fibre_strech_at_rest": 0.5}, "did you mean 'fibre_stretch_at_rest'"),
     ],
 )
 def test_wrong_keys_are_one_line(keys, words):
@@ -171,7 +136,7 @@ def test_fibres_that_leave_the_muscle_are_refused():
         (STO.format(column="tibia"), "has no column 'muscle', known: tibia"),
         (STO.format(column=MUSCLE).replace("0.8", "1.8"), "row 2"),
         (STO.format(column=MUSCLE).replace("0.8", "nan"), "row 2"),
-        (STO.format(column=MUSCLE).replace("0.5\t", ""), "rows need 3 values"),
+        (STO.format(column=MUSCLE).replace("0.5\t", ""), "row 2 has 2 values, the header names 3"),
         (STO.format(column=MUSCLE).replace("0.5\t", "0.0\t"), "increases"),
     ],
 )

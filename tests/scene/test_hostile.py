@@ -57,12 +57,12 @@ class TestNumbers:
     @pytest.mark.parametrize(
         ("change", "words"),
         [
-            (put("contact", "margin", Raw("9" * 5000)), "not valid TOML"),
+            (put("contact", "substep_angle", Raw("9" * 5000)), "not valid TOML"),
             (put("muscle", 0, "attach", 0, "vertices", [10**19]), "2\\^53"),
             (put("muscle", 0, "attach", 0, "vertices", [2**52]), "out of range"),
             (put("joint", 0, "centre", nested(1000)), "nested"),
             (put("defaults", "model", float("inf")), "defaults.model: must be a finite number, got inf"),
-            (put("muscle", 0, "model", "seed", 1.5), "seed"),
+            (put("muscle", 0, "model", "centres", 1.5), "centres"),
             (put("contact", "substep_angle", float("nan")), "finite"),
             (put("muscle", 0, "mesh", "/dev/zero"), "not a mesh|no such"),
             (put("motion", {"file": "/dev/zero"}), "no such file"),

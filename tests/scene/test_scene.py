@@ -47,12 +47,12 @@ attach = [ { bone = "upper", near = 4 }, { bone = "lower", vertices = "lower.txt
 [contact]
 initial = "keep"
 [detect]
-tunnelling = { angle = 120, action = "report" }
+tunnelling = { action = "report" }
 """
 
 
 @pytest.mark.parametrize(
-    ("key", "place"), [("model.centres", "muscle.biceps."), ("detect.tunnelling.angle", "")]
+    ("key", "place"), [("model.centres", "muscle.biceps."), ("detect.tunnelling.action", "")]
 )
 def test_removed_key_is_an_error_that_names_what_replaces_it(tmp_path, monkeypatch, key, place):
     monkeypatch.setitem(options.REMOVED_KEYS, key, "use another")
@@ -110,7 +110,7 @@ class TestLoading:
         assert (muscle.model, muscle.options) == ("rbf", {"centres": 60})
         assert [a.bone for a in muscle.attachments] == ["upper", "lower"]
         assert scene.contact.initial == "keep" and scene.contact.substep_angle == 2
-        assert scene.detect.tunnelling.angle == 120 and scene.sliding is None
+        assert scene.detect.tunnelling.action == "report" and scene.sliding is None
         assert [f["elbow.flexion"] for f in scene.motion.frames] == pytest.approx(np.radians([0, 10, 20]))
 
     def test_sphere_attachment_and_inline_vertices(self, folder):
@@ -165,7 +165,7 @@ class TestMistakes:
             ('name = "lower"', 'name = "upper"', r"bone 'upper' is given twice"),
             ('name = "biceps"', 'name = "../x"', r"muscle name '../x' may hold letters"),
             ("[scene]", "[scene", r"not valid TOML.*line 2"),
-            ("angle = 120", "angle = 400", r"\[detect\] tunnelling angle: .*400"),
+            ('"report"', '"reprot"', r"\[detect\] tunnelling action: .*'reprot'"),
         ],
     )
     def test_one_line_names_file_place_and_remedy(self, folder, old, new, message):
@@ -203,13 +203,13 @@ class TestOptions:
     def test_copy_shares_meshes_and_leaves_the_original_alone(self):
         scene = built().set_motion(ramp={"elbow.flexion": {"to": 30, "step": 10}})
         other = scene.with_options(
-            {"contact.substep_angle": 1.0, "detect.tunnelling.angle": 90.0, "motion.step": 5.0},
+            {"contact.substep_angle": 1.0, "detect.tunnelling.swept": False, "motion.step": 5.0},
             model={"name": "rbf", "centres": 10},
             frames="1:3",
         )
         assert other.muscles[0].mesh is scene.muscles[0].mesh
         assert (other.contact.substep_angle, scene.contact.substep_angle) == (1.0, 2.0)
-        assert other.detect.tunnelling.angle == 90 and scene.detect is None
+        assert not other.detect.tunnelling.swept and scene.detect is None
         assert other.muscles[0].options == {"centres": 10} and scene.muscles[0].options == {}
         assert len(other.motion) == 2 and len(scene.motion) == 4
 

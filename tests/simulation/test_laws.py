@@ -23,6 +23,7 @@ from rbfmuscle.scene.check import (
 )
 from rbfmuscle.scene.meshes.read import read_mesh
 from rbfmuscle.scene.motion import turned_angle
+from rbfmuscle.scene.objects import Bone
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.tunnelling import sweep_paths
 from rbfmuscle.simulation.workers import Workers
@@ -56,10 +57,10 @@ class TestPlaces:
         place[axis] = high[axis] + away + 1.0 if sign > 0 else low[axis] - away - 1.0
         ball.apply_translation(place)
         if share < 1.0:
-            check_place(scene, "ball", ball, "")
+            check_place(scene, "ball", Bone("ball", ball))
             return
         with pytest.raises(MeshError, match=r"muscle 'ball'.*away from all bones") as error:
-            check_place(scene, "ball", ball, "")
+            check_place(scene, "ball", Bone("ball", ball))
         assert f"lies {away:.4g} mm away" in str(error.value)
 
     @pytest.mark.parametrize(("axis", "sign"), SIDES)
@@ -88,10 +89,10 @@ class TestPlaces:
             side = millimetres * UNITS[units] / math.sqrt(3.0)
             box = trimesh.creation.box((side, side, side))
             if fine:
-                check_size(scene, "bone", "b", box, "")
+                check_size(scene, "bone", "b", Bone("b", box))
             else:
                 with pytest.raises(MeshError, match=rf"bone 'b' .* {units} across"):
-                    check_size(scene, "bone", "b", box, "")
+                    check_size(scene, "bone", "b", Bone("b", box))
 
 
 @settings(max_examples=60, deadline=None)

@@ -65,7 +65,7 @@ def test_without_surfaces_and_metrics_nothing_is_extracted_or_measured(monkeypat
 
     monkeypatch.setattr(BlendMuscle, "drawing", refuse)
     monkeypatch.setattr("rbfmuscle.sharing.share.MuscleMeasures", refuse)
-    run = simulate(arm_scene(surfaces=False, metrics=False))
+    run = simulate(arm_scene(surfaces=False))
     assert len(run.frames) == 3 and run.metrics == []
 
 

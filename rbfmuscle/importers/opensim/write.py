@@ -8,7 +8,6 @@ import numpy as np
 from rbfmuscle.importers.opensim.scene import Imported
 from rbfmuscle.importers.toml_text import table_text
 from rbfmuscle.scene.joints.tables import coupling_row, joint_row
-from rbfmuscle.scene.options import MotionOptions
 from rbfmuscle.validation import UsageError
 
 
@@ -30,10 +29,10 @@ def write_scene(found: Imported, directory: Path, *, motion: Path | None = None)
         directory.mkdir(parents=True, exist_ok=True)
         tail = []
         if motion is not None:
-            options = MotionOptions(file=os.path.relpath(Path(motion).resolve(), directory.resolve()))
-            scene.motion = scene.motion_from(options, folder=directory)
+            file = os.path.relpath(Path(motion).resolve(), directory.resolve())
+            scene.set_motion(file=file, folder=directory)
             found.notes += scene.motion.notes
-            tail = [table_text("[motion]", {"file": options.file})]
+            tail = [table_text("[motion]", {"file": file})]
         parts = [_head(found)]
         directions = {"superior": scene.superior, "anterior": scene.anterior}
         parts.append(table_text("[scene]", {**facts, **directions}))

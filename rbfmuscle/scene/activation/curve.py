@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from pathlib import Path
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.scene.activation.keys import CurveTable
 from rbfmuscle.scene.motion import interpolate
-from rbfmuscle.scene.motion_file import storage_parts
+from rbfmuscle.scene.motion_file import read_storage
 from rbfmuscle.scene.objects import Motion, Muscle, SceneData
 from rbfmuscle.validation import SceneError, did_you_mean
 
@@ -33,47 +33,27 @@ def activation_curve(muscle: Muscle, motion: Motion) -> Floats:
     """
     progress = np.asarray(motion.progress, dtype=float)
     given = 0.0 if muscle.contraction is None else muscle.contraction.activation
-    if isinstance(given, (int, float)):
-        return np.full(len(progress), float(given))
-    if isinstance(given, list):
-        return np.interp(progress, np.linspace(0.0, 1.0, len(given)), given)
-    times, values = read_controls(Path(given.file), given.column or muscle.name, muscle=muscle.name)
-    when = times[0] + progress * (times[-1] - times[0]) if motion.times is None else motion.times
-    return np.interp(when, times, values)
+    if isinstance(given, CurveTable):
+        times, values = _read_controls(given.file, given.column or muscle.name, muscle.name)
+        when = times[0] + progress * (times[-1] - times[0]) if motion.times is None else motion.times
+        return np.interp(when, times, values)
+    values = np.atleast_1d(given)
+    return np.interp(progress, np.linspace(0.0, 1.0, len(values)), values)
 
 
-def read_controls(path: Path, column: str, *, muscle: str) -> tuple[Floats, Floats]:
-    """Times [s] and activations, (n,) each, of one column of an OpenSim storage file (.sto).
-
-    Parameters
-    ----------
-    path : pathlib.Path
-    column : str
-        The column's name, or the muscle's in ``/forceset/NAME/activation`` or ``NAME.activation``.
-    muscle : str
-        For messages.
-
-    Raises
-    ------
-    SceneError
-        If the file or the column cannot be used.
-    """
-    _, labels, rows = storage_parts(path, place=f"muscle {muscle!r} activation")
-    place = f"muscle {muscle!r} activation: {path}"
-    index = _column(labels, column, place)
-    if any(len(row) != len(labels) for row in rows):
-        raise SceneError(f"{place}: rows need {len(labels)} values each, as the header names")
-    try:
-        times, values = np.array([[float(row[0]), float(row[index])] for row in rows]).T
-    except ValueError as error:
-        raise SceneError(f"{place}: {error}") from None
+def _read_controls(path, column, muscle):
+    """Times [s] and activations, (n,) each, of one column of an OpenSim storage file (.sto)."""
+    place = f"muscle {muscle!r} activation"
+    _, labels, rows = read_storage(path, place=place)
+    index = _column(labels, column, f"{place}: {path}")
+    times, values = rows[:, 0], rows[:, index]
     bad = np.flatnonzero(~((values >= 0.0) & (values <= 1.0)))
     if len(bad):
         raise SceneError(
-            f"{place} row {bad[0] + 1}: {labels[index]} is {values[bad[0]]:g}, activation lies from 0 to 1"
+            f"{place}: {path} row {bad[0] + 1}: {labels[index]} is {values[bad[0]]:g}, activation lies from 0 to 1"
         )
     if not np.all(np.diff(times) > 0.0):
-        raise SceneError(f"{place}: the first column must be a time that increases")
+        raise SceneError(f"{place}: {path}: the first column must be a time that increases")
     return times, values
 
 
@@ -88,7 +68,7 @@ def _column(labels, wanted, place):
 
 
 class Activations:
-    """What the frame loop asks about activation: sub-steps, and the activations at the end of each.
+    """Activations of the muscles that contract in the frame loop, and the sub-steps that they need.
 
     Parameters
     ----------

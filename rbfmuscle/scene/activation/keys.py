@@ -1,24 +1,24 @@
 """The keys of a muscle that contracts, checked as they stand in a scene."""
 
-from dataclasses import dataclass
-from typing import Annotated
+from __future__ import annotations
 
-from pydantic import Field, model_validator
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
 
-from rbfmuscle.scene.options import Positive, Table
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
-KEYS = ("activation", "fibre_stretch_at_rest", "optimal_fibre_length", "shortening", "tendon")
+from rbfmuscle.geometry.arrays import Booleans
+from rbfmuscle.scene.options import FileName, Positive, Table
 
-Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
-
-
+KEYS = ("activation", "fibre_stretch_at_rest", "tendon")
 TENDON_STRAIN = 0.033
 
 
 class CurveTable(Table):
     """``activation`` as a table: a ``column`` of a ``file``, by default the one named as the muscle."""
 
-    file: str
+    file: FileName
     column: str | None = None
 
 
@@ -30,9 +30,9 @@ class TendonTable(Table):
     """
 
     length: Positive | None = None
-    vertices: str | list[int] | None = None
+    vertices: FileName | list[int] | None = None
     at: str | None = None
-    strain: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = TENDON_STRAIN
+    strain: Annotated[float, Field(ge=0, le=0.5)] = TENDON_STRAIN
 
     @model_validator(mode="after")
     def _check_one_place(self):
@@ -43,6 +43,32 @@ class TendonTable(Table):
         return self
 
 
+def _check_activation(value: Any) -> Any:
+    """One message in place of one for each of the forms that it may take."""
+    numbers = value if isinstance(value, list) and value else [value]
+    for number in numbers:
+        if isinstance(number, bool) or not isinstance(number, (int, float)) or not 0.0 <= number <= 1.0:
+            raise ValueError(
+                "must be a number from 0 to 1, a list of them over the motion, or a table with 'file'"
+            )
+    return value
+
+
+def _form(value: Any) -> str:
+    return "table" if isinstance(value, (dict, Table)) else "number"
+
+
+Curve = Annotated[
+    Annotated[float | list[float], BeforeValidator(_check_activation), Tag("number")]
+    | Annotated[CurveTable, Tag("table")],
+    Discriminator(_form),
+]
+Tendon = Annotated[
+    Annotated[float, Field(gt=0, lt=1), Tag("number")] | Annotated[TendonTable, Tag("table")],
+    Discriminator(_form),
+]
+
+
 class ContractionTable(Table):
     """The keys of one muscle that contracts.
 
@@ -50,37 +76,40 @@ class ContractionTable(Table):
     ----------
     activation : number, list of numbers, or table
         0 to 1; waypoints are spread evenly over the motion.
-    fibre_stretch_at_rest : float
+    fibre_stretch_at_rest : float, optional
         Stretch of the fibres in the scan pose against their slack length.
-    optimal_fibre_length : float, optional
-        The slack length itself [scene unit]; the muscle then needs ``fibres``.
-    shortening : float
-        Stretch, against the slack length, at which a fully activated fibre is content. The default is where
-        muscle gives no active force any more: half the optimal length (Zajac 1989).
     tendon : number (a share of the length at every attachment) or table, optional
     """
 
-    activation: Fraction | Annotated[list[Fraction], Field(min_length=1)] | CurveTable = 0.0
-    fibre_stretch_at_rest: Annotated[float, Field(gt=0.2, lt=5, allow_inf_nan=False)] | None = None
-    optimal_fibre_length: Positive | None = None
-    shortening: Annotated[float, Field(gt=0.1, le=1, allow_inf_nan=False)] = 0.5
-    tendon: Annotated[float, Field(gt=0, lt=1)] | TendonTable | None = None
-
-    @model_validator(mode="after")
-    def _check_one_length(self):
-        if self.fibre_stretch_at_rest is not None and self.optimal_fibre_length is not None:
-            raise ValueError("give one of fibre_stretch_at_rest and optimal_fibre_length, not both")
-        return self
+    activation: Curve = 0.0
+    fibre_stretch_at_rest: Annotated[float, Field(gt=0.2, lt=5)] | None = None
+    tendon: Tendon | None = None
 
 
-@dataclass(frozen=True)
-class Contraction:
-    """What the keys come to, for one muscle.
+def contraction_keys(
+    given: Mapping[str, Any], *, muscle: str, folder: Path | None = None
+) -> ContractionTable | None:
+    """The checked keys of one muscle, or None where it has none.
+
+    Parameters
+    ----------
+    given : mapping
+        None counts as not given.
+    muscle : str
+        For messages.
+    folder : path, optional
+        What relative files are relative to.
+    """
+    found = {key: value for key, value in given.items() if value is not None}
+    return ContractionTable.build(found, place=f"muscle {muscle!r} ", folder=folder) if found else None
+
+
+class Contraction(NamedTuple):
+    """What the keys of a muscle come to.
 
     Attributes
     ----------
     stretch_at_rest : float
-    shortening : float
     tendon : (n,) ndarray of bool
         Vertices of the muscle's mesh that are tendon.
     tendon_strain : float
@@ -90,7 +119,11 @@ class Contraction:
     """
 
     stretch_at_rest: float
-    shortening: float
-    tendon: object
-    tendon_strain: float
+    tendon: Booleans
+    tendon_strain: float = TENDON_STRAIN
     slack: bool = False
+
+    @property
+    def shortest(self) -> float:
+        """Stretch against the scan at which a fully active fibre has no tension: half its slack length (Zajac 1989)."""
+        return 0.5 / self.stretch_at_rest
