@@ -28,8 +28,8 @@ TOPICS = {
     "Fields and kernels": ("RBFField", "study_kernels", "reach_error"),
     "Muscles and bones": ("RBFMuscle", "BoneSDF"),
     "Errors and warnings": (
-        "RBFMuscleError", "SceneError", "MeshError", "SolveError", "LimitExceededError", "MissingPartError",
-        "NumericalWarning",
+        "RBFMuscleError", "UsageError", "SceneError", "MeshError", "SolveError", "LimitExceededError",
+        "MissingPartError", "NumericalWarning", "SceneWarning",
     ),
 }  # fmt: skip
 _TIMEOUT = 600
@@ -162,10 +162,10 @@ def _allowed(field):
     if "$ref" in field:
         name = field["$ref"].rsplit("/", 1)[-1]
         return f"table [{name}](#{name.lower()})"
-    if "anyOf" in field:
-        return " or ".join(
-            dict.fromkeys(_allowed(part) for part in field["anyOf"] if part.get("type") != "null")
-        )
+    for several in ("anyOf", "oneOf"):
+        if several in field:
+            parts = [_allowed(part) for part in field[several] if part.get("type") != "null"]
+            return " or ".join(dict.fromkeys(parts))
     if "const" in field or "enum" in field:
         return ", ".join(f"`{value}`" for value in field.get("enum", [field.get("const")]))
     kind = field.get("type", "any")

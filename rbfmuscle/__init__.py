@@ -6,42 +6,66 @@ Public names are loaded when first used, so that ``import rbfmuscle`` stays ligh
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rbfmuscle.bones.sdf import BoneSDF as BoneSDF
+    from rbfmuscle.compare import compare_models as compare_models
+    from rbfmuscle.experiments.kernel_study import study_kernels as study_kernels
+    from rbfmuscle.experiments.wanted_error import reach_error as reach_error
+    from rbfmuscle.implicit.field import RBFField as RBFField
+    from rbfmuscle.muscle.muscle import RBFMuscle as RBFMuscle
+    from rbfmuscle.report.figure import figure_html as figure_html
+    from rbfmuscle.run import Run as Run
+    from rbfmuscle.run import simulate as simulate
+    from rbfmuscle.scene.phantom import phantom_scene as phantom_scene
+    from rbfmuscle.scene.scene import Scene as Scene
+    from rbfmuscle.validation import LimitExceededError as LimitExceededError
+    from rbfmuscle.validation import MeshError as MeshError
+    from rbfmuscle.validation import MissingPartError as MissingPartError
+    from rbfmuscle.validation import NumericalWarning as NumericalWarning
+    from rbfmuscle.validation import RBFMuscleError as RBFMuscleError
+    from rbfmuscle.validation import SceneError as SceneError
+    from rbfmuscle.validation import SceneWarning as SceneWarning
+    from rbfmuscle.validation import SolveError as SolveError
+    from rbfmuscle.validation import UsageError as UsageError
+    from rbfmuscle.viewer.page import Page as Page
+    from rbfmuscle.viewer.page import show as show
 
 __version__ = "0.1.0"
 
+_ERRORS = (
+    "LimitExceededError", "MeshError", "MissingPartError", "NumericalWarning", "RBFMuscleError", "SceneError",
+    "SceneWarning", "SolveError", "UsageError",
+)  # fmt: skip
 _HOME = {
     "BoneSDF": "rbfmuscle.bones.sdf",
-    "LimitExceededError": "rbfmuscle.validation",
-    "MeshError": "rbfmuscle.validation",
-    "MissingPartError": "rbfmuscle.validation",
-    "NumericalWarning": "rbfmuscle.validation",
     "RBFField": "rbfmuscle.implicit.field",
     "RBFMuscle": "rbfmuscle.muscle.muscle",
-    "RBFMuscleError": "rbfmuscle.validation",
     "Run": "rbfmuscle.run",
     "Scene": "rbfmuscle.scene.scene",
-    "SceneError": "rbfmuscle.validation",
-    "SolveError": "rbfmuscle.validation",
     "compare_models": "rbfmuscle.compare",
     "phantom_scene": "rbfmuscle.scene.phantom",
     "reach_error": "rbfmuscle.experiments.wanted_error",
     "show": "rbfmuscle.viewer.page",
     "simulate": "rbfmuscle.run",
     "study_kernels": "rbfmuscle.experiments.kernel_study",
+    **dict.fromkeys(_ERRORS, "rbfmuscle.validation"),
 }
+# For modules that may not import it themselves.
+_INNER = {"figure_html": "rbfmuscle.report.figure", "Page": "rbfmuscle.viewer.page"}
 
 __all__ = [*_HOME, "__version__"]
 
 
-def __getattr__(name: str) -> Callable[..., Any]:
-    if name in _HOME:
-        value = getattr(importlib.import_module(_HOME[name]), name)
-        globals()[name] = value
-        return value
-    raise AttributeError(f"module 'rbfmuscle' has no attribute {name!r}")
+def __getattr__(name: str) -> object:
+    home = _HOME.get(name) or _INNER.get(name)
+    if home is None:
+        raise AttributeError(f"module 'rbfmuscle' has no attribute {name!r}")
+    value = getattr(importlib.import_module(home), name)
+    globals()[name] = value
+    return value
 
 
-def __dir__() -> Any:
+def __dir__() -> list[str]:
     return sorted(__all__)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.options import Table
 from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.settings import HEADS
 from rbfmuscle.simulation.frame import MuscleModel
 from rbfmuscle.validation import SceneError, UsageError, did_you_mean, shown
 
@@ -114,6 +115,9 @@ def configure_scene(
         If the settings do.
     """
     check_models(scene)
+    for key in settings or ():
+        if key.partition(".")[0] not in HEADS and f"model.{key}" in _model_keys():
+            raise UsageError(f"{key}: unknown setting, did you mean 'model.{key}'?")
     changed = scene.with_options(settings, model=model, frames=frames)
     for muscle in changed.muscles:
         try:
@@ -147,6 +151,12 @@ def check_model_name(name: str) -> str:
         return name
     hint = did_you_mean(str(name).lower()[:100].replace("_", "-"), MODEL_NAMES)
     raise UsageError(f"unknown model {shown(repr(name))}, {hint}")
+
+
+def _model_keys():
+    return {
+        f"model.{key}" for home in _HOME.values() for key in _part(home, "options", home.options).model_fields
+    }
 
 
 def _check_muscle(muscle):

@@ -8,27 +8,39 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from typing import Any
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.metrics.summary import parse_limits, require_limits
 from rbfmuscle.models import configure_scene
-from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.output.export import export_run
+from rbfmuscle.output.saved import SavedRun, saved_frames
 from rbfmuscle.output.sinks import MemorySink
 from rbfmuscle.output.writer import RunWriter, check_writable
 from rbfmuscle.progress import Progress, stage
 from rbfmuscle.recording import Recording
+from rbfmuscle.scene.phantom import open_scene
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.simulation.frame import Event, Frame
-from rbfmuscle.validation import SolveError, UsageError
+from rbfmuscle.simulation.frame import Event, Frame, MuscleModel
+from rbfmuscle.validation import MissingPartError, SolveError, UsageError, did_you_mean
+
+if TYPE_CHECKING:
+    import pandas
+    import trimesh
+    from matplotlib.axes import Axes
+
+    from rbfmuscle.viewer.page import Page
 
 
 def simulate(
-    scene: Scene,
-    model: str | dict | None = None,
+    scene: Scene | str | Path,
+    model: str | dict[str, Any] | None = None,
     *,
     settings: Mapping[str, Any] | None = None,
     frames: slice | str | None = None,
@@ -39,7 +51,8 @@ def simulate(
 
     Parameters
     ----------
-    scene : Scene
+    scene : Scene, path or "phantom"
+        A scene, its file, or the embedded hip.
     model : str or dict, optional
         For every muscle; the scene's own choice where not given.
     settings : mapping, optional
@@ -72,6 +85,7 @@ def simulate(
     >>> len(run.frames)
     3
     """
+    scene = open_scene(scene)
     if progress is True:
         with Progress(scene.name) as shown:
             return simulate(scene, model, settings=settings, frames=frames, progress=shown, fields=fields)
@@ -81,7 +95,7 @@ def simulate(
         raise UsageError(f"fields must name each bone ({bones}), got {', '.join(fields) or 'none'}")
     options = _options(model, settings, frames)
     recording, memory = Recording(scene, options=options, models_here=False, fields=fields), MemorySink()
-    run = Run(recording, memory)
+    run = Run(memory.frames, memory.rows, recording=recording, memory=memory)
     try:
         recording.feed(memory, progress=progress or None)
     except SolveError as error:
@@ -92,16 +106,16 @@ def simulate(
 
 def stream_run(
     scene: Scene,
-    directory: Any,
+    directory: str | Path,
     *,
-    model: str | dict | None = None,
+    model: str | dict[str, Any] | None = None,
     settings: Mapping[str, Any] | None = None,
     frames: slice | str | None = None,
-    fail_on: str | Sequence[str] | dict | None = None,
+    fail_on: str | Sequence[str] | dict[str, float] | None = None,
     pictures: bool = True,
     progress: Callable[[int, int], None] | None = None,
-    watch: Callable[[list, Frame | None], None] | None = None,
-) -> dict:
+    watch: Callable[[list[MuscleModel], Frame | None], None] | None = None,
+) -> dict[str, Any]:
     """Run a scene and write it to a folder frame by frame; memory does not grow with the frames.
 
     Parameters
@@ -164,36 +178,72 @@ def _finish(recording, writer, limits, pictures):
 
 
 class Run:
-    """A finished run in memory.
+    """A run: in memory, or of a folder that holds one.
+
+    ``len(run)`` is the number of its frames, ``run["extensor"]`` one muscle; iteration gives every muscle.
 
     Attributes
     ----------
-    scene : Scene
-        As it was run.
+    frames : list of Frame
+        Those that were written, in their order.
+    metrics : list of Row
+        (frame, coordinate, angle [degree], muscle, quantity, value, unit), frame by frame.
+    scene : Scene or None
+        As it was run; None of a run that was loaded.
 
     Examples
     --------
     >>> from rbfmuscle import phantom_scene
     >>> run = simulate(phantom_scene(end=0.0), model="pbd")
-    >>> [muscle.name for muscle in run][:1]
-    ['extensor']
+    >>> len(run), "extensor" in run, run.muscles[0]
+    (1, True, 'extensor')
     >>> bool(abs(run["extensor"].surface(frame=0).volume) > 0.0)
     True
     """
 
-    def __init__(self, recording: Recording, memory: MemorySink) -> None:
+    def __init__(
+        self,
+        frames: list[Frame],
+        metrics: list[Row],
+        *,
+        recording: Recording | None = None,
+        memory: MemorySink | None = None,
+        saved: SavedRun | None = None,
+    ) -> None:
+        self.frames, self.metrics = frames, metrics
         self._recording, self._memory = recording, memory
-        self.scene = recording.scene
+        self.scene = None if recording is None else recording.scene
+        if saved is not None:
+            self.saved = saved
+
+    @classmethod
+    def load(cls, directory: str | Path) -> "Run":
+        """Return the run in a folder.
+
+        Parameters
+        ----------
+        directory : path
+
+        Raises
+        ------
+        UsageError
+            If the folder holds no run.
+        """
+        saved = SavedRun(directory)
+        return cls(saved_frames(saved), saved.metrics, saved=saved)
+
+    @cached_property
+    def saved(self) -> SavedRun:
+        """The run in a folder; one in memory is written to a temporary folder."""
+        folder = tempfile.mkdtemp(prefix="rbfmuscle")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        self._write(folder)
+        return SavedRun(folder)
 
     @property
-    def frames(self) -> list[Frame]:
-        """Frames that were written, in their order."""
-        return self._memory.frames
-
-    @property
-    def metrics(self) -> list[Row]:
-        """Rows (frame, coordinate, angle [degree], muscle, quantity, value, unit), frame by frame."""
-        return self._memory.rows
+    def info(self) -> dict[str, Any]:
+        """What ``run.json`` holds."""
+        return self.saved.info if self._recording is None else self._recording.info()
 
     @property
     def events(self) -> list[Event]:
@@ -201,25 +251,85 @@ class Run:
         return [event for frame in self.frames for event in frame.events]
 
     @property
-    def summary(self) -> dict:
+    def summary(self) -> dict[str, dict[str, Any]]:
         """Nested dict: muscle -> quantity -> min, max, mean, median, worst."""
-        return self._recording.summary.table()
+        return self.info["muscles"]
+
+    @property
+    def verdict(self) -> str:
+        """Which muscles are within all limits, which not, and the worst value."""
+        return self.info["verdict"]
+
+    @property
+    def muscles(self) -> list[str]:
+        """Names of the muscles."""
+        return [muscle["name"] for muscle in self.info["scene"]["muscles"]]
+
+    @property
+    def quantities(self) -> list[str]:
+        """Names of what was measured."""
+        return list(dict.fromkeys(row.quantity for row in self.metrics))
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __contains__(self, muscle: object) -> bool:
+        return muscle in self.muscles
 
     def __getitem__(self, muscle: str) -> "MuscleRun":
         """The `MuscleRun` of a muscle."""
-        return MuscleRun(self, self.scene.muscle(muscle).name)
+        if muscle not in self:
+            raise UsageError(f"unknown muscle {muscle!r}, {did_you_mean(muscle, self.muscles)}")
+        return MuscleRun(self, muscle)
 
     def __iter__(self) -> Iterator["MuscleRun"]:
         """All muscles."""
-        return (MuscleRun(self, muscle.name) for muscle in self.scene.muscles)
+        return (MuscleRun(self, muscle) for muscle in self.muscles)
 
-    def values(self, muscle: str, quantity: str) -> np.ndarray:
+    def values(self, muscle: str, quantity: str) -> NDArray[np.float64]:
         """Values of a quantity over the frames, (n,) ndarray."""
-        found = [r.value for r in self.metrics if r.muscle == muscle and r.quantity == quantity]
-        return np.array(found)
+        return np.array([r.value for r in self.metrics if r.muscle == muscle and r.quantity == quantity])
 
-    def save(self, directory: Any, *, pictures: bool = True) -> None:
-        """Write what `stream_run` would have written.
+    def table(self) -> "pandas.DataFrame":
+        """Return the metrics as a pandas DataFrame.
+
+        Raises
+        ------
+        MissingPartError
+            If pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError:
+            raise MissingPartError("run.table() needs pandas: pip install pandas") from None
+        return pandas.DataFrame(self.metrics, columns=list(Row._fields))
+
+    def plot(self, quantity: str = "penetration_max") -> "Axes":
+        """Plot a quantity of every muscle over the motion.
+
+        Parameters
+        ----------
+        quantity : str
+
+        Returns
+        -------
+        matplotlib.axes.Axes
+        """
+        if quantity not in self.quantities:
+            raise UsageError(f"unknown quantity {quantity!r}, {did_you_mean(quantity, self.quantities)}")
+        from matplotlib import pyplot
+
+        rows = [row for row in self.metrics if row.quantity == quantity]
+        axes = pyplot.figure().add_subplot()
+        for muscle, coordinate in dict.fromkeys((row.muscle, row.coordinate) for row in rows):
+            track = [row for row in rows if (row.muscle, row.coordinate) == (muscle, coordinate)]
+            axes.plot([row.frame for row in track], [row.value for row in track], label=muscle)
+        axes.set(title=quantity, xlabel="frame", ylabel=rows[0].unit)
+        axes.legend()
+        return axes
+
+    def save(self, directory: str | Path, *, pictures: bool = True) -> None:
+        """Write what `stream_run` would have written; a run that was loaded is copied.
 
         Parameters
         ----------
@@ -232,25 +342,61 @@ class Run:
         UsageError
             If the folder cannot be written to.
         """
-        _finish(self._recording, self._write(directory), {}, pictures)
+        if self._recording is None:
+            shutil.copytree(self.saved.directory, directory, dirs_exist_ok=True)
+        else:
+            _finish(self._recording, self._write(directory), {}, pictures)
 
-    def show(self) -> Any:
+    def export(
+        self, directory: str | Path, formats: str | Sequence[str], *, units: str | None = None, up: str = "z"
+    ) -> list[Path]:
+        """Write the surfaces in other formats and return the files.
+
+        Parameters
+        ----------
+        directory : path
+            Takes a folder for each format.
+        formats : str or list of str
+            ``pvd``, ``vtp``, ``ply``, ``stl``, ``obj``, ``glb``, ``usd``, ``animated-glb`` or ``html``.
+        units : {"m", "cm", "mm"}, optional
+            The scene's where not given; glTF and html are in metres.
+        up : {"z", "y"}
+            The scene's axis that points up, for usd, glb, animated-glb and html.
+        """
+        names = [formats] if isinstance(formats, str) else list(formats)
+        return export_run(self.saved.directory, names, output=directory, units=units, up=up)
+
+    def show(self) -> "Page":
         """Show the frames in a browser or a notebook; see `rbfmuscle.show`."""
         import rbfmuscle
 
-        folder = tempfile.mkdtemp(prefix="rbfmuscle")
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        self._write(folder)
-        return rbfmuscle.show(SavedRun(folder))
+        return rbfmuscle.show(self.saved)
 
-    def _write(self, directory: Any) -> RunWriter:
+    def _write(self, directory):
         writer = RunWriter(directory, self.scene)
         self._memory.replay(writer)
         writer.write_info(self._recording.info())
         return writer
 
+    def _bones(self):
+        """Bones in the last frame."""
+        poses = self.frames[-1].poses
+        for name in poses:
+            mesh = self.scene.bone(name).mesh if self.scene is not None else None
+            vertices, faces = self.saved.bone(name) if mesh is None else (mesh.vertices, mesh.faces)
+            yield name, (vertices @ poses[name][:3, :3].T + poses[name][:3, 3], faces)
+
     def __repr__(self) -> str:
-        return f"<Run of {self.scene.name!r}: {len(self.frames)} frames>"
+        return f"<Run of {self.info['scene']['name']!r}: {len(self)} frames, {', '.join(self.muscles)}>"
+
+    def _repr_html_(self) -> str:
+        from rbfmuscle.report.figure import figure_html
+
+        if not self.frames:
+            return figure_html({}, {}, repr(self))
+        surfaces = self.frames[-1].surfaces
+        muscles = {name: (surfaces[name].vertices, surfaces[name].faces) for name in surfaces}
+        return figure_html(dict(self._bones()), muscles, f"{self!r} {self.verdict}")
 
 
 class MuscleRun:
@@ -260,7 +406,7 @@ class MuscleRun:
         self.run = run
         self.name = name
 
-    def surface(self, frame: int = -1) -> Any:
+    def surface(self, frame: int = -1) -> "trimesh.Trimesh":
         """Surface in a frame of the run.
 
         Parameters
@@ -275,18 +421,15 @@ class MuscleRun:
         """
         import trimesh
 
-        surface = self._frame(frame).surfaces[self.name]
-        return trimesh.Trimesh(surface.vertices, surface.faces, process=False)
-
-    def values(self, quantity: str) -> np.ndarray:
-        """Values of a quantity over the frames, (n,) ndarray."""
-        return self.run.values(self.name, quantity)
-
-    def _frame(self, frame):
-        count = len(self.run.frames)
+        count = len(self.run)
         if not -count <= frame < count:
             raise UsageError(f"frame {frame} is out of range, the run has {count} frames")
-        return self.run.frames[frame]
+        surface = self.run.frames[frame].surfaces[self.name]
+        return trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+
+    def values(self, quantity: str) -> NDArray[np.float64]:
+        """Values of a quantity over the frames, (n,) ndarray."""
+        return self.run.values(self.name, quantity)
 
     def __repr__(self) -> str:
         return f"<{self.name!r} in {self.run!r}>"

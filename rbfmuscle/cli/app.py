@@ -11,7 +11,7 @@ import os
 import sys
 import warnings
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, Group
 
 from rbfmuscle import __version__
 from rbfmuscle.cli.check import check
@@ -30,25 +30,20 @@ from rbfmuscle.validation import RBFMuscleError, SolveError, UsageError
 
 LONGEST_LINE = 1000  # characters of a message: what a hostile file holds is not all shown
 
+GROUPS = {
+    "Start": (demo, new, import_, check, plan),
+    "Run": (run, export),
+    "Study": (compare, kernels, sweep, paths),
+    "Look": (view, render),
+}
 app = App(
     name="rbfmuscle", help="Muscles as implicit RBF surfaces that move with the bones.", version=__version__
 )
-for command in (
-    demo,
-    check,
-    plan,
-    run,
-    compare,
-    sweep,
-    export,
-    render,
-    new,
-    view,
-    kernels,
-):
-    app.command(command)
-app.command(import_, name="import")
-app.command(paths)
+app["--help"].group = app["--version"].group = Group("Options", sort_key=1000)
+for title, commands in GROUPS.items():
+    group = Group.create_ordered(title)
+    for command in commands:
+        app.command(command, group=group)
 
 
 def run_command(arguments: list[str]) -> int:

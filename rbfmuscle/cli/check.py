@@ -5,66 +5,48 @@ from __future__ import annotations
 import json
 import logging
 import sys
-from pathlib import Path
-from typing import Annotated
 
-from cyclopts import Parameter
-
-from rbfmuscle.cli.scenes import load_scene
+from rbfmuscle.cli.options import Flag, Json, SceneName
 from rbfmuscle.progress import Progress, stage
 from rbfmuscle.validation import SceneError
 
 
-def check(
-    scene: Path,
-    *,
-    picture: Annotated[bool, Parameter(negative="")] = False,
-    fields: Annotated[bool, Parameter(negative="")] = False,
-    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
-) -> int:
+def check(scene: SceneName, *, picture: Flag = False, fields: Flag = False, as_json: Json = False) -> int:
     """Check a scene file and its meshes; nothing is solved.
 
     Parameters
     ----------
-    scene
-        Scene file (TOML), or "phantom" for the embedded hip.
     picture
         Draw patches, joint axes, far ends and overlaps to a PNG beside the scene file.
     fields
         Measure the bones' distance fields against exact distances.
-    as_json
-        Print JSON and nothing else.
     """
     with Progress(f"check {scene.name}"):
         loaded, findings = _findings(scene)
         errors_of = _measure_fields(loaded) if fields else {}
-    drawn = _draw(loaded, scene) if picture else None
-    errors = [finding for finding in findings if finding.level == "error"]
+    drawn = _draw(loaded, scene.with_suffix(".png")) if picture else None
     if as_json:
-        shown = [{"level": f.level, "place": f.place, "message": f.message} for f in findings]
-        facts = {"scene": loaded.resolved(), "findings": shown}
         more = {"picture": drawn, "fields": errors_of}
+        facts = {"scene": loaded.resolved(), "findings": [vars(finding) for finding in findings]}
         print(json.dumps({**facts, **{key: value for key, value in more.items() if value}}, indent=1))
     else:
-        _print_scene(loaded)
-        for name, found in errors_of.items():
-            print(_describe_field(name, found, loaded.units))
-        for finding in findings:
-            print(finding)
+        of_fields = [_describe_field(name, found, loaded.units) for name, found in errors_of.items()]
+        print("\n".join([*_scene_lines(loaded), *of_fields, *map(str, findings)]))
         if drawn is not None:
             print(
                 f"{drawn['file']}: {drawn['far_ends']} ends far from their bone, {drawn['overlaps']} overlaps"
             )
-        print("not usable" if errors else "usable", file=sys.stderr)
-    return SceneError.exit_code if errors else 0
+    usable = not any(finding.level == "error" for finding in findings)
+    if not as_json:
+        print("usable" if usable else "not usable", file=sys.stderr)
+    return 0 if usable else SceneError.exit_code
 
 
-def _draw(scene, path):
-    """Draw a scene beside its file; return the file and what is marked."""
+def _draw(scene, file):
+    """Draw a scene; return the file and what is marked."""
     from rbfmuscle.report.scene_picture import draw_scene
 
-    file = path.with_suffix(".png")
-    with Progress(f"picture of {path.name}"):
+    with Progress(f"picture of {scene.name}"):
         return {"file": str(file), **draw_scene(scene, file)}
 
 
@@ -73,10 +55,11 @@ def _findings(path):
     from rbfmuscle.models import check_models
     from rbfmuscle.scene.attachments import ExactMeshes
     from rbfmuscle.scene.check import Finding, check_scene
+    from rbfmuscle.scene.phantom import open_scene
     from rbfmuscle.simulation.plan.motion_check import motion_findings
     from rbfmuscle.simulation.substeps import check_substeps
 
-    loaded = load_scene(path, skeleton=True)
+    loaded = open_scene(path, skeleton=True)
     orient_scene(loaded)
     check_models(loaded)
     exact = ExactMeshes()
@@ -89,8 +72,7 @@ def _findings(path):
     if not any(finding.level == "error" for finding in findings):
         with stage("checking the motion"):
             findings += motion_findings(loaded, exact)
-    order = {"error": 0, "warning": 1, "note": 2}
-    return loaded, sorted(findings, key=lambda finding: order[finding.level])
+    return loaded, sorted(findings, key=lambda finding: ("error", "warning", "note").index(finding.level))
 
 
 def _field_notes(scene):
@@ -99,15 +81,16 @@ def _field_notes(scene):
     from rbfmuscle.scene.check import Finding
 
     logger = logging.getLogger("rbfmuscle.bones.sdf")
-    level, found = logger.level, []
+    level = logger.level
     logger.setLevel(logging.ERROR)  # what it would say is said by the findings
     try:
-        for bone in scene.bones:
-            notes = BoneSDF.from_mesh(bone.mesh, name=bone.name).notes
-            found += [Finding("note", f"bone {bone.name!r}", note) for note in notes]
+        return [
+            Finding("note", f"bone {bone.name!r}", note)
+            for bone in scene.bones
+            for note in BoneSDF.from_mesh(bone.mesh, name=bone.name).notes
+        ]
     finally:
         logger.setLevel(level)
-    return found
 
 
 def _measure_fields(scene):
@@ -127,21 +110,19 @@ def _describe_field(name, found, units):
     )
 
 
-def _print_scene(scene):
-    print(f"{scene.name}: {len(scene.motion)} frames, lengths in {scene.units}")
+def _scene_lines(scene):
+    yield f"{scene.name}: {len(scene.motion)} frames, lengths in {scene.units}"
     if scene.superior is not None:
         up, front = (", ".join(f"{x:.3g}" for x in v) for v in (scene.superior, scene.anterior))
-        print(f"  superior is ({up}), anterior ({front})")
+        yield f"  superior is ({up}), anterior ({front})"
     for bone in scene.bones:
-        print(f"  bone {bone.name}: {len(bone.mesh.vertices)} vertices, {len(bone.mesh.faces)} triangles")
+        yield f"  bone {bone.name}: {len(bone.mesh.vertices)} vertices, {len(bone.mesh.faces)} triangles"
     for joint in scene.joints:
-        print(
-            f"  joint {joint.name}: {joint.parent} to {joint.child}, {', '.join(joint.coordinates) or joint.kind}"
-        )
+        yield f"  joint {joint.name}: {joint.parent} to {joint.child}, {', '.join(joint.coordinates) or joint.kind}"
     for muscle in scene.muscles:
         held = ", ".join(f"{len(a.vertices)} on {a.bone}" for a in muscle.attachments)
         volume = muscle.mesh.volume / scene.length(10.0) ** 3
-        print(
+        yield (
             f"  muscle {muscle.name}: model {muscle.model}, {len(muscle.mesh.vertices)} vertices, "
             f"{volume:.4g} cm3, attached: {held}"
         )

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Any
 
-from cyclopts import Parameter
-
-from rbfmuscle.cli.run import Json, Output
-from rbfmuscle.cli.scenes import load_scene
+from rbfmuscle.cli.options import Frames, Json, Output, SceneName, Settings
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import SolveError
 
@@ -29,39 +26,32 @@ SHOWN = (
 
 
 def compare(
-    scene: str,
+    scene: SceneName,
     *,
     output: Output,
     models: str | None = None,
-    settings: Annotated[list[str] | None, Parameter(name="--set", negative="")] = None,
-    frames: str | None = None,
+    settings: Settings = None,
+    frames: Frames = None,
     pictures: bool = True,
     as_json: Json = False,
 ) -> None:
     """Run models on one scene: the same motion, contacts and measures; tables, report, pictures.
 
+    Each model's run is in a folder of its own; MODEL:KEY=VALUE is a setting for one model.
+
     Parameters
     ----------
-    scene
-        Scene file (TOML), or "phantom" for the embedded hip.
-    output
-        Folder for the results; each model's run is in a folder of its own there.
     models
         Names with commas between; distances are measured to the first. The sweeps of a mesh model with "-converged"
         after its name go on until no vertex moves.
-    settings
-        KEY=VALUE as for run, for all models; MODEL:KEY=VALUE for one. May be repeated.
-    frames
-        Frames of the motion, as A:B:S (B not included).
     pictures
         Draw pictures and the animation.
-    as_json
-        Print JSON and nothing else.
     """
     from rbfmuscle import interruption
     from rbfmuscle.compare import compare_models
     from rbfmuscle.models import COMPARED
     from rbfmuscle.output.writer import json_text
+    from rbfmuscle.scene.phantom import open_scene
     from rbfmuscle.scene.settings import parse_settings
 
     names = [name.strip() for name in (models or "").split(",") if name.strip()] or list(COMPARED)
@@ -74,16 +64,9 @@ def compare(
             progress(done, total)
             interruption.check()
 
+        options: dict[str, Any] = {"frames": frames, "settings": changes, "pictures": pictures}
         try:
-            table = compare_models(
-                load_scene(scene),
-                output,
-                names,
-                frames=frames,
-                settings=changes,
-                pictures=pictures,
-                progress=advance,
-            )
+            table = compare_models(open_scene(scene), output, names, progress=advance, **options)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"interrupted; finished runs are kept in {output}") from None
     if as_json:
@@ -96,12 +79,14 @@ def compare(
 
 
 def _print_table(table, output):
+    from rbfmuscle.metrics.summary import shown_number
+
     width = max(len(name) for name in (*table["models"], *SHOWN)) + 2
     print(" " * width + "".join(f"{name:>18}" for name in table["models"]))
     for quantity in SHOWN:
         cells = [table["results"][name]["all"].get(quantity) for name in table["models"]]
         if any(value is not None for value in cells):
-            texts = ("-" if value is None else f"{value:.3g}" for value in cells)
+            texts = ("-" if value is None else shown_number(value) for value in cells)
             unit = table["measures"][quantity]["unit"]
             print(f"{quantity:{width}}" + "".join(f"{text:>18}" for text in texts) + f"  {unit}")
     print(table["answer"])

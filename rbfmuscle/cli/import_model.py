@@ -7,19 +7,20 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
+from rbfmuscle.cli.options import Flag, Output
 from rbfmuscle.validation import UsageError
 
 
 def import_(
     model: Path,
     *,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    output: Output,
     units: Literal["m", "cm", "mm"] = "m",
     geometry: Annotated[list[Path] | None, Parameter(negative="")] = None,
     bodies: Annotated[list[str] | None, Parameter(negative="")] = None,
     motion: Path | None = None,
     muscles: Annotated[bool, Parameter(negative="--no-muscles")] = True,
-    force: Annotated[bool, Parameter(negative="")] = False,
+    force: Flag = False,
 ) -> None:
     """Write a scene file and its meshes from an OpenSim model (.osim).
 
@@ -27,8 +28,6 @@ def import_(
     ----------
     model
         The model, of version 2 to 4; OpenSim itself is not needed.
-    output
-        Folder for scene.toml and the bones.
     units
         Unit of the scene's lengths.
     geometry

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
+from rbfmuscle.cli.options import Flag
 from rbfmuscle.validation import UsageError
 
 
@@ -15,7 +16,7 @@ def new(
     units: Literal["mm", "cm", "m"] | None = None,
     labels: Path | None = None,
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
-    force: Annotated[bool, Parameter(negative="")] = False,
+    force: Flag = False,
 ) -> None:
     """Write a commented scene file for a folder of meshes or a volume of labels.
 

@@ -3,40 +3,30 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from time import perf_counter
+from typing import TYPE_CHECKING
 
-from cyclopts import Parameter
-
-from rbfmuscle.cli.scenes import load_scene
+from rbfmuscle.cli.options import Flag, Json, SceneName
 from rbfmuscle.progress import Progress, stage
 
 if TYPE_CHECKING:
     from rbfmuscle.scene.scene import Scene
 
 
-def plan(
-    scene: Path,
-    *,
-    time: Annotated[bool, Parameter(negative="")] = False,
-    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
-) -> None:
+def plan(scene: SceneName, *, time: Flag = False, as_json: Json = False) -> None:
     """List what a run of the scene would build, without building it.
 
     Parameters
     ----------
-    scene
-        Scene file (TOML), or "phantom" for the embedded hip.
     time
         Also build the muscles, solve two frames after the first, and extrapolate to the whole motion.
-    as_json
-        Print JSON and nothing else.
     """
     from rbfmuscle.models import check_models, solved_points
+    from rbfmuscle.scene.phantom import open_scene
     from rbfmuscle.simulation.plan.plan import plan_scene
 
     with Progress(f"plan {scene.name}"):
-        loaded = load_scene(scene)
+        loaded = open_scene(scene)
         check_models(loaded)
         made = plan_scene(loaded)
         for muscle, facts in zip(loaded.muscles, made["muscles"]):
@@ -47,17 +37,15 @@ def plan(
     print(json.dumps(made, indent=1) if as_json else "\n".join(_lines(made)))
 
 
-def measure_time(scene: Scene) -> dict[str, Any]:
+def measure_time(scene: Scene) -> dict[str, float]:
     """Wall time of a run [s], from its first three frames: ``build`` (with the first frame), ``frame``, ``total``.
 
     Report, pictures and files are not in it.
     """
-    from time import perf_counter
-
     from rbfmuscle.run import simulate
 
     start = perf_counter()
-    frames = simulate(scene, frames=slice(0, 3), settings={"output.report": False}).frames
+    frames = simulate(scene, frames=slice(0, 3)).frames
     spent, count = perf_counter() - start, len(scene.motion)
     frame = spent / count if len(frames) < 2 else sum(f.wall for f in frames[1:]) / (len(frames) - 1)
     build = max(0.0, spent - frame * (len(frames) - 1))
@@ -65,21 +53,18 @@ def measure_time(scene: Scene) -> dict[str, Any]:
 
 
 def _lines(made):
-    lines = [f"{made['frames']} frames in {made['substeps']} sub-steps"]
+    yield f"{made['frames']} frames in {made['substeps']} sub-steps"
     for muscle in made["muscles"]:
         work = ", ".join(f"{s} in {muscle[s]}" for s in ("solved", "carried", "skipped") if muscle[s])
-        lines.append(
+        yield (
             f"muscle {muscle['name']}: {muscle['model']}, {muscle['points']}, can meet "
             f"{', '.join(muscle['bones']) or 'no bone'}; {work or 'solved in 0'} frames ({muscle['reason']})"
         )
     for field in made["fields"]:
-        lines.append(
-            f"field of {field['bone']}: {field['share']:.0%} of its box, {field['triangles']} triangles"
-        )
+        yield f"field of {field['bone']}: {field['share']:.0%} of its box, {field['triangles']} triangles"
     if "time" in made:
         spent = made["time"]
-        lines.append(
+        yield (
             f"expected time: {spent['total']:.3g} s without report, pictures and files; build and first frame "
             f"{spent['build']:.2g} s, {1e3 * spent['frame']:.3g} ms per frame"
         )
-    return lines

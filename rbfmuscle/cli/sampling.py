@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rbfmuscle.importers.opensim.fitted import MOST_COORDINATES, FittedPath, fit_path, write_paths
+from rbfmuscle.importers.opensim.fitted import MOST_COORDINATES, fit_path, write_paths
 from rbfmuscle.metrics.centreline import Centreline, MuscleAtRest
 from rbfmuscle.models import build_models
 from rbfmuscle.scene.joints.skeleton import all_coordinates
@@ -22,6 +22,8 @@ from rbfmuscle.validation import SceneError, SolveError, UsageError
 
 # Every fifth sample is held out of the fit.
 HELD_OUT = 5
+# Of the polynomials that are tried.
+HIGHEST_ORDER = 7
 # Of the central differences, to either side [degree, or mm of a shift].
 STEP = 1.0
 # A muscle has settled where no contact point moves by more than this share of its size in a solve.
@@ -86,26 +88,22 @@ def sample_muscles(
     progress : callable, optional
         Told how many poses are done, and of how many.
     """
-    if not scene.muscles:
-        raise SceneError(f"scene {scene.name!r} has no muscles, add a [[muscle]]")
     scene = scene.validate().copy()
     scene.sliding = None
-    groups = _groups(scene, given)
-    found, done = [], 0
-    for ranges, muscles in groups:
+    groups, found, done = _groups(scene), [], 0
+    ranges = {name: _range(scene, name, given) for names in groups for name in names}
+    for names, muscles in groups.items():
         part = scene.copy()
-        part.muscles = [muscle for muscle in scene.muscles if muscle.name in muscles]
-        poses = _poses(ranges, samples)
+        part.muscles = muscles
+        values = _poses([ranges[name] for name in names], samples)
         rows = []
-        for row in _measured(part, poses):
+        for row in _measured(part, [dict(zip(names, pose)) for pose in values.tolist()]):
             rows.append(row)
             done += 1
             if progress is not None:
                 progress(done, samples * len(groups))
-        values = np.array([[pose[name] for name in ranges] for pose in poses])
-        for k, muscle in enumerate(part.muscles):
-            table = np.array([row[k] for row in rows])
-            found.append(Samples(muscle.name, tuple(ranges), values, table[:, 0], table[:, 1:]))
+        for muscle, table in zip(muscles, np.array(rows).transpose(1, 0, 2)):
+            found.append(Samples(muscle.name, names, values, table[:, 0], table[:, 1:]))
     return found
 
 
@@ -162,16 +160,17 @@ def _settle(stepper, here):
 
 
 def _poses(ranges, samples):
+    """Sobol's points (n, d) within the ranges."""
     from scipy.stats import qmc
 
     # A power of two of them, as Sobol's points are balanced.
     points = qmc.Sobol(len(ranges), scramble=True, seed=0).random(1 << (samples - 1).bit_length())
-    low, high = np.array(list(ranges.values())).T
-    return [dict(zip(ranges, row)) for row in (low + points[:samples] * (high - low)).tolist()]
+    low, high = np.array(ranges).T
+    return low + points[:samples] * (high - low)
 
 
-def _groups(scene, given):
-    """Ranges of the coordinates that muscles depend on, with the names of these muscles, which are sampled together."""
+def _groups(scene):
+    """Muscles by the coordinates that they depend on; those of a group are sampled together."""
     facts, followers = all_coordinates(scene.joints), {coupling.coordinate for coupling in scene.couplings}
     free = [name for name, fact in facts.items() if name not in followers and not fact.locked]
     groups = {}
@@ -183,10 +182,8 @@ def _groups(scene, given):
                 f"muscle {muscle.name!r} depends on {len(needed)} coordinates ({', '.join(needed)}); OpenSim takes "
                 f"1 to {MOST_COORDINATES}: lock some in the scene"
             )
-        groups.setdefault(needed, []).append(muscle.name)
-    return [
-        ({name: _range(scene, name, given) for name in needed}, names) for needed, names in groups.items()
-    ]
+        groups.setdefault(needed, []).append(muscle)
+    return groups
 
 
 def _moves(scene, bones, name):
@@ -209,59 +206,51 @@ def _range(scene, name, given):
     raise UsageError(f"coordinate {name!r} has no range; give --range {name}=LOW:HIGH")
 
 
-def report_fits(scene: Scene, sampled: list[Samples], directory: Path, order: int) -> list[str]:
+def report_fits(scene: Scene, sampled: list[Samples], directory: Path) -> list[str]:
     """Fit every muscle, write the files, and return lines that say how well the fits hold where they were not made."""
     fitted, lines, errors, unit = [], [], [], scene.units
     for found in sampled:
-        solved = np.isfinite(found.lengths)
-        held = np.arange(len(solved)) % HELD_OUT == HELD_OUT - 1
-        use, out = solved & ~held, solved & held
-        failed = int((~solved).sum())
-        if use.sum() < 2 * (len(found.coordinates) + 1) or not out.any():
-            raise SolveError(
-                f"muscle {found.muscle!r}: {failed} of {len(solved)} poses failed, too few are left to fit"
-            )
-        parts = (found.values[use], found.lengths[use], found.arms[use])
-        path = fit_path(found.muscle, found.coordinates, *parts, most=order)
-        row = held_out_errors(path, found.values[out], found.lengths[out], found.arms[out])
+        path, row = _fit(found)
         fitted.append(path)
-        head = {"muscle": path.muscle, "order": path.order, "fitted": int(use.sum()), "failed": failed}
-        errors.append({**head, **row})
+        errors.append(row)
         lines.append(
-            f"{path.muscle}: order {path.order} in {', '.join(path.coordinates)}; {int(out.sum())} poses held out: "
+            f"{path.muscle}: order {path.order} in {', '.join(path.coordinates)}; {row['held_out']} poses held out: "
             f"length {row['length_rms']:.3g} {unit} RMS, {row['length_max']:.3g} at most; "
             f"arms {row['arm_rms']:.3g} {unit} RMS, {row['arm_max']:.3g} at most"
-            + (f"; {failed} poses could not be solved" if failed else "")
+            + (f"; {row['failed']} poses could not be solved" if row["failed"] else "")
         )
     turning = {name: f.motion != "translation" for name, f in all_coordinates(scene.joints).items()}
     try:
         directory.mkdir(parents=True, exist_ok=True)
         write_paths(directory / "paths.xml", fitted, scene.length(1000.0), turning)
-        _write_csv(directory / "errors.csv", errors)
+        with (directory / "errors.csv").open("w", encoding="utf-8", newline="") as out:
+            writer = csv.DictWriter(out, fieldnames=list(errors[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(errors)
     except OSError as error:
         raise UsageError(f"cannot write to {directory}: {error.strerror}; choose another folder") from None
-    lines.append(
-        f"{directory / 'paths.xml'}: {len(fitted)} paths; OpenSim puts them in by their names, /forceset/MUSCLE"
-    )
-    return lines
+    return [
+        *lines,
+        f"{directory / 'paths.xml'}: {len(fitted)} paths; OpenSim puts them in by their names, /forceset/MUSCLE",
+    ]
 
 
-def held_out_errors(
-    path: FittedPath, values: np.ndarray, lengths: np.ndarray, arms: np.ndarray
-) -> dict[str, float]:
-    """Return root mean square and greatest errors of length and arms at poses that the fit has not seen."""
-    length, arm = path.length(values) - lengths, path.arms(values) - arms
-    return {
-        "held_out": len(values),
-        "length_rms": float(np.sqrt(np.mean(length**2))),
-        "length_max": float(np.abs(length).max()),
-        "arm_rms": float(np.sqrt(np.mean(arm**2))),
-        "arm_max": float(np.abs(arm).max()),
-    }
-
-
-def _write_csv(file, rows):
-    with file.open("w", encoding="utf-8", newline="") as out:
-        writer = csv.DictWriter(out, fieldnames=list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+def _fit(found):
+    """The path of a muscle, and its errors at poses that the fit has not seen."""
+    solved = np.isfinite(found.lengths)
+    held = np.arange(len(solved)) % HELD_OUT == HELD_OUT - 1
+    use, out, failed = solved & ~held, solved & held, int((~solved).sum())
+    if use.sum() < 2 * (len(found.coordinates) + 1) or not out.any():
+        raise SolveError(
+            f"muscle {found.muscle!r}: {failed} of {len(solved)} poses failed, too few are left to fit"
+        )
+    parts = (found.values[use], found.lengths[use], found.arms[use])
+    path = fit_path(found.muscle, found.coordinates, *parts, most=HIGHEST_ORDER)
+    row = {"muscle": path.muscle, "order": path.order, "fitted": int(use.sum()), "failed": failed}
+    row["held_out"] = int(out.sum())
+    for name, error in (
+        ("length", path.length(found.values[out]) - found.lengths[out]),
+        ("arm", path.arms(found.values[out]) - found.arms[out]),
+    ):
+        row |= {f"{name}_rms": float(np.sqrt(np.mean(error**2))), f"{name}_max": float(np.abs(error).max())}
+    return path, row

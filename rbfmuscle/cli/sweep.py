@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from cyclopts import Parameter
-
-from rbfmuscle.cli.run import Json, Output
-from rbfmuscle.cli.scenes import load_scene
+from rbfmuscle.cli.options import Frames, Json, Model, Output, Settings, Texts
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import SolveError, UsageError, did_you_mean
 
@@ -18,16 +15,13 @@ if TYPE_CHECKING:
     from rbfmuscle.scene.scene import Scene
 
 
-Texts = Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)]
-
-
 def sweep(
     *scenes: str,
     output: Output,
     grid: Texts = None,
-    model: str | None = None,
-    settings: Annotated[list[str] | None, Parameter(name="--set", negative="")] = None,
-    frames: str | None = None,
+    model: Model = None,
+    settings: Settings = None,
+    frames: Frames = None,
     reference: Texts = None,
     jobs: int | None = None,
     cluster: str | None = None,
@@ -42,17 +36,9 @@ def sweep(
     ----------
     scenes
         Scene files (TOML), or "phantom" for the embedded hip.
-    output
-        Folder for the results.
     grid
         KEY=a,b,c with keys as for run --set, for instance model.centres=100,200,300; MODEL:KEY=a,b for one
         model of a grid with model=...
-    model
-        Model of every muscle, in place of the scenes'.
-    settings
-        KEY=VALUE for all points, as for run --set.
-    frames
-        Frames of the motions, as A:B:S.
     reference
         KEY=VALUE settings of the reference that errors are measured against; by default the finest values
         of the grid.
@@ -62,13 +48,12 @@ def sweep(
         Address of a Dask scheduler, for instance tcp://127.0.0.1:8786; its workers must see the folder.
     error
         The quantity that the front trades against time.
-    as_json
-        Print JSON and nothing else.
     """
     from rbfmuscle import interruption
     from rbfmuscle.experiments.sweep import parse_grid, plan_sweep
     from rbfmuscle.experiments.sweep_run import VALUES, run_sweep
     from rbfmuscle.models import configure_scene
+    from rbfmuscle.scene.phantom import open_scene
     from rbfmuscle.scene.settings import parse_settings
 
     if error not in VALUES:
@@ -79,7 +64,7 @@ def sweep(
     if not scenes or (len(scenes) == 1 and not axes):
         raise UsageError("a sweep needs several scenes, or a grid, for instance --grid model.centres=100,200")
     loaded = {
-        name: configure_scene(load_scene(path), changes, model=model) for name, path in _names(scenes).items()
+        name: configure_scene(open_scene(path), changes, model=model) for name, path in _names(scenes).items()
     }
     points = plan_sweep(loaded, axes, frames=frames, reference=parse_settings(reference))
     for point in points:  # a mistyped key is reported now, not after the first point
@@ -94,14 +79,15 @@ def sweep(
     _finish(points, output, {name: scene.units for name, scene in loaded.items()}, error, as_json)
 
 
-def _names(scenes: tuple[str, ...]) -> dict[str, str]:
-    """Scene files by what tells them apart: their own names, or those of their folders."""
-    names = [Path(path).stem for path in scenes]
-    if len(set(names)) < len(names):
-        names = [Path(path).resolve().parent.name for path in scenes]
-    if len(set(names)) < len(names):
-        raise UsageError("scenes of a sweep need different names, or folders of different names")
-    return dict(zip(names, scenes))
+def _names(scenes):
+    """Scene files by their names, or by those of their folders where names are the same."""
+    for names in (
+        [Path(path).stem for path in scenes],
+        [Path(path).resolve().parent.name for path in scenes],
+    ):
+        if len(set(names)) == len(names):
+            return dict(zip(names, scenes))
+    raise UsageError("scenes of a sweep need different names, or folders of different names")
 
 
 def run_point(scene: Scene, settings: dict[str, Any], frames: str | None) -> Run:
@@ -126,10 +112,7 @@ def _finish(points, output, units, error, as_json):
         print(f"{table['done']} points done, {table['failed']} failed, in {output}, open {output}/sweep.html")
     bad = [row for row in table["rows"] if row["status"] != "done"]
     for row in bad[:5]:
-        print(
-            f"rbfmuscle: {row['scene']} {row['label']}: {row['error'] or row['status']}",
-            file=sys.stderr,
-        )
+        print(f"rbfmuscle: {row['scene']} {row['label']}: {row['error'] or row['status']}", file=sys.stderr)
     if bad:
         raise SolveError(
             f"{len(bad)} of {len(table['rows'])} points failed; the others are kept, the same command runs these again"

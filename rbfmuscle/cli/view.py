@@ -6,24 +6,20 @@ import tempfile
 import threading
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from rbfmuscle.cli.scenes import load_scene
+from rbfmuscle.cli.options import Model, Texts
 from rbfmuscle.progress import Progress, stage
 from rbfmuscle.validation import UsageError, did_you_mean
-
-if TYPE_CHECKING:
-    from rbfmuscle.output.saved import SavedRun
-    from rbfmuscle.scene.scene import Scene
 
 
 def view(
     scene: Annotated[Path, Parameter(name=["scene", "--scene"])],
     *,
-    model: str | None = None,
-    at: Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)] = None,
+    model: Model = None,
+    at: Texts = None,
     colour: Literal["group", "activation", "stretch", "penetration", "distance"] = "group",
     browser: bool = True,
     port: int = 0,
@@ -35,8 +31,6 @@ def view(
     ----------
     scene
         Scene file (TOML), "phantom" for the embedded hip, or the folder of a run or of a comparison.
-    model
-        Model to begin with, in place of the scene's.
     at
         COORDINATE=DEGREES to begin at, for instance hip.flexion=60; may be repeated. Of a saved run: frame=N.
     colour
@@ -48,9 +42,11 @@ def view(
     screenshot
         Draw this PNG at --at, without a display, and open nothing.
     """
+    from rbfmuscle.scene.phantom import open_scene
+
     stops = dict(_parse_stop(text) for text in at or [])
     with Progress(f"view {scene.name}"):
-        opened = _open_runs(scene) if scene.is_dir() else load_scene(str(scene))
+        opened = _open_runs(scene) if scene.is_dir() else open_scene(scene)
         if screenshot is not None:
             with stage("drawing the picture"):
                 _draw(opened, model, stops, screenshot, colour)
@@ -69,7 +65,7 @@ def view(
     threading.Event().wait()
 
 
-def _parse_stop(text: str) -> tuple[str, float]:
+def _parse_stop(text):
     name, _, value = text.partition("=")
     try:
         return name, float(value)
@@ -77,14 +73,14 @@ def _parse_stop(text: str) -> tuple[str, float]:
         raise UsageError(f"--at {text!r} is not COORDINATE=DEGREES, for instance hip.flexion=60") from None
 
 
-def _check_stops(stops: dict[str, float], known: Any) -> None:
+def _check_stops(stops, known):
     for name in stops:
         if name not in known:
             raise UsageError(f"--at: unknown coordinate {name!r}, {did_you_mean(name, list(known))}")
 
 
-def _open_runs(folder: Path) -> dict[str, SavedRun]:
-    """The run in a folder, or those of the models of a comparison."""
+def _open_runs(folder):
+    """The run in a folder, or those of the models of a comparison, by name."""
     from rbfmuscle.output.saved import SavedRun
 
     inside = sorted(path.parent for path in folder.glob("*/run.json"))
@@ -93,9 +89,7 @@ def _open_runs(folder: Path) -> dict[str, SavedRun]:
     return {path.name: SavedRun(path) for path in inside}
 
 
-def _draw(
-    opened: Scene | dict[str, SavedRun], model: str | None, stops: dict[str, float], path: Path, colour: str
-) -> None:
+def _draw(opened, model, stops, path, colour):
     """Draw a run's frame, or a scene's pose after a run to it, in the way `rbfmuscle render` does."""
     from rbfmuscle.report.render import render_run
 
@@ -105,18 +99,15 @@ def _draw(
     path.parent.mkdir(parents=True, exist_ok=True)
     if isinstance(opened, dict):
         _check_stops(stops, ["frame"])
-        frame = stops.get("frame")
         saved = next(iter(opened.values()))
-        render_run(
-            saved.directory, path, frame=saved.frames[0] if frame is None else int(frame), colour=colour
-        )
+        render_run(saved.directory, path, frame=int(stops.get("frame", saved.frames[0])), colour=colour)
         return
     with tempfile.TemporaryDirectory() as folder:
         _run_to(opened, model, stops, folder)
         render_run(folder, path, colour=colour)
 
 
-def _run_to(scene: Scene, model: str | None, stops: dict[str, float], folder: str) -> None:
+def _run_to(scene, model, stops, folder):
     """Run a scene from rest to one pose, and write that frame."""
     from rbfmuscle.run import stream_run
     from rbfmuscle.scene.motion import inner_value, rest_coordinates
@@ -127,5 +118,4 @@ def _run_to(scene: Scene, model: str | None, stops: dict[str, float], folder: st
     rest = rest_coordinates(scene)
     scene = scene.copy()
     scene.motion = Motion([rest, rest | {name: inner_value(scene, name, x) for name, x in stops.items()}])
-    settings = {"output.report": False, "output.preview": False}
-    stream_run(scene, folder, model=model, settings=settings, pictures=False)
+    stream_run(scene, folder, model=model, settings={"output.report": False, "output.preview": False})

@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.output.meshfiles import SUFFIXES, read_mesh
+from rbfmuscle.simulation.frame import Event, Frame, ModelSurface
 from rbfmuscle.validation import UsageError
 
 # Coordinates that a caption names at most.
@@ -162,6 +164,34 @@ class SavedRun:
         text = path.read_text(encoding="utf-8")
         whole = text[: text.rfind("\n") + 1]  # the last line of a run that was killed may be cut
         return list(csv.reader(io.StringIO(whole, newline="")))[1:]
+
+
+class _SavedSurfaces(Mapping[str, ModelSurface]):
+    """Surfaces of the muscles in a frame, each read when it is asked for."""
+
+    def __init__(self, saved: SavedRun, frame: int) -> None:
+        self._saved, self._frame = saved, frame
+
+    def __getitem__(self, muscle: str) -> ModelSurface:
+        return ModelSurface(*self._saved.surface(muscle, self._frame))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._saved.muscles if self._saved.suffix is not None else [])
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+
+def saved_frames(saved: SavedRun) -> list[Frame]:
+    """The frames of a saved run, without what no file holds: material surfaces and times of single muscles."""
+    units, found = saved.info["scene"].get("coordinate_units", {}), []
+    for entry in saved.info["frames"]:
+        index = entry["frame"]
+        angles = {n: v if n in units else math.radians(v) for n, v in entry["coordinates"].items()}
+        events = [Event(*row) for row in saved.events if row[0] == index]
+        surfaces = _SavedSurfaces(saved, index)
+        found.append(Frame(index, angles, saved.poses[index], surfaces, {}, events, {}, entry["wall"]))
+    return found
 
 
 def coordinate_texts(info: Mapping[str, Any], entry: Mapping[str, Any]) -> list[str]:

@@ -33,7 +33,7 @@ class Bone:
     """A rigid body: its mesh (outward, rest pose), where it came from, what was mended."""
 
     name: str
-    mesh: trimesh.Trimesh
+    mesh: trimesh.Trimesh = field(repr=False)
     source: str = ""
     closed: bool = True
     notes: list[str] = field(default_factory=list)
@@ -44,7 +44,7 @@ class Attachment:
     """Vertices (n,) of a muscle's mesh that move with a bone."""
 
     bone: str
-    vertices: Integers
+    vertices: Integers = field(repr=False)
 
 
 @dataclass
@@ -55,11 +55,11 @@ class Muscle:
     """
 
     name: str
-    mesh: trimesh.Trimesh
+    mesh: trimesh.Trimesh = field(repr=False)
     model: str = "rbf"
     options: dict[str, Any] = field(default_factory=dict)
     attachments: list[Attachment] = field(default_factory=list)
-    fibres: list[Floats] | None = None
+    fibres: list[Floats] | None = field(default=None, repr=False)
     source: str = ""
     notes: list[str] = field(default_factory=list)
     contraction: ContractionTable | None = None

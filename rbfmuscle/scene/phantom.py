@@ -6,6 +6,7 @@ A right hip in millimetres with the joint's centre at the origin: +x medial, +y 
 from __future__ import annotations
 
 import functools
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from rbfmuscle.scene.phantom_shapes import (
 )
 from rbfmuscle.scene.scene import Scene
 
+PHANTOM = "phantom"
 HEAD_RADIUS = 23.0
 SOCKET_RADIUS = 26.5
 AXES = {"flexion": (-1, 0, 0), "adduction": (0, -1, 0), "internal_rotation": (0, 0, 1)}
@@ -179,3 +181,20 @@ def phantom_scene(*, model: str = "rbf", end: float = 90.0, step: float = 2.0, s
     scene.set_motion(ramp={"hip.flexion": {"from": 0.0, "to": float(end), "step": float(step)}})
     scene.detect = DetectOptions(tunnelling=TunnellingOptions())
     return scene
+
+
+def open_scene(scene: Scene | str | Path, *, skeleton: bool = False) -> Scene:
+    """Return the scene of a file; the embedded hip for "phantom" where there is no file of that name.
+
+    Parameters
+    ----------
+    scene : path, "phantom" or Scene
+        A Scene is returned as it is.
+    skeleton : bool
+        As for `Scene.load`.
+    """
+    if isinstance(scene, Scene):
+        return scene
+    if str(scene) == PHANTOM and not Path(scene).exists():
+        return phantom_scene()
+    return Scene.load(scene, skeleton=skeleton)

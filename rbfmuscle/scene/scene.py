@@ -1,12 +1,17 @@
 """`Scene`: the data of a scene with the functions that load, build, check and change it as methods."""
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 from rbfmuscle.scene import build
 from rbfmuscle.scene.check import check_scene
 from rbfmuscle.scene.file import describe_scene, load_scene
 from rbfmuscle.scene.objects import SceneData
 from rbfmuscle.scene.settings import change_scene
+
+if TYPE_CHECKING:
+    import rbfmuscle
 
 
 class Scene(SceneData):
@@ -41,8 +46,17 @@ class Scene(SceneData):
     with_options = change_scene
     resolved = describe_scene
 
-    def show(self, *, model: str | None = None) -> Any:
+    def show(self, *, model: str | None = None) -> rbfmuscle.Page:
         """Show the scene in a browser or a notebook, to be moved by hand; see `rbfmuscle.show`."""
         import rbfmuscle  # Scenes know nothing of viewers; the facade does.
 
         return rbfmuscle.show(self, model=model)
+
+    def _repr_html_(self) -> str:
+        import rbfmuscle
+
+        bones, muscles = (
+            {item.name: (item.mesh.vertices, item.mesh.faces) for item in items}
+            for items in (self.bones, self.muscles)
+        )
+        return rbfmuscle.figure_html(bones, muscles, repr(self))

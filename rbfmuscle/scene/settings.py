@@ -17,6 +17,7 @@ from rbfmuscle.validation import SceneError, UsageError, did_you_mean
 
 S = TypeVar("S", bound=SceneData)
 TABLES = ("contact", "sliding", "detect", "output", "motion")
+HEADS = ("model", "muscle", *KEYS, *TABLES)
 
 
 def change_scene(
@@ -94,7 +95,7 @@ def _apply(scene, key, value):
     elif head in KEYS:
         _set_contraction(muscles, scene, head, rest, value)
     elif head not in TABLES:
-        raise SceneError(f"{key}: unknown setting, {did_you_mean(head, ['model', 'muscle', *KEYS, *TABLES])}")
+        raise SceneError(f"{key}: unknown setting, {did_you_mean(head, HEADS)}")
     elif not rest:
         raise SceneError(f"{key}: name a key of the table, for instance {head}.KEY=VALUE")
     elif head == "motion":

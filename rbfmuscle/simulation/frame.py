@@ -47,11 +47,11 @@ class ModelSurface:
         An earlier surface and the rigid motion since, where the muscle moved rigidly.
     """
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    vertices: np.ndarray = field(repr=False)
+    faces: np.ndarray = field(repr=False)
     quantities: dict = field(default_factory=dict)
     notes: list = field(default_factory=list)
-    origin: Any = None
+    origin: Any = field(default=None, repr=False)
 
 
 @dataclass
@@ -86,11 +86,11 @@ class Frame:
 
     index: int
     coordinates: dict
-    poses: dict
-    surfaces: dict
-    carried: dict
+    poses: dict = field(repr=False)
+    surfaces: Mapping[str, ModelSurface] = field(repr=False)
+    carried: dict = field(repr=False)
     events: list
-    times: dict
+    times: dict = field(repr=False)
     wall: float
     activations: dict = field(default_factory=dict)
     work: dict = field(default_factory=dict)

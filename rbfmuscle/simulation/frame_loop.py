@@ -146,7 +146,7 @@ class FrameLoop:
     def finish(self, frame: Frame, drawn: Iterable[tuple[ModelSurface, float]]) -> Frame:
         """Add surfaces and the time since the last frame."""
         for name, (surface, seconds) in zip(frame.carried, drawn):
-            frame.surfaces[name] = surface
+            frame.surfaces = {**frame.surfaces, name: surface}
             frame.events.extend(Event(frame.index, name, *note) for note in surface.notes)
             for key in ("time_surface", "time_frame"):
                 frame.times[name][key] = frame.times[name].get(key, 0.0) + seconds

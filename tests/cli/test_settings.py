@@ -1,17 +1,17 @@
 """``--set``: every key that the schemas document, from the command line into the run."""
 
-import importlib
 import inspect
+import itertools
 import json
-import pkgutil
 import re
+import typing
 
 import pytest
 from blend_model import arm_files
 from command_line import call
 
 from pbd_baseline.options import PBDOptions
-from rbfmuscle import cli
+from rbfmuscle.cli.app import GROUPS
 from rbfmuscle.models import MODEL_NAMES
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.scene import options
@@ -179,11 +179,10 @@ def test_the_name_of_a_model_decides_its_method(scene_file, tmp_path, capsys):
 def test_flag_without_a_negative_is_off_by_default():
     """``--json`` has no ``--no-json``: were it on by default, nobody could turn it off."""
     found = []
-    for module in pkgutil.walk_packages(cli.__path__, cli.__name__ + "."):
-        for name, function in inspect.getmembers(importlib.import_module(module.name), inspect.isfunction):
-            for key, parameter in inspect.signature(function).parameters.items():
-                bare = re.search(r"negative=(''|\"\"|\(\))", str(parameter.annotation))
-                if bare and isinstance(parameter.default, bool):
-                    found.append((name, key))
-                    assert parameter.default is False, (name, key)
+    for command in itertools.chain(*GROUPS.values()):
+        hints = typing.get_type_hints(command, include_extras=True)
+        for key, parameter in inspect.signature(command).parameters.items():
+            if re.search(r"negative=(''|\"\"|\(\))", str(hints[key])) and isinstance(parameter.default, bool):
+                found.append((command.__name__, key))
+                assert parameter.default is False, found[-1]
     assert len(found) >= 8, found

@@ -114,7 +114,7 @@ class Joint:
     name: str
     parent: str
     child: str
-    frame: np.ndarray
+    frame: np.ndarray = field(repr=False)
     coordinates: dict[str, Coordinate]
     rotations: tuple[TransformAxis, ...] = ()
     translations: tuple[TransformAxis, ...] = ()

@@ -54,8 +54,8 @@ class ReadMesh:
         The file.
     """
 
-    mesh: trimesh.Trimesh
-    vertex_map: Integers
+    mesh: trimesh.Trimesh = field(repr=False)
+    vertex_map: Integers = field(repr=False)
     notes: list[str] = field(default_factory=list)
     closed: bool = True
     source: str = ""

@@ -1,0 +1,22 @@
+"""Options that several commands take."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+SceneName = Annotated[Path, Parameter(help='Scene file (TOML), or "phantom" for the embedded hip.')]
+Output = Annotated[Path, Parameter(name=["--output", "-o"], help="Folder for the results.")]
+Model = Annotated[str | None, Parameter(help="Model of every muscle, in place of the scene's.")]
+Settings = Annotated[
+    list[str] | None,
+    Parameter(
+        name="--set",
+        negative="",
+        help="KEY=VALUE, for instance model.centres=200 or contact.substep_angle=1; may be repeated.",
+    ),
+]
+Frames = Annotated[str | None, Parameter(help="Frames of the motion, as A:B:S (B not included).")]
+Json = Annotated[bool, Parameter(name="--json", negative="", help="Print JSON and nothing else.")]
+Flag = Annotated[bool, Parameter(negative="")]
+Texts = Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)]

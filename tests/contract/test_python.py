@@ -1,0 +1,136 @@
+"""The Python interface as a user meets it: names, types, runs in memory and in folders, notebooks."""
+
+import ast
+import subprocess
+import sys
+import types
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+import rbfmuscle as rm
+
+SCRIPT = ROOT / "tests" / "data" / "user_script.py"
+
+
+@pytest.fixture(scope="module")
+def run():
+    scene = rm.phantom_scene(end=4.0, step=2.0, spacing=6.0)
+    scene.muscles = [scene.muscle("abductor")]
+    return rm.simulate(scene, model="pbd")
+
+
+@pytest.fixture(scope="module")
+def loaded(run, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    run.save(folder, pictures=False)
+    return rm.Run.load(folder)
+
+
+def test_names_are_what_a_user_needs_and_types_know_them():
+    assert dir(rm) == sorted(rm.__all__)
+    tree = ast.parse((ROOT / "rbfmuscle" / "__init__.py").read_text(encoding="utf-8"))
+    (block,) = [node for node in tree.body if isinstance(node, ast.If)]
+    typed = {alias.asname: node.module for node in block.body for alias in node.names}
+    assert typed == {**rm._HOME, **rm._INNER}
+
+
+def test_user_script_is_typed_and_runs(tmp_path):
+    planted = tmp_path / "planted.py"
+    planted.write_text("import rbfmuscle as rm\nrun = rm.simulate('phantom')\nrun.mussels\nrm.Scene(units=3)\n")
+    words = ["--strict", "--config-file=", "--follow-imports=silent", f"--cache-dir={tmp_path}"]
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", *words, str(SCRIPT), str(planted)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    found = [line for line in done.stdout.splitlines() if ": error:" in line]
+    assert len(found) == 2 and all("planted.py" in line for line in found), done.stdout
+    done = subprocess.run([sys.executable, SCRIPT, tmp_path], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("2 ['abductor'] True ") and "3 nowhere.toml: no such scene file" in done.stdout
+
+
+def test_scene_is_given_as_a_word_or_a_path(run, monkeypatch, tmp_path):
+    given = []
+    monkeypatch.setattr("rbfmuscle.run.Recording", lambda scene, **options: given.append(scene) or pytest.skip)
+    with pytest.raises(AttributeError):
+        rm.simulate("phantom", frames="0:1")
+    assert given[0].name == "phantom_hip" and len(given[0].motion) == 1
+    with pytest.raises(rm.SceneError, match=r"none\.toml: no such scene file"):
+        rm.simulate(tmp_path / "none.toml")
+
+
+def test_run_answers_as_a_container(run):
+    assert len(run) == len(run.frames) == 3
+    assert "abductor" in run and "abducter" not in run
+    assert run.muscles == [muscle.name for muscle in run] == ["abductor"]
+    assert {"volume_error", "penetration_max", "length"} <= set(run.quantities)
+    with pytest.raises(rm.UsageError, match=r"unknown muscle 'abducter', did you mean 'abductor'\?"):
+        run["abducter"]
+    with pytest.raises(rm.UsageError, match="frame 3 is out of range, the run has 3 frames"):
+        run["abductor"].surface(3)
+
+
+def test_run_that_is_loaded_is_the_run_that_was_saved(run, loaded, tmp_path):
+    assert (len(loaded), loaded.muscles, loaded.verdict) == (3, run.muscles, run.verdict)
+    for mine, other in zip(run.frames, loaded.frames, strict=True):
+        assert other.coordinates == pytest.approx(mine.coordinates)
+        np.testing.assert_array_equal(other.poses["femur"], mine.poses["femur"])
+        assert list(other.surfaces) == ["abductor"]
+    np.testing.assert_allclose(loaded["abductor"].surface().vertices, run["abductor"].surface().vertices, rtol=1e-6)
+    np.testing.assert_array_equal(loaded.values("abductor", "length"), run.values("abductor", "length"))
+    loaded.save(tmp_path / "copy")
+    assert len(rm.Run.load(tmp_path / "copy")) == 3
+    with pytest.raises(rm.UsageError, match="holds no run"):
+        rm.Run.load(tmp_path)
+
+
+def test_run_in_memory_is_exported_like_a_saved_one(run, loaded, tmp_path):
+    names = [[file.name for file in one.export(tmp_path / str(k), ["stl"])] for k, one in enumerate((run, loaded))]
+    assert names[0] == names[1] and "abductor_0002.stl" in names[0]
+
+
+def test_metrics_as_a_table_where_pandas_is_there(run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(rm.MissingPartError, match="pip install pandas"):
+        run.table()
+    fake = types.SimpleNamespace(DataFrame=lambda rows, columns: [dict(zip(columns, row)) for row in rows])
+    monkeypatch.setitem(sys.modules, "pandas", fake)
+    assert [row["value"] for row in run.table() if row["quantity"] == "length"] == list(
+        run.values("abductor", "length")
+    )
+
+
+def test_plot_shows_every_value(run):
+    import matplotlib
+
+    matplotlib.use("Agg")
+    (line,) = run.plot("length").lines
+    np.testing.assert_array_equal(line.get_ydata(), run.values("abductor", "length"))
+    with pytest.raises(rm.UsageError, match="did you mean 'length'"):
+        run.plot("lenght")
+
+
+def test_notebooks_show_a_small_picture(run, loaded):
+    for shown in (run.scene, run, loaded):
+        html = shown._repr_html_()
+        assert html.startswith("<figure><img src") and len(html) < 200_000 and "abductor" in html
+    assert "no muscles" in rm.Scene("bare")._repr_html_()
+
+
+def test_no_repr_fills_the_screen(run):
+    frame = run.frames[-1]
+    scene = run.scene
+    things = [scene, run, frame, frame.surfaces["abductor"], scene.bones[0], scene.muscles[0], scene.joints[0]]
+    things += [run["abductor"], scene.motion, rm.BoneSDF.from_mesh(scene.bones[1].mesh)]
+    mesh = scene.muscles[0].mesh
+    things.append(rm.RBFField.fit_hermite(mesh.vertices[::40], mesh.vertex_normals[::40], kernel="cubic"))
+    assert {type(thing).__name__: len(repr(thing)) for thing in things if len(repr(thing)) > 700} == {}
+
+
+def test_setting_without_its_table_is_named_with_it():
+    with pytest.raises(rm.UsageError, match=r"centres: unknown setting, did you mean 'model\.centres'\?"):
+        rm.simulate("phantom", settings={"centres": 300})
