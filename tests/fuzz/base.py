@@ -36,9 +36,7 @@ def write_mesh(path: Path, mesh: trimesh.Trimesh, form: str) -> Path:
     """Write a mesh in one of ``FORMS``."""
     kind, *how = form.split("-")
     if kind == "stl":
-        path.write_bytes(
-            mesh.export(file_type="stl") if not how else mesh.export(file_type="stl_ascii").encode()
-        )
+        path.write_bytes(mesh.export(file_type="stl_ascii").encode() if how else mesh.export(file_type="stl"))
     elif kind == "ply":
         path.write_bytes(mesh.export(file_type="ply", encoding="ascii" if how else "binary"))
     elif kind == "obj":
@@ -99,6 +97,9 @@ def write_base(folder: Path) -> dict[str, bytes]:
 
 def base_scene() -> dict:
     """The tables of the scene file, with a value for every key that a small scene can have."""
+    axes = {"flexion": [0.0, 1.0, 0.0], "turn": [0.0, 0.0, 1.0]}
+    model = {"name": "rbf", "centres": 60, "samples": 200, "resolution": 16, "iterations": 4}
+    attach = [{"bone": bone, "vertices": f"{bone}.txt"} for bone in ("upper", "lower")]
     return {
         "scene": {"format": 1, "name": "small", "units": "mm"},
         "defaults": {"model": "rbf"},
@@ -107,27 +108,11 @@ def base_scene() -> dict:
             {"name": "lower", "mesh": "lower.ply", "scale": 1.0},
         ],
         "joint": [
-            {
-                "name": "hip",
-                "parent": "upper",
-                "child": "lower",
-                "centre": [0.0, 0.0, 0.0],
-                "axes": {"flexion": [0.0, 1.0, 0.0], "turn": [0.0, 0.0, 1.0]},
-            }
+            {"name": "hip", "parent": "upper", "child": "lower", "centre": [0.0, 0.0, 0.0], "axes": axes}
         ],
         "motion": {"ramp": {"hip.flexion": {"from": 0.0, "to": 6.0, "step": 3.0}}},
-        "muscle": [
-            {
-                "name": "muscle",
-                "mesh": "muscle-ply.ply",
-                "model": {"name": "rbf", "centres": 60, "samples": 200, "resolution": 16, "iterations": 4},
-                "attach": [
-                    {"bone": "upper", "vertices": "upper.txt"},
-                    {"bone": "lower", "vertices": "lower.txt"},
-                ],
-            }
-        ],
+        "muscle": [{"name": "muscle", "mesh": "muscle-ply.ply", "model": model, "attach": attach}],
         "contact": {"initial": "resolve", "substep_angle": 3.0},
-        "detect": {"tunnelling": {"action": "substep"}},
+        "detect": {"tunnelling": {"angle": 135.0, "action": "substep"}},
         "output": {"report": False, "preview": False},
     }

@@ -26,22 +26,8 @@ HOSTILE = (
     nested(30), nested(1000), nested(100000), Raw("'''a'''"), Raw("{ a = 1, a = 2 }"), Raw("?"),
 )  # fmt: skip
 KEYS = (
-    "x",
-    "name",
-    "mesh",
-    "model",
-    "axes",
-    "from",
-    "step",
-    "scale",
-    "attach",
-    "near",
-    "type",
-    "",
-    "a.b",
-    "😀",
-    "\x07",
-)
+    "x", "name", "mesh", "model", "axes", "from", "step", "scale", "attach", "near", "type", "", "a.b", "😀", "\x07",
+)  # fmt: skip
 
 
 def scene_text(rng: np.random.Generator, *, deep: bool = False) -> str:
@@ -94,46 +80,39 @@ def _number(rng):
 
 
 def _motion(scene, rng):
-    kind, name = rng.integers(6), pick(rng, ["hip.flexion", "flexion", "hip.turn", "turn", "knee.flexion"])
+    name = pick(rng, ["hip.flexion", "flexion", "hip.turn", "turn", "knee.flexion"])
     step = abs(_number(rng)) if rng.random() < 0.7 else 3.0
-    if kind == 0:
-        scene["motion"] = {"ramp": {name: {"from": _number(rng), "to": _number(rng), "step": step}}}
-    elif kind == 1:
-        scene["motion"] = {
-            "ramp": {name: {"to": 10.0 ** rng.uniform(0, 9), "step": 10.0 ** rng.uniform(0, 8)}}
-        }
-    elif kind == 2:
-        count = int(rng.choice([1, 2, 5, 2000]))
-        stops = [{name: float(rng.normal(0, 60))} for _ in range(count)]
-        scene["motion"] = {"waypoints": stops, "step": step}
-    elif kind == 3:
-        scene["motion"] = {"waypoints": [{name: _number(rng)}, {"turn": _number(rng)}], "step": step}
-    elif kind == 4:
-        scene["motion"] = {
-            "file": pick(rng, ["flex.mot", "none.mot", "upper.ply", ".", "/dev/zero", "upper.txt"])
-        }
-    else:
-        scene["motion"] = pick(rng, HOSTILE)
+    count = int(rng.choice([1, 2, 5, 2000]))
+    scene["motion"] = pick(
+        rng,
+        (
+            {"ramp": {name: {"from": _number(rng), "to": _number(rng), "step": step}}},
+            {"ramp": {name: {"to": 10.0 ** rng.uniform(0, 9), "step": 10.0 ** rng.uniform(0, 8)}}},
+            {"waypoints": [{name: float(rng.normal(0, 60))} for _ in range(count)], "step": step},
+            {"waypoints": [{name: _number(rng)}, {"turn": _number(rng)}], "step": step},
+            {"file": pick(rng, ["flex.mot", "none.mot", "upper.ply", ".", "/dev/zero", "upper.txt"])},
+            pick(rng, HOSTILE),
+        ),
+    )
 
 
 def _joint(scene, rng):
     joint = pick(rng, scene["joint"]) if scene.get("joint") and isinstance(scene["joint"], list) else None
     if not isinstance(joint, dict):
         return
-    kind = rng.integers(5)
-    if kind == 0:
-        joint["centre"] = [_number(rng) for _ in range(3)]
-    elif kind == 1:
-        joint["axes"] = {"flexion": [_number(rng) for _ in range(3)]}
-    elif kind == 2:
-        joint["child"], joint["parent"] = (
-            pick(rng, ["upper", "lower", "muscle", ""]),
-            pick(rng, ["upper", "lower"]),
-        )
-    elif kind == 3:
-        joint["type"] = pick(rng, ["hinge", "slider", "free", "fixed", "custom", "ball", "bal", 3])
-    else:
+    axis = [_number(rng) for _ in range(3)]
+    changes = (
+        {"centre": axis},
+        {"axes": {"flexion": axis}},
+        {"child": pick(rng, ["upper", "lower", "muscle", ""]), "parent": pick(rng, ["upper", "lower"])},
+        {"type": pick(rng, ["hinge", "slider", "free", "fixed", "custom", "ball", "bal", 3])},
+        None,
+    )
+    change = pick(rng, changes)
+    if change is None:
         scene["joint"] = scene["joint"] * 2
+    else:
+        joint.update(change)
 
 
 def _attach(scene, rng):
@@ -178,23 +157,19 @@ def _model(scene, rng):
     muscle["model"] = pick(rng, [*HOSTILE[:10], "pbd", "xpbd"]) if rng.random() < 0.15 else model
 
 
+TABLES = (
+    ("contact", "substep_angle", [1e-300, 1e-9, 1e-3, 0.5, 90, 91, 0, -1]),
+    ("contact", "initial", ["keep", "error", "resolv"]),
+    ("sliding", "threshold", [1e-300, 0.5, 1e300, -1]),
+    ("sliding", "pairs", [[], [["muscle", "muscle"]], [["a", "b"]], [["muscle"]], 1]),
+    ("detect", "tunnelling", [{}, {"angle": 1e-300}, {"action": "rotate"}, 1]),
+    ("output", "surfaces", [False, True, {"format": "stl"}, {"format": "glb"}, {"format": "x"}]),
+    ("scene", "units", ["m", "cm", "km", 1]),
+)
+
+
 def _tables(scene, rng):
-    name, key, values = pick(
-        rng,
-        [
-            ("contact", "substep_angle", [1e-300, 1e-9, 1e-3, 0.5, 90, 91, 0, -1]),
-            ("contact", "initial", ["keep", "error", "resolv"]),
-            ("sliding", "threshold", [1e-300, 0.5, 1e300, -1]),
-            ("sliding", "pairs", [[], [["muscle", "muscle"]], [["a", "b"]], [["muscle"]], 1]),
-            (
-                "detect",
-                "tunnelling",
-                [{}, {"swept": False}, {"action": "rotate"}, 1],
-            ),
-            ("output", "surfaces", [False, True, {"format": "stl"}, {"format": "glb"}, {"format": "x"}]),
-            ("scene", "units", ["m", "cm", "km", 1]),
-        ],
-    )
+    name, key, values = pick(rng, TABLES)
     if isinstance(scene.get(name, {}), dict):
         scene.setdefault(name, {})[key] = pick(rng, values)
 
@@ -240,20 +215,18 @@ def _change_text(text, rng):
 
 def to_toml(scene: dict[str, Any]) -> str:
     """Tables as TOML: one level of headings, all else inline."""
-    lines = []
+    first, lines = [], []
     for name, table in scene.items():
         rows = (
-            table
-            if isinstance(table, list) and table and all(isinstance(row, dict) for row in table)
-            else None
+            table if isinstance(table, list) and table and all(isinstance(r, dict) for r in table) else None
         )
         if rows is None and not isinstance(table, dict):
-            lines.insert(0, f"{_key(name)} = {_value(table)}")
+            first.append(f"{_key(name)} = {_value(table)}")
             continue
         for row in [table] if rows is None else rows:
             lines.append(f"[{_key(name)}]" if rows is None else f"[[{_key(name)}]]")
             lines += [f"{_key(key)} = {_value(value)}" for key, value in row.items()]
-    return "\n".join(lines) + "\n"
+    return "\n".join(first + lines) + "\n"
 
 
 def _key(name):

@@ -22,6 +22,7 @@ from rbfmuscle.validation import SceneError
 
 BOX = trimesh.creation.box((10, 10, 10))
 DEG = math.pi / 180
+Q = {"axes": {"q": (1, 0, 0)}}
 
 
 def pair(units="mm", **row):
@@ -118,13 +119,10 @@ class TestKinds:
                 "linear needs a slope",
             ),
             (
-                {
-                    "axes": {"q": (1, 0, 0)},
-                    "coordinates": {"q": {"locked": True, "rest": 1.0, "default": 2.0}},
-                },
+                {**Q, "coordinates": {"q": {"locked": True, "rest": 1.0, "default": 2.0}}},
                 "locked coordinate stays",
             ),
-            ({"axes": {"q": (1, 0, 0)}, "coordinates": {"q": {"range": [3, 1]}}}, "range must go upwards"),
+            ({**Q, "coordinates": {"q": {"range": [3, 1]}}}, "range must go upwards"),
         ],
     )
     def test_wrong_tables_are_named(self, row, message):
@@ -244,14 +242,3 @@ class TestSteps:
         assert turn == pytest.approx(0.1, rel=1e-9)
         slide = pair(type="slider", axes={"s": (0, 1, 0)})
         assert step_angle(slide, {}, {"j.s": 5.0}) == pytest.approx(0.1)
-
-
-def test_custom_joint_that_equals_a_ball_gives_the_same_poses():
-    ball = pair(axes={"flexion": (-1, 0, 0), "turn": (0.2, 0.3, 0.9)})
-    row = joint_row(ball.joints[0])
-    axes = row.pop("axes")
-    row |= {"type": "custom", "rotations": [{"axis": a, "coordinates": [n]} for n, a in axes.items()]}
-    other = Scene("other").add_bone("a", BOX).add_bone("b", BOX)
-    other.place_joint(JointTable.build(row, place="").joint())
-    q = {"j.flexion": 0.7, "j.turn": -0.4}
-    assert np.array_equal(bone_poses(other, q)["b"], bone_poses(ball, q)["b"])

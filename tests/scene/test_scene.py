@@ -10,14 +10,7 @@ import trimesh
 from rbfmuscle.scene import options
 from rbfmuscle.scene.check import bone_collisions, check_initial
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.validation import (
-    LimitExceededError,
-    MeshError,
-    MissingPartError,
-    SceneError,
-    SolveError,
-    UsageError,
-)
+from rbfmuscle.validation import SceneError, UsageError
 
 TEXT = """
 [scene]
@@ -302,20 +295,3 @@ class TestCheck:
         assert depths[15] == pytest.approx(0.7, abs=0.3)
         assert depths[22] == pytest.approx(9, abs=1)
         assert bone_collisions(Scene.load(hip_data / "gluteus.toml")) == []
-
-
-def test_exit_codes_are_the_promised_ones(folder):
-    with pytest.raises(SceneError) as scene:
-        load(folder, ("step = 10", "step = 0"))
-    with pytest.raises(MeshError) as mesh:
-        load(folder, ('"biceps.ply"', '"bicep.ply"'))
-    assert (scene.value.exit_code, mesh.value.exit_code) == (3, 4)
-    promised = {
-        UsageError: 2,
-        SceneError: 3,
-        MeshError: 4,
-        SolveError: 5,
-        LimitExceededError: 6,
-        MissingPartError: 7,
-    }
-    assert all(error.exit_code == code for error, code in promised.items())

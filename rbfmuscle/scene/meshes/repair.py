@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import igl
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.validation import MeshError
 
 MERGE_TOLERANCE = 1e-7  # of the diagonal: float32 files repeat vertices to about this
@@ -48,8 +49,6 @@ def repair(vertices: Floats, faces: Integers, *, place: str, may_be_open: bool =
     MeshError
         If holes, non-manifold edges or several parts remain that cannot be mended safely.
     """
-    import igl
-
     bad = _repeated(faces)
     state = Repaired(vertices, faces[~bad], np.arange(len(vertices)))
     if bad.any():
@@ -64,11 +63,8 @@ def repair(vertices: Floats, faces: Integers, *, place: str, may_be_open: bool =
     state.vertex_map = new[state.vertex_map]
     if not _is_closed(state.faces):
         if may_be_open:
-            _, count, used = _edges(state.faces)
-            _drop_few(state, (count[used] > 2).any(axis=1), "at edges of more than two triangles")
+            _drop_crowded(state)
         _fill_holes(state, place)
-    if may_be_open:
-        _drop_few(state, _one_sided(state.faces), "where the surface has one side only")
     _orient(state, place)
     _check_closed(state, place, may_be_open)
     return state
@@ -92,25 +88,26 @@ def _check_closed(state, place, may_be_open):
                 f"{place}: the surface has {len(sizes)} separate parts (triangles: "
                 f"{', '.join(map(str, sizes[:5]))}); a muscle is one closed surface, split or join them"
             )
-        wrong = check_volume(state.vertices, state.faces, place=place)
+        wrong = _check_volume(state.vertices, state.faces, place=place)
         if wrong > TWISTED_NOTED:
             state.notes.append(f"the surface passes through itself over {100 * wrong:.2g} % of its area")
 
 
-def check_volume(vertices: Floats, faces: Integers, *, place: str) -> float:
-    """Raise MeshError unless a closed surface (n, 3), (m, 3) encloses a volume, once, over most of its area.
+def _check_volume(vertices, faces, *, place):
+    """Refuse a closed surface that does not enclose a volume, once, over most of its area.
 
     A flat or twisted surface may be closed and consistently oriented, and still have no inside. Returned is the
     share of its area that does not bound the inside.
     """
-    volume = float(_cones(vertices, faces).sum())
-    area = float(np.linalg.norm(_normals(vertices, faces), axis=1).sum() / 2.0)
-    if not volume > LEAST_COMPACTNESS * area**1.5:
+    import trimesh
+
+    mesh, volume = trimesh.Trimesh(vertices, faces, process=False), float(_cones(vertices, faces).sum())
+    if not volume > LEAST_COMPACTNESS * mesh.area**1.5:
         raise MeshError(
-            f"{place}: the surface encloses no volume ({volume:.3g}, of an area of {area:.3g}): it is flat or "
-            "twisted through itself; export the mesh again"
+            f"{place}: the surface encloses no volume ({volume:.3g}, of an area of {mesh.area:.3g}): it is flat "
+            "or twisted through itself; export the mesh again"
         )
-    wrong = _twisted_share(vertices, faces)
+    wrong = _twisted_share(mesh)
     if wrong > MOST_TWISTED:
         raise MeshError(
             f"{place}: the surface passes through itself, {100 * wrong:.0f} % of it does not bound its inside, so its "
@@ -119,27 +116,22 @@ def check_volume(vertices: Floats, faces: Integers, *, place: str) -> float:
     return wrong
 
 
-def _twisted_share(vertices, faces):
+def _twisted_share(mesh):
     """Share of the area with another winding number than 1 just behind it and 0 just before it, large faces asked."""
-    import igl
-
-    normals = _normals(vertices, faces)
-    length = np.linalg.norm(normals, axis=1)
-    chosen = np.argsort(-length, kind="stable")[:WINDING_SAMPLES]
-    chosen = chosen[length[chosen] > 0]
-    weight = length[chosen]
-    middle = vertices[faces[chosen]].mean(axis=1)
-    step = WINDING_STEP * normals[chosen] / np.sqrt(weight)[:, None]
+    chosen = np.argsort(-mesh.area_faces, kind="stable")[:WINDING_SAMPLES]
+    chosen = chosen[mesh.area_faces[chosen] > 0]
+    area, middle = mesh.area_faces[chosen], mesh.triangles_center[chosen]
+    step = WINDING_STEP * _normals(mesh.triangles[chosen]) / np.sqrt(2.0 * area)[:, None]
     asked = np.ascontiguousarray(np.concatenate([middle + step, middle - step]))
-    winding = igl.fast_winding_number(np.ascontiguousarray(vertices), np.ascontiguousarray(faces), asked)
-    before, behind = winding[: len(chosen)], winding[len(chosen) :]
+    vertices, faces = np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces)
+    before, behind = igl.fast_winding_number(vertices, faces, asked).reshape(2, -1)
     wrong = (np.abs(before) > 0.4) | (np.abs(behind - 1.0) > 0.4)
-    return float(weight[wrong].sum() / weight.sum())
+    return float(area[wrong].sum() / area.sum())
 
 
-def _normals(vertices: Floats, faces: Integers) -> Floats:
-    """Normals (m, 3) of triangles, twice as long as the area."""
-    a, b, c = vertices[faces].transpose(1, 0, 2)
+def _normals(triangles: Floats) -> Floats:
+    """Normals (m, 3) of triangles (m, 3, 3), twice as long as the area."""
+    a, b, c = triangles.transpose(1, 0, 2)
     return np.cross(b - a, c - a)
 
 
@@ -163,8 +155,6 @@ def _is_closed(faces):
 
 def _parts(faces: Integers) -> Integers:
     """Number of the connected part that each face belongs to."""
-    import igl
-
     return np.unique(igl.vertex_components(np.ascontiguousarray(faces))[faces[:, 0]], return_inverse=True)[1]
 
 
@@ -216,7 +206,7 @@ def _drop_fins(state):
 
 def _drop_crumbs(state, *, keep_parts):
     part = _parts(state.faces)
-    area = np.bincount(part, weights=np.linalg.norm(_normals(state.vertices, state.faces), axis=1))
+    area = np.bincount(part, weights=np.linalg.norm(_normals(state.vertices[state.faces]), axis=1))
     large = area >= CRUMB_LIMIT * area.max()
     if not large.all():
         state.faces = state.faces[large[part]]
@@ -250,21 +240,13 @@ def _fill_holes(state, place):
         state.notes.append(f"{filled} small holes closed")
 
 
-def _drop_few(state, wrong, what):
-    """Drop wrong triangles of a bone where they are few; its inside is then found by winding numbers."""
+def _drop_crowded(state):
+    """Drop triangles of a bone at edges of more than two where they are few; its inside is then found by winding."""
+    _, count, used = _edges(state.faces)
+    wrong = (count[used] > 2).any(axis=1)
     if wrong.any() and wrong.mean() < MOST_WRONG:
         state.faces = state.faces[~wrong]
-        state.notes.append(f"{int(wrong.sum())} triangles {what} dropped")
-
-
-def _one_sided(faces: Integers) -> Booleans:
-    """Triangles at edges that no consistent orientation uses once in either direction."""
-    import igl
-
-    oriented, _ = igl.bfs_orient(np.ascontiguousarray(faces))
-    sides = oriented * (int(faces.max()) + 1) + np.roll(oriented, -1, axis=1)
-    _, place, count = np.unique(sides, return_inverse=True, return_counts=True)
-    return np.asarray((count[place.reshape(-1, 3)] > 1).any(axis=1))
+        state.notes.append(f"{int(wrong.sum())} triangles at edges of more than two triangles dropped")
 
 
 def _rims(faces: Integers) -> list[Integers]:
@@ -290,8 +272,6 @@ def _orient(state, place):
 
     A consistent inner shell (a cavity of a bone) rightly faces the other way and stays.
     """
-    import igl
-
     faces = np.ascontiguousarray(state.faces)
     oriented, part = igl.bfs_orient(faces)
     sides = oriented * (int(faces.max()) + 1) + np.roll(oriented, -1, axis=1)
