@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     import trimesh
     from matplotlib.axes import Axes
 
-    from rbfmuscle.viewer.page import Page
+    import rbfmuscle
 
 
 def simulate(
@@ -366,7 +366,7 @@ class Run:
         names = [formats] if isinstance(formats, str) else list(formats)
         return export_run(self.saved.directory, names, output=directory, units=units, up=up)
 
-    def show(self) -> "Page":
+    def show(self) -> "rbfmuscle.Page":
         """Show the frames in a browser or a notebook; see `rbfmuscle.show`."""
         import rbfmuscle
 

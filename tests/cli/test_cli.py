@@ -11,6 +11,8 @@ import trimesh
 from command_line import call
 
 from rbfmuscle.cli.app import GROUPS
+from rbfmuscle.cli.run import SHOWN
+from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.scene.phantom import phantom_scene
 
 
@@ -66,10 +68,16 @@ def one_line(err):
 class TestRun:
     def test_run_leaves_what_is_promised(self, phantom_folder, tmp_path, capsys):
         code, out, err = call(capsys, "run", phantom_folder / "hip.toml", "-o", tmp_path / "out")
-        assert code == 0 and "adductor" in out and "frame 5 of 5" in err
+        assert code == 0 and "frame 5 of 5" in err
         names = {path.name for path in (tmp_path / "out").iterdir()}
         assert {"run.json", "metrics.csv", "events.csv", "poses.csv", "surfaces.pvd", "bones.pvd"} <= names
         assert len(list((tmp_path / "out" / "surfaces").iterdir())) == 5
+        title, head, row, verdict, end = out.splitlines()
+        facts = json.loads((tmp_path / "out" / "run.json").read_text())["muscles"]["adductor"]
+        worst = [shown_number(abs(facts[key]["worst"])) for key in SHOWN]
+        assert title.endswith("lengths in mm") and head.split() == list(SHOWN)
+        assert re.split(r"\s{2,}", row) == ["adductor", *worst]
+        assert verdict.startswith("verdict: ") and re.match(r"5 frames in [\d.]+ s, in ", end)
 
     def test_spike_in_a_mesh_is_in_the_verdict(self, phantom_folder, tmp_path, capsys):
         """A vertex 60 mm off the muscle, which no field follows; without it all is well."""
@@ -103,9 +111,11 @@ class TestRun:
 
     def test_export_of_a_run(self, phantom_folder, tmp_path, capsys):
         call(capsys, "run", phantom_folder / "hip.toml", "-o", tmp_path / "o", "--frames", "0:1")
-        code, _, _ = call(capsys, "export", tmp_path / "o", "--format", "stl", "obj", "--units", "m")
-        assert code == 0
-        assert (tmp_path / "o" / "export" / "stl" / "adductor_0000.stl").exists()
+        code, out, _ = call(capsys, "export", tmp_path / "o", "--format", "stl", "obj", "--units", "m")
+        folders = [tmp_path / "o" / "export" / name for name in ("obj", "stl")]
+        written = [path for folder in folders for path in folder.iterdir()]
+        assert code == 0 and out == f"{len(written)} files in {folders[0]}, {folders[1]}\n"
+        assert folders[1] / "adductor_0000.stl" in written
         assert call(capsys, "export", tmp_path / "o", "--format", "step")[0] == 2
 
     @pytest.mark.parametrize(
@@ -137,11 +147,7 @@ class TestErrors:
             (("check", "typo.toml"), 3, "did you mean 'centre'"),
             (("check", "mesh.toml"), 4, "femr.ply: no such mesh file, did you mean 'femur.ply'"),
             (("check", "hip.toml", "--bad"), 2, "--bad"),
-            (
-                ("check", "model.toml"),
-                3,
-                "model.toml: muscle 'adductor': unknown model 'rbff', did you mean 'rbf'",
-            ),
+            (("check", "model.toml"), 3, "model.toml: muscle 'adductor': unknown model 'rbff', did you mean 'rbf'"),
             (("run", "model.toml", "-o", "o"), 3, "unknown model 'rbff', did you mean 'rbf'"),
             (("check", "setting.toml"), 3, "model: unknown key 'centers', did you mean 'centres'"),
             (("check", "number.toml"), 3, "centres: input should be greater than or equal to 0, got -5"),
@@ -177,16 +183,8 @@ class TestErrors:
                 2,
                 "--centres must be whole numbers of 8 and more",
             ),
-            (
-                ("check", "metres.toml"),
-                4,
-                "cannot be right; correct the scene's units, or set its scale (0.001",
-            ),
-            (
-                ("check", "bare.toml"),
-                3,
-                "not valid TOML: Invalid value (at line 3, column 9); text stands in quotes",
-            ),
+            (("check", "metres.toml"), 4, "cannot be right; correct the scene's units, or set its scale (0.001"),
+            (("check", "bare.toml"), 3, "not valid TOML: Invalid value (at line 3, column 9); text stands in quotes"),
             (("run", "hip.toml", "-o", "o", "--set", "x"), 2, "KEY=VALUE"),
             (("run", "hip.toml", "-o", "o", "--fail-on", "volum_error"), 2, "did you mean 'volume_error'"),
             (("run", "inside.toml", "-o", "o"), 3, "start inside bone 'pelvis'"),
@@ -194,7 +192,7 @@ class TestErrors:
             (("render", "nowhere", "-o", "a.png"), 2, "holds no run"),
             (("new", "nowhere", "--units", "mm"), 2, "is no folder"),
         ],
-    )
+    )  # fmt: skip
     def test_code_and_one_line(self, phantom_folder, capsys, monkeypatch, arguments, code, words):
         monkeypatch.chdir(phantom_folder)
         self.write_variants(phantom_folder)

@@ -37,49 +37,6 @@ def test_file_is_shown_and_names_command_commit_and_machine(path):
     assert f"<!-- evidence: {path.stem} -->" in shown
 
 
-# Tables whose figures nobody measured: what is allowed, how something is stored.
-GIVEN = {
-    ("limits", "| what | limit |"),
-    ("metrics", "| quantity | limit |"),
-    ("pbd", "| model | shape | volume | sweeps per solve |"),
-    ("sdf", "| level | edge, in fine cells | where |"),
-}
-MEASURED_BY = re.compile(
-    r"(benchmarks|examples)/\w+(/\w+)?\.py|<!-- evidence: |`make \w|(python -m|rbfmuscle) \w+"
-)
-
-
-def tables(text):
-    """Heads of the tables that are full of figures, each with its section of the page."""
-    # A comment in a block of commands is no heading.
-    text = re.sub(r"^```.*?^```", lambda block: block[0].replace("\n#", "\n #"), text, flags=re.S | re.M)
-    for section in re.split(r"^(?=#+ )", text, flags=re.M):
-        for head, body in re.findall(r"^(\|.*)\n\|[-| :]+\n((?:\|.*\n?)+)", section, flags=re.M):
-            cells = [cell.strip() for row in body.splitlines() for cell in row.strip("|").split("|")[1:]]
-            if sum(bool(re.match(r"[-+−<~(]*\d", cell)) for cell in cells) >= 0.4 * len(cells):
-                yield head, section
-
-
-def unexplained(page, text):
-    return [
-        head
-        for head, section in tables(text)
-        if (page, head) not in GIVEN and not MEASURED_BY.search(section.replace(head, ""))
-    ]
-
-
-@pytest.mark.parametrize("page", figures.page_files(), ids=lambda path: path.stem)
-def test_tables_of_figures_say_what_measures_them(page):
-    assert unexplained(page.stem, page.read_text(encoding="utf-8")) == []
-
-
-def test_planted_table_without_a_command_is_found():
-    table = "| model | error mm |\n|---|---|\n| rbf | 0.5 |\n"
-    assert unexplained("page", f"# Page\n\n## Here\n\n{table}") == ["| model | error mm |"]
-    assert unexplained("page", f"# Page\n\n## Here\n\n`python benchmarks/table.py`\n\n{table}") == []
-    assert unexplained("page", f"# Page\n\n`python benchmarks/table.py`\n\n## Here\n\n{table}") != []
-
-
 def test_scripts_that_pages_name_exist():
     for page in figures.page_files():
         for script in re.findall(

@@ -109,22 +109,16 @@ class TestKinds:
     @pytest.mark.parametrize(
         ("row", "message"),
         [
-            (
-                {"type": "hinge", "axes": {"p": (1, 0, 0), "q": (0, 1, 0)}},
-                "a hinge joint has 1 coordinates, 2",
-            ),
+            ({"type": "hinge", "axes": {"p": (1, 0, 0), "q": (0, 1, 0)}}, "a hinge joint has 1 coordinates, 2"),
             ({"type": "custom", "axes": {"q": (1, 0, 0)}}, "rotations and translations instead of axes"),
             (
                 {"type": "custom", "rotations": [{"axis": [1, 0, 0], "coordinates": ["q"], "linear": [1.0]}]},
                 "linear needs a slope",
             ),
-            (
-                {**Q, "coordinates": {"q": {"locked": True, "rest": 1.0, "default": 2.0}}},
-                "locked coordinate stays",
-            ),
+            ({**Q, "coordinates": {"q": {"locked": True, "rest": 1.0, "default": 2.0}}}, "locked coordinate stays"),
             ({**Q, "coordinates": {"q": {"range": [3, 1]}}}, "range must go upwards"),
         ],
-    )
+    )  # fmt: skip
     def test_wrong_tables_are_named(self, row, message):
         with pytest.raises(SceneError, match=message):
             pair(**row)

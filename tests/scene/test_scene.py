@@ -160,7 +160,7 @@ class TestMistakes:
             ("[scene]", "[scene", r"not valid TOML.*line 2"),
             ('"report"', '"reprot"', r"\[detect\] tunnelling action: .*'reprot'"),
         ],
-    )
+    )  # fmt: skip
     def test_one_line_names_file_place_and_remedy(self, folder, old, new, message):
         with pytest.raises(SceneError, match=message) as caught:
             load(folder, (old, new))
