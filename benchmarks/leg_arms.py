@@ -83,9 +83,7 @@ def joint_scene(folder, joint):
     count = round(np.degrees(last[leading]) / step)
     scene.motion = Motion([{name: end * k / count for name, end in moving.items()} for k in range(count + 1)])
     scene.muscles = [muscle for muscle in scene.muscles if muscle.name in MUSCLES[joint]]
-    return scene.with_options(
-        {"output.surfaces": False, "output.report": False, "output.preview": False}
-    ), leading
+    return scene.with_options({"output.surfaces": False, "output.report": False}), leading
 
 
 def our_arms(folder, joint, model):

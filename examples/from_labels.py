@@ -65,7 +65,7 @@ command("check", out / "hip_scene" / "scene.toml", "--picture")
 shutil.copy(out / "hip_scene" / "scene.png", out / "guesses.png")
 
 # Moment arms follow from the lengths along the motion; out/report.html draws them.
-arms = ["--set", "output.preview=false", "--frames", "0:9:4"]
+arms = ["--frames", "0:9:4"]
 command("run", out / "hip_scene" / "scene.toml", "-o", out / "run", *arms)
 
 # The check of this page: the same through the meshes that the labels were made of. The surfaces are less than a voxel

@@ -141,7 +141,7 @@ def _variants(scene, models, settings):
         own = {key: value for key, value in mine.items() if not chooses_model(key)}
         variant = configure_scene(scene, whole).with_options(model=name)
         variant = configure_scene(variant, own).validate()
-        variant.output = OutputOptions(report=False, preview=False)
+        variant.output = OutputOptions(report=False)
         variants[name] = variant
     return variants
 

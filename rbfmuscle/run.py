@@ -163,14 +163,11 @@ def _options(model, settings, frames):
 
 def _finish(recording, writer, limits, pictures):
     """Report and pictures, then the limits."""
-    output = recording.scene.output
     with recording.timed("report"), stage("drawing pictures"):
-        if output.report or output.preview:
+        if recording.scene.output.report:
             from rbfmuscle.report.report import write_report
 
-            write_report(
-                writer.directory, report=output.report, preview=output.preview and pictures, pictures=pictures
-            )
+            write_report(writer.directory, preview=pictures, pictures=pictures)
     info = recording.info()
     writer.write_info(info)
     require_limits(recording.summary.table(), limits)

@@ -54,7 +54,7 @@ def arm_scene(*, end=20, step=10, units="mm", **output):
     scene.add_joint("elbow", "upper", "fore", (0, 0, 0), {"flexion": (0, -1, 0)})
     scene.add_muscle("biceps", egg, attach=attach)
     scene.set_motion(ramp={"elbow.flexion": {"to": float(end), "step": float(step)}})
-    scene.output = OutputOptions(**{"report": False, "preview": False, **output})
+    scene.output = OutputOptions(**{"report": False, **output})
     return scene
 
 
@@ -80,7 +80,6 @@ ramp = {{ "elbow.flexion" = {{ from = 0, to = {end}, step = {step} }} }}
 {defaults}attach = [{{ bone = "upper", vertices = "upper.txt" }}, {{ bone = "fore", vertices = "fore.txt" }}]
 [output]
 report = false
-preview = false
 """
 
 

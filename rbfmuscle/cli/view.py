@@ -118,4 +118,4 @@ def _run_to(scene, model, stops, folder):
     rest = rest_coordinates(scene)
     scene = scene.copy()
     scene.motion = Motion([rest, rest | {name: inner_value(scene, name, x) for name, x in stops.items()}])
-    stream_run(scene, folder, model=model, settings={"output.report": False, "output.preview": False})
+    stream_run(scene, folder, model=model, settings={"output.report": False})

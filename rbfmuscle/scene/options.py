@@ -76,6 +76,7 @@ REMOVED_KEYS: dict[str, str] = {
     "model.sound": "use model.self_collision",
     "model.response": 'use model = "pbd-paper", or delete the key: ways out of several bones are added up',
     "model.derivatives": "delete the key: up to 200 centres, and fitted ones, meet all derivatives",
+    "output.preview": "use output.report = false, which leaves out report.html and preview.webp",
     "output.metrics": "delete the key: every run is measured",
     "output.fibres": "delete the key: fibres of a run are no longer followed; those of a scene still steer its muscles",
     "output.moment_arms": "delete the key: moment arms are measured along every motion, about what moves alone",
@@ -244,7 +245,6 @@ class OutputOptions(Table):
 
     surfaces: SurfaceOptions | Literal[False] = SurfaceOptions()
     report: bool = True
-    preview: bool = True
 
 
 class RampOptions(Table):

@@ -53,7 +53,6 @@ mesh = "adductor_posterior.ply"
 attach = [{ bone = "pelvis", vertices = "pelvis.txt" }, { bone = "femur", vertices = "femur.txt" }]
 [output]
 report = false
-preview = false
 """
 
 

@@ -36,7 +36,7 @@ def write_scene(folder, *, end):
         '[[muscle]]\nname = "m"\nmesh = "muscle.ply"\nmodel = { name = "pbd" }\n'
         "attach = [{ bone = 'upper', sphere = { centre = [34, 0, 45], radius = 22 } },\n"
         "{ bone = 'lower', sphere = { centre = [34, 0, -65], radius = 22 } }]\n"
-        "[output]\nreport = false\npreview = false\n"
+        "[output]\nreport = false\n"
     )
     return folder / "scene.toml"
 

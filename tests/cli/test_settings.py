@@ -39,7 +39,7 @@ TABLES = {
     "output": (
         options.OutputOptions,
         {
-            "surfaces": {"format": "ply"}, "report": False, "preview": False,
+            "surfaces": {"format": "ply"}, "report": False,
         },
     ),
 }  # fmt: skip

@@ -114,5 +114,5 @@ def base_scene() -> dict:
         "muscle": [{"name": "muscle", "mesh": "muscle-ply.ply", "model": model, "attach": attach}],
         "contact": {"initial": "resolve", "substep_angle": 3.0},
         "detect": {"tunnelling": {"angle": 135.0, "action": "substep"}},
-        "output": {"report": False, "preview": False},
+        "output": {"report": False},
     }

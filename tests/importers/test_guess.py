@@ -309,7 +309,7 @@ def test_what_is_written_of_meshes_in_metres_passes_check_and_runs(tmp_path, cap
     assert run_command(["new", str(tmp_path)]) == 0
     assert "units are m: " in capsys.readouterr().out
     assert run_command(["check", str(file)]) == 0
-    quick = ["--set", "output.report=false", "--set", "output.preview=false", "--model", "pbd"]
+    quick = ["--set", "output.report=false", "--model", "pbd"]
     assert run_command(["run", str(file), "-o", str(tmp_path / "out"), "--frames", "0:5", *quick]) == 0
     assert len(SavedRun(tmp_path / "out").frames) == 5
 

@@ -103,7 +103,7 @@ def test_motions_as_scene_files_of_the_phantom(tmp_path, capsys):
     path = tmp_path / "flexion_abduction_internal_rotation.toml"
     code, _, err = call(
         capsys, "run", path, "-o", tmp_path / "out", "--frames", "0:2", "--set", "model=pbd",
-        "--set", "output.report=false", "--set", "output.preview=false",
+        "--set", "output.report=false",
     )  # fmt: skip
     assert code == 0, err
     assert len(list((tmp_path / "out" / "surfaces").iterdir())) == 2 * len(rm.phantom_scene().muscles)

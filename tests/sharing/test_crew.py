@@ -57,7 +57,7 @@ def small_scene(mixed=0, **settings):
         muscle.model = "pbd"
     for muscle in scene.muscles[:mixed]:
         muscle.options.update(centres=80, samples=300, resolution=16)
-    return scene.with_options({"output.report": False, "output.preview": False, **settings})
+    return scene.with_options({"output.report": False, **settings})
 
 
 def assert_same_folders(one, other):
