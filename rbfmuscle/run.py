@@ -3,6 +3,8 @@
 Both are one run, a generator of frames, and differ in the sink that takes them.
 """
 
+from __future__ import annotations
+
 import atexit
 import shutil
 import tempfile
@@ -46,7 +48,7 @@ def simulate(
     frames: slice | str | None = None,
     progress: Callable[[int, int], None] | bool | None = None,
     fields: Mapping[str, BoneField] | None = None,
-) -> "Run":
+) -> Run:
     """Run a scene through its motion and keep every frame in memory.
 
     Parameters
@@ -214,7 +216,7 @@ class Run:
             self.saved = saved
 
     @classmethod
-    def load(cls, directory: str | Path) -> "Run":
+    def load(cls, directory: str | Path) -> Run:
         """Return the run in a folder.
 
         Parameters
@@ -273,13 +275,13 @@ class Run:
     def __contains__(self, muscle: object) -> bool:
         return muscle in self.muscles
 
-    def __getitem__(self, muscle: str) -> "MuscleRun":
+    def __getitem__(self, muscle: str) -> MuscleRun:
         """The `MuscleRun` of a muscle."""
         if muscle not in self:
             raise UsageError(f"unknown muscle {muscle!r}, {did_you_mean(muscle, self.muscles)}")
         return MuscleRun(self, muscle)
 
-    def __iter__(self) -> Iterator["MuscleRun"]:
+    def __iter__(self) -> Iterator[MuscleRun]:
         """All muscles."""
         return (MuscleRun(self, muscle) for muscle in self.muscles)
 
@@ -287,7 +289,7 @@ class Run:
         """Values of a quantity over the frames, (n,) ndarray."""
         return np.array([r.value for r in self.metrics if r.muscle == muscle and r.quantity == quantity])
 
-    def table(self) -> "pandas.DataFrame":
+    def table(self) -> pandas.DataFrame:
         """Return the metrics as a pandas DataFrame.
 
         Raises
@@ -301,7 +303,7 @@ class Run:
             raise MissingPartError("run.table() needs pandas: pip install pandas") from None
         return pandas.DataFrame(self.metrics, columns=list(Row._fields))
 
-    def plot(self, quantity: str = "penetration_max") -> "Axes":
+    def plot(self, quantity: str = "penetration_max") -> Axes:
         """Plot a quantity of every muscle over the motion.
 
         Parameters
@@ -363,7 +365,7 @@ class Run:
         names = [formats] if isinstance(formats, str) else list(formats)
         return export_run(self.saved.directory, names, output=directory, units=units, up=up)
 
-    def show(self) -> "rbfmuscle.Page":
+    def show(self) -> rbfmuscle.Page:
         """Show the frames in a browser or a notebook; see `rbfmuscle.show`."""
         import rbfmuscle
 
@@ -403,7 +405,7 @@ class MuscleRun:
         self.run = run
         self.name = name
 
-    def surface(self, frame: int = -1) -> "trimesh.Trimesh":
+    def surface(self, frame: int = -1) -> trimesh.Trimesh:
         """Surface in a frame of the run.
 
         Parameters

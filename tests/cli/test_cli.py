@@ -273,7 +273,7 @@ class TestOtherCommands:
         code, out, _ = call(capsys, "--help")
         assert code == 0
         for title, commands in GROUPS.items():
-            part = out[out.index(f" {title} ") :]
+            part = out[out.index(f"─ {title} ─") :]
             for command in commands:
                 name = command.__name__.rstrip("_")
                 assert f" {name} " in part[: part.index("╰")]

@@ -13,7 +13,7 @@ from rbfmuscle.metrics.summary import parse_limits
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.run import simulate, stream_run
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.validation import LimitExceededError, SceneError, SceneWarning, SolveError, UsageError
+from rbfmuscle.validation import LimitExceededError, SceneWarning, SolveError, UsageError
 
 
 @pytest.fixture(autouse=True)
@@ -50,7 +50,7 @@ class TestSimulate:
 
     def test_unknown_muscle_and_frame(self):
         run = simulate(arm_scene())
-        with pytest.raises(SceneError, match="biceps"):
+        with pytest.raises(UsageError, match="did you mean 'biceps'"):
             run["bicep"]
         with pytest.raises(UsageError, match="3 frames"):
             run["biceps"].surface(frame=3)

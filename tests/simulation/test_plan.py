@@ -57,18 +57,6 @@ def test_command_prints_the_plan(hip_data, capsys, arguments):
         assert "gluteus_maximus: rbf" in text and "field of femur" in text and "expected" not in text
 
 
-def test_without_surfaces_and_metrics_nothing_is_extracted_or_measured(monkeypatch):
-    use_blend_model(monkeypatch)
-
-    def refuse(*_args, **_settings):
-        raise AssertionError("called")
-
-    monkeypatch.setattr(BlendMuscle, "drawing", refuse)
-    monkeypatch.setattr("rbfmuscle.sharing.share.MuscleMeasures", refuse)
-    run = simulate(arm_scene(surfaces=False))
-    assert len(run.frames) == 3 and run.metrics == []
-
-
 def test_one_muscle_builds_no_sliding(monkeypatch):
     use_blend_model(monkeypatch)
     made = []
