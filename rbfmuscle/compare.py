@@ -132,17 +132,13 @@ def _variants(scene, models, settings):
             raise UsageError(f"{key}: model {model!r} is not compared; models: {', '.join(models)}")
     variants = {}
     for name in models:
-        mine = {}
-        for key, value in settings.items():
-            if key.rpartition(":")[0] in ("", name):
-                mine[key.rpartition(":")[2]] = value
+        mine = {k.rpartition(":")[2]: v for k, v in settings.items() if k.rpartition(":")[0] in ("", name)}
         # As in the scene file, a model given for all is the model whose settings these are; each then takes its turn.
         whole = {key: value for key, value in mine.items() if chooses_model(key)}
         own = {key: value for key, value in mine.items() if not chooses_model(key)}
         variant = configure_scene(scene, whole).with_options(model=name)
-        variant = configure_scene(variant, own).validate()
-        variant.output = OutputOptions(report=False)
-        variants[name] = variant
+        variants[name] = configure_scene(variant, own).validate()
+        variants[name].output = OutputOptions(report=False)
     return variants
 
 

@@ -1,5 +1,7 @@
 """Poses of bones from coordinates: couplings, locks and ranges first, then joint after joint from the root."""
 
+from graphlib import CycleError, TopologicalSorter
+
 import numpy as np
 
 from rbfmuscle.scene.joints.joint import Coordinate, Coupling, Joint
@@ -47,21 +49,16 @@ def ordered(couplings: list[Coupling]) -> list[Coupling]:
     SceneError
         If a coordinate follows itself, or is given twice.
     """
-    targets = [coupling.coordinate for coupling in couplings]
-    for name in targets:
-        if targets.count(name) > 1:
+    by_name = {coupling.coordinate: coupling for coupling in couplings}
+    for name in by_name:
+        if sum(coupling.coordinate == name for coupling in couplings) > 1:
             raise SceneError(f"coupling of {name!r} is given twice")
-    found, waiting = [], list(couplings)
-    while waiting:
-        open_names = {coupling.coordinate for coupling in waiting}
-        ready = [c for c in waiting if not open_names & set(c.of)]
-        if not ready:
-            raise SceneError(
-                f"coupling of {waiting[0].coordinate!r} follows itself; leave one of the ring out"
-            )
-        found += ready
-        waiting = [c for c in waiting if c not in ready]
-    return found
+    try:
+        order = list(TopologicalSorter({name: one.of for name, one in by_name.items()}).static_order())
+    except CycleError as error:
+        ring = error.args[1]
+        raise SceneError(f"coupling of {ring[0]!r} follows itself; leave one of the ring out") from None
+    return [by_name[name] for name in order if name in by_name]
 
 
 def joint_poses(
