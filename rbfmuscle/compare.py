@@ -21,6 +21,7 @@ from rbfmuscle.progress import stage
 from rbfmuscle.run import stream_run
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.options import OutputOptions
+from rbfmuscle.scene.phantom import open_scene
 from rbfmuscle.scene.settings import chooses_model
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.validation import SolveError, UsageError
@@ -37,7 +38,7 @@ _PAPER_SWEEPS = 3
 
 
 def compare_models(
-    scene: Scene,
+    scene: Scene | str | Path,
     directory: str | Path,
     models: Sequence[str] = COMPARED,
     *,
@@ -50,7 +51,7 @@ def compare_models(
 
     Parameters
     ----------
-    scene : Scene
+    scene : Scene, path or "phantom"
     directory : path
         Takes ``comparison.json``, ``comparison.csv``, ``report.html``, ``models.webp`` and the run of each model.
     models : list of str
@@ -84,7 +85,7 @@ def compare_models(
     >>> sorted(table["models"])
     ['pbd', 'xpbd']
     """
-    variants = _variants(configure_scene(scene, frames=frames), list(models), settings or {})
+    variants = _variants(configure_scene(open_scene(scene), frames=frames), list(models), settings or {})
     folder = Path(directory)
     check_writable(folder)
     poses = chosen_poses(next(iter(variants.values())))

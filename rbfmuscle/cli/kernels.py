@@ -132,6 +132,7 @@ def _find_wanted(meshes, output, error, options, units, as_json):
 
 def _print(study: KernelStudy, name: str) -> None:
     from rbfmuscle.experiments.kernel_study import describe, row_toml
+    from rbfmuscle.metrics.summary import shown_number
 
     print(f"{name + ' [' + (study.units or 'mesh units') + ']':26s} {'centres':>7s} {'eps h':>6s} {'RMS':>8s} "
           f"{'Hausd.':>8s} {'vol %':>7s} {'cond.':>8s} {'fit ms':>7s}")  # fmt: skip
@@ -141,7 +142,7 @@ def _print(study: KernelStudy, name: str) -> None:
         if row["unfit"]:
             print(f"{start} unfit: {row['unfit'][:90]}")
             continue
-        print(f"{start}{row['rms']:8.3g} {row['hausdorff']:8.3g} {100 * row['volume_error']:7.3g} "
+        print(f"{start}{row['rms']:8.3g} {row['hausdorff']:8.3g} {shown_number(100 * row['volume_error']):>7s} "
               f"{row['condition']:8.1e} {1e3 * row['fit_time']:7.3g}")  # fmt: skip
     print(describe(study.rows))
     if study.recommended is not None:

@@ -46,8 +46,8 @@ class KernelStudy:
         The quickest row that errs at most 5 % more than the best; None where every one is unfit.
     """
 
-    rows: list[dict]
-    surfaces: list[tuple[Floats, Integers] | None] = field(default_factory=list)
+    rows: list[dict] = field(repr=False)
+    surfaces: list[tuple[Floats, Integers] | None] = field(default_factory=list, repr=False)
     units: str = ""
     recommended: dict | None = None
 

@@ -10,6 +10,7 @@ import pytest
 from conftest import ROOT
 
 import rbfmuscle as rm
+from rbfmuscle.experiments.kernel_study import KernelStudy
 
 SCRIPT = ROOT / "tests" / "data" / "user_script.py"
 
@@ -145,6 +146,7 @@ def test_no_repr_fills_the_screen(run):
     ]
     things += [run["abductor"], scene.motion, rm.BoneSDF.from_mesh(scene.bones[1].mesh)]
     mesh = scene.muscles[0].mesh
+    things.append(KernelStudy([{"rms": 0.1}] * 200, [(mesh.vertices, mesh.faces)]))
     things.append(rm.RBFField.fit_hermite(mesh.vertices[::40], mesh.vertex_normals[::40], kernel="cubic"))
     assert {type(thing).__name__: len(repr(thing)) for thing in things if len(repr(thing)) > 1000} == {}
 
