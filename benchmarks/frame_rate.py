@@ -13,7 +13,7 @@ import numpy as np
 
 from rbfmuscle.models import build_models
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.scene.settings import parse_setting
+from rbfmuscle.scene.settings import parse_settings
 from rbfmuscle.simulation.frame_loop import simulate_frames
 
 
@@ -27,7 +27,7 @@ def frames_of(scene):
 
 
 def measure(path, settings, repeat):
-    scene = Scene.load(path).with_options(dict(parse_setting(text) for text in settings))
+    scene = Scene.load(path).with_options(parse_settings(settings))
     walls = []
     for _ in range(repeat):
         wall, frames = frames_of(scene)

@@ -105,23 +105,21 @@ def _apply(scene, key, value):
         setattr(scene, head, table.changed(rest, value, place=key))
 
 
-def parse_setting(text: str) -> tuple[Any, ...]:
-    """Return (key, value) of "KEY=VALUE"; the value is read as TOML, else taken as text.
+def parse_settings(texts: Sequence[str] | None) -> dict[str, Any]:
+    """Return the settings of several "KEY=VALUE", of which the last of a key counts; values are as in TOML, or text.
 
     Raises
     ------
     UsageError
-        If there is no "=", or the value is a number or a nesting that nothing takes.
+        If there is no "=", or a value is a number or a nesting that nothing takes.
     """
-    key, found, value = text.partition("=")
-    if not found or not key.strip():
-        raise UsageError(f"{text!r} is not KEY=VALUE, for instance model.centres=200")
-    return key.strip(), parse_value(value.strip(), place=key.strip())
-
-
-def parse_settings(texts: list[str] | None) -> dict[str, Any]:
-    """Return the settings of several "KEY=VALUE", of which the last of a key counts."""
-    return dict(parse_setting(text) for text in texts or [])
+    found = {}
+    for text in texts or ():
+        key, equals, value = (part.strip() for part in text.partition("="))
+        if not equals or not key:
+            raise UsageError(f"{text!r} is not KEY=VALUE, for instance model.centres=200")
+        found[key] = parse_value(value, place=key)
+    return found
 
 
 def parse_value(text: str, *, place: str) -> dict[str, Any] | int | str:

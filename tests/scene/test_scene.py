@@ -228,20 +228,24 @@ class TestOptions:
             built().with_options({key: 1})
 
     def test_settings_from_text(self):
-        from rbfmuscle.scene.settings import parse_setting, parse_slice
+        from rbfmuscle.scene.settings import parse_settings, parse_slice
 
-        assert parse_setting("model.centres=200") == ("model.centres", 200)
-        assert parse_setting("contact.initial=keep") == ("contact.initial", "keep")
-        assert parse_setting("model={name='rbf', a=[1, 2]}") == ("model", {"name": "rbf", "a": [1, 2]})
+        texts = ["a=1", "model.centres=200", "contact.initial=keep", "model={name='rbf', a=[1, 2]}", "a = 2"]
+        assert parse_settings(texts) == {
+            "a": 2,
+            "model.centres": 200,
+            "contact.initial": "keep",
+            "model": {"name": "rbf", "a": [1, 2]},
+        }
         assert parse_slice("2:8:3") == slice(2, 8, 3) and parse_slice("-1") == slice(-1, None)
         for text in ("a:b", "1:2:0", "", "1:2:3:4"):
             with pytest.raises(UsageError, match="A:B:S"):
                 parse_slice(text)
         with pytest.raises(UsageError, match="KEY=VALUE"):
-            parse_setting("centres")
+            parse_settings(["centres"])
         for value in ("nan", "-inf", "{a=[inf]}", "99999999999999999999"):
             with pytest.raises(UsageError, match=r"^model\.rest_error"):
-                parse_setting(f"model.rest_error={value}")
+                parse_settings([f"model.rest_error={value}"])
 
     def test_pickle_and_resolved(self, folder):
         import json
