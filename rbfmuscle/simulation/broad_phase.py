@@ -59,14 +59,14 @@ def answer_loop(points, pose, box, near, distance, gradient, anchor, bound):
 def take_contacts_loop(near, distance, direction, limits, found):
     """Copy the contacts nearer than their reach into the arrays ``found``; return how many there are.
 
-    ``limits`` holds the reach (n,) of every point, the margin, and the depth (n,) that is allowed, or an empty array.
+    ``limits`` holds the reach (n,) of every point and the depth (n,) that is allowed, or an empty array.
     """
-    reach, margin, allowed = limits
+    reach, allowed = limits
     index, gap, normal = found
     count = 0
     for n in range(len(near)):
         i = near[n]
-        here = distance[n] - margin
+        here = distance[n]
         if len(allowed) > 0:
             here += allowed[i]
         if here < reach[i]:

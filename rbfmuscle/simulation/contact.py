@@ -66,8 +66,6 @@ class BoneContacts:
         One for each name; None where the muscle cannot reach the bone. Fields may be shared between muscles.
     contact_bone : (n,) array_like of int, optional
         Bone that contact point i is attached to, -1 where free. Attached points take no contact.
-    margin : float
-        Gap that contact points keep from bones [scene unit].
     """
 
     def __init__(
@@ -76,7 +74,6 @@ class BoneContacts:
         fields: list[Any],
         *,
         contact_bone: ArrayLike | None = None,
-        margin: float = 0.0,
     ) -> None:
         if len(names) != len(fields):
             raise ValueError(f"one field per bone is needed, got {len(fields)} for {len(names)} bones")
@@ -88,7 +85,6 @@ class BoneContacts:
         self.boxes = np.array(boxes, dtype=np.float64).reshape(-1, 2, 3)
         self.contact_bone = None if contact_bone is None else np.asarray(contact_bone, dtype=np.int64)
         self._take({name: np.eye(4) for name in self.names})
-        self.margin = float(margin)
         self.allowed = {}
         self.neighbours, self.cuts = [], []
         self._known: tuple[Floats, ...] = (
@@ -214,14 +210,14 @@ class BoneContacts:
         """
         points = check_points(points)
         reach = np.full(len(points), reach) if np.ndim(reach) == 0 else np.asarray(reach, dtype=np.float64)
-        near = self._near(points, reach + self.margin, self.reached)
+        near = self._near(points, reach, self.reached)
         room = sum(len(some) for _, some in near)
         index, source = np.empty(room, np.int64), np.empty(room, np.int64)
         gap, normal, count = np.empty(room), np.empty((room, 3)), 0
         for b, some in near:
-            distance, direction = self._ask(points, some, b, reach[some] + self.margin)
+            distance, direction = self._ask(points, some, b, reach[some])
             allowed = self.allowed.get(b, NONE_ALLOWED)
-            limits = reach, self.margin, allowed if len(allowed) == len(points) else NONE_ALLOWED
+            limits = reach, allowed if len(allowed) == len(points) else NONE_ALLOWED
             found = index[count:], gap[count:], normal[count:]
             end = count + take_contacts_loop(some, distance, direction, limits, found)
             source[count:end] = b

@@ -73,13 +73,13 @@ def test_moving_everything_moves_the_contacts_along():
     assert np.allclose(before.normal @ turn[:3, :3].T, after.normal)
 
 
-def test_attached_points_take_no_contact_and_margin_is_kept():
+def test_attached_points_take_no_contact():
     held = np.where(np.arange(400) % 2 == 0, 0, -1)
-    contacts, poses = _pair(contact_bone=held, margin=0.25)
+    contacts, poses = _pair(contact_bone=held)
     found = contacts.half_spaces(_points(), 1.0)
-    expected = _literal(contacts, poses, _points(), 1.25)
+    expected = _literal(contacts, poses, _points(), 1.0)
     assert set(found.index) == {i for i, _ in expected if i % 2}
-    assert found.gap.min() == pytest.approx(min(d - 0.25 for (i, _), (d, _) in expected.items() if i % 2))
+    assert found.gap.min() == pytest.approx(min(d for (i, _), (d, _) in expected.items() if i % 2))
 
 
 def test_allowed_depth_is_added_to_the_gap():
