@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats
+from rbfmuscle.muscle.fibres import flux
 from rbfmuscle.muscle.solid import EmbeddedSolid
 from rbfmuscle.scene.activation.resolve import resolve_contraction
 from rbfmuscle.scene.objects import Muscle
@@ -78,8 +79,7 @@ def fibre_density(solid: EmbeddedSolid, belly: Booleans) -> Floats:
 
     They run as a flux without sources from one end to the other, spread evenly over both.
     """
-    flux = solid.flux()
-    size = np.linalg.norm(flux, axis=1)
+    size = np.linalg.norm(flux(solid), axis=1)
     order = np.argsort(size[belly], kind="stable")
     weight = np.cumsum(solid.weights[belly][order])
     widest = size[belly][order][np.searchsorted(weight, 0.5 * WIDEST * weight[-1])]

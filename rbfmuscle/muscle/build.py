@@ -7,7 +7,7 @@ import numpy as np
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.implicit.placement.lattice import Lattice
 from rbfmuscle.muscle.activation import FibrePull
-from rbfmuscle.muscle.fibres import fibre_directions
+from rbfmuscle.muscle.fibres import fibre_directions, rise
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.rest import LEAST_ATTACHED, RestState
 from rbfmuscle.muscle.solid import EmbeddedSolid
@@ -39,7 +39,7 @@ def build_solid(
         bones={bone.name: (np.asarray(bone.mesh.vertices), np.asarray(bone.mesh.faces)) for bone in scene.bones},
     )  # fmt: skip
     axis = points[held].mean(axis=0) - points.mean(axis=0)
-    along = fibre_directions(solid.quad_points, solid.rise(), muscle.fibres, fallback=axis)
+    along = fibre_directions(solid.quad_points, rise(solid), muscle.fibres, fallback=axis)
     count = len(along)
     solid.take_fibres(
         solid.fibres._replace(

@@ -1,9 +1,12 @@
-"""Which way the fibres of an RBF muscle run at its centres."""
+"""Directions of the fibres in an RBF muscle, and the flux that they are."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
+
+from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.muscle.solid import HOLD, EmbeddedSolid
 
 # Pieces of polyline that speak for one place.
 NEAREST = 3
@@ -41,3 +44,22 @@ def fibre_directions(
     weak = length < 1e-9 * max(length.max(), 1e-300)
     along = np.where(weak[:, None], fallback, along)
     return along / np.linalg.norm(along, axis=1, keepdims=True)
+
+
+def rise(solid: EmbeddedSolid) -> Floats:
+    """Unit directions at the quadrature points from the muscle's first bone to its last, (Q, 3)."""
+    slope = _gradient(solid, solid.motion_weights @ np.arange(len(solid.bones)))
+    return slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-300)
+
+
+def flux(solid: EmbeddedSolid) -> Floats:
+    """Gradient (Q, 3) of a potential whose flux from the first bone's held points to the others' is one."""
+    first = solid.owner[solid.held] == solid.bones[0]
+    source = np.where(first, -1.0 / max(first.sum(), 1), 1.0 / max((~first).sum(), 1))
+    right = solid.spring @ source / (HOLD * solid.side)
+    return _gradient(solid, np.linalg.lstsq(solid.without_springs, right, rcond=None)[0])
+
+
+def _gradient(solid: EmbeddedSolid, values: Floats) -> Floats:
+    """Gradient (Q, 3) at the quadrature points of values (N,) at the nodes."""
+    return np.asarray(np.einsum("qk,qka->qa", values[solid.quad_columns], solid.slopes))

@@ -199,20 +199,6 @@ class EmbeddedSolid:
 
     # --- fibres -----------------------------------------------------------------------------------------------
 
-    def rise(self) -> Floats:
-        """Unit directions at the quadrature points from the muscle's first bone to its last, (Q, 3)."""
-        height = self.motion_weights @ np.arange(len(self.bones))
-        slope = np.einsum("qk,qka->qa", height[self.quad_columns], self.slopes)
-        return slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-300)
-
-    def flux(self) -> Floats:
-        """Gradient (Q, 3) of a potential whose flux from the first bone's held points to the others' is one."""
-        first = self.owner[self.held] == self.bones[0]
-        source = np.where(first, -1.0 / max(first.sum(), 1), 1.0 / max((~first).sum(), 1))
-        right = self.spring @ source / (HOLD * self.side)
-        height = np.linalg.lstsq(self.without_springs, right, rcond=None)[0]
-        return np.einsum("qk,qka->qa", height[self.quad_columns], self.slopes)
-
     def take_fibres(self, fibres: Fibres) -> None:
         """Take springs along the fibres; their stiffness becomes part of the matrix."""
         self.fibres, stiff = fibres, fibres.passive + fibres.active
