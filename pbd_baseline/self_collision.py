@@ -9,7 +9,7 @@ import numpy as np
 from pbd_baseline.rest import RestState
 from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.geometry.crossing import FaceTree
-from rbfmuscle.geometry.rigid import smooth_displacement
+from rbfmuscle.geometry.rotations import smooth_displacement
 from rbfmuscle.jit import compiled
 
 # Rounds of smoothing, how many of them until the smoothed region grows by a ring, and sweeps in each.

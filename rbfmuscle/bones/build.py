@@ -76,7 +76,7 @@ class _Builder:
         record, distance = np.empty(len(points), dtype=np.int32), np.empty(len(points))
         near = np.full(len(points), -1, dtype=np.int32) if near is None else near
         exact = self.exact
-        normals = (exact.edge_normals, exact.vertex_normals, exact.faces, exact.order)
+        normals = (*exact.pseudonormals, exact.faces, exact.order)
 
         def work(a, b):
             _node_loop(points[a:b], near[a:b], exact.tree, normals, record[a:b], distance[a:b])
@@ -182,8 +182,8 @@ def build_cells(
         corners=corners,
         far=far,
         records=records,
-        edge_normals=exact.edge_normals[rows].astype(np.float32),
-        vertex_normals=exact.vertex_normals.astype(np.float32),
+        edge_normals=exact.pseudonormals[0][rows].astype(np.float32),
+        vertex_normals=exact.pseudonormals[1].astype(np.float32),
         vertices=exact.faces[rows].astype(np.int32),
         across=builder.across,
     )

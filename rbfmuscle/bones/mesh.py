@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.exact_distance import faces_across
 from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.geometry.triangles import opposite_faces, vertex_faces
 from rbfmuscle.validation import MeshError, check_mesh
 
 # Area below this share of the squared longest edge is rounding.
@@ -57,7 +57,7 @@ def prepare_bone(vertices: Floats, faces: Integers, *, name: str = "bone") -> Bo
         _keep(mesh, ~flat, f"{int(flat.sum())} faces without area left out")
     if len(mesh.faces) == 0:
         raise MeshError(f"{name} has no face with an area")
-    across = _across(mesh)
+    across = faces_across(mesh.faces)
     if (across < 0).any() or flat.any():
         across = _mend(mesh)
     if (across < 0).any():
@@ -85,10 +85,6 @@ def _keep(mesh, which, note):
     mesh.notes.append(note)
 
 
-def _across(mesh):
-    return opposite_faces(mesh.faces, *vertex_faces(mesh.faces, len(mesh.vertices)))
-
-
 def _mend(mesh):
     """Merge equal vertices, drop duplicate faces, orient patches alike; return the faces across."""
     import igl
@@ -103,13 +99,13 @@ def _mend(mesh):
     _, kept = np.unique(np.sort(mesh.faces, axis=1), axis=0, return_index=True)
     if len(kept) < len(mesh.faces):
         _keep(mesh, np.sort(kept), f"{len(mesh.faces) - len(kept)} duplicate faces left out")
-    across = _across(mesh)
+    across = faces_across(mesh.faces)
     if (across == -2).any():
         oriented = np.ascontiguousarray(igl.bfs_orient(mesh.faces)[0])
         if not np.array_equal(oriented, mesh.faces):
             mesh.faces = oriented
             mesh.notes.append("neighbouring faces were oriented alike")
-        across = _across(mesh)
+        across = faces_across(mesh.faces)
     return across
 
 

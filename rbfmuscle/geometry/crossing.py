@@ -3,6 +3,7 @@
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.surfaces import opposite_half_edges
 from rbfmuscle.geometry.triangles import triangle_normal
 from rbfmuscle.jit import compiled
 
@@ -39,7 +40,8 @@ class FaceTree:
         self.order = morton_order(middle)
         self._corners = self.faces[self.order]
         self.leaves = 1 << max(int(np.ceil(len(self.faces) / LEAF)) - 1, 0).bit_length()
-        self.closed = _is_closed(self.faces)
+        # Every edge has two triangles that agree on their outside.
+        self.closed = bool((opposite_half_edges(self.faces) >= 0).all())
         self._room = 16 * self.leaves
 
     def crossing(self, vertices: Floats, among: Booleans | None = None) -> Booleans:
@@ -79,14 +81,6 @@ class FaceTree:
             if count <= len(pairs):
                 return pairs[:count]
             self._room = max(self._room, 2 * count)
-
-
-def _is_closed(faces: Integers) -> bool:
-    """Whether every edge has two triangles that agree on their outside."""
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
-    span = int(ends.max(initial=0)) + 1
-    forth, back = np.sort(ends[:, 0] * span + ends[:, 1]), np.sort(ends[:, 1] * span + ends[:, 0])
-    return bool((np.diff(forth) > 0).all() and np.array_equal(forth, back))
 
 
 def crossing_faces(vertices: Floats, faces: Integers) -> Booleans:

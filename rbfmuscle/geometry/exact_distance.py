@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rbfmuscle.geometry.surfaces import opposite_half_edges
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.geometry.triangles import (
     BX,
@@ -23,11 +24,9 @@ from rbfmuscle.geometry.triangles import (
     INVERSE_BC,
     INVERSE_CA,
     WIDTH,
-    fill_pseudonormals,
     fill_records,
     nearest_in_frame,
-    opposite_faces,
-    vertex_faces,
+    pseudonormals,
 )
 from rbfmuscle.jit import compiled
 
@@ -87,25 +86,9 @@ class ExactDistance:
         _box_loop(vertices, faces, self.order, self.starts, self.boxes)
 
     @cached_property
-    def _pseudonormals(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        edges, vertices = np.empty((len(self.faces), 3, 3)), np.empty((len(self.vertices), 3))
-        fill_pseudonormals(self.vertices, self.faces, self.across, edges, vertices)
-        return edges, vertices
-
-    @property
-    def edge_normals(self) -> NDArray[np.float64]:
-        """Pseudonormals (m, 3, 3) of the faces' edges."""
-        return self._pseudonormals[0]
-
-    @property
-    def vertex_normals(self) -> NDArray[np.float64]:
-        """Pseudonormals (n, 3) of the vertices."""
-        return self._pseudonormals[1]
-
-    @property
-    def closed(self) -> bool:
-        """Whether every edge has exactly one face on each side, with consistent orientation."""
-        return bool((self.across >= 0).all())
+    def pseudonormals(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Pseudonormals of the faces' edges (m, 3, 3) and of the vertices (n, 3)."""
+        return pseudonormals(self.vertices, self.faces, self.across)
 
     @property
     def tree(self) -> Tree:
@@ -123,10 +106,6 @@ class ExactDistance:
         """
         return self.nearest(points, reach=reach)[0]
 
-    def closest_point(self, points: ArrayLike) -> NDArray[np.float64]:
-        """Nearest point on the surface, (n, 3)."""
-        return self.nearest(points)[1]
-
     def nearest(
         self, points: ArrayLike, *, reach: float = np.inf
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
@@ -140,7 +119,7 @@ class ExactDistance:
         count = len(points)
         distance, closest = np.empty(count), np.empty((count, 3))
         face, normal = np.empty(count, dtype=np.int64), np.empty((count, 3))
-        normals = (self.edge_normals, self.vertex_normals, self.faces, self.order)
+        normals = (*self.pseudonormals, self.faces, self.order)
 
         def work(a, b):
             out = (distance[a:b], closest[a:b], face[a:b], normal[a:b])
@@ -155,8 +134,16 @@ def _layout(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Layout:
     depth = max(0, int(np.ceil(np.log2(len(faces) / LEAF))))
     starts = np.zeros((1 << depth) + 1, dtype=np.int64)
     _order_loop(vertices[faces].mean(axis=1), order, depth, starts)
-    start, around = vertex_faces(faces, len(vertices))
-    return Layout(order, starts, opposite_faces(faces, start, around))
+    return Layout(order, starts, faces_across(faces))
+
+
+def faces_across(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Face across edge k (corner k to k + 1) of each face, (m, 3).
+
+    -1 where the edge has no other face, -2 where it has several, or one that runs the same way.
+    """
+    opposite = opposite_half_edges(faces)
+    return np.where(opposite < 0, opposite, opposite // 3).reshape(-1, 3)
 
 
 @compiled

@@ -50,6 +50,25 @@ def unique_edges(faces: Integers) -> Integers:
     return ends[np.sort(first)]
 
 
+def opposite_half_edges(faces: Integers) -> Integers:
+    """Number (3m,) of the opposite half-edge of each half-edge ``3 * face + corner``, which runs to the next corner.
+
+    -1 where the edge has no other face; -2 where it has several, or one that runs the same way.
+    """
+    tail, head = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    key = np.minimum(tail, head) * (int(faces.max(initial=0)) + 1) + np.maximum(tail, head)
+    order = np.argsort(key, kind="stable")
+    first = np.flatnonzero(np.diff(key[order], prepend=-1))
+    count = np.diff(first, append=len(key))
+    opposite = np.full(len(key), -2)
+    opposite[order[first[count == 1]]] = -1
+    one, other = (order[first[count == 2] + k] for k in range(2))
+    paired = (tail[one] == head[other]) & (one // 3 != other // 3)
+    one, other = one[paired], other[paired]
+    opposite[one], opposite[other] = other, one
+    return opposite
+
+
 def split_pinched_vertices(vertices: Floats, faces: Integers) -> tuple[Floats, Integers]:
     """Repeat each vertex where several fans of triangles meet, so that every fan has its own.
 
@@ -66,14 +85,10 @@ def split_pinched_vertices(vertices: Floats, faces: Integers) -> tuple[Floats, I
     faces : (m, 3) ndarray of int
         The same triangles in the same order.
     """
-    following = np.roll(faces, -1, axis=1)
-    size = len(vertices)
-    key, back = (faces * size + following).ravel(), (following * size + faces).ravel()
-    order = np.argsort(key, kind="stable")
-    twin = order[np.searchsorted(key, back, sorter=order)]
+    size, twin = len(vertices), opposite_half_edges(faces)
     # the corner after the opposite side, in the neighbouring triangle, is at the same vertex
     beside = twin - twin % 3 + (twin + 1) % 3
-    corners = len(key)
+    corners = len(twin)
     links = coo_matrix((np.ones(corners), (np.arange(corners), beside)), shape=(corners, corners))
     count, fan = connected_components(links, directed=False)
     at, first = faces.ravel(), np.unique(fan, return_index=True)[1]
@@ -185,3 +200,26 @@ def volume_cubic(vertices, faces, direction, origin):
         c2 += six_volumes(v, r, u) + six_volumes(q, w, u) + six_volumes(v, w, p)
         c3 += six_volumes(v, w, u)
     return c0 / 6.0, c1 / 6.0, c2 / 6.0, c3 / 6.0
+
+
+@compiled
+def touching_balls(points, normals, steps, nearest):
+    """Radii ``steps`` (2, n) of the empty balls that touch each point from outside and inside, infinite where no point
+    limits them, and how far the nearest other point is.
+    """
+    for i in range(len(points)):
+        steps[:, i] = np.inf
+        least = np.inf
+        for j in range(len(points)):
+            square, along = 0.0, 0.0
+            for c in range(3):
+                d = points[j, c] - points[i, c]
+                square += d * d
+                along += d * normals[i, c]
+            if j == i:
+                continue
+            least = min(least, square)
+            side = 0 if along > 0 else 1
+            if along != 0.0:
+                steps[side, i] = min(steps[side, i], square / (2 * abs(along)))
+        nearest[i] = np.sqrt(least)

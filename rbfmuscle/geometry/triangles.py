@@ -8,6 +8,7 @@ computation using the angle weighted pseudonormal").
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.jit import compiled
 
 # Columns of a record: corner A, x-axis, y-axis, normal, then x of B, x and y of C, and 1/|BC|^2, 1/|CA|^2.
@@ -118,80 +119,30 @@ def nearest_in_frame(bx, cx, cy, inverse_bc, inverse_ca, x, y):
     return dx, dy, feature
 
 
-@compiled
-def vertex_faces(faces, count):
-    """Faces around each vertex: ``(start, list)``, those of vertex v in ``list[start[v]:start[v + 1]]``."""
-    start = np.zeros(count + 2, dtype=np.int64)
-    for n in range(len(faces)):
-        for k in range(3):
-            start[faces[n, k] + 2] += 1
-    start = np.cumsum(start)
-    around = np.empty(3 * len(faces), dtype=np.int64)
-    for n in range(len(faces)):
-        for k in range(3):
-            v = faces[n, k] + 1
-            around[start[v]] = n
-            start[v] += 1
-    return start[:-1], around
-
-
-@compiled
-def opposite_faces(faces, start, around):
-    """Face across edge k (corner k to k + 1) of each face, (m, 3).
-
-    -1 where the edge has no face on the other side; -2 where the other side is not a single face in the
-    opposite direction (inconsistent orientation, or more than two faces).
-    """
-    across = np.full((len(faces), 3), -1, dtype=np.int64)
-    for n in range(len(faces)):
-        for k in range(3):
-            a, b = faces[n, k], faces[n, (k + 1) % 3]
-            count = 0
-            for m in range(start[a], start[a + 1]):
-                other = around[m]
-                if other == n:
-                    continue
-                for j in range(3):
-                    c, d = faces[other, j], faces[other, (j + 1) % 3]
-                    if c == b and d == a:
-                        across[n, k] = other
-                        count += 1
-                    elif c == a and d == b:
-                        count += 2
-            if count > 1:
-                across[n, k] = -2
-    return across
-
-
-@compiled
-def fill_pseudonormals(vertices, faces, across, edge_normals, vertex_normals):
-    """Fill the directions that sign a distance: ``edge_normals`` (m, 3, 3), ``vertex_normals`` (n, 3).
+def pseudonormals(vertices: Floats, faces: Integers, across: Integers) -> tuple[Floats, Floats]:
+    """Directions that sign a distance, of edges (m, 3, 3) and of vertices (n, 3).
 
     Edge k of a face takes the sum of the two unit face normals, a vertex the normals weighted by their angle.
+
+    Parameters
+    ----------
+    vertices : (n, 3) ndarray
+    faces : (m, 3) ndarray of int
+        Those without area have no normal.
+    across : (m, 3) ndarray of int
+        Face across edge k of each face, below zero where there is none.
     """
-    unit = np.zeros((len(faces), 3))
-    vertex_normals[:] = 0.0
-    for n in range(len(faces)):
-        a, b, c = vertices[faces[n, 0]], vertices[faces[n, 1]], vertices[faces[n, 2]]
-        ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-        vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        area = np.sqrt(nx * nx + ny * ny + nz * nz)
-        if area == 0.0:
-            continue
-        unit[n, 0], unit[n, 1], unit[n, 2] = nx / area, ny / area, nz / area
-        wx, wy, wz = vx - ux, vy - uy, vz - uz
-        angle_a = np.arctan2(area, ux * vx + uy * vy + uz * vz)
-        angle_b = np.arctan2(area, -(ux * wx + uy * wy + uz * wz))
-        for j in range(3):
-            vertex_normals[faces[n, 0], j] += angle_a * unit[n, j]
-            vertex_normals[faces[n, 1], j] += angle_b * unit[n, j]
-            vertex_normals[faces[n, 2], j] += (np.pi - angle_a - angle_b) * unit[n, j]
-    for n in range(len(faces)):
-        for k in range(3):
-            other = across[n, k]
-            for j in range(3):
-                edge_normals[n, k, j] = unit[n, j] + (unit[other, j] if other >= 0 else 0.0)
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    u, v = b - a, c - a
+    normal = np.cross(u, v)
+    area = np.sqrt(np.einsum("md,md->m", normal, normal))
+    unit = np.divide(normal, area[:, None], out=np.zeros_like(normal), where=area[:, None] > 0.0)
+    at_a = np.arctan2(area, np.einsum("md,md->m", u, v))
+    at_b = np.arctan2(area, -np.einsum("md,md->m", u, v - u))
+    angles = np.column_stack([at_a, at_b, np.pi - at_a - at_b])
+    of_vertices = np.zeros((len(vertices), 3))
+    np.add.at(of_vertices, faces, angles[:, :, None] * unit[:, None])
+    return unit[:, None] + np.where((across >= 0)[:, :, None], unit[across], 0.0), of_vertices
 
 
 @compiled

@@ -132,15 +132,13 @@ def _cubic_block_loop(terms, gradient, p, acc, g):
     """Values, and gradients, of the cubic kernel with epsilon 1."""
     centres, a, b = terms.centres, terms.a, terms.b
     for j in range(centres.shape[1]):
-        at, w = (centres[0, j], centres[1, j], centres[2, j]), a[j]
-        if terms.hermite and gradient:
-            _cubic_hermite_gradient_loop(p, at, w, (b[0, j], b[1, j], b[2, j]), acc, g)
-        elif terms.hermite:
-            _cubic_hermite_value_loop(p, at, w, (b[0, j], b[1, j], b[2, j]), acc)
+        at, slope = (centres[0, j], centres[1, j], centres[2, j]), (b[0, j], b[1, j], b[2, j])
+        if gradient and terms.hermite:
+            _cubic_hermite_gradient_loop(p, at, a[j], slope, acc, g)
         elif gradient:
-            _cubic_gradient_loop(p, at, w, acc, g)
+            _cubic_gradient_loop(p, at, a[j], acc, g)
         else:
-            _cubic_value_loop(p, at, w, acc)
+            _cubic_value_loop(p, at, a[j], slope, acc)
 
 
 @compiled(error_model="numpy")
@@ -213,15 +211,6 @@ def _polynomial_loop(terms, gradient, p, acc, g):
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
-def _cubic_value_loop(p, at, a, acc):
-    """acc += a r^3."""
-    for i in range(acc.size):
-        dx, dy, dz = p[0, i] - at[0], p[1, i] - at[1], p[2, i] - at[2]
-        u = dx * dx + dy * dy + dz * dz
-        acc[i] += a * u * np.sqrt(u)
-
-
-@compiled(error_model="numpy", fastmath={"contract"})
 def _cubic_gradient_loop(p, at, a, acc, g):
     """acc += a r^3, g += 3 a r d."""
     for i in range(acc.size):
@@ -235,7 +224,7 @@ def _cubic_gradient_loop(p, at, a, acc, g):
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
-def _cubic_hermite_value_loop(p, at, a, b, acc):
+def _cubic_value_loop(p, at, a, b, acc):
     """acc += a r^3 - 3 r (B . d)."""
     bx, by, bz = b
     for i in range(acc.size):

@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.implicit.evaluation import Terms, evaluate
-from rbfmuscle.implicit.fit.fitting import Basis, solve, solve_bounded
-from rbfmuscle.implicit.fit.systems import check_count, frame, hermite_system, hermite_weights
+from rbfmuscle.implicit.fit.assembly import Basis, check_count, frame, hermite_system, hermite_weights
+from rbfmuscle.implicit.fit.fitting import solve, solve_bounded
 from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
 from rbfmuscle.validation import (
     NumericalWarning,

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.surfaces import touching_balls
 from rbfmuscle.implicit.field import RBFField, warn_if_narrow
 from rbfmuscle.implicit.kernels.table import Kernel
-from rbfmuscle.implicit.placement.off_surface import off_surface_points
 
 # With more centres than these a fit to normal derivatives alone errs less for the same time.
 MOST_WITH_ALL_DERIVATIVES = 200
+# Part of the touching ball's radius that a step off the surface may use.
+SAFETY = 0.5
 
 
 @dataclass(frozen=True)
@@ -58,3 +60,32 @@ class FieldFit:
 def wanted_derivatives(count: int, *, fitted: bool) -> str:
     """What a fit to so many centres meets: all derivatives of few ones and of those fitted to the whole surface."""
     return "all" if fitted or count <= MOST_WITH_ALL_DERIVATIVES else "normal"
+
+
+def off_surface_points(points: Floats, normals: Floats) -> tuple[Floats, Floats]:
+    """Points on and off a surface with their signed distances, for fits to values.
+
+    Each point x gives f(x) = 0, f(x + d n) = d and f(x - d n) = -d (Carr et al. 2001). The step d is half the median
+    distance to the nearest other point, and at most half the radius of the empty ball that touches the surface in x,
+    so that x stays the nearest of all points to x + d n.
+
+    Parameters
+    ----------
+    points : (K, 3) ndarray
+        Positions on the surface, two or more [scene unit].
+    normals : (K, 3) ndarray
+        Unit outward normals.
+
+    Returns
+    -------
+    points : (3K, 3) ndarray
+        On the surface, outside, inside.
+    values : (3K,) ndarray
+        0, then +d, then -d.
+    """
+    steps = np.empty((2, len(points)))
+    nearest = np.empty(len(points))
+    touching_balls(points, normals, steps, nearest)
+    outside, inside = np.minimum(SAFETY * steps, 0.5 * np.median(nearest))
+    where = np.vstack([points, points + outside[:, None] * normals, points - inside[:, None] * normals])
+    return where, np.concatenate([np.zeros(len(points)), outside, -inside])

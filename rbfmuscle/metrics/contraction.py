@@ -6,19 +6,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import RBFInterpolator
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.geometry.mean_value import mean_value_weights
-from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.metrics.centreline import MuscleAtRest, carried_middle, end_groups
 from rbfmuscle.scene.activation.resolve import resolve_contraction
-from rbfmuscle.validation import SolveError
 
 SEGMENTS = 16  # of each fibre
 STATIONS = 48  # sections along the line of action
-SKIN = 0.004  # of the muscle's diagonal: how deep below the surface a fibre is kept
+CARRIERS = 600  # vertices of the carried mesh that carry the fibres
 CALIPERS = 36  # directions in which a section's width is taken
 
 
@@ -33,16 +30,19 @@ class ContractionStudy:
     """
 
     def __init__(self, rest: MuscleAtRest) -> None:
-        muscle, vertices, faces = rest.muscle, rest.vertices, rest.faces
+        muscle, vertices = rest.muscle, rest.vertices
         self.name = muscle.name
         self.ends = end_groups(muscle, rest.joints, rest.moving)
         self.weights = None
         if not muscle.fibres:
             return
         lines = np.array([resampled(np.asarray(line, dtype=float), SEGMENTS) for line in muscle.fibres])
-        lines = _kept_inside(lines, vertices, faces)
         self.shape = lines.shape
-        self.weights = mean_value_weights(lines.reshape(-1, 3), vertices, faces)
+        self.carriers = np.unique(np.linspace(0, len(vertices) - 1, CARRIERS).astype(int))
+        # Cubic radial functions with a linear polynomial reproduce every affine motion of the vertices.
+        units = np.eye(len(self.carriers))
+        carried = RBFInterpolator(vertices[self.carriers], units, kernel="cubic", degree=1)
+        self.weights = carried(lines.reshape(-1, 3))
         nearest = cKDTree(np.asarray(muscle.mesh.vertices, dtype=float)).query(lines)[1]
         tendon = resolve_contraction(muscle).tendon[nearest]
         # A segment is belly where neither end is tendon; a line of tendon alone counts for nothing.
@@ -52,7 +52,7 @@ class ContractionStudy:
     def lines(self, vertices: NDArray[np.float64]) -> NDArray[np.float64]:
         """The fibres (n, k, 3) that a carried mesh with these vertices holds; there must be some."""
         middle = vertices.mean(axis=0)
-        return (self.weights @ (vertices - middle) + middle).reshape(self.shape)
+        return (self.weights @ (vertices[self.carriers] - middle) + middle).reshape(self.shape)
 
     def measure(self, vertices: Floats, poses: dict[str, Any], surface: Any = None) -> dict[str, float]:
         """Quantities of a frame.
@@ -170,23 +170,6 @@ def _thickness(section, axis):
     angle = np.pi * np.arange(CALIPERS) / CALIPERS
     directions = np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v
     return float(np.ptp(points @ directions.T, axis=0).min())
-
-
-def _kept_inside(lines, vertices, faces):
-    """Lines whose points on or beyond the surface are put just below it, as only inner points can be carried.
-
-    Lines with a point that cannot be put there, at a thin rim, are left out, unless that is all of them.
-    """
-    tree = ExactDistance(vertices, faces)
-    points = lines.reshape(-1, 3).copy()
-    skin = SKIN * float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    out = tree.signed_distance(points) > -skin
-    normals = vertex_normals(vertices, faces)[cKDTree(vertices).query(points[out])[1]]
-    points[out] = tree.closest_point(points[out]) - skin * normals
-    good = (tree.signed_distance(points) < -0.1 * skin).reshape(lines.shape[:2]).all(axis=1)
-    if not good.any():
-        raise SolveError("no fibre lies inside the muscle's mesh, so none can be followed; check fibres")
-    return points.reshape(lines.shape)[good]
 
 
 def resampled(line: Floats, segments: int) -> Floats:

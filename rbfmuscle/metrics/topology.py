@@ -3,11 +3,10 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.sparse as sparse
-from scipy.sparse.csgraph import connected_components
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.crossing import FaceTree
+from rbfmuscle.geometry.surfaces import label_sheets
 
 if TYPE_CHECKING:
     from rbfmuscle.simulation.frame import ModelSurface
@@ -44,10 +43,7 @@ def self_crossings(vertices: Floats, faces: Integers, *, tree: FaceTree | None =
 
 def count_components(count: int, faces: Integers) -> int:
     """Number of connected pieces among ``count`` vertices; vertices that no face uses do not count."""
-    ends = np.concatenate([faces[:, :2], faces[:, 1:]])
-    graph = sparse.coo_matrix((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), shape=(count, count))
-    _, label = connected_components(graph, directed=False)
-    return len(np.unique(label[faces[:, 0]]))
+    return len(np.unique(label_sheets(faces, count)[1][faces[:, 0]]))
 
 
 class SurfaceForm:

@@ -6,7 +6,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import RestFrame
-from rbfmuscle.geometry.rigid import smooth_displacement
+from rbfmuscle.geometry.rotations import smooth_displacement
 from rbfmuscle.implicit.extraction.material import project_to_level_set
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
 from rbfmuscle.implicit.extraction.slivers import mend_slivers

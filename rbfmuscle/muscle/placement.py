@@ -38,7 +38,7 @@ FALL, TRIALS, MOST_CENTRES = 1.2, 5, 4.0
 # What is aimed at, in what is wanted: the shown mesh adds its own.
 AIM = 0.97
 # Parts of the names under which samples and numbers of centres are cached: raise one when these are found anew.
-SAMPLING, SEARCH = 3, 1
+SAMPLING, SEARCH = 4, 1
 SEED = 0
 
 

@@ -9,8 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats
-from rbfmuscle.geometry.surfaces import vertex_normals
-from rbfmuscle.geometry.touching_balls import touching_balls
+from rbfmuscle.geometry.surfaces import touching_balls, vertex_normals
 from rbfmuscle.geometry.triangles import nearest_weights, triangle_normal
 from rbfmuscle.geometry.winding import wound_around
 from rbfmuscle.jit import compiled

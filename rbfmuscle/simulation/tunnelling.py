@@ -16,7 +16,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.geometry.rigid import rigid_fit
+from rbfmuscle.geometry.rotations import rigid_fit
 from rbfmuscle.jit import compiled
 from rbfmuscle.simulation.broad_phase import box_loop, boxes_apart
 from rbfmuscle.simulation.neighbours.pairs import Planes
@@ -213,7 +213,7 @@ def only_grazed(
         [scene unit].
     """
     exact = ExactDistance(mesh.vertices, mesh.faces)
-    if not exact.closed:
+    if (exact.across < 0).any():  # not closed
         return False
     for n in crossing.index:
         first, last = (

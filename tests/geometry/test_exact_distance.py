@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.exact_distance import ExactDistance, faces_across
 
 
 def tree(mesh):
@@ -80,19 +80,13 @@ def test_triangles_without_area_count_as_their_longest_edge(axis):
     np.testing.assert_allclose(np.abs(exact.signed_distance(points)), [3.0, 1.0, 2.0, 1.0])
 
 
-def test_closed_tells_open_and_inconsistent_meshes_apart():
+def test_faces_across_of_open_turned_and_doubled_meshes():
     box = trimesh.creation.box((2.0, 2.0, 2.0))
-    turned = box.faces.copy()
+    faces, turned = np.array(box.faces), np.array(box.faces)
     turned[0] = turned[0, ::-1]
-    assert tree(box).closed
-    assert not ExactDistance(box.vertices, box.faces[1:]).closed
-    assert not ExactDistance(box.vertices, turned).closed
-
-
-def test_reach_of_zero_is_refused():
-    with pytest.raises(ValueError, match="reach"):
-        tree(trimesh.creation.icosphere(1, 1.0)).signed_distance(np.zeros((1, 3)), reach=0.0)
-
-
-def test_no_points_give_no_distances():
-    assert tree(trimesh.creation.icosphere(1, 1.0)).signed_distance(np.zeros((0, 3))).shape == (0,)
+    across = faces_across(faces)
+    found = {tuple(sorted(pair)) for pair in zip(np.repeat(np.arange(12), 3), across.ravel())}
+    assert found == {tuple(pair) for pair in np.sort(box.face_adjacency, axis=1).tolist()}
+    assert np.count_nonzero(faces_across(faces[1:]) == -1) == 3
+    assert np.count_nonzero(faces_across(turned) == -2) == 6
+    assert (faces_across(np.vstack([faces, faces[:1]]))[0] == -2).all()

@@ -10,51 +10,15 @@ from pbd_baseline.contraction import _stretch_loop
 from pbd_baseline.shapes import _scale_loop
 from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.fields import LevelField
-from rbfmuscle.geometry.mean_value import mean_value_weights
 from rbfmuscle.geometry.rest_frame import BoneFrame
-from rbfmuscle.geometry.touching_balls import touching_balls
+from rbfmuscle.geometry.surfaces import touching_balls
 from rbfmuscle.geometry.triangles import nearest_weights
-from rbfmuscle.geometry.winding import winding_number
+from rbfmuscle.geometry.winding import wound_around
 
 
 def solid():
     mesh = trimesh.creation.icosphere(subdivisions=1)
     return np.array(mesh.vertices) * [2.0, 1.0, 0.7] + [5.0, 0.0, 1.0], np.array(mesh.faces)
-
-
-def test_mean_value_weights_give_points_back_and_follow_affine_motions():
-    vertices, faces = solid()
-    rng = np.random.default_rng(0)
-    points = [5.0, 0.0, 1.0] + rng.uniform(-0.35, 0.35, (12, 3)) * [2.0, 1.0, 0.7]
-    weights = mean_value_weights(points, vertices, faces)
-    np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=1e-12)
-    np.testing.assert_allclose(weights @ vertices, points, atol=1e-10)
-    matrix = rng.normal(size=(3, 3))
-    np.testing.assert_allclose(weights @ (vertices @ matrix.T + 3.0), points @ matrix.T + 3.0, atol=1e-9)
-    assert weights.min() > 0.0  # the solid is convex
-
-
-def test_mean_value_weights_of_a_middle_are_even_and_do_not_depend_on_unit_place_or_order():
-    """An octahedron's middle is as near to each vertex."""
-    mesh = trimesh.creation.icosphere(subdivisions=0)
-    even = mean_value_weights([[0.0, 0.0, 0.0]], mesh.vertices, mesh.faces)
-    np.testing.assert_allclose(even, 1.0 / len(mesh.vertices), atol=1e-12)
-    vertices, faces = solid()
-    points = [5.0, 0.0, 1.0] + np.random.default_rng(1).uniform(-0.3, 0.3, (5, 3))
-    weights = mean_value_weights(points, vertices, faces)
-    np.testing.assert_allclose(
-        mean_value_weights(1e3 * points + 7.0, 1e3 * vertices + 7.0, faces), weights, atol=1e-10
-    )
-    order = np.random.default_rng(2).permutation(len(faces))
-    np.testing.assert_allclose(
-        mean_value_weights(points, vertices, np.roll(faces[order], 1, axis=1)), weights, atol=1e-12
-    )
-
-
-def test_mean_value_weights_refuse_a_vertex_of_the_mesh():
-    vertices, faces = solid()
-    with pytest.raises(ValueError, match="point 1 at"):
-        mean_value_weights([[5.0, 0.0, 1.0], vertices[3]], vertices, faces)
 
 
 def literal_balls(points, normals):
@@ -140,15 +104,13 @@ def test_a_field_less_a_level_is_zero_where_the_field_has_the_level():
     np.testing.assert_allclose(gradient, [[1, 0, 0], [0, 1, 0]])
 
 
-def test_winding_numbers_are_one_inside_none_outside_and_halves_add_up():
+def test_a_mesh_winds_around_what_is_inside_it_and_once_only():
     vertices, faces = solid()
-    inside, outside = np.array([5.2, 0.1, 1.1]), np.array([8.0, 0.3, 1.0])
-    assert winding_number(inside, vertices, faces) == pytest.approx(1.0)
-    assert winding_number(outside, vertices, faces) == pytest.approx(0.0, abs=1e-12)
-    half = faces[: len(faces) // 2], faces[len(faces) // 2 :]
-    parts = [winding_number(inside, vertices, np.ascontiguousarray(part)) for part in half]
-    assert sum(parts) == pytest.approx(1.0) and 0.1 < parts[0] < 0.9
-    assert winding_number(inside, vertices, np.ascontiguousarray(faces[:, ::-1])) == pytest.approx(-1.0)
+    points = np.array([[5.2, 0.1, 1.1], [8.0, 0.3, 1.0]])
+    for triangles, expected in ((faces, [True, False]), (faces[:, ::-1], [False, False])):
+        found = np.empty(2, dtype=bool)
+        wound_around(points, vertices, np.ascontiguousarray(triangles), found)
+        np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize("scale", [1.0, 40.0])

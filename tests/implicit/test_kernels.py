@@ -6,8 +6,7 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from rbfmuscle.implicit.fit.assembly import exponents, monomials
-from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
-from rbfmuscle.validation import UsageError
+from rbfmuscle.implicit.kernels.table import KERNELS
 
 mp.mp.dps = 50
 COMPACT = [name for name, kernel in KERNELS.items() if kernel.compact]
@@ -132,14 +131,3 @@ def test_kernel_is_conditionally_definite_of_its_order(name):
 def test_one_degree_lower_is_not_definite(name):
     points = np.random.default_rng(0).uniform(-1, 1, (40, 3))
     assert least_eigenvalue(KERNELS[name], points, KERNELS[name].degree - 1) < 0
-
-
-def test_wendland_functions_of_dimension_one_are_refused():
-    axis = np.arange(6.0)
-    grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
-    lengths = np.linspace(1, 12, 60)
-    distances = cdist(grid, grid)
-    assert min(np.linalg.eigvalsh(np.maximum(1 - distances / a, 0))[0] for a in lengths) < 0
-    for name in ("wendland_10", "wendland_11", "wendland_12"):
-        with pytest.raises(UsageError, match="one dimension only"):
-            get_kernel(name)

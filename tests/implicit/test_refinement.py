@@ -1,14 +1,16 @@
 """Centres and normals fitted to the whole surface."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
 
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.field_fit import FieldFit
-from rbfmuscle.implicit.fit.systems import hermite_system
+from rbfmuscle.implicit.fit.assembly import hermite_system
 from rbfmuscle.implicit.kernels.table import get_kernel
-from rbfmuscle.implicit.placement.refinement import _rows, fit_centres, fit_sample
+from rbfmuscle.implicit.placement.refinement import _rows, fit_sample
 from rbfmuscle.implicit.placement.sampling import sample_surface, spread_points
 from rbfmuscle.implicit.selection import spacing
 from rbfmuscle.validation import UsageError
@@ -61,27 +63,20 @@ def test_rows_give_the_field(bean):
     np.testing.assert_allclose(rows @ solution, field(at * scale + origin), atol=1e-7)
 
 
-def test_nothing_moves_where_nothing_is_missed(bean):
-    _, _, sample = bean
-    points, normals = fit_centres(sample.points, sample.normals, sample.points, CUBIC, rounds=1)
-    np.testing.assert_allclose(points, sample.points, atol=1e-6)
-    np.testing.assert_allclose(normals, sample.normals, atol=1e-6)
-
-
 def test_units_and_place_do_not_matter(bean):
     vertices, faces, sample = bean
-    where = spread_points(vertices, faces, 1000)[0]
-    points, normals = fit_centres(sample.points, sample.normals, where, CUBIC)
+    fitted = fit_sample(sample, vertices, faces, fit=CUBIC)
     shift = np.array([3.0, -1.0, 2.0])
-    there, same = fit_centres(sample.points * 1e-3 + shift, sample.normals, where * 1e-3 + shift, CUBIC)
-    np.testing.assert_allclose((there - shift) * 1e3, points, atol=1e-6)
-    np.testing.assert_allclose(same, normals, atol=1e-6)
+    moved = replace(sample, points=sample.points * 1e-3 + shift)
+    there = fit_sample(moved, vertices * 1e-3 + shift, faces, fit=CUBIC)
+    np.testing.assert_allclose((there.points - shift) * 1e3, fitted.points, atol=1e-6)
+    np.testing.assert_allclose(there.normals, fitted.normals, atol=1e-6)
 
 
 def test_a_kernel_without_hermite_fit_is_refused(bean):
-    sample = bean[2]
+    vertices, faces, sample = bean
     with pytest.raises(UsageError, match="no Hermite fit"):
-        fit_centres(sample.points, sample.normals, sample.points, FieldFit(get_kernel("linear"), 1.0, "all"))
+        fit_sample(sample, vertices, faces, fit=FieldFit(get_kernel("linear"), 1.0, "all"))
 
 
 def test_spread_points_are_on_the_mesh_and_even():

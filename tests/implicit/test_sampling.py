@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 import trimesh
 
+from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.surfaces import unique_edges
 from rbfmuscle.implicit.field import RBFField
+from rbfmuscle.implicit.field_fit import off_surface_points
 from rbfmuscle.implicit.placement.clustering import _equalise_loop
 from rbfmuscle.implicit.placement.control_mesh import contract_clusters
-from rbfmuscle.implicit.placement.off_surface import off_surface_points
-from rbfmuscle.implicit.placement.sampling import sample_surface
+from rbfmuscle.implicit.placement.sampling import sample_surface, spread_points
 from rbfmuscle.validation import MeshError
 
 HIP = Path(os.environ.get("RBFMUSCLE_DATA", Path(__file__).parents[3] / "shared" / "data")) / "hip"
-MUSCLES = ("gluteus_maximus", "gluteus_medius", "iliacus", "adductor_brevis")
 needs_hip = pytest.mark.skipif(not HIP.exists(), reason="real hip not present (RBFMUSCLE_DATA)")
 
 
@@ -51,30 +51,38 @@ def check_control(mesh, sample, count):
     assert control.volume > 0
 
 
-@pytest.mark.parametrize("count", [60, 300])
+@pytest.mark.parametrize(("count", "placement"), [(60, "even"), (300, "adaptive"), (100, "greedy")])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_control_triangulation_is_closed_manifold_of_the_same_genus(shape, count):
+def test_control_triangulation_is_closed_manifold_of_the_same_genus(shape, count, placement):
     mesh = SHAPES[shape]()
-    sample = sample_surface(mesh.vertices, mesh.faces, count)
+    sample = sample_surface(mesh.vertices, mesh.faces, count, placement=placement)
     check_control(mesh, sample, count)
-    assert sample.areas.sum() == pytest.approx(mesh.area, rel=1e-12)
+    # No two points may meet, or the fit is singular.
+    gaps = trimesh.proximity.cKDTree(sample.points).query(sample.points, k=2)[0][:, 1]
+    assert gaps.min() > 0.1 * np.sqrt(mesh.area / count)
     np.testing.assert_allclose(np.linalg.norm(sample.normals, axis=1), 1.0, rtol=1e-12)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_points_lie_on_the_surface_where_their_coordinates_say(shape):
+def test_points_lie_on_the_surface(shape):
     mesh = SHAPES[shape]()
     sample = sample_surface(mesh.vertices, mesh.faces, 100)
-    corners = mesh.vertices[mesh.faces[sample.face]]
-    rebuilt = np.einsum("ic,icd->id", sample.barycentric, corners)
-    np.testing.assert_allclose(rebuilt, sample.points, atol=1e-9 * mesh.scale)
-    assert (mesh.faces[sample.face] == sample.vertex[:, None]).any(axis=1).all()
+    distance = ExactDistance(mesh.vertices, mesh.faces).signed_distance(sample.points)
+    np.testing.assert_allclose(distance, 0.0, atol=1e-9 * mesh.scale)
+
+
+def areas(mesh, sample):
+    """Area nearest to each point, by many points spread evenly."""
+    points = spread_points(mesh.vertices, mesh.faces, 40_000)[0]
+    nearest = trimesh.proximity.cKDTree(sample.points).query(points)[1]
+    return np.bincount(nearest, minlength=len(sample.points)) * mesh.area / len(points)
 
 
 def test_sphere_is_covered_evenly_with_radial_normals():
     mesh = trimesh.creation.icosphere(subdivisions=5, radius=10.0)
     sample = sample_surface(mesh.vertices, mesh.faces, 300, placement="even")
-    assert sample.areas.std() / sample.areas.mean() < 0.1
+    share = areas(mesh, sample)
+    assert share.std() / share.mean() < 0.12  # 0.09 of it by the 130 points that measure a cell
     gaps = trimesh.proximity.cKDTree(sample.points).query(sample.points, k=2)[0][:, 1]
     # Hexagonal packing would give 2.2; clusters of mesh vertices come within a third of it.
     assert gaps.min() > 0.67 * np.sqrt(2 / np.sqrt(3) * mesh.area / 300)
@@ -125,45 +133,29 @@ def test_scrambled_clusters_still_contract_to_a_manifold():
 
 @pytest.mark.parametrize("placement", ["even", "adaptive", "greedy"])
 def test_sheets_that_meet_in_a_vertex_are_sampled_as_if_apart(placement):
-    """The same surface with a pole of its own on either side, or one pole for both, is the same field's."""
+    """One pole for both sides of a ball gives the triangulation of a ball all the same."""
     mesh = trimesh.creation.icosphere(3, 10.0)
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
     upper, lower = vertices[:, 2].argmax(), vertices[:, 2].argmin()
     vertices[[upper, lower]] = 0.0
-    apart = sample_surface(vertices, faces, 60, placement=placement)
     joined = np.where(faces == lower, upper, faces)
     sample = sample_surface(vertices, joined, 60, placement=placement)
     check_control(mesh, sample, 60)
-    assert sample.areas.sum() == pytest.approx(apart.areas.sum(), rel=1e-12)
-    assert (joined[sample.face] == sample.vertex[:, None]).any(axis=1).all()
 
 
-def test_open_mesh_is_refused():
-    mesh = trimesh.creation.icosphere(2)
-    with pytest.raises(MeshError, match="closed"):
-        sample_surface(mesh.vertices, mesh.faces[1:], 20)
-
-
-def test_too_few_points_for_the_topology_are_refused():
+@pytest.mark.parametrize(
+    ("error", "words", "count", "placement", "dropped"),
+    [
+        (MeshError, "closed", 20, "even", 1),
+        (MeshError, "topology", 5, "even", 0),
+        (ValueError, "at least 4", 3, "even", 0),
+        (ValueError, "placement", 20, "evn", 0),
+    ],
+)
+def test_what_cannot_be_sampled_is_refused(error, words, count, placement, dropped):
     mesh = SHAPES["torus"]()
-    with pytest.raises(MeshError, match="topology"):
-        sample_surface(mesh.vertices, mesh.faces, 5)
-    with pytest.raises(ValueError, match="at least 4"):
-        sample_surface(mesh.vertices, mesh.faces, 3)
-    with pytest.raises(ValueError, match="placement"):
-        sample_surface(mesh.vertices, mesh.faces, 20, placement="evn")
-
-
-@pytest.mark.parametrize("placement", ["adaptive", "greedy"])
-@pytest.mark.parametrize("shape", ["ellipsoid", "torus"])
-def test_other_placements_cover_everything_with_a_manifold(shape, placement):
-    mesh = SHAPES[shape]()
-    sample = sample_surface(mesh.vertices, mesh.faces, 100, placement=placement)
-    check_control(mesh, sample, 100)
-    assert sample.areas.max() < 4 * sample.areas.mean()
-    # No two points may meet, or the fit is singular.
-    gaps = trimesh.proximity.cKDTree(sample.points).query(sample.points, k=2)[0][:, 1]
-    assert gaps.min() > 0.1 * np.sqrt(mesh.area / 100)
+    with pytest.raises(error, match=words):
+        sample_surface(mesh.vertices, mesh.faces[dropped:], count, placement=placement)
 
 
 def test_adapted_placement_puts_points_where_the_surface_bends():
@@ -197,13 +189,11 @@ def test_greedy_placement_of_thousands_follows_the_curvature_alone():
 
 
 @needs_hip
-@pytest.mark.parametrize("count", [150, 2000])
-@pytest.mark.parametrize("muscle", MUSCLES)
-def test_real_muscles_get_an_even_cover_and_a_closed_control_mesh(muscle, count):
+@pytest.mark.parametrize(("muscle", "count"), [("gluteus_maximus", 2000), ("iliacus", 150)])
+def test_real_muscles_get_a_closed_control_mesh(muscle, count):
     mesh = trimesh.load(HIP / f"{muscle}.ply", process=False)
     sample = sample_surface(mesh.vertices, mesh.faces, count, placement="even")
     check_control(mesh, sample, count)
-    assert sample.areas.std() / sample.areas.mean() < 0.25
     control = trimesh.Trimesh(sample.points, sample.control_faces, process=False)
     # Chords of a thin muscle cut its volume: 19 % for the iliacus at 150.
     assert 0.8 < control.volume / mesh.volume < 1.0

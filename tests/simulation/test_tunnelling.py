@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from toy_scene import ToyMuscle, attach, bone, box, cylinder, ellipsoid, joint, muscle, scene, sphere
 
-from rbfmuscle.geometry.rigid import rigid_fit
+from rbfmuscle.geometry.rotations import rigid_fit
 from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.options import TunnellingOptions

@@ -1,4 +1,4 @@
-"""Matrices of RBF systems.
+"""Systems of RBF fits: the coordinates that they are scaled to, their matrices and right sides.
 
 Unknowns of a Hermite fit are grouped: all values, then all x-, y- and z-derivatives (or all normal
 derivatives), so that every column of every block is one contiguous run. Only the lower triangle (Fortran
@@ -7,12 +7,18 @@ order) is filled.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.implicit.evaluation import _offsets_loop
 from rbfmuscle.implicit.kernels.radial import _radial_loop
 from rbfmuscle.jit import compiled
+from rbfmuscle.validation import UsageError
+
+if TYPE_CHECKING:
+    from rbfmuscle.implicit.kernels.table import Kernel
 
 
 def exponents(degree: int) -> Integers:
@@ -146,3 +152,118 @@ def _normal_matrix_loop(x, normals, epsilon, form, out):
             both = nx * normals[0, i] + ny * normals[1, i] + nz * normals[2, i]
             value[n + i] = e2 * first[i] * at_i
             slope[n + i] = -e2 * (first[i] * both + e2 * second[i] * at_i * at_j)
+
+
+# Of a basis without normals.
+NO_NORMALS = np.zeros((0, 3))
+
+
+class Basis:
+    """Scaled centres, kernel and polynomial part of one fit.
+
+    Parameters
+    ----------
+    points : (K, 3) ndarray
+        Centres, scaled to order one.
+    kernel : Kernel
+    epsilon : float
+        In scaled coordinates.
+    kind : str
+        "value", "gradient" (values and all derivatives) or "normal" (values and normal derivatives).
+    normals : (K, 3) ndarray, optional
+        Unit normals, for kind "normal".
+    """
+
+    def __init__(
+        self,
+        points: Floats,
+        kernel: Kernel,
+        epsilon: float,
+        *,
+        kind: str = "value",
+        normals: Floats = NO_NORMALS,
+    ) -> None:
+        self.points, self.kernel, self.epsilon = points, kernel, float(epsilon)
+        self.kind, self.normals = kind, normals
+        self.powers = exponents(kernel.degree)
+        if kind == "gradient":
+            block = hermite_polynomials(points, self.powers)
+        elif kind == "normal":
+            block = normal_polynomials(points, normals, self.powers)
+        else:
+            block = monomials(points, self.powers)
+        self.polynomials = np.ascontiguousarray(block)
+        self.size = self.polynomials.shape[1]
+
+    def matrix(self) -> Floats:
+        """A, lower triangle valid, Fortran order: (size, size)."""
+        kernel = self.kernel
+        out = np.empty((self.size, self.size))
+        first = (np.ascontiguousarray(self.points.T),)
+        if self.kind == "normal":
+            first += (np.ascontiguousarray(self.normals.T),)
+        if self.kind == "gradient" and kernel.plain_cube:
+            _cubic_hermite_matrix_loop(*first, float(self.epsilon), out)
+            return out.T
+        loop = {
+            "value": _value_matrix_loop,
+            "gradient": _hermite_matrix_loop,
+            "normal": _normal_matrix_loop,
+        }[self.kind]
+        loop(*first, self.epsilon, kernel.form, out)
+        return out.T
+
+    def full_matrix(self) -> Floats:
+        """The augmented matrix [A P^T; P 0], both triangles: (size + q, size + q)."""
+        size, q = self.size, len(self.powers)
+        full = np.zeros((size + q, size + q))
+        lower = np.tril(self.matrix())
+        full[:size, :size] = lower + np.tril(lower, -1).T
+        full[size:, :size], full[:size, size:] = self.polynomials, self.polynomials.T
+        return full
+
+
+def frame(points: Floats) -> tuple[Floats, float]:
+    """Origin (3,) and scale: the points lie in the unit ball of (x - origin) / scale."""
+    if not len(points):
+        raise UsageError("a fit needs at least one point, got none")
+    origin = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    scale = float(np.sqrt(((points - origin) ** 2).sum(axis=1).max()))
+    return origin, scale if scale > 0 else 1.0
+
+
+def hermite_system(
+    points: Floats, normals: Floats, kernel: Kernel, epsilon: float, derivatives: str
+) -> tuple[Basis, Floats, Floats, float]:
+    """Basis, right side, origin and scale of a Hermite fit (arguments as in `RBFField.fit_hermite`)."""
+    origin, scale = frame(points)
+    shape = epsilon * scale if kernel.has_epsilon else 1.0
+    scaled = (points - origin) / scale
+    if derivatives == "all":
+        basis = Basis(scaled, kernel, shape, kind="gradient")
+        return basis, np.concatenate([np.zeros(len(points)), normals.T.ravel()]) * scale, origin, scale
+    lengths = np.linalg.norm(normals, axis=1)
+    if not lengths.all():
+        raise UsageError(f"normals must not be zero, row {int(np.argmin(lengths))} is")
+    unit = normals / lengths[:, None]
+    basis = Basis(scaled, kernel, shape, kind="normal", normals=unit)
+    return basis, np.concatenate([np.zeros(len(points)), lengths]) * scale, origin, scale
+
+
+def hermite_weights(basis: Basis, weights: Floats) -> Floats:
+    """Rows (a, B) for each centre from the solution of a Hermite system: (K, 4)."""
+    if basis.kind == "gradient":
+        return weights.reshape(4, -1).T.copy()
+    value, along = weights.reshape(2, -1)
+    return np.column_stack([value, along[:, None] * basis.normals])
+
+
+def check_count(kernel: Kernel, count: int) -> None:
+    """Raise LinAlgError where a kernel's polynomial has more terms than there are points."""
+    degree = kernel.degree
+    terms = (degree + 1) * (degree + 2) * (degree + 3) // 6
+    if terms > count:
+        raise np.linalg.LinAlgError(
+            f"degree {degree} of kernel '{kernel.name}' has {terms} polynomial terms, more than the {count} points; "
+            "degree too high: use a kernel of lower order or add points"
+        )

@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import linalg
@@ -24,8 +24,7 @@ from scipy.linalg import blas
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.implicit.fit import assembly
-from rbfmuscle.implicit.fit.condition import largest_eigenvalue, probe
+from rbfmuscle.implicit.fit.assembly import Basis
 from rbfmuscle.implicit.fit.lapack import (
     factor_cholesky,
     multiply_symmetric,
@@ -34,85 +33,11 @@ from rbfmuscle.implicit.fit.lapack import (
 )
 from rbfmuscle.validation import NumericalWarning
 
-if TYPE_CHECKING:
-    from rbfmuscle.implicit.kernels.table import Kernel
-
-
 DOUBTFUL = 1e13
 """Condition above which a fit is reported as doubtful, and a ridge takes part."""
 KEPT = 1e12
 """Condition that this ridge keeps: with a greater one Cholesky may still fail."""
 _DEPENDENT = 1e-9
-
-
-# Of a basis without normals.
-NO_NORMALS = np.zeros((0, 3))
-
-
-class Basis:
-    """Scaled centres, kernel and polynomial part of one fit.
-
-    Parameters
-    ----------
-    points : (K, 3) ndarray
-        Centres, scaled to order one.
-    kernel : Kernel
-    epsilon : float
-        In scaled coordinates.
-    kind : str
-        "value", "gradient" (values and all derivatives) or "normal" (values and normal derivatives).
-    normals : (K, 3) ndarray, optional
-        Unit normals, for kind "normal".
-    """
-
-    def __init__(
-        self,
-        points: Floats,
-        kernel: Kernel,
-        epsilon: float,
-        *,
-        kind: str = "value",
-        normals: Floats = NO_NORMALS,
-    ) -> None:
-        self.points, self.kernel, self.epsilon = points, kernel, float(epsilon)
-        self.kind, self.normals = kind, normals
-        self.powers = assembly.exponents(kernel.degree)
-        if kind == "gradient":
-            block = assembly.hermite_polynomials(points, self.powers)
-        elif kind == "normal":
-            block = assembly.normal_polynomials(points, normals, self.powers)
-        else:
-            block = assembly.monomials(points, self.powers)
-        self.polynomials = np.ascontiguousarray(block)
-        self.size = self.polynomials.shape[1]
-
-    def matrix(self) -> Floats:
-        """A, lower triangle valid, Fortran order: (size, size)."""
-        kernel = self.kernel
-        out = np.empty((self.size, self.size))
-        first = (np.ascontiguousarray(self.points.T),)
-        if self.kind == "normal":
-            first += (np.ascontiguousarray(self.normals.T),)
-        if self.kind == "gradient" and kernel.plain_cube:
-            assembly._cubic_hermite_matrix_loop(*first, float(self.epsilon), out)
-            return out.T
-        loop = {
-            "value": assembly._value_matrix_loop,
-            "gradient": assembly._hermite_matrix_loop,
-            "normal": assembly._normal_matrix_loop,
-        }[self.kind]
-        loop(*first, self.epsilon, kernel.form, out)
-        return out.T
-
-    def full_matrix(self, smoothing: float = 0.0) -> Floats:
-        """The augmented matrix [A P^T; P 0], both triangles: (size + q, size + q)."""
-        size, q = self.size, len(self.powers)
-        full = np.zeros((size + q, size + q))
-        lower = np.tril(self.matrix())
-        full[:size, :size] = lower + np.tril(lower, -1).T
-        full[np.arange(size), np.arange(size)] += smoothing
-        full[size:, :size], full[:size, size:] = self.polynomials, self.polynomials.T
-        return full
 
 
 def solve(basis: Basis, right: Floats, *, smoothing: float = 0.0) -> tuple[Floats, Floats, float]:
@@ -308,6 +233,59 @@ def factorise(matrix: Floats, polynomials: Floats, *, condition: float = math.in
     if factor_cholesky(matrix):
         return None
     return Factor(matrix, gamma, directions, triangle, products, norm)
+
+
+def largest_eigenvalue(
+    size: int, multiply: Callable[[Floats], Floats], *, steps: int = 2, start: Floats | None = None
+) -> float:
+    """Largest eigenvalue of a symmetric matrix by a few steps of power iteration, a lower bound.
+
+    Parameters
+    ----------
+    size : int
+    multiply : callable
+        Vector (size,) -> matrix times vector.
+    steps : int
+    start : (size,) ndarray, optional
+        First vector; all but constant by default.
+
+    Returns
+    -------
+    float
+    """
+    if start is None:
+        vector = np.full(size, 1.0)
+        vector[1::2] -= 1e-3
+    else:
+        vector = start.copy()
+    norm = 0.0
+    for _ in range(steps):
+        vector /= math.sqrt(vector @ vector)
+        vector = multiply(vector)
+        norm = math.sqrt(vector @ vector)
+        if norm == 0.0:  # one centre of a kernel that is 0 there
+            break
+    return norm
+
+
+def probe(pivots: Floats) -> Floats:
+    """Probe for the smallest eigenvector: random signs, and the unit vector of the smallest pivot.
+
+    Parameters
+    ----------
+    pivots : (size,) ndarray
+        Diagonal of the Cholesky factor.
+
+    Returns
+    -------
+    (size,) ndarray
+        Of length about one; the length of the solution for it is an estimate of 1 / (smallest eigenvalue).
+    """
+    size = len(pivots)
+    signs = np.where((np.arange(size) * 0x9E3779B1) >> 7 & 1, 1.0, -1.0) / math.sqrt(2 * size)
+    weakest = int(np.argmin(pivots))
+    signs[weakest] += math.copysign(math.sqrt(0.5), signs[weakest])
+    return signs
 
 
 def _warn(basis: Basis) -> None:

@@ -242,12 +242,6 @@ def _build() -> dict[str, Kernel]:
 
 KERNELS = _build()
 
-_REFUSED = {
-    "wendland_10": "phi_1,0 = (1-s)+ is positive definite in one dimension only",
-    "wendland_11": "phi_1,1 = (1-s)^3+ (3s+1) is positive definite in one dimension only",
-    "wendland_12": "phi_1,2 = (1-s)^5+ (8s^2+5s+1) is positive definite in one dimension only",
-}
-
 
 def get_kernel(name: Kernel | str) -> Kernel:
     """Look a kernel up by name.
@@ -260,12 +254,10 @@ def get_kernel(name: Kernel | str) -> Kernel:
     Raises
     ------
     UsageError
-        For an unknown name (with the nearest right one), or a kernel that is not positive definite in three dimensions.
+        For an unknown name, with the nearest right one.
     """
     if isinstance(name, Kernel):
         return name
-    if name in _REFUSED:
-        raise UsageError(f"kernel '{name}' is refused: {_REFUSED[name]}; use wendland_c0, _c2, _c4 or _c6")
     if name not in KERNELS:
         raise UsageError(f"unknown kernel {str(name)!r}, {did_you_mean(name, KERNELS)}")
     return KERNELS[name]

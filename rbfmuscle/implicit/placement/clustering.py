@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.surfaces import face_normals, unique_edges
 from rbfmuscle.implicit.placement.control_mesh import contract_clusters
 from rbfmuscle.jit import compiled
@@ -20,40 +20,35 @@ FINENESS = 2.5
 
 @dataclass(frozen=True)
 class FineMesh:
-    """The input mesh with its long edges split; ``parent`` is the input triangle of each triangle."""
+    """The input mesh with its long edges split."""
 
     vertices: np.ndarray
     faces: np.ndarray
-    parent: np.ndarray
 
 
 def refine_mesh(vertices: Floats, faces: Integers, count: int) -> FineMesh:
     """Split long edges until ``count`` cells of even size can be made of the mesh's triangles."""
     area = np.linalg.norm(face_normals(vertices, faces), axis=1).sum()
     limit = np.sqrt(2 / np.sqrt(3) * area / count) / FINENESS
-    parent = np.arange(len(faces))
     while True:
-        vertices, faces, parent, done = _split_long_edges(vertices, faces, parent, limit)
-        if done:
-            return FineMesh(vertices, faces, parent)
+        sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+        long = np.linalg.norm(vertices[sides[:, 0]] - vertices[sides[:, 1]], axis=1) > limit
+        if not long.any():
+            return FineMesh(vertices, faces)
+        vertices, faces = _split_edges(vertices, faces, sides, long)
 
 
-def _split_long_edges(
-    vertices: Floats, faces: Integers, parent: Integers, limit: float
-) -> tuple[Floats, Integers, Integers, bool]:
-    """Split every edge longer than ``limit`` at its middle, conforming, once."""
-    sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
-    sides = np.sort(sides, axis=1)
-    long = np.linalg.norm(vertices[sides[:, 0]] - vertices[sides[:, 1]], axis=1) > limit
-    if not long.any():
-        return vertices, faces, parent, True
+def _split_edges(
+    vertices: Floats, faces: Integers, sides: Integers, long: Booleans
+) -> tuple[Floats, Integers]:
+    """Split the marked ones of the faces' sides (3m, 2) at their middles, conforming."""
     keys, inverse = np.unique(sides[long, 0] * len(vertices) + sides[long, 1], return_inverse=True)
     middle = np.full(len(sides), -1)
     middle[long] = len(vertices) + inverse
     ends = np.column_stack([keys // len(vertices), keys % len(vertices)])
     middle = middle.reshape(-1, 3)
     number = (middle >= 0).sum(axis=1)
-    pieces, parents = [faces[number == 0]], [parent[number == 0]]
+    pieces = [faces[number == 0]]
     for corner in range(3):
         f, m = np.roll(faces, -corner, axis=1), np.roll(middle, -corner, axis=1)
         a, b, c, ab, bc, ca = f[:, 0], f[:, 1], f[:, 2], m[:, 0], m[:, 1], m[:, 2]
@@ -69,16 +64,12 @@ def _split_long_edges(
             (two & short, ((ab, b, bc), (a, ab, bc), (a, bc, c))),
             (two & ~short, ((ab, b, bc), (a, ab, c), (ab, bc, c))),
         ):
-            for t in triangles:
-                pieces.append(np.column_stack(t)[rows])
-                parents.append(parent[rows])
+            pieces += [np.column_stack(t)[rows] for t in triangles]
     a, b, c = faces.T
     ab, bc, ca = middle.T
     for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)):
         pieces.append(np.column_stack(t)[number == 3])
-        parents.append(parent[number == 3])
-    vertices = np.vstack([vertices, vertices[ends].mean(axis=1)])
-    return vertices, np.vstack(pieces), np.concatenate(parents), False
+    return np.vstack([vertices, vertices[ends].mean(axis=1)]), np.vstack(pieces)
 
 
 def cluster_mesh(fine: FineMesh, density: Floats, count: int, seed: int) -> tuple[Integers, Integers]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.surfaces import opposite_half_edges
 from rbfmuscle.jit import compiled
 from rbfmuscle.validation import MeshError
 
@@ -64,28 +65,6 @@ def contract_clusters(
     alive = tail.reshape(-1, 3)
     alive = alive[alive[:, 0] >= 0]
     return final, order[alive]
-
-
-def opposite_half_edges(faces: Integers) -> Integers:
-    """Index of the opposite half-edge of each half-edge ``3 * face + corner``.
-
-    Raises
-    ------
-    MeshError
-        Unless every edge is shared by exactly two faces with opposite directions.
-    """
-    start = faces.ravel()
-    end = np.roll(faces, -1, axis=1).ravel()
-    size = int(faces.max()) + 1
-    key = start * size + end
-    order = np.argsort(key, kind="stable")
-    place = np.searchsorted(key[order], end * size + start)
-    place[place == len(key)] = 0
-    twin = order[place]
-    doubled = (np.diff(key[order]) == 0).any()
-    if doubled or (key[twin] != end * size + start).any():
-        raise MeshError("mesh must be a closed, consistently oriented 2-manifold; repair it first")
-    return twin
 
 
 @compiled

@@ -19,14 +19,14 @@ from scipy.spatial.distance import cdist
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.field_fit import FieldFit
 from rbfmuscle.implicit.fit import assembly
+from rbfmuscle.implicit.fit.assembly import hermite_system
 from rbfmuscle.implicit.fit.fitting import bounding_ridge
-from rbfmuscle.implicit.fit.systems import hermite_system
 from rbfmuscle.implicit.placement.sampling import spread_points
 from rbfmuscle.implicit.selection import spacing, surface_error
-from rbfmuscle.validation import UsageError, check_points, check_vectors
+from rbfmuscle.validation import UsageError
 
 if TYPE_CHECKING:
-    from rbfmuscle.implicit.fit.fitting import Basis
+    from rbfmuscle.implicit.fit.assembly import Basis
     from rbfmuscle.implicit.kernels.table import Kernel
     from rbfmuscle.implicit.placement.sampling import SurfaceSample
 
@@ -48,78 +48,52 @@ def fit_sample(
     *,
     fit: FieldFit,
     seed: int = 0,
+    rounds: int = ROUNDS,
 ) -> SurfaceSample:
-    """A `SurfaceSample` with points and normals as `fit_centres` finds them; the points then lie beside the surface.
+    """Centres moved along their normals, and normals turned, so that the field is small on the whole mesh.
 
     Parameters
     ----------
     sample : SurfaceSample
+        Of the mesh, with unit normals.
     vertices : (n, 3) array_like
     faces : (m, 3) array_like of int
-        The mesh that was sampled.
     fit : FieldFit
         Of the field that will be fitted to it, to all derivatives.
     seed : int
-
-    Returns
-    -------
-    SurfaceSample
-    """
-    where, _ = spread_points(np.asarray(vertices), np.asarray(faces), SAMPLES, seed=seed)
-    points, normals = fit_centres(sample.points, sample.normals, where, fit)
-    return replace(sample, points=points, normals=normals)
-
-
-def fit_centres(
-    points: ArrayLike,
-    normals: ArrayLike,
-    samples: ArrayLike,
-    fit: FieldFit,
-    *,
-    rounds: int = ROUNDS,
-) -> tuple[Floats, Floats]:
-    """Move centres along their normals and turn the normals, so that the field is small at the samples.
-
-    Parameters
-    ----------
-    points, normals : (K, 3) array_like
-        Of a Hermite fit to all derivatives; unit normals.
-    samples : (n, 3) array_like
-        Points of the surface, spread evenly, ten and more for each centre.
-    fit : FieldFit
-        To all derivatives.
+        Of the points of the mesh.
     rounds : int
         The least-squares problem is that of the given centres; what their moves leave is met by further rounds of it.
 
     Returns
     -------
-    points, normals : (K, 3) ndarray
-        Those of all rounds, the given ones included, whose field misses the samples least.
+    SurfaceSample
+        Points and normals are those of all rounds, the given ones included, whose field misses the mesh least.
 
     Raises
     ------
     UsageError
         For a kernel that is not smooth enough for a Hermite fit, or a fit to normal derivatives alone.
     """
-    points, samples = check_points(points), check_points(samples, name="samples")
-    normals = check_vectors(normals, len(points))
     if not fit.kernel.hermite or fit.derivatives != "all":
         raise UsageError(
             f"kernel '{fit.kernel.name}' has no Hermite fit to all derivatives, whose centres could be fitted"
         )
-    reach = spacing(points).mean()
+    where, _ = spread_points(np.asarray(vertices), np.asarray(faces), SAMPLES, seed=seed)
+    points, normals = sample.points, sample.normals
+    reach = float(spacing(points).mean())
 
-    def fitted(where: Floats, direction: Floats) -> tuple[Floats, float]:
-        field = fit.fit(where, direction)
-        return field(samples), surface_error(field, samples, reach)
+    def fitted(points: Floats, normals: Floats) -> tuple[Floats, float]:
+        field = fit.fit(points, normals)
+        return field(where), surface_error(field, where, reach)
 
     value, least = fitted(points, normals)
-    best, problem = (points, normals), _problem(points, normals, samples, fit, reach)
+    best, problem = sample, _problem(points, normals, where, fit, reach)
     for _ in range(rounds):
         points, normals = _step(points, normals, value, problem)
         value, now = fitted(points, normals)
         if now < least:
-            best, least = (points, normals), now
+            best, least = replace(sample, points=points, normals=normals), now
     return best
 
 

@@ -11,6 +11,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import (
     barycentric_weights,
     face_normals,
+    opposite_half_edges,
     split_pinched_vertices,
     unique_edges,
     vertex_normals,
@@ -18,7 +19,6 @@ from rbfmuscle.geometry.surfaces import (
 from rbfmuscle.geometry.triangles import nearest_weights
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.clustering import FineMesh, cluster_mesh, refine_mesh
-from rbfmuscle.implicit.placement.control_mesh import opposite_half_edges
 from rbfmuscle.jit import compiled
 from rbfmuscle.validation import MeshError, check_mesh
 
@@ -41,24 +41,12 @@ class SurfaceSample:
         Positions on the surface [scene unit].
     normals : (K, 3) ndarray
         Unit outward normals.
-    areas : (K,) ndarray
-        Surface area that each point stands for [scene unit squared]; they add up to the mesh's area.
-    face : (K,) ndarray
-        Input triangle that holds each point.
-    barycentric : (K, 3) ndarray
-        Its coordinates in that triangle.
-    vertex : (K,) ndarray
-        The corner of that triangle nearest to the point.
     control_faces : (m, 3) ndarray
         Closed, outward, 2-manifold triangulation over the K points.
     """
 
     points: np.ndarray
     normals: np.ndarray
-    areas: np.ndarray
-    face: np.ndarray
-    barycentric: np.ndarray
-    vertex: np.ndarray
     control_faces: np.ndarray
 
 
@@ -102,15 +90,16 @@ def sample_surface(
         raise ValueError(f"count must be at least 4, got {count}")
     if placement not in PLACEMENTS:
         raise ValueError(f"placement must be one of {', '.join(PLACEMENTS)}, got {placement!r}")
-    opposite_half_edges(faces)
+    if (opposite_half_edges(faces) < 0).any():
+        raise MeshError("mesh must be a closed, consistently oriented 2-manifold; repair it first")
     fine = refine_mesh(*split_pinched_vertices(vertices, faces), count)
     if placement == "greedy" and count <= GREEDY_LARGEST:
-        return _greedy_sample(vertices, faces, fine, count, seed)
+        return _greedy_sample(fine, count, seed)
     density = np.ones(len(fine.vertices)) if placement == "even" else curvature_density(fine, count)
-    return _gather(vertices, faces, fine, count, *cluster_mesh(fine, density, count, seed))
+    return _gather(fine, count, *cluster_mesh(fine, density, count, seed))
 
 
-def _greedy_sample(vertices: Floats, faces: Integers, fine: FineMesh, count: int, seed: int) -> SurfaceSample:
+def _greedy_sample(fine: FineMesh, count: int, seed: int) -> SurfaceSample:
     """Cells made smaller, round by round, where a cubic Hermite fit misses the mesh.
 
     Each round fits the field to the centres, takes |f| at the mesh's vertices as the distance missed, and
@@ -122,7 +111,7 @@ def _greedy_sample(vertices: Floats, faces: Integers, fine: FineMesh, count: int
     for density in (np.ones(len(fine.vertices)), curvature_density(fine, count)):
         for _ in range(GREEDY_ROUNDS // 2):
             labels, control = cluster_mesh(fine, density, count, seed)
-            sample = _gather(vertices, faces, fine, count, labels, control)
+            sample = _gather(fine, count, labels, control)
             miss = np.abs(RBFField.fit_hermite(sample.points, sample.normals)(fine.vertices))
             rms = np.sqrt((miss**2).mean())
             if rms + 0.2 * miss.max() < least:
@@ -196,10 +185,8 @@ def spread_points(vertices: Floats, faces: Integers, count: int, *, seed: int = 
     return np.einsum("nk,nkj->nj", rng.dirichlet(np.ones(3), count), corners[which]), which
 
 
-def _gather(
-    vertices: Floats, faces: Integers, fine: FineMesh, count: int, labels: Integers, control: Integers
-) -> SurfaceSample:
-    """Points, normals and areas of the cells."""
+def _gather(fine: FineMesh, count: int, labels: Integers, control: Integers) -> SurfaceSample:
+    """Points and normals of the cells."""
     third = np.linalg.norm(face_normals(fine.vertices, fine.faces), axis=1) / 3
     corner = labels[fine.faces]
     areas = np.bincount(corner.ravel(), np.repeat(third, 3), count)
@@ -210,10 +197,7 @@ def _gather(
     points, piece, distance = np.zeros((count, 3)), np.zeros(count, dtype=np.int64), np.full(count, np.inf)
     _nearest_in_cell_loop(fine.vertices, fine.faces, corner, centroid, points, piece, distance)
     normals = _normals_at(fine, points, piece, corner)
-    face = fine.parent[piece]
-    barycentric = barycentric_weights(points, vertices[faces[face]])
-    vertex = faces[face, barycentric.argmax(axis=1)]
-    return SurfaceSample(points, normals, areas, face, barycentric, vertex, control)
+    return SurfaceSample(points, normals, control)
 
 
 def _normals_at(fine: FineMesh, points: Floats, piece: Integers, corner: Integers) -> Floats:

@@ -122,7 +122,7 @@ def _out_of_bone(bone, points, reach):
     near = np.isfinite(distance) & (distance < reach)
     if not near.any():
         return points
-    closest = bone.closest_point(points[near])
+    closest = bone.nearest(points[near])[1]
     away = (points[near] - closest) * np.where(distance[near] < 0.0, -1.0, 1.0)[:, None]
     size = np.maximum(np.linalg.norm(away, axis=1), 1e-12)[:, None]
     out = points.copy()
