@@ -21,9 +21,6 @@ from rbfmuscle.validation import NumericalWarning
 SHARED = {"linear": 1.0, "cubic": 1.0, "quintic": 1.0, "thin_plate_spline": 1.0, "multiquadric": 4.0,
           "inverse_multiquadric": 4.0, "inverse_quadratic": 4.0, "gaussian": 6.0}  # fmt: skip
 COUNTS = (500, 1000, 2000)
-PARTS = ("fit", "evaluate")
-
-
 ROUNDS = 5
 
 
@@ -39,37 +36,17 @@ def least_times(*works):
     return best
 
 
-class Table:
-    """Rows of the table, printed as they come."""
+def compare(work, ours, theirs, *, apart=False):
+    """Time ``ours`` against SciPy's ``theirs``, print the line and return it.
 
-    def __init__(self):
-        self.rows = []
-        print(f"{'scene':10}{'work':46}{'ours ms':>9}  {'peer':28}{'ms':>9}{'ratio':>8}", flush=True)
-
-    def add(self, scene, work, other, ours, theirs, *, apart=False):
-        """Time ``ours`` against ``theirs``.
-
-        ``apart`` times all rounds of one, then of the other: BLAS threads of a peer go on waiting on the cores for
-        some 20 ms after their work, which would be counted to ours.
-        """
-        mine, yours = (least_times(ours) + least_times(theirs)) if apart else least_times(ours, theirs)
-        self.keep(scene, work, other, mine, yours)
-
-    def keep(self, scene, work, other, mine, yours):
-        """Keep and print a row of two times [s]."""
-        row = {
-            "scene": scene,
-            "work": work,
-            "peer": other,
-            "ours": mine,
-            "theirs": yours,
-            "ratio": yours / mine,
-        }
-        self.rows.append(row)
-        print(
-            f"{scene:10}{work:46}{1e3 * mine:9.2f}  {other:28}{1e3 * yours:9.2f}{yours / mine:8.2f}",
-            flush=True,
-        )
+    ``apart`` times all rounds of one, then of the other: BLAS threads of a peer go on waiting on the cores for
+    some 20 ms after their work, which would be counted to ours.
+    """
+    mine, yours = (least_times(ours) + least_times(theirs)) if apart else least_times(ours, theirs)
+    print(
+        f"{work:40}{1e3 * mine:9.2f} ms, SciPy {1e3 * yours:9.2f} ms, ratio {yours / mine:6.2f}", flush=True
+    )
+    return {"work": work, "ours": mine, "theirs": yours, "ratio": yours / mine}
 
 
 def scattered(count):
@@ -85,8 +62,8 @@ def both_fits(kernel, count):
     return lambda: RBFField.fit(points, values, **given), lambda: RBFInterpolator(points, values, **given)
 
 
-def bench_fit(table):
-    """Fits against SciPy's, after a look at whether they agree."""
+def fits():
+    """Rows of fits, after a look at whether they agree."""
     where = np.random.default_rng(0).uniform(-0.9, 0.9, (500, 3))
     for count in COUNTS:
         for kernel in SHARED:
@@ -94,35 +71,32 @@ def bench_fit(table):
             apart = np.abs(ours()(where) - theirs()(where)).max()
             if apart > 1e-8:
                 print(f"{kernel}, {count}: SciPy and we differ by {apart:.1e}")
-            table.add("fit", f"{kernel}, {count}, apart {apart:.0e}", "SciPy RBFInterpolator", ours, theirs)
+            yield compare(f"fit: {kernel}, {count} values", ours, theirs)
 
 
-def bench_evaluate(table):
-    """64^3 points, 1000 centres."""
+def evaluations():
+    """Rows of 64^3 points, 1000 centres."""
     where = np.random.default_rng(0).uniform(-1, 1, (64**3, 3))
     for kernel in ("cubic", "gaussian"):
         ours, theirs = (make() for make in both_fits(kernel, 1000))
-        table.add("evaluate", f"{kernel}, 1000 centres, 64^3", "SciPy RBFInterpolator",
-                  lambda ours=ours: ours(where), lambda theirs=theirs: theirs(where), apart=True)  # fmt: skip
+        yield compare(
+            f"64^3 points: {kernel}, 1000 centres",
+            lambda f=ours: f(where),
+            lambda f=theirs: f(where),
+            apart=True,
+        )
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path)
-    parser.add_argument("--part", choices=PARTS, action="append", help="what to measure; all by default")
     chosen = parser.parse_args()
     about = machine()
     print(f"{about['cpu']}, {about['usable_cores']} of {about['cores']} cores, {about['threads']} threads")
     warnings.simplefilter("ignore", NumericalWarning)
-    table = Table()
-    work = (bench_fit, bench_evaluate)
-    for part, bench in zip(PARTS, work):
-        if not chosen.part or part in chosen.part:
-            bench(table)
+    rows = [*fits(), *evaluations()]
     if chosen.output:
-        chosen.output.write_text(
-            json.dumps({"machine": about, "rows": table.rows}, indent=1), encoding="utf-8"
-        )
+        chosen.output.write_text(json.dumps({"machine": about, "rows": rows}, indent=1), encoding="utf-8")
 
 
 if __name__ == "__main__":

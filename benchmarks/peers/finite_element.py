@@ -15,9 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
+from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from peers.dissection import Dissection
 from rbfmuscle.validation import MissingPartError, SolveError
 
 MOST_ITERATIONS = 60
@@ -26,6 +26,25 @@ MOST_ITERATIONS = 60
 ENERGY_TOLERANCE = 2e-6
 # Least stiffness of a point where the true ones are not all positive [shear modulus].
 LEAST_STIFF = 0.01
+
+
+def positive_factor(matrix):
+    """What solves with a symmetric sparse matrix.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the matrix is not positive definite: pivots are taken from the diagonal, and some are not positive.
+    """
+    try:
+        factor = splu(
+            matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
+    except RuntimeError as error:  # exactly singular
+        raise np.linalg.LinAlgError(str(error)) from None
+    if not (factor.U.diagonal() > 0.0).all():
+        raise np.linalg.LinAlgError("the matrix is not positive definite")
+    return factor
 
 
 def _skfem():
@@ -153,7 +172,7 @@ class HexSolid:
         self.side_weights, self.side_nodes = np.abs(side.dx), side.element_dofs.T
         self.side_cells = mesh.f2t[0, self.facets]
         self.obstacles = ()
-        self.order, self.places = None, None
+        self.places = None
 
     def surface_faces(self):
         """Corner nodes of the boundary, (k, 4) or (k, 3), in scikit-fem's order."""
@@ -226,19 +245,13 @@ class HexSolid:
                 matrix = self._assemble(u, positive=True)[1]
             inner = matrix[free][:, free]
             try:
-                factor = self._elimination(free, inner).factor(inner)
+                factor = positive_factor(inner)
             except np.linalg.LinAlgError:
                 continue
             step[free] = factor.solve(-(force + matrix @ first)[free])
             if np.isfinite(step).all() and (first.any() or force @ step < 0.0):
                 return step
         raise SolveError("the stiffness of the cells is singular, take smaller steps")
-
-    def _elimination(self, free, inner):
-        """Order in which the free unknowns are eliminated, found once."""
-        if self.order is None or (self.order[0] != free).any():
-            self.order = free.copy(), Dissection(np.repeat(self.rest, 3, axis=0)[free], inner)
-        return self.order[1]
 
     def _walk(self, u, step, force, *, moving):
         """Longest of the halved steps that lowers the energy; one that moves held nodes must only stay valid."""

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from command_line import call
 from conftest import benchmark_script
 
 import rbfmuscle as rm
@@ -72,47 +71,14 @@ def test_gluteus_maximus_in_a_combined_motion(hip_scene):
     assert run.values("gluteus_maximus", "flicker").max() < 1.5
 
 
-def written_motions(source, folder):
-    """Scene files of the combined motions of the page on reliability, on another scene's bones and muscles."""
-    motions = benchmark_script("combined_motions")
-    given = {name: {"ramp": motions.ramp(ends)} for name, ends in motions.RAMPS.items()}
-    given["random walk"] = {"waypoints": motions.walk(12), "step": motions.FARTHEST}
-    if source is None:
-        source = motions.phantom_files(folder)
-    return {
-        title: rm.Scene.load(path)
-        for title, path in zip(given, motions.write_scenes(source, given, folder), strict=True)
-    }
-
-
-def check_ends(scenes):
-    """Both ramps begin at rest and end where their names say, and the walk goes elsewhere."""
-    first, second, walk = (
-        [{name: round(float(np.degrees(v)), 6) for name, v in frame.items()} for frame in scene.motion.frames]
-        for scene in scenes.values()
-    )
-    assert set(first[0].values()) == {0.0} and len(first) == 61
-    assert first[-1] == {"hip.flexion": 90.0, "hip.adduction": -25.0, "hip.internal_rotation": 20.0}
-    assert second[-1] == {"hip.flexion": 60.0, "hip.adduction": 12.0, "hip.internal_rotation": -25.0}
-    assert len(walk) == 13 and len({tuple(stop.values()) for stop in walk}) == 13
-
-
-def test_motions_as_scene_files_of_the_phantom(tmp_path, capsys):
-    scenes = written_motions(None, tmp_path)
-    check_ends(scenes)
-    path = tmp_path / "flexion_abduction_internal_rotation.toml"
-    code, _, err = call(
-        capsys, "run", path, "-o", tmp_path / "out", "--frames", "0:2", "--set", "model=pbd",
-        "--set", "output.report=false",
-    )  # fmt: skip
-    assert code == 0, err
-    assert len(list((tmp_path / "out" / "surfaces").iterdir())) == 2 * len(rm.phantom_scene().muscles)
-
-
-@pytest.mark.filterwarnings("ignore:.*drives the bones into each other")
-def test_motions_as_scene_files_of_the_hip(hip_data, tmp_path):
-    scenes = written_motions(hip_data / "flexion.toml", tmp_path)
-    check_ends(scenes)
-    scene = scenes["random walk"].copy()
-    scene.muscles = [scene.muscle("iliacus")]
-    check_shapes(rm.simulate(scene, frames="0:2"), "iliacus")
+def test_the_measured_motions_begin_at_rest_and_end_where_their_names_say():
+    motions, scene = benchmark_script("combined_motions"), phantom_scene()
+    for title, ends in motions.RAMPS.items():
+        scene.set_motion(ramp=motions.ramp(ends))
+        first, last = scene.motion.frames[0], scene.motion.frames[-1]
+        assert not any(first.values()), title
+        assert {name: float(np.degrees(v)) for name, v in last.items()} == pytest.approx(
+            {f"hip.{name}": end for name, end in ends.items()}
+        )
+    walk = motions.walk(12)
+    assert len(walk) == 13 and walk != motions.walk(12, 8) and walk == motions.walk(12)

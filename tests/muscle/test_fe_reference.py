@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.sparse as sparse
 from conftest import benchmark_script
 from scipy.optimize import brentq
 
@@ -147,39 +148,16 @@ class TestTetrahedra:
         np.testing.assert_array_equal(solid.skin(), np.flatnonzero(on))
 
 
-class TestDissection:
-    @staticmethod
-    def _problem(size=9):
-        import scipy.sparse as sparse
+def test_a_factor_solves_and_a_matrix_that_is_not_positive_has_none():
+    from peers.finite_element import positive_factor
 
-        line = sparse.diags_array([-1.0, 2.1, -1.0], offsets=[-1, 0, 1], shape=(size, size))
-        one = sparse.eye_array(size)
-        matrix = sum(
-            sparse.kron(sparse.kron(a, b), c)
-            for a, b, c in ((line, one, one), (one, line, one), (one, one, line))
-        )
-        points = np.stack(np.meshgrid(*[np.arange(size)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-        return points.astype(float), sparse.csr_array(matrix)
-
-    def test_solves_what_a_dense_solver_does(self):
-        from peers.dissection import Dissection
-
-        points, matrix = self._problem()
-        order = Dissection(points, matrix)
-        assert len(order.fronts) > 10
-        right = np.random.default_rng(2).normal(size=len(points))
-        np.testing.assert_allclose(
-            order.factor(matrix).solve(right), np.linalg.solve(matrix.toarray(), right)
-        )
-
-    def test_matrix_that_is_not_positive_is_told(self):
-        import scipy.sparse as sparse
-        from peers.dissection import Dissection
-
-        points, matrix = self._problem()
-        order = Dissection(points, matrix)
+    root = sparse.random_array((60, 60), density=0.1, rng=np.random.default_rng(2))
+    matrix, right = sparse.csr_array(root @ root.T + sparse.eye_array(60)), np.arange(60.0)
+    found = positive_factor(matrix).solve(right)
+    np.testing.assert_allclose(found, np.linalg.solve(matrix.toarray(), right))
+    for shift in (2.0, 1.0 + np.linalg.eigvalsh((root @ root.T).toarray())[30]):
         with pytest.raises(np.linalg.LinAlgError):
-            order.factor(matrix - 1.0 * sparse.eye_array(len(points)))
+            positive_factor(matrix - shift * sparse.eye_array(60))
 
 
 class TestReference:
