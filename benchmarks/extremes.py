@@ -9,7 +9,6 @@ import warnings
 
 import numpy as np
 
-from rbfmuscle.implicit.extraction.sheets import count_sheets
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field_fit import FieldFit
 from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
@@ -104,8 +103,7 @@ def outcome(kernel, points, normals, shape, judge, bound):
         return "right", error, ""
     try:  # what showing the surface says of it
         where = np.asarray(points, dtype=float)
-        extract_surface(field, points=where, resolution=32)
-        sheets = count_sheets(field, where, lambda at: np.full(len(at), np.inf)).number
+        sheets = extract_surface(field, points=where, resolution=32).components
     except ValueError as failed:
         return "refused", error, str(failed)
     if sheets > 1:

@@ -14,10 +14,9 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from rbfmuscle.experiments.kernel_judge import ReferenceSurface
-from rbfmuscle.experiments.kernel_row import VOLUME_BOUND, measure_row
+from rbfmuscle.experiments.kernel_row import VOLUME_BOUND, ReferenceSurface, measure_row
 from rbfmuscle.experiments.workers import threads_limited
-from rbfmuscle.implicit.extraction.sheets import count_sheets
+from rbfmuscle.implicit.extraction.marching import find_sheets
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.kernels.table import KERNELS
 from rbfmuscle.implicit.placement.sampling import sample_surface
@@ -44,12 +43,12 @@ def error(judge, sample, fit):
     """Error both ways of a fit [length], infinite where it gives no surface that could be used."""
     try:
         field = fit.fit(sample.points, sample.normals)
-        if not count_sheets(field, sample.points, judge.distance.unsigned).sound():
+        if not find_sheets(field, sample.points, judge.distance.unsigned).sound():
             return np.inf
-        found = extract_surface(field, points=sample.points, resolution=judge.resolution)
+        found = extract_surface(field, points=sample.points, resolution=judge.resolution, axes=judge.axes)
     except (ValueError, np.linalg.LinAlgError):
         return np.inf
-    if found.components > 1 or abs(found.volume / judge.volume - 1.0) > VOLUME_BOUND:
+    if abs(found.volume / judge.volume - 1.0) > VOLUME_BOUND:
         return np.inf
     return judge.apart(found.vertices, found.faces)[0]
 

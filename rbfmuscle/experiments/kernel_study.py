@@ -10,8 +10,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from rbfmuscle.experiments.kernel_judge import ReferenceSurface
-from rbfmuscle.experiments.kernel_row import Measured, measure_row, time_row
+from rbfmuscle.experiments.kernel_row import Measured, ReferenceSurface, measure_row, time_row
 from rbfmuscle.experiments.sweep_table import pareto_front
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.geometry.threads import each
@@ -109,7 +108,7 @@ def study_kernels(
     centres : sequence of int
     placement : {"greedy", "fitted"}
         Fitted centres lie beside the surface, so that the whole of it is met in the least-squares sense
-        (`fit_centres`); kernels that are not C2 have greedy ones.
+        (`fit_sample`); kernels that are not C2 have greedy ones.
     resolution : int
         Cells along the longest side of the extracted surfaces; as many as a muscle so slender needs by default.
     seed : int

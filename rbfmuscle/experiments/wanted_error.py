@@ -1,8 +1,7 @@
 """The fewest centres that meet a surface to a wanted error, with the kernel and the setting.
 
 The error falls with the number of centres by a power, but for some per cent of chance: the power law brackets the
-number and a bisection narrows it to 4 %. Other kernels take part where they may need fewer centres. The row is
-confirmed at points that chose nothing.
+number and a bisection narrows it to 4 %. Other kernels take part where they may need fewer centres.
 """
 
 from __future__ import annotations
@@ -13,11 +12,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rbfmuscle.experiments.kernel_judge import ReferenceSurface
-from rbfmuscle.experiments.kernel_row import Measured, measure_row, time_row
+from rbfmuscle.experiments.kernel_row import Measured, ReferenceSurface, measure_row, time_row
 from rbfmuscle.experiments.kernel_study import check_placement, row_name
-from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
-from rbfmuscle.geometry.surfaces import mesh_volume, vertex_areas
+from rbfmuscle.geometry.arrays import MeshLike
 from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
 from rbfmuscle.implicit.placement.refinement import FITTED
 from rbfmuscle.implicit.placement.sampling import GREEDY_LARGEST, SurfaceSample, sample_surface
@@ -30,10 +27,6 @@ FEWEST, MOST = 20, GREEDY_LARGEST
 STEP = 0.04
 # Power of the number of centres by which the error falls.
 POWER = 1.4
-# What a cell's chord may take of the wanted error, and the cells that follow.
-CHORD, CELLS = 0.15, (64, 160)
-# Seeds of the points that choose and of those that confirm.
-CHOOSING, CONFIRMING = 0, 1
 
 
 @dataclass
@@ -43,11 +36,10 @@ class WantedError:
     Attributes
     ----------
     reached : bool
-        Whether the error is met at points that chose nothing.
     row : dict
         As in `KernelStudy.rows`: the one that reached it, else the one of the smallest error.
     error : float
-        Of that row at those points [length].
+        Of that row [length].
     wanted : float
     tried : list of dict
         ``kernel, centres, error`` of all that was measured, in order.
@@ -65,9 +57,7 @@ class WantedError:
         if self.row["unfit"]:
             return f"{name}: no field is fit; take more centres or another kernel"
         if self.reached:
-            return (
-                f"{name}: {said} reaches {self.error:.3g}{unit} RMS on unseen points, wanted {self.wanted:g}"
-            )
+            return f"{name}: {said} reaches {self.error:.3g}{unit} RMS, wanted {self.wanted:g}"
         return (
             f"{name}: {self.wanted:g}{unit} RMS is not reached; the best, {said}, reaches {self.error:.3g}; "
             "take other kernels, or a larger error"
@@ -121,10 +111,10 @@ def reach_error(
     named = [get_kernel(name) for name in (kernels or CANDIDATES)]
     check_placement(placement)
     surface = check_mesh(*(mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)))
-    search = _Search(surface, float(error), placement, progress)
+    search = _Search(ReferenceSurface(*surface), float(error), placement, progress)
     for kernel in named:
         search.try_kernel(kernel)
-    return search.confirmed()
+    return search.result()
 
 
 class _Search:
@@ -132,30 +122,30 @@ class _Search:
 
     def __init__(
         self,
-        surface: tuple[Floats, Integers],
+        judge: ReferenceSurface,
         error: float,
         placement: str,
         progress: Callable[[int, int], None] | None,
     ) -> None:
-        self.surface, self.error, self.placement, self.progress = surface, error, placement, progress
-        self.cells = _cells(*surface, error)
-        self.judge = ReferenceSurface(*surface, self.cells, CHOOSING)
+        self.judge, self.error, self.placement, self.progress = judge, error, placement, progress
         self.samples: dict[int, SurfaceSample] = {}
         self.found: dict[tuple[str, int], Measured] = {}
-        self.best: tuple[Kernel, int] | None = None
+        self.best: tuple[str, int] | None = None
 
     def measure(self, kernel: Kernel, count: int) -> float:
         """Error of a kernel with so many centres [length], infinite where it broke."""
         key = kernel.name, count
         if key not in self.found:
             if count not in self.samples:
-                self.samples[count] = sample_surface(*self.surface, count, placement="greedy")
+                self.samples[count] = sample_surface(
+                    self.judge.vertices, self.judge.faces, count, placement="greedy"
+                )
             self.found[key] = measure_row(self.judge, self.samples[count], kernel, self.placement)
             if self.progress is not None:
                 self.progress(len(self.found), max(len(self.found) + 1, 8))
-        error = _error(self.found[key].row)
+        error = _error(self.found[key])
         if error <= self.error and (self.best is None or count < self.best[1]):
-            self.best = kernel, count
+            self.best = key
         return error
 
     def try_kernel(self, kernel: Kernel) -> None:
@@ -178,35 +168,17 @@ class _Search:
                 )
             count = int(np.clip(count, low + 1, high - 1)) if high > low + 1 else high
 
-    def confirmed(self) -> WantedError:
-        """The best row where it holds at points that chose nothing; with more centres where it does not."""
-        other = ReferenceSurface(*self.surface, self.cells, CONFIRMING)
-        while self.best is not None:
-            kernel, count = self.best
-            found = measure_row(self.judge, self.samples[count], kernel, self.placement, confirm=other)
-            if _error(found.row) <= self.error:
-                return self._result(found, True)
-            self.best, more = None, math.ceil(count * (1.0 + STEP))
-            while more <= MOST and self.measure(kernel, more) > self.error:
-                more = math.ceil(more * (1.0 + STEP))
-        return self._result(min(self.found.values(), key=lambda found: _error(found.row)), False)
-
-    def _result(self, found: Measured, reached: bool) -> WantedError:
+    def result(self) -> WantedError:
+        """The row of fewest centres that reaches the error, or that of the smallest error."""
+        found = min(self.found.values(), key=_error) if self.best is None else self.found[self.best]
         if not found.row["unfit"]:
             time_row(found, self.judge.points)
         tried = [
-            {"kernel": kernel, "centres": count, "error": _error(one.row)}
+            {"kernel": kernel, "centres": count, "error": _error(one)}
             for (kernel, count), one in self.found.items()
         ]
-        return WantedError(reached, found.row, _error(found.row), self.error, tried)
+        return WantedError(self.best is not None, found.row, _error(found), self.error, tried)
 
 
-def _error(row: dict) -> float:
-    return math.inf if row["unfit"] else float(row["rms"])
-
-
-def _cells(vertices: Floats, faces: Integers, error: float) -> int:
-    """Cells along the longest side whose chords, c^2 / 8R with R the mean thickness, take little of the error."""
-    radius = 2.0 * mesh_volume(vertices, faces) / vertex_areas(vertices, faces).sum()
-    wanted = np.ptp(vertices, axis=0).max() / math.sqrt(8.0 * CHORD * error * radius)
-    return int(np.clip(wanted, *CELLS))
+def _error(found: Measured) -> float:
+    return math.inf if found.row["unfit"] else float(found.row["rms"])

@@ -10,14 +10,15 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.implicit.extraction.sheets import count_sheets
+from rbfmuscle.implicit.extraction.marching import find_sheets
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.field_fit import FieldFit
 from rbfmuscle.validation import NumericalWarning, UsageError, check_points, check_vectors
@@ -42,8 +43,7 @@ Trial = tuple[float, float, float]
 """epsilon, error, condition."""
 
 
-@dataclass(frozen=True)
-class EpsilonChoice:
+class EpsilonChoice(NamedTuple):
     """A chosen shape parameter.
 
     Attributes
@@ -53,8 +53,6 @@ class EpsilonChoice:
     error : float
         Root mean square distance of the held-out points [length].
     condition : float
-    tried : (n, 3) ndarray
-        epsilon, error at the held-out points, condition of all fits, by epsilon.
     broken : str
         Why no zero set that was extracted is that of the surface, empty where one is.
     """
@@ -62,7 +60,6 @@ class EpsilonChoice:
     epsilon: float
     error: float
     condition: float
-    tried: np.ndarray
     broken: str = ""
 
 
@@ -156,7 +153,7 @@ def choose_epsilon(
     if distance is not None:
         sound, broken = _first_sound(search, order, distance)
         epsilon, error, found = sound or order[0]
-    return EpsilonChoice(epsilon, error, found, np.array(sorted(search.trials.values())), broken)
+    return EpsilonChoice(epsilon, error, found, broken)
 
 
 class _Search:
@@ -209,21 +206,21 @@ class _Search:
 def _first_sound(
     search: _Search, order: list[Trial], distance: Callable[[Floats], Floats]
 ) -> tuple[Trial | None, str]:
-    """The first trial whose zero set is one closed sheet, or None and why there is none."""
+    """The first trial whose zero set is closed and has no stray sheets, or None and why there is none."""
     broken: list[float] = []
-    several, remedy = 0, "take more centres or another kernel"
+    stray, remedy = 0, "take more centres or another kernel"
     for trial in order:
         if trial[1] >= FLAT * search.reach or len(broken) == LOOKS:
             break
         if any(max(trial[0] / epsilon, epsilon / trial[0]) < APART for epsilon in broken):
             continue
-        sheets = count_sheets(search.fields[trial[0]], search.points, distance)
+        sheets = find_sheets(search.fields[trial[0]], search.points, distance)
         if sheets.sound():
             return trial, ""
         broken.append(trial[0])
-        several = max(several, sheets.number)
+        stray = max(stray, sheets.stray)
     if not broken:
         return None, f"the field is flat between the centres at every epsilon; {remedy}"
-    if several > 1:
-        return None, f"{several} sheets at every epsilon that was tried"
+    if stray:
+        return None, f"{stray} stray sheets at every epsilon that was tried; {remedy}"
     return None, f"the level set is open at every epsilon that was tried; {remedy}"

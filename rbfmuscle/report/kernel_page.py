@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 COLUMNS = {
     "centres": ("centres", 1.0), "placement": ("placement", 1.0), "shape": ("epsilon times spacing", 1.0),
     "rms": ("RMS", 1.0), "hausdorff": ("greatest", 1.0), "normal_error": ("normals [°]", 1.0),
-    "volume_error": ("volume [%]", 100.0), "components": ("sheets", 1.0), "condition": ("condition", 1.0),
+    "volume_error": ("volume [%]", 100.0), "condition": ("condition", 1.0),
     "fit_time": ("fit [ms]", 1e3), "evaluation_time": ("20,000 values [ms]", 1e3), "note": ("note", 1.0),
 }  # fmt: skip
 _MOST_LIGHTS = 5

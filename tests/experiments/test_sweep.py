@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from rbfmuscle.cli.app import run_command as command
 from rbfmuscle.cli.sweep import run_point
-from rbfmuscle.experiments.sweep import SweepPoint, parse_grid, plan_sweep, point_key
+from rbfmuscle.experiments.sweep import SweepPoint, parse_grid, plan_sweep
 from rbfmuscle.experiments.sweep_run import SweepFolder, run_sweep
 from rbfmuscle.experiments.sweep_table import (
     mark_front,
@@ -106,10 +106,6 @@ class TestGrid:
     def test_wrong_key_fails_before_anything_runs(self):
         with pytest.raises(UsageError, match="substep_angle"):
             plan_of(["contact.substep_angel=1,2"])
-
-    def test_key_depends_on_scene_and_settings_not_on_their_order(self):
-        assert point_key("a", {"x": 1, "y": 2}) == point_key("a", {"y": 2, "x": 1})
-        assert len({point_key("a", {"x": 1}), point_key("b", {"x": 1}), point_key("a", {"x": 2})}) == 3
 
 
 def row(error, time, role=""):

@@ -6,8 +6,8 @@ import trimesh
 
 from rbfmuscle.geometry.crossing import FaceTree, crossing_faces
 from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.implicit.extraction.material import _Fitting, carry_material, project_to_level_set
-from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh, _edges_loop
+from rbfmuscle.implicit.extraction.material import CarriedMaterial, carry_material, project_to_level_set
+from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
 from rbfmuscle.implicit.extraction.obstacles import PointGrid
 from rbfmuscle.implicit.extraction.projection import Projector
 
@@ -65,8 +65,11 @@ def mesh_of(ball=BALL):
 def test_vertices_come_to_lie_on_the_sphere():
     rng = np.random.default_rng(1)
     carried = BALL.vertices * (1.0 + 0.05 * rng.normal(size=(len(BALL.vertices), 1)))
-    found = project_to_level_set(mesh_of(), carried, Sphere())
-    np.testing.assert_allclose(np.linalg.norm(found.vertices, axis=1), 1.0, atol=1e-8)
+    found = project_to_level_set(mesh_of(), carried, Sphere(), volume=BALL.volume)
+    np.testing.assert_allclose(
+        np.linalg.norm(found.vertices, axis=1), 1.0, atol=0.01
+    )  # edges are of other lengths
+    assert np.ptp(np.linalg.norm(found.vertices, axis=1)) < 1e-8
     np.testing.assert_array_equal(found.faces, BALL.faces)
     assert (found.left, found.crossing) == (0, 0)
 
@@ -82,20 +85,22 @@ def test_the_level_gives_the_volume():
 
 def test_what_the_cut_takes_away_lies_on_it():
     cut = Bone(5.0, (5.5, 0.0, 0.0))
-    found = project_to_level_set(mesh_of(), np.asarray(BALL.vertices), Sphere(), cut=cut)
+    found = project_to_level_set(mesh_of(), np.asarray(BALL.vertices), Sphere(), cut=cut, volume=0.8 * VOLUME)
     assert cut(found.vertices).min() > -1e-5
     on_cut = np.abs(cut(found.vertices)) < 1e-4
     assert on_cut.sum() > 50
-    np.testing.assert_allclose(np.linalg.norm(found.vertices[~on_cut], axis=1), 1.0, atol=1e-6)
+    assert (
+        np.ptp(np.linalg.norm(found.vertices[~on_cut], axis=1)) < 1e-4
+    )  # a level's last step is of first order
     assert not crossing_faces(found.vertices, found.faces).any()
 
 
 def test_the_last_step_to_the_volume_drives_nothing_into_a_bone():
     """Beside what lies on the bone the level's last step moves vertices, here by 0.7 % of the radius."""
     cut = Bone(5.0, (5.9, 0.0, 0.0))
-    fitting = _Fitting(mesh_of(), np.asarray(BALL.vertices), Sphere(), cut, 0.0)
+    fitting = CarriedMaterial(mesh_of(), np.asarray(BALL.vertices), Sphere(), cut, 0.0)
     fitting.reach(0.97 * VOLUME)
-    fitting.meet(0.99 * VOLUME)
+    fitting.fill(0.99 * VOLUME)
     vertices = fitting.projector.vertices
     assert cut(vertices).min() > -1e-9
     assert mesh_volume(vertices, BALL.faces) == pytest.approx(0.99 * VOLUME, rel=1e-12)
@@ -121,7 +126,7 @@ def test_sheets_that_met_do_not_pull_vertices_off_the_material():
     mesh.slope = np.ones(len(BALL.vertices))
     x = np.asarray(BALL.vertices)
     carried = np.column_stack([1.9 * x[:, 0], x[:, 1] * (0.4 + x[:, 0] ** 2), x[:, 2] * (0.4 + x[:, 0] ** 2)])
-    found = project_to_level_set(mesh, carried, Two(0.9))
+    found = project_to_level_set(mesh, carried, Two(0.9), volume=mesh_volume(carried, mesh.faces))
     away = np.linalg.norm(found.vertices - carried, axis=1)
     assert away.max() <= 1.0 * mesh.edge(carried) + 1e-12
     assert found.left > 0 and found.crossing == 0
@@ -133,7 +138,7 @@ def test_tangled_triangles_are_smoothed_until_none_cross():
     assert crossing_faces(carried, BALL.faces).sum() > 50
     found = project_to_level_set(mesh_of(), carried, Sphere(), volume=VOLUME)
     assert not crossing_faces(found.vertices, found.faces).any()
-    assert found.smoothed > 0 and found.crossing == 0
+    assert found.crossing == 0
     assert mesh_volume(found.vertices, found.faces) == pytest.approx(VOLUME, rel=1e-12)
 
 
@@ -251,11 +256,3 @@ def test_what_is_known_of_the_cut_changes_nothing(shift):
     ]
     np.testing.assert_allclose(found[0].vertices, found[1].vertices, rtol=0, atol=1e-12)
     assert np.abs(cut(found[0].vertices)).min() < 1e-3
-
-
-def test_edges_of_a_mesh_have_their_mean_and_greatest_length_whichever_corner_is_first():
-    vertices = np.array(BALL.vertices) * [3.0, 1.0, 0.5]
-    lengths = np.linalg.norm(np.diff(vertices[BALL.edges_unique], axis=1)[:, 0], axis=1)
-    for first in range(3):
-        mean, greatest = _edges_loop(vertices, np.roll(BALL.faces, first, axis=1).astype(np.int64))
-        assert mean == pytest.approx(lengths.mean()) and greatest == pytest.approx(lengths.max())

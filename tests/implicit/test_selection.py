@@ -8,13 +8,21 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.implicit.extraction.sheets import count_sheets
+from rbfmuscle.implicit.extraction.marching import find_sheets
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.field_fit import FieldFit
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.placement.sampling import sample_surface
-from rbfmuscle.implicit.selection import BOUND, SPAN, _first_sound, choose_epsilon, spacing, surface_error
+from rbfmuscle.implicit.selection import (
+    BOUND,
+    SPAN,
+    _first_sound,
+    _Search,
+    choose_epsilon,
+    spacing,
+    surface_error,
+)
 from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.validation import NumericalWarning, UsageError
 
@@ -39,7 +47,7 @@ def both_ways(plate, kernel, epsilon):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NumericalWarning)
         field = replace(fit_of(kernel), epsilon=epsilon).fit(centres.points, centres.normals)
-        if not count_sheets(field, centres.points, distance.unsigned).sound():
+        if not find_sheets(field, centres.points, distance.unsigned).sound():
             return np.inf  # sheets of its own away from the surface: no field to use
         found = extract_surface(field, points=centres.points, resolution=48)
     there = MeshDistance(found.vertices, found.faces, closed=False).unsigned(vertices)
@@ -71,13 +79,10 @@ def test_a_zero_set_in_several_sheets_is_passed_over(plate, kernel):
 
 def test_a_ridge_keeps_the_bound_over_the_whole_range(plate):
     _, _, _, centres, held_out = plate
-    choice = choose_epsilon(
-        centres.points, centres.normals, fit_of("inverse_quadratic", 1e8), held_out=held_out
-    )
-    h = spacing(centres.points).mean()
-    assert (choice.tried[:, 2] <= 1e8).all() and choice.condition <= 1e8
-    assert choice.tried[0, 0] * h == pytest.approx(SPAN[0])
-    assert choice.tried[-1, 0] * h == pytest.approx(SPAN[1])
+    search = _Search(centres.points, centres.normals, fit_of("inverse_quadratic", 1e8), held_out)
+    order = search.run()
+    assert all(condition <= 1e8 for _, _, condition in order)
+    assert [min(search.trials) * search.reach, max(search.trials) * search.reach] == pytest.approx(SPAN)
 
 
 @pytest.mark.parametrize("size", [1e-6, 1e6])
@@ -136,33 +141,31 @@ def ball(points, centre=0.0, radius=10.0):
     return np.linalg.norm(points - np.array([centre, 0.0, 0.0]), axis=1) - radius
 
 
-def test_a_slender_bent_tube_is_one_sheet_though_the_coarse_box_cuts_it():
-    """The cells of the box are 5 wide, the tube 4; a ball beside it is a sheet of its own at any grid."""
+def test_a_slender_bent_tube_is_sound_though_the_cells_cut_it():
+    """The cells are 3 wide, the tube 2; a ball beside it is a stray sheet at any grid."""
 
     def tube(points):
         x, y, z = points.T
         across = np.hypot(y - 10.0 * np.sin(x / 20.0), z)
-        return np.hypot(across, np.maximum(np.abs(x) - 95.0, 0.0)) - 2.0
+        return np.hypot(across, np.maximum(np.abs(x) - 95.0, 0.0)) - 1.0
 
     x = np.linspace(-95.0, 95.0, 400)
-    points = np.c_[x, 10.0 * np.sin(x / 20.0), 2.0 + 0.0 * x]
+    points = np.c_[x, 10.0 * np.sin(x / 20.0), 1.0 + 0.0 * x]
     field = Shape(tube)
-    assert extract_surface(field, points=points, resolution=40).components > 1
-    assert count_sheets(field, points, field).sound()
-    both = Shape(lambda at: np.minimum(tube(at), ball(at - [0.0, 10.0, 0.0], 70.0, 3.0)))
-    assert count_sheets(both, np.vstack([points, [[0.0, 14.0, 0.0]]]), field).number > 1
+    assert extract_surface(field, points=points, resolution=64).components > 1
+    assert find_sheets(field, points, field).sound()
+    both = Shape(lambda at: np.minimum(tube(at), ball(at - [0.0, 10.0, 0.0], 70.0, 4.0)))
+    assert find_sheets(both, np.vstack([points, [[0.0, 14.0, 0.0]]]), field).stray == 1
 
 
-def test_sheets_beyond_the_box_of_a_band_and_open_ones_are_seen():
-    """Whatever the cells, the box is the same: a ball 12 off, of radius 1.5, touches none of the surface's cells."""
+def test_stray_and_open_sheets_in_the_box_are_seen():
     points = np.vstack([10.0 * trimesh.creation.icosphere(subdivisions=2).vertices, [[30.0, 0.0, 0.0]]])
     two = Shape(lambda at: np.minimum(ball(at), ball(at, 22.0, 1.5)))
-    assert count_sheets(Shape(ball), points, ball).sound()
-    assert count_sheets(two, points, ball) == (2, False, 40)
-    assert count_sheets(two, points, ball, wanted=2).sound(2)
+    assert find_sheets(Shape(ball), points, ball) == (0, False, True)
+    assert find_sheets(two, points, ball) == (1, False, True)
     halved = Shape(lambda at: np.minimum(ball(at), at[:, 0] - 11.0))
-    assert count_sheets(halved, points, ball).is_open
-    assert count_sheets(Shape(lambda at: 1.0 + 0.0 * at[:, 0]), points, ball).number == 0
+    assert find_sheets(halved, points, ball).is_open
+    assert not find_sheets(Shape(lambda at: 1.0 + 0.0 * at[:, 0]), points, ball).found
 
 
 def two_balls(at):

@@ -1,26 +1,26 @@
-"""Marching cubes on the cells of a regular grid that a level set crosses, found by following it."""
+"""Level sets on the nodes of a regular grid: marching cubes, and the sheets of a level set."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import product
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.fields import ClipDistance, Field
+from rbfmuscle.geometry.surfaces import label_sheets
 from rbfmuscle.validation import check_points
 
-# More nodes than this are refused: 13 bytes each.
-MAX_NODES = 50_000_000
-# A vertex both of whose nodes are farther than this from the cut, in cells, stays clear of it.
-NEAR_CUT = 1.2
+# More nodes than this are refused; so many are evaluated at a time.
+MAX_NODES, SLAB = 50_000_000, 500_000
 # Values nearer to zero than this share of their mean are moved away from it: no vertex then lies on a node.
 LEAST_VALUE = 1e-6
-# Offsets of the corners of a cell from its lower node, and of the cells around it and itself.
-CORNERS = np.array(list(product((0, 1), repeat=3)))
-AROUND = np.array(list(product((-1, 0, 1), repeat=3)))
+# Cells along the longest side of the points when stray sheets are looked for, and the share of it added on every side.
+SEARCHED, MARGIN = 64, 0.075
 
 
 @dataclass(frozen=True)
@@ -84,25 +84,27 @@ class Grid:
         corner = 0.5 * (low + high) - 0.5 * spacing * cells
         return cls(corner @ axes, spacing, tuple(int(n) + 1 for n in cells), axes)
 
-    @property
-    def strides(self) -> Integers:
-        """Step in flat node number along each axis."""
-        return np.array([self.shape[1] * self.shape[2], self.shape[2], 1])
-
     def positions(self, coordinates: Floats) -> Floats:
         """World positions (n, 3) of grid coordinates, in cells from the origin."""
         return coordinates @ (self.spacing * self.axes) + self.origin
 
-    def cells(self, points: Floats) -> Integers:
-        """Flat numbers (n,) of the cells that hold points; outside the grid its outermost cells."""
-        where = np.floor((points - self.origin) @ self.axes.T / self.spacing)
-        return np.clip(where, 0, np.array(self.shape) - 2).astype(np.int64) @ self.strides
+    def evaluate(self, function: Callable[[Floats], Floats]) -> NDArray[np.float32]:
+        """Values of a function of points (n, 3) at the nodes, in single precision as marching cubes has them."""
+        values = np.empty(int(np.prod(self.shape)), dtype=np.float32)
+        for low in range(0, len(values), SLAB):
+            nodes = np.arange(low, min(low + SLAB, len(values)))
+            points = self.positions(np.stack(np.unravel_index(nodes, self.shape), 1))
+            values[nodes] = function(points)
+            if np.isnan(values[nodes]).any():
+                where = points[np.argmax(np.isnan(values[nodes]))]
+                raise ValueError(
+                    f"field or cut is NaN at {where}; check the fit (its condition) and the bone fields"
+                )
+        return values.reshape(self.shape)
 
 
-class Band:
-    """Values of a field, and of what cuts it, at the nodes of the cells that were visited.
-
-    A cell has the flat number of its lower node.
+class LevelSet:
+    """Triangles of the zero set of max(field - level, -cut) on a grid.
 
     Parameters
     ----------
@@ -110,105 +112,90 @@ class Band:
     field : Field
         Negative inside.
     cut : ClipDistance, optional
-
-    Attributes
-    ----------
-    cells : (k,) ndarray of int
-        Visited cells.
     """
 
     def __init__(self, grid: Grid, field: Field, cut: ClipDistance | None = None) -> None:
         self.grid, self.field, self.cut = grid, field, cut
-        self.cells = np.zeros(0, dtype=np.int64)
-        # Single precision, as marching cubes has it; its vertices are projected afterwards.
-        self._f = np.full(int(np.prod(grid.shape)), np.nan, dtype=np.float32)
-        self._c = np.full(len(self._f), np.inf, dtype=np.float32)
-        # The last nodes along each axis are no cells: they keep the walk inside the grid.
-        visited = np.ones(grid.shape, dtype=np.bool_)
-        visited[:-1, :-1, :-1] = False
-        self._visited = visited.ravel()
-        self._corners = CORNERS @ grid.strides
+        self._f = grid.evaluate(field)
+        self._c = None if cut is None else grid.evaluate(cut)
 
-    def visit(self, cells: Integers) -> Integers:
-        """Evaluate the nodes of cells; those (k,) that were not visited before."""
-        new = np.unique(cells)
-        new = new[~self._visited[new]]
-        self._visited[new] = True
-        self.cells = np.concatenate([self.cells, new])
-        nodes = np.unique(new[:, None] + self._corners)
-        nodes = nodes[np.isnan(self._f[nodes])]
-        if len(nodes):
-            points = self.grid.positions(np.stack(np.unravel_index(nodes, self.grid.shape), 1))
-            value = self.field(points)
-            distance = np.full(len(nodes), np.inf) if self.cut is None else self.cut(points)
-            bad = np.isnan(value) | np.isnan(distance)
-            if bad.any():
-                where = points[np.argmax(bad)]
-                raise ValueError(
-                    f"field or cut is NaN at {where}; check the fit (its condition) and the bone fields"
-                )
-            self._f[nodes], self._c[nodes] = value, distance
-        return new
+    def march(self, level: float) -> tuple[Floats, Integers]:
+        """Vertices (n, 3) in grid coordinates and outward triangles (m, 3); none where the values have one sign.
 
-    def visit_all(self) -> None:
-        """Visit every cell of the grid."""
-        self.visit(np.flatnonzero(~self._visited))
-
-    def widen(self) -> bool:
-        """Visit all neighbours of the visited cells; whether there were any."""
-        around = (self.cells[:, None] + AROUND @ self.grid.strides).ravel().astype(np.int64)
-        return len(self.visit(around[(around >= 0) & (around < len(self._f))])) > 0
-
-    def follow(self, level: float) -> None:
-        """Visit the cells behind crossed faces until none is left."""
-        front = self.cells
-        while len(front):
-            inside = self._values(front[:, None] + self._corners, level) < 0.0
-            behind = []
-            for axis, stride in enumerate(self.grid.strides):
-                for side in (0, 1):
-                    face = inside[:, CORNERS[:, axis] == side]
-                    behind.append(front[face.any(axis=1) & ~face.all(axis=1)] + (2 * side - 1) * stride)
-            front = self.visit(np.concatenate(behind))
-
-    def _values(self, nodes: Integers, level: float) -> Floats:
-        """The function whose zero set is sought, max(f - level, -c), at nodes."""
-        return np.maximum(self._f[nodes] - np.float32(level), -self._c[nodes])
-
-    def crosses(self, level: float) -> bool:
-        """Whether the level set meets any visited cell."""
-        value = self._values(np.flatnonzero(~np.isnan(self._f)), level)
-        return bool((value < 0).any() and (value >= 0).any())
-
-    def march(self, level: float) -> tuple[Floats, Integers, Booleans, Booleans]:
-        """Closed triangles of the level set in the visited cells.
-
-        Returns
-        -------
-        coordinates : (n, 3) ndarray
-            Vertices in grid coordinates.
-        triangles : (m, 3) ndarray
-            Outward.
-        is_open : (n,) ndarray of bool
-            Vertices on the outermost cells, where the surface leaves the grid.
-        near_cut : (n,) ndarray of bool
-            Vertices that a shift by a cell may bring to the cut.
+        They are closed but for edges on the border of the grid.
         """
         from skimage.measure import marching_cubes
 
-        known = np.flatnonzero(~np.isnan(self._f))
-        value = self._values(known, level)
+        value = self._f - np.float32(level)
+        if self._c is not None:
+            value = np.maximum(value, -self._c)
+        inside = value < 0.0
+        if inside.all() or not inside.any():
+            return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
         least = LEAST_VALUE * np.abs(value[np.isfinite(value)]).mean()
-        volume = np.ones(len(self._f), dtype=np.float32)
-        volume[known] = np.where(value < 0.0, np.minimum(value, -least), np.maximum(value, least))
-        # scikit-image masks a cell by its upper node.
-        mask = np.zeros(len(self._f), dtype=np.bool_)
-        mask[self.cells + self._corners[-1]] = True
-        shape = self.grid.shape
-        vertices, faces, _, _ = marching_cubes(volume.reshape(shape), 0.0, mask=mask.reshape(shape))
-        coordinates = np.ascontiguousarray(vertices, dtype=np.float64)
-        is_open = np.any((coordinates <= 0.0) | (coordinates >= np.array(shape) - 1.0), axis=1)
-        ends = (np.floor(coordinates), np.ceil(coordinates))
-        clear = np.minimum(*(self._c[end.astype(np.int64) @ self.grid.strides] for end in ends))
-        near_cut: Booleans = clear < NEAR_CUT * self.grid.spacing
-        return coordinates, faces.astype(np.int64), is_open, near_cut
+        value = np.where(inside, np.minimum(value, -least), np.maximum(value, least))
+        vertices, faces, _, _ = marching_cubes(value, 0.0)
+        return vertices.astype(np.float64), faces.astype(np.int64)
+
+    def on_border(self, coordinates: Floats) -> Booleans:
+        """Mask (n,) of the vertices on the border of the grid, where a surface leaves it."""
+        return np.any((coordinates <= 0.0) | (coordinates >= np.array(self.grid.shape) - 1.0), axis=1)
+
+
+class Sheets(NamedTuple):
+    """Sheets of a level set beside a surface.
+
+    Attributes
+    ----------
+    stray : int
+        Sheets beside that nearest to most points which stand off the surface by more than a cell.
+    is_open : bool
+        Whether a sheet leaves the box.
+    found : bool
+        Whether there is any sheet.
+    """
+
+    stray: int
+    is_open: bool
+    found: bool
+
+    def sound(self) -> bool:
+        """Whether there are sheets, all of them closed and on the surface."""
+        return self.found and not self.is_open and self.stray == 0
+
+
+def find_sheets(field: Field, points: Floats, distance: Callable[[Floats], Floats]) -> Sheets:
+    """Sheets of a field's zero set in a box around a surface, 7.5 % larger than it on every side.
+
+    Parameters
+    ----------
+    field : Field
+        Negative inside.
+    points : (n, 3) ndarray
+        Points of the surface, which give the box [length].
+    distance : callable
+        ``(n, 3) -> (n,)``, distance to the surface, signed or not. Where a muscle is thinner than a cell, its own sheet
+        falls into pieces on the grid: these lie within a cell of it and do not count.
+
+    Returns
+    -------
+    Sheets
+    """
+    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    grid = Grid.around(points, resolution=SEARCHED, padding=round(MARGIN * SEARCHED), axes=axes)
+    level_set = LevelSet(grid, field)
+    coordinates, faces = level_set.march(0.0)
+    if len(faces) == 0:
+        return Sheets(0, False, False)
+    vertices = grid.positions(coordinates)
+    number, label, own = nearest_sheet(vertices, faces, points)
+    off = np.zeros(number)
+    np.maximum.at(off, label, np.abs(distance(vertices)))
+    stray = int((off > grid.spacing).sum() - (off[own] > grid.spacing))
+    return Sheets(stray, bool(level_set.on_border(coordinates).any()), True)
+
+
+def nearest_sheet(vertices: Floats, faces: Integers, points: Floats) -> tuple[int, Integers, int]:
+    """Number of connected sheets, the sheet (n,) of each vertex, and the sheet that lies nearest to most points."""
+    number, label = label_sheets(faces, len(vertices))
+    return number, label, int(np.bincount(label[cKDTree(vertices).query(points)[1]]).argmax())

@@ -8,17 +8,37 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.fields import ClipDistance, Field
 from rbfmuscle.geometry.surfaces import mesh_volume, vertex_normals
-from rbfmuscle.implicit.extraction.carried_material import CarriedMaterial
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
 from rbfmuscle.implicit.extraction.obstacles import Obstacles
+from rbfmuscle.implicit.extraction.projection import CutBounds, Projector
 from rbfmuscle.implicit.extraction.surface import ExtractedSurface
-from rbfmuscle.implicit.extraction.untangling import gather, untangle
 from rbfmuscle.jit import compiled
 from rbfmuscle.validation import check_finite
 
+# What is within this many mean edges of the bones may come to lie on them.
+NEAR_CUT = 1.5
+# Greatest bound of the distance from them that is kept, in mean edges.
+FAR = 100.0
+# A triangle none of whose corners is so many spacings near a bone has no bone vertex behind it by a chord: no point
+# of it is farther from a corner than its longest side over the root of three.
+NEAR_BONE = 1.5
+# What the material takes so many mean edges deep into a bone is sunk.
+SUNK = 1.0
+# Mean edges that a bone's vertex may lie within the surface.
+PUSHED = 0.01
+# Where both sides of a muscle sink into a bone, the far one stays above it by this share of a mean edge.
+LAMELLA = 0.02
+# Rounds of smoothing for triangles that cross others, and how the smoothed region grows with them.
+UNTANGLE, GROWTH = 24, 4
+# Rounds before them in which what crosses is taken back to where the material is, by this share of the way.
+RETURN, BACK = 12, 0.15
+# What is sunk in a bone, or what a bone sent so many mean edges away, is drawn as a skin over the place where it goes
+# in: so many sweeps of smoothing first, and in each of some rounds after, each followed by the way out of the bone.
+STRAYED = 1.5
+FILL_SWEEPS, GATHER, GATHER_SWEEPS = 150, 4, 12
 # No vertex goes farther than this from where the material carries it, in mean edges; and where the field's slope
 # has sunk to these shares of its slope at rest, not at all, or as far as it likes within that.
 FARTHEST = 1.0
@@ -40,14 +60,11 @@ class FittedMesh(ExtractedSurface):
     ----------
     left : int
         Vertices that were kept from a level set far from where the material carries them.
-    smoothed : int
-        Vertices that were smoothed, as triangles around them crossed others.
     crossing : int
         Triangles that still cross others.
     """
 
     left: int = 0
-    smoothed: int = 0
     crossing: int = 0
 
 
@@ -56,12 +73,12 @@ def project_to_level_set(
     vertices: Floats,
     field: Field,
     *,
-    volume: float | None = None,
+    volume: float,
     level: float = 0.0,
     cut: ClipDistance | None = None,
     obstacles: Obstacles | None = None,
 ) -> FittedMesh:
-    """Bring a triangulation onto the zero set of max(field - level, -cut).
+    """Bring a triangulation onto the zero set of max(field - level, -cut) that has a volume.
 
     Parameters
     ----------
@@ -80,19 +97,16 @@ def project_to_level_set(
     ValueError
         On NaN in field or cut, and where no level gives the volume.
     """
-    fitting = _Fitting(mesh, vertices, field, cut, float(level))
-    if volume is None:
-        fitting.project()
-    else:
-        fitting.reach(volume)
-    return fitting.finish(volume, obstacles)
+    fitting = CarriedMaterial(mesh, vertices, field, cut, float(level))
+    fitting.reach(volume)
+    return fitting.finish(volume, obstacles or [])
 
 
 def carry_material(
     mesh: MaterialMesh,
     vertices: Floats,
     *,
-    volume: float | None = None,
+    volume: float,
     cut: ClipDistance | None = None,
     obstacles: Obstacles | None = None,
 ) -> FittedMesh:
@@ -113,13 +127,35 @@ def carry_material(
     ValueError
         Where so much of it is in the bones that nothing can be blown up to the volume.
     """
-    fitting = _Fitting(mesh, vertices, None, cut, 0.0)
+    fitting = CarriedMaterial(mesh, vertices, None, cut, 0.0)
     fitting.inflate(volume)
-    return fitting.finish(volume, obstacles)
+    return fitting.finish(volume, obstacles or [])
 
 
-class _Fitting(CarriedMaterial):
-    """A material mesh on its way to a level set."""
+class CarriedMaterial:
+    """A material mesh on its way from where the material takes it.
+
+    Parameters
+    ----------
+    mesh : MaterialMesh
+    vertices : (n, 3) ndarray
+        Where the material carries them [scene unit].
+    field : Field or None
+    cut : ClipDistance or None
+    level : float
+
+    Attributes
+    ----------
+    carried : (n, 3) ndarray
+        The vertices as given.
+    projector : Projector
+        Holds the vertices where they are now.
+    edge : float
+        Mean length of an edge [scene unit].
+    sunk, outside, pushed, left : (n,) ndarray of bool
+        What the material takes deep into a bone, what it leaves outside all bones, what a bone's vertex pushed off,
+        and what was kept from a level set that is too far away.
+    """
 
     def __init__(
         self,
@@ -129,14 +165,131 @@ class _Fitting(CarriedMaterial):
         cut: ClipDistance | None,
         level: float,
     ) -> None:
-        super().__init__(mesh, vertices, field, cut, level)
-        self.reach_of = None
+        self.mesh, self.carried, self.level = mesh, np.ascontiguousarray(vertices, dtype=np.float64), level
+        self.field, self.cut = field, cut
+        self.edge = mesh.edge(self.carried)
+        self.sunk, self.pushed, self.left = np.zeros((3, len(vertices)), dtype=np.bool_)
+        self.outside = np.ones(len(vertices), dtype=np.bool_)
+        self.reach_of: Floats | None = None
+        self._start(cut)
         if mesh.slope is not None and field is not None:
             self.projector.known = field.value_and_gradient(self.carried)
             self.projector.least = SURE * mesh.slope
             gradient = self.projector.known[1]
             share = np.sqrt(np.einsum("nd,nd->n", gradient, gradient)) / mesh.slope
             self.reach_of = FARTHEST * self.edge * np.clip((share - UNSURE) / (SURE - UNSURE), 0.0, 1.0)
+
+    def _start(self, cut: ClipDistance | None) -> None:
+        """A projector of the vertices where the material takes them, that knows how far the bones are there."""
+        near, vertices = np.zeros(len(self.carried), dtype=np.bool_), self.carried.copy()
+        if cut is None:
+            self.projector = Projector(self.field, None, vertices, self.edge, near)
+            return
+        limit = np.full(len(vertices), NEAR_CUT * self.edge)
+        distance, outward = cut.value_and_gradient_below(self.carried, limit)
+        near, self.outside = distance < limit, distance >= 0.0
+        self.projector = Projector(self.field, cut if near.any() else None, vertices, self.edge, near)
+        if np.isfinite(cut.steepest):
+            self.projector.bounds = CutBounds(
+                self.carried, np.minimum(distance, FAR * self.edge), cut.steepest
+            )
+        if near.any():
+            self.projector.clearance = self._clearance(near, distance, outward)
+
+    def _clearance(self, near: Booleans, distance: Floats, outward: Floats) -> Floats:
+        """How far from the bones vertices that sink into them end: those that look away keep off the others."""
+        normals, clearance = vertex_normals(self.carried, self.mesh.faces), np.zeros(len(self.carried))
+        away = near & (np.einsum("nd,nd->n", normals, outward) > 0.0)
+        clearance[away] = LAMELLA * self.edge
+        self.sunk = near & (distance < -SUNK * self.edge)
+        return clearance
+
+    def lift(self, rows: Integers) -> None:
+        """Bring vertices out of the bones, where they stay."""
+        self.projector.lift(rows)
+        self.projector.hold(rows)
+
+    def push_off(self, obstacles: Obstacles) -> None:
+        """Move the corners of triangles that a bone's vertices came through."""
+        if not obstacles:
+            return
+        vertices, faces = self.projector.vertices, self.mesh.faces
+        # So large that no corner is farther than 1.3 of it from its triangle's middle.
+        spacing = max(self.edge, 0.52 * self.mesh.longest(vertices))
+        if self.projector.bounds is not None:
+            near = self.projector.bounds.distance(vertices) < NEAR_BONE * spacing
+            faces = faces[near[faces].any(axis=1)]
+        if len(faces):
+            self.pushed |= self.projector.push_off(faces, obstacles, self.level, spacing, PUSHED * self.edge)
+
+    def gather(self) -> None:
+        """Close the surface over what is deep in a bone: a sheet that is folded over it would cross itself."""
+        lost = self.sunk | self._strayed(slice(None))
+        if not lost.any():
+            return
+        rows = np.flatnonzero(self.mesh.around(lost, 1))
+        for turn in range(GATHER):
+            self.mesh.smooth(self.projector.vertices, rows, GATHER_SWEEPS if turn else FILL_SWEEPS)
+            if self.field is None:
+                self.lift(rows)
+            else:
+                self.projector.project(self.level, rows)
+
+    def untangle(self) -> bool:
+        """Smooth what crosses itself; return whether anything was moved for it."""
+        faces, moved = self.mesh.faces, False
+        among = self._suspicious()
+        for turn in range(0 if self.field is None else -RETURN, UNTANGLE + 1):
+            # What was not moved does not begin to cross.
+            bad = self.mesh.tree.crossing(self.projector.vertices, among)
+            if turn == UNTANGLE or not bad.any():
+                break
+            moved, marked = True, np.zeros(len(self.carried), dtype=np.bool_)
+            marked[faces[bad].ravel()] = True
+            region = self.mesh.around(marked, 1 + max(turn, 0) // GROWTH)
+            among = np.asarray(region[faces].any(axis=1), dtype=np.bool_)
+            if turn < 0:
+                self._return(np.flatnonzero(region))
+            else:
+                self._smooth(np.flatnonzero(region), self.field is not None and turn < UNTANGLE // 2)
+        return moved
+
+    def _suspicious(self) -> Booleans | None:
+        """Mask of the triangles that may cross others without being folded at a corner; None where it can be any.
+
+        These are where the field's slope has sunk, as between sheets that met, and what was held back, sunk or pushed.
+        """
+        if self.field is None or self.mesh.slope is None:
+            return None
+        faded = SURE * self.projector.slope * self.mesh.slope >= 1.0
+        odd = self.sunk | self.pushed | self.left | faded
+        return np.asarray(odd[self.mesh.faces].any(axis=1), dtype=np.bool_)
+
+    def _strayed(self, rows: Integers | slice) -> Booleans:
+        """Mask of the vertices that are far from where the material takes them."""
+        away = self.projector.vertices[rows] - self.carried[rows]
+        return np.asarray(np.einsum("nd,nd->n", away, away) > (STRAYED * self.edge) ** 2)
+
+    def _return(self, rows: Integers) -> None:
+        """Take vertices back towards where the material is, which smoothing would shorten; not those on bones."""
+        projector = self.projector
+        rows = rows[projector.on_field[rows] & ~self._strayed(rows) & ~self.pushed[rows]]
+        projector.vertices[rows] -= BACK * (projector.vertices[rows] - self.carried[rows])
+        self.lift(rows)
+
+    def _smooth(self, rows: Integers, onto_field: bool) -> None:
+        """Move vertices towards their neighbours, then back onto the surface, or out of the bones at least."""
+        projector = self.projector
+        before = projector.vertices[rows]
+        self.mesh.smooth(projector.vertices, rows, 3)
+        if not onto_field:
+            self.lift(rows)
+            return
+        smoothed = projector.vertices[rows]
+        projector.project(self.level, rows)
+        away = projector.vertices[rows] - before
+        gone = np.einsum("nd,nd->n", away, away) > self.edge**2
+        projector.vertices[rows[gone]] = smoothed[gone]
 
     def project(self) -> None:
         """Newton steps onto the level set, no farther from where the material is than the field is to be trusted."""
@@ -164,13 +317,11 @@ class _Fitting(CarriedMaterial):
                 return
         raise ValueError(f"no level gives a volume of {volume:g}; is it the volume of the surface fitted?")
 
-    def inflate(self, volume: float | None) -> None:
+    def inflate(self, volume: float) -> None:
         """Out of the bones, and along the normals to the volume; every vertex counts as left."""
         projector, faces = self.projector, self.mesh.faces
         self.left[:] = True
         projector.lift()
-        if volume is None:
-            return
         for _ in range(20):
             projector.move_along(vertex_normals(projector.vertices, faces))
             step = float(np.clip(projector.volume_step(faces, volume), -0.5 * self.edge, 0.5 * self.edge))
@@ -179,53 +330,35 @@ class _Fitting(CarriedMaterial):
             if abs(step) < 1e-3 * self.edge:
                 break
 
-    def finish(
-        self,
-        volume: float | None,
-        obstacles: Obstacles | None,
-    ) -> FittedMesh:
+    def finish(self, volume: float, obstacles: Obstacles) -> FittedMesh:
         """Bone vertices pushed off, crossings smoothed, the volume met: the mesh."""
-        gather(self)
+        self.gather()
         self.push_off(obstacles)
-        smoothed, crossing = self.settle(volume, obstacles)
+        crossing = self.settle(volume, obstacles)
         vertices, faces = self.projector.vertices, self.mesh.faces
         check_finite(vertices, name="fitted vertices")
         return FittedMesh(
-            vertices, faces, self.level, mesh_volume(vertices, faces), 1, self.edge, int(self.left.sum()), smoothed,
-            crossing,
+            vertices, faces, self.level, mesh_volume(vertices, faces), 1, self.edge, int(self.left.sum()), crossing
         )  # fmt: skip
 
-    def settle(
-        self,
-        volume: float | None,
-        obstacles: Obstacles | None,
-    ) -> tuple[int, int]:
-        """The volume met and nothing smoothed since; vertices that were, and triangles that cross all the same."""
-        smoothed = 0
+    def settle(self, volume: float, obstacles: Obstacles) -> int:
+        """The volume met and nothing smoothed since; triangles that cross all the same."""
         for turn in range(AGAIN):
             self.fill(volume)
-            touched = untangle(self)
-            if touched == 0:
-                return smoothed, 0
-            smoothed = max(smoothed, touched)
+            if not self.untangle():
+                return 0
             if turn < CLEAR:
                 # What was smoothed may lie over a bone's vertex again.
                 self.push_off(obstacles)
         self.fill(volume)
-        return smoothed, int(self.mesh.tree.crossing(self.projector.vertices).sum())
+        return int(self.mesh.tree.crossing(self.projector.vertices).sum())
 
-    def fill(self, volume: float | None) -> None:
-        """The volume, where one is to be met."""
-        if volume is None:
-            return
+    def fill(self, volume: float) -> None:
+        """The volume to the last digit; what its last step drove into a bone is brought out and stays there."""
         if self.field is None:
             # What was smoothed or filled stays put otherwise, and that may be all of it.
             self.projector.move_along(vertex_normals(self.projector.vertices, self.mesh.faces))
             self.projector.lift()
-        self.meet(volume)
-
-    def meet(self, volume: float) -> None:
-        """The volume to the last digit; what its last step drove into a bone is brought out and stays there."""
         for turn in range(MEET + 1):
             step = self.projector.volume_step(self.mesh.faces, volume, steps=4)
             self.level += step

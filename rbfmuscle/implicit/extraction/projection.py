@@ -39,19 +39,6 @@ class CutBounds:
         """How far (n,) vertices (n, 3) are from the cut at least."""
         return self.below(vertices) / self.steepest
 
-    def within(self, vertices: Floats, rows: Integers, limit: Floats) -> Booleans:
-        """Mask of the vertices that may lie below their limit (k,)."""
-        found: Booleans = self.below(vertices, rows) <= limit
-        return found
-
-    def keep(self, vertices: Floats, rows: Integers, values: Floats) -> None:
-        """Take over new answers."""
-        self.places[rows], self.values[rows] = vertices, values
-
-    def part(self, rows: Integers) -> CutBounds:
-        """The bounds of some of the vertices."""
-        return CutBounds(self.places[rows], self.values[rows], self.steepest)
-
 
 class Projector:
     """Vertices on their way to the zero set of max(f - level, -d).
@@ -69,8 +56,7 @@ class Projector:
     ) -> None:
         self.vertices = vertices
         self.spacing = spacing
-        self._field = field
-        self._cut = None if cut is None else cut.value_and_gradient_below
+        self._field, self._cut = field, cut
         self._near_cut = near_cut
         # What is known before the first step: the field with its gradient, and the cut by values or lower bounds.
         self.known: tuple[Floats, Floats] | None = None
@@ -83,12 +69,12 @@ class Projector:
         self.on_field = np.ones(len(vertices), dtype=bool)
         self._direction = np.zeros_like(vertices)
 
-    def project(self, level: float, rounds: int = 6) -> None:
-        """Newton steps until they are shorter than 1e-4 of a cell."""
+    def project(self, level: float, rows: Integers | None = None, *, rounds: int = 6) -> None:
+        """Newton steps of all vertices, or those numbered ``rows``, until they are shorter than 1e-4 of a cell."""
         if self._field is None:
             raise ValueError("there is no field to project onto")
+        todo = np.arange(len(self.vertices)) if rows is None else rows
         on_field = np.ones(len(self.vertices), dtype=bool)
-        todo = np.arange(len(self.vertices))
         for _ in range(rounds):
             x = self.vertices[todo]
             f, gradient = self._field.value_and_gradient(x) if self.known is None else self.known
@@ -99,39 +85,41 @@ class Projector:
             )
             self.slope[todo] = slope
             if self._cut is not None:
-                self._turn_to_cut(x, todo, (f - level) * slope, step, on_field)
+                self._turn_to_cut(todo, (f - level) * slope, step, on_field)
             # Newton squares the error: what moved by less than 1 % of a cell is there.
             unsettled = np.empty(len(x), dtype=np.bool_)
             _step_loop(todo, step, self.spacing, self.vertices, unsettled)
             todo = todo[unsettled]
             if len(todo) == 0:
                 break
-        self._direction[~on_field] = 0.0
-        self.slope[~on_field] = 0.0
-        self.on_field = on_field
+        self.hold(~on_field)
+        if rows is None:
+            self.on_field = on_field
 
-    def _turn_to_cut(
-        self, x: Floats, todo: Integers, height: Floats, step: Floats, on_field: Booleans
-    ) -> None:
+    def _turn_to_cut(self, todo: Integers, height: Floats, step: Floats, on_field: Booleans) -> None:
         """Replace the steps of vertices that lie on the cut; marks which lie on the field's own surface."""
         rows = np.flatnonzero(self._near_cut[todo])
-        limit = self.clearance[todo[rows]] - height[rows]
-        if self.bounds is not None:
-            within = self.bounds.within(x[rows], todo[rows], limit)
-            rows, limit = rows[within], limit[within]
-        if self._cut is None or len(rows) == 0:
-            return
-        distance, outward = self._cut(x[rows], limit)
-        if self.bounds is not None:
-            self.bounds.keep(x[rows], todo[rows], distance)
+        found, distance, outward = self._ask_cut(todo[rows], self.clearance[todo[rows]] - height[rows])
+        rows = rows[found]
         distance = distance - self.clearance[todo[rows]]
         on_cut = height[rows] < -distance
         on_field[todo[rows]] = ~on_cut
-        rows, distance, outward = rows[on_cut], distance[on_cut], outward[on_cut]
-        size = np.maximum(np.einsum("ij,ij->i", outward, outward), np.finfo(float).tiny)
-        step[rows] = -(distance / size)[:, None] * outward
+        step[rows[on_cut]] = _way_out(distance[on_cut], outward[on_cut])
 
-    def hold(self, rows: Integers | slice) -> None:
+    def _ask_cut(self, rows: Integers, limit: Floats) -> tuple[Booleans, Floats, Floats]:
+        """Which of some vertices may lie below their limit (k,), and the cut's distances and gradients there."""
+        near = np.ones(len(rows), dtype=np.bool_)
+        if self.bounds is not None:
+            near = self.bounds.below(self.vertices[rows], rows) <= limit
+        if self._cut is None or not near.any():
+            return np.zeros(len(rows), dtype=np.bool_), np.zeros(0), np.zeros((0, 3))
+        where = self.vertices[rows[near]]
+        distance, outward = self._cut.value_and_gradient_below(where, limit[near])
+        if self.bounds is not None:
+            self.bounds.places[rows[near]], self.bounds.values[rows[near]] = where, distance
+        return near, distance, outward
+
+    def hold(self, rows: Integers | Booleans) -> None:
         """Let vertices stay where they are when the level changes."""
         self._direction[rows] = 0.0
         self.slope[rows] = 0.0
@@ -141,35 +129,12 @@ class Projector:
         self._direction[:] = direction
         self.slope[:] = np.linalg.norm(direction, axis=1)
 
-    def part(self, rows: Integers) -> Projector:
-        """A projector of some of the vertices."""
-        part = Projector.__new__(Projector)
-        part.vertices, part.spacing = self.vertices[rows], self.spacing
-        part._field, part._cut, part._near_cut = self._field, self._cut, self._near_cut[rows]
-        part.clearance, part.least = self.clearance[rows], self.least[rows]
-        part.known, part.bounds = None, None if self.bounds is None else self.bounds.part(rows)
-        part.slope, part._direction = np.zeros(len(rows)), np.zeros((len(rows), 3))
-        return part
-
-    def take(self, part: Projector, rows: Integers) -> None:
-        """Take over the vertices of a part, with their motions."""
-        self.vertices[rows], self.slope[rows] = part.vertices, part.slope
-        self._direction[rows] = part._direction
-
-    def lift(self) -> int:
-        """Move vertices that lie in the cut onto it, and let these stay there when the level changes: how many."""
+    def lift(self, rows: Integers | None = None) -> int:
+        """Move vertices, or those numbered ``rows``, that lie in the cut onto it, where they stay: how many."""
         moved = 0
-        if self._cut is None:
-            return moved
-        rows = np.flatnonzero(self._near_cut)
+        rows = np.flatnonzero(self._near_cut) if rows is None else rows[self._near_cut[rows]]
         for _ in range(2):
-            limit = self.clearance[rows]
-            if self.bounds is not None:
-                within = self.bounds.within(self.vertices[rows], rows, limit)
-                rows, limit = rows[within], limit[within]
-            if len(rows) == 0:
-                break
-            rows = self._move_out(rows, limit, OUT * self.spacing)
+            rows = self._move_out(rows, self.clearance[rows], OUT * self.spacing)
             if len(rows) == 0:
                 break
             moved = max(moved, len(rows))
@@ -178,15 +143,12 @@ class Projector:
 
     def _move_out(self, rows: Integers, limit: Floats, slack: float) -> Integers:
         """Move those of some vertices that are nearer to the cut than a limit, by more than a slack, there: which."""
-        if self._cut is None:
-            return rows[:0]
-        distance, outward = self._cut(self.vertices[rows], limit)
-        distance = distance - limit
+        near, distance, outward = self._ask_cut(rows, limit)
+        distance = distance - limit[near]
         inside = distance < -slack
-        distance, outward = distance[inside], outward[inside]
-        size = np.maximum(np.einsum("ij,ij->i", outward, outward), np.finfo(float).tiny)
-        self.vertices[rows[inside]] -= (distance / size)[:, None] * outward
-        return rows[inside]
+        rows = rows[near][inside]
+        self.vertices[rows] += _way_out(distance[inside], outward[inside])
+        return rows
 
     def volume_step(self, faces: Integers, target: float, steps: int = 1) -> float:
         """Change of level that brings the mesh to the target volume, its vertices moving along their directions.
@@ -239,6 +201,12 @@ class Projector:
     def shift(self, step: float) -> None:
         """Move the vertices as the level set moves with its level, to first order."""
         self.vertices = self.vertices + step * self._direction
+
+
+def _way_out(distance: Floats, outward: Floats) -> Floats:
+    """Newton steps (k, 3) onto the cut from its distances (k,) and gradients (k, 3)."""
+    size = np.maximum(np.einsum("ij,ij->i", outward, outward), np.finfo(float).tiny)
+    return -(distance / size)[:, None] * outward
 
 
 @compiled(error_model="numpy")

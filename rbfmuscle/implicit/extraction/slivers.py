@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.surfaces import face_normals, vertex_normals
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
 
 # Triangles with a smaller angle [degree] are slivers; rounds of mending, and rounds without gain that end it.
@@ -37,32 +37,50 @@ def mend_slivers(
         Another one where edges were flipped.
     vertices : (n, 3) ndarray
     """
-    best, least, waited = (mesh, vertices), _badness(vertices, mesh.faces), 0
+    quality = triangle_quality(vertices, mesh.faces, vertex_normals(vertices, mesh.faces))
+    best, least, waited = (mesh, vertices), _faults(quality), 0
     for _ in range(ROUNDS):
         if least == (0, 0) or waited == PATIENCE:
             break
         faces = flip_edges(vertices, mesh.faces)
         if faces is not mesh.faces:
             mesh = MaterialMesh(vertices, faces)
-        bad = bad_triangles(vertices, faces)
+        bad = triangle_quality(vertices, faces, vertex_normals(vertices, faces)) < LEAST_ANGLE
         if bad.any():
             marked = np.zeros(len(vertices), dtype=np.bool_)
             marked[faces[bad].ravel()] = True
             moved = vertices.copy()
             mesh.smooth(moved, np.flatnonzero(mesh.around(marked, 1)), 2)
             vertices = onto(mesh, moved)
-        now = _badness(vertices, mesh.faces)
+        now = _faults(triangle_quality(vertices, mesh.faces, vertex_normals(vertices, mesh.faces)))
         waited += 1
         if now < least:
             best, least, waited = (mesh, vertices), now, 0
     return best
 
 
-def bad_triangles(vertices: Floats, faces: Integers) -> Booleans:
-    """Mask (m,) of the triangles that look inwards or have an angle below `LEAST_ANGLE`."""
-    found: Booleans = _look_inwards(faces, vertices, vertex_normals(vertices, faces))
-    found |= _smallest_angles(vertices, faces) < LEAST_ANGLE
-    return found
+def triangle_quality(vertices: Floats, faces: Integers, normals: Floats) -> Floats:
+    """Smallest angle (m,) of each triangle [degree], negative where it looks away from the normals of its corners.
+
+    Parameters
+    ----------
+    vertices : (n, 3) ndarray
+    faces : (m, 3) ndarray of int
+    normals : (n, 3) ndarray
+        Of the vertices.
+    """
+    corners = vertices[faces]
+    sides = np.roll(corners, -1, axis=1) - corners
+    inwards = (np.einsum("mkd,md->mk", normals[faces], np.cross(sides[:, 0], sides[:, 1])) < 0.0).all(axis=1)
+    sides /= np.maximum(np.linalg.norm(sides, axis=2, keepdims=True), np.finfo(float).tiny)
+    cosines = -np.einsum("mkd,mkd->mk", sides, np.roll(sides, 1, axis=1))
+    angle = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))).min(axis=1)
+    return np.where(inwards, angle - 180.0, angle)
+
+
+def _faults(quality: Floats) -> tuple[int, int]:
+    """How many triangles look inwards, and how many are slivers or do."""
+    return int((quality < 0.0).sum()), int((quality < LEAST_ANGLE).sum())
 
 
 def flip_edges(vertices: Floats, faces: Integers) -> Integers:
@@ -78,16 +96,14 @@ def flip_edges(vertices: Floats, faces: Integers) -> Integers:
     -------
     (m, 3) ndarray of int
     """
-    bad: list[int] = np.flatnonzero(bad_triangles(vertices, faces)).tolist()
-    if not bad:
-        return faces
     normals, count = vertex_normals(vertices, faces), len(vertices)
+    bad = np.flatnonzero(triangle_quality(vertices, faces, normals) < LEAST_ANGLE)
     sides = faces.astype(np.int64) * count + np.roll(faces, -1, axis=1)
     beside = {side: f for f, row in enumerate(sides.tolist()) for side in row}
     changed = faces.copy()
     done: set[int] = set()
-    for f in bad:
-        choice, worth = None, None
+    for f in bad.tolist():
+        choice, worth = None, -np.inf
         for k in range(3):
             i, j, c = (int(v) for v in np.roll(changed[f], -k))
             g = beside.get(j * count + i)
@@ -98,8 +114,10 @@ def flip_edges(vertices: Floats, faces: Integers) -> Integers:
             if c * count + d in beside or d * count + c in beside:
                 continue
             pair = np.array([[c, i, d], [d, j, c]])
-            before, after = (_worth(vertices, two, normals) for two in (changed[[f, g]], pair))
-            if after > before and (worth is None or after > worth):
+            before, after = (
+                triangle_quality(vertices, two, normals).min() for two in (changed[[f, g]], pair)
+            )
+            if after > max(before, worth):
                 choice, worth = (g, pair), after
         if choice is not None:
             g, pair = choice
@@ -109,30 +127,3 @@ def flip_edges(vertices: Floats, faces: Integers) -> Integers:
             beside[int(pair[0, 2]) * count + int(pair[0, 0])] = f
             beside[int(pair[1, 2]) * count + int(pair[1, 0])] = g
     return changed if done else faces
-
-
-def _worth(vertices: Floats, pair: Integers, normals: Floats) -> tuple[int, float]:
-    """How good two triangles are: few that look inwards, then a great smallest angle."""
-    inwards = int(_look_inwards(pair, vertices, normals).sum())
-    return -inwards, float(_smallest_angles(vertices, pair).min())
-
-
-def _badness(vertices: Floats, faces: Integers) -> tuple[int, int]:
-    inwards = _look_inwards(faces, vertices, vertex_normals(vertices, faces))
-    return int(inwards.sum()), int((_smallest_angles(vertices, faces) < LEAST_ANGLE).sum())
-
-
-def _look_inwards(faces: Integers, vertices: Floats, normals: Floats) -> Booleans:
-    """Mask of the triangles that look away from the normals of all their corners."""
-    along = np.einsum("mkd,md->mk", normals[faces], face_normals(vertices, faces))
-    return np.asarray((along < 0.0).all(axis=1), dtype=np.bool_)
-
-
-def _smallest_angles(vertices: Floats, faces: Integers) -> Floats:
-    """Smallest angle of each triangle [degree]."""
-    corners = vertices[faces]
-    sides = np.roll(corners, -1, axis=1) - corners
-    sides /= np.maximum(np.linalg.norm(sides, axis=2, keepdims=True), np.finfo(float).tiny)
-    cosines = -np.einsum("mkd,mkd->mk", sides, np.roll(sides, 1, axis=1))
-    found: Floats = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))).min(axis=1)
-    return found

@@ -1,8 +1,7 @@
 """From a field to a closed triangle mesh of wanted volume, cut by bones.
 
 The surface is the zero set of F = max(f - s, -d): f the field (negative inside), s the level, d the distance to the
-bones (negative inside them). Marching cubes on the cells that it crosses give its topology, and Newton steps put each
-vertex onto the zero set itself.
+bones (negative inside them). Marching cubes give its topology, and Newton steps put each vertex onto the zero set.
 """
 
 from __future__ import annotations
@@ -14,11 +13,14 @@ from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.fields import ClipDistance, Field
-from rbfmuscle.geometry.surfaces import label_sheets, mesh_volume
-from rbfmuscle.implicit.extraction.marching import Band, Grid
+from rbfmuscle.geometry.surfaces import mesh_volume
+from rbfmuscle.implicit.extraction.marching import Grid, LevelSet, nearest_sheet
 from rbfmuscle.implicit.extraction.obstacles import Obstacles
 from rbfmuscle.implicit.extraction.projection import Projector
 from rbfmuscle.validation import check_finite, check_points, check_positive
+
+# A vertex farther than this from the cut, in cells, stays clear of it.
+NEAR_CUT = 1.2
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class ExtractedSurface:
     volume : float
         Enclosed by the mesh [scene unit cubed].
     components : int
-        Sheets found in the cells that were visited; all but the largest closed one are left out.
+        Sheets in the box; all but the one nearest to the points are left out.
     spacing : float
         Edge of a grid cell [scene unit].
     """
@@ -66,7 +68,7 @@ def extract_surface(
     field : Field
         Negative inside.
     points : (n, 3) array_like
-        Predicted surface points, where the search starts; also give the grid's extent [scene unit].
+        Predicted surface points: give the grid's extent, and which sheet is the surface's [scene unit].
     resolution : int
         Grid cells along the longest side of the points' box.
     cut : ClipDistance, optional
@@ -88,53 +90,39 @@ def extract_surface(
     Raises
     ------
     ValueError
-        On bad arguments, NaN in field or cut, an empty level set, or one that is not closed within three
-        times the box of the points; on a volume that no level reaches.
+        On bad arguments, NaN in field or cut, an empty level set, or one that is not closed within twice
+        the box of the points; on a volume that no level reaches.
     """
     points = check_points(points)
     level = float(level)
     check_finite(np.array([level]), name="level")
     target = None if volume is None else check_positive(volume, name="volume")
-    padding = 3
+    padding, most = 3, int(resolution) // 2
     while True:
-        band = Band(Grid.around(points, resolution=resolution, padding=padding, axes=axes), field, cut)
-        _start(band, points, level)
-        surface = _reach_volume(band, target, level, obstacles or [])
+        grid = Grid.around(points, resolution=resolution, padding=padding, axes=axes)
+        surface = _reach_volume(LevelSet(grid, field, cut), points, target, level, obstacles or [])
         if surface is not None:
             return surface
-        if padding >= resolution:
+        if padding >= most:
             raise ValueError(
-                "the level set is open: it leaves three times the box of the points; "
+                "the level set is open: it leaves twice the box of the points; "
                 "check normals (all outward?), or fit with more centres"
             )
-        padding = min(4 * padding, int(resolution))
-
-
-def _start(band: Band, points: Floats, level: float) -> None:
-    """Visit first cells until some are crossed."""
-    band.visit(band.grid.cells(points))
-    while not band.crosses(level):
-        if not band.widen():
-            raise ValueError(
-                f"the level set is empty: field - {level:g} has one sign in the whole box of the points; "
-                "check the points' place, the sign of the field and the level"
-            )
+        padding = min(4 * padding, most)
 
 
 def _reach_volume(
-    band: Band, target: float | None, level: float, obstacles: Obstacles
+    level_set: LevelSet, points: Floats, target: float | None, level: float, obstacles: Obstacles
 ) -> ExtractedSurface | None:
     """Mesh at the level that gives the target volume; None where the surface leaves the grid."""
-    spacing = band.grid.spacing
+    spacing = level_set.grid.spacing
     for _ in range(20):
-        if target is not None and not band.crosses(level):
-            raise ValueError(f"no level gives a volume of {target:g}: the level set is empty at {level:g}")
-        band.follow(level)
-        found = _largest_sheet(band, level)
+        found = _nearest_sheet(level_set, points, level)
         if found is None:
             return None
-        vertices, faces, near_cut, components = found
-        projector = Projector(band.field, band.cut, vertices, spacing, near_cut)
+        vertices, faces, components = found
+        near_cut = _near_cut(level_set, vertices)
+        projector = Projector(level_set.field, level_set.cut, vertices, spacing, near_cut)
         projector.project(level)
         if target is None:
             return _finish(projector, faces, target, level, components, obstacles)
@@ -173,21 +161,25 @@ def _finish(
     return ExtractedSurface(vertices, faces, level, mesh_volume(vertices, faces), components, spacing)
 
 
-def _largest_sheet(band: Band, level: float) -> tuple[Floats, Integers, Booleans, int] | None:
-    """The closed sheet of greatest volume: vertices, faces, which are near the cut, and the number of sheets.
-
-    None where it is open.
-    """
-    coordinates, faces, on_border, near_cut = band.march(level)
-    sheets, label = label_sheets(faces, len(coordinates))
-    centred = coordinates - coordinates.mean(axis=0)
-    six = np.linalg.det(centred[faces])
-    volume = np.bincount(label[faces[:, 0]], six, sheets)
-    size = np.bincount(label, minlength=sheets)
-    is_open = np.bincount(label, on_border, sheets) > 0
-    if is_open.all() or size[is_open].max(initial=0) > size[~is_open].max():
+def _nearest_sheet(level_set: LevelSet, points: Floats, level: float) -> tuple[Floats, Integers, int] | None:
+    """The sheet that lies nearest to most points: vertices, faces, and the number of sheets; None where it is open."""
+    coordinates, faces = level_set.march(level)
+    if len(faces) == 0:
+        raise ValueError(
+            f"the level set is empty: field - {level:g} has one sign in the whole box of the points; "
+            "check the points' place, the sign of the field, the level and the volume"
+        )
+    vertices = level_set.grid.positions(coordinates)
+    sheets, label, own = nearest_sheet(vertices, faces, points)
+    used = label == own
+    if level_set.on_border(coordinates[used]).any():
         return None
-    used = label == np.argmax(np.where(is_open, -np.inf, volume))
     number = np.cumsum(used) - 1
-    faces = number[faces[used[faces[:, 0]]]]
-    return band.grid.positions(coordinates[used]), faces, near_cut[used], sheets
+    return vertices[used], number[faces[used[faces[:, 0]]]], sheets
+
+
+def _near_cut(level_set: LevelSet, vertices: Floats) -> Booleans:
+    """Mask (n,) of the vertices that a shift by a cell may bring to the cut."""
+    if level_set.cut is None:
+        return np.zeros(len(vertices), dtype=np.bool_)
+    return np.asarray(level_set.cut(vertices) < NEAR_CUT * level_set.grid.spacing)
