@@ -41,8 +41,8 @@ from rbfmuscle.simulation.contact import BoneContacts
 MEMORY = 5  # steps that Anderson acceleration combines
 HOLD = 25.0  # stiffness of the spring at a held point, relative to that of a cell
 GHOST = 1e-3  # stiffness of second differences, relative to a cell: for nodes that hold hardly any material
-# b: where all fibres have a slack of 1.6 they bear 0.375 μ; at full activation they bear 30 μ. With 1 the gluteus maximus
-# leaps straight at the start of external rotation.
+# b: where all fibres have a slack of 1.6 they bear 0.375 μ; at full activation they bear 30 μ. With 1 the gluteus
+# maximus leaps straight at the start of external rotation.
 TONE = 0.5
 # Bulk modulus and greatest pressure of a region, over 2 μ: a muscle that bones squeeze yields in volume. The surface
 # is drawn at the volume at rest in any case.
