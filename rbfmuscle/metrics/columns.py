@@ -24,7 +24,7 @@ class _Grid(NamedTuple):
     axes: NDArray[np.int64]
     low: NDArray[np.float64]
     high: NDArray[np.float64]
-    spacing: float
+    fine: float
     width: int
     starts: NDArray[np.int64]
     items: NDArray[np.int64]
@@ -47,19 +47,21 @@ class Columns:
 
     def __init__(self, vertices: Floats, faces: Integers) -> None:
         self.vertices, self.faces = vertices, faces
-        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        # Column by column, which takes a tenth of the time of all at once.
+        low, high = (np.array([end(column) for column in vertices.T]) for end in (np.min, np.max))
         along = int(np.argmin(high - low))
         axes = np.array([(along + 1) % 3, (along + 2) % 3, along])  # a right-handed turn of x, y, z
         cells = min(max(int(len(faces) ** 0.5), 1), _MOST_CELLS)
-        spacing = max(float((high - low).max()) / cells, 1e-300)
-        width, height = (int((high[k] - low[k]) / spacing) + 1 for k in axes[:2])
+        fine = cells / max(float((high - low).max()), 1e-300)
+        width, height = (int((high[k] - low[k]) * fine) + 1 for k in axes[:2])
         starts = np.zeros(width * height + 1, dtype=np.int64)
         ends = np.repeat([[np.inf, -np.inf]], width * height, axis=0)
-        self._grid = _Grid(axes, low, high, spacing, width, starts, np.empty(0, dtype=np.int64), ends)
-        _sort_loop(vertices, faces, self._grid, False)
+        self._grid = _Grid(axes, low, high, fine, width, starts, np.empty(0, dtype=np.int64), ends)
+        covered = np.empty((len(faces), 4), dtype=np.int64)
+        _count_loop(vertices, faces, self._grid, covered)
         np.cumsum(starts, out=starts)
         self._grid = self._grid._replace(items=np.empty(starts[-1], dtype=np.int64))
-        _sort_loop(vertices, faces, self._grid, True)
+        _sort_loop(covered, width, starts, self._grid.items)
 
     def inside(self, points: Floats, pose: Floats) -> Booleans:
         """Mask (n,) of the points (n, 3) that lie inside once a pose (4, 4) has carried them."""
@@ -69,32 +71,36 @@ class Columns:
 
 
 @compiled(error_model="numpy")
-def _sort_loop(vertices, faces, grid, fill):
-    """Count the triangles of each cell into ``starts``; or put them into ``items``, each cell's from its end on."""
+def _count_loop(vertices, faces, grid, covered):
+    """Columns and rows of cells that each triangle's box covers, and the number of triangles of each cell in ``starts``."""
     u, v, w = grid.axes[0], grid.axes[1], grid.axes[2]
+    x, y, fine = grid.low[u], grid.low[v], grid.fine
     for f in range(len(faces)):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        left = min(vertices[a, u], vertices[b, u], vertices[c, u]) - grid.low[u]
-        right = max(vertices[a, u], vertices[b, u], vertices[c, u]) - grid.low[u]
-        near = min(vertices[a, v], vertices[b, v], vertices[c, v]) - grid.low[v]
-        far = max(vertices[a, v], vertices[b, v], vertices[c, v]) - grid.low[v]
-        bottom = min(vertices[a, w], vertices[b, w], vertices[c, w])
-        top = max(vertices[a, w], vertices[b, w], vertices[c, w])
-        for j in range(int(near / grid.spacing), int(far / grid.spacing) + 1):
-            for i in range(int(left / grid.spacing), int(right / grid.spacing) + 1):
-                cell = j * grid.width + i
-                if fill:
-                    grid.starts[cell] -= 1
-                    grid.items[grid.starts[cell]] = f
-                else:
-                    grid.starts[cell] += 1
-                    grid.ends[cell, 0] = min(grid.ends[cell, 0], bottom)
-                    grid.ends[cell, 1] = max(grid.ends[cell, 1], top)
+        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+        left, right = int((min(a[u], b[u], c[u]) - x) * fine), int((max(a[u], b[u], c[u]) - x) * fine)
+        near, far = int((min(a[v], b[v], c[v]) - y) * fine), int((max(a[v], b[v], c[v]) - y) * fine)
+        bottom, top = min(a[w], b[w], c[w]), max(a[w], b[w], c[w])
+        covered[f, 0], covered[f, 1], covered[f, 2], covered[f, 3] = left, right, near, far
+        for j in range(near, far + 1):
+            for cell in range(j * grid.width + left, j * grid.width + right + 1):
+                grid.starts[cell] += 1
+                grid.ends[cell, 0] = min(grid.ends[cell, 0], bottom)
+                grid.ends[cell, 1] = max(grid.ends[cell, 1], top)
+
+
+@compiled(error_model="numpy")
+def _sort_loop(covered, width, starts, items):
+    """Put the triangles into their cells, each cell's from its end on."""
+    for f in range(len(covered)):
+        for j in range(covered[f, 2], covered[f, 3] + 1):
+            for cell in range(j * width + covered[f, 0], j * width + covered[f, 1] + 1):
+                starts[cell] -= 1
+                items[starts[cell]] = f
 
 
 @compiled(error_model="numpy")
 def _inside_loop(points, pose, vertices, faces, grid, out):
-    low, high = grid.low, grid.high
+    low, high, fine = grid.low, grid.high, grid.fine
     u, v, w = grid.axes[0], grid.axes[1], grid.axes[2]
     at = np.empty(3)
     for n in range(len(points)):
@@ -105,7 +111,7 @@ def _inside_loop(points, pose, vertices, faces, grid, out):
             outside |= not (low[k] <= at[k] <= high[k])
         if outside:
             continue
-        i, j = int((at[u] - low[u]) / grid.spacing), int((at[v] - low[v]) / grid.spacing)
+        i, j = int((at[u] - low[u]) * fine), int((at[v] - low[v]) * fine)
         cell, count = j * grid.width + i, 0
         if not (grid.ends[cell, 0] <= at[w] <= grid.ends[cell, 1]):
             continue

@@ -2,7 +2,7 @@
 
 The string has `NODES` nodes. Its first and last stay, and the others take the places where the sum of its segments'
 squared lengths is least while each is on the outer side of the plane that touches the nearest bone there. Planes are
-taken again until the nodes stay where they are.
+taken again until the nodes are where they were one or two rounds before.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.jit import compiled
-from rbfmuscle.metrics.penetration import BoneProbe, bone_coordinates, bones_about
+from rbfmuscle.metrics.penetration import BoneProbe, bone_coordinates, bones_about, inverse_pose
 
 NODES = 33
 ROUNDS = 40  # in which planes are taken, at most
-STILL = 1e-4  # of the string's length: a round that moves no node farther is the last
+STILL = 1e-4  # of the string's length: what counts as the same place
 SWEEPS, OVER_RELAXATION = 100, 1.8  # of a round
 # Nearer to a bone than this its distance is no way to tell the normal, in lengths of the string.
 TOUCHING = 1e-9
@@ -26,7 +26,9 @@ def path_length(points: Floats) -> float:
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
-def shortest_path(line: Floats, probes: list[BoneProbe], poses: dict[str, Floats]) -> Floats:
+def shortest_path(
+    line: Floats, probes: list[BoneProbe], poses: dict[str, Floats], *, offset: Floats | None = None
+) -> Floats:
     """Nodes of the shortest path over the bones between the ends of a line, beside which it begins.
 
     Parameters
@@ -36,6 +38,8 @@ def shortest_path(line: Floats, probes: list[BoneProbe], poses: dict[str, Floats
     probes : list of BoneProbe
     poses : dict of str to (4, 4) ndarray
         Of the bones.
+    offset : (`NODES`, 3) ndarray, optional
+        From the points of `evenly` to where the string begins: what it was in the frame before.
 
     Returns
     -------
@@ -44,20 +48,25 @@ def shortest_path(line: Floats, probes: list[BoneProbe], poses: dict[str, Floats
     """
     chord = np.linspace(line[0], line[-1], NODES)
     near = bones_about(line, probes, poses)
-    if not near or _planes(chord, near, poses)[0][1:-1].min() >= 0.0:
+    inner = chord[1:-1]
+    if not any(probe.inside(inner, pose=inverse_pose(poses[probe.name])).any() for probe in near):
         return chord[[0, -1]]
-    string = _evenly(line)
-    size = path_length(line)
+    string = evenly(line) if offset is None else evenly(line) + offset
+    still, earlier = STILL * path_length(line), [string]
     for _ in range(ROUNDS):
         gap, normal = _planes(string, near, poses)
-        before = string.copy()
-        _tighten_loop(string, normal, np.einsum("ij,ij->i", normal, before) - gap, SWEEPS, OVER_RELAXATION)
-        if np.abs(string - before).max() < STILL * size:
+        string = string.copy()
+        _tighten_loop(
+            string, normal, np.einsum("ij,ij->i", normal, earlier[-1]) - gap, SWEEPS, OVER_RELAXATION
+        )
+        # A node between two planes can go to and fro.
+        if min(np.abs(string - other).max() for other in earlier) < still:
             break
+        earlier = [earlier[-1], string]
     return string
 
 
-def _evenly(line: Floats) -> Floats:
+def evenly(line: Floats) -> Floats:
     """`NODES` points at even distances along a line (n, 3)."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     places = np.linspace(0.0, along[-1], NODES)

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbfmuscle.geometry.arrays import Booleans, Floats
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.exact_distance import STACK, ExactDistance, Layout, nearest_triangle, record_square
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.jit import compiled
@@ -75,28 +75,33 @@ class MeshDistance:
         points = points @ pose[:3, :3].T + pose[:3, 3]
         return np.asarray(igl.fast_winding_number(self.vertices, self.faces, points) > 0.5)
 
-    def unsigned(self, points: ArrayLike) -> Floats:
-        """Distance to the surface, (n,) ndarray [scene unit]; points as (n, 3) array_like."""
+    def unsigned(self, points: ArrayLike, *, near: Integers | None = None) -> Floats:
+        """Distance to the surface, (n,) ndarray [scene unit].
+
+        Parameters
+        ----------
+        points : (n, 3) array_like
+        near : (n,) ndarray of int, optional
+            Place in the tree of a triangle near each point, -1 where none is known; afterwards that of the nearest
+            one, for the next call with a mesh of the same layout.
+        """
         points = check_points(points)
-        out = np.empty(len(points))
+        out, near = np.empty(len(points)), np.full(len(points), -1) if near is None else near
 
         def work(first: int, last: int) -> None:
-            _distance_loop(points[first:last], self._exact.tree, out[first:last])
+            _distance_loop(points[first:last], self._exact.tree, near[first:last], out[first:last])
 
         in_chunks(len(points), work)
         return out
 
-    def signed(self, points: ArrayLike) -> Floats:
-        """Distance to the surface, negative inside, (n,) ndarray [scene unit]; points as (n, 3) array_like."""
-        return np.where(self.inside(points), -1.0, 1.0) * self.unsigned(points)
+    def signed(self, points: ArrayLike, *, near: Integers | None = None) -> Floats:
+        """Distance to the surface, negative inside; as `unsigned`."""
+        return np.where(self.inside(points), -1.0, 1.0) * self.unsigned(points, near=near)
 
-    def nearest(self, points: ArrayLike) -> tuple[Floats, Floats, Floats]:
-        """Signed distance (n,), nearest point (n, 3) and the outward pseudonormal there (n, 3) of points (n, 3)."""
-        points = check_points(points)
-        if len(points) == 0:
-            return np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))
+    def nearest(self, points: Floats) -> tuple[Floats, Floats, Floats]:
+        """Distance (n,) on the side of the nearest face, nearest point (n, 3) and outward pseudonormal there (n, 3)."""
         distance, closest, _, normal = self._exact.nearest(points)
-        return np.where(self.inside(points), -1.0, 1.0) * np.abs(distance), closest, normal
+        return distance, closest, normal
 
     def depth(self, points: ArrayLike, *, pose: Floats = _HERE) -> Floats:
         """How deep points lie inside, 0 where outside.
@@ -120,12 +125,13 @@ class MeshDistance:
 
 
 @compiled
-def _distance_loop(points, tree, out):
+def _distance_loop(points, tree, near, out):
     stack = np.empty(STACK, np.int64), np.empty(STACK)
     best = np.int64(-1)
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         # The last answer bounds the next one where points come in order.
+        best = near[i] if near[i] >= 0 else best
         square = np.inf if best < 0 else record_square(tree.records, best, x, y, z)
         best, square = nearest_triangle(tree, (x, y, z), best, square, 0.0, stack)
-        out[i] = np.sqrt(square)
+        near[i], out[i] = best, np.sqrt(square)

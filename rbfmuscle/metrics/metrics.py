@@ -13,7 +13,7 @@ from rbfmuscle.geometry.threads import each
 from rbfmuscle.jit import compiled
 from rbfmuscle.metrics.centreline import Centreline, MuscleAtRest, carried_middle, moving_joints
 from rbfmuscle.metrics.contraction import ContractionStudy, belly_measures
-from rbfmuscle.metrics.geodesic import path_length, shortest_path
+from rbfmuscle.metrics.geodesic import NODES, evenly, path_length, shortest_path
 from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.metrics.penetration import BoneProbe, bone_depth, surface_depth
 from rbfmuscle.metrics.quantities import QUANTITIES
@@ -84,6 +84,9 @@ class _Tracker:
         # Of the last surface.
         self.distance: MeshDistance | None = None
         self.offset: Floats | None = None
+        self.near: Integers | None = None
+        # Of the last shortest path, from the points along the centreline.
+        self.pulled: Floats | None = None
 
     def _of_line(
         self, carried: Floats, probes: list[BoneProbe], poses: dict[str, Floats]
@@ -92,7 +95,9 @@ class _Tracker:
         if self.line is None:
             return {}
         line = self.line.points(carried, poses)
-        length, shortest = path_length(line), path_length(shortest_path(line, probes, poses))
+        path = shortest_path(line, probes, poses, offset=self.pulled)
+        self.pulled = path - evenly(line) if len(path) == NODES else None
+        length, shortest = path_length(line), path_length(path)
         return {"length": length, "slack": length / shortest if shortest > 0.0 else math.nan}
 
     def measure(self, frame: Frame, probes: list[BoneProbe], at_rest: bool) -> dict[str, float]:
@@ -134,14 +139,16 @@ class _Tracker:
             "penetration_fraction": np.mean(depth > 0.0),
             "bone_penetration_max": bone_depth(vertices, faces, probes, poses, distance=self.distance),
             **self.form.measure(surface, same_faces=same),
-            **self._flicker(carried, vertices),
+            **self._flicker(carried, vertices, same),
         }
 
-    def _flicker(self, carried, vertices):
+    def _flicker(self, carried, vertices, same):
         """Change of the signed distances of the carried vertices to the surface; of a mesh that is shown, none."""
         if np.array_equal(carried, vertices):
             return {}
-        before, self.offset = self.offset, self.distance.signed(carried)
+        if self.near is None or not same:
+            self.near = np.full(len(carried), -1)
+        before, self.offset = self.offset, self.distance.signed(carried, near=self.near)
         return {"flicker": np.abs(self.offset - before).max() if before is not None else 0.0}
 
     def _at_rest(self, surface, probes, poses):

@@ -51,11 +51,12 @@ def surface_depth(vertices: Floats, probes: list[BoneProbe], poses: dict[str, Fl
     """
     out = np.zeros(len(vertices))
     for probe in bones_about(vertices, probes, poses):
-        np.maximum(out, probe.depth(vertices, pose=_inverse(poses[probe.name])), out=out)
+        np.maximum(out, probe.depth(vertices, pose=inverse_pose(poses[probe.name])), out=out)
     return out
 
 
-def _inverse(pose):
+def inverse_pose(pose: Floats) -> Floats:
+    """The pose (4, 4) that takes a rigid one back."""
     back = np.eye(4)
     back[:3, :3] = pose[:3, :3].T
     back[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
