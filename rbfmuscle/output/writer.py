@@ -33,14 +33,7 @@ TABLES = {
 }
 
 # Of an earlier run in the same folder.
-_OLD_FILES = (
-    "run.json",
-    "surfaces.pvd",
-    "bones.pvd",
-    "metrics.csv",
-    "report.html",
-    "preview.webp",
-)
+_OLD_FILES = ("run.json", "surfaces.pvd", "bones.pvd", "metrics.csv", "report.html", "preview.webp")
 
 
 def check_writable(directory: str | Path) -> None:

@@ -141,10 +141,7 @@ def _lights(studies: Mapping[str, KernelStudy], units: str) -> list[Light]:
 
 
 def _light(row: dict[str, Any], note: str, units: str, state: str) -> Light:
-    cells = [
-        Cell(number(row["rms"], units), row["rms"], state),
-        Cell(number(cost(row), "s"), cost(row)),
-    ]
+    cells = [Cell(number(row["rms"], units), row["rms"], state), Cell(number(cost(row), "s"), cost(row))]
     return Light(row_name(row), cells, note=note)
 
 

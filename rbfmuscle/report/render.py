@@ -11,13 +11,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.output.colours import BONE_COLOUR, MUSCLE_COLOURS, muscle_colours, rgb
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.appearance import (
-    BACKGROUND,
-    USUAL_VIEWS,
-    VIEWS,
-    motion_direction,
-    muscle_groups,
-)
+from rbfmuscle.report.appearance import BACKGROUND, USUAL_VIEWS, VIEWS, motion_direction, muscle_groups
 from rbfmuscle.report.labels import labelled
 from rbfmuscle.report.paint import activations, check_colouring, scale_chips, scale_colours
 from rbfmuscle.report.raster import Solid, aim, draw_solids, fitted_size

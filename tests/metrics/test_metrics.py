@@ -14,12 +14,7 @@ from rbfmuscle.metrics.columns import Columns
 from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.metrics.metrics import MuscleMeasures, edge_strain, surface_distance
 from rbfmuscle.metrics.moment_arms import moment_arms
-from rbfmuscle.metrics.penetration import (
-    BoneProbe,
-    bone_depth,
-    bones_about,
-    surface_depth,
-)
+from rbfmuscle.metrics.penetration import BoneProbe, bone_depth, bones_about, surface_depth
 from rbfmuscle.metrics.rows import frame_rows, moment_arm_rows
 from rbfmuscle.metrics.topology import SurfaceForm, count_components
 from rbfmuscle.scene.joints.joint import Coordinate

@@ -9,12 +9,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
-from rbfmuscle.output.animation.moving import (
-    FRAMES_A_SECOND,
-    MovingBone,
-    MovingMuscle,
-    MovingRun,
-)
+from rbfmuscle.output.animation.moving import FRAMES_A_SECOND, MovingBone, MovingMuscle, MovingRun
 from rbfmuscle.output.colours import linear_rgb
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import MissingPartError
