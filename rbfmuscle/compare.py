@@ -92,7 +92,7 @@ def compare_models(
     results, failed = {}, {}
     for name, variant in variants.items():
         try:
-            results[name] = _measure(name, variant, folder / name, poses, progress)
+            results[name] = _measure(name, variant, folder / name, progress)
         except SolveError as error:
             failed[name] = str(error)
     if not results:
@@ -143,10 +143,10 @@ def _variants(scene, models, settings):
     return variants
 
 
-def _measure(name, scene, folder, poses, progress):
+def _measure(name, scene, folder, progress):
     """One model: warm up, run and watch, then there and back by coarser steps."""
     _surfaces(scene, scene.motion.frames[:2])
-    probe = ModelProbe(scene, poses)
+    probe = ModelProbe(scene)
     report = None if progress is None else (lambda done, total: progress(name, done, total))
     stream_run(scene, folder, pictures=False, progress=report, watch=probe)
     with stage(f"{name}: there and back by coarser steps"):

@@ -15,7 +15,7 @@ from rbfmuscle.metrics.joint_gaps import joint_gaps
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.rows import frame_rows, moment_arm_rows
 from rbfmuscle.metrics.summary import LIMITS, Summary, default_limit, describe_verdict, exceeded
-from rbfmuscle.output.runinfo import Clock, Stages, build_info, frame_facts
+from rbfmuscle.output.runinfo import Stages, build_info, frame_facts
 from rbfmuscle.output.sinks import Sink
 from rbfmuscle.progress import stage
 from rbfmuscle.scene.check import bone_collisions, bone_findings, check_initial, sampled_frames
@@ -160,14 +160,17 @@ class Recording:
         limits = {name: default_limit(name, self.scene) for name in LIMITS}
         return build_info(
             self.scene,
-            ending=(status or self.status, self.message),
-            clock=Clock(self.started, self._spent(), self.stages),
-            frames=self.written,
-            summary=table,
+            self.started,
+            self.stages,
+            table,
+            status=status or self.status,
+            message=self.message,
+            options=self.options,
+            times=self._spent(),
             limits=limits,
             verdict=describe_verdict(table, limits),
             beyond=exceeded(table, limits),
-            options=self.options,
+            frames=self.written,
         )
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from rbfmuscle.metrics.comparison_measures import MaterialProbe, curvature_variation
+from rbfmuscle.metrics.comparison_measures import MaterialProbe
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.metrics.quantities import ALL, unit_text
 from rbfmuscle.output.runinfo import machine, versions
@@ -71,9 +71,6 @@ MEASURES = {
     "rest_error_rms": Measure("rest error (RMS)", "length", MESH, 0.02, "surface to input mesh at rest"),
     "rest_error_max": Measure("rest error (greatest)", "length", MESH, 0.1, "the same, greatest distance"),
     "strain_rms": Measure("strain", "1", OWN, 0.002, "edges between the same 1200 points of the material"),
-    "curvature_variation": Measure(
-        "curvature variation", "1/length", OWN, 0.0, "among neighbours, mean curvature"
-    ),
     "distance_rms": Measure(
         "distance (RMS)", "length", FIRST, 0.0, "to the first model's surface, worst pose"
     ),
@@ -97,12 +94,10 @@ class ModelProbe:
     Parameters
     ----------
     scene : Scene
-    poses : collection of int
-        Frames in which curvature is measured.
     """
 
-    def __init__(self, scene: Scene, poses: list[int]) -> None:
-        self.scene, self.poses = scene, set(poses)
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
         self.found = {muscle.name: {} for muscle in scene.muscles}
         self._material = {}
 
@@ -116,10 +111,6 @@ class ModelProbe:
             return
         for name, (probe, start) in self._material.items():
             self._worst(name, "strain_rms", probe.strain(probe.points(frame.carried[name][0]), start))
-        if frame.index in self.poses:
-            for name, surface in frame.surfaces.items():
-                variation = curvature_variation(surface.vertices, surface.faces)
-                self._worst(name, "curvature_variation", variation)
 
     def _worst(self, muscle, quantity, value):
         known = self.found[muscle]
@@ -263,7 +254,7 @@ def write_tables(
     dict
         What the JSON file holds.
     """
-    units = {name: measure_unit(m.kind, scene.units) for name, m in MEASURES.items()}
+    units = {name: unit_text(m.kind, scene.units) for name, m in MEASURES.items()}
     table = {
         "format": FORMAT,
         "scene": scene.name,
@@ -292,11 +283,6 @@ def write_tables(
                 for name in [name for name in MEASURES if name in values]:
                     rows.writerow((model, muscle, name, values[name], units[name], MEASURES[name].against))
     return table
-
-
-def measure_unit(kind: str, units: str) -> str:
-    """Unit of a measure in a scene of these units."""
-    return f"1/{units}" if kind == "1/length" else unit_text(kind, units)
 
 
 def best_models(results: dict[str, Any], quantity: str, units: str) -> list[str]:

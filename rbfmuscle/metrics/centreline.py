@@ -61,8 +61,7 @@ class Centreline:
         field = harmonic_weights(vertices, faces, sides)[:, 1]
         levels = np.linspace(0.0, 1.0, _FINE + 2)[1:-1]
         fine = slice_operator(vertices, faces, field, levels)
-        line = fine @ vertices
-        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+        along = distance_along(fine @ vertices)
         even = np.interp(np.linspace(0.0, along[-1], slices), along, levels)
         self.operator = slice_operator(vertices, faces, field, even)
 
@@ -84,7 +83,19 @@ class Centreline:
 
     def length(self, vertices: Floats, poses: dict[str, Floats]) -> float:
         """Length of the line now [scene unit]."""
-        return float(np.linalg.norm(np.diff(self.points(vertices, poses), axis=0), axis=1).sum())
+        return float(distance_along(self.points(vertices, poses))[-1])
+
+
+def distance_along(line: Floats) -> Floats:
+    """How far along a line each of its points (n, 3) lies, (n,); the last is its length."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+
+
+def resampled(line: Floats, segments: int) -> Floats:
+    """Points (segments + 1, 3) at even distances along a line (n, 3)."""
+    along = distance_along(line)
+    even = np.linspace(0.0, along[-1], segments + 1)
+    return np.stack([np.interp(even, along, column) for column in line.T], axis=1)
 
 
 def end_groups(
@@ -157,16 +168,7 @@ def slice_operator(vertices: Floats, faces: Integers, field: Floats, levels: Flo
     (k, n) scipy.sparse.csr_matrix
         Rows sum to one.
     """
-    levels = np.asarray(levels, dtype=float)
-    at_corner = field[faces]
-    face, row = _crossings(at_corner, levels)
-    level = levels[row]
-    crossed, above = faces[face], at_corner[face] > level[:, None]
-    # The corner that is alone on its side: both crossing points lie on its edges.
-    lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
-    each = np.arange(len(crossed))
-    a, b, c = (crossed[each, (lone + k) % 3] for k in range(3))
-    s, t = (level - field[a]) / (field[b] - field[a]), (level - field[a]) / (field[c] - field[a])
+    (a, b, c), (s, t), row = _crossed_edges(faces, field, np.asarray(levels, dtype=float))
     p = vertices[a] + s[:, None] * (vertices[b] - vertices[a])
     q = vertices[a] + t[:, None] * (vertices[c] - vertices[a])
     share = np.linalg.norm(p - q, axis=1)
@@ -174,6 +176,36 @@ def slice_operator(vertices: Floats, faces: Integers, field: Floats, levels: Flo
     values = np.concatenate([share * (2 - s - t), share * s, share * t])
     where = np.tile(row, 3), np.concatenate([a, b, c])
     return sparse.csr_matrix((values, where), shape=(len(levels), len(vertices)))
+
+
+def isolines(
+    vertices: Floats, faces: Integers, field: Floats, levels: Floats
+) -> tuple[Floats, Floats, Integers]:
+    """Segments of a field's isolines on an outward surface, all in one direction.
+
+    Returns
+    -------
+    start, end : (s, 3) ndarray
+    level : (s,) ndarray of int
+        Place of each segment's level.
+    """
+    (a, b, c), (s, t), row = _crossed_edges(faces, field, levels)
+    start = vertices[a] + s[:, None] * (vertices[b] - vertices[a])
+    end = vertices[a] + t[:, None] * (vertices[c] - vertices[a])
+    below = (field[a] <= levels[row])[:, None]
+    return np.where(below, end, start), np.where(below, start, end), row
+
+
+def _crossed_edges(faces, field, levels):
+    """Of each face that an isoline crosses: the corner alone on its side, the others, shares of both edges, level."""
+    at_corner = field[faces]
+    face, row = _crossings(at_corner, levels)
+    level = levels[row]
+    crossed, above = faces[face], at_corner[face] > level[:, None]
+    lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
+    each = np.arange(len(crossed))
+    a, b, c = (crossed[each, (lone + k) % 3] for k in range(3))
+    return (a, b, c), [(level - field[a]) / (field[k] - field[a]) for k in (b, c)], row
 
 
 def _crossings(at_corner, levels):

@@ -72,7 +72,7 @@ class Columns:
 
 @compiled(error_model="numpy")
 def _count_loop(vertices, faces, grid, covered):
-    """Columns and rows of cells that each triangle's box covers, and the number of triangles of each cell in ``starts``."""
+    """Cells that each triangle's box covers, by column and row, and in ``starts`` how many triangles each cell has."""
     u, v, w = grid.axes[0], grid.axes[1], grid.axes[2]
     x, y, fine = grid.low[u], grid.low[v], grid.fine
     for f in range(len(faces)):

@@ -10,7 +10,7 @@ from scipy.interpolate import RBFInterpolator
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.metrics.centreline import MuscleAtRest, carried_middle, end_groups
+from rbfmuscle.metrics.centreline import MuscleAtRest, carried_middle, end_groups, isolines, resampled
 from rbfmuscle.scene.activation.resolve import resolve_contraction
 
 SEGMENTS = 16  # of each fibre
@@ -111,9 +111,9 @@ def belly_measures(vertices: Floats, faces: Integers, first: Floats, last: Float
     length = float(np.linalg.norm(last - first))
     axis = (last - first) / length
     height = (vertices - first) @ axis
-    low, high = height.min(), height.max()
-    places = low + (high - low) * (np.arange(STATIONS) + 0.5) / STATIONS
-    areas = np.array([section_area(vertices, faces, axis, height, place) for place in places])
+    places = height.min() + np.ptp(height) * (np.arange(STATIONS) + 0.5) / STATIONS
+    start, end, station = isolines(vertices, faces, height, places)
+    areas = np.abs(np.bincount(station, 0.5 * np.cross(start - first, end - first) @ axis, STATIONS))
     best = int(np.argmax(areas))
     area, place = areas[best], places[best]
     if 0 < best < STATIONS - 1:
@@ -125,44 +125,12 @@ def belly_measures(vertices: Floats, faces: Integers, first: Floats, last: Float
     return {
         "csa_max": float(area),
         "csa_place": float(place / length),
-        "belly_thickness": _thickness(_section(vertices, faces, height, places[best]), axis),
+        "belly_thickness": _thickness(start[station == best], axis),
     }
 
 
-def section_area(vertices: Floats, faces: Integers, axis: Any, height: Any, place: Any) -> float:
-    """Area of a closed surface's section where ``height`` (n,), along ``axis``, is ``place``."""
-    start, end = _section(vertices, faces, height, place)
-    if len(start) == 0:
-        return 0.0
-    middle = start.mean(axis=0)
-    return float(abs(0.5 * (np.cross(start - middle, end - middle) @ axis).sum()))
-
-
-def _section(vertices, faces, height, place):
-    """Segments in which the surface meets a plane, from (s, 3) to (s, 3), all in one direction."""
-    above = height[faces] > place
-    crossed = above.any(axis=1) & ~above.all(axis=1)
-    corners, above = faces[crossed], above[crossed]
-    lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
-    row = np.arange(len(corners))
-    a, b, c = (corners[row, (lone + k) % 3] for k in range(3))
-    p = _crossing(vertices, height, a, b, place)
-    q = _crossing(vertices, height, a, c, place)
-    flipped = ~above[row, lone]
-    p[flipped], q[flipped] = q[flipped].copy(), p[flipped].copy()
-    return p, q
-
-
-def _crossing(vertices, height, one, other, place):
-    share = ((place - height[one]) / (height[other] - height[one]))[:, None]
-    return vertices[one] + share * (vertices[other] - vertices[one])
-
-
-def _thickness(section, axis):
-    """Least width of a section over all directions across the axis."""
-    points = section[0]
-    if len(points) == 0:
-        return 0.0
+def _thickness(points, axis):
+    """Least width of a section's points over all directions across the axis."""
     helper = np.eye(3)[np.argmin(np.abs(axis))]
     u = np.cross(axis, helper)
     u /= np.linalg.norm(u)
@@ -170,13 +138,6 @@ def _thickness(section, axis):
     angle = np.pi * np.arange(CALIPERS) / CALIPERS
     directions = np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v
     return float(np.ptp(points @ directions.T, axis=0).min())
-
-
-def resampled(line: Floats, segments: int) -> Floats:
-    """Points (segments + 1, 3) at even distances along a polyline."""
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    even = np.linspace(0.0, along[-1], segments + 1)
-    return np.stack([np.interp(even, along, line[:, k]) for k in range(3)], axis=1)
 
 
 def _segments(lines):

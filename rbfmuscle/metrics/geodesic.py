@@ -11,6 +11,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.jit import compiled
+from rbfmuscle.metrics.centreline import distance_along, resampled
 from rbfmuscle.metrics.penetration import BoneProbe, bone_coordinates, bones_about, inverse_pose
 
 NODES = 33
@@ -19,11 +20,6 @@ STILL = 1e-4  # of the string's length: what counts as the same place
 SWEEPS, OVER_RELAXATION = 100, 1.8  # of a round
 # Nearer to a bone than this its distance is no way to tell the normal, in lengths of the string.
 TOUCHING = 1e-9
-
-
-def path_length(points: Floats) -> float:
-    """Length of the line through points (n, 3)."""
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
 def shortest_path(
@@ -39,7 +35,7 @@ def shortest_path(
     poses : dict of str to (4, 4) ndarray
         Of the bones.
     offset : (`NODES`, 3) ndarray, optional
-        From the points of `evenly` to where the string begins: what it was in the frame before.
+        From the points at even distances along the line to where the string begins: what it was in the frame before.
 
     Returns
     -------
@@ -51,8 +47,8 @@ def shortest_path(
     inner = chord[1:-1]
     if not any(probe.inside(inner, pose=inverse_pose(poses[probe.name])).any() for probe in near):
         return chord[[0, -1]]
-    string = evenly(line) if offset is None else evenly(line) + offset
-    still, earlier = STILL * path_length(line), [string]
+    string = resampled(line, NODES - 1) + (0.0 if offset is None else offset)
+    still, earlier = STILL * distance_along(line)[-1], [string]
     for _ in range(ROUNDS):
         gap, normal = _planes(string, near, poses)
         string = string.copy()
@@ -66,17 +62,10 @@ def shortest_path(
     return string
 
 
-def evenly(line: Floats) -> Floats:
-    """`NODES` points at even distances along a line (n, 3)."""
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    places = np.linspace(0.0, along[-1], NODES)
-    return np.stack([np.interp(places, along, line[:, axis]) for axis in range(3)], axis=1)
-
-
 def _planes(points: Floats, probes: list[BoneProbe], poses: dict[str, Floats]) -> tuple[Floats, Floats]:
     """Signed distance (n,) to the nearest bone and the unit normal (n, 3) of the plane that touches it there."""
     gap, normal = np.full(len(points), np.inf), np.zeros((len(points), 3))
-    least = TOUCHING * max(path_length(points), 1e-300)
+    least = TOUCHING * max(distance_along(points)[-1], 1e-300)
     for probe in probes:
         pose = poses[probe.name]
         local = bone_coordinates(points, pose)

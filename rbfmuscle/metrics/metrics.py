@@ -11,9 +11,16 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.jit import compiled
-from rbfmuscle.metrics.centreline import Centreline, MuscleAtRest, carried_middle, moving_joints
+from rbfmuscle.metrics.centreline import (
+    Centreline,
+    MuscleAtRest,
+    carried_middle,
+    distance_along,
+    moving_joints,
+    resampled,
+)
 from rbfmuscle.metrics.contraction import ContractionStudy, belly_measures
-from rbfmuscle.metrics.geodesic import NODES, evenly, path_length, shortest_path
+from rbfmuscle.metrics.geodesic import NODES, shortest_path
 from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.metrics.penetration import BoneProbe, bone_depth, surface_depth
 from rbfmuscle.metrics.quantities import QUANTITIES
@@ -96,8 +103,8 @@ class _Tracker:
             return {}
         line = self.line.points(carried, poses)
         path = shortest_path(line, probes, poses, offset=self.pulled)
-        self.pulled = path - evenly(line) if len(path) == NODES else None
-        length, shortest = path_length(line), path_length(path)
+        self.pulled = path - resampled(line, NODES - 1) if len(path) == NODES else None
+        length, shortest = distance_along(line)[-1], distance_along(path)[-1]
         return {"length": length, "slack": length / shortest if shortest > 0.0 else math.nan}
 
     def measure(self, frame: Frame, probes: list[BoneProbe], at_rest: bool) -> dict[str, float]:

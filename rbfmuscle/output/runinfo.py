@@ -9,11 +9,12 @@ import platform
 from collections import Counter, defaultdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 import rbfmuscle
+from rbfmuscle.metrics.quantities import ALL
 from rbfmuscle.scene.motion import shown_value
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Frame
@@ -22,80 +23,37 @@ FORMAT = 1
 _PACKAGES = ("numpy", "scipy", "numba", "scikit-image", "trimesh", "pyvista", "vtk", "libigl")
 
 
-class Clock(NamedTuple):
-    """When a run started, and what its time went into.
-
-    Attributes
-    ----------
-    started : datetime
-    times : dict of str to float
-        Wall time of the parts of the run [s].
-    stages : Stages
-    """
-
-    started: datetime
-    times: dict[str, float]
-    stages: Stages
-
-
 def build_info(
-    scene: Scene,
-    *,
-    ending: tuple[str, str],
-    clock: Clock,
-    frames: list[Any],
-    summary: dict[str, Any],
-    limits: dict[str, float],
-    verdict: str,
-    beyond: list[Any],
-    options: dict[str, Any],
+    scene: Scene, started: datetime, stages: Stages, summary: dict[str, Any], **facts: Any
 ) -> dict[str, Any]:
     """Assemble ``run.json``.
 
     Parameters
     ----------
     scene : Scene
-    ending : pair of str
-        "running", "complete", "interrupted" or "failed", and why it ended, where it was not complete.
-    clock : Clock
-    frames : list of dict
-        Frame number, coordinates [degree] and wall time of each written frame.
+    started : datetime
+    stages : Stages
     summary : dict
         From `Summary.table`.
-    limits : dict
-        Quantity -> limit in the unit of ``metrics.csv``.
-    verdict : str
-        Which muscles are within the limits, as the terminal and the report say it.
-    beyond : list of (muscle, quantity, worst value, limit, frame)
-    options : dict
-        What the caller asked for.
-
-    Returns
-    -------
-    dict
+    **facts
+        As they are: ``status`` ("running", "complete", "interrupted" or "failed"), ``message`` (why it did not
+        complete), ``options`` of the caller, ``times`` of the parts of the run [s], ``limits``, ``verdict``, ``beyond``
+        (muscle, quantity, worst value, limit, frame) and ``frames`` (`frame_facts`).
     """
-    status, message = ending
     return {
         "format": FORMAT,
-        "status": status,
-        "message": message,
-        "started": clock.started.isoformat(timespec="seconds"),
+        "started": started.isoformat(timespec="seconds"),
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
         "scene": scene.resolved(),
-        "options": options,
         "versions": versions(),
         "machine": machine(),
         "inputs": input_hashes(scene),
-        "times": clock.times,
-        "stages": clock.stages.table(),
-        "work": clock.stages.work(),
-        **({"neighbours": clock.stages.neighbours()} if clock.stages.pairs else {}),
-        "limits": limits,
-        "verdict": verdict,
-        "beyond": beyond,
-        "muscles": {name: facts for name, facts in summary.items() if name != "all"},
-        "frame_time": summary.get("all", {}).get("time_frame"),
-        "frames": frames,
+        "stages": stages.table(),
+        "work": stages.work(),
+        **({"neighbours": stages.neighbours()} if stages.pairs else {}),
+        "muscles": {name: found for name, found in summary.items() if name != ALL},
+        "frame_time": summary.get(ALL, {}).get("time_frame"),
+        **facts,
     }
 
 

@@ -122,8 +122,6 @@ def _packed_again(raw: bytes) -> bytes:
 class Collection:
     """A .pvd file that is complete after every frame, so that an interrupted run can be opened.
 
-    Its ``end`` is the number of bytes before the closing tags.
-
     Parameters
     ----------
     path : path
@@ -136,7 +134,8 @@ class Collection:
     def __init__(self, path: str | Path) -> None:
         # Unbuffered: entries and closing tags go to the disk in one piece.
         self._file = open(path, "wb", buffering=0)  # noqa: SIM115
-        self.roll_back(self._file.write(self._HEAD.encode()))
+        self._end = 0
+        self._write(self._HEAD)
 
     def add(self, time: float, entries: list[tuple[str, str]]) -> None:
         """Add one time step; ``entries`` are pairs of name and file."""
@@ -146,19 +145,17 @@ class Collection:
         ]
         self._write("".join(lines))
 
-    def roll_back(self, end: int) -> None:
-        """Forget what was added beyond this ``end``."""
-        self.end = end
-        self._file.truncate(end)
-        self._write("")
-
     def close(self) -> None:
         """End the file."""
         self._file.close()
 
-    def _write(self, text):
-        data = text.encode()
-        self._file.seek(self.end)
-        if self._file.write(data + self._TAIL.encode()) < len(data) + len(self._TAIL):
+    def _write(self, text: str) -> None:
+        """Add text before the closing tags, or nothing where the disk is full."""
+        data, tail = text.encode(), self._TAIL.encode()
+        self._file.seek(self._end)
+        if self._file.write(data + tail) < len(data) + len(tail):
+            self._file.seek(self._end)
+            self._file.write(tail)
+            self._file.truncate()
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        self.end += len(data)
+        self._end += len(data)

@@ -16,6 +16,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.threads import each
+from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.output.light_mesh import light_mesh
 from rbfmuscle.output.meshfiles import SUFFIXES, write_mesh
 from rbfmuscle.output.vtp import Collection
@@ -27,9 +28,9 @@ if TYPE_CHECKING:
 
 
 TABLES = {
-    "metrics.csv": ("frame", "coordinate", "angle", "muscle", "quantity", "value", "unit"),
-    "events.csv": ("frame", "muscle", "bone", "count", "action"),
     "poses.csv": ("frame", "bone", *(f"m{i}{j}" for i in range(4) for j in range(4))),
+    "events.csv": ("frame", "muscle", "bone", "count", "action"),
+    "metrics.csv": Row._fields,
 }
 
 # Of an earlier run in the same folder.
@@ -80,14 +81,13 @@ class RunWriter:
         self._light: dict[str, tuple[Floats, Integers]] = {}
         try:
             self._clear()
-            self._tables = {name: self._table(name, columns) for name, columns in TABLES.items()}
+            self._tables = {name: self._table(name) for name in TABLES}
             names = ("surfaces", "bones") if self.format == "pvd" else ()
             self._collections = {name: Collection(self.directory / f"{name}.pvd") for name in names}
         except OSError as error:
             raise UsageError(
                 f"cannot write to {self.directory}: {error.strerror}; choose another folder"
             ) from None
-        self._good = self._sizes()
 
     def write(self, frame: Frame, rows: Sequence[Any] = ()) -> None:
         """Write one frame and the rows of metrics that are complete by now.
@@ -105,11 +105,14 @@ class RunWriter:
         try:
             self._write(frame, rows)
         except OSError as error:
-            self._roll_back(frame.index)
+            self._failed = True
+            for file in self._open_files():
+                with suppress(OSError):
+                    file.close()
+            self._remove(frame.index - 1)
             kept = f"{self.count} frames are kept in {self.directory}"
             raise SolveError(f"cannot write frame {frame.index}: {error.strerror}; {kept}") from None
         self.count += 1
-        self._good = self._sizes()
 
     def close(self, rows: Sequence[Any] = ()) -> None:
         """Write the last rows of metrics and close all files; after a frame that could not be written, nothing."""
@@ -117,19 +120,13 @@ class RunWriter:
             return
         try:
             self._add_rows(rows)
-            for _, file in self._tables.values():
+            for file in self._open_files():
                 file.close()
-            for collection in self._collections.values():
-                collection.close()
         except OSError as error:
             raise SolveError(f"cannot finish the tables in {self.directory}: {error.strerror}") from None
 
-    def _sizes(self):
-        """Bytes of the tables and of the collections as they stand."""
-        return {
-            "sizes": {name: os.fstat(file.fileno()).st_size for name, (_, file) in self._tables.items()},
-            "ends": {name: collection.end for name, collection in self._collections.items()},
-        }
+    def _open_files(self):
+        return [*(file for _, file in self._tables.values()), *self._collections.values()]
 
     def write_info(self, info: dict[str, Any]) -> None:
         """Write ``run.json`` in one piece: a reader finds the old one or the new one, never half of it.
@@ -137,7 +134,8 @@ class RunWriter:
         While the run goes on it holds the coordinates of all frames to come, for readers of a run that was killed.
         """
         if info.get("status") == "running":
-            planned = [_degrees(coordinates) for coordinates in self.scene.motion.frames]
+            frames = self.scene.motion.frames
+            planned = [{name: math.degrees(value) for name, value in frame.items()} for frame in frames]
             info = {**info, "planned": planned}
         write_json(self.directory / "run.json", info)
 
@@ -203,23 +201,6 @@ class RunWriter:
             self._light[bone.name] = light_mesh(bone.mesh.vertices, bone.mesh.faces)
         return self._light[bone.name]
 
-    def _roll_back(self, frame):
-        """Leave the folder as it was before a frame that could not be written.
-
-        As far as the disk allows; only its first refusal is reported.
-        """
-        self._failed = True
-        for name, (_, file) in self._tables.items():
-            with suppress(OSError):
-                file.close()
-            with suppress(OSError):
-                os.truncate(self.directory / name, self._good["sizes"][name])
-        for name, collection in self._collections.items():
-            with suppress(OSError):
-                collection.roll_back(self._good["ends"][name])
-                collection.close()
-        self._remove(frame - 1)
-
     def _remove(self, last):
         """Take the meshes of all frames after ``last`` away."""
         for folder in ("surfaces", "bones"):
@@ -239,16 +220,12 @@ class RunWriter:
         for folder in ("surfaces", "bones") if self.format is not None else ():
             (self.directory / folder).mkdir(exist_ok=True)
 
-    def _table(self, name, columns):
+    def _table(self, name):
         file = open(self.directory / name, "w", encoding="utf-8", newline="")  # noqa: SIM115
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
+        writer.writerow(TABLES[name])
         file.flush()
         return writer, file
-
-
-def _degrees(coordinates):
-    return {name: math.degrees(value) for name, value in coordinates.items()}
 
 
 def write_json(path: Path, data: dict[str, Any]) -> None:

@@ -12,7 +12,7 @@ from blend_model import BlendMuscle, arm_scene
 from rbfmuscle import compare
 from rbfmuscle.compare import compare_models
 from rbfmuscle.experiments.comparison import MEASURES, best_models, describe
-from rbfmuscle.metrics.comparison_measures import MaterialProbe, curvature_variation
+from rbfmuscle.metrics.comparison_measures import MaterialProbe
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report.comparison_page import map_limit, shown
 from rbfmuscle.scene.phantom import phantom_scene
@@ -43,16 +43,6 @@ class TestMaterialProbe:
             rest, moved = (probe.points(np.array(mesh.vertices) * f) for f in ([1, 1, 1], [1.3, 0.9, 0.9]))
             found.append(probe.strain(moved, rest))
         assert found[0] == pytest.approx(found[1], rel=5e-3)
-
-
-class TestCurvatureVariation:
-    def test_bumps_count_and_size_scales(self):
-        mesh = trimesh.creation.icosphere(subdivisions=5)
-        smooth = curvature_variation(mesh.vertices, mesh.faces)
-        assert smooth < 0.01  # of 1, the sphere's own curvature
-        assert curvature_variation(10 * mesh.vertices, mesh.faces) == pytest.approx(smooth / 10, rel=1e-6)
-        bumpy = mesh.vertices * (1 + 0.02 * np.sin(8 * mesh.vertices[:, :1]))
-        assert curvature_variation(bumpy, mesh.faces) > 10 * smooth
 
 
 def results(**models):
@@ -152,7 +142,6 @@ class TestComparison:
             rows = list(csv.DictReader(file))
         for row in rows:
             assert float(row["value"]) == table["results"][row["model"]][row["muscle"]][row["quantity"]]
-        assert {row["unit"] for row in rows if row["quantity"] == "curvature_variation"} == {"1/mm"}
 
     def test_page_begins_with_the_answer_and_holds_every_measure(self, compared):
         folder, table = compared

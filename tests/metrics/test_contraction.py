@@ -2,18 +2,11 @@
 
 import numpy as np
 import pytest
-import trimesh
 from contraction_scenes import MUSCLE, SPINDLE, spindle_scene
 
 import rbfmuscle as rm
 from rbfmuscle.metrics.centreline import MuscleAtRest
-from rbfmuscle.metrics.contraction import ContractionStudy, pennation, section_area
-
-
-def test_section_beside_the_surface_is_empty():
-    mesh = trimesh.creation.icosphere()
-    points = np.asarray(mesh.vertices)
-    assert section_area(points, np.asarray(mesh.faces), np.eye(3)[2], points[:, 2], 2.0) == 0.0
+from rbfmuscle.metrics.contraction import ContractionStudy, pennation
 
 
 def test_pennation_is_the_angle_to_the_axis_whichever_way_fibres_are_numbered():

@@ -5,7 +5,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.metrics.geodesic import path_length, shortest_path
+from rbfmuscle.metrics.centreline import distance_along, resampled
+from rbfmuscle.metrics.geodesic import NODES, shortest_path
 from rbfmuscle.metrics.penetration import BoneProbe
 
 RADIUS, FAR = 10.0, 25.0
@@ -19,6 +20,10 @@ def over_the_ball(height):
     """Points from one side of the ball to the other, over it for a positive height."""
     x = np.linspace(-FAR, FAR, 20)
     return np.stack([x, np.zeros(20), height * (1 - (x / FAR) ** 2)], axis=1)
+
+
+def path_length(points):
+    return distance_along(points)[-1]
 
 
 def wrapped():
@@ -59,3 +64,13 @@ def test_path_is_no_longer_than_a_line_beside_the_bones():
     line = over_the_ball(18.0)
     line[1:-1] += rng.uniform(0.0, 2.0, (len(line) - 2, 3)) * [0.0, 1.0, 1.0]
     assert path_length(shortest_path(line, [ball()], {"ball": np.eye(4)})) < path_length(line)
+
+
+def test_string_that_begins_as_in_the_frame_before_ends_in_the_same_place():
+    poses = {"ball": np.eye(4)}
+    before, line = over_the_ball(15.0), over_the_ball(15.0) + [0.0, 2.0, 0.0]
+    offset = shortest_path(before, [ball()], poses) - resampled(before, NODES - 1)
+    anew = shortest_path(line, [ball()], poses)
+    found = shortest_path(line, [ball()], poses, offset=offset)
+    # Rounds end where no node moves farther than 1e-4 of the length, whose square the length differs by.
+    assert path_length(found) == pytest.approx(path_length(anew), rel=1e-5)
