@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import math
 from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import cycle
@@ -14,11 +12,9 @@ import numpy as np
 
 from rbfmuscle.experiments.comparison import AGAINST, MEASURES, best_models
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.metrics.quantities import ALL
 from rbfmuscle.output.colours import MUSCLE_COLOURS
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.appearance import motion_direction
 from rbfmuscle.report.page import (
     BAD,
     GOOD,
@@ -33,17 +29,13 @@ from rbfmuscle.report.page import (
     number,
     table,
 )
-from rbfmuscle.report.paint import scale_chips, scale_colours
 from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
-from rbfmuscle.report.raster import fitted_size
-from rbfmuscle.report.render import Panel, chosen_frames, draw_panels, muscle_path, save_images
+from rbfmuscle.report.render import draw_preview
 from rbfmuscle.report.report import COUNTS, packed_scene
 
 LIGHTS = ("volume_error", "penetration_max", "bone_penetration_max", "return_rms", "time_frame")
-# Pixels of a panel, of all beside each other; frames of the animation.
-_AREA, _WHOLE, _FRAMES = 90_000, 400_000, 12
-# Distance maps: from the greatest distance of the models down to what leaves the map its colours.
-_MAP_SHARE = 0.25
+# Pixels of a picture of one model, and of all together.
+_AREA, _WHOLE = 90_000, 400_000
 _READING = """<p>All models ran through the same frames and sub-steps, one after another in one process with the
 same bone fields and number of threads, each after a warm-up. <b>The time per frame</b> is the wall time of prediction,
 solution, contacts and surface of all muscles; <b>solution</b> and <b>surface</b> are sums over muscles, which run side
@@ -70,13 +62,10 @@ def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) ->
     page = _page(found, runs)
     if pictures:
         moving = folder / "models.webp"
-        _draw_models(found, runs, moving)
-        page.scene = packed_scene({found["labels"][name]: run for name, run in runs.items()})
+        labelled = {found["labels"][name]: run for name, run in runs.items()}
+        draw_preview(labelled, moving, area=min(_AREA, _WHOLE / len(runs)))
+        page.scene = packed_scene(labelled)
         page.picture = embedded_image(moving.read_bytes(), "webp", "the motion, models beside each other")
-        if len(runs) > 1:
-            page.sections.insert(
-                1, Section(f"Distance to {_label(found, 0)}", _distance_map(found, runs), "last pose")
-            )
     else:
         page.missing = "No pictures: they were switched off."
     page.write(folder / "report.html")
@@ -110,10 +99,6 @@ def _page(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> Page:
         footer=", ".join(f"{name} {value}" for name, value in found["versions"].items()),
         layout="below",
     )
-
-
-def _label(found: dict[str, Any], place: int) -> str:
-    return found["labels"][found["models"][place]]
 
 
 def _light(found: dict[str, Any], runs: Mapping[str, SavedRun], quantity: str) -> Light | None:
@@ -225,47 +210,3 @@ def worst_series(run: SavedRun, quantity: str) -> tuple[Integers, Floats]:
         return np.zeros(0, dtype=int), np.zeros(0)
     values = np.array([values for _, values in found])
     return found[0][0], values[np.argmax(np.abs(values), axis=0), np.arange(values.shape[1])]
-
-
-def _draw_models(found: dict[str, Any], runs: Mapping[str, SavedRun], path: Path) -> None:
-    """The motion in its plane, models beside each other."""
-    first = next(iter(runs.values()))
-    frames = chosen_frames(first.frames, _FRAMES)
-    titles = [found["labels"][name] for name in runs]
-    save_images(draw_panels(_panels(runs, frames), frames, titles, {}), path, 4.0)
-
-
-def _panels(runs: Mapping[str, SavedRun], frames: list[int], paint: Any = None) -> list[Panel]:
-    first = next(iter(runs.values()))
-    seen = muscle_path(list(runs.values()), [frames[0], frames[len(frames) // 2], frames[-1]])
-    direction = motion_direction([first.poses[frame] for frame in frames])
-    size = fitted_size(direction, seen, min(_AREA, _WHOLE / len(runs)))
-    return [Panel(run, direction, size, seen, paint) for run in runs.values()]
-
-
-def _distance_map(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> str:
-    """The other models in the last pose, coloured by their distance to the first."""
-    (_, reference), *others = runs.items()
-    limit = map_limit(found)
-
-    def paint(saved: SavedRun, muscle: str, frame: int, vertices: Floats) -> Floats:
-        away = MeshDistance(*reference.surface(muscle, frame)).unsigned(vertices)
-        return scale_colours(np.minimum(away / limit, 1.0))
-
-    texts = [f"{limit * share:.3g} {found['units']}" for share in np.linspace(0, 1, 5)]
-    titles = [found["labels"][name] for name, _ in others]
-    panels = _panels(dict(others), reference.frames, paint)
-    (image,) = draw_panels(
-        panels, reference.frames[-1:], titles, scale_chips([*texts[:-1], f"{texts[-1]} or more"])
-    )
-    out = io.BytesIO()
-    image.save(out, "png")
-    return embedded_image(out.getvalue(), "png", "distance to the first model")
-
-
-def map_limit(found: dict[str, Any]) -> float:
-    """Distance at which the maps' colours end: one, two or five times a power of ten."""
-    greatest = max(results[ALL].get("distance_max", 0.0) for results in found["results"].values())
-    wanted = max(_MAP_SHARE * greatest, 1e-12)
-    power = 10.0 ** math.floor(math.log10(wanted))
-    return next(step * power for step in (1, 2, 5, 10) if step * power >= wanted * 0.999)

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 _INK, _SOFT, _GRID, _LIMIT = "#26282b", "#5f646b", "#e8e6e0", "#a3281f"
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 12, 26, 36
-# Of a letter at the size of labels [pixel].
-_LETTER = 6.2
+# Width of a letter of a bold label, and height of a row of labels [pixel].
+_LETTER, _ROW = 6.6, 15
 
 
 class Track(NamedTuple):
@@ -183,54 +183,39 @@ def front_plot(points: Sequence[Point], labels: tuple[str, str], *, groups: Mapp
     if not shown:
         return ""
     spans = [(min(values), max(values)) for values in ([p.x for p in shown], [p.y for p in shown])]
-    axes = _Axes((500, 370), spans, log=True)
+    named = [point for point in shown if point.label and (point.star or point.front)]
+    column = _LETTER * max((len(name) for name in [*groups, *(p.label for p in named)]), default=0)
+    tall = max(370, _TOP + _BOTTOM + _ROW * (len(named) + len(groups)))
+    axes = _Axes((500, tall), spans, log=True)
     axes.frame("", labels)
-    taken: list[tuple[float, float, float, float]] = []
     for colour in dict.fromkeys(point.colour for point in shown):
         front = sorted(point for point in shown if point.front and point.colour == colour)
         axes.line([p.x for p in front], [p.y for p in front], colour, width=1.2)
     for point in shown:
         x, y = axes.place(point.x, 0), axes.place(point.y, 1)
-        taken.append((x - 6, y - 6, x + 6, y + 6))
         shape = _star(x, y) if point.star else f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4.5"'
         faint = 1.0 if point.star or point.front else 0.4
         axes.parts.append(f'{shape} fill="{point.colour}" fill-opacity="{faint}"/>')
-    for point in sorted(shown, key=lambda point: not point.star):
-        if point.label and (point.star or point.front):
-            _label(axes, point, taken)
+    left = axes.size[0] + 14
     for k, (name, colour) in enumerate(groups.items()):
-        axes.text(axes.size[0] - _RIGHT, _TOP + 16 + 16 * k, name, anchor="end", colour=colour, bold=True)
+        axes.text(left, _TOP + _ROW * k + 8, name, colour=colour, bold=True)
+    _label_beside(axes, named, left, _TOP + _ROW * len(groups) + 8)
+    axes.size = int(left + column + 4), tall
     return axes.svg(f"{labels[1]} against {labels[0]}")
 
 
-def _label(axes: _Axes, point: Point, taken: list[tuple[float, float, float, float]]) -> None:
-    """Write a point's label where it covers nothing, joined to it by a line where that is far away."""
-    x, y = axes.place(point.x, 0), axes.place(point.y, 1)
-    wide = _LETTER * len(point.label)
-    for far in (9, 18, 32, 48, 66, 86, 108):
-        for dx, dy in ((1, -0.4), (-1, -0.4), (1, 1), (-1, 1), (0, -1), (0, 1.2)):
-            left = x + far * dx - (wide if dx < 0 else 0.5 * wide if dx == 0 else 0)
-            box = (left, y + far * dy - 9, left + wide, y + far * dy + 4)
-            inside = (
-                box[0] > _LEFT
-                and box[2] < axes.size[0] - 4
-                and box[1] > _TOP
-                and box[3] < axes.size[1] - _BOTTOM
-            )
-            if inside and not any(_overlap(box, other) for other in taken):
-                taken.append(box)
-                if far > 9:
-                    end = min(max(x, box[0]), box[2]), min(max(y, box[1]), box[3])
-                    axes.parts.append(
-                        f'<path d="M{x:.1f} {y:.1f}L{end[0]:.1f} {end[1]:.1f}" '
-                        f'stroke="{_SOFT}" stroke-width="0.6"/>'
-                    )
-                axes.text(left, y + far * dy, point.label, colour=_INK, bold=point.star)
-                return
-
-
-def _overlap(one, other):
-    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+def _label_beside(axes: _Axes, points: Sequence[Point], left: float, top: float) -> None:
+    """Write labels below each other beside the plot, each joined to its point."""
+    points = sorted(points, key=lambda point: axes.place(point.y, 1))
+    lowest = axes.size[1] - _BOTTOM
+    for k, point in enumerate(points):
+        x, y = axes.place(point.x, 0), axes.place(point.y, 1)
+        top = min(max(y, top), lowest - _ROW * (len(points) - 1 - k))
+        axes.parts.append(
+            f'<path d="M{x:.1f} {y:.1f}L{left - 3:.1f} {top:.1f}" stroke="{_SOFT}" stroke-width="0.6"/>'
+        )
+        axes.text(left, top + 4, point.label, colour=_INK, bold=point.star)
+        top += _ROW
 
 
 def _star(x: float, y: float) -> str:

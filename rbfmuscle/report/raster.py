@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
@@ -71,31 +72,46 @@ def fitted_size(direction: Sequence[float] | Floats, points: Floats, area: float
     return 2 * round(0.5 * (area / shape) ** 0.5), 2 * round(0.5 * (area * shape) ** 0.5)
 
 
-def draw_solids(solids: Sequence[Solid], camera: Camera, background: Floats) -> Integers:
-    """Picture (h, w, 3) of uint8; of solids that are not opaque the nearest one is seen, over all that are."""
-    fine = camera._replace(
-        scale=camera.scale * _FINER, size=(_FINER * camera.size[0], _FINER * camera.size[1])
-    )
-    depth, image = _layer([solid for solid in solids if solid.opacity >= 1.0], fine, background)
+class Layer(NamedTuple):
+    """What is nearest in each fine pixel: depth (h, w), and colour with opacity (h, w, 4)."""
+
+    depth: NDArray[np.float32]
+    image: NDArray[np.float32]
+
+
+def draw_solids(
+    solids: Sequence[Solid], camera: Camera, background: Floats, *, behind: Layer | None = None
+) -> Integers:
+    """Picture (h, w, 3) of uint8; of solids that are not opaque the nearest one is seen, over all that are.
+
+    ``behind`` is drawn already: opaque solids from `draw_layer`.
+    """
+    depth, image = draw_layer([one for one in solids if one.opacity >= 1.0], camera, background, on=behind)
     veils = [solid for solid in solids if solid.opacity < 1.0]
     if veils:
-        over, veil = _layer(veils, fine, background)
+        over, veil = draw_layer(veils, camera, background)
         share = np.where(over > depth, veil[..., 3], 0.0)[..., None]
         image = (1.0 - share) * image + share * veil
     corners = [image[i::_FINER, j::_FINER, :3] for i in range(_FINER) for j in range(_FINER)]
     return np.round(255.0 * np.clip(sum(corners) / len(corners), 0.0, 1.0)).astype(np.uint8)
 
 
-def _layer(solids: Sequence[Solid], camera: Camera, background: Floats) -> tuple[Floats, Floats]:
-    """Depth (h, w) and colour with opacity (h, w, 4) of what is nearest."""
-    depth = np.full(camera.size[::-1], -np.inf, dtype=np.float32)
-    image = np.empty((*depth.shape, 4), dtype=np.float32)
-    image[:] = [*background, 1.0]
+def draw_layer(
+    solids: Sequence[Solid], camera: Camera, background: Floats, *, on: Layer | None = None
+) -> Layer:
+    """The nearest of some solids, and of a layer that they are drawn on."""
+    width, height = camera.size
+    fine = camera._replace(scale=camera.scale * _FINER, size=(_FINER * width, _FINER * height))
+    if on is None:
+        depth = np.full(fine.size[::-1], -np.inf, dtype=np.float32)
+        image = np.tile(np.array([*background, 1.0], dtype=np.float32), (*depth.shape, 1))
+    else:
+        depth, image = on.depth.copy(), on.image.copy()
     for solid in solids:
         shades = np.empty((len(solid.vertices), 4))
-        shades[:, :3], shades[:, 3] = _shaded(solid, camera.axes), solid.opacity
-        _raster_loop(camera.project(solid.vertices), shades, solid.faces.astype(np.int64), depth, image)
-    return depth, image
+        shades[:, :3], shades[:, 3] = _shaded(solid, fine.axes), solid.opacity
+        _raster_loop(fine.project(solid.vertices), shades, solid.faces.astype(np.int64), depth, image)
+    return Layer(depth, image)
 
 
 def _shaded(solid: Solid, axes: Floats) -> Floats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,18 +13,17 @@ from rbfmuscle.output.colours import BONE_COLOUR, MUSCLE_COLOURS, muscle_colours
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report.appearance import BACKGROUND, USUAL_VIEWS, VIEWS, motion_direction, muscle_groups
 from rbfmuscle.report.labels import labelled
-from rbfmuscle.report.paint import activations, check_colouring, scale_chips, scale_colours
-from rbfmuscle.report.raster import Solid, aim, draw_solids, fitted_size
+from rbfmuscle.report.raster import Solid, aim, draw_layer, draw_solids, fitted_size
 from rbfmuscle.validation import SolveError, UsageError
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-ANIMATIONS = (".webp", ".gif")
-# Pixels of a panel, and of one of the preview; frames of the preview.
-_AREA, _PREVIEW_AREA, _PREVIEW_FRAMES = 220_000, 110_000, 12
-# Colours (n, 3) of a muscle's vertices in a frame.
-Paint = Callable[[SavedRun, str, int, Floats], Floats]
+ANIMATIONS, COLOURINGS = (".webp", ".gif"), ("muscle", "activation")
+# Of activations from 0 to 1: viridis, which people who are colour-blind can read and which prints in grey.
+_SCALE = ("#440154", "#3b528b", "#21918c", "#5ec962", "#fde725")
+# Pixels of a panel, and of one of a preview; frames of a preview, and how many a second.
+_AREA, _PREVIEW_AREA, _PREVIEW_FRAMES, _PREVIEW_SECONDS = 220_000, 110_000, 12, 4.0
 
 
 class Panel:
@@ -37,10 +36,10 @@ class Panel:
         From the subject to the camera.
     size : (width, height)
         Pixels.
-    path : (n, 3) ndarray
+    seen : (n, 3) ndarray
         What is to be seen.
-    paint : callable, optional
-        ``paint(saved, muscle, frame, vertices)`` gives colours (n, 3); the muscles' own where not given.
+    activation : dict of (muscle, frame) to float, optional
+        Muscles are coloured by it.
     """
 
     def __init__(
@@ -48,57 +47,68 @@ class Panel:
         saved: SavedRun,
         direction: Sequence[float] | Floats,
         size: tuple[int, int],
-        path: Floats,
-        paint: Paint | None = None,
+        seen: Floats,
+        activation: Mapping[tuple[str, int], float] | None = None,
     ) -> None:
-        self.saved, self.paint = saved, paint
+        self.saved, self.activation = saved, activation
         self.colours = muscle_colours(saved.muscles, muscle_groups(saved.info))
-        self.bones = {name: saved.bone(name) for name in saved.bones}
-        self.camera = aim(direction, path, size)
+        self.camera = aim(direction, seen, size)
+        bones, first = {name: saved.bone(name) for name in saved.bones}, saved.poses[saved.frames[0]]
+        moving = {
+            name
+            for name in bones
+            if any(not np.array_equal(saved.poses[k][name], first[name]) for k in saved.frames)
+        }
+        self.moving = {name: bones[name] for name in moving}
+        still = [_posed(*bones[name], first[name]) for name in bones if name not in moving]
+        self._behind = draw_layer(still, self.camera, rgb(BACKGROUND))
 
     def draw(self, frame: int) -> Integers:
         """Picture (h, w, 3) of a frame."""
-        solids = []
-        for name, (vertices, faces) in self.bones.items():
-            pose = self.saved.poses[frame][name]
-            solids.append(Solid(vertices @ pose[:3, :3].T + pose[:3, 3], faces, rgb(BONE_COLOUR)))
+        solids = [_posed(*mesh, self.saved.poses[frame][name]) for name, mesh in self.moving.items()]
         for name, colour in self.colours.items():
-            vertices, faces = self.saved.surface(name, frame)
-            shade = rgb(colour) if self.paint is None else self.paint(self.saved, name, frame, vertices)
-            solids.append(Solid(vertices, faces, shade))
-        return draw_solids(solids, self.camera, rgb(BACKGROUND))
+            shade = rgb(colour) if self.activation is None else _shade(self.activation.get((name, frame), 0))
+            solids.append(Solid(*self.saved.surface(name, frame), shade))
+        return draw_solids(solids, self.camera, rgb(BACKGROUND), behind=self._behind)
 
 
-def muscle_path(runs: Sequence[SavedRun], frames: Sequence[int]) -> Floats:
-    """Points (n, 3) of all muscles in some frames."""
-    return np.concatenate(
-        [run.surface(name, frame)[0][::3] for run in runs for name in run.muscles for frame in frames]
-    )
+def _posed(vertices: Floats, faces: Integers, pose: Floats) -> Solid:
+    return Solid(vertices @ pose[:3, :3].T + pose[:3, 3], faces, rgb(BONE_COLOUR))
+
+
+def _shade(activation: float) -> Floats:
+    table = np.array([rgb(colour) for colour in _SCALE])
+    return np.array([np.interp(activation, np.linspace(0, 1, len(table)), column) for column in table.T])
+
+
+def muscle_points(runs: Sequence[SavedRun], frames: Sequence[int]) -> Floats:
+    """Points (n, 3) of all muscles in the first, middle and last of some frames."""
+    some = sorted({frames[0], frames[len(frames) // 2], frames[-1]})
+    return np.concatenate([r.surface(name, k)[0][::3] for r in runs for name in r.muscles for k in some])
 
 
 def draw_panels(
     panels: Sequence[Panel], frames: Sequence[int], titles: Sequence[str], chips: Mapping[str, str]
 ) -> list[Image]:
     """Panels beside each other, a picture for each frame, with titles above and caption and colours below."""
-    return [
-        labelled(
-            np.concatenate([panel.draw(frame) for panel in panels], axis=1),
-            panels[0].saved.caption(frame),
-            titles,
-            chips,
-        )
-        for frame in frames
-    ]
+    images = [np.concatenate([panel.draw(frame) for panel in panels], axis=1) for frame in frames]
+    saved = panels[0].saved
+    return [labelled(image, saved.caption(k), titles, chips) for image, k in zip(images, frames)]
 
 
-def draw_preview(saved: SavedRun, path: Path) -> None:
-    """Write the whole motion, seen in its plane and from the front, as an animation."""
-    frames = chosen_frames(saved.frames, _PREVIEW_FRAMES)
-    seen = muscle_path([saved], frames[:: max(1, len(frames) // 4)] + frames[-1:])
-    directions = [motion_direction([saved.poses[frame] for frame in frames]), np.array(VIEWS["front"][0])]
-    size = fitted_size(directions[0], seen, _PREVIEW_AREA)
-    panels = [Panel(saved, direction, size, seen) for direction in directions]
-    save_images(draw_panels(panels, frames, ["plane of the motion", "front"], _chips(saved)), path, 4.0)
+def draw_preview(runs: Mapping[str, SavedRun], path: Path, *, area: float = _PREVIEW_AREA) -> None:
+    """Write the whole motion of runs beside each other, seen in its plane; one run is seen from the front as well."""
+    first = next(iter(runs.values()))
+    frames = chosen_frames(first.frames, _PREVIEW_FRAMES)
+    seen = muscle_points(list(runs.values()), frames)
+    side = motion_direction([first.poses[frame] for frame in frames])
+    size = fitted_size(side, seen, area)
+    panels, titles = [Panel(run, side, size, seen) for run in runs.values()], list(runs)
+    if len(runs) == 1:
+        panels.append(Panel(first, VIEWS["front"][0], size, seen))
+        titles = ["plane of the motion", "front"]
+    chips = _chips(first) if len(runs) == 1 else {}
+    save_images(draw_panels(panels, frames, titles, chips), path, _PREVIEW_SECONDS)
 
 
 def render_run(
@@ -144,22 +154,22 @@ def render_run(
         raise UsageError(f"{output}: the suffix must be .png, .gif or .webp")
     if not saved.has_surfaces():
         raise UsageError(f"{directory} has no surfaces to draw")
-    check_colouring(saved, colour)
+    if colour not in COLOURINGS:
+        raise UsageError(f"unknown colouring {colour!r}; known: {', '.join(COLOURINGS)}")
+    activation, chips = None, _chips(saved)
+    if colour == "activation":
+        activation = {(row.muscle, row.frame): row.value for row in saved.metrics if row.quantity == colour}
+        chips = {f"activation {share:g}": _SCALE[k] for k, share in enumerate(np.linspace(0, 1, 5))}
+        if not activation:
+            raise UsageError(f"{saved.directory} has no activation: none of its muscles contracts")
     frame = saved.frames[-1] if frame is None else frame
     if frame not in saved.frames:
         raise UsageError(
             f"frame {frame} was not written; the run has {saved.frames[0]} to {saved.frames[-1]}"
         )
-    seen = muscle_path(
-        [saved], sorted({saved.frames[0], saved.frames[len(saved.frames) // 2], saved.frames[-1]})
-    )
-    paint, chips = (
-        (activation_paint(saved), _activation_chips()) if colour == "activation" else (None, _chips(saved))
-    )
-    panels = [
-        Panel(saved, VIEWS[view][0], fitted_size(VIEWS[views[0]][0], seen, area), seen, paint)
-        for view in views
-    ]
+    seen = muscle_points([saved], saved.frames)
+    size = fitted_size(VIEWS[views[0]][0], seen, area)
+    panels = [Panel(saved, VIEWS[view][0], size, seen, activation) for view in views]
     frames = [frame] if output.suffix == ".png" else saved.frames
     images = draw_panels(panels, frames, [f"{view} ({VIEWS[view][1]})" for view in views], chips)
     save_images(images, output, seconds)
@@ -172,18 +182,6 @@ def _chips(saved: SavedRun) -> dict[str, str]:
     if len(colours) <= len(MUSCLE_COLOURS):
         return colours
     return {groups[name]: colours[name] for name in reversed(saved.muscles)}
-
-
-def _activation_chips() -> dict[str, str]:
-    return scale_chips([f"activation {share:g}" for share in np.linspace(0, 1, 5)])
-
-
-def activation_paint(saved: SavedRun) -> Paint:
-    """Each muscle by its activation, 0 where it does not contract."""
-    known = activations(saved)
-    return lambda _, muscle, frame, vertices: scale_colours(
-        np.full(len(vertices), known.get((muscle, frame), 0.0))
-    )
 
 
 def chosen_frames(frames: Sequence[int], most: int) -> list[int]:

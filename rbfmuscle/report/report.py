@@ -90,7 +90,7 @@ def write_report(
     saved = SavedRun(directory)
     animation = saved.directory / "preview.webp"
     if preview and saved.has_surfaces() and len(saved.frames) > 1:
-        draw_preview(saved, animation)
+        draw_preview({"": saved}, animation)
     if not report:
         return
     page = _page(saved)
