@@ -1,25 +1,8 @@
 """Motions from OpenSim; moment arms of the real hip."""
 
-import math
-
 import numpy as np
-import pytest
-from blend_model import arm_scene
 
 from rbfmuscle.run import simulate
-from rbfmuscle.scene.motion import make_motion
-from rbfmuscle.scene.options import MotionOptions
-
-
-@pytest.mark.parametrize(("degrees", "factor"), [("yes", math.pi / 180), ("no", 1.0)])
-def test_motion_file_honours_in_degrees(tmp_path, degrees, factor):
-    scene = arm_scene()
-    joint = scene.joints[0]
-    name = next(iter(joint.axes))
-    text = f"m\nversion=1\nnRows=2\nnColumns=2\ninDegrees={degrees}\nendheader\ntime\t{name}\n0\t0\n1\t0.75\n"
-    (tmp_path / "a.mot").write_text(text)
-    motion = make_motion(scene, MotionOptions(file=tmp_path / "a.mot"))
-    assert [frame[f"{joint.name}.{name}"] for frame in motion.frames] == pytest.approx([0.0, 0.75 * factor])
 
 
 def test_moment_arms_of_the_real_hip_have_the_right_signs_and_sum(hip_scene):

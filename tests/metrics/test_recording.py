@@ -6,7 +6,6 @@ import pytest
 from blend_model import arm_scene, use_blend_model
 
 from rbfmuscle.recording import Recording
-from rbfmuscle.run import simulate, stream_run
 from rbfmuscle.validation import SceneWarning, SolveError
 
 
@@ -81,12 +80,3 @@ def test_notes_of_the_motion_are_warned_of():
     assert [f"motion: {note}" for note in scene.motion.notes] == [
         line for line in said if line.startswith("motion: ")
     ]
-
-
-@pytest.mark.parametrize("way", [simulate, lambda scene, folder: stream_run(scene, folder, pictures=False)])
-def test_what_is_noted_of_the_motion_points_at_who_asked_for_the_run(way, tmp_path):
-    scene = arm_scene(end=5)
-    scene.motion.notes.append("it leaves its range")
-    with pytest.warns(SceneWarning, match="motion: it leaves its range") as said:
-        way(scene, tmp_path) if way is not simulate else simulate(scene)
-    assert [each.filename for each in said if "leaves" in str(each.message)] == [__file__]

@@ -73,15 +73,6 @@ class TestVtp:
         write_vtp(tmp_path / "a.vtp", *mesh, values=values)
         np.testing.assert_array_equal(pyvista.read(tmp_path / "a.vtp")["distance"], values["distance"])
 
-    def test_large_arrays_too(self, tmp_path):
-        rng = np.random.default_rng(0)
-        vertices = rng.normal(size=(120_000, 3))
-        faces = rng.integers(0, len(vertices), size=(100_000, 3))
-        write_vtp(tmp_path / "a.vtp", vertices, faces)
-        data = pyvista.read(tmp_path / "a.vtp")
-        np.testing.assert_allclose(data.points, vertices, rtol=ROUNDING, atol=0)
-        np.testing.assert_array_equal(data.regular_faces, faces)
-
 
 class TestCollection:
     def test_complete_after_every_frame(self, tmp_path, mesh):

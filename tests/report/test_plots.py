@@ -95,13 +95,6 @@ def test_tracks_are_the_series_of_the_run_and_times_leave_out_the_first_frame(sa
     np.testing.assert_allclose(track.y, 1000.0 * saved.series("biceps", "time_frame")[1][1:], rtol=1e-12)
 
 
-def test_axis_is_the_frame_on_the_way_there_and_back():
-    rows = [{"frame": k, "coordinates": {"a.b": v}} for k, v in enumerate([0, 10, 0])]
-    places, label = motion_axis(SimpleNamespace(info={"frames": rows}, frames=[0, 1, 2]))
-    assert label == "frame"
-    assert places == {0: 0, 1: 1, 2: 2}
-
-
 def test_worst_of_several_muscles_is_the_greatest_in_size_with_its_sign():
     rows = {"a": [0.1, -0.5, 0.2], "b": [-0.3, 0.4, 0.1]}
     run = SimpleNamespace(

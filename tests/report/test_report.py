@@ -3,21 +3,18 @@
 import json
 import re
 from html.parser import HTMLParser
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import trimesh
 from blend_model import arm_scene, use_blend_model
 from PIL import Image
 
 from rbfmuscle.metrics.summary import describe_verdict, within
-from rbfmuscle.output.colours import muscle_colours
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report import labels, render
+from rbfmuscle.report import render
 from rbfmuscle.report.appearance import muscle_groups
 from rbfmuscle.report.page import Cell, limit_state, number, table
-from rbfmuscle.report.report import _events, _stages, write_report
+from rbfmuscle.report.report import _events, write_report
 from rbfmuscle.run import simulate
 from rbfmuscle.validation import UsageError
 
@@ -145,37 +142,6 @@ def test_render_refuses_wrong_words(folder, tmp_path):
             render.render_run(folder, tmp_path / words.pop("output"), **words)
 
 
-@pytest.fixture(scope="module")
-def crowd(tmp_path_factory):
-    """Folder of a saved run of twelve muscles, one of which goes beyond a limit."""
-    place = tmp_path_factory.mktemp("crowd")
-    with pytest.MonkeyPatch.context() as patch:
-        use_blend_model(patch)
-        scene = arm_scene(end=20)
-        one = scene.muscles[0]
-        for k in range(1, 12):
-            mesh = one.mesh.copy()
-            mesh.apply_translation([0.0, 11.0 * k, 0.0])
-            attach = [{"bone": a.bone, "vertices": np.asarray(a.vertices).tolist()} for a in one.attachments]
-            scene.add_muscle(f"muscle_{k:02d}", mesh, attach=attach)
-        # It runs through the seventh.
-        nail = trimesh.creation.box((4, 4, 40))
-        nail.apply_translation([0.0, 11.0 * 7, 9.5])
-        scene.add_bone("nail", nail)
-        simulate(scene).save(place)
-    return place
-
-
-def test_dozens_of_muscles_have_a_row_each_the_worst_first(crowd):
-    write_report(crowd, preview=False, pictures=False)
-    text, _ = read(crowd)
-    start = text.index("Every quantity")
-    rows = text[text.index("<tbody>", start) : text.index("</tbody>", start)].split("<tr>")[1:]
-    assert len(rows) == 12 and "muscle_07" in rows[0] and 'class="find"' in text
-    red = [row.count("bad") for row in rows]
-    assert red == sorted(red, reverse=True) and red[0] > red[1]
-
-
 def scene_info(attached, joints):
     return {
         "scene": {
@@ -206,27 +172,11 @@ def test_muscles_are_grouped_by_the_joints_that_they_cross():
     }
 
 
-def test_few_muscles_have_a_colour_each_and_many_a_hue_for_each_group():
-    assert len(set(muscle_colours([str(k) for k in range(8)]).values())) == 8
-    names = [f"{group}{k}" for group in "abc" for k in range(5)]
-    colours = muscle_colours(names, {name: name[0] for name in names})
-    assert all(len({colours[f"{group}{k}"] for k in range(3)}) == 3 for group in "abc")
-    assert not {colours[f"a{k}"] for k in range(5)} & {colours[f"b{k}"] for k in range(5)}
-
-
 def test_events_are_listed_by_kind_and_names_stay_text():
     events = [(k, "<b>one", "bone", 1, "halved") for k in range(70)] + [(3, "", "bone", 1, "bones_overlap")]
     text = _events(events)
     assert text.index("halved") < text.index("bones_overlap") and "and 10 more" in text
     assert text.count("<tr>") == 60 + 1 + 2 and "<b>" not in text and "&lt;b&gt;one 70" in text
-
-
-def test_stages_are_milliseconds_with_counts_and_reasons():
-    work = {"solved": 17, "carried": 14, "skipped": 3, "substeps": 41, "reasons": {"solved": "femur turns"}}
-    info = {"stages": {"strap": {"time_solve": {"median": 0.0171}}}, "work": {"strap": work}}
-    cells = re.findall(r"<t[dh](?: [^>]*)?>(.*?)</t[dh]>", _stages(SimpleNamespace(info=info)))
-    head = ["muscle", "solve", "solved", "carried", "skipped", "substeps", "why"]
-    assert cells == [*head, "strap", "17.1", "17", "14", "3", "41", "solved: femur turns"]
 
 
 @pytest.mark.parametrize(
@@ -256,22 +206,3 @@ def test_lights_are_green_amber_from_four_fifths_and_red_beyond():
 def test_tables_sort_by_value_and_names_stay_text():
     text = table(["a", "b"], [["<i>x", Cell("1.2 mm", 1.2, "bad")], ["y", "n/a"]], find=True)
     assert "&lt;i&gt;x" in text and 'data-value="1.2" class="bad">1.2 mm<' in text and "<input" in text
-
-
-@pytest.mark.parametrize("suffix", [".webp", ".gif"])
-def test_frames_of_different_heights_make_one_animation(tmp_path, suffix):
-    path = tmp_path / f"moving{suffix}"
-    images = [Image.new("RGB", (80, height), "#aa3333") for height in (60, 75, 60)]
-    render.save_images(images, path, 1.0)
-    with Image.open(path) as made:
-        assert (made.size, made.n_frames) == ((80, 75), 3)
-
-
-def test_long_captions_take_more_lines():
-    picture = np.full((50, 300, 3), 255, dtype=np.uint8)
-    text = "frame 12, " + ", ".join(f"joint_{k}.coordinate {k}°" for k in range(4))
-    sheet = labels.labelled(picture, text, ["front"], {"muscle": "#aa0000"})
-    short = labels.labelled(picture, "frame 12", ["front"], {"muscle": "#aa0000"})
-    assert sheet.size[0] == 300 and sheet.size[1] > short.size[1]
-    # Nothing of the caption is cut off by the right edge.
-    assert (np.asarray(sheet)[50:, -4:] == 255).all()

@@ -264,15 +264,6 @@ def test_server_listens_on_one_address(page):
         socket.create_connection(("127.0.0.2", urlsplit(page.address).port), timeout=5)
 
 
-def test_two_servers_have_two_tokens():
-    from rbfmuscle.viewer.server import open_server
-
-    servers, addresses = zip(open_server(), open_server())
-    assert len({urlsplit(address).path for address in addresses}) == 2
-    for server in servers:
-        server.stop()
-
-
 def test_notebook_shows_a_scene_and_a_run():
     shown = rm.simulate(rm.phantom_scene(end=0.0, spacing=6.0), model="pbd").show()
     try:

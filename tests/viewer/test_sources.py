@@ -10,7 +10,7 @@ from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.run import stream_run
 from rbfmuscle.simulation.live import LiveSession, coordinate_limits
 from rbfmuscle.validation import SolveError, UsageError
-from rbfmuscle.viewer.colours import COLOURINGS, legend, shades, vertex_values
+from rbfmuscle.viewer.colours import vertex_values
 from rbfmuscle.viewer.sources import LiveFigure, LiveSource, Picture, SavedSource
 
 
@@ -83,15 +83,6 @@ def test_coarse_pictures_show_the_material_and_end_with_a_full_one(figure):
     assert np.degrees(figure.session.here["hinge.bend"]) == pytest.approx(10.0)
 
 
-def test_coarse_picture_alone_is_not_the_last(figure):
-    go(figure)
-    figure.set("hinge.bend", 1.0)
-    figure.advance(coarse=True)
-    assert figure.session.arrived and figure.pending
-    figure.advance()
-    assert not figure.pending
-
-
 def test_rest_leads_back_to_the_same_shape(figure):
     start, _ = go(figure)
     figure.set("hinge.bend", 10.0)
@@ -159,17 +150,6 @@ def test_distance_to_the_other_model(ball):
     # A chord of the polyhedron lies up to 0.05 inside the sphere of radius 10.
     np.testing.assert_allclose(values.max(), 1.0, atol=0.05)
     assert np.isnan(vertex_values("distance", "ball", picture_of(vertices, faces), [], None)).all()
-
-
-def test_colours_go_from_end_to_end_and_grey_is_unknown():
-    colouring = COLOURINGS["penetration"]
-    low, high, beyond, unknown = shades(colouring, np.array([0.0, 2.0, 9.0, np.nan]), 1.0)
-    np.testing.assert_allclose(beyond, high)
-    assert not np.allclose(low, high)
-    assert np.ptp(unknown) < 1e-9
-    # 2 mm are 0.2 cm.
-    np.testing.assert_allclose(shades(colouring, np.array([0.2]), 0.1)[0], high)
-    assert "<span>0.2</span>" in legend(colouring, "cm", 0.1)
 
 
 @pytest.fixture(scope="module")
