@@ -57,35 +57,57 @@ def write_gallery(root):
         list(pool.map(lambda name: _write_page(root, folder, name), EXAMPLES))
     listed = "\n".join(EXAMPLES)
     (folder / "index.md").write_text(
-        "# Gallery\n\nEach page is a script of `examples/`, run when these pages were built; each ends with a check of "
-        f"its own result.\n\n```{{toctree}}\n:maxdepth: 1\n\n{listed}\n```\n",
+        "# Gallery\n\nEach page is a script or a notebook of `examples/`, run when these pages were built; each ends with "
+        f"a check of its own result.\n\n```{{toctree}}\n:maxdepth: 1\n\n{listed}\n```\n",
         encoding="utf-8",
     )
 
 
+def find_example(root, name):
+    """Path of an example: a script, or a notebook."""
+    return next(path for path in (root / "examples").glob(f"{name}.*") if path.suffix in (".py", ".ipynb"))
+
+
+def read_example(path):
+    """Text of an example, which begins with its title, and its code; of a notebook all cells of either kind."""
+    source = path.read_text(encoding="utf-8")
+    if path.suffix == ".py":
+        return ast.get_docstring(ast.parse(source)), source.split('"""\n', 1)[1].strip()
+    cells = json.loads(source)["cells"]
+    text, code = (
+        "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == kind)
+        for kind in ("markdown", "code")
+    )
+    return text, code
+
+
+def run_example(path, pictures):
+    """Run an example's code in its folder, with where its files go; the finished process."""
+    return subprocess.run(
+        [sys.executable, "-c", read_example(path)[1], str(pictures)], cwd=path.parent, capture_output=True,
+        text=True, timeout=_TIMEOUT, env=os.environ | {"PYTHONUNBUFFERED": "1"}, check=False,
+    )  # fmt: skip
+
+
 def _write_page(root, folder, name):
-    script, page = root / "examples" / f"{name}.py", folder / f"{name}.md"
-    if page.exists() and page.stat().st_mtime > script.stat().st_mtime:
+    example, page = find_example(root, name), folder / f"{name}.md"
+    if page.exists() and page.stat().st_mtime > example.stat().st_mtime:
         return
     pictures = folder / name
     shutil.rmtree(pictures, ignore_errors=True)
-    done = subprocess.run(
-        [sys.executable, script.name, str(pictures)], cwd=script.parent, capture_output=True, text=True,
-        timeout=_TIMEOUT, env=os.environ | {"PYTHONUNBUFFERED": "1"}, check=False,
-    )  # fmt: skip
+    done = run_example(example, pictures)
     if done.returncode != 0:
-        raise RuntimeError(f"examples/{script.name} failed:\n{done.stderr[-2000:]}")
-    source = script.read_text(encoding="utf-8")
+        raise RuntimeError(f"examples/{example.name} failed:\n{done.stderr[-2000:]}")
+    text, code = read_example(example)
     shown = "\n\n".join(
         f"![{path.stem.replace('_', ' ')}]({name}/{path.name})" for path in sorted(pictures.glob("*.png"))
     )
     output = done.stdout.replace(str(pictures), name).replace(str(root), ".").splitlines()[:_LONGEST]
-    code = source.split('"""\n', 1)[1].strip()
     parts = [
-        ast.get_docstring(ast.parse(source)),
+        text,
         shown,
         "\n".join(["```text", *output, "```"]),
-        f"## The script\n\n```python\n{code}\n```\n",
+        f"## The code\n\n```python\n{code}\n```\n",
     ]
     page.write_text("\n\n".join(parts), encoding="utf-8")
 

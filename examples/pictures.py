@@ -13,7 +13,9 @@ _SAVED = {}  # runs that were drawn already, and their folders
 
 def folder(name):
     """Folder of an example's files: the first argument of the script, else example_output/NAME."""
-    path = Path(sys.argv[1]) if len(sys.argv) > 1 else Path("example_output") / name
+    # In a notebook the arguments are those of its kernel.
+    given = len(sys.argv) == 2 and not sys.argv[1].startswith("-")
+    path = Path(sys.argv[1]) if given else Path("example_output") / name
     path.mkdir(parents=True, exist_ok=True)
     return path
 

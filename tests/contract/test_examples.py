@@ -13,30 +13,28 @@ from command_line import call
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "docs"))
-from gallery import EXAMPLES  # noqa: E402
+from gallery import EXAMPLES, find_example, read_example, run_example  # noqa: E402
 
 # Scripts that are no pages of the gallery.
 OTHERS = {"pictures", "paper_experiments", "contact_pictures"}
 
 
-def test_every_script_is_a_page_of_the_gallery():
-    found = {path.stem for path in (ROOT / "examples").glob("*.py")}
-    assert found - OTHERS == set(EXAMPLES)
+def test_every_script_and_notebook_is_a_page_of_the_gallery():
+    found = [path for path in (ROOT / "examples").iterdir() if path.suffix in (".py", ".ipynb")]
+    assert sorted(path.stem for path in found if path.stem not in OTHERS) == sorted(EXAMPLES)
+    assert sum(path.suffix == ".ipynb" for path in found) == 2
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_example_begins_with_a_title_and_ends_with_a_check(name):
-    tree = ast.parse((ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8"))
-    assert ast.get_docstring(tree).startswith("# ")
-    assert any(isinstance(node, ast.Assert) for node in tree.body[-3:])
+    text, code = read_example(find_example(ROOT, name))
+    assert text.startswith("# ")
+    assert any(isinstance(node, ast.Assert) for node in ast.parse(code).body[-3:])
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_example_passes_its_own_check(name, tmp_path):
-    done = subprocess.run(
-        [sys.executable, f"{name}.py", str(tmp_path)], cwd=ROOT / "examples", env=dict(os.environ),
-        capture_output=True, text=True, timeout=600, check=False,
-    )  # fmt: skip
+    done = run_example(find_example(ROOT, name), tmp_path)
     assert done.returncode == 0, done.stderr[-2000:]
 
 
