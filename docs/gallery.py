@@ -57,8 +57,8 @@ def write_gallery(root):
         list(pool.map(lambda name: _write_page(root, folder, name), EXAMPLES))
     listed = "\n".join(EXAMPLES)
     (folder / "index.md").write_text(
-        "# Gallery\n\nEach page is a script or a notebook of `examples/`, run when these pages were built; each ends with "
-        f"a check of its own result.\n\n```{{toctree}}\n:maxdepth: 1\n\n{listed}\n```\n",
+        "# Gallery\n\nEach page is a script or a notebook of `examples/`, run when these pages were built; "
+        f"each ends with a check of its own result.\n\n```{{toctree}}\n:maxdepth: 1\n\n{listed}\n```\n",
         encoding="utf-8",
     )
 

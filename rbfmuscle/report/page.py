@@ -54,6 +54,8 @@ class Page:
         Few words each, beside the title.
     answer : str
         One sentence.
+    detail : str
+        What stands below it.
     state : {"good", "near", "bad", "plain"}
     scene : str
         From `pack_runs`; moves.
@@ -74,6 +76,7 @@ class Page:
     facts: Sequence[str]
     answer: str
     state: str = PLAIN
+    detail: str = ""
     scene: str = ""
     picture: str = ""
     missing: str = ""

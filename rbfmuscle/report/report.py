@@ -123,9 +123,9 @@ def packed_scene(runs: Mapping[str, SavedRun]) -> str:
 def _page(saved: SavedRun) -> Page:
     info = saved.info
     complete = info["status"] == "complete"
-    answer = info["verdict"]
+    answer, _, detail = info["verdict"].partition(". ")
     if not complete:
-        answer = f"the run ended early ({info['status']}): {info['message'] or ''}"
+        answer, detail = f"the run ended early ({info['status']}): {info['message'] or ''}", ""
     sections = [
         *_plots(saved),
         Section("Every quantity of every muscle", _summary(saved), "worst over the frames"),
@@ -143,6 +143,7 @@ def _page(saved: SavedRun) -> Page:
         _facts(saved),
         sentence(answer),
         BAD if info["beyond"] or not complete else GOOD,
+        detail=sentence(detail) if detail else "",
         lights=_lights(saved),
         sections=sections,
         footer=", ".join(f"{name} {value}" for name, value in info["versions"].items()),

@@ -108,7 +108,7 @@ class Panel:
         head = (" / ".join(side.choice for side in sides), "volume [%]", f"in bones [{units}]")
         rows = [f"<tr><th style='text-align:left'>{'</th><th>'.join(head)}</th></tr>"]
         for name, colour in self.source.colours.items() if sides else ():
-            cells = [f"<span style='color:{colour}'>■</span> {name}"]
+            cells = [f"<span style='color:{colour}'>■</span> {name.replace('_', ' ')}"]
             for key, digits in (("volume", 3), ("depth", 2)):
                 # 0.0 is added so that no -0 is shown.
                 numbers = (f"{round(side.numbers[name][key], digits) + 0.0:.{digits}f}" for side in sides)
@@ -116,7 +116,7 @@ class Panel:
             rows.append(f"<tr><td style='text-align:left'>{'</td><td>'.join(cells)}</td></tr>")
         self._numbers.content = (
             f"<div style='padding:4px 12px;font-size:12px'>{bar}<div style='max-height:170px;overflow:auto'>"
-            "<table style='width:100%;text-align:right;white-space:nowrap;line-height:1.25'>"
+            "<table style='width:100%;text-align:right;line-height:1.25'>"
             f"{''.join(rows)}</table></div>{'<br>'.join(text for text in texts if text)}</div>"
         )
 

@@ -65,7 +65,7 @@ def test_answer_picture_and_rows_come_before_what_is_folded(folder):
     text, outline = read(folder)
     verdict = describe_verdict(SavedRun(folder).info["muscles"], SavedRun(folder).info["limits"])
     order = [
-        verdict[1:],
+        verdict.partition(". ")[0][1:],
         'data-scene="scene"',
         "Keeps its volume",
         "<details>",
