@@ -210,14 +210,14 @@ def exceeded(table: Table, limits: Mapping[str, float]) -> list[tuple[str, str, 
             worst = math.nan if worst is None else worst  # as a file has it
             if not within(name, worst, limit):
                 found.append((muscle, name, worst, limit, facts.get("worst_frame")))
-    return sorted(found, key=_excess, reverse=True)
+    return sorted(found, key=lambda row: excess(*row[1:4]), reverse=True)
 
 
-def _excess(row):
-    """How many times its limit a worst value is, as far as that can be said."""
-    _, quantity, worst, limit, _ = row
-    bounded = quantity not in LEAST and limit > 0 and math.isfinite(worst)
-    return abs(worst) / limit if bounded else math.inf
+def excess(quantity: str, worst: float, limit: float) -> float:
+    """How many times its limit a worst value is; of limits that cannot say so, 0 within and infinite beyond."""
+    if quantity in LEAST or limit <= 0 or not math.isfinite(worst):
+        return 0.0 if within(quantity, worst, limit) else math.inf
+    return abs(worst) / limit
 
 
 def describe_verdict(table: Table, limits: Mapping[str, float]) -> str:
@@ -236,7 +236,9 @@ def describe_verdict(table: Table, limits: Mapping[str, float]) -> str:
     if not found:
         return text
     # The worst of each muscle first, then whatever else is beyond a limit.
-    first = sorted({row[0]: row for row in reversed(found)}.values(), key=_excess, reverse=True)
+    first = sorted(
+        {row[0]: row for row in reversed(found)}.values(), key=lambda row: excess(*row[1:4]), reverse=True
+    )
     named = [*first, *(row for row in found if row not in first)][:MOST_NAMED]
     remedies = dict.fromkeys(LIMITS[quantity].remedy for _, quantity, *_ in named if quantity in LIMITS)
     values = "; ".join(_describe_excess(row, table) for row in named)

@@ -74,7 +74,6 @@ class Stages:
     def __init__(self) -> None:
         self._values = defaultdict(lambda: defaultdict(list))
         self._work = defaultdict(Counter)
-        self._reasons = defaultdict(Counter)
         #: Pairs of neighbours: worst overlap and its frame, worst gap and its frame.
         self.pairs: dict[tuple[str, str], tuple[float, int, float, int]] = {}
 
@@ -87,7 +86,6 @@ class Stages:
             self.pairs[pair] = deepest, at, widest, there
         for name, work in frame.work.items():
             self._work[name].update({work.state: 1, "substeps": work.substeps})
-            self._reasons[name, work.state][work.reason] += 1
         for name, times in frame.times.items():
             surface = frame.surfaces.get(name)
             inner = surface.quantities if surface is not None else {}
@@ -102,19 +100,10 @@ class Stages:
         found = [{"muscles": list(pair), **dict(zip(names, worst))} for pair, worst in self.pairs.items()]
         return sorted(found, key=lambda row: -row["overlap_max"])
 
-    def work(self) -> dict[str, Any]:
-        """Nested dict: muscle -> frames ``solved``, ``carried``, ``skipped``; ``substeps``; commonest ``reasons``."""
-        return {
-            name: {
-                **{key: count[key] for key in ("solved", "carried", "skipped", "substeps")},
-                "reasons": {
-                    state: self._reasons[name, state].most_common(1)[0][0]
-                    for state in ("solved", "carried", "skipped")
-                    if count[state]
-                },
-            }
-            for name, count in self._work.items()
-        }
+    def work(self) -> dict[str, dict[str, int]]:
+        """Nested dict: muscle -> frames ``solved``, ``carried``, ``skipped``, and ``substeps``."""
+        keys = ("solved", "carried", "skipped", "substeps")
+        return {name: {key: count[key] for key in keys} for name, count in self._work.items()}
 
     def table(self) -> dict[str, Any]:
         """Nested dict: muscle -> stage -> total, median, 95th percentile and first [s]."""

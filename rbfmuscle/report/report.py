@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES
-from rbfmuscle.metrics.summary import LEAST, exceeded, muscle_limit, within
+from rbfmuscle.metrics.summary import LEAST, exceeded, excess, muscle_limit, within
 from rbfmuscle.output.animation.moving import read_moving
 from rbfmuscle.output.animation.page import pack_runs
 from rbfmuscle.output.colours import muscle_colours
@@ -133,7 +133,7 @@ def _page(saved: SavedRun) -> Page:
     sections += [
         Section("Neighbours", _neighbours(saved)),
         Section("Events", _events(saved.events), f"{len(saved.events)}"),
-        Section("Time of each stage", _stages(saved), "median milliseconds per frame"),
+        Section("Time of each stage", _stages(saved), "median per frame"),
         Section(
             "How to read this", _READING + definitions((n, meaning) for n, (_, meaning) in QUANTITIES.items())
         ),
@@ -183,7 +183,8 @@ def _light(saved: SavedRun, title: str, quantities: Sequence[str]) -> Light | No
             if facts and limits.get(name) is not None and muscle != ALL:
                 worst = math.nan if facts.get("worst") is None else facts["worst"]
                 limit = muscle_limit(name, limits[name], table_)
-                found.append((_excess(name, worst, limit), muscle, name, worst, facts, limit))
+                near = 0.0 if name in COUNTS and within(name, worst, limit) else excess(name, worst, limit)
+                found.append((near, muscle, name, worst, facts, limit))
     if not found:
         return None
     _, muscle, name, worst, facts, limit = max(found, key=lambda entry: entry[0])
@@ -195,13 +196,6 @@ def _light(saved: SavedRun, title: str, quantities: Sequence[str]) -> Light | No
     return Light(
         title, [Cell(number(worst, unit), worst, state)], shown, note if worst else name.replace("_", " ")
     )
-
-
-def _excess(name: str, worst: float, limit: float) -> float:
-    """How near a worst value is to its limit: 1 where it is there, more beyond."""
-    if not within(name, worst, limit):
-        return math.inf if limit <= 0 or name in LEAST or math.isnan(worst) else abs(worst) / limit
-    return 0.0 if name in COUNTS or limit <= 0 else abs(worst) / limit
 
 
 def _plots(saved: SavedRun) -> list[Section]:
@@ -290,23 +284,15 @@ def _stages(saved: SavedRun) -> str:
     """What each stage took of each muscle, the most expensive first, and in how many frames it was solved."""
     stages, work = saved.info.get("stages") or {}, saved.info.get("work") or {}
     names = list(dict.fromkeys(key for found in stages.values() for key in found))
-    rows: list[list[Cell | str]] = []
-    for muscle, found in stages.items():
-        medians = [(found.get(name) or {}).get("median") for name in names]
-        done = work.get(muscle, {})
-        cells = [Cell(f"{1e3 * value:.1f}" if value is not None else "–", value) for value in medians]
-        cells += [Cell(str(done.get(name, "–")), done.get(name)) for name in _WORK]
-        rows.append(
-            [muscle, *cells, Cell(", ".join(f"{k}: {v}" for k, v in done.get("reasons", {}).items()))]
-        )
-    rows.sort(
-        key=lambda row: -max((cell.value or 0.0 for cell in row[1:] if isinstance(cell, Cell)), default=0.0)
-    )
-    return (
-        table(["muscle", *(name.removeprefix("time_") for name in names), *_WORK, "why"], rows)
-        if rows
-        else ""
-    )
+    rows = []
+    for muscle, found in sorted(
+        stages.items(), key=lambda row: -max(part["median"] for part in row[1].values())
+    ):
+        medians = [found[name]["median"] if name in found else None for name in names]
+        cells = [Cell(number(value, "s"), value) for value in medians]
+        counts = [work.get(muscle, {}).get(name) for name in _WORK]
+        rows.append([muscle, *cells, *(Cell("–" if n is None else str(n), n) for n in counts)])
+    return table(["muscle", *(name.removeprefix("time_") for name in names), *_WORK], rows) if rows else ""
 
 
 def _neighbours(saved: SavedRun) -> str:

@@ -29,21 +29,12 @@ _MUSCLE, _OPACITY, _FAR_END, _OVERLAP, _AXIS = "#9a8f8f", 0.4, "#111111", "#e300
 _PALE, _MOST_NAMED = 0.72, 6
 
 
-class FarEnd(NamedTuple):
-    """A patch away from its bone: least distance, and the line to the nearest place on the bone."""
+class Fault(NamedTuple):
+    """An end of a muscle away from its bone, or a muscle inside one: how far or deep, and the places (n, 3) of it."""
 
     muscle: str
     bone: str
-    gap: float
-    line: Floats
-
-
-class Overlap(NamedTuple):
-    """Free vertices of a muscle inside a bone: the greatest depth, and their places."""
-
-    muscle: str
-    bone: str
-    depth: float
+    size: float
     points: Floats
 
 
@@ -83,7 +74,7 @@ def draw_scene(scene: Scene, path: str | Path) -> dict[str, int]:
     return {"far_ends": len(far), "overlaps": len(overlaps)}
 
 
-def find_faults(scene: Scene) -> tuple[list[FarEnd], list[Overlap]]:
+def find_faults(scene: Scene) -> tuple[list[Fault], list[Fault]]:
     """Ends of muscles away from their bones, and muscles that start inside bones."""
     millimetre = scene.length(1.0)
     distances = {bone.name: ExactDistance(*_mesh(bone)) for bone in scene.bones}
@@ -99,14 +90,14 @@ def find_faults(scene: Scene) -> tuple[list[FarEnd], list[Overlap]]:
             if gap > FAR * millimetre:
                 middle, places = patch.mean(axis=0), _mesh(bones[held.bone])[0]
                 nearest = places[np.argmin(((places - middle) ** 2).sum(axis=1))]
-                far.append(FarEnd(muscle.name, held.bone, gap, np.array([middle, nearest])))
+                far.append(Fault(muscle.name, held.bone, gap, np.array([middle, nearest])))
         for bone in scene.bones:
             low, high = bone.mesh.bounds
             near = vertices[((vertices > low) & (vertices < high)).all(axis=1) & free]
             depth = -distances[bone.name].signed_distance(near) if len(near) else np.zeros(0)
             deep = depth > DEEP * millimetre
             if deep.any():
-                overlaps.append(Overlap(muscle.name, bone.name, float(depth.max()), near[deep]))
+                overlaps.append(Fault(muscle.name, bone.name, float(depth.max()), near[deep]))
     return far, overlaps
 
 
@@ -129,7 +120,7 @@ def _muscle_solids(muscle: Muscle, colours: dict[str, str]) -> list[Solid]:
 
 
 def _marked(
-    image: Integers, camera: Camera, scene: Scene, far: list[FarEnd], overlaps: list[Overlap]
+    image: Integers, camera: Camera, scene: Scene, far: list[Fault], overlaps: list[Fault]
 ) -> Integers:
     """The picture with joints, far ends and overlaps drawn over it."""
     from PIL import Image, ImageDraw
@@ -140,7 +131,7 @@ def _marked(
         for x, y, _ in camera.project(overlap.points):
             pen.ellipse((x - 2, y - 2, x + 2, y + 2), fill=_OVERLAP)
     for end in far:
-        pen.line([tuple(place[:2]) for place in camera.project(end.line)], fill=_FAR_END, width=3)
+        pen.line([tuple(place[:2]) for place in camera.project(end.points)], fill=_FAR_END, width=3)
     _draw_joints(pen, camera, scene)
     return np.asarray(sheet)
 
@@ -175,11 +166,10 @@ def _bone_colour(k: int) -> str:
     return mixed_colour(MUSCLE_COLOURS[k % len(MUSCLE_COLOURS)], -min(0.45 * (k // len(MUSCLE_COLOURS)), 0.8))
 
 
-def _notes(scene: Scene, far: list[FarEnd], overlaps: list[Overlap]) -> list[str]:
+def _notes(scene: Scene, far: list[Fault], overlaps: list[Fault]) -> list[str]:
     """The worst of what is marked, in words."""
-    ends = sorted(far, key=lambda end: -end.gap)[:_MOST_NAMED]
-    deepest = sorted(overlaps, key=lambda overlap: -overlap.depth)[:_MOST_NAMED]
-    return [
-        *(f"{end.muscle} ends {end.gap:.3g} {scene.units} from {end.bone}" for end in ends),
-        *(f"{one.muscle} is {one.depth:.3g} {scene.units} deep in {one.bone}" for one in deepest),
-    ]
+    words = []
+    for faults, verb, place in ((far, "ends", "from"), (overlaps, "is", "deep in")):
+        for one in sorted(faults, key=lambda fault: -fault.size)[:_MOST_NAMED]:
+            words.append(f"{one.muscle} {verb} {one.size:.3g} {scene.units} {place} {one.bone}")
+    return words

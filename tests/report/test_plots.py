@@ -133,7 +133,6 @@ def test_stages_sum_times_and_work_and_keep_the_worst_of_neighbours():
     assert table["a"]["time_fit"]["total"] == 0.5
     work = stages.work()["a"]
     assert [work[key] for key in ("solved", "carried", "skipped", "substeps")] == [4, 1, 0, 8]
-    assert work["reasons"] == {"solved": "bones turn", "carried": "moves with b"}
     first, second = stages.neighbours()
     assert first == {
         "muscles": ["a", "c"],

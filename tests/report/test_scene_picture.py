@@ -19,7 +19,7 @@ def test_far_ends_and_overlaps_are_those_of_the_scene():
     inside.apply_translation(np.asarray(scene.bones[1].mesh.centroid) - inside.centroid)
     scene.muscles[1].mesh = inside
     far, overlaps = find_faults(scene)
-    gaps = {(end.muscle, end.bone): end.gap for end in far}
+    gaps = {(end.muscle, end.bone): end.size for end in far}
     assert all(250.0 < gaps[muscle.name, a.bone] < 410.0 for a in muscle.attachments)
     assert ("femur", scene.muscles[1].name) in {(one.bone, one.muscle) for one in overlaps}
     deep = next(one for one in overlaps if one.bone == "femur")
