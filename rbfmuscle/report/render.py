@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.threads import each
 from rbfmuscle.output.colours import BONE_COLOUR, MUSCLE_COLOURS, muscle_colours, rgb
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report.appearance import BACKGROUND, USUAL_VIEWS, VIEWS, motion_direction, muscle_groups
@@ -91,7 +92,7 @@ def draw_panels(
     panels: Sequence[Panel], frames: Sequence[int], titles: Sequence[str], chips: Mapping[str, str]
 ) -> list[Image]:
     """Panels beside each other, a picture for each frame, with titles above and caption and colours below."""
-    images = [np.concatenate([panel.draw(frame) for panel in panels], axis=1) for frame in frames]
+    images = each(lambda frame: np.concatenate([panel.draw(frame) for panel in panels], axis=1), frames)
     saved = panels[0].saved
     return [labelled(image, saved.caption(k), titles, chips) for image, k in zip(images, frames)]
 

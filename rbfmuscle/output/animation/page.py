@@ -151,4 +151,4 @@ class _Packer:
 
     def text(self) -> str:
         """All of it, deflated, as base64."""
-        return base64.b64encode(zlib.compress(b"".join(self.parts), 6)).decode("ascii")
+        return base64.b64encode(zlib.compress(b"".join(self.parts), 4)).decode("ascii")
