@@ -92,6 +92,17 @@ class TestMeshDistance:
         # Near zero both round a squared distance.
         np.testing.assert_allclose(MeshDistance(*arrays(blob)).signed(points), expected, atol=1e-9)
 
+    def test_triangles_near_from_the_frame_before_change_no_distance(self, blob):
+        vertices, faces = arrays(blob)
+        points = vertices + np.random.default_rng(5).normal(scale=0.3, size=vertices.shape)
+        before, near = MeshDistance(vertices, faces), np.full(len(points), -1)
+        before.unsigned(points, near=near)
+        moved = vertices * [1.1, 0.9, 1.0] + [0.5, 0.0, 0.0]
+        later = MeshDistance(moved, faces, layout=before.layout)
+        np.testing.assert_array_equal(
+            later.unsigned(points, near=near), MeshDistance(moved, faces).unsigned(points)
+        )
+
     def test_deepest_point_is_not_believed_at_a_fold(self):
         # A flap folded flat onto the outside: the layers above it look like the inside from one face.
         box = trimesh.creation.box((2, 2, 2))
