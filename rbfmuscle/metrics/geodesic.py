@@ -18,6 +18,7 @@ NODES = 33
 ROUNDS = 40  # in which planes are taken, at most
 STILL = 1e-4  # of the string's length: what counts as the same place
 SWEEPS, OVER_RELAXATION = 100, 1.8  # of a round
+RENEWED = 0.1  # of its distance to the nearest bone: a node that has moved farther gets another plane
 # Nearer to a bone than this its distance is no way to tell the normal, in lengths of the string.
 TOUCHING = 1e-9
 
@@ -48,24 +49,28 @@ def shortest_path(
     if not any(probe.inside(inner, pose=inverse_pose(poses[probe.name])).any() for probe in near):
         return chord[[0, -1]]
     string = resampled(line, NODES - 1) + (0.0 if offset is None else offset)
-    still, earlier = STILL * distance_along(line)[-1], [string]
+    size, earlier = float(distance_along(line)[-1]), [string]
+    gap, normal = _planes(string, near, poses, TOUCHING * size)
+    taken, offsets = string.copy(), np.einsum("ij,ij->i", normal, string) - gap
     for _ in range(ROUNDS):
-        gap, normal = _planes(string, near, poses)
         string = string.copy()
-        _tighten_loop(
-            string, normal, np.einsum("ij,ij->i", normal, earlier[-1]) - gap, SWEEPS, OVER_RELAXATION
-        )
+        _tighten_loop(string, normal, offsets, SWEEPS, OVER_RELAXATION)
         # A node between two planes can go to and fro.
-        if min(np.abs(string - other).max() for other in earlier) < still:
+        if min(np.abs(string - other).max() for other in earlier) < STILL * size:
             break
         earlier = [earlier[-1], string]
+        renewed = np.abs(string - taken).max(axis=1) > RENEWED * np.abs(gap)
+        gap[renewed], normal[renewed] = _planes(string[renewed], near, poses, TOUCHING * size)
+        taken[renewed] = string[renewed]
+        offsets[renewed] = np.einsum("ij,ij->i", normal, string)[renewed] - gap[renewed]
     return string
 
 
-def _planes(points: Floats, probes: list[BoneProbe], poses: dict[str, Floats]) -> tuple[Floats, Floats]:
+def _planes(
+    points: Floats, probes: list[BoneProbe], poses: dict[str, Floats], least: float
+) -> tuple[Floats, Floats]:
     """Signed distance (n,) to the nearest bone and the unit normal (n, 3) of the plane that touches it there."""
     gap, normal = np.full(len(points), np.inf), np.zeros((len(points), 3))
-    least = TOUCHING * max(distance_along(points)[-1], 1e-300)
     for probe in probes:
         pose = poses[probe.name]
         local = bone_coordinates(points, pose)
