@@ -28,28 +28,25 @@ class AnalyticBone:
         return self.distance_and_gradient(points, pose)[0]
 
 
-def sphere(radius=1.0, centre=(0, 0, 0)):
+def _round(radius, centre, axes, half):
+    """All within a radius of a centre, by the coordinates of which ``axes`` is 1."""
     centre = np.asarray(centre, dtype=float)
 
     def formula(p):
-        d = p - centre
+        d = (p - centre) * axes
         r = np.maximum(np.linalg.norm(d, axis=1), 1e-12)
         return r - radius, d / r[:, None]
 
-    return AnalyticBone(formula, [centre - radius, centre + radius])
-
-
-def cylinder(radius=1.0, half_length=50.0, axis=(0.0, 0.0)):
-    """Along z through ``axis``, endless inside its box."""
-    centre = np.array([*axis, 0.0])
-
-    def formula(p):
-        d = (p - centre) * [1, 1, 0]
-        r = np.maximum(np.linalg.norm(d, axis=1), 1e-12)
-        return r - radius, d / r[:, None]
-
-    half = np.array([radius, radius, half_length])
     return AnalyticBone(formula, [centre - half, centre + half])
+
+
+def sphere(radius=1.0, centre=(0, 0, 0)):
+    return _round(radius, centre, np.ones(3), np.full(3, radius))
+
+
+def cylinder(radius=1.0, half_length=50.0):
+    """Along z, endless inside its box."""
+    return _round(radius, np.zeros(3), np.array([1, 1, 0]), np.array([radius, radius, half_length]))
 
 
 def box(half, centre=(0, 0, 0)):
@@ -223,3 +220,38 @@ def hinged_scene(angles, **options):
         **options,
     )
     return made, fields
+
+
+def box_mesh(low, high):
+    """A box between two corners, its sides in 128 triangles each."""
+    low, high = np.array(low, float), np.array(high, float)
+    mesh = trimesh.creation.box(extents=high - low).subdivide().subdivide().subdivide()
+    mesh.apply_translation(0.5 * (low + high))
+    return mesh
+
+
+def neighbour_scene(angles, gap=1.0, *, sliding, order=(0, 1), belly=4.0):
+    """Two long muscles side by side, "lower" and "upper": (scene, fields).
+
+    One end of the upper hangs on an arm that presses it into the lower, lifts it off or rolls it along, by angles in
+    degrees: a dict for each frame.
+    """
+    fields = {"trunk": sphere(1.0, (0, 0, -60)), "arm": box((1, 1, 1), (60, 0, -40))}
+    muscles = []
+    for k, (name, far) in enumerate((("lower", "trunk"), ("upper", "arm"))):
+        mesh = ellipsoid((30, belly, belly), (0, 0, (2 * belly + gap) * k), subdivisions=3)
+        ends = [attach(mesh, "trunk", lambda v: v[:, 0] < -25), attach(mesh, far, lambda v: v[:, 0] > 25)]
+        muscles.append(muscle(name, mesh, ends))
+    made = scene(
+        [bone(name, field) for name, field in fields.items()],
+        [joint("hinge", "trunk", "arm", (-30, 0, 0), press=(0, 1, 0), lift=(0, -1, 0), roll=(1, 0, 0))],
+        [muscles[k] for k in order],
+        [{f"hinge.{name}": np.radians(a) for name, a in angle.items()} for angle in angles],
+        sliding=sliding,
+    )
+    return made, fields
+
+
+def neighbour_parts(made):
+    """Toy muscles of such a scene, by name."""
+    return {one.name: ToyMuscle(one, made, sweeps=4, reach=2.0) for one in made.muscles}

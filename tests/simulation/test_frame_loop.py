@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, hinged_scene, joint, muscle, scene, sphere
+from toy_scene import ToyMuscle, bone, box, hinged_scene
 
 from rbfmuscle import models
 from rbfmuscle.scene.motion import bone_poses
@@ -38,40 +38,16 @@ def test_frames_carry_what_they_promise():
     assert sum(f.wall for f in frames) >= sum(f.times["strap"].get("time_solve", 0.0) for f in frames)
 
 
-def test_a_failing_frame_leaves_those_before():
-    made, fields = hinged_scene([0, 10, 20, 30])
-    model = ToyMuscle(made.muscles[0], made)
-    predict = model.predict
-
-    def fails_in_the_third(before, after):
-        if min(np.trace(pose) for pose in after.values()) < 2 + 2 * np.cos(np.radians(15)):
-            raise SolveError("planted")
-        predict(before, after)
-
-    model.predict = fails_in_the_third
-    seen = []
-    with pytest.raises(SolveError, match="planted"):
-        for frame in simulate_frames(made, [model], fields=fields):
-            seen.append((frame.index, sorted(frame.surfaces)))
-    assert seen == [(0, ["strap"]), (1, ["strap"])]
-
-
-def test_muscle_stays_out_of_the_bone_it_wraps():
-    made, fields = hinged_scene([0, 40, 80])
+def test_muscle_stays_out_of_the_bone_it_wraps_however_it_gets_there():
+    made, fields = hinged_scene([0, 20, 40, 60])
     model = ToyMuscle(made.muscles[0], made)
     for frame in simulate_frames(made, [model], fields=fields):
         distance = fields["trunk"].distance(model.x[model.contact_bone < 0], frame.poses["trunk"])
         assert distance.min() > -0.05
-
-
-def test_first_frame_is_reached_from_the_rest_pose():
-    direct, _ = _run([60])
-    stepped, _ = _run([0, 20, 40, 60])
-    assert direct[0].index == 0
-    # The toy's target does not depend on the path; only contact does.
-    assert np.allclose(
-        direct[-1].surfaces["strap"].vertices, stepped[-1].surfaces["strap"].vertices, atol=0.05
-    )
+    # The first frame is reached from the rest pose. The toy's target does not depend on the path; only contact does.
+    (direct,), _ = _run([60])
+    assert direct.index == 0
+    assert np.allclose(direct.surfaces["strap"].vertices, model.x, atol=0.05)
 
 
 def test_sub_steps_bound_turn_and_travel():
@@ -108,82 +84,53 @@ def test_sub_steps_end_at_the_same_angles_however_frames_are_spaced():
     np.testing.assert_allclose(back[-2::-1], whole[:-1], rtol=0, atol=1e-12)
 
 
-def test_whole_turn_in_one_step_is_split():
-    made, _ = hinged_scene([0, 360])
-    assert len(SubSteps(made).split(*made.motion.frames)) >= 180
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-7, 0.5, 3.1])
-def test_turned_angle(angle):
-    c, s = np.cos(angle), np.sin(angle)
-    assert turned_angle(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])) == pytest.approx(angle, rel=1e-9)
-
-
-def test_bones_out_of_reach_are_left_out():
-    fields = {"near": sphere(5.0), "far": box((2, 2, 2), (500, 0, 0))}
-    mesh = ellipsoid((10, 3, 3), (0, 0, 9))
-    ends = [attach(mesh, "near", lambda v: v[:, 0] < -8)]
-    made = scene([bone(n, f) for n, f in fields.items()], [], [muscle("m", mesh, ends)], [{}])
-    assert set(find_contact_pairs(made)) == {("m", "near")}
-
-
-def test_swept_region_follows_the_motion():
-    made, fields = hinged_scene([0, 90])
-    fields["post"] = box((2, 2, 2), (0, -30, 0))
-    made.bones.append(bone("post", fields["post"]))
+def test_bones_out_of_reach_of_the_motion_are_left_out():
+    made, _ = hinged_scene([0, 90])
+    made.bones += [bone("post", box((2, 2, 2), (0, -30, 0))), bone("far", box((2, 2, 2), (500, 0, 0)))]
     assert ("strap", "post") in find_contact_pairs(made)
+    assert ("strap", "far") not in find_contact_pairs(made)
     assert len(sampled_poses(made)) > 9
     made.motion.frames[:] = [{}]
     assert ("strap", "post") not in find_contact_pairs(made)
 
 
 class _Breaking(ToyMuscle):
+    """Gives infinite vertices, or raises what it is given, in frame 3."""
+
+    breaks = None
+
     def solve(self, contacts):
         super().solve(contacts)
+        if self.solves > 12 and self.breaks is not None:
+            raise self.breaks
         if self.solves > 12:
             self.x = self.x * np.nan
 
 
-class _Interrupting(ToyMuscle):
-    def solve(self, contacts):
-        super().solve(contacts)
-        if self.solves > 12:
-            raise KeyboardInterrupt
-
-
-class _Singular(ToyMuscle):
-    def solve(self, contacts):
-        raise np.linalg.LinAlgError("singular matrix")
-
-
 @pytest.mark.parametrize("count", [1, 3])
-def test_failing_solve_names_muscle_frame_and_coordinate_and_keeps_the_frames(count):
+@pytest.mark.parametrize(
+    ("breaks", "error", "message"),
+    [
+        (None, SolveError, r"'strap', frame 3 \(hinge.bend = .*deg\).*not finite"),
+        (np.linalg.LinAlgError("singular matrix"), SolveError, r"frame 3 .*singular matrix"),
+        (KeyboardInterrupt(), KeyboardInterrupt, None),
+    ],
+)
+def test_failing_solve_names_muscle_frame_and_coordinate_and_keeps_the_frames(
+    monkeypatch, count, breaks, error, message
+):
+    monkeypatch.setattr(_Breaking, "breaks", breaks)
     made, fields = hinged_scene([0, 10, 20, 30, 40])
     parts = [_Breaking(made.muscles[0], made) for _ in range(count)]
     frames = []
-    with pytest.raises(SolveError, match=r"'strap', frame 3 \(hinge.bend = .*deg\).*not finite"):
+    with pytest.raises(error, match=message):
         for frame in simulate_frames(made, parts, fields=fields):
             frames.append(frame)
     assert [frame.index for frame in frames] == [0, 1, 2]
 
 
-def test_singular_system_becomes_a_solve_error():
-    made, fields = hinged_scene([0, 10])
-    with pytest.raises(SolveError, match=r"frame 1 .*singular matrix"):
-        list(simulate_frames(made, [_Singular(made.muscles[0], made)], fields=fields))
-
-
-def test_interrupt_keeps_the_frames_so_far():
-    made, fields = hinged_scene([0, 10, 20, 30])
-    frames = []
-    with pytest.raises(KeyboardInterrupt):
-        for frame in simulate_frames(made, [_Interrupting(made.muscles[0], made)], fields=fields):
-            frames.append(frame)
-    assert len(frames) == 3
-
-
-def test_leaving_early_ends_the_workers():
-    made, fields = hinged_scene([0, 10, 20])
+def test_leaving_early_and_failing_to_begin_end_the_workers():
+    made, fields = hinged_scene([0, 10, 20], initial="error")
     parts = [ToyMuscle(made.muscles[0], made) for _ in range(2)]
     before = set(threading.enumerate())
     course = simulate_frames(made, parts, fields=fields)
@@ -191,119 +138,48 @@ def test_leaving_early_ends_the_workers():
     course.close()
     assert parts[0].solves == 0  # the frames to come are not begun
     assert set(threading.enumerate()) == before
+    made.muscles[0].mesh.apply_translation([0, -4.0, 0])
+    with pytest.raises(SceneError, match="overlaps bone 'trunk' at rest"):
+        FrameLoop(made, [ToyMuscle(made.muscles[0], made) for _ in range(3)], fields=fields)
+    assert set(threading.enumerate()) == before
 
 
-def _several(count):
-    """Muscles of different girth side by side over the same two bones."""
-    fields = {"trunk": sphere(8.0), "arm": box((15, 2, 2), (30, 0, 0))}
-    muscles = []
-    for k in range(count):
-        mesh = ellipsoid((32, 3, 3), (0, 13.5, 8.0 * k - 8.0))
-        ends = [attach(mesh, "trunk", lambda v: v[:, 0] < -24), attach(mesh, "arm", lambda v: v[:, 0] > 24)]
-        muscles.append(muscle(f"m{k}", mesh, ends))
-    joints = [joint("hinge", "trunk", "arm", (0, 0, 0), bend=(0, 0, -1))]
-    frames = [{"hinge.bend": np.radians(a)} for a in (0, 30)]
-    return scene([bone(n, f) for n, f in fields.items()], joints, muscles, frames), fields
-
-
-def test_muscles_in_parallel_give_what_they_give_alone():
-    made, fields = _several(3)
-    together = list(simulate_frames(made, [ToyMuscle(m, made) for m in made.muscles], fields=fields))[-1]
-    for one in made.muscles:
-        alone = list(simulate_frames(made, [ToyMuscle(one, made)], fields=fields))[-1]
-        assert np.array_equal(alone.surfaces[one.name].vertices, together.surfaces[one.name].vertices)
-
-
-def test_models_may_come_as_a_dict_and_frames_be_chosen():
-    made, fields = hinged_scene([0, 10, 20, 30])
-    model = ToyMuscle(made.muscles[0], made)
-    frames = list(simulate_frames(made, {"strap": model}, fields=fields, written={1, 3}))
-    assert [frame.index for frame in frames] == [1, 3]
-
-
-def test_without_surfaces_none_is_extracted():
+def test_without_surfaces_and_tables_nothing_is_extracted_and_no_optional_module_loaded():
+    optional = {
+        f"rbfmuscle.{name}" for name in ("simulation.sliding", "simulation.neighbour_surface", "bones.sdf")
+    }
+    for name in optional:
+        sys.modules.pop(name, None)
     made, fields = hinged_scene([0, 10])
     model = ToyMuscle(made.muscles[0], made)
     model.drawing = None
-    frames = list(simulate_frames(made, [model], fields=fields, surfaces=False))
-    assert frames[-1].surfaces == {}
-    assert "time_surface" not in frames[-1].times["strap"]
-
-
-def test_without_tables_no_optional_module_is_loaded():
-    for name in (
-        "rbfmuscle.simulation.sliding",
-        "rbfmuscle.simulation.neighbour_surface",
-        "rbfmuscle.bones.sdf",
-    ):
-        sys.modules.pop(name, None)
-    frames, _ = _run([0, 10])
-    assert not {
-        "rbfmuscle.simulation.sliding",
-        "rbfmuscle.simulation.neighbour_surface",
-        "rbfmuscle.bones.sdf",
-    } & set(sys.modules)
-    assert not {"time_sliding", "time_tunnelling"} & set(frames[-1].times["strap"])
-
-
-def test_scene_without_bones_in_reach_builds_no_field():
-    mesh = ellipsoid((10, 3, 3), (0, 0, 200.0))
-    base = sphere(5.0)
-    made = scene(
-        [bone("base", base)], [], [muscle("m", mesh, [attach(mesh, "base", lambda v: v[:, 0] < -8)])], [{}]
-    )
-    sys.modules.pop("rbfmuscle.bones.sdf", None)
-    (frame,) = simulate_frames(made, [ToyMuscle(made.muscles[0], made)])
-    assert "rbfmuscle.bones.sdf" not in sys.modules
-    # It stands apart from the bone and nothing moves, so it stays as it is.
-    assert np.array_equal(frame.surfaces["m"].vertices, mesh.vertices)
-
-
-def _crossing():
-    """A muscle that is bent by 60 degrees, watched for tunnelling."""
-    made, fields = hinged_scene([0, 10, 20, 30], tunnelling=TunnellingOptions())
-    return made, fields, ToyMuscle(made.muscles[0], made)
+    *_, last = simulate_frames(made, [model], fields=fields, surfaces=False)
+    assert last.surfaces == {}
+    assert not {"time_surface", "time_sliding", "time_tunnelling"} & set(last.times["strap"])
+    assert not optional & set(sys.modules)
 
 
 def test_frames_that_are_skipped_leave_the_muscle_where_shown_ones_would():
-    made, fields, shown = _crossing()
+    made, fields = hinged_scene([0, 10, 20, 30], tunnelling=TunnellingOptions())
+    shown, skipping = (ToyMuscle(made.muscles[0], made) for _ in range(2))
     with FrameLoop(made, [shown], fields=fields) as loop:
         frames = [loop.advance(coordinates) for coordinates in made.motion.frames]
-    made, fields, skipping = _crossing()
     with FrameLoop(made, [skipping], fields=fields) as loop:
         for coordinates in made.motion.frames[:-1]:
             loop.skip(coordinates)
         last = loop.advance(made.motion.frames[-1])
-    assert last.index == 3 and np.array_equal(last.surfaces["strap"].vertices, shown.x)
-    assert skipping.solves == shown.solves
-    # What happened on the way is told with the frame that is shown.
-    assert last.events == [event for frame in frames for event in frame.events]
-    assert last.times["strap"]["time_solve"] > 0.0
-
-
-def test_a_loop_follows_a_path_that_is_not_known_beforehand():
-    made, fields, model = _crossing()
-    with FrameLoop(made, [model], fields=fields) as loop:
-        there = [loop.advance({"hinge.bend": np.radians(a)}) for a in (0, 30)]
+        assert last.index == 3 and np.array_equal(last.surfaces["strap"].vertices, shown.x)
+        assert skipping.solves == shown.solves
+        # What happened on the way comes with the frame that is shown.
+        assert last.events == [event for frame in frames for event in frame.events]
+        assert last.times["strap"]["time_solve"] > 0.0
         back = loop.advance({"hinge.bend": 0.0})
-    assert [frame.index for frame in (*there, back)] == [0, 1, 2]
     # The toy's target does not depend on the path; only contact does.
-    assert np.allclose(back.surfaces["strap"].vertices, there[0].surfaces["strap"].vertices, atol=0.05)
+    assert np.allclose(back.surfaces["strap"].vertices, frames[0].surfaces["strap"].vertices, atol=0.05)
     assert loop.here == {"hinge.bend": 0.0}
-
-
-def test_a_loop_that_cannot_begin_ends_its_threads():
-    made, fields = hinged_scene([0], initial="error")
-    made.muscles[0].mesh.apply_translation([0, -4.0, 0])
-    before = threading.active_count()
-    with pytest.raises(SceneError, match="overlaps bone 'trunk' at rest"):
-        FrameLoop(made, [ToyMuscle(made.muscles[0], made) for _ in range(3)], fields=fields)
-    assert threading.active_count() == before
 
 
 def test_unknown_model_names_the_nearest_right_one():
     made, _ = hinged_scene([0])
     with pytest.raises(UsageError, match="unknown model 'xpdb', did you mean 'xpbd'"):
         models.build_model(made.muscles[0], made, "xpdb")
-    with pytest.raises(UsageError, match="known: rbf, pbd"):
-        models.build_model(made.muscles[0], made, "finite")
