@@ -9,12 +9,10 @@ from contraction_scenes import MUSCLE, belly_length, compare_spindle, spindle_sc
 import rbfmuscle as rm
 from rbfmuscle.muscle.muscle import RBFMuscle
 from rbfmuscle.muscle.options import RBFOptions
-from rbfmuscle.scene.activation.keys import ContractionTable
 
 DATA = Path(__file__).resolve().parents[1] / "data" / "contraction_spindle.npz"
 INSIDE = {"name": "rbf", "centres": 300, "nodes": 300}
 TENDON = {"length": 100.0, "strain": 0.08}
-QUIET = {"output.surfaces": False}
 
 
 def test_spindle_lies_near_the_one_of_finite_elements():
@@ -29,25 +27,6 @@ def test_spindle_lies_near_the_one_of_finite_elements():
     wanted = belly_length(*(kept["vertices"][k].astype(float) for k in (0, -1)))
     assert belly_length(rest, now) == pytest.approx(wanted, rel=0.04)
     assert np.abs(run.values(MUSCLE, "volume_error")).max() < 1e-10
-
-
-def test_activation_zero_changes_nothing_and_all_of_it_comes_back():
-    phantom = rm.phantom_scene(end=10.0, step=10.0, spacing=4.0)
-    phantom.muscles = [phantom.muscle("extensor")]
-    asked = QUIET
-    plain = rm.simulate(phantom, settings=asked)
-    phantom.muscles[0].contraction = ContractionTable(activation=0.0)
-    active = rm.simulate(phantom, settings=asked)
-    for one, other in zip(plain.frames, active.frames, strict=True):
-        assert np.array_equal(one.carried["extensor"][0], other.carried["extensor"][0])
-    found = []
-    for count in (1, 4):
-        scene = spindle_scene(model=INSIDE, frames=2 * count, activation=[0, 1, 0], tendon=TENDON)
-        run = rm.simulate(scene, settings=QUIET)
-        shapes = [frame.carried[MUSCLE][0] for frame in run.frames]
-        assert np.linalg.norm(shapes[-1] - shapes[0], axis=1).max() < 0.1  # mm
-        found.append(shapes[count])
-    assert np.linalg.norm(found[1] - found[0], axis=1).max() < 0.1
 
 
 def test_fibres_through_a_unit_area_are_those_of_the_belly_over_its_girth():

@@ -19,9 +19,8 @@ def drawn():
     """A spindle's model and what it meets."""
     scene = build_scene()
     model = RBFMuscle(scene.muscles[0], scene)
-    names = [bone.name for bone in scene.bones]
-    fields = [BoneSDF.from_mesh(bone.mesh, cache=False) for bone in scene.bones]
-    return model, BoneContacts(names, fields, contact_bone=model.contact_bone)
+    fields = {bone.name: BoneSDF.from_mesh(bone.mesh, cache=False) for bone in scene.bones}
+    return model, BoneContacts(list(fields), list(fields.values()), contact_bone=model.contact_bone)
 
 
 def no_fit():
