@@ -29,30 +29,18 @@ def _near(mesh, width, count=20000, seed=0):
     return points + mesh.face_normals[faces] * rng.uniform(-width, width, (count, 1))
 
 
-def _pose():
-    pose = trimesh.transformations.rotation_matrix(1.1, [1.0, -2.0, 0.5])
-    pose[:3, 3] = [100.0, -40.0, 7.0]
-    return pose
-
-
-def _angles(field, exact, points):
-    distance, closest, _, _ = exact.nearest(points)
-    away = np.abs(distance) > 0.02
-    cosine = np.einsum(
-        "ni,ni->n", field.gradient(points[away]), (points[away] - closest[away]) / distance[away, None]
-    )
-    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-
-
 def test_band_meets_the_promised_accuracy(shape):
     mesh, field = shape
     points = _near(mesh, 1.0)
-    exact = field.exact.signed_distance(points)
+    exact, closest, _, _ = field.exact.nearest(points)
     error = field.distance(points) - exact
     assert np.sqrt(np.mean(error**2)) <= 0.01
     assert np.abs(error).max() <= 0.3
     assert np.mean(field.distance(points) * exact < 0.0) <= 1e-4
-    assert np.median(_angles(field, field.exact, _near(mesh, 2.0))) <= 0.5
+    away = np.abs(exact) > 0.02
+    outward = (points[away] - closest[away]) / exact[away, None]
+    cosine = np.einsum("ni,ni->n", field.gradient(points[away]), outward)
+    assert np.median(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))) <= 0.5
 
 
 def test_distances_far_from_the_bone_are_right(shape):
@@ -93,7 +81,9 @@ def test_gradient_is_that_of_the_distance(shape):
 
 def test_pose_moves_points_and_turns_gradients(shape):
     mesh, field = shape
-    points, pose = _near(mesh, 3.0, 5000), _pose()
+    points = _near(mesh, 3.0, 5000)
+    pose = trimesh.transformations.rotation_matrix(1.1, [1.0, -2.0, 0.5])
+    pose[:3, 3] = [100.0, -40.0, 7.0]
     moved = trimesh.transform_points(points, pose)
     distance, gradient = field.distance_and_gradient(points)
     there, turned = field.distance_and_gradient(moved, pose)
@@ -154,13 +144,9 @@ def test_smaller_tolerance_gives_smaller_errors():
         assert field.error <= tolerance
         errors.append(np.sqrt(np.mean((field.distance(points) - field.exact.signed_distance(points)) ** 2)))
         sizes.append(field.memory)
-    assert errors[2] <= errors[1] <= errors[0]
-    assert sizes[2] >= sizes[1] >= sizes[0]
-
-
-def test_tolerance_beyond_the_memory_is_a_clear_error():
+    assert errors == sorted(errors, reverse=True) and sizes == sorted(sizes)
     with pytest.raises(MeshError, match=r"tib: a tolerance .* needs about .* MB.*memory limit"):
-        BoneSDF.from_mesh(SHAPES["torus"](), tolerance=1e-9, memory_limit=3_000_000, cache=False, name="tib")
+        BoneSDF.from_mesh(mesh, tolerance=1e-9, memory_limit=3_000_000, cache=False, name="tib")
 
 
 def test_bad_points_and_poses_are_refused():
@@ -175,9 +161,9 @@ def test_bad_points_and_poses_are_refused():
 
 
 @pytest.mark.parametrize(
-    ("turn", "scale"), [([0.4, -1.0, 2.0], 1.0), ([0.0, 0.0, 0.0], 1e-3), ([3.0, 0.1, 0.0], 10.0)]
+    ("name", "turn", "scale"),
+    [("torus", [0.4, -1.0, 2.0], 1.0), ("sphere", [0.0, 0.0, 0.0], 1e-3), ("box", [3.0, 0.1, 0.0], 10.0)],
 )
-@pytest.mark.parametrize("name", ["torus", "sphere", "box"])
 def test_a_moved_turned_or_scaled_bone_has_the_same_field(name, turn, scale):
     mesh = SHAPES[name]()
     points = _near(mesh, 2.0, 2000)
