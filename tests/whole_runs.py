@@ -163,27 +163,27 @@ def measure(name):
 def differences(kept, found, place=""):
     """Largest difference by kind of number, and where it is: a dict of kind to (difference, place)."""
     worst = {}
-    _compare(kept, found, place, "", worst)
+    for (where, kind, a), (other, _, b) in zip(_numbers(kept, place), _numbers(found, place), strict=True):
+        if where != other or (a is None) != (b is None):
+            raise AssertionError(f"{where}: {a} is kept, {other}: {b} is there")
+        if a is not None:
+            gap = abs(a - b) if math.isfinite(b) else math.inf
+            if kind not in worst or gap > worst[kind][0]:
+                worst[kind] = gap, where
     return worst
 
 
-def _compare(kept, found, place, kind, worst):
-    if isinstance(kept, dict):
-        if sorted(kept) != sorted(found):
-            raise AssertionError(f"{place}: {sorted(kept)} are kept, {sorted(found)} are there")
-        for key in kept:
-            _compare(kept[key], found[key], f"{place} {key}", key, worst)
-    elif isinstance(kept, list):
-        if len(kept) != len(found):
-            raise AssertionError(f"{place}: {len(kept)} are kept, {len(found)} are there")
-        for k, (a, b) in enumerate(zip(kept, found)):
-            _compare(a, b, f"{place} {k}", kind, worst)
-    elif (kept is None) != (found is None):
-        raise AssertionError(f"{place}: {kept} is kept, {found} is there")
-    elif kept is not None:
-        gap = abs(kept - found) if math.isfinite(found) else math.inf
-        if kind not in worst or gap > worst[kind][0]:
-            worst[kind] = gap, place
+def _numbers(value, place, kind=""):
+    """Place, nearest key and value of each number below a value; None with its length for each list."""
+    if isinstance(value, dict):
+        for key in sorted(value):
+            yield from _numbers(value[key], f"{place} {key}", key)
+    elif isinstance(value, list):
+        yield f"{place} of {len(value)}", kind, None
+        for k, one in enumerate(value):
+            yield from _numbers(one, f"{place} {k}", kind)
+    else:
+        yield place, kind, value
 
 
 def write(name):
