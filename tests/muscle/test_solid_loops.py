@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.geometry.rotations import quaternion_matrix, rotation_loop
+from rbfmuscle.geometry.rotations import quaternion_matrix
 from rbfmuscle.muscle.solid_loops import (
     Fibres,
     carry_loop,
@@ -83,26 +83,6 @@ def test_acceleration_solves_a_linear_map_in_few_steps(rng, measured):
         x = mixer.mix(x, m @ x + b)
     # The normal equations carry 1e-8 of their diagonal.
     np.testing.assert_allclose(x, np.linalg.solve(np.eye(12) - m, b), atol=1e-4)
-
-
-def test_without_memory_and_after_a_restart_steps_are_plain(rng):
-    image, mixer = np.arange(12.0), Anderson(3, 12, 12)
-    np.testing.assert_array_equal(Anderson(0, 12, 12).mix(np.ones(12), image), image)
-    for _ in range(3):
-        mixer.mix(rng.normal(size=12), rng.normal(size=12))
-    mixer.restart()
-    np.testing.assert_array_equal(mixer.mix(np.ones(12), image), image)
-
-
-def test_turning_towards_a_deformation_ends_at_its_polar_rotation(rng):
-    for _ in range(20):
-        turn = Rotation.random(random_state=rng).as_matrix()
-        stretch = np.eye(3) + 0.2 * rng.normal(size=(3, 3))
-        f, q = turn @ (stretch @ stretch.T), np.array([1.0, 0.0, 0.0, 0.0])
-        for _ in range(50):
-            rotation_loop(f, q)
-        u, _, vt = np.linalg.svd(f)
-        np.testing.assert_allclose(np.array(quaternion_matrix(q)), u @ vt, atol=1e-6)
 
 
 class Cells:

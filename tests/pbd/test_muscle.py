@@ -95,25 +95,15 @@ def test_xpbd_does_not_depend_on_the_number_of_iterations():
     assert np.sqrt(((ten - forty) ** 2).sum(axis=1).mean()) < 0.5
 
 
-def roughness(rig):
-    """Variance over the free vertices of the change of curvature: the umbrella vector's change in length."""
-    rest = rig.model.rest
-    lap = ARAP(rest.vertices, rest.topology).laplacian
-    area = np.maximum(lap.diagonal(), 1e-12)
-    change = [np.linalg.norm(lap @ x / area[:, None], axis=1) for x in (rig.model.points, rest.vertices)]
-    return np.var((change[0] - change[1])[rest.attached_bone < 0])
-
-
-def test_arap_with_volume_has_no_more_energy_than_the_pbd_option_and_is_smoother_than_interleaved():
-    energies, rough = {}, {}
-    for name in ("arap-pbd", "arap-volume", "arap-interleaved"):
+def test_arap_with_volume_has_no_more_energy_than_the_pbd_option():
+    energies = []
+    for name in ("arap-volume", "arap-pbd"):
         rig = Rig(method=name, slack=1.0)
         rig.go(*range(2, 32, 2))
         arap = ARAP(rig.model.rest.vertices, rig.model.rest.topology)
         arap.fit_rotations(rig.model.points, steps=60)
-        energies[name], rough[name] = energy(arap, rig.model.points), roughness(rig)
-    assert energies["arap-volume"] <= 1.01 * energies["arap-pbd"]
-    assert rough["arap-volume"] < rough["arap-interleaved"]
+        energies.append(energy(arap, rig.model.points))
+    assert energies[0] <= 1.01 * energies[1]
 
 
 def test_arap_holds_the_volume_at_every_iteration():

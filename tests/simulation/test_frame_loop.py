@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from toy_scene import ToyMuscle, bone, box, hinged_scene
 
-from rbfmuscle import models
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.options import TunnellingOptions
 from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames
 from rbfmuscle.simulation.plan.contact_pairs import find_contact_pairs, sampled_poses
 from rbfmuscle.simulation.substeps import SubSteps, turned_angle
-from rbfmuscle.validation import SceneError, SolveError, UsageError
+from rbfmuscle.validation import SceneError, SolveError
 
 
 def _run(angles, **options):
@@ -177,9 +176,3 @@ def test_frames_that_are_skipped_leave_the_muscle_where_shown_ones_would():
     # The toy's target does not depend on the path; only contact does.
     assert np.allclose(back.surfaces["strap"].vertices, frames[0].surfaces["strap"].vertices, atol=0.05)
     assert loop.here == {"hinge.bend": 0.0}
-
-
-def test_unknown_model_names_the_nearest_right_one():
-    made, _ = hinged_scene([0])
-    with pytest.raises(UsageError, match="unknown model 'xpdb', did you mean 'xpbd'"):
-        models.build_model(made.muscles[0], made, "xpdb")
