@@ -12,13 +12,15 @@ from peers.known_scenes import FAR, Bar, _block
 
 from rbfmuscle.metrics.contraction import belly_measures
 from rbfmuscle.metrics.mesh_distance import MeshDistance
-from rbfmuscle.scene.objects import Attachment
+from rbfmuscle.scene.objects import Attachment, Motion
 from rbfmuscle.scene.phantom_shapes import stitch
 from rbfmuscle.scene.scene import Scene
 
 MUSCLE = "muscle"
-# Long against its radius: the ends keep theirs, over about one radius each, and that volume goes to the middle.
-FREE_BAR = Bar(length=600.0, width=10.0, thickness=10.0, dome=10.0)
+# A flat pennate muscle between two plates: their length and width, the fibres' length and their angle [degree] at rest.
+PLATES, FIBRE, PENNATION = (120.0, 40.0), 60.0, 25.0
+# How far the plates are apart, which does not change, nor does the volume, and how far fibres lean.
+HEIGHT, LEAN = FIBRE * math.sin(math.radians(PENNATION)), FIBRE * math.cos(math.radians(PENNATION))
 
 
 @dataclass(frozen=True)
@@ -85,35 +87,22 @@ class Spindle:
 SPINDLE = Spindle()
 
 
-def spindle_scene(*, spindle=SPINDLE, spacing=3.0, frames=10, model="rbf", **contraction):
-    """A spindle between two bones that stand still, activated from 0 to 1.
+def spindle_scene(*, spacing=3.0, frames=10, model="rbf", **contraction):
+    """The spindle between two bones that stand still, with ``frames`` after the one at rest.
 
-    Parameters
-    ----------
-    spindle : Spindle
-    spacing : float
-        Edge length of the muscle's mesh [mm].
-    frames : int
-        Frames after the one at rest.
-    model : str or dict
-    **contraction
-        Keys of contraction; ``activation`` rises from 0 to 1 where not given.
-
-    Returns
-    -------
-    Scene
+    ``contraction`` are keys of the muscle; its activation rises from 0 to 1 where not given.
     """
     scene = Scene("spindle", units="mm")
-    ends = Bar(length=spindle.length, width=spindle.tendon, thickness=spindle.tendon, dome=spindle.tendon)
+    ends = Bar(length=SPINDLE.length, width=SPINDLE.tendon, thickness=SPINDLE.tendon, dome=SPINDLE.tendon)
     _add_slider(scene, ends)
-    vertices, faces = spindle.mesh(spacing)
+    vertices, faces = SPINDLE.mesh(spacing)
     contraction.setdefault("activation", [0.0, 1.0])
-    _add(scene, vertices, faces, 0.5 * spindle.length - 1e-6, spindle.fibres(), model, contraction)
+    _add(scene, vertices, faces, 0.5 * SPINDLE.length - 1e-6, SPINDLE.fibres(), model, contraction)
     scene.set_motion(waypoints=[{"slider.pull": 0.0}, {"slider.pull": 0.0}], step=1.0)
-    return with_frames(scene, [0.0] * (frames + 1), spindle.length)
+    return with_frames(scene, [0.0] * (frames + 1), SPINDLE.length)
 
 
-def bar_scene(*, bar=FREE_BAR, spacing=2.5, model="rbf", **contraction):
+def bar_scene(*, bar, spacing, model, **contraction):
     """A bar on a slider: `with_frames` moves it."""
     scene = Scene("free_bar", units="mm")
     _add_slider(scene, bar)
@@ -125,8 +114,6 @@ def bar_scene(*, bar=FREE_BAR, spacing=2.5, model="rbf", **contraction):
 
 def with_frames(scene, pulls, length):
     """The scene with one frame for each pull of the slider [mm, positive shortens]."""
-    from rbfmuscle.scene.objects import Motion
-
     far = FAR * length
     moved = scene.copy()
     moved.motion = Motion([{"slider.pull": math.asin(pull / far)} for pull in pulls])
@@ -148,77 +135,39 @@ def _add(scene, vertices, faces, edge, fibres, model, contraction):
     scene.add_muscle(MUSCLE, (vertices, faces), attach=attach, model=model, fibres=fibres, **contraction)
 
 
-@dataclass(frozen=True)
-class Panel:
-    """A flat pennate muscle between two plates: fibres of a length, at an angle to the plates.
-
-    Parameters
-    ----------
-    length : float
-        Of the plates.
-    width : float
-        Across the plane of the fibres.
-    fibre : float
-        Length of the fibres at rest.
-    pennation : float
-        Angle between fibres and plates at rest [degree].
-    """
-
-    length: float = 120.0
-    width: float = 40.0
-    fibre: float = 60.0
-    pennation: float = 25.0
-
-    @property
-    def height(self):
-        """Distance of the plates: it does not change, nor does the volume."""
-        return self.fibre * math.sin(math.radians(self.pennation))
-
-
-PANEL = Panel()
-
-
-def panel_pennation(stretch, *, panel=PANEL):
+def panel_pennation(stretch):
     """Pennation [degree] at a stretch of the fibres: height / (fibre stretch) is its sine (constant thickness)."""
-    return math.degrees(math.asin(panel.height / (panel.fibre * stretch)))
+    return math.degrees(math.asin(HEIGHT / (FIBRE * stretch)))
 
 
-def panel_scene(stretch, *, panel=PANEL, spacing=4.0, frames=5, model="rbf"):
+def panel_scene(stretch, *, spacing=4.0, frames=5, model="rbf"):
     """The panel with its upper plate slid so far that straight fibres have the stretch, fully active at the end.
 
     The line of action is along the plates: attachments are the lower and the upper face, and fibres are given.
     """
-    lean = panel.fibre * math.cos(math.radians(panel.pennation))
-    box = trimesh.creation.box((panel.length, panel.width, panel.height)).subdivide_to_size(1.5 * spacing)
-    vertices, faces = box.vertices + [0.0, 0.0, 0.5 * panel.height], box.faces
-    vertices[:, 0] += lean * (vertices[:, 2] / panel.height)
+    length, width = PLATES
+    box = trimesh.creation.box((length, width, HEIGHT)).subdivide_to_size(1.5 * spacing)
+    vertices, faces = box.vertices + [0.0, 0.0, 0.5 * HEIGHT], box.faces
+    vertices[:, 0] += LEAN * (vertices[:, 2] / HEIGHT)
     scene = Scene("panel", units="mm")
-    for name, low in (("lower", -6.0), ("upper", panel.height + 2.0)):
-        plate = trimesh.creation.box(extents=(0.5 * panel.length, panel.width, 4.0))
-        plate.apply_translation((0.0 if low < 0 else lean, 0.0, low + 2.0))
+    for name, low in (("lower", -6.0), ("upper", HEIGHT + 2.0)):
+        plate = trimesh.creation.box(extents=(0.5 * length, width, 4.0))
+        plate.apply_translation((0.0 if low < 0 else LEAN, 0.0, low + 2.0))
         scene.add_bone(name, plate)
-    far = FAR * panel.length
-    scene.add_joint("slider", "lower", "upper", (lean, 0.0, panel.height + far), {"pull": (0, 1, 0)})
+    scene.add_joint("slider", "lower", "upper", (LEAN, 0.0, HEIGHT + FAR * length), {"pull": (0, 1, 0)})
     attach = [
         Attachment("lower", np.flatnonzero(vertices[:, 2] <= 1e-9)),
-        Attachment("upper", np.flatnonzero(vertices[:, 2] >= panel.height - 1e-9)),
+        Attachment("upper", np.flatnonzero(vertices[:, 2] >= HEIGHT - 1e-9)),
     ]
-    starts = [(x, y) for x in (-0.3, 0.0, 0.3) for y in (-0.25, 0.25)]
     share = np.linspace(0.02, 0.98, 12)[:, None]
     fibres = [
-        np.array([x * panel.length, y * panel.width, 0.0]) + share * [lean, 0.0, panel.height]
-        for x, y in starts
+        np.array([x * length, y * width, 0.0]) + share * [LEAN, 0.0, HEIGHT]
+        for x in (-0.3, 0.0, 0.3)
+        for y in (-0.25, 0.25)
     ]
-    scene.add_muscle(
-        MUSCLE,
-        (vertices, faces),
-        attach=attach,
-        model=model,
-        fibres=fibres,
-        activation=[0, 1],
-    )
-    shortened = math.sqrt((panel.fibre * stretch) ** 2 - panel.height**2)
-    return with_frames(scene, np.linspace(0.0, lean - shortened, frames + 1), panel.length)
+    scene.add_muscle(MUSCLE, (vertices, faces), attach=attach, model=model, fibres=fibres, activation=[0, 1])
+    shortened = math.sqrt((FIBRE * stretch) ** 2 - HEIGHT**2)
+    return with_frames(scene, np.linspace(0.0, LEAN - shortened, frames + 1), length)
 
 
 # Ends of the spindle's line of action.
