@@ -99,6 +99,6 @@ def place_patellae(joints: list[JointGuess], millimetre: float) -> None:
             joint.reason = "no groove or no ligament was found: it turns about the knee's axis"
             continue
         joint.kind, joint.centre, joint.confidence = "custom", path.centre, 0.6
-        joint.follows, joint.tables = (knee.coordinate,), path.tables
-        ligament = f"{path.ligament / millimetre:.3g} mm"
+        joint.follows, joint.tables, joint.ligament = (knee.coordinate,), path.tables, path.ligament
+        ligament = f"{np.linalg.norm(path.ligament[1] - path.ligament[0]) / millimetre:.3g} mm"
         joint.reason = f"in its groove, on a ligament of {ligament}, to {FLEXIONS[-1]} degrees"

@@ -74,6 +74,8 @@ class JointGuess:
         ``rotations`` and ``translations`` of a custom joint, as the scene file has them.
     follows : tuple of str
         Full name of the coordinate that the first one follows.
+    ligament : (2, 3) ndarray or None
+        Ends of a patella's ligament at rest, on it and on the tibia [scene unit].
     """
 
     parent: Part
@@ -88,6 +90,7 @@ class JointGuess:
     rest: float = 0.0
     tables: dict[str, list] = field(default_factory=dict)
     follows: tuple[str, ...] = ()
+    ligament: np.ndarray | None = None
 
     @property
     def axis(self) -> np.ndarray:

@@ -41,7 +41,7 @@ FAR = 25.0
 class AttachmentGuess:
     """Vertices of a muscle's mended mesh that a bone holds, their least distance to it [mm], and why.
 
-    ``tendon`` is what carries an end far from its bone.
+    ``tendon`` is that of an end far from its bone.
     """
 
     bone: Part
@@ -49,11 +49,6 @@ class AttachmentGuess:
     gap: float
     reason: str
     tendon: Any = None
-
-    @property
-    def attached_bone(self) -> str:
-        """Name of the bone in the scene that holds the vertices."""
-        return self.tendon.name if self.tendon is not None else self.bone.name
 
 
 @dataclass

@@ -13,7 +13,7 @@ from rbfmuscle.importers.guess.attachments import MuscleGuess, Skeleton, guess_a
 from rbfmuscle.importers.guess.joints import guess_joints
 from rbfmuscle.importers.guess.orientation import Orientation, find_orientation
 from rbfmuscle.importers.guess.parts import MILLIMETRE, Part, guess_units, read_parts
-from rbfmuscle.importers.guess.tendons import guess_tendons, write_stubs
+from rbfmuscle.importers.guess.tendons import guess_tendons
 from rbfmuscle.importers.guess.text import hold_file, scene_text
 from rbfmuscle.scene.attachments import ExactMeshes
 from rbfmuscle.scene.scene import Scene
@@ -96,7 +96,7 @@ def guess_scene(
     # Where the bones that names ask for are not here, what is there is taken.
     if all(muscle.wrong for muscle in guess.muscles):
         guess.muscles = [guess_attachments(muscle, skeleton, named=False) for muscle in found.muscles]
-    guess_tendons(guess, millimetre)
+    guess_tendons(guess)
     order = [root, *(joint.child for joint in joints)]
     for muscle in guess.muscles:  # from the bone that stands still outwards
         muscle.holds.sort(key=lambda hold: order.index(hold.bone) if hold.bone in order else 0)
@@ -130,7 +130,6 @@ def write_scene(guess: SceneGuess, path: Path) -> Scene:
                 file.parent.mkdir(parents=True, exist_ok=True)
                 in_file = np.isin(muscle.muscle.read.vertex_map, hold.vertices)
                 np.savetxt(file, np.flatnonzero(in_file), fmt="%d")
-        write_stubs(guess, path.parent, MILLIMETRE[guess.units])
         while True:
             path.write_text(scene_text(guess), encoding="utf-8")
             if all(muscle.wrong for muscle in guess.muscles):

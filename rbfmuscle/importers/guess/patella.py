@@ -28,10 +28,10 @@ OUTLINE, STEP, ORDER = (-50.0, 125.0), 5.0, 6
 
 
 class PatellaPath(NamedTuple):
-    """Place (3,) at rest, length of the ligament [scene unit], and the custom joint's rotations and translations."""
+    """Place (3,) and the ligament's ends (2, 3), at rest, and the custom joint's rotations and translations."""
 
     centre: np.ndarray
-    ligament: float
+    ligament: np.ndarray
     tables: dict[str, list]
 
 
@@ -69,8 +69,11 @@ def patella_path(
         "rotations": [table(axis, TURN * flexions)],
         "translations": [table(front, shifts.real), table(down, shifts.imag)],
     }
-    centre = knee.centre + side * axis + middle.real * front + middle.imag * down
-    return PatellaPath(centre, float(abs(apex - tuberosity)), tables)
+
+    def place(point):
+        return knee.centre + side * axis + point.real * front + point.imag * down
+
+    return PatellaPath(place(middle), np.stack([place(apex), place(tuberosity)]), tables)
 
 
 class _Groove:

@@ -8,7 +8,6 @@ import numpy as np
 
 from rbfmuscle.importers.guess.anatomy import JointGuess, rounded
 from rbfmuscle.importers.guess.attachments import AttachmentGuess, MuscleGuess
-from rbfmuscle.importers.guess.tendons import ANGLES, stub_file, tendons_of
 from rbfmuscle.importers.toml_text import table_text
 
 _TAIL = """[contact]
@@ -24,13 +23,11 @@ surfaces = { format = "pvd" }   # or vtp, ply, stl, obj, glb
 
 def scene_text(guess: Any) -> str:
     """Text of the scene file of a `SceneGuess`."""
-    tendons = tendons_of(guess)
     parts = [_head(guess)]
     for bone in guess.bones:
         row = {"name": bone.name, "mesh": bone.file}
         parts.append(table_text("[[bone]]", row, {} if bone.sure else {"name": f"GUESS: {bone.reason}"}))
-    parts += [_stub(tendon) for tendon in tendons] + [_joint(joint) for joint in guess.joints]
-    parts += [_slider(tendon) for tendon in tendons]
+    parts += [_joint(joint) for joint in guess.joints]
     movable = [joint for joint in guess.joints if joint.axes and not joint.follows]
     if movable:
         parts.append(_motion(movable[0]))
@@ -64,22 +61,6 @@ def _joint(joint: JointGuess) -> str:
     return text
 
 
-def _stub(tendon):
-    head = "[[bone]]   # GUESS: holds an end that stops short of its bone; a stub put aside, where nothing meets it"
-    return table_text(head, {"name": tendon.name, "mesh": stub_file(tendon)})
-
-
-def _slider(tendon):
-    """The joint of a tendon's stub, and what drives it."""
-    hinge = tendon.joint.coordinate
-    why = f"slides along the missing tendon as {hinge} changes its length, straight to its bone"
-    row = {"name": tendon.name, "parent": tendon.guide.name, "child": tendon.name, "type": "slider"}
-    row |= {"centre": rounded(tendon.place, 6), "axes": {"slide": rounded(tendon.direction, 6)}}
-    points = {"x": rounded(tendon.joint.rest + np.array(ANGLES), 3), "y": rounded(tendon.slides, 6)}
-    coupling = {"coordinate": f"{tendon.name}.slide", "of": [hinge], "natural_spline": points}
-    return table_text(f"[[joint]]   # GUESS: {why}", row) + "\n" + table_text("[[coupling]]", coupling)
-
-
 def _motion(joint):
     """A ramp of the joint's first coordinate, within its range."""
     _, high = joint.ranges.get(next(iter(joint.axes)), (0.0, joint.rest + 30.0))
@@ -93,11 +74,22 @@ def hold_file(muscle: MuscleGuess, hold: AttachmentGuess) -> str:
     return f"attachments/{muscle.muscle.name}_{hold.bone.name}.txt"
 
 
+def _attachment(hold: AttachmentGuess, file: str) -> dict[str, Any]:
+    """A row of ``attach``, with its tendon."""
+    tendon = hold.tendon
+    if tendon is None:
+        return {"bone": hold.bone.name, "vertices": file}
+    line: dict[str, Any] = {"to": rounded(tendon.to, 6)}
+    if tendon.via:
+        line["via"] = [{"bone": bone.name, "point": rounded(point, 6)} for bone, point in tendon.via]
+    return {"bone": tendon.bone.name, "vertices": file, "tendon": line}
+
+
 def _muscle(guess: MuscleGuess) -> str:
     part, said = guess.muscle, []
     row: dict[str, Any] = {"name": part.name, "mesh": part.file, "attach": []}
     for hold in guess.holds:
-        row["attach"].append({"bone": hold.attached_bone, "vertices": hold_file(guess, hold)})
+        row["attach"].append(_attachment(hold, hold_file(guess, hold)))
         said.append(f"GUESS {guess.confidence:.1f}: {len(hold.vertices)} vertices, {hold.reason}")
     comments = {"attach": said} | ({} if part.sure else {"name": f"GUESS: {part.reason}"})
     text = table_text("\n".join(["[[muscle]]", *(f"# {reason}" for reason in guess.reasons)]), row, comments)
