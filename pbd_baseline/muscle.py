@@ -71,7 +71,7 @@ class PBDMuscle:
             self.sweeps = method.sweeps
             self.most_sweeps = self.options.iterations or MOST_SWEEPS
         self.still = self.options.tolerance * diameter(self.rest.vertices)
-        self.contact_bone = _bone_numbers(self.rest, scene)
+        self.contact_bone = _bone_numbers(self.rest, scene.holders(muscle))
         held = np.flatnonzero(self.contact_bone >= 0)
         self.contact = ContactConstraint(held, reach=scene.length(REACH), nearest_only=self.as_printed)
         self.self_collision = SelfCollision(self.rest) if self.options.self_collision else None
@@ -191,9 +191,8 @@ class PBDMuscle:
         self.penetration = self.contact.depth(self.points)
 
 
-def _bone_numbers(rest, scene):
-    """Number in the scene of the bone that holds each vertex, -1 where it is free."""
-    names = [bone.name for bone in scene.bones]
+def _bone_numbers(rest, names):
+    """Number of the bone, or end of a tendon, that holds each vertex, -1 where it is free."""
     numbers = np.array([names.index(bone) for bone in rest.bones])
     return np.where(rest.attached_bone < 0, -1, numbers[rest.attached_bone])
 

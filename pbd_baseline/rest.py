@@ -104,10 +104,10 @@ def _renumbered(muscle):
     place = np.argsort(order, kind="stable")
     vertices = np.ascontiguousarray(muscle.mesh.vertices, dtype=np.float64)[order]
     faces = _sorted_faces(place[np.asarray(muscle.mesh.faces)])
-    bones = list(dict.fromkeys(attachment.bone for attachment in muscle.attachments))
+    bones = list(dict.fromkeys(attachment.holder for attachment in muscle.attachments))
     attached_bone = np.full(len(vertices), -1)
     for attachment in muscle.attachments:
-        attached_bone[place[attachment.vertices]] = bones.index(attachment.bone)
+        attached_bone[place[attachment.vertices]] = bones.index(attachment.holder)
     return order, vertices, faces, bones, attached_bone
 
 

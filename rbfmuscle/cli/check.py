@@ -120,7 +120,10 @@ def _scene_lines(scene):
     for joint in scene.joints:
         yield f"  joint {joint.name}: {joint.parent} to {joint.child}, {', '.join(joint.coordinates) or joint.kind}"
     for muscle in scene.muscles:
-        held = ", ".join(f"{len(a.vertices)} on {a.bone}" for a in muscle.attachments)
+        held = ", ".join(
+            f"{len(a.vertices)} {'on' if a.tendon is None else 'by a tendon to'} {a.bone}"
+            for a in muscle.attachments
+        )
         volume = muscle.mesh.volume / scene.length(10.0) ** 3
         yield (
             f"  muscle {muscle.name}: model {muscle.model}, {len(muscle.mesh.vertices)} vertices, "

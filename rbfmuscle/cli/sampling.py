@@ -145,8 +145,12 @@ def _settled(loop, lines, pose):
     loop.skip(pose)
     with loop.workers.one_thread_each():
         loop.workers.each(lambda stepper: _settle(stepper, loop.here), loop.steppers)
-    poses = bone_poses(loop.scene, loop.here)
-    return np.array([lines[s.name].length(s.model.material_mesh()[0], poses) for s in loop.steppers])
+    poses, found = bone_poses(loop.scene, loop.here), []
+    for stepper in loop.steppers:
+        line = lines[stepper.name]
+        belly = line.length(stepper.model.material_mesh()[0], poses)
+        found.append(belly + line.tendon_length(poses.tendons))
+    return np.array(found)
 
 
 def _settle(stepper, here):

@@ -171,7 +171,13 @@ def scene_content(scene: Scene, frames: str | None = None) -> str:
         facts.pop(part)
     for item in [*facts["bones"], *facts["muscles"]]:
         item.pop("mesh")
-    held = [[(a.bone, [int(v) for v in a.vertices]) for a in muscle.attachments] for muscle in scene.muscles]
+    held = [
+        [
+            (a.bone, [int(v) for v in a.vertices], a.tendon and a.tendon.model_dump())
+            for a in muscle.attachments
+        ]
+        for muscle in scene.muscles
+    ]
     fibres = [[line.tolist() for line in muscle.fibres or []] for muscle in scene.muscles]
     track = [sorted(frame.items()) for frame in scene.motion.frames]
     return _hash([facts, held, fibres, track, str(frames or "")])

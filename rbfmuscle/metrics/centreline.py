@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +13,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import harmonic_weights
 from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.scene.joints.skeleton import all_coordinates
+from rbfmuscle.scene.tendons import TendonLine, line_length
 
 _FINE, _SLICES = 120, 16
 
@@ -65,7 +66,7 @@ class Centreline:
         even = np.interp(np.linspace(0.0, along[-1], slices), along, levels)
         self.operator = slice_operator(vertices, faces, field, even)
 
-    def points(self, vertices: Floats, poses: dict[str, Floats]) -> Floats:
+    def points(self, vertices: Floats, poses: Mapping[str, Floats]) -> Floats:
         """The line now.
 
         Parameters
@@ -81,9 +82,18 @@ class Centreline:
         first, last = (carried_middle(end, poses) for end in self.ends)
         return np.vstack([first, self.operator @ vertices, last])
 
-    def length(self, vertices: Floats, poses: dict[str, Floats]) -> float:
-        """Length of the line now [scene unit]."""
+    def length(self, vertices: Floats, poses: Mapping[str, Floats]) -> float:
+        """Length of the line now, without tendons [scene unit]."""
         return float(distance_along(self.points(vertices, poses))[-1])
+
+    def tendon_length(self, tendons: Mapping[str, TendonLine]) -> float:
+        """Length of the tendons at both ends now [scene unit]; of several attachments of an end the mean by area."""
+        total = 0.0
+        for end in self.ends:
+            areas = [patch.sum() for _, _, patch in end]
+            lengths = [line_length(tendons[name].points) if name in tendons else 0.0 for name, _, _ in end]
+            total += float(np.average(lengths, weights=areas))
+        return total
 
 
 def distance_along(line: Floats) -> Floats:
@@ -108,14 +118,14 @@ def end_groups(
 
     Returns
     -------
-    list of two lists of (bone, points, areas)
+    list of two lists of (holder, points, areas)
         ``points`` (k, 3) are the attached vertices at rest, ``areas`` (k,) what each stands for: where triangles are
         small there are more of them, which must not draw the end of a line there.
     """
     vertices = np.asarray(muscle.mesh.vertices, dtype=float)
     areas = vertex_areas(vertices, np.asarray(muscle.mesh.faces))
     return [
-        [(a.bone, vertices[np.asarray(a.vertices)], areas[np.asarray(a.vertices)]) for a in group]
+        [(a.holder, vertices[np.asarray(a.vertices)], areas[np.asarray(a.vertices)]) for a in group]
         for group in split_ends(muscle, joints, moving)
     ]
 
@@ -234,7 +244,7 @@ def _sides(muscle, ends, vertices):
     return [np.setdiff1d(sides[0], sides[1]), sides[1]]
 
 
-def carried_middle(end: list[tuple[Any, ...]], poses: dict[str, Floats]) -> Any:
+def carried_middle(end: list[tuple[Any, ...]], poses: Mapping[str, Floats]) -> Any:
     """Middle (3,) of an end's patches where its bones (their poses (4, 4)) carry them."""
     total = sum(areas.sum() for _, _, areas in end)
     moved = [

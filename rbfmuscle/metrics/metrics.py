@@ -95,17 +95,16 @@ class _Tracker:
         # Of the last shortest path, from the points along the centreline.
         self.pulled: Floats | None = None
 
-    def _of_line(
-        self, carried: Floats, probes: list[BoneProbe], poses: dict[str, Floats]
-    ) -> dict[str, float]:
-        """Length of the centreline, and over that of the shortest path between its ends."""
+    def _of_line(self, carried: Floats, probes: list[BoneProbe], frame: Frame) -> dict[str, float]:
+        """Length from bone to bone, and of the belly's centreline over the shortest path between its ends."""
         if self.line is None:
             return {}
-        line = self.line.points(carried, poses)
-        path = shortest_path(line, probes, poses, offset=self.pulled)
+        line = self.line.points(carried, frame.poses)
+        path = shortest_path(line, probes, frame.poses, offset=self.pulled)
         self.pulled = path - resampled(line, NODES - 1) if len(path) == NODES else None
-        length, shortest = distance_along(line)[-1], distance_along(path)[-1]
-        return {"length": length, "slack": length / shortest if shortest > 0.0 else math.nan}
+        belly, shortest = distance_along(line)[-1], distance_along(path)[-1]
+        length = belly + self.line.tendon_length(frame.tendons)
+        return {"length": length, "slack": belly / shortest if shortest > 0.0 else math.nan}
 
     def measure(self, frame: Frame, probes: list[BoneProbe], at_rest: bool) -> dict[str, float]:
         """What there is to measure of this muscle in a frame."""
@@ -121,7 +120,7 @@ class _Tracker:
         mine = [event for event in frame.events if event.muscle == self.name]
         found["tunnelled"] = sum(event.count for event in mine if event.action in _THROUGH)
         found["edge_strain_rms"] = edge_strain(carried, self.edges, self.rest_lengths)
-        found.update(self._of_line(carried, probes, frame.poses))
+        found.update(self._of_line(carried, probes, frame))
         if self.contraction is not None:
             found["activation"] = frame.activations[self.name]
             found.update(self.contraction.measure(carried, frame.poses, surface))
@@ -163,7 +162,8 @@ class _Tracker:
         mesh = self.mesh.vertices, self.mesh.faces
         rms, worst = surface_distance(surface.vertices, surface.faces, *mesh)
         bones = {probe.name: probe for probe in probes}
-        gaps = [bones[a.bone].unsigned(mesh[0][a.vertices]).min() for a in self.attachments]
+        held = [a for a in self.attachments if a.tendon is None]
+        gaps = [bones[a.bone].unsigned(mesh[0][a.vertices]).min() for a in held]
         found = {"rest_error_rms": rms, "rest_error_max": worst, "end_gap": max(gaps, default=0.0)}
         if self.line is not None:
             first, last = (carried_middle(end, poses) for end in self.line.ends)

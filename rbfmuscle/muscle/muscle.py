@@ -57,7 +57,7 @@ class RBFMuscle:
         self.rest = RestState.from_muscle(muscle, scene, self.options)
         self.solid, self.law = build_solid(muscle, scene, self.rest, self.options)
         self.drawer = SurfaceBuilder(muscle, scene, self.rest, self.options)
-        names = [bone.name for bone in scene.bones]
+        names = scene.holders(muscle)
         numbers = np.array([names.index(bone) for bone in self.rest.bones])
         self.contact_bone = np.where(self.solid.owner < 0, -1, numbers[self.solid.owner])
         self.points = self.rest.centres.copy()

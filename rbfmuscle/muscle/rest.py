@@ -33,7 +33,7 @@ class RestState:
     fit : FieldFit
         How the field through the centres is fitted.
     bones : list of str
-        Bones that hold the muscle, in the order of the scene.
+        Bones, and ends of tendons, that hold the muscle, in the order of the scene.
     holder : (K + S,) ndarray of int
         Position in ``bones`` of the bone that holds a contact point (centres, then samples), -1 where it is free.
     free, held : ndarray of int
@@ -108,9 +108,9 @@ class _Attachment:
     def __init__(
         self, muscle: Muscle, scene: Scene, frame: RestFrame, centres: np.ndarray, samples: np.ndarray
     ) -> None:
-        names = [bone.name for bone in scene.bones]
+        names = scene.holders(muscle)
         patches = [np.asarray(attachment.vertices) for attachment in muscle.attachments]
-        numbers = np.array([names.index(attachment.bone) for attachment in muscle.attachments])
+        numbers = np.array([names.index(attachment.holder) for attachment in muscle.attachments])
         owner = np.full(len(frame.local), -1)
         for number, patch in zip(numbers, patches):
             owner[patch] = number

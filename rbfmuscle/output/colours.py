@@ -8,7 +8,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 
-BONE_COLOUR = "#e9e0cd"
+BONE_COLOUR, TENDON_COLOUR = "#e9e0cd", "#cfd8dc"
 # People who are colour-blind can distinguish them (P. Tol, "muted"); its sand is left out, as bones have that colour.
 MUSCLE_COLOURS = ("#cc6677", "#332288", "#44aa99", "#882255", "#88ccee", "#117733", "#aa4499", "#999933")
 # How much nearer to white or black the muscles of one group are, one after the other.

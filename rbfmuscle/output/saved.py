@@ -16,6 +16,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.output.meshfiles import SUFFIXES, read_mesh
+from rbfmuscle.output.tubes import tendon_name
 from rbfmuscle.simulation.frame import Event, Frame, ModelSurface
 from rbfmuscle.validation import UsageError
 
@@ -44,6 +45,8 @@ class SavedRun:
     frames : list of int
         Frames that were written.
     muscles, bones : list of str
+    tendons : list of str
+        Names of the meshes of tendons, which `surface` takes as it takes muscles.
     units : str
     """
 
@@ -55,7 +58,13 @@ class SavedRun:
             self.units = self.info["scene"]["units"]
             self.muscles = [muscle["name"] for muscle in self.info["scene"]["muscles"]]
             self.bones = [bone["name"] for bone in self.info["scene"]["bones"]]
-            surfaces = self.info["scene"]["output"]["surfaces"]
+            output = self.info["scene"]["output"]
+            surfaces = output["surfaces"]
+            self.tendons = [
+                tendon_name(muscle["name"])
+                for muscle in self.info["scene"]["muscles"]
+                if output.get("tendons") and any("tendon" in held for held in muscle.get("attach", ()))
+            ]
             self.frames = [frame["frame"] for frame in self.info["frames"]]
         except OSError:
             raise UsageError(
@@ -147,7 +156,9 @@ class SavedRun:
         ]
 
     def _has_files(self, frame):
-        return self.suffix is None or all(self._file("surfaces", m, frame).is_file() for m in self.muscles)
+        return self.suffix is None or all(
+            self._file("surfaces", m, frame).is_file() for m in [*self.muscles, *self.tendons]
+        )
 
     def _check_surfaces(self):
         if self.suffix is None:

@@ -19,6 +19,7 @@ from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.output.light_mesh import light_mesh
 from rbfmuscle.output.meshfiles import SUFFIXES, write_mesh
+from rbfmuscle.output.tubes import tendon_mesh, tendon_name
 from rbfmuscle.output.vtp import Collection
 from rbfmuscle.validation import SolveError, UsageError
 
@@ -149,7 +150,8 @@ class RunWriter:
             self._collections["surfaces"].add(step, surfaces)
         (poses, poses_file), (events, events_file) = self._tables["poses.csv"], self._tables["events.csv"]
         poses.writerows(
-            [frame.index, bone, *(repr(float(x)) for x in pose.ravel())] for bone, pose in frame.poses.items()
+            [frame.index, bone.name, *(repr(float(x)) for x in frame.poses[bone.name].ravel())]
+            for bone in self.scene.bones
         )
         events.writerows([e.frame, e.muscle, e.bone, e.count, e.action] for e in frame.events)
         poses_file.flush()
@@ -163,15 +165,12 @@ class RunWriter:
 
     def _write_surfaces(self, frame):
         """Surfaces of a frame, side by side: most of the time goes into packing them."""
-        entries = [
-            (name, f"surfaces/{name}_{frame.index:04d}{SUFFIXES[self.format]}") for name in frame.surfaces
-        ]
-
-        def write(entry):
-            surface = frame.surfaces[entry[0]]
-            write_mesh(self.directory / entry[1], surface.vertices, surface.faces)
-
-        each(write, entries)
+        meshes = {name: (surface.vertices, surface.faces) for name, surface in frame.surfaces.items()}
+        if self.scene.output.tendons:
+            tendons = {muscle.name: tendon_mesh(muscle, frame.tendons) for muscle in self.scene.muscles}
+            meshes |= {tendon_name(name): mesh for name, mesh in tendons.items() if mesh is not None}
+        entries = [(name, f"surfaces/{name}_{frame.index:04d}{SUFFIXES[self.format]}") for name in meshes]
+        each(lambda entry: write_mesh(self.directory / entry[1], *meshes[entry[0]]), entries)
         return entries
 
     def _write_bones(self, frame):

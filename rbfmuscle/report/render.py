@@ -10,7 +10,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.output.colours import BONE_COLOUR, MUSCLE_COLOURS, muscle_colours, rgb
+from rbfmuscle.output.colours import BONE_COLOUR, MUSCLE_COLOURS, TENDON_COLOUR, muscle_colours, rgb
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report.appearance import BACKGROUND, USUAL_VIEWS, VIEWS, motion_direction, muscle_groups
 from rbfmuscle.report.labels import labelled
@@ -70,6 +70,8 @@ class Panel:
         for name, colour in self.colours.items():
             shade = rgb(colour) if self.activation is None else _shade(self.activation.get((name, frame), 0))
             solids.append(Solid(*self.saved.surface(name, frame), shade))
+        tendons = (self.saved.surface(name, frame) for name in self.saved.tendons)
+        solids += [Solid(vertices, faces, rgb(TENDON_COLOUR)) for vertices, faces in tendons]
         return draw_solids(solids, self.camera, rgb(BACKGROUND), behind=self._behind)
 
 
@@ -83,9 +85,10 @@ def _shade(activation: float) -> Floats:
 
 
 def muscle_points(runs: Sequence[SavedRun], frames: Sequence[int]) -> Floats:
-    """Points (n, 3) of all muscles in the first, middle and last of some frames."""
+    """Points (n, 3) of all muscles and tendons in the first, middle and last of some frames."""
     some = sorted({frames[0], frames[len(frames) // 2], frames[-1]})
-    return np.concatenate([r.surface(name, k)[0][::3] for r in runs for name in r.muscles for k in some])
+    names = [(run, name) for run in runs for name in (*run.muscles, *run.tendons)]
+    return np.concatenate([run.surface(name, k)[0][::3] for run, name in names for k in some])
 
 
 def draw_panels(

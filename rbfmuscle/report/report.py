@@ -115,7 +115,7 @@ def packed_scene(runs: Mapping[str, SavedRun]) -> str:
         {title: read_moving(run, frames, unit=run.units) for title, run in runs.items()},
         [first.caption(frame) for frame in frames],
         direction=motion_direction([first.poses[frame] for frame in frames]),
-        groups=groups if len(first.muscles) > 1 else {},
+        groups=groups | dict.fromkeys(first.tendons, "tendons") if len(first.muscles) > 1 else {},
         colours=muscle_colours(first.muscles, groups),
     )
 

@@ -9,10 +9,12 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.output.colours import MUSCLE_COLOURS, mixed_colour, rgb
+from rbfmuscle.output.colours import MUSCLE_COLOURS, TENDON_COLOUR, mixed_colour, rgb
+from rbfmuscle.output.tubes import tendon_mesh
 from rbfmuscle.report.appearance import BACKGROUND, VIEWS, body_axes
 from rbfmuscle.report.labels import labelled
 from rbfmuscle.report.raster import Camera, Solid, aim, draw_solids
+from rbfmuscle.scene.tendons import AT_REST
 
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
@@ -87,7 +89,7 @@ def find_faults(scene: Scene) -> tuple[list[Fault], list[Fault]]:
             patch = vertices[held.vertices]
             free[held.vertices] = False
             gap = float(distances[held.bone].signed_distance(patch).min())
-            if gap > FAR * millimetre:
+            if held.tendon is None and gap > FAR * millimetre:
                 middle, places = patch.mean(axis=0), _mesh(bones[held.bone])[0]
                 nearest = places[np.argmin(((places - middle) ** 2).sum(axis=1))]
                 far.append(Fault(muscle.name, held.bone, gap, np.array([middle, nearest])))
@@ -106,7 +108,7 @@ def _mesh(item: Bone | Muscle) -> tuple[Floats, Integers]:
 
 
 def _muscle_solids(muscle: Muscle, colours: dict[str, str]) -> list[Solid]:
-    """A muscle as a veil, and its held patches in the colours of their bones."""
+    """A muscle as a veil, its held patches in the colours of their bones, and its tendons."""
     vertices, faces = _mesh(muscle)
     held = np.zeros(len(vertices), dtype=bool)
     solids = []
@@ -116,6 +118,9 @@ def _muscle_solids(muscle: Muscle, colours: dict[str, str]) -> list[Solid]:
         solids.append(Solid(vertices, faces[mine[faces].all(axis=1)], rgb(colours[attachment.bone])))
         held |= mine
     veil = Solid(vertices, faces[~held[faces].all(axis=1)], rgb(_MUSCLE), _OPACITY)
+    tendons = tendon_mesh(muscle, {end.name: end.place(AT_REST)[0] for end in muscle.tendons})
+    if tendons is not None:
+        solids.append(Solid(*tendons, rgb(TENDON_COLOUR)))
     return [veil, *(solid for solid in solids if len(solid.faces))]
 
 

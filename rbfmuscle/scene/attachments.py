@@ -11,14 +11,29 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.geometry.winding import inside_test
+from rbfmuscle.scene.joints.skeleton import bones_between
 from rbfmuscle.scene.meshes.read import ReadMesh
-from rbfmuscle.scene.objects import Attachment, Bone, find_named
+from rbfmuscle.scene.objects import (
+    Attachment,
+    Bone,
+    LineTable,
+    Muscle,
+    SceneData,
+    ViaTable,
+    find_named,
+)
 from rbfmuscle.scene.options import NotNegative, Positive, Table, Vector
+from rbfmuscle.scene.tendons import BonePoint, TendonEnd
 from rbfmuscle.validation import SceneError, is_file, shown, shown_path
 
 if TYPE_CHECKING:
     import trimesh
+
+
+# Section of a tendon as it is drawn, over the mean section of its muscle.
+THIN = 0.05
 
 
 class SphereTable(Table):
@@ -29,12 +44,13 @@ class SphereTable(Table):
 
 
 class AttachTable(Table):
-    """A bone, and one of: a file or list of vertex numbers, a distance to the bone, a ball."""
+    """A bone, and one of: a file or list of vertex numbers, a distance to the bone, a ball; maybe a tendon."""
 
     bone: str
     vertices: str | list[int] | None = None
     near: NotNegative | None = None
     sphere: SphereTable | None = None
+    tendon: LineTable | None = None
 
 
 def resolve_attachments(
@@ -65,18 +81,81 @@ def resolve_attachments(
         place = f"muscle {muscle!r} attach {number + 1}: "
         if not isinstance(entry, AttachTable):
             row = vars(entry) if isinstance(entry, Attachment) else entry
-            plain = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in row.items()}
+            plain = {
+                k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in row.items() if k != "holder"
+            }
             entry = AttachTable.build(plain, place=place)
         bone = find_named(bones, entry.bone, "bone", place=place)
-        found.append(Attachment(bone.name, np.unique(_select(entry, read, bone, place))))
+        holder = "" if entry.tendon is None else f"{muscle} tendon {number + 1} to {bone.name}"
+        held = Attachment(bone.name, np.unique(_select(entry, read, bone, place)), entry.tendon, holder)
+        for name in held.bones:
+            find_named(bones, name, "bone", place=f"{place}tendon: ")
+        found.append(held)
     for first, second in itertools.combinations(found, 2):
         shared = np.intersect1d(first.vertices, second.vertices)
-        if first.bone != second.bone and len(shared):
+        if first.holder != second.holder and len(shared):
             raise SceneError(
                 f"muscle {muscle!r}: {len(shared)} vertices (first: {shared[0]}) are attached to both "
                 f"{first.bone!r} and {second.bone!r}, make the attachments smaller"
             )
     return found
+
+
+def tendon_ends(muscle: Muscle, scene: SceneData) -> list[TendonEnd]:
+    """The ends of a muscle's belly that tendons hold, in the order of its attachments.
+
+    Parameters
+    ----------
+    muscle : Muscle
+    scene : SceneData
+        With its bones and joints.
+    """
+    vertices = np.asarray(muscle.mesh.vertices, dtype=float)
+    areas = vertex_areas(vertices, np.asarray(muscle.mesh.faces))
+    held = [attachment for attachment in muscle.attachments if attachment.tendon is None]
+    held.sort(key=lambda attachment: -areas[attachment.vertices].sum())
+    ends = []
+    for attachment in muscle.attachments:
+        if attachment.tendon is not None:
+            line = _line(attachment)
+            middle, radius = _patch(vertices[attachment.vertices], areas[attachment.vertices], line[0][1])
+            section = abs(muscle.mesh.volume) / np.linalg.norm(vertices - middle, axis=1).max()
+            thin = float(np.sqrt(THIN * section / np.pi))
+            radii = radius, min(thin, radius)
+            ends.append(TendonEnd(attachment.holder, vertices[attachment.vertices], middle, radii, line))
+    for end in ends:
+        opposite = next((other for other in ends if other is not end), None)
+        if held:
+            patch = held[0].vertices
+            end.other = [(held[0].bone, np.average(vertices[patch], axis=0, weights=areas[patch]))]
+        elif opposite is not None:
+            end.other = opposite.line[::-1]
+        names = bones_between(scene.joints, [bone for bone, _ in (*end.other, *end.line)])
+        end.obstacles = [bone for bone in scene.bones if bone.name in names]
+    for end, opposite in zip(ends, ends[::-1]):
+        end.slack = 0.0 if held else opposite.length
+    return ends
+
+
+def _line(attachment: Attachment) -> list[BonePoint]:
+    """Via points and insertion of a tendon."""
+    table = attachment.tendon
+    assert table is not None
+    points = [*table.via, table.to]
+    return [
+        (point.bone, np.array(point.point))
+        if isinstance(point, ViaTable)
+        else (attachment.bone, np.array(point))
+        for point in points
+    ]
+
+
+def _patch(points: Floats, areas: Floats, towards: Floats) -> tuple[Floats, float]:
+    """Middle of an end, and its radius about the line towards the tendon, as of a disc with the same moment of area."""
+    middle = np.average(points, axis=0, weights=areas)
+    direction = (towards - middle) / max(float(np.linalg.norm(towards - middle)), 1e-300)
+    away = np.linalg.norm(np.cross(points - middle, direction), axis=1)
+    return middle, float(np.sqrt(2.0 * np.average(away**2, weights=areas)))
 
 
 def _select(table, read, bone, place):

@@ -13,7 +13,7 @@ from rbfmuscle.geometry.arrays import MeshLike
 from rbfmuscle.scene.activation.curve import activation_curve
 from rbfmuscle.scene.activation.keys import contraction_keys
 from rbfmuscle.scene.activation.resolve import resolve_contraction
-from rbfmuscle.scene.attachments import AttachTable, resolve_attachments
+from rbfmuscle.scene.attachments import AttachTable, resolve_attachments, tendon_ends
 from rbfmuscle.scene.fibres import read_fibres
 from rbfmuscle.scene.joints.joint import Coupling, Joint
 from rbfmuscle.scene.joints.skeleton import all_coordinates, ordered
@@ -142,7 +142,7 @@ def add_muscle(
         Closed; mended where that is safe.
     attach : list of Attachment or dict
         A dict holds ``bone`` and one of ``vertices`` (indices or a file), ``near`` (distance) and
-        ``sphere`` (``centre``, ``radius``).
+        ``sphere`` (``centre``, ``radius``); a ``tendon`` (``to``, ``via``) where the mesh ends short of the bone.
     model : str or dict
         A model's name, or a table with ``name`` and the model's own options.
     fibres : path or list of (k, 3) array_like, optional
@@ -157,9 +157,9 @@ def add_muscle(
     attachments = resolve_attachments(attach, read, scene.bones, muscle=name)
     lines = None if fibres is None else read_fibres(fibres, scale=scale, muscle=name)
     keys = contraction_keys(contraction, muscle=name)
-    scene.muscles.append(
-        Muscle(name, read.mesh, model_name, options, attachments, lines, read.source, read.notes, keys)
-    )
+    muscle = Muscle(name, read.mesh, model_name, options, attachments, lines, read.source, read.notes, keys)
+    muscle.tendons = tendon_ends(muscle, scene)
+    scene.muscles.append(muscle)
     return scene
 
 

@@ -24,7 +24,7 @@ from rbfmuscle.scene.joints.tables import (
 )
 from rbfmuscle.scene.meshes.read import read_mesh
 from rbfmuscle.scene.motion import coordinate_names, make_motion, unit_sign
-from rbfmuscle.scene.objects import Bone, Muscle, SceneData
+from rbfmuscle.scene.objects import Attachment, Bone, Muscle, SceneData
 from rbfmuscle.scene.options import (
     ContactOptions,
     DetectOptions,
@@ -276,11 +276,16 @@ def _describe_muscle(muscle: Muscle) -> dict[str, Any]:
     return {
         "name": muscle.name,
         "model": {"name": muscle.model, **muscle.options},
-        "attach": [{"bone": a.bone, "vertices": len(a.vertices)} for a in muscle.attachments],
+        "attach": [_describe_attachment(attachment) for attachment in muscle.attachments],
         "fibres": len(muscle.fibres) if muscle.fibres else 0,
         **({} if keys is None else keys.model_dump(mode="json", by_alias=True, exclude_none=True)),
         **_describe_mesh(muscle),
     }
+
+
+def _describe_attachment(attachment: Attachment) -> dict[str, Any]:
+    tendon = {} if attachment.tendon is None else {"tendon": attachment.tendon.model_dump()}
+    return {"bone": attachment.bone, "vertices": len(attachment.vertices), **tendon}
 
 
 def _describe_mesh(item: Bone | Muscle) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from rbfmuscle.scene.joints.tables import FACTORS, full_name
 from rbfmuscle.scene.motion_file import read_motion_file
 from rbfmuscle.scene.objects import Motion, SceneData
 from rbfmuscle.scene.options import MAX_FRAMES, MotionOptions, RampOptions
+from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.validation import SceneError, did_you_mean
 
 # Lever [mm] at which a shift of a joint is counted as a turn.
@@ -99,8 +100,8 @@ def interpolate(before: dict[str, float], after: dict[str, float], t: float) -> 
     return {name: (1 - t) * before.get(name, 0.0) + t * after.get(name, 0.0) for name in names}
 
 
-def bone_poses(scene: SceneData, coordinates: dict[str, float]) -> dict[str, Floats]:
-    """Return the pose (4, 4) of every bone: rest bone coordinates -> world.
+def bone_poses(scene: SceneData, coordinates: dict[str, float]) -> Poses:
+    """Return the pose (4, 4) of every bone, and of every end of a muscle that a tendon holds: rest -> world.
 
     A joint moves its child, and all that hangs on it, against its parent. At the coordinates at which the
     scene's meshes are (``rest``), every pose is the identity. A bone without a joint is fixed.
@@ -115,7 +116,8 @@ def bone_poses(scene: SceneData, coordinates: dict[str, float]) -> dict[str, Flo
     for name in coordinates:
         if name not in known:
             raise SceneError(f"unknown coordinate {name!r}, {did_you_mean(name, sorted(known))}")
-    return joint_poses([bone.name for bone in scene.bones], scene.joints, scene.couplings, coordinates)
+    poses = joint_poses([bone.name for bone in scene.bones], scene.joints, scene.couplings, coordinates)
+    return Poses(poses, {end.name: end for muscle in scene.muscles for end in muscle.tendons})
 
 
 def step_angle(

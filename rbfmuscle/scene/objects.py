@@ -5,12 +5,15 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+from pydantic import Field
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.scene.activation.keys import ContractionTable
 from rbfmuscle.scene.joints.joint import Coupling, Joint
 from rbfmuscle.scene.options import (
@@ -19,12 +22,17 @@ from rbfmuscle.scene.options import (
     MotionOptions,
     OutputOptions,
     SlidingOptions,
+    Table,
+    Vector,
 )
+from rbfmuscle.scene.tendons import TendonEnd
 from rbfmuscle.validation import SceneError, did_you_mean
 
 if TYPE_CHECKING:
     import trimesh
 
+# About how many points cover a bone: 4.5 mm apart on a femur.
+SURFACE_POINTS = 2000
 MM_PER_UNIT = {"m": 1000.0, "cm": 10.0, "mm": 1.0}
 
 
@@ -38,20 +46,74 @@ class Bone:
     closed: bool = True
     notes: list[str] = field(default_factory=list)
 
+    @cached_property
+    def bounds(self) -> Floats:
+        """Box (2, 3) about the mesh."""
+        return np.array(self.mesh.bounds)
+
+    @cached_property
+    def _distance(self) -> ExactDistance:
+        return ExactDistance(self.mesh.vertices, self.mesh.faces)
+
+    def nearest(self, points: Floats) -> tuple[Floats, Floats]:
+        """Distances (n,) to the mesh, negative inside, and the nearest places (n, 3) on it, of points (n, 3)."""
+        distances, places, *_ = self._distance.nearest(points)
+        return distances, places
+
+    @cached_property
+    def surface_points(self) -> Floats:
+        """Points (n, 3) that cover the mesh evenly, one in each cell of a grid."""
+        from trimesh.remesh import subdivide_to_size
+
+        cell = float(np.sqrt(self.mesh.area / SURFACE_POINTS))
+        points, _ = subdivide_to_size(self.mesh.vertices, self.mesh.faces, cell, max_iter=30)
+        kept = np.unique(np.floor(points / cell), axis=0, return_index=True)[1]
+        return np.ascontiguousarray(points[kept], dtype=float)
+
+
+class ViaTable(Table):
+    """A via point of a tendon on another bone than the insertion's."""
+
+    bone: str
+    point: Vector
+
+
+class LineTable(Table):
+    """The tendon of an attachment: from the belly's end past ``via`` to ``to``, points at rest [scene unit]."""
+
+    to: Vector
+    via: list[Vector | ViaTable] = Field(default_factory=list)
+
 
 @dataclass
 class Attachment:
-    """Vertices (n,) of a muscle's mesh that move with a bone."""
+    """Vertices (n,) of a muscle's mesh that move with a bone.
+
+    ``tendon`` joins them to it where they end short of it. ``holder`` is the name, among the poses, of what they move
+    with: the bone, or the end of the tendon.
+    """
 
     bone: str
     vertices: Integers = field(repr=False)
+    tendon: LineTable | None = None
+    holder: str = ""
+
+    def __post_init__(self) -> None:
+        self.holder = self.holder or self.bone
+
+    @property
+    def bones(self) -> list[str]:
+        """The bone, and those of the tendon's via points."""
+        via = [] if self.tendon is None else self.tendon.via
+        return [self.bone, *(point.bone for point in via if isinstance(point, ViaTable))]
 
 
 @dataclass
 class Muscle:
     """A closed surface (outward, rest pose) held by bones, and the model that moves it.
 
-    ``contraction`` holds the keys of a muscle that contracts, None for any other.
+    ``contraction`` holds the keys of a muscle that contracts, None for any other; ``tendons`` are the ends that
+    tendons hold.
     """
 
     name: str
@@ -63,6 +125,7 @@ class Muscle:
     source: str = ""
     notes: list[str] = field(default_factory=list)
     contraction: ContractionTable | None = None
+    tendons: list[TendonEnd] = field(default_factory=list)
 
 
 class Motion:
@@ -167,6 +230,10 @@ class SceneData:
     def muscle(self, name: str) -> Muscle:
         """Return the muscle of that name, or raise SceneError naming the nearest."""
         return find_named(self.muscles, name, "muscle")
+
+    def holders(self, muscle: Muscle) -> list[str]:
+        """Names of the bones, then of the ends that tendons of a muscle hold."""
+        return [*(bone.name for bone in self.bones), *(end.name for end in muscle.tendons)]
 
     def copy(self) -> Self:
         """Return a copy whose lists and tables are its own; meshes are shared."""

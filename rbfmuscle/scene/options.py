@@ -244,6 +244,7 @@ class OutputOptions(Table):
     """``[output]``: which files a run writes."""
 
     surfaces: SurfaceOptions | Literal[False] = SurfaceOptions()
+    tendons: bool = True
     report: bool = True
 
 

@@ -164,7 +164,7 @@ def _joined(parts, order):
         return {name: found.pop(name) for name in order if name in found} | found
 
     first, frames = parts[0].frame, [part.frame for part in parts]
-    by_muscle = ("surfaces", "carried", "times", "work")
+    by_muscle = ("surfaces", "carried", "times", "work", "tendons")
     frame = replace(
         first,
         events=[event for f in frames for event in f.events],

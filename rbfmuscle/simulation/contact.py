@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Booleans, Floats
+from rbfmuscle.scene.tendons import AtRest
 from rbfmuscle.simulation.broad_phase import (
     answer_loop,
     apart_loop,
@@ -84,7 +85,7 @@ class BoneContacts:
         boxes = [self.fields[b].bounds for b in self.reached]
         self.boxes = np.array(boxes, dtype=np.float64).reshape(-1, 2, 3)
         self.contact_bone = None if contact_bone is None else np.asarray(contact_bone, dtype=np.int64)
-        self._take({name: np.eye(4) for name in self.names})
+        self._take(AtRest((name, np.eye(4)) for name in self.names))
         self.allowed = {}
         self.neighbours, self.cuts = [], []
         self._known: tuple[Floats, ...] = (

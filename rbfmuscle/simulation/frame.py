@@ -82,6 +82,8 @@ class Frame:
         Whether each muscle was solved, moved rigidly or skipped, and why.
     neighbours : dict of (str, str) to (float, float)
         For each pair that slides: overlap, and RMS gap opened where they touched at rest.
+    tendons : dict of str to TendonLine
+        By the end that each holds; the poses have these too.
     """
 
     index: int
@@ -95,6 +97,7 @@ class Frame:
     activations: dict = field(default_factory=dict)
     work: dict = field(default_factory=dict)
     neighbours: dict = field(default_factory=dict)
+    tendons: dict = field(default_factory=dict)
 
 
 class Drawing(Protocol):

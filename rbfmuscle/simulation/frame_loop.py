@@ -136,8 +136,12 @@ class FrameLoop:
         for stepper in self.steppers:
             times[stepper.name], happened = stepper.collect()
             events.extend(happened)
-        poses = dict(self._poses(self.here))
-        frame = Frame(self._next_index - 1, dict(self.here), poses, {}, carried, events, times, 0.0)
+        poses = self._poses(self.here)
+        solved = [muscle for muscle in self.scene.muscles if muscle.name in carried]
+        for end in (end.name for muscle in solved for end in muscle.tendons):
+            poses[end]
+        frame = Frame(self._next_index - 1, dict(self.here), dict(poses), {}, carried, events, times, 0.0)
+        frame.tendons.update(poses.tendons)
         frame.activations.update(self.activations.here)
         frame.neighbours.update(self._pairs)
         frame.work.update({stepper.name: stepper.work for stepper in self.steppers})

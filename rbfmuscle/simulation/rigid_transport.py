@@ -60,7 +60,7 @@ class OwnBones:
     Attributes
     ----------
     names : list of str
-        Bones that hold the muscle; the first holds most of it.
+        Bones, and ends of tendons, that hold the muscle; the first holds most of it.
     """
 
     def __init__(self, muscle: Muscle, scene: Scene) -> None:
@@ -68,7 +68,7 @@ class OwnBones:
         frame, self.size = RestFrame(vertices), diameter(vertices)
         held: dict[str, list[np.ndarray]] = {}
         for attachment in muscle.attachments:
-            held.setdefault(attachment.bone, []).append(attachment.vertices)
+            held.setdefault(attachment.holder, []).append(attachment.vertices)
         parts = {name: np.concatenate(found) for name, found in held.items()}
         self.names = sorted(parts, key=lambda name: -len(parts[name]))
         self._corners = {name: frame.corners(parts[name]) for name in self.names}

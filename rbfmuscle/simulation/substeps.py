@@ -18,6 +18,7 @@ from rbfmuscle.scene.motion import (
     step_angle,
     turned_angle,
 )
+from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.validation import SceneError
 
 if TYPE_CHECKING:
@@ -61,16 +62,17 @@ class SubSteps:
         self.scene = scene
         self._poses = poses or (lambda coordinates: bone_poses(scene, coordinates))
         muscles = scene.muscles if muscle is None else [muscle]
-        own = [attachment.bone for part in muscles for attachment in part.attachments]
+        own = [attachment.holder for part in muscles for attachment in part.attachments]
+        guides = [name for part in muscles for attachment in part.attachments for name in attachment.bones]
         self._facts = all_coordinates(scene.joints)
         #: The bones that count, and the coordinates that move them against each other. A muscle's are seen from the
         #: first that holds it, a whole scene's from the world.
         if muscle is None:
-            self._root, self.bones = None, [bone.name for bone in scene.bones]
+            self._root, self.bones = None, [*dict.fromkeys([*own, *(bone.name for bone in scene.bones)])]
             self.relevant = set(self._facts)
         else:
             self._root, self.bones = own[0], [*dict.fromkeys([*own, *bones])]
-            self.relevant = _moving_apart(scene, self.bones)
+            self.relevant = _moving_apart(scene, [*guides, *bones])
         self.limit = math.radians(scene.contact.substep_angle)
         names = self.bones
         owner, corners, size = [], [], []
@@ -78,7 +80,7 @@ class SubSteps:
             vertices = np.asarray(part.mesh.vertices)
             frame = RestFrame(vertices)
             for attachment in part.attachments:
-                owner.append(names.index(attachment.bone))
+                owner.append(names.index(attachment.holder))
                 corners.append(frame.corners(attachment.vertices))
                 size.append(diameter(vertices))
         # Of each attachment: its bone, a box about it, and how far that may move in one sub-step.
@@ -184,9 +186,9 @@ class PoseCache:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        self._known: dict[Any, dict[str, Any]] = {}
+        self._known: dict[Any, Poses] = {}
 
-    def __call__(self, coordinates: dict[str, float]) -> dict[str, Any]:
+    def __call__(self, coordinates: dict[str, float]) -> Poses:
         """Poses (4, 4) by bone, as `bone_poses` gives them; shared, so not to be changed."""
         key = tuple(sorted(coordinates.items()))
         found = self._known.get(key)

@@ -9,7 +9,8 @@ import numpy as np
 
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.metrics.penetration import BoneProbe
-from rbfmuscle.output.colours import BONE_COLOUR, linear_rgb
+from rbfmuscle.output.colours import BONE_COLOUR, TENDON_COLOUR, linear_rgb
+from rbfmuscle.output.tubes import tendon_name
 from rbfmuscle.viewer.colours import COLOURINGS, shades, vertex_values
 from rbfmuscle.viewer.sources import LiveSource, Mesh, Picture, SavedSource
 
@@ -89,6 +90,9 @@ class Side:
             self._show(name, part, self.source.colours[name], visible=shown and colouring is None)
             if shown and colouring is not None:
                 painted.append((*part, linear_rgb(shades(colouring, values, self.source.millimetre))))
+        for name, mesh in self.picture.tendons.items():
+            part = self._part(mesh, cut)
+            self._show(tendon_name(name), part, TENDON_COLOUR, visible=name not in hidden)
         self._paint(painted)
 
     def _part(self, mesh: Mesh, cut: tuple[int, float] | None) -> Mesh:

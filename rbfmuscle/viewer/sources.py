@@ -11,6 +11,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.models import MODEL_NAMES, build_models, configure_scene
 from rbfmuscle.output.colours import muscle_colours
 from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.output.tubes import tendon_mesh, tendon_name
 from rbfmuscle.report.appearance import muscle_groups
 from rbfmuscle.scene.motion import inner_value, shown_value, unit_sign
 from rbfmuscle.scene.objects import MM_PER_UNIT
@@ -33,7 +34,7 @@ class Control(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """One picture's content, by bone or muscle.
+    """One picture's content, by bone or muscle; tendons of the muscles that have some.
 
     ``material`` is a mesh of constant topology where one is known: vertices, vertices at rest, faces. ``depth`` in
     the bones [scene unit] and ``activation`` are there for the muscles that have them.
@@ -41,6 +42,7 @@ class Picture(NamedTuple):
 
     poses: dict[str, Floats]
     surfaces: dict[str, Mesh]
+    tendons: dict[str, Mesh]
     material: dict[str, tuple[Floats, Floats, Integers]]
     activation: dict[str, float]
     depth: dict[str, float]
@@ -130,7 +132,9 @@ class LiveFigure:
         material = {n: (frame.carried[n][0], *mesh) for n, mesh in self._rest.items()}
         key = "solver_penetration_max"
         depth = {n: s.quantities[key] for n, s in drawn if key in s.quantities}
-        return Picture(frame.poses, surfaces, material, frame.activations, depth, "")
+        meshes = {m.name: tendon_mesh(m, frame.tendons) for m in self.session.scene.muscles}
+        tendons = {name: mesh for name, mesh in meshes.items() if mesh is not None}
+        return Picture(frame.poses, surfaces, tendons, material, frame.activations, depth, "")
 
     def close(self) -> None:
         """End the session's threads."""
@@ -186,7 +190,11 @@ class SavedFigure:
         rest = {n: mesh for n, mesh in self._rest.items() if np.array_equal(mesh[1], surfaces[n][1])}
         material = {n: (surfaces[n][0], *mesh) for n, mesh in rest.items()}
         activation, depth = (self._known(quantity) for quantity in ("activation", "penetration_max"))
-        return Picture(saved.poses[frame], surfaces, material, activation, depth, saved.caption(frame))
+        named = {name: tendon_name(name) for name in saved.muscles}
+        tendons = {n: saved.surface(mesh, frame) for n, mesh in named.items() if mesh in saved.tendons}
+        return Picture(
+            saved.poses[frame], surfaces, tendons, material, activation, depth, saved.caption(frame)
+        )
 
     def _known(self, quantity: str) -> dict[str, float]:
         series = {name: self.saved.series(name, quantity) for name in self.saved.muscles}

@@ -39,7 +39,7 @@ TABLES = {
     "output": (
         options.OutputOptions,
         {
-            "surfaces": {"format": "ply"}, "report": False,
+            "surfaces": {"format": "ply"}, "tendons": False, "report": False,
         },
     ),
 }  # fmt: skip

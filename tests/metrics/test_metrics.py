@@ -18,7 +18,7 @@ from rbfmuscle.metrics.penetration import BoneProbe, bone_depth, bones_about, su
 from rbfmuscle.metrics.rows import frame_rows, moment_arm_rows
 from rbfmuscle.metrics.topology import SurfaceForm, count_components
 from rbfmuscle.scene.joints.joint import Coordinate
-from rbfmuscle.scene.objects import Motion
+from rbfmuscle.scene.objects import Attachment, Motion
 from rbfmuscle.simulation.frame_loop import Event, Frame, ModelSurface
 
 EYE = np.eye(4)
@@ -229,8 +229,8 @@ def rod(length=100.0, radius=8.0, rings=60, around=24):
 
 def rod_muscle(mesh, length=100.0):
     ends = [("trunk", mesh.vertices[:, 0] == 0), ("limb", mesh.vertices[:, 0] == length)]
-    attachments = [SimpleNamespace(bone=bone, vertices=np.flatnonzero(where)) for bone, where in ends]
-    return SimpleNamespace(name="rod", mesh=mesh, attachments=attachments, contraction=None)
+    attachments = [Attachment(bone, np.flatnonzero(where)) for bone, where in ends]
+    return SimpleNamespace(name="rod", mesh=mesh, attachments=attachments, contraction=None, tendons=[])
 
 
 BEND = {"bend": Coordinate()}

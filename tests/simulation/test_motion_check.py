@@ -42,7 +42,7 @@ def test_end_driven_into_a_bone_is_found_with_depth_and_frame():
     assert one.depth == pytest.approx(deepest, abs=0.2)  # the field's own error, and thinned vertices
     assert 14 <= one.first <= 18
     text = str(motion_findings(scene)[0])
-    assert "strap" in text and "'post'" in text and "carrier" in text
+    assert "strap" in text and "'post'" in text and "give it a tendon" in text
 
 
 def test_nothing_is_found_where_nothing_is_wrong():

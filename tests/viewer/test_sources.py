@@ -114,7 +114,9 @@ def test_muscle_that_cannot_be_solved_can_go_on_from_rest(figure):
 
 def picture_of(vertices, faces, *, rest=None, activation=0.5):
     material = {} if rest is None else {"ball": (vertices, rest, faces)}
-    return Picture({"bone": np.eye(4)}, {"ball": (vertices, faces)}, material, {"ball": activation}, {}, "")
+    return Picture(
+        {"bone": np.eye(4)}, {"ball": (vertices, faces)}, {}, material, {"ball": activation}, {}, ""
+    )
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.output.colours import BONE_COLOUR, muscle_colours, rgb
+from rbfmuscle.output.colours import BONE_COLOUR, TENDON_COLOUR, muscle_colours, rgb
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.objects import MM_PER_UNIT
 
@@ -18,7 +18,9 @@ FRAMES_A_SECOND = 24.0
 
 @dataclass(frozen=True)
 class MovingMuscle:
-    """The surface of a muscle: vertices (n, 3) and faces (m, 3) of each frame, the same array of faces where it stays.
+    """The surface of a muscle, or of its tendons.
+
+    Vertices (n, 3) and faces (m, 3) are those of each frame, with the same array of faces where it stays.
 
     ``colour`` (3,) is red, green and blue, 0 to 1, as screens show them.
     """
@@ -88,7 +90,8 @@ class MovingRun:
 def read_moving(saved: SavedRun, frames: list[int], *, unit: str, up: str = "z") -> MovingRun:
     """Some frames of a saved run at once, lengths in ``unit``."""
     factor = MM_PER_UNIT[saved.units] / MM_PER_UNIT[unit]
-    muscles = [_read_muscle(saved, name, frames, factor) for name in saved.muscles]
+    colours = {**muscle_colours(saved.muscles), **dict.fromkeys(saved.tendons, TENDON_COLOUR)}
+    muscles = [_read_muscle(saved, name, frames, factor, rgb(colour)) for name, colour in colours.items()]
     bones = []
     for name in saved.bones:
         vertices, faces = saved.bone(name)
@@ -101,11 +104,11 @@ def read_moving(saved: SavedRun, frames: list[int], *, unit: str, up: str = "z")
     return MovingRun(name, unit, at, bool(saved.times), muscles, bones, up)
 
 
-def _read_muscle(saved, name, frames, factor):
+def _read_muscle(saved, name, frames, factor, colour):
     vertices, faces = [], []
     for frame in frames:
         points, triangles = saved.surface(name, frame)
         same = faces and np.array_equal(faces[0], triangles)
         vertices.append(points * factor)
         faces.append(faces[0] if same else triangles)
-    return MovingMuscle(name, rgb(muscle_colours(saved.muscles)[name]), vertices, faces)
+    return MovingMuscle(name, colour, vertices, faces)

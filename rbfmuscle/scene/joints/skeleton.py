@@ -81,6 +81,19 @@ def joint_poses(
     return {bone: poses[bone] for bone in bones}
 
 
+def bones_between(joints: list[Joint], bones: list[str]) -> set[str]:
+    """Names of these bones and of those on the way between them, from joint to joint."""
+    parents, chains = {joint.child: joint.parent for joint in joints}, []
+    for bone in dict.fromkeys(bones):
+        chain = [bone]
+        while chain[-1] in parents and parents[chain[-1]] not in chain:
+            chain.append(parents[chain[-1]])
+        chains.append(chain)
+    common = set(chains[0]).intersection(*chains)
+    root = next((bone for bone in chains[0] if bone in common), None)
+    return {bone for chain in chains for bone in chain if bone not in common} | {root or bones[0], *bones}
+
+
 def joint_values(
     joints: list[Joint], couplings: list[Coupling], coordinates: dict[str, float]
 ) -> dict[str, dict[str, float]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.motion import bone_poses, completed, interpolate, rest_coordinates
+from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.simulation.substeps import check_substeps, path_angle
 
 if TYPE_CHECKING:
@@ -27,7 +29,7 @@ SAMPLED_POSES = 48
 PADDING = 0.1
 
 
-def swept_region(muscle: Muscle, bone_name: str, poses: list[dict[str, Floats]]) -> Floats:
+def swept_region(muscle: Muscle, bone_name: str, poses: Sequence[Mapping[str, Floats]]) -> Floats:
     """Box (2, 3) in a bone's coordinates that holds a muscle through a motion.
 
     Parameters
@@ -38,7 +40,7 @@ def swept_region(muscle: Muscle, bone_name: str, poses: list[dict[str, Floats]])
         Poses of all bones, the rest pose among them.
     """
     back = np.linalg.inv(np.array([pose[bone_name] for pose in poses]))
-    held = np.array([[pose[name] for pose in poses] for name in {a.bone for a in muscle.attachments}])
+    held = np.array([[pose[name] for pose in poses] for name in {a.holder for a in muscle.attachments}])
     return _swept(muscle, back[None], held)[0]
 
 
@@ -51,7 +53,7 @@ def _swept(muscle, back, held):
     return np.stack([low, high], axis=1)
 
 
-def sampled_poses(scene: Scene) -> list[dict[str, Floats]]:
+def sampled_poses(scene: Scene) -> list[Poses]:
     """Poses along the scene's motion, the rest pose first, thinned to a bounded number."""
     frames = scene.motion.frames
     chosen = sorted({round(k) for k in np.linspace(0, len(frames) - 1, min(len(frames), SAMPLED_POSES))})
@@ -72,7 +74,7 @@ def find_contact_pairs(scene: Scene) -> dict[tuple[Any, ...], Floats]:
     boxes = np.array([bone.mesh.bounds for bone in scene.bones])
     regions = {}
     for muscle in scene.muscles:
-        held = np.array([there[name] for name in {a.bone for a in muscle.attachments}])
+        held = np.array([[pose[name] for pose in poses] for name in {a.holder for a in muscle.attachments}])
         swept = _swept(muscle, back, held)
         met = np.all((swept[:, 0] <= boxes[:, 1]) & (swept[:, 1] >= boxes[:, 0]), axis=1)
         regions.update({(muscle.name, scene.bones[b].name): swept[b] for b in np.flatnonzero(met)})

@@ -84,7 +84,7 @@ def _patches(muscle: Muscle) -> dict[str, Floats]:
     """Attached vertices by bone, thinned."""
     found: dict[str, list[Any]] = {}
     for attachment in muscle.attachments:
-        found.setdefault(attachment.bone, []).append(attachment.vertices)
+        found.setdefault(attachment.holder, []).append(attachment.vertices)
     thinned = {}
     for bone, parts in found.items():
         index = np.unique(np.concatenate(parts))
@@ -162,8 +162,8 @@ def describe(found: tuple[Sequence[Driven], Sequence[Stretched]], units: str) ->
             "warning",
             one.muscle,
             f"the motion drives the end held by {one.bone!r} into bone {one.into!r}, from about frame {one.first}, "
-            f"by up to {one.depth:.3g} {units} at frame {one.frame}; hold it by a carrier (a bone with a joint of its "
-            "own that goes where the tendon would), or end the motion sooner",
+            f"by up to {one.depth:.3g} {units} at frame {one.frame}; give it a tendon, or its tendon via "
+            "points, or end the motion sooner",
         )
         for one in sorted(driven, key=lambda one: -one.depth)
     ]
@@ -176,8 +176,8 @@ def describe(found: tuple[Sequence[Driven], Sequence[Stretched]], units: str) ->
                 one.muscle,
                 f"{one.bones[0]!r} and {one.bones[1]!r} {how} its ends to {one.distance / one.rest:.2f} times their "
                 f"distance at rest ({one.rest:.4g} to {one.distance:.4g} {units} at frame {one.frame}, too far from "
-                f"about frame {one.first}); a tendon may be missing between mesh and bone: hold the end by a carrier, "
-                "or correct the attachments",
+                f"about frame {one.first}); a tendon may be missing between mesh and bone: give one to the "
+                "attachment, or correct the attachments",
             )
         )
     return said

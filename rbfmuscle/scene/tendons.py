@@ -1,0 +1,398 @@
+"""Tendons: lines from the end of a muscle's belly to the insertion, along which that end moves.
+
+A taut string runs from the muscle's other end past the belly's end and the via points to the insertion, around the
+bones. It takes up a change of its length as two springs in series do: the tendon's strain is `STIFFNESS_RATIO` of the
+belly's, at most `TENDON_STRAIN`, and zero where the string is shorter than at rest. The belly's end lies on the string
+at the tendon's length from the insertion, displaced from it as at rest and out of the bones. All this depends on the
+poses of the bones alone and continuously: a pose has the same ends however it is reached.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import NamedTuple, Protocol, TypeAlias
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.jit import compiled
+from rbfmuscle.scene.activation.keys import TENDON_STRAIN
+
+# Strain of a passive belly at which it bears the force that strains its tendon by `TENDON_STRAIN` (Zajac 1989), and
+# the tendon's strain over the belly's.
+BELLY_STRAIN = 0.6
+STIFFNESS_RATIO = TENDON_STRAIN / BELLY_STRAIN
+# The string's direction is that of a chord so long, in lengths of the string.
+CHORD = 0.06
+# Steps to the place of the end where its tendon has the wanted length, and the relative error that ends them.
+STEPS, TOLERANCE = 8, 1e-9
+# Points of a tendon as it is drawn, and of the belly's end that are kept out of bones, at most.
+NODES, PATCH = 33, 16
+# Greatest slope of a line against the chord of its ends.
+STEEPEST = 2.0
+# Directions in which a convex hull is begun.
+DIRECTIONS = 64
+
+# A bone and a point (3,) of it at rest [scene unit].
+BonePoint: TypeAlias = tuple[str, Floats]
+
+
+class Obstacle(Protocol):
+    """A bone that tendons go around."""
+
+    name: str
+
+    @property
+    def bounds(self) -> Floats:
+        """Box (2, 3) about it at rest."""
+
+    @property
+    def surface_points(self) -> Floats:
+        """Points (n, 3) on it at rest."""
+
+    def nearest(self, points: Floats) -> tuple[Floats, Floats]:
+        """Distances (n,) at rest, negative inside, and nearest places (n, 3) on it, of points (n, 3)."""
+
+
+class TendonLine(NamedTuple):
+    """A tendon as it is drawn: points (n, 3) from the belly's end to the insertion, and its radii at both."""
+
+    points: Floats
+    radii: tuple[float, float]
+
+
+class AtRest(dict[str, Floats]):
+    """The pose (4, 4) of every bone, and of every end, at rest."""
+
+    def __missing__(self, name: str) -> Floats:
+        return np.eye(4)
+
+
+AT_REST = AtRest()
+
+
+class Poses(dict[str, Floats]):
+    """Poses (4, 4) of bones by name; those of ends that tendons hold are computed when they are first asked for.
+
+    Parameters
+    ----------
+    bones : mapping of str to (4, 4) ndarray
+    ends : mapping of str to TendonEnd
+
+    Attributes
+    ----------
+    tendons : dict of str to TendonLine
+        Of the ends asked for so far.
+    """
+
+    def __init__(self, bones: Mapping[str, Floats], ends: Mapping[str, TendonEnd]) -> None:
+        super().__init__(bones)
+        self._ends = ends
+        self.tendons: dict[str, TendonLine] = {}
+
+    def __missing__(self, name: str) -> Floats:
+        self.tendons[name], pose = self._ends[name].place(self)
+        self[name] = pose
+        return pose
+
+
+class _Mark(NamedTuple):
+    """A point (3,) on a string, the direction (3,) there, and how many legs of the string end before it."""
+
+    point: Floats
+    direction: Floats
+    legs: int
+
+
+class TendonEnd:
+    """The end of a belly that a tendon joins to a bone.
+
+    Parameters
+    ----------
+    name : str
+        Of the end among the poses.
+    patch : (n, 3) ndarray
+        The end's vertices at rest [scene unit].
+    middle : (3,) ndarray
+        Of the patch.
+    radii : (float, float)
+        Of the belly there, and of the tendon as it is drawn [scene unit].
+    line : list of BonePoint
+        Via points, then the insertion.
+
+    Attributes
+    ----------
+    other : list of BonePoint
+        The muscle's other end: a point of its bone, or of its tendon the insertion and the via points.
+    slack : float
+        Length of that tendon at rest, zero where there is none.
+    obstacles : sequence of Obstacle
+        Bones that string and tendon go around.
+    """
+
+    def __init__(
+        self, name: str, patch: Floats, middle: Floats, radii: tuple[float, float], line: list[BonePoint]
+    ) -> None:
+        self.name, self.middle, self.radii, self.line = name, middle, radii, line
+        self.patch = patch[:: -(-len(patch) // PATCH)]
+        self.other: list[BonePoint] = []
+        self.obstacles: Sequence[Obstacle] = ()
+        self.slack = 0.0
+
+    @cached_property
+    def length(self) -> float:
+        """Of the tendon at rest [scene unit]."""
+        return line_length(self._tendon(self.middle, 0, AT_REST))
+
+    @cached_property
+    def _rest(self) -> tuple[float, _Mark]:
+        """Length of the string at rest, and its point at the tendon's length from the insertion."""
+        legs = self._string(AT_REST)
+        return sum(map(line_length, legs)), _mark(legs, self.length)
+
+    @cached_property
+    def _share(self) -> float:
+        """Place of the belly's end between the muscle's ends at rest, 0 to 1."""
+        belly, tendon = (
+            float(np.linalg.norm(self.middle - end[1])) for end in (self.other[0], self.line[-1])
+        )
+        return belly / max(belly + tendon, 1e-300)
+
+    @cached_property
+    def _sides(self) -> list[Floats]:
+        """Direction (3,) at rest to the side on which each leg of the string passes the bones.
+
+        It leads out of the nearest bone: from the belly's end in the leg that passes it, from the middle of others.
+        """
+        stops = [point for _, point in (*self.other, *self.line)]
+        places = [0.5 * (a + b) for a, b in itertools.pairwise(stops)]
+        places[len(self.other) - 1] = self.middle
+        return [self._outwards(*leg) for leg in zip(places, stops, stops[1:])]
+
+    def _outwards(self, place: Floats, start: Floats, end: Floats) -> Floats:
+        """Unit direction (3,) across a leg, out of or away from the bone nearest to a place (3,), all at rest."""
+        found = (bone.nearest(place[None]) for bone in self.obstacles)
+        distance, closest = min(((float(d[0]), c[0]) for d, c in found), key=lambda one: one[0])
+        way, along = place - closest if distance > 0.0 else closest - place, end - start
+        way = way - (way @ along) / max(float(along @ along), 1e-300) * along
+        return way / max(float(np.linalg.norm(way)), 1e-300)
+
+    def place(self, poses: Mapping[str, Floats]) -> tuple[TendonLine, Floats]:
+        """The tendon, and the pose (4, 4) of the belly's end from rest to world.
+
+        Parameters
+        ----------
+        poses : mapping of str to (4, 4) ndarray
+            Of the bones.
+        """
+        at_rest, before = self._rest
+        legs = self._string(poses)
+        length = self.length * (1.0 + self._strain(sum(map(line_length, legs)) - at_rest))
+        now = _mark(legs, length)
+        turn = self._turn(before.direction, now.direction, poses)
+        middle = now.point + turn @ (self.middle - before.point)
+        middle = middle + self._lift(turn, middle, now.direction, poses)
+        passed = max(0, now.legs - len(self.other) + 1)
+        for _ in range(STEPS):
+            tendon = self._tendon(middle, passed, poses)
+            excess = line_length(tendon) - length
+            if abs(excess) <= TOLERANCE * length:
+                break
+            # A taut line becomes shorter by as much as its end goes along it.
+            ahead = tendon[1] - tendon[0]
+            middle = middle + excess / max(float(np.linalg.norm(ahead)), 1e-300) * ahead
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn, middle - turn @ self.middle
+        return TendonLine(_with_nodes(tendon), self.radii), pose
+
+    def _lift(self, turn: Floats, middle: Floats, direction: Floats, poses: Mapping[str, Floats]) -> Floats:
+        """Shift (3,) across the string that takes the patch out of bones, as far as it is deeper there than at rest."""
+        points = (self.patch - self.middle) @ turn.T + middle
+        deepest = 0.0
+        for bone, at_rest in zip(self.obstacles, self._rest_depths):
+            pose = poses[bone.name]
+            local = (points - pose[:3, 3]) @ pose[:3, :3]
+            deepest = max(deepest, float((_depths(bone, local) - at_rest).max()))
+        near, far = (poses[bone][:3, :3] for bone, _ in (self.other[-1], self.line[0]))
+        side = (near + far) @ self._sides[len(self.other) - 1]
+        side = side - (side @ direction) * direction
+        return deepest * side / max(float(np.linalg.norm(side)), 1e-300)
+
+    @cached_property
+    def _rest_depths(self) -> list[Floats]:
+        """Depth (n,) of the patch in each obstacle at rest."""
+        return [_depths(bone, self.patch) for bone in self.obstacles]
+
+    def _strain(self, longer: float) -> float:
+        """The tendon's strain where the string is longer than at rest by so much."""
+        tendons = self.length + self.slack
+        belly = max(self._rest[0] - tendons, 0.0)
+        strain = STIFFNESS_RATIO * longer / max(belly + STIFFNESS_RATIO * tendons, 1e-300)
+        return min(max(strain, 0.0), TENDON_STRAIN)
+
+    def _string(self, poses: Mapping[str, Floats]) -> list[Floats]:
+        """Legs of the string, each from one of its fixed points to the next."""
+        stops = [*self.other, *self.line]
+        return self._legs([_moved(*point, poses) for point in stops], stops, self._sides, poses)
+
+    def _tendon(self, middle: Floats, passed: int, poses: Mapping[str, Floats]) -> Floats:
+        """The line from the belly's end to the insertion, without the via points that the end has passed."""
+        first = len(self.other) - 1 + passed
+        stops = [*self.other, *self.line][first:]
+        points = [middle, *(_moved(*point, poses) for point in stops[1:])]
+        legs = self._legs(points, stops, self._sides[first:], poses)
+        return np.concatenate([legs[0], *(leg[1:] for leg in legs[1:])])
+
+    def _legs(
+        self,
+        points: Sequence[Floats],
+        stops: Sequence[BonePoint],
+        sides: Sequence[Floats],
+        poses: Mapping[str, Floats],
+    ) -> list[Floats]:
+        """Taut lines from one point to the next, whose sides turn half with the bone of either."""
+        bones = [(poses[bone.name], bone.surface_points) for bone in self.obstacles]
+        legs = []
+        for k, side in zip(range(len(points) - 1), sides):
+            turned = (poses[stops[k][0]][:3, :3] + poses[stops[k + 1][0]][:3, :3]) @ side
+            legs.append(taut_line(points[k], points[k + 1], turned, bones, self.radii[0]))
+        return legs
+
+    def _turn(self, before: Floats, now: Floats, poses: Mapping[str, Floats]) -> Floats:
+        """Rotation (3, 3) that takes one direction to the other.
+
+        Seen from the bone of either end it would be the least rotation that does; the twist about the direction between
+        these two is spread evenly along the string.
+        """
+        near, far = (poses[end[0]][:3, :3] for end in (self.other[0], self.line[-1]))
+        first, last = (turn @ _least_turn(turn.T @ now, before) for turn in (near, far))
+        twist = last @ first.T
+        skew = np.array([twist[2, 1] - twist[1, 2], twist[0, 2] - twist[2, 0], twist[1, 0] - twist[0, 1]])
+        angle = self._share * np.arctan2(skew @ now, np.trace(twist) - 1.0)
+        return _about(now, angle) @ first
+
+
+def taut_line(
+    start: Floats, end: Floats, side: Floats, bones: Sequence[tuple[Floats, Floats]], width: float
+) -> Floats:
+    """Points (n, 3) of the taut line between two points that passes bones on one side.
+
+    The line lies in the plane of its ends and ``side``. A point of a bone at a distance z from the plane is an obstacle
+    in it, lower by z² / (2 ``width``), as for a round band. One that the line could only pass by leaving an end more
+    steeply than `STEEPEST` is lowered below that slope by as much as it is above. So the line changes continuously
+    where the plane comes to meet a bone, and parts of bones that lie far to the side do not count.
+
+    Parameters
+    ----------
+    start, end, side : (3,) ndarray
+    bones : sequence of (pose, points)
+        (4, 4) and, at rest, (n, 3).
+    width : float
+        [scene unit]
+    """
+    size = float(np.linalg.norm(end - start))
+    along = (end - start) / max(size, 1e-300)
+    up = side - (side @ along) * along
+    up = up / max(float(np.linalg.norm(up)), 1e-300)
+    axes = np.stack([along, up, np.cross(along, up)])
+    profile = []
+    for pose, points in bones:
+        turn, shift, found = axes @ pose[:3, :3], axes @ (pose[:3, 3] - start), np.empty((len(points), 2))
+        profile.append(found[: _profile_loop(points, turn, shift, size, max(width, 1e-300), found)])
+    if not any(len(found) for found in profile):
+        return np.stack([start, end])
+    return start + _upper_hull(np.concatenate([[[0.0, 0.0], [size, 0.0]], *profile])) @ axes[:2]
+
+
+@compiled(error_model="numpy")
+def _profile_loop(points, turn, shift, size, width, found):
+    """Fill ``found`` with points along and above a chord, counted as in `taut_line`; return how many there are."""
+    count = 0
+    for i in range(len(points)):
+        a, b, c = points[i, 0], points[i, 1], points[i, 2]
+        x = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c + shift[0]
+        if x <= 0.0 or x >= size:
+            continue
+        y = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c + shift[1]
+        z = turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c + shift[2]
+        y = min(y, 2.0 * STEEPEST * min(x, size - x) - y) - z * z / (2.0 * width)
+        if y > 0.0:
+            found[count, 0], found[count, 1] = x, y
+            count += 1
+    return count
+
+
+def _upper_hull(points: Floats) -> Floats:
+    """Upper convex hull (k, 2) of points (n, 2), from left to right (Andrew 1979)."""
+    # Nearly all points lie below the hull of those that are outermost in some directions.
+    angles = np.linspace(0.0, np.pi, DIRECTIONS)
+    outermost = np.unique(np.argmax(np.stack([-np.cos(angles), np.sin(angles)], axis=1) @ points.T, axis=1))
+    outermost = outermost[np.argsort(points[outermost, 0], kind="stable")]
+    above = points[:, 1] >= np.interp(points[:, 0], *points[outermost].T)
+    hull: list[Floats] = []
+    for point in points[above][np.lexsort(points[above].T[::-1])]:
+        while len(hull) > 1:
+            (ax, ay), (bx, by) = hull[-2], hull[-1]
+            if (bx - ax) * (point[1] - ay) < (by - ay) * (point[0] - ax):
+                break
+            hull.pop()
+        hull.append(point)
+    return np.array(hull)
+
+
+def line_length(points: Floats) -> float:
+    """Length of the line through points (n, 3)."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def _points_along(line: Floats, places: Floats) -> Floats:
+    """Points (k, 3) at distances (k,) along a line (n, 3) from its beginning."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    return np.stack([np.interp(places, along, line[:, axis]) for axis in range(3)], axis=1)
+
+
+def _with_nodes(line: Floats) -> Floats:
+    """`NODES` points at about even distances along a line (n, 3), its sharpest corners among them."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    places = np.linspace(0.0, along[-1], NODES)
+    for corner in along[1:-1]:
+        places[1 + np.argmin(np.abs(places[1:-1] - corner))] = corner
+    return _points_along(line, np.sort(places))
+
+
+def _depths(bone: Obstacle, points: Floats) -> Floats:
+    """Depth (n,) of points (n, 3) in a bone at rest, 0 outside."""
+    low, high = bone.bounds
+    if np.any(points.min(axis=0) > high) or np.any(points.max(axis=0) < low):
+        return np.zeros(len(points))
+    return np.maximum(-bone.nearest(points)[0], 0.0)
+
+
+def _moved(bone: str, point: Floats, poses: Mapping[str, Floats]) -> Floats:
+    """A point of a bone (3,) at rest, where the bone is now."""
+    return poses[bone][:3, :3] @ point + poses[bone][:3, 3]
+
+
+def _mark(legs: Sequence[Floats], distance: float) -> _Mark:
+    """The point of a string at a distance along it from its end."""
+    ends = np.cumsum([line_length(leg) for leg in legs])
+    place, half = max(float(ends[-1]) - distance, 0.0), 0.5 * CHORD * float(ends[-1])
+    point, behind, ahead = _points_along(np.concatenate(legs), place + half * np.array([0.0, -1.0, 1.0]))
+    chord = ahead - behind
+    return _Mark(point, chord / max(float(np.linalg.norm(chord)), 1e-300), int((ends[:-1] <= place).sum()))
+
+
+def _least_turn(now: Floats, before: Floats) -> Floats:
+    """Least rotation (3, 3) that takes one direction (3,) to another."""
+    axis, cosine = np.cross(before, now), float(before @ now)
+    skew = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    return np.eye(3) + skew + skew @ skew / max(1.0 + cosine, 1e-9)
+
+
+def _about(axis: Floats, angle: float) -> Floats:
+    """Rotation (3, 3) by an angle [radian] about a unit axis (3,)."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(angle * axis).as_matrix()

@@ -1,0 +1,232 @@
+"""Tendons against known answers: straight, around a pulley, of kept length, the same by every path."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import trimesh
+
+import rbfmuscle as rm
+from rbfmuscle.output.export import export_run
+from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.output.tubes import tendon_mesh
+from rbfmuscle.scene.motion import bone_poses
+from rbfmuscle.scene.tendons import (
+    AT_REST,
+    STIFFNESS_RATIO,
+    TENDON_STRAIN,
+    TendonLine,
+    line_length,
+    taut_line,
+)
+
+END = "strap tendon 2 to limb"
+
+
+def arm(model="pbd", **keys):
+    """A limb that hangs on a trunk, and a strap before both that ends 40 mm above the limb."""
+    scene = rm.Scene("arm", units="mm")
+    for name, middle in (("trunk", 60.0), ("limb", -65.0)):
+        mesh = trimesh.creation.cylinder(8.0, 120.0, sections=48)
+        scene.add_bone(name, mesh.apply_translation([0.0, 0.0, middle]))
+    scene.add_joint(
+        "elbow",
+        "trunk",
+        "limb",
+        type="universal",
+        centre=[0, 0, 0],
+        axes={"bend": [-1, 0, 0], "turn": [0, 0, 1]},
+    )
+    belly = trimesh.creation.capsule(70.0, 9.0, count=[16, 16]).apply_translation([0.0, -20.0, 15.0])
+    z = belly.vertices[:, 2]
+    tendon = {"to": [0.0, -8.0, -70.0], **keys}
+    attach = [
+        {"bone": "trunk", "vertices": np.flatnonzero(z > z.max() - 6.0)},
+        {"bone": "limb", "vertices": np.flatnonzero(z < z.min() + 6.0), "tendon": tendon},
+    ]
+    return scene.add_muscle("strap", belly, attach=attach, model=model)
+
+
+def placed(scene, bend, turn=0.0):
+    poses = bone_poses(scene, {"elbow.bend": math.radians(bend), "elbow.turn": math.radians(turn)})
+    return poses[END], poses.tendons[END].points, poses
+
+
+def test_a_bent_joint_takes_the_end_along_the_straight_line_at_the_tendons_length():
+    scene = arm()
+    end = scene.muscles[0].tendons[0]
+    assert end.length == pytest.approx(np.linalg.norm(end.middle - [0.0, -8.0, -70.0]), rel=1e-12)
+    for bend in (0.0, 20.0, 50.0, 80.0):
+        pose, line, poses = placed(scene, bend)
+        middle = pose[:3, :3] @ end.middle + pose[:3, 3]
+        insertion = (poses["limb"] @ [0.0, -8.0, -70.0, 1.0])[:3]
+        np.testing.assert_allclose(line[[0, -1]], [middle, insertion], atol=1e-9)
+        # The strap becomes slack: its belly takes up all of that.
+        assert line_length(line) == pytest.approx(end.length, rel=1e-9)
+        assert np.linalg.norm(middle - insertion) == pytest.approx(end.length, rel=1e-9)
+
+
+def test_at_rest_the_end_is_where_it_was():
+    np.testing.assert_allclose(placed(arm(), 0.0)[0], np.eye(4), atol=1e-12)
+
+
+def test_a_pulled_tendon_takes_its_share_of_the_stretch_and_never_more_than_its_limit():
+    scene = arm()
+    end = scene.muscles[0].tendons[0]
+    start = np.asarray(end.other[0][1])
+    away = np.array([0.0, -8.0, -70.0]) - start
+    belly = np.linalg.norm(away) - end.length
+    for longer in (-10.0, 5.0, 30.0, 500.0):
+        pulled = np.eye(4)
+        pulled[:3, 3] = longer * away / np.linalg.norm(away)
+        line, _ = end.place({"trunk": np.eye(4), "limb": pulled})
+        strain = line_length(line.points) / end.length - 1.0
+        springs = longer * STIFFNESS_RATIO / (belly + STIFFNESS_RATIO * end.length)
+        # The end lies 5 mm beside the string, whose length at rest is therefore not quite belly and tendon.
+        assert strain == pytest.approx(min(max(springs, 0.0), TENDON_STRAIN), rel=0.01, abs=1e-9)
+
+
+def test_a_taut_line_around_a_cylinder_is_two_tangents_and_an_arc():
+    radius, far, height = 20.0, 60.0, 10.0
+    angles = np.linspace(0.0, 2.0 * np.pi, 721)[:-1]
+    ring = [radius * np.cos(angles), np.zeros_like(angles), radius * np.sin(angles)]
+    points = np.concatenate(
+        [np.stack([ring[0], ring[1] + y, ring[2]], axis=1) for y in np.linspace(-9, 9, 19)]
+    )
+    ends = np.array([[-far, 0.0, height - 5.0], [far, 0.0, height - 5.0]])
+    line = taut_line(*ends, np.array([0.3, 0.0, 1.0]), [(np.eye(4), points)], 5.0)
+    away = math.hypot(far, height - 5.0)
+    tangent = math.sqrt(away**2 - radius**2)
+    turned = 2.0 * (math.asin(far / away) - math.acos(radius / away))
+    # A ring of 720 points: its arc is short by 3e-6 of itself.
+    assert line_length(line) == pytest.approx(2.0 * tangent + radius * turned, rel=1e-5)
+    assert np.linalg.norm(line[:, [0, 2]], axis=1).min() > radius - 1e-3
+    straight = taut_line(*ends, np.array([0.0, 0.0, -1.0]), [(np.eye(4), points + [0, 0, 50.0])], 5.0)
+    np.testing.assert_array_equal(straight, ends)
+
+
+def test_the_end_of_a_limb_bent_backwards_goes_around_the_joint_continuously():
+    scene = arm()
+    end = scene.muscles[0].tendons[0]
+    middles = []
+    for bend in np.arange(20.0, -60.0, -1.0):
+        pose, line, poses = placed(scene, bend)
+        middles.append(pose[:3, :3] @ end.middle + pose[:3, 3])
+        inverse = np.linalg.inv(poses["limb"])
+        local = line @ inverse[:3, :3].T + inverse[:3, 3]
+        inside = np.hypot(local[:, 0], local[:, 1])[(local[:, 2] < -5.0) & (local[:, 2] > -125.0)]
+        # The line passes points of the surface that are 2 mm apart.
+        assert inside.min() > 8.0 - 0.3
+        assert line_length(line) <= end.length * (1.0 + TENDON_STRAIN) * (1.0 + 1e-6)
+    steps = np.linalg.norm(np.diff(middles, axis=0), axis=1)
+    # The insertion moves by 1.2 mm in a step of one degree.
+    assert steps.max() < 3.0
+
+
+def test_a_motion_of_all_bones_together_moves_the_end_with_them():
+    scene = arm()
+    end = scene.muscles[0].tendons[0]
+    poses = bone_poses(scene, {"elbow.bend": -0.6, "elbow.turn": 0.4})
+    motion = trimesh.transformations.rotation_matrix(1.1, [1.0, 2.0, 0.5], [30.0, -5.0, 7.0])
+    motion[:3, 3] += [5.0, 6.0, -7.0]
+    moved = end.place({name: motion @ poses[name] for name in ("trunk", "limb")})[1]
+    np.testing.assert_allclose(moved, motion @ poses[END], atol=1e-9)
+
+
+def test_a_twist_of_the_limb_turns_the_end_by_its_place_along_the_string():
+    scene = arm()
+    end = scene.muscles[0].tendons[0]
+    turn = math.radians(30.0)
+    start, axis = end.other[0][1], np.array([0.0, 0.0, 1.0])
+    twisted = trimesh.transformations.rotation_matrix(turn, axis, [0.0, -8.0, 0.0])
+    pose = end.place({"trunk": np.eye(4), "limb": twisted})[1]
+    near = np.linalg.norm(end.middle - start)
+    share = near / (near + np.linalg.norm(end.middle - [0.0, -8.0, -70.0]))
+    found = math.acos(0.5 * (np.trace(pose[:3, :3]) - 1.0))
+    # The string leans by 6 degrees against the axis of the twist.
+    assert found == pytest.approx(share * turn, rel=0.02)
+
+
+@pytest.mark.parametrize("model", ["pbd", "rbf"])
+def test_both_models_carry_the_end_and_measure_and_write_the_tendon(model, tmp_path):
+    name = {"name": "rbf", "centres": 60} if model == "rbf" else model
+    scene = arm(name).set_motion(
+        waypoints=[{"elbow.bend": 0}, {"elbow.bend": 30}, {"elbow.bend": 0}], step=15
+    )
+    run = rm.simulate(scene)
+    run.save(tmp_path)
+    vertices = np.asarray(scene.muscles[0].mesh.vertices)[scene.muscles[0].attachments[1].vertices]
+    for frame in run.frames:
+        pose = frame.poses[END]
+        held = vertices @ pose[:3, :3].T + pose[:3, 3]
+        surface = trimesh.Trimesh(
+            frame.surfaces["strap"].vertices, frame.surfaces["strap"].faces, process=False
+        )
+        # The surface of 60 centres is fitted to the patch, that of the mesh is the patch.
+        assert np.abs(trimesh.proximity.signed_distance(surface, held)).max() < (
+            1.5 if model == "rbf" else 1e-6
+        )
+    first, last = run.frames[0], run.frames[-1]
+    np.testing.assert_allclose(last.poses[END], first.poses[END], atol=1e-12)
+    rows = {(row.frame, row.quantity): row.value for row in run.metrics}
+    end = scene.muscles[0].tendons[0]
+    # The centreline of the fitted surface bends a little.
+    belly = np.linalg.norm(end.middle - end.other[0][1])
+    assert rows[0, "length"] == pytest.approx(belly + end.length, abs=0.5)
+    assert rows[0, "end_gap"] < 10.0 < np.linalg.norm(end.middle - [0.0, -8.0, -70.0])
+    saved = SavedRun(tmp_path)
+    assert saved.tendons == ["strap_tendon"]
+    mesh = trimesh.Trimesh(*saved.surface("strap_tendon", 1), process=False)
+    assert mesh.is_watertight and mesh.volume > 0.0
+    assert set(saved.poses[0]) == {"trunk", "limb"}
+    (file,) = export_run(tmp_path, "animated-glb")
+    assert {"strap", "strap_tendon"} <= set(trimesh.load(file).geometry)
+
+
+def test_tendons_are_left_out_of_the_files_on_request(tmp_path):
+    rm.simulate(arm().with_options({"output.tendons": False})).save(tmp_path)
+    assert not SavedRun(tmp_path).tendons and not list(tmp_path.glob("surfaces/*tendon*"))
+
+
+def test_a_belly_between_two_tendons_keeps_both():
+    scene = arm()
+    z = scene.muscles[0].mesh.vertices[:, 2]
+    attach = [
+        {
+            "bone": "trunk",
+            "vertices": np.flatnonzero(z > z.max() - 6.0),
+            "tendon": {"to": [0.0, -8.0, 110.0]},
+        },
+        {"bone": "limb", "vertices": np.flatnonzero(z < z.min() + 6.0), "tendon": {"to": [0.0, -8.0, -70.0]}},
+    ]
+    scene.muscles = []
+    first, last = scene.add_muscle("strap", arm().muscles[0].mesh, attach=attach).muscles[0].tendons
+    poses = bone_poses(scene, {"elbow.bend": 0.7})
+    for end in (first, last):
+        assert poses[end.name].shape == (4, 4)
+        assert line_length(poses.tendons[end.name].points) == pytest.approx(end.length, rel=1e-6)
+
+
+def test_via_points_of_another_bone_hold_the_line():
+    scene = arm(via=[{"bone": "trunk", "point": [0.0, -12.0, 5.0]}])
+    _, line, _ = placed(scene, 40.0)
+    assert np.linalg.norm(line - [0.0, -12.0, 5.0], axis=1).min() < 1e-9
+    with pytest.raises(rm.SceneError, match="tendon: unknown bone 'trunc'"):
+        arm(via=[{"bone": "trunc", "point": [0.0, 0.0, 0.0]}])
+    with pytest.raises(rm.SceneError, match="tendon"):
+        arm(to=[0.0, 0.0])
+
+
+def test_a_tube_tapers_from_the_belly_to_the_tendon():
+    line = np.stack([np.zeros(33), np.zeros(33), np.linspace(0.0, 100.0, 33)], axis=1)
+    muscle = arm().muscles[0]
+    vertices, faces = tendon_mesh(muscle, {END: TendonLine(line, (8.0, 2.0))})
+    away = np.hypot(vertices[:, 0], vertices[:, 1])
+    assert away[vertices[:, 2] == 0.0].max() == pytest.approx(8.0)
+    assert away[vertices[:, 2] == 100.0].max() == pytest.approx(2.0)
+    at = [away[np.isclose(vertices[:, 2], z)].max() for z in line[:, 2]]
+    assert all(a >= b for a, b in itertools.pairwise(at))
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    assert mesh.is_watertight and mesh.volume > 0.0
+    assert tendon_mesh(muscle, {}) is None and AT_REST["any"].shape == (4, 4)
