@@ -15,6 +15,8 @@ from pathlib import Path
 from evidence import data_folder
 from scipy.spatial.transform import Rotation
 
+from rbfmuscle.importers.toml_text import table_text
+
 HEEL = {"to": [-567.3, -347.0, 133.0]}
 PES = {"to": [-597.0, -436.0, 441.0], "via": [[-582.0, -412.0, 470.0]]}
 # Muscle and bone of its attachment file: the tendon, and `bone` where another one is its insertion.
@@ -145,22 +147,13 @@ def _patella(facts: dict) -> dict:
 
 
 def _toml(data: dict) -> str:
-    """Tables, and lists of tables, with what is in them in one line a key."""
-    lines = []
-    for key, value in data.items():
-        many = isinstance(value, list)
-        for table in value if many else [value]:
-            lines.append(f"[[{key}]]" if many else f"[{key}]")
-            lines += [f"{name} = {_inline(item)}" for name, item in table.items()] + [""]
-    return "\n".join(lines)
-
-
-def _inline(value: object) -> str:
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{json.dumps(key)} = {_inline(item)}" for key, item in value.items()) + " }"
-    if isinstance(value, list):
-        return "[" + ", ".join(_inline(item) for item in value) + "]"
-    return json.dumps(value)
+    """Text of the tables of a scene."""
+    rows = [
+        (f"[[{key}]]" if isinstance(value, list) else f"[{key}]", table)
+        for key, value in data.items()
+        for table in (value if isinstance(value, list) else [value])
+    ]
+    return "\n".join(table_text(head, table) for head, table in rows)
 
 
 def main() -> None:

@@ -13,7 +13,8 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import harmonic_weights
 from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.scene.joints.skeleton import all_coordinates
-from rbfmuscle.scene.tendons import TendonLine, line_length
+from rbfmuscle.scene.taut_line import line_length
+from rbfmuscle.scene.tendons import TendonLine
 
 _FINE, _SLICES = 120, 16
 

@@ -17,8 +17,8 @@ from typing import NamedTuple, Protocol, TypeAlias
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.jit import compiled
 from rbfmuscle.scene.activation.keys import TENDON_STRAIN
+from rbfmuscle.scene.taut_line import line_length, points_along, taut_line
 
 # Strain of a passive belly at which it bears the force that strains its tendon by `TENDON_STRAIN` (Zajac 1989), and
 # the tendon's strain over the belly's.
@@ -30,10 +30,6 @@ CHORD = 0.06
 STEPS, TOLERANCE = 8, 1e-9
 # Points of a tendon as it is drawn, and of the belly's end that are kept out of bones, at most.
 NODES, PATCH = 33, 16
-# Greatest slope of a line against the chord of its ends.
-STEEPEST = 2.0
-# Directions in which a convex hull is begun.
-DIRECTIONS = 64
 
 # A bone and a point (3,) of it at rest [scene unit].
 BonePoint: TypeAlias = tuple[str, Floats]
@@ -274,92 +270,16 @@ class TendonEnd:
         return _about(now, angle) @ first
 
 
-def taut_line(
-    start: Floats, end: Floats, side: Floats, bones: Sequence[tuple[Floats, Floats]], width: float
-) -> Floats:
-    """Points (n, 3) of the taut line between two points that passes bones on one side.
-
-    The line lies in the plane of its ends and ``side``. A point of a bone at a distance z from the plane is an obstacle
-    in it, lower by z² / (2 ``width``), as for a round band. One that the line could only pass by leaving an end more
-    steeply than `STEEPEST` is lowered below that slope by as much as it is above. So the line changes continuously
-    where the plane comes to meet a bone, and parts of bones that lie far to the side do not count.
-
-    Parameters
-    ----------
-    start, end, side : (3,) ndarray
-    bones : sequence of (pose, points)
-        (4, 4) and, at rest, (n, 3).
-    width : float
-        [scene unit]
-    """
-    size = float(np.linalg.norm(end - start))
-    along = (end - start) / max(size, 1e-300)
-    up = side - (side @ along) * along
-    up = up / max(float(np.linalg.norm(up)), 1e-300)
-    axes = np.stack([along, up, np.cross(along, up)])
-    profile = []
-    for pose, points in bones:
-        turn, shift, found = axes @ pose[:3, :3], axes @ (pose[:3, 3] - start), np.empty((len(points), 2))
-        profile.append(found[: _profile_loop(points, turn, shift, size, max(width, 1e-300), found)])
-    if not any(len(found) for found in profile):
-        return np.stack([start, end])
-    return start + _upper_hull(np.concatenate([[[0.0, 0.0], [size, 0.0]], *profile])) @ axes[:2]
-
-
-@compiled(error_model="numpy")
-def _profile_loop(points, turn, shift, size, width, found):
-    """Fill ``found`` with points along and above a chord, counted as in `taut_line`; return how many there are."""
-    count = 0
-    for i in range(len(points)):
-        a, b, c = points[i, 0], points[i, 1], points[i, 2]
-        x = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c + shift[0]
-        if x <= 0.0 or x >= size:
-            continue
-        y = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c + shift[1]
-        z = turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c + shift[2]
-        y = min(y, 2.0 * STEEPEST * min(x, size - x) - y) - z * z / (2.0 * width)
-        if y > 0.0:
-            found[count, 0], found[count, 1] = x, y
-            count += 1
-    return count
-
-
-def _upper_hull(points: Floats) -> Floats:
-    """Upper convex hull (k, 2) of points (n, 2), from left to right (Andrew 1979)."""
-    # Nearly all points lie below the hull of those that are outermost in some directions.
-    angles = np.linspace(0.0, np.pi, DIRECTIONS)
-    outermost = np.unique(np.argmax(np.stack([-np.cos(angles), np.sin(angles)], axis=1) @ points.T, axis=1))
-    outermost = outermost[np.argsort(points[outermost, 0], kind="stable")]
-    above = points[:, 1] >= np.interp(points[:, 0], *points[outermost].T)
-    hull: list[Floats] = []
-    for point in points[above][np.lexsort(points[above].T[::-1])]:
-        while len(hull) > 1:
-            (ax, ay), (bx, by) = hull[-2], hull[-1]
-            if (bx - ax) * (point[1] - ay) < (by - ay) * (point[0] - ax):
-                break
-            hull.pop()
-        hull.append(point)
-    return np.array(hull)
-
-
-def line_length(points: Floats) -> float:
-    """Length of the line through points (n, 3)."""
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-
-
-def _points_along(line: Floats, places: Floats) -> Floats:
-    """Points (k, 3) at distances (k,) along a line (n, 3) from its beginning."""
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    return np.stack([np.interp(places, along, line[:, axis]) for axis in range(3)], axis=1)
-
-
 def _with_nodes(line: Floats) -> Floats:
-    """`NODES` points at about even distances along a line (n, 3), its sharpest corners among them."""
+    """`NODES` points along a line (n, 3), its corners among them, the others at even distances."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     places = np.linspace(0.0, along[-1], NODES)
-    for corner in along[1:-1]:
-        places[1 + np.argmin(np.abs(places[1:-1] - corner))] = corner
-    return _points_along(line, np.sort(places))
+    free = places.copy()
+    free[[0, -1]] = np.inf
+    for corner in along[1:-1][: NODES - 2]:
+        nearest = np.argmin(np.abs(free - corner))
+        places[nearest], free[nearest] = corner, np.inf
+    return points_along(line, np.sort(places))
 
 
 def _depths(bone: Obstacle, points: Floats) -> Floats:
@@ -379,7 +299,7 @@ def _mark(legs: Sequence[Floats], distance: float) -> _Mark:
     """The point of a string at a distance along it from its end."""
     ends = np.cumsum([line_length(leg) for leg in legs])
     place, half = max(float(ends[-1]) - distance, 0.0), 0.5 * CHORD * float(ends[-1])
-    point, behind, ahead = _points_along(np.concatenate(legs), place + half * np.array([0.0, -1.0, 1.0]))
+    point, behind, ahead = points_along(np.concatenate(legs), place + half * np.array([0.0, -1.0, 1.0]))
     chord = ahead - behind
     return _Mark(point, chord / max(float(np.linalg.norm(chord)), 1e-300), int((ends[:-1] <= place).sum()))
 

@@ -12,14 +12,8 @@ from rbfmuscle.output.export import export_run
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.tubes import tendon_mesh
 from rbfmuscle.scene.motion import bone_poses
-from rbfmuscle.scene.tendons import (
-    AT_REST,
-    STIFFNESS_RATIO,
-    TENDON_STRAIN,
-    TendonLine,
-    line_length,
-    taut_line,
-)
+from rbfmuscle.scene.taut_line import line_length, taut_line
+from rbfmuscle.scene.tendons import AT_REST, STIFFNESS_RATIO, TENDON_STRAIN, TendonLine
 
 END = "strap tendon 2 to limb"
 
