@@ -58,8 +58,11 @@ def scattered(count):
 def both_fits(kernel, count):
     """Our fit and SciPy's, to be called."""
     points, values = scattered(count)
-    given = {"kernel": kernel, "epsilon": SHARED[kernel], "degree": KERNELS[kernel].degree}
-    return lambda: RBFField.fit(points, values, **given), lambda: RBFInterpolator(points, values, **given)
+    given, degree = {"kernel": kernel, "epsilon": SHARED[kernel]}, KERNELS[kernel].degree
+    return (
+        lambda: RBFField.fit(points, values, **given),
+        lambda: RBFInterpolator(points, values, **given, degree=degree),
+    )
 
 
 def fits():

@@ -80,7 +80,7 @@ class TreeDetector(PointDetector):
     @property
     def memory(self) -> int:
         """Bytes of the tree and its triangles."""
-        arrays = (self.exact.boxes, self.exact.records, self.exact.edge_normals, self.exact.vertex_normals)
+        arrays = (self.exact.boxes, self.exact.records, *self.exact.pseudonormals)
         return sum(array.nbytes for array in arrays)
 
     def _local(self, points):
