@@ -25,7 +25,9 @@ def machine():
     info = Path("/proc/cpuinfo")
     if info.exists():
         names = [
-            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line
+            line.split(":", 1)[1].strip()
+            for line in info.read_text(encoding="utf-8").splitlines()
+            if "model name" in line
         ]
         model = names[0] if names else model
     versions = {name: version(name) for name in ("numpy", "numba", "rbfmuscle", "scipy")}

@@ -169,7 +169,9 @@ def record(tests: list[str]) -> None:
     import coverage
 
     listed = [
-        line for line in (ROOT / "tests/nojit.txt").read_text().splitlines() if not line.startswith("#")
+        line
+        for line in (ROOT / "tests/nojit.txt").read_text(encoding="utf-8").splitlines()
+        if not line.startswith("#")
     ]
     WORK.mkdir(exist_ok=True)
     for kind, files in (("plain", tests or listed), ("compiled", tests or ["tests"])):
@@ -204,7 +206,9 @@ class Reach:
 
     def __init__(self, kind: str) -> None:
         path = WORK / f"{kind}.json"
-        found = json.loads(path.read_text()) if path.exists() else {"lines": {}, "seconds": {}}
+        found = (
+            json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"lines": {}, "seconds": {}}
+        )
         self.lines, self.seconds = found["lines"], found["seconds"]
 
     def tests(self, fault: Fault) -> list[str]:
@@ -299,13 +303,15 @@ def run(count: int, seed: int, minutes: float) -> None:
 def results() -> list[dict]:
     """All results so far."""
     path = WORK / "results.jsonl"
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    return (
+        [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
+    )
 
 
 def table(seed: int) -> str:
     """Planted, noticed, unnoticed and equivalent faults, by package."""
     named = WORK / "equivalent.json"
-    equivalent = json.loads(named.read_text()) if named.exists() else {}
+    equivalent = json.loads(named.read_text(encoding="utf-8")) if named.exists() else {}
     rows: dict[str, list[int]] = {}
     for row in results():
         if row["seed"] == seed:

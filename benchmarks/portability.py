@@ -57,7 +57,7 @@ def run_tests(name: str, tests: list[str], folder: Path) -> tuple[str, int]:
             return "not run: this processor has not the instructions", 0
         command = [python, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "--tb=short", *tests]
         done = subprocess.run(command, cwd=ROOT, env=environment, stdout=printed, check=False)
-    lines = log.read_text().splitlines() or ["nothing"]
+    lines = log.read_text(encoding="utf-8").splitlines() or ["nothing"]
     for line in lines:
         if line.startswith(("FAILED", "ERROR")):
             print(f"    {line}", flush=True)

@@ -36,7 +36,7 @@ def command(*words):
 command("new", meshes, "--units", "mm", "--force")
 
 # Every guess in the file is marked: the joint's centre, its axes, what is attached to what.
-text = (meshes / "scene.toml").read_text()
+text = (meshes / "scene.toml").read_text(encoding="utf-8")
 print("\n".join(line for line in text.splitlines() if "GUESS" in line))
 
 # The guessed axes are those of the files. Flexion of this hip is a turn about -x.

@@ -27,7 +27,7 @@ for path in found:
         shutil.copy(path, out / path.name)
 
 # The check of this page: all points are measured (six, and the default), and there is a verdict on the default.
-table = json.loads((out / "sweep" / "sweep.json").read_text())
+table = json.loads((out / "sweep" / "sweep.json").read_text(encoding="utf-8"))
 assert len(table["rows"]) == 7
 assert all(row["status"] == "done" for row in table["rows"])
 assert table["verdicts"]

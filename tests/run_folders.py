@@ -6,9 +6,9 @@ import json
 def timeless(path):
     """What a file holds, without what a clock wrote into it."""
     if path.name == "run.json":
-        return without_times(json.loads(path.read_text()))
+        return without_times(json.loads(path.read_text(encoding="utf-8")))
     if path.name == "metrics.csv":
-        lines = path.read_text().splitlines()
+        lines = path.read_text(encoding="utf-8").splitlines()
         return [line.rsplit(",", 2)[0] if ",time_" in line else line for line in lines]
     return path.read_bytes()
 

@@ -72,7 +72,7 @@ class TestRun:
         assert {"run.json", "metrics.csv", "events.csv", "poses.csv", "surfaces.pvd", "bones.pvd"} <= names
         assert len(list((tmp_path / "out" / "surfaces").iterdir())) == 5
         title, head, row, verdict, end = out.splitlines()
-        facts = json.loads((tmp_path / "out" / "run.json").read_text())["muscles"]["adductor"]
+        facts = json.loads((tmp_path / "out" / "run.json").read_text(encoding="utf-8"))["muscles"]["adductor"]
         worst = [shown_number(abs(facts[key]["worst"])) for key in SHOWN]
         assert title.endswith("lengths in mm") and head.split() == list(SHOWN)
         assert re.split(r"\s{2,}", row) == ["adductor", *worst]
@@ -261,7 +261,7 @@ class TestOtherCommands:
         target = tmp_path / "guess.toml"
         code, out, _ = call(capsys, "new", tmp_path, "--units", "mm", "-o", target)
         assert code == 0 and str(target) in out
-        text = target.read_text()
+        text = target.read_text(encoding="utf-8")
         assert 'name = "hip"' in text and "GUESS" in text
         bones = [line.split('"')[1] for line in text.splitlines() if line.startswith("  { bone")]
         assert bones == ["pelvis", "femur"] * 4  # the origin, on the bone that stands still, comes first

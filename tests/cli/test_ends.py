@@ -223,7 +223,7 @@ class TestKilledRuns:
         assert figure.advance().text.startswith("frame 5")
 
     def test_what_was_cut_short_is_left_out(self, killed):
-        poses = (killed / "poses.csv").read_text()
+        poses = (killed / "poses.csv").read_text(encoding="utf-8")
         (killed / "poses.csv").write_text(poses[: poses.rindex("\n", 0, -1) + 30])  # within the last line
         assert SavedRun(killed).frames == [0, 1, 2, 3, 4]
         (killed / "poses.csv").write_text(poses)
@@ -231,6 +231,8 @@ class TestKilledRuns:
         assert 3 not in SavedRun(killed).frames
 
     def test_one_without_a_frame_says_so(self, killed):
-        (killed / "poses.csv").write_text((killed / "poses.csv").read_text().splitlines()[0] + "\n")
+        (killed / "poses.csv").write_text(
+            (killed / "poses.csv").read_text(encoding="utf-8").splitlines()[0] + "\n"
+        )
         with pytest.raises(UsageError, match="no surfaces"):
             export_run(killed, ["stl"])

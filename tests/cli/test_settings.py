@@ -92,7 +92,7 @@ def run(capsys, scene_file, folder, *settings, model=None):
     arguments = [part for text in texts for part in ("--set", text)] + (["--model", model] if model else [])
     code, _, err = call(capsys, "run", scene_file, "-o", folder, "--frames", "0:2", *arguments)
     assert code == 0, err
-    info = json.loads((folder / "run.json").read_text())
+    info = json.loads((folder / "run.json").read_text(encoding="utf-8"))
     assert len(info["frames"]) == 2
     return info
 
@@ -162,7 +162,9 @@ def test_compare_takes_a_whole_model_as_the_file_would_give_it(scene_file, tmp_p
     )  # fmt: skip
     assert code == 0, err
     found = {
-        name: json.loads((tmp_path / name / "run.json").read_text())["scene"]["muscles"][0]["model"]
+        name: json.loads((tmp_path / name / "run.json").read_text(encoding="utf-8"))["scene"]["muscles"][0][
+            "model"
+        ]
         for name in ("pbd", "xpbd")
     }
     assert found == {"pbd": {"name": "pbd", "bending": 0.8}, "xpbd": {"name": "xpbd", "iterations": 4}}

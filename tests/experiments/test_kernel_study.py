@@ -147,11 +147,11 @@ def test_rows_that_err_more_than_the_coarsest_kernel_are_unfit():
 
 def test_files_hold_the_table(study, ellipsoid, tmp_path):
     write_studies({"egg": study}, tmp_path, {"egg": ellipsoid})
-    kept = json.loads((tmp_path / "kernels.json").read_text())
+    kept = json.loads((tmp_path / "kernels.json").read_text(encoding="utf-8"))
     assert [row["kernel"] for row in kept["rows"]] == [row["kernel"] for row in study.rows]
-    assert (tmp_path / "kernels.csv").read_text().count("\n") == len(study.rows) + 1
+    assert (tmp_path / "kernels.csv").read_text(encoding="utf-8").count("\n") == len(study.rows) + 1
     assert (tmp_path / "recommended_egg.vtp").stat().st_size > 1000
-    page = (tmp_path / "kernels.html").read_text()
+    page = (tmp_path / "kernels.html").read_text(encoding="utf-8")
     assert "Kernels for egg" in page and "http" not in page and html.escape(describe(study.rows)) in page
     text = html.unescape(page.split("<pre>")[1].split("</pre>")[0])
     assert tomllib.loads(text)["muscle"]["model"]["kernel"] == study.recommended["kernel"]
@@ -163,7 +163,7 @@ def test_several_surfaces_share_a_page_and_an_answer(study, ellipsoid, tmp_path)
     write_studies(studies, tmp_path, dict.fromkeys(studies, ellipsoid))
     best = study.recommended["kernel"]
     assert answer(studies).startswith(f"Use {best}: within 5 % of the least error on 2 of 2 muscles")
-    page = (tmp_path / "kernels.html").read_text()
+    page = (tmp_path / "kernels.html").read_text(encoding="utf-8")
     assert "Kernels for all 2 muscles" in page and "Every row of two" in page
     assert {path.name for path in tmp_path.glob("*.vtp")} == {"recommended_one.vtp", "recommended_two.vtp"}
 
@@ -173,7 +173,7 @@ def test_page_of_few_fit_rows_is_written(study, ellipsoid, tmp_path, left):
     rows = [{**row, "unfit": "" if k < left else "too few centres"} for k, row in enumerate(study.rows)]
     few = replace(study, rows=rows, recommended=recommend(rows))
     write_studies({"egg": few}, tmp_path, {"egg": ellipsoid})
-    page = (tmp_path / "kernels.html").read_text()
+    page = (tmp_path / "kernels.html").read_text(encoding="utf-8")
     assert page.count("too few centres") == len(rows) - left
     assert ("Every field is unfit" in page) is (left == 0)
 

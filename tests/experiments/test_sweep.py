@@ -219,9 +219,9 @@ class TestRun:
     def test_page_stands_alone(self, finished):
         points, folder = finished
         write_page(write_table(points, folder, {"arm": "mm"}), folder)
-        page = (folder / "sweep.html").read_text()
+        page = (folder / "sweep.html").read_text(encoding="utf-8")
         assert "<svg" in page and "http" not in page and "the default lies" in page
-        assert (folder / "pareto.svg").read_text().startswith("<svg xmlns")
+        assert (folder / "pareto.svg").read_text(encoding="utf-8").startswith("<svg xmlns")
 
 
 def crash_or_run(scene, settings, frames):
@@ -257,7 +257,7 @@ def cluster(tmp_path):
         subprocess.Popen([*words, "--local-directory", str(tmp_path / str(k))], **quiet) for k in (0, 1)
     ]
     try:
-        yield json.loads(file.read_text())["address"], started[1:]
+        yield json.loads(file.read_text(encoding="utf-8"))["address"], started[1:]
     finally:
         for process in reversed(started):
             process.terminate()
@@ -292,7 +292,7 @@ class TestCommand:
     def test_several_scenes_and_a_grid(self, scene_file, tmp_path, monkeypatch, capsys):
         use_blend_model(monkeypatch)
         other = scene_file.with_name("other.toml")
-        other.write_text(scene_file.read_text())
+        other.write_text(scene_file.read_text(encoding="utf-8"))
         words = ["sweep", str(scene_file), str(other), "-o", str(tmp_path / "out"), "--jobs", "1", "--json"]
         assert command([*words, "--grid", "contact.substep_angle=1,2"]) == 0
         table = json.loads(capsys.readouterr().out)

@@ -64,7 +64,7 @@ def test_command_says_what_to_paste(tmp_path, ellipsoid, capsys, monkeypatch):
     words = [tmp_path / "muscle.ply", "-o", tmp_path / "out", "--kernels", "cubic", "--placement", "greedy"]
     code, said, _ = call(capsys, "kernels", *words, "--error", "0.4", "--units", "mm")
     assert code == 0 and "reaches" in said and "mm RMS" in said
-    facts = json.loads((tmp_path / "out" / "error.json").read_text())["muscle"]
+    facts = json.loads((tmp_path / "out" / "error.json").read_text(encoding="utf-8"))["muscle"]
     assert facts["reached"] and facts["error"] <= 0.4
     table = tomllib.loads(facts["toml"])["muscle"]["model"]
     assert table["kernel"] == "cubic" and table["centres"] == facts["row"]["centres"]

@@ -151,7 +151,7 @@ def test_muscle_that_cannot_be_loaded_is_commented_out_with_its_reason(tmp_path)
     name = guess.muscles[0].muscle.name
     scene = write_scene(guess, tmp_path / "scene.toml")
     assert name not in [muscle.name for muscle in scene.muscles]
-    text = (tmp_path / "scene.toml").read_text()
+    text = (tmp_path / "scene.toml").read_text(encoding="utf-8")
     assert f'# name = "{name}"' in text and "# NOT RUN: " in text
     assert any(name in doubt for doubt in guess.doubts())
 
@@ -163,7 +163,7 @@ def leg():
     folder = next((Path(p) / "leg" for p in places if p and (Path(p) / "leg").is_dir()), None)
     if folder is None:
         pytest.skip("the leg is not here (set RBFMUSCLE_DATA to the folder that holds leg/)")
-    return folder, json.loads((folder / "scene.json").read_text())
+    return folder, json.loads((folder / "scene.json").read_text(encoding="utf-8"))
 
 
 @pytest.fixture(scope="module")
@@ -376,7 +376,7 @@ def test_what_cannot_be_used_is_left_out_with_its_reason_and_the_rest_loads(tmp_
     assert {"gracilis.ply", "sacrum.stl"} == {Path(file).name for file in guess.unusable}
     assert any("femoral_cartilage.ply" in note for note in guess.notes)
     scene = write_scene(guess, tmp_path / "scene.toml")
-    text = (tmp_path / "scene.toml").read_text()
+    text = (tmp_path / "scene.toml").read_text(encoding="utf-8")
     assert "# NOT USED: gracilis.ply: " in text and len(scene.muscles) == 4
 
 

@@ -227,7 +227,7 @@ def test_times_of_a_motion_are_those_of_the_files(folder, tmp_path):
     import pyvista
 
     copy = shutil.copytree(folder, tmp_path / "run")
-    info = json.loads((copy / "run.json").read_text())
+    info = json.loads((copy / "run.json").read_text(encoding="utf-8"))
     info["scene"]["motion"]["times"] = [1.0, 1.25, 2.0]
     (copy / "run.json").write_text(json.dumps(info))
     export_run(copy, ["pvd", "animated-glb"], output=tmp_path / "out")

@@ -203,5 +203,10 @@ class TestExport:
 def test_json_has_no_nan_and_is_replaced_whole(tmp_path):
     path = tmp_path / "a.json"
     write_json(path, {"a": float("nan"), "b": np.float64(2.5), "c": np.arange(3), "d": (1, np.inf)})
-    assert json.load(io.StringIO(path.read_text())) == {"a": None, "b": 2.5, "c": [0, 1, 2], "d": [1, None]}
+    assert json.load(io.StringIO(path.read_text(encoding="utf-8"))) == {
+        "a": None,
+        "b": 2.5,
+        "c": [0, 1, 2],
+        "d": [1, None],
+    }
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]

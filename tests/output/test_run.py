@@ -91,7 +91,7 @@ class TestStream:
             "surfaces.pvd",
             *(f"surfaces/biceps_000{k}.vtp" for k in range(3)),
         ]
-        on_disk = json.loads((tmp_path / "run.json").read_text())
+        on_disk = json.loads((tmp_path / "run.json").read_text(encoding="utf-8"))
         assert on_disk["status"] == info["status"] == "complete"
         assert on_disk["scene"]["muscles"][0]["sha256"]
         assert {"python", "numpy", "rbfmuscle"} <= set(on_disk["versions"])
@@ -132,7 +132,7 @@ class TestStream:
         assert saved.frames == [0, 1]
         assert {r.frame for r in saved.metrics} == {0, 1}
         assert len(saved.surface("biceps", 1)[0]) > 0
-        assert (tmp_path / "surfaces.pvd").read_text().endswith("</VTKFile>\n")
+        assert (tmp_path / "surfaces.pvd").read_text(encoding="utf-8").endswith("</VTKFile>\n")
 
     def test_failure_is_written_down(self, tmp_path, monkeypatch):
         use_blend_model(monkeypatch, fail_at=8)
@@ -194,5 +194,5 @@ def test_bones_driven_into_each_other_are_reported(hip_data, tmp_path):
     scene.muscles = [scene.muscle("gluteus_medius")]
     with pytest.warns(SceneWarning, match="pelvis and femur: the motion drives the bones into each other"):
         stream_run(scene, tmp_path / "out", frames="0:22", pictures=False)
-    rows = (tmp_path / "out" / "events.csv").read_text().splitlines()
+    rows = (tmp_path / "out" / "events.csv").read_text(encoding="utf-8").splitlines()
     assert any(row.split(",")[1:] == ["", "pelvis and femur", "1", "bones_overlap"] for row in rows)

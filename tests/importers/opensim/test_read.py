@@ -31,7 +31,7 @@ KINDS = {"rotational": "rotation", "translational": "translation", "coupled": "c
 
 
 def reference(data, name):
-    found = json.loads((data / "reference" / f"{name}.json").read_text())
+    found = json.loads((data / "reference" / f"{name}.json").read_text(encoding="utf-8"))
     return next(data.rglob(f"{name}.osim")), found
 
 
@@ -113,7 +113,7 @@ class TestSmall:
             <socket_child_frame>shank</socket_child_frame>
             <coordinates><Coordinate name="strut_angle"><range>-1 1</range></Coordinate></coordinates></PinJoint>"""
         assert not any("closes a loop" in note for note in read_osim(small).notes)
-        small.write_text(small.read_text().replace("<SliderJoint", joint + "<SliderJoint"))
+        small.write_text(small.read_text(encoding="utf-8").replace("<SliderJoint", joint + "<SliderJoint"))
         (note,) = [note for note in read_osim(small).notes if "closes a loop" in note]
         assert "joint 'strut' (ground to shank)" in note
 
@@ -151,7 +151,7 @@ class TestSmall:
 
 
 def test_ground_may_be_the_child(small):
-    text = small.read_text().replace(
+    text = small.read_text(encoding="utf-8").replace(
         "<socket_parent_frame>/ground</socket_parent_frame><socket_child_frame>thigh</socket_child_frame>",
         "<socket_parent_frame>/bodyset/thigh</socket_parent_frame><socket_child_frame>/ground</socket_child_frame>",
     )
@@ -166,7 +166,7 @@ def test_ground_may_be_the_child(small):
 
 def test_a_body_keeps_the_meshes_that_can_be_read_beside_one_that_cannot(small):
     both = '<Mesh name="bad"><mesh_file>bad.obj</mesh_file></Mesh><Mesh name="n">'
-    small.write_text(small.read_text().replace('<Mesh name="n">', both))
+    small.write_text(small.read_text(encoding="utf-8").replace('<Mesh name="n">', both))
     torn = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 99\n"
     (small.parent / "bad.obj").write_text(torn)
     found = import_osim(small)

@@ -10,7 +10,7 @@ from rbfmuscle.validation import SceneError
 
 
 def changed(path, *pairs):
-    text = path.read_text()
+    text = path.read_text(encoding="utf-8")
     for before, after in pairs:
         assert text.count(before) >= 1, before
         text = text.replace(before, after, 1)
@@ -82,7 +82,7 @@ WRONG = [
 
 @pytest.mark.parametrize(("before", "after", "words"), WRONG)
 def test_wrong_model_is_refused_in_one_line(small, before, after, words):
-    text = small.read_text()
+    text = small.read_text(encoding="utf-8")
     assert before in text
     small.write_text(text.replace(before, after))
     with pytest.raises(SceneError) as error:
@@ -158,7 +158,7 @@ def test_a_limit_holds_only_where_it_is_given_and_clamped(small):
 def test_a_frame_is_the_same_wherever_it_stands(small, where):
     """The knee's parent frame, moved out of the joint, places the shank where it was."""
     before = read_osim(small).joints
-    text = small.read_text()
+    text = small.read_text(encoding="utf-8")
     frame = re.search(r"<PhysicalOffsetFrame.*?</PhysicalOffsetFrame>", text, flags=re.S)[0]
     text = text.replace(frame, "")
     name = "offset"
