@@ -16,6 +16,8 @@ from gallery import TOPICS  # noqa: E402
 
 ERRORS = "Errors and warnings"
 NAMES = [name for topic, names in TOPICS.items() if topic != ERRORS for name in names] + ["RBFMuscleError"]
+# Packages without which an example cannot run.
+NEEDED = {"show": "viser"}
 # Modules of which every example is run, not the public names' alone.
 MODULES = ("rbfmuscle.geometry.surfaces", "rbfmuscle.geometry.exact_distance", "rbfmuscle.validation")
 
@@ -29,6 +31,8 @@ def run_examples(tests):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_example_of_a_public_name_runs(name):
+    if name in NEEDED:
+        pytest.importorskip(NEEDED[name])
     value = getattr(rbfmuscle, name)
     module = importlib.import_module(value.__module__)
     tests = doctest.DocTestFinder(recurse=False).find(value, name, module=module)
