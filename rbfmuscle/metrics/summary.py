@@ -41,7 +41,7 @@ LIMITS = {
     "self_crossings": Limit(0.0, "self-crossing triangles", _SMALLER_STEPS),
     "unfitted_fraction": Limit(0.999, "surface shown without a fit", f"{_SMALLER_STEPS} or {_MORE_CENTRES}"),
     "flicker": Limit(0.5, "flicker", _SMALLER_STEPS),
-    "slack": Limit(1.03, "slack", "let the fibres shorten further"),
+    "slack": Limit(1.03, "centreline over shortest path", "look at that frame with rbfmuscle view"),
     "tunnelled": Limit(0.0, "points beyond a bone", _SMALLER_STEPS),
     "rest_error_rms": Limit(0.6, "rest error", _MORE_CENTRES),
     "end_gap": Limit(25.0, "end away from its bone", "correct the attachment, or give it a tendon"),
