@@ -9,6 +9,7 @@ import io
 import os
 import re
 import struct
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -188,7 +189,9 @@ def _read_trimesh(content, kind):
         content = b"\n".join(map(b" ".join, rows))
         content.decode("ascii")  # trimesh leaves out what is not
     options = {"process": False, "force": "mesh", "skip_materials": True, "maintain_order": True}
-    mesh = trimesh.load(io.BytesIO(content), file_type=kind, **options)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # older NumPy, of text that is no number
+        mesh = trimesh.load(io.BytesIO(content), file_type=kind, **options)
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(getattr(mesh, "faces", ()), np.int64)
     faces = faces.reshape(-1, 3)
     if len(vertices) and vertices.shape[1] != 3:
