@@ -116,8 +116,8 @@ def test_places_within_tetrahedra_are_those_of_a_quadratic_motion():
 def test_a_factor_solves_and_a_matrix_that_is_not_positive_has_none():
     from peers.finite_element import positive_factor
 
-    root = sparse.random_array((60, 60), density=0.1, rng=np.random.default_rng(2))
-    matrix, right = sparse.csr_array(root @ root.T + sparse.eye_array(60)), np.arange(60.0)
+    root = sparse.random(60, 60, density=0.1, random_state=2)
+    matrix, right = sparse.csr_array(root @ root.T + sparse.eye(60)), np.arange(60.0)
     found = positive_factor(matrix).solve(right)
     np.testing.assert_allclose(found, np.linalg.solve(matrix.toarray(), right))
     for shift in (2.0, 1.0 + np.linalg.eigvalsh((root @ root.T).toarray())[30]):

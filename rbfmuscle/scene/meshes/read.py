@@ -37,6 +37,9 @@ if TYPE_CHECKING:
 LARGEST_COORDINATE = 1e12
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".vtk", ".vtp")
 
+# What reading a damaged file raises.
+UNREADABLE = (ValueError, KeyError, IndexError, TypeError, AttributeError, EOFError, DeprecationWarning)
+
 
 @dataclass
 class ReadMesh:
@@ -161,7 +164,7 @@ def read_arrays(path: Path) -> tuple[Floats, Integers]:
         return read_polydata(path)[:2]
     try:
         return _read_trimesh(content, suffix[1:])
-    except (ValueError, KeyError, IndexError, TypeError, AttributeError, EOFError, struct.error) as error:
+    except (*UNREADABLE, struct.error) as error:
         why = shown(" ".join(str(error).split())) or type(error).__name__
         raise MeshError(f"{path}: not a readable {suffix[1:].upper()} file ({why})") from None
 
@@ -190,7 +193,8 @@ def _read_trimesh(content, kind):
         content.decode("ascii")  # trimesh leaves out what is not
     options = {"process": False, "force": "mesh", "skip_materials": True, "maintain_order": True}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # older NumPy, of text that is no number
+        # Older NumPy warns of text that is no number and goes on.
+        warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
         mesh = trimesh.load(io.BytesIO(content), file_type=kind, **options)
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(getattr(mesh, "faces", ()), np.int64)
     faces = faces.reshape(-1, 3)
