@@ -122,7 +122,7 @@ def test_a_factor_solves_and_a_matrix_that_is_not_positive_has_none():
     np.testing.assert_allclose(found, np.linalg.solve(matrix.toarray(), right))
     for shift in (2.0, 1.0 + np.linalg.eigvalsh((root @ root.T).toarray())[30]):
         with pytest.raises(np.linalg.LinAlgError):
-            positive_factor(matrix - shift * sparse.eye_array(60))
+            positive_factor(matrix - shift * sparse.eye(60))
 
 
 class TestReference:
