@@ -380,9 +380,11 @@ class Run:
     def _bones(self):
         """Bones in the last frame."""
         poses = self.frames[-1].poses
-        for name in poses:
-            mesh = self.scene.bone(name).mesh if self.scene is not None else None
-            vertices, faces = self.saved.bone(name) if mesh is None else (mesh.vertices, mesh.faces)
+        if self.scene is None:
+            meshes = {name: self.saved.bone(name) for name in self.saved.bones}
+        else:
+            meshes = {bone.name: (bone.mesh.vertices, bone.mesh.faces) for bone in self.scene.bones}
+        for name, (vertices, faces) in meshes.items():
             yield name, (vertices @ poses[name][:3, :3].T + poses[name][:3, 3], faces)
 
     def __repr__(self) -> str:

@@ -11,7 +11,7 @@ from rbfmuscle.implicit.extraction.material import project_to_level_set
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
 from rbfmuscle.implicit.extraction.slivers import mend_slivers
 from rbfmuscle.muscle.options import RBFOptions
-from rbfmuscle.muscle.placement import SEED, cached_sample
+from rbfmuscle.muscle.placement import cached_sample
 from rbfmuscle.muscle.rest import RestState
 from rbfmuscle.scene.objects import Muscle
 
@@ -59,7 +59,7 @@ class DisplayMesh:
         frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
         count = display_vertices(muscle, options.resolution)
         faces = np.asarray(muscle.mesh.faces)
-        sample = cached_sample(frame.local, faces, count, seed=SEED, placement="adaptive")
+        sample = cached_sample(frame.local, faces, count, "adaptive")
         points = frame.points(sample.points)
         self.mesh = MaterialMesh(points, sample.control_faces)
         self.rest = self._on_level(rest, points)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Integers
 from rbfmuscle.geometry.crossing import morton_order
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.rest_frame import RestFrame
@@ -37,7 +37,7 @@ REST_ERROR, REST_SHARE = 0.5, 0.1
 FALL, TRIALS, MOST_CENTRES = 1.2, 5, 4.0
 # What is aimed at, in what is wanted: the shown mesh adds its own.
 AIM = 0.97
-# Parts of the names under which samples and numbers of centres are cached: raise one when these are found anew.
+# Parts of the names under which samples and numbers of centres are cached: raise one when the way to find them changes.
 SAMPLING, SEARCH = 4, 1
 SEED = 0
 
@@ -159,8 +159,8 @@ def place_points(
     """
     fitted = options.placement == FITTED
     faces = np.asarray(muscle.mesh.faces)
-    centres = cached_sample(frame.local, faces, count, seed=SEED, placement="greedy")
-    samples = cached_sample(frame.local, faces, options.samples, seed=SEED, placement="even")
+    centres = cached_sample(frame.local, faces, count, "greedy")
+    samples = cached_sample(frame.local, faces, options.samples, "even")
     surface = frame, faces
     fit = _choose_fit(muscle.name, surface, options, centres, samples)
     if fitted:
@@ -248,24 +248,18 @@ def _fit_centres(
     return fit_sample(centres, frame.local, faces, fit=local, seed=SEED)
 
 
-def cached_sample(
-    vertices: np.ndarray, faces: np.ndarray, count: int, *, seed: int, placement: str
-) -> SurfaceSample:
+def cached_sample(vertices: np.ndarray, faces: np.ndarray, count: int, placement: str) -> SurfaceSample:
     """`sample_surface` of a muscle's mesh, from the cache on disk by content: greedy placement takes a second.
 
     Points are in an order in which near ones are mostly near each other, except for greedy placement.
     """
-    key = _sample_key(vertices, faces, count, seed, placement)
+    key = content_key(vertices, faces, ("surface sample", SAMPLING, count, SEED, placement))
     arrays = load_arrays(key)
     if arrays is None:
-        arrays = asdict(sample_surface(vertices, faces, count, seed=seed, placement=placement))
+        arrays = asdict(sample_surface(vertices, faces, count, seed=SEED, placement=placement))
         if placement != "greedy":
             order = morton_order(arrays["points"])
             corners = np.argsort(order)[arrays.pop("control_faces")]
             arrays = {name: part[order] for name, part in arrays.items()} | {"control_faces": corners}
         store_arrays(key, arrays)
     return SurfaceSample(**arrays)
-
-
-def _sample_key(vertices: Floats, faces: Integers, count: int, seed: int, placement: str) -> str:
-    return content_key(vertices, faces, ("surface sample", SAMPLING, count, seed, placement))

@@ -47,15 +47,12 @@ class RoundedField:
     ) -> tuple[Floats, Floats]:
         """Distance (n,) and its unit gradient (n, 3), as `BoneSDF.distance_and_gradient` gives them.
 
-        Only where that answers in its place is ``reach`` of use.
+        ``reach`` matters where the exact field answers, which is where the rounded distance is flat.
         """
         axes = np.ascontiguousarray(self.frame.axes @ pose[:3, :3].T)
         origin = pose[:3, :3] @ self.frame.origin + pose[:3, 3]
-        row, distance, gradient = (
-            np.empty(len(points), np.int64),
-            np.empty(len(points)),
-            np.empty((len(points), 3)),
-        )
+        row, distance = np.empty(len(points), np.int64), np.empty(len(points))
+        gradient = np.empty((len(points), 3))
         if _rows_loop(points, axes, origin, self.edge, self.keys, row):
             self._fill(np.unique(-1 - row[row < 0]))
             _rows_loop(points, axes, origin, self.edge, self.keys, row)
@@ -106,6 +103,15 @@ def bone_thickness(field: BoneField, vertices: Floats, faces: Integers, most: fl
     return min(2.0 * float(np.quantile(depth, 0.1)), most)
 
 
+@compiled(error_model="numpy", inline="always")
+def _place(point, axis, origin, edge):
+    """Place of a point along an axis of the lattice, in cells."""
+    place = 0.0
+    for b in range(3):
+        place += (point[b] - origin[b]) * axis[b]
+    return place / edge
+
+
 @compiled(error_model="numpy")
 def _rows_loop(points, axes, origin, edge, keys, row):
     """Row of the block that holds each point, -1 less its key where that is lacking; returns whether one is."""
@@ -113,10 +119,8 @@ def _rows_loop(points, axes, origin, edge, keys, row):
     for n in range(len(points)):
         key = 0
         for a in range(3):
-            place = 0.0
-            for b in range(3):
-                place += (points[n, b] - origin[b]) * axes[a, b]
-            key += (np.int64(np.floor(place / edge / SIDE)) + MOST) << SHIFTS[a]
+            block = np.int64(np.floor(_place(points[n], axes[a], origin, edge) / SIDE))
+            key += (block + MOST) << SHIFTS[a]
         k = np.searchsorted(keys, key)
         row[n] = k
         if k == len(keys) or keys[k] != key:
@@ -131,10 +135,7 @@ def _spline_loop(points, axes, origin, edge, row, nodes, distance, gradient):
     first, flat = np.empty(3, np.int64), False
     for n in range(len(points)):
         for k in range(3):
-            place = 0.0
-            for b in range(3):
-                place += (points[n, b] - origin[b]) * axes[k, b]
-            place /= edge
+            place = _place(points[n], axes[k], origin, edge)
             cell = np.int64(np.floor(place))
             bspline_weights(place - cell, weight[k], lean[k])
             first[k] = cell - SIDE * np.int64(np.floor(place / SIDE))

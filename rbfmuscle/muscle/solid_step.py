@@ -35,15 +35,8 @@ class Anderson:
         """Next state (m,) from a state (m,) and its image (m,)."""
         out = image.copy()
         _mix_loop(
-            state,
-            image,
-            self._steps,
-            self._residuals,
-            self._images,
-            self._last_residual,
-            self._last_image,
-            out,
-        )
+            state, image, self._steps, self._residuals, self._images, self._last_residual, self._last_image, out
+        )  # fmt: skip
         self._steps += 1
         return out
 
@@ -100,8 +93,8 @@ def global_loop(y, force, inverse, regions, pressure, law, response, factor, ste
     """Nodes ``step`` under a force and the regions' pressures, volumes corrected; the whitened ``change`` of pressure.
 
     ``regions`` holds where each begins, its nodes, gradients, volumes now and at rest; ``law`` the bulk modulus and
-    the pressure beyond which steps are shortened. Returns the share of a full step that was taken. The matrix
-    product is that of Bouaziz et al. (2014).
+    the pressure beyond which steps are shortened. Returns the share of a full step that was taken.
+    Bouaziz et al. (2014) call it the global step.
     """
     start, node, gradient, volume, rest = regions
     bulk, calm = law

@@ -138,8 +138,8 @@ class FrameLoop:
             events.extend(happened)
         poses = self._poses(self.here)
         solved = [muscle for muscle in self.scene.muscles if muscle.name in carried]
-        for end in (end.name for muscle in solved for end in muscle.tendons):
-            poses[end]
+        for end in (end for muscle in solved for end in muscle.tendons):
+            poses[end.name]  # the pose of an end is computed, and kept, when it is first asked for
         frame = Frame(self._next_index - 1, dict(self.here), dict(poses), {}, carried, events, times, 0.0)
         frame.tendons.update(poses.tendons)
         frame.activations.update(self.activations.here)
@@ -149,12 +149,13 @@ class FrameLoop:
 
     def finish(self, frame: Frame, drawn: Iterable[tuple[ModelSurface, float]]) -> Frame:
         """Add surfaces and the time since the last frame."""
+        surfaces = {}
         for name, (surface, seconds) in zip(frame.carried, drawn):
-            frame.surfaces = {**frame.surfaces, name: surface}
+            surfaces[name] = surface
             frame.events.extend(Event(frame.index, name, *note) for note in surface.notes)
             for key in ("time_surface", "time_frame"):
                 frame.times[name][key] = frame.times[name].get(key, 0.0) + seconds
-        frame.wall, self._wall = self._wall, 0.0
+        frame.surfaces, frame.wall, self._wall = surfaces, self._wall, 0.0
         return frame
 
     @contextmanager

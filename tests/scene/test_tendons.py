@@ -183,6 +183,13 @@ def test_tendons_are_left_out_of_the_files_on_request(tmp_path):
     assert not SavedRun(tmp_path).tendons and not list(tmp_path.glob("surfaces/*tendon*"))
 
 
+def test_a_notebook_shows_a_run_with_tendons(tmp_path):
+    run = rm.simulate(arm())
+    run.save(tmp_path, pictures=False)
+    for shown in (run, rm.Run.load(tmp_path)):
+        assert "data:image/png;base64," in shown._repr_html_()
+
+
 def test_a_belly_between_two_tendons_keeps_both():
     scene = arm()
     z = scene.muscles[0].mesh.vertices[:, 2]

@@ -38,7 +38,16 @@ LARGEST_COORDINATE = 1e12
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".vtk", ".vtp")
 
 # What reading a damaged file raises.
-UNREADABLE = (ValueError, KeyError, IndexError, TypeError, AttributeError, EOFError, DeprecationWarning)
+UNREADABLE = (
+    ValueError,
+    KeyError,
+    IndexError,
+    TypeError,
+    AttributeError,
+    EOFError,
+    DeprecationWarning,
+    struct.error,
+)
 
 
 @dataclass
@@ -164,7 +173,7 @@ def read_arrays(path: Path) -> tuple[Floats, Integers]:
         return read_polydata(path)[:2]
     try:
         return _read_trimesh(content, suffix[1:])
-    except (*UNREADABLE, struct.error) as error:
+    except UNREADABLE as error:
         why = shown(" ".join(str(error).split())) or type(error).__name__
         raise MeshError(f"{path}: not a readable {suffix[1:].upper()} file ({why})") from None
 
