@@ -19,12 +19,7 @@ from rbfmuscle.cli.app import run_command as command
 from rbfmuscle.cli.sweep import run_point
 from rbfmuscle.experiments.sweep import SweepPoint, parse_grid, plan_sweep
 from rbfmuscle.experiments.sweep_run import SweepFolder, run_sweep
-from rbfmuscle.experiments.sweep_table import (
-    mark_front,
-    pareto_front,
-    sweep_rows,
-    write_table,
-)
+from rbfmuscle.experiments.sweep_table import mark_front, pareto_front, sweep_rows, write_table
 from rbfmuscle.report.sweep_page import front_picture, inside_grid, write_page
 from rbfmuscle.validation import UsageError
 

@@ -1,8 +1,6 @@
 """Level sets to closed meshes by marching cubes: topology, volume, cut."""
 
 import inspect
-import os
-from pathlib import Path
 
 import igl
 import numpy as np
@@ -13,12 +11,7 @@ from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction import surface as extraction
 from rbfmuscle.implicit.extraction.marching import Grid, LevelSet
 from rbfmuscle.implicit.extraction.obstacles import PointGrid
-from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.placement.sampling import sample_surface
 
-HIP = Path(os.environ.get("RBFMUSCLE_DATA", Path(__file__).parents[3] / "shared" / "data")) / "hip"
-MUSCLES = ("gluteus_maximus", "gluteus_medius", "iliacus", "adductor_brevis")
-needs_hip = pytest.mark.skipif(not HIP.exists(), reason="real hip not present (RBFMUSCLE_DATA)")
 CENTRE = np.array([1.0, 2.0, 3.0])
 
 
@@ -81,10 +74,10 @@ def check_closed(surface, euler=2):
     return mesh
 
 
-@pytest.mark.parametrize("radius", [50.0, 40.0])
-def test_sphere_is_closed_exact_and_outward(radius):
-    """Also one that lies off the points that give the box."""
-    surface = extract_surface(sphere(radius), points=on_sphere())
+@pytest.mark.parametrize(("radius", "box"), [(50.0, 50.0), (40.0, 50.0), (50.0, 40.0)])
+def test_sphere_is_closed_exact_and_outward(radius, box):
+    """Also one that lies within the points that give the box, or outgrows it."""
+    surface = extract_surface(sphere(radius), points=on_sphere(box))
     mesh = check_closed(surface)
     np.testing.assert_allclose(sphere(radius)(surface.vertices), 0.0, atol=1e-9)
     assert surface.volume == pytest.approx(mesh.volume, rel=1e-12)
@@ -168,10 +161,6 @@ def test_spurious_sheets_are_counted_and_left_out():
     assert extract_surface(two, points=wide).components == 2
 
 
-def test_surface_that_outgrows_the_box_is_still_closed():
-    check_closed(extract_surface(sphere(50.0), points=on_sphere(50.0)[:40] * 0.8, resolution=24))
-
-
 def broken(x):
     return np.where(x[:, 0] > 40, np.nan, sphere()(x))
 
@@ -212,16 +201,3 @@ def test_mesh_moves_rigidly_with_the_grid_axes():
     )
     np.testing.assert_array_equal(moved.faces, rest.faces)
     np.testing.assert_allclose(moved.vertices, rest.vertices @ rotation.T + offset, atol=1e-7)
-
-
-@needs_hip
-@pytest.mark.parametrize("muscle", MUSCLES)
-def test_real_muscles_come_out_closed_with_their_volume(muscle):
-    mesh = trimesh.load(HIP / f"{muscle}.ply", process=False)
-    sample = sample_surface(mesh.vertices, mesh.faces, 300)
-    field = RBFField.fit_hermite(sample.points, sample.normals)
-    surface = extract_surface(field, points=sample.points, resolution=48, volume=mesh.volume)
-    check_closed(surface)
-    assert surface.volume == pytest.approx(mesh.volume, rel=1e-9)
-    assert surface.components == 1
-    np.testing.assert_allclose(field(surface.vertices), surface.level, atol=0.02)

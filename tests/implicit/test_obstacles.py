@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.implicit.extraction.obstacles import BESIDE, CELLS, PointGrid, near_triangles
+from rbfmuscle.implicit.extraction.obstacles import BESIDE, PointGrid, near_triangles
 
 
 def test_points_near_triangles_are_those_found_one_by_one():
@@ -36,11 +36,3 @@ def test_points_near_triangles_are_those_found_one_by_one():
     for p, row in enumerate(rows[order]):
         near = found.faces[found.first[p] : found.first[p + 1]]
         np.testing.assert_array_equal(near, np.flatnonzero(inside[row]))
-
-
-def test_points_of_a_plane_of_a_line_and_alone_have_a_grid():
-    line = np.array([[float(k), 0.0, 0.0] for k in range(9)])
-    for points in (line, line[:1], np.concatenate([line, line + [0.0, 1.0, 0.0]])):
-        grid = PointGrid(points)
-        assert grid.start[-1] == len(points)
-        assert grid.shape.prod() <= 100 * CELLS * len(points)

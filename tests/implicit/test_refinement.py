@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.field_fit import FieldFit
-from rbfmuscle.implicit.fit.assembly import hermite_system
 from rbfmuscle.implicit.kernels.table import get_kernel
-from rbfmuscle.implicit.placement.refinement import _rows, fit_sample
+from rbfmuscle.implicit.placement.refinement import fit_sample
 from rbfmuscle.implicit.placement.sampling import sample_surface, spread_points
 from rbfmuscle.implicit.selection import spacing
-from rbfmuscle.validation import UsageError
 
 CUBIC = FieldFit(get_kernel("cubic"), 1.0, "all")
 
@@ -52,17 +49,6 @@ def test_fitted_centres_err_less_at_points_they_have_not_seen(bean, kernel, epsi
     assert (fitted.control_faces == plain.control_faces).all()
 
 
-def test_rows_give_the_field(bean):
-    _, _, sample = bean
-    kernel = get_kernel("matern_52")
-    basis, right, origin, scale = hermite_system(sample.points, sample.normals, kernel, 0.1, "all")
-    at = np.random.default_rng(0).uniform(-1, 1, (50, 3))
-    solution = np.linalg.solve(basis.full_matrix(), np.append(right, np.zeros(len(basis.powers))))
-    field = RBFField.fit_hermite(sample.points, sample.normals, kernel=kernel, epsilon=0.1)
-    rows = _rows(basis, kernel, 0.1 * scale, at)
-    np.testing.assert_allclose(rows @ solution, field(at * scale + origin), atol=1e-7)
-
-
 def test_units_and_place_do_not_matter(bean):
     vertices, faces, sample = bean
     fitted = fit_sample(sample, vertices, faces, fit=CUBIC)
@@ -71,12 +57,6 @@ def test_units_and_place_do_not_matter(bean):
     there = fit_sample(moved, vertices * 1e-3 + shift, faces, fit=CUBIC)
     np.testing.assert_allclose((there.points - shift) * 1e3, fitted.points, atol=1e-6)
     np.testing.assert_allclose(there.normals, fitted.normals, atol=1e-6)
-
-
-def test_a_kernel_without_hermite_fit_is_refused(bean):
-    vertices, faces, sample = bean
-    with pytest.raises(UsageError, match="no Hermite fit"):
-        fit_sample(sample, vertices, faces, fit=FieldFit(get_kernel("linear"), 1.0, "all"))
 
 
 def test_spread_points_are_on_the_mesh_and_even():

@@ -33,12 +33,7 @@ def test_fibres_of_a_mesh_are_slack_pull_or_yield_by_the_law():
 
 
 @pytest.mark.parametrize(
-    ("given", "values"),
-    [
-        (0.4, [0.4] * 5),
-        ([0.2], [0.2] * 5),
-        ([0, 1, 0], [0, 0.5, 1, 0.5, 0]),
-    ],
+    ("given", "values"), [(0.4, [0.4] * 5), ([0.2], [0.2] * 5), ([0, 1, 0], [0, 0.5, 1, 0.5, 0])]
 )
 def test_activation_along_the_motion(given, values):
     made = scene(activation=given)
