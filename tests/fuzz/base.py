@@ -65,7 +65,7 @@ def _write_legacy(path, mesh, how, version):
     writer.Write()
 
 
-def _write_vtp(path, mesh, mode, compressor):
+def _write_vtp(path, mesh, mode, compressor, header="UInt32", encoded=""):
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
     writer = vtkXMLPolyDataWriter()
@@ -73,7 +73,9 @@ def _write_vtp(path, mesh, mode, compressor):
     writer.SetFileName(str(path))
     getattr(writer, f"SetDataModeTo{mode}")()
     getattr(writer, f"SetCompressorTypeTo{compressor}")()
-    writer.SetEncodeAppendedData(False)
+    getattr(writer, f"SetHeaderTypeTo{header}")()
+    writer.SetEncodeAppendedData(bool(encoded))
+    writer.SetBlockSize(4096)  # several blocks an array
     writer.Write()
 
 

@@ -35,32 +35,24 @@ def test_fibres_of_a_mesh_are_slack_pull_or_yield_by_the_law():
 @pytest.mark.parametrize(
     ("given", "values"), [(0.4, [0.4] * 5), ([0.2], [0.2] * 5), ([0, 1, 0], [0, 0.5, 1, 0.5, 0])]
 )
-def test_activation_along_the_motion(given, values):
+def test_activation_along_the_motion_and_in_chosen_frames(given, values):
     made = scene(activation=given)
-    course = activation_curve(made.muscle(MUSCLE), made.motion)
-    assert course == pytest.approx(values)
+    assert activation_curve(made.muscle(MUSCLE), made.motion) == pytest.approx(values)
+    chosen = made.with_options(frames="2:5:2")
+    assert activation_curve(chosen.muscle(MUSCLE), chosen.motion) == pytest.approx(values[2:5:2])
 
 
 @pytest.mark.parametrize("column", [MUSCLE, f"/forceset/{MUSCLE}/activation", f"{MUSCLE}.excitation"])
-def test_activation_from_a_file_of_controls(tmp_path, column):
+def test_activation_from_a_file_of_controls_follows_the_time_of_a_motion_file(tmp_path, column):
     path = tmp_path / "controls.sto"
     path.write_text(STO.format(column=column))
     made = scene(activation={"file": str(path)})
-    course = activation_curve(made.muscle(MUSCLE), made.motion)
-    assert course == pytest.approx([0.0, 0.4, 0.8, 0.6, 0.4])
-
-
-def test_controls_follow_the_time_of_a_motion_file(tmp_path):
-    path = tmp_path / "controls.sto"
-    path.write_text(STO.format(column=MUSCLE))
-    made = scene(activation={"file": str(path)})
-    made.motion.times = [0.0, 0.25, 0.5, 2.0, 3.0]
-    assert activation_curve(made.muscle(MUSCLE), made.motion) == pytest.approx([0.0, 0.4, 0.8, 0.4, 0.4])
-
-
-def test_chosen_frames_keep_their_activation():
-    made = scene(activation=[0, 1]).with_options(frames="2:5:2")
-    assert activation_curve(made.muscle(MUSCLE), made.motion) == pytest.approx([0.5, 1.0])
+    for times, values in (
+        ([], [0.0, 0.4, 0.8, 0.6, 0.4]),
+        ([0.0, 0.25, 0.5, 2.0, 3.0], [0.0, 0.4, 0.8, 0.4, 0.4]),
+    ):
+        made.motion.times = times or made.motion.times
+        assert activation_curve(made.muscle(MUSCLE), made.motion) == pytest.approx(values)
 
 
 def test_sub_steps_follow_activation_and_settle_where_bones_stand_still():
@@ -94,6 +86,9 @@ def test_tendon_by_share_length_and_vertices_agree():
     assert np.array_equal(one, tendon & (x < 0))
 
 
+CONTROLS = STO.format(column=MUSCLE)
+
+
 @pytest.mark.parametrize(
     ("keys", "words"),
     [
@@ -107,15 +102,21 @@ def test_tendon_by_share_length_and_vertices_agree():
         ({"tendon": {"vertices": [10**6]}}, "out of range"),
         ({"tendon": {"length": 5.0, "vertices": [1]}}, "one of length and vertices"),
         ({"fibre_strech_at_rest": 0.5}, "did you mean 'fibre_stretch_at_rest'"),
+        (STO.format(column="tibia"), "has no column 'muscle', known: tibia"),
+        (CONTROLS.replace("0.8", "1.8"), "row 2"),
+        (CONTROLS.replace("0.8", "nan"), "row 2"),
+        (CONTROLS.replace("0.5\t", ""), "row 2 has 2 values, the header names 3"),
+        (CONTROLS.replace("0.5\t", "0.0\t"), "increases"),
     ],
 )
-def test_wrong_keys_are_one_line(keys, words):
-    with pytest.raises(SceneError) as caught:
+def test_wrong_keys_and_controls_are_one_line(tmp_path, keys, words):
+    if isinstance(keys, str):
+        (tmp_path / "controls.sto").write_text(keys)
+        keys = {"activation": {"file": str(tmp_path / "controls.sto")}}
+    with pytest.raises(SceneError, match=words) as caught:
         scene(**keys).validate()
     message = str(caught.value)
-    assert words in message
-    assert "\n" not in message
-    assert MUSCLE in message
+    assert "\n" not in message and (MUSCLE in message or "controls.sto" in message)
 
 
 def test_fibres_that_leave_the_muscle_are_refused():
@@ -123,23 +124,3 @@ def test_fibres_that_leave_the_muscle_are_refused():
     made.muscle(MUSCLE).fibres = [line + [0, 0, 80.0] for line in made.muscle(MUSCLE).fibres]
     with pytest.raises(SceneError, match="leaves the muscle"):
         made.validate()
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (STO.format(column="tibia"), "has no column 'muscle', known: tibia"),
-        (STO.format(column=MUSCLE).replace("0.8", "1.8"), "row 2"),
-        (STO.format(column=MUSCLE).replace("0.8", "nan"), "row 2"),
-        (STO.format(column=MUSCLE).replace("0.5\t", ""), "row 2 has 2 values, the header names 3"),
-        (STO.format(column=MUSCLE).replace("0.5\t", "0.0\t"), "increases"),
-    ],
-)
-def test_wrong_controls_are_one_line(tmp_path, text, words):
-    path = tmp_path / "controls.sto"
-    path.write_text(text)
-    with pytest.raises(SceneError) as caught:
-        scene(activation={"file": str(path)}).validate()
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
-    assert "controls.sto" in str(caught.value)

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from rbfmuscle.scene.joints.functions import Linear, PiecewiseLinear, Polynomial, Spline
 from rbfmuscle.scene.joints.joint import KINDS, frame_at
 from rbfmuscle.scene.joints.skeleton import rest_values
-from rbfmuscle.scene.joints.tables import JointTable, coupling_row, joint_row
-from rbfmuscle.scene.motion import bone_poses, step_angle, turned_angle
+from rbfmuscle.scene.joints.tables import JointTable, joint_row
+from rbfmuscle.scene.motion import bone_poses, turned_angle
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.plan.contact_pairs import find_contact_pairs
@@ -101,11 +101,6 @@ class TestKinds:
         assert pose[:3, :3] == pytest.approx(Rotation.from_euler("XYZ", [0.3, -0.5, 0.9]).as_matrix())
         assert pose[:3, :3] @ centre + pose[:3, 3] == pytest.approx(centre + [1, 2, 3])
 
-    def test_backward_is_the_inverse(self):
-        forth, back = pair(axes={"q": (1, 2, 3)}), pair(axes={"q": (1, 2, 3)}, backward=True)
-        product = bone_poses(forth, {"j.q": 0.8})["b"] @ bone_poses(back, {"j.q": 0.8})["b"]
-        assert product == pytest.approx(np.eye(4), abs=1e-13)
-
     @pytest.mark.parametrize(
         ("row", "message"),
         [
@@ -168,18 +163,6 @@ class TestCoordinates:
         ]
         assert any("leaves its range" in str(finding) for finding in scene.check())
 
-    def test_motion_of_a_custom_coordinate_is_told_as_opensim_does(self):
-        row = {"axis": [1, 0, 0], "coordinates": ["q"]}
-        for function, kind in (
-            ({}, "rotation"),
-            ({"linear": [-1, 3]}, "rotation"),
-            ({"linear": [0.5, 0]}, "coupled"),
-        ):
-            scene = pair(type="custom", rotations=[{**row, **function}])
-            assert scene.joints[0].coordinates["q"].motion == kind
-        both = pair(type="custom", rotations=[row], translations=[{**row, "axis": [0, 1, 0]}])
-        assert both.joints[0].coordinates["q"].motion == "translation"
-
 
 class TestRows:
     def test_rows_make_the_same_joint_again(self):
@@ -205,14 +188,6 @@ class TestRows:
                 {n: c.resting for n, c in given.items()}
             )
 
-    def test_coupling_rows(self):
-        scene = knee()
-        scene.add_link("p").add_joint("k", "a", "p", (0, 0, 0), type="slider", coordinates={"s": {}})
-        scene.add_coupling("s", ["q"], spline={"x": [-120, 0, 10], "y": [30, 2, 1]})
-        row = coupling_row(scene.couplings[0], scene.joints)
-        assert row["coordinate"] == "k.s" and row["of"] == ["j.q"]
-        assert row["spline"]["x"] == pytest.approx([-120, 0, 10]) and row["spline"]["y"] == [30, 2, 1]
-
 
 class TestSteps:
     def test_a_pure_shift_is_cut_into_steps_and_reached(self):
@@ -229,10 +204,3 @@ class TestSteps:
         assert values[-1] == 40.0 and max(b - a for a, b in itertools.pairwise(values)) < 60 / 27 * 1.01
         box = find_contact_pairs(scene)["m", "b"]
         assert box[0, 0] <= -70.0 + 1e-9  # seen from b, the muscle's other end is 40 further away
-
-    def test_step_angle_counts_turns_and_shifts(self):
-        scene = knee()
-        turn = step_angle(scene, {"j.q": 0.0}, {"j.q": -0.1}, shifts=False)
-        assert turn == pytest.approx(0.1, rel=1e-9)
-        slide = pair(type="slider", axes={"s": (0, 1, 0)})
-        assert step_angle(slide, {}, {"j.s": 5.0}) == pytest.approx(0.1)

@@ -8,6 +8,7 @@ import zlib
 import numpy as np
 import pytest
 import trimesh
+from fuzz.base import FORMS, suffix_of, write_mesh
 
 from rbfmuscle.scene.meshes import polydata
 from rbfmuscle.scene.meshes.polydata import read_polydata
@@ -15,39 +16,7 @@ from rbfmuscle.scene.meshes.read import read_mesh
 from rbfmuscle.validation import MeshError
 
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=20.0)
-
-
-def vtk_data():
-    import pyvista
-
-    return pyvista.make_tri_mesh(BALL.vertices, BALL.faces)
-
-
-def write_vtp(path, mode="Appended", compressor="ZLib", header="UInt32", *, encode=True):
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
-
-    writer = vtkXMLPolyDataWriter()
-    writer.SetInputData(vtk_data())
-    writer.SetFileName(str(path))
-    getattr(writer, f"SetDataModeTo{mode}")()
-    getattr(writer, f"SetCompressorTypeTo{compressor}")()
-    getattr(writer, f"SetHeaderTypeTo{header}")()
-    writer.SetEncodeAppendedData(encode)
-    writer.SetBlockSize(4096)  # several blocks an array
-    writer.Write()
-    return path
-
-
-def write_legacy(path, *, binary, version):
-    from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
-
-    writer = vtkPolyDataWriter()
-    writer.SetInputData(vtk_data())
-    writer.SetFileName(str(path))
-    writer.SetFileVersion(version)
-    (writer.SetFileTypeToBinary if binary else writer.SetFileTypeToASCII)()
-    writer.Write()
-    return path
+ASCII, ENCODED = "vtp-Ascii-None", "vtp-Appended-LZMA-UInt32-encoded"
 
 
 def assert_is_ball(path):
@@ -64,18 +33,12 @@ def assert_refused(path, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-VTP_FORMS = [("Ascii", "None", "UInt32"), ("Binary", "ZLib", "UInt64"), ("Appended", "LZMA", "UInt32")]
-
-
 class TestWholeFiles:
-    @pytest.mark.parametrize(("mode", "compressor", "header"), VTP_FORMS)
-    def test_vtp_holds_what_vtk_wrote(self, tmp_path, mode, compressor, header):
-        assert_is_ball(write_vtp(tmp_path / "a.vtp", mode, compressor, header))
-
-    @pytest.mark.parametrize("binary", [False, True])
-    @pytest.mark.parametrize("version", [42, 51])
-    def test_legacy_file_holds_what_vtk_wrote(self, tmp_path, binary, version):
-        assert_is_ball(write_legacy(tmp_path / "ball.vtk", binary=binary, version=version))
+    @pytest.mark.parametrize(
+        "form", [*(f for f in FORMS if f[:2] == "vt"), "vtp-Binary-ZLib-UInt64", ENCODED]
+    )
+    def test_file_holds_what_vtk_wrote(self, tmp_path, form):
+        assert_is_ball(write_mesh(tmp_path / f"ball{suffix_of(form)}", BALL, form))
 
     def test_quads_and_strips_become_triangles(self, tmp_path):
         path = tmp_path / "cube.vtk"
@@ -89,20 +52,14 @@ class TestWholeFiles:
 
 
 class TestDamagedFiles:
-    @pytest.mark.parametrize("form", [("Ascii", "None"), ("Binary", "ZLib"), ("Appended", "LZ4")], ids=str)
-    def test_vtp_cut_anywhere_is_refused_in_one_line(self, tmp_path, form, capfd):
-        whole = write_vtp(tmp_path / "whole.vtp", *form, encode=False).read_bytes()
-        path = tmp_path / "cut.vtp"
-        for cut in np.linspace(1, 0.9 * len(whole), 25).astype(int):
-            path.write_bytes(whole[:cut])
-            assert_refused(path, capfd)
-
-    @pytest.mark.parametrize("binary", [False, True])
-    def test_legacy_file_cut_anywhere_is_refused(self, tmp_path, binary, capfd):
-        whole = write_legacy(tmp_path / "whole.vtk", binary=binary, version=51).read_bytes()
+    @pytest.mark.parametrize(
+        "form", [ASCII, "vtp-Binary-ZLib", "vtp-Appended-LZ4", "vtk-text-51", "vtk-binary-51"]
+    )
+    def test_file_cut_anywhere_is_refused_in_one_line(self, tmp_path, form, capfd):
+        whole = write_mesh(tmp_path / "whole", BALL, form).read_bytes()
         # VTK does not notice the cut of a binary file's last array: a lost triangle or two are closed as a hole.
-        end = len(whole) - (40 if binary else 20)
-        path = tmp_path / "cut.vtk"
+        end = 0.9 * len(whole) if form[:3] == "vtp" else len(whole) - 40
+        path = tmp_path / f"cut{suffix_of(form)}"
         for cut in np.linspace(1, end, 25).astype(int):
             path.write_bytes(whole[:cut])
             assert_refused(path, capfd)
@@ -122,11 +79,8 @@ class TestDamagedFiles:
         ],
     )
     def test_file_that_says_what_is_not_so(self, tmp_path, suffix, old, new, capfd):
-        if suffix == "vtk":
-            whole = write_legacy(tmp_path / "a.vtk", binary=False, version=42)
-        else:
-            whole = write_vtp(tmp_path / "a.vtp", encode=False)
-        data = whole.read_bytes()
+        form = "vtk-text-42" if suffix == "vtk" else "vtp-Appended-ZLib"
+        data = write_mesh(tmp_path / f"a.{suffix}", BALL, form).read_bytes()
         at = max(data.find(b"<Points>"), 0) if old == 'offset="' else 0
         assert old.encode() in data[at:]
         damaged = tmp_path / f"b.{suffix}"
@@ -139,7 +93,7 @@ class TestReader:
 
     @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
     def test_process_that_ends_or_hangs_costs_one_file(self, tmp_path, monkeypatch, capfd, number):
-        path = write_vtp(tmp_path / "a.vtp")
+        path = write_mesh(tmp_path / "a.vtp", BALL, "vtp-Appended-ZLib")
         assert_is_ball(path)
         monkeypatch.setattr(polydata, "PATIENCE", 0.5)
         os.kill(polydata._child(os.getpid()).pid, number)

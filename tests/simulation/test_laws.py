@@ -21,7 +21,6 @@ from rbfmuscle.scene.check import (
     check_place,
     check_size,
 )
-from rbfmuscle.scene.meshes.read import read_mesh
 from rbfmuscle.scene.motion import turned_angle
 from rbfmuscle.scene.objects import Bone
 from rbfmuscle.scene.scene import Scene
@@ -96,37 +95,6 @@ def test_angle_of_a_turn_is_its_angle_about_any_axis_and_way_round(axis, angle):
     turn = Rotation.from_rotvec(angle * axis).as_matrix()
     assert turned_angle(turn) == pytest.approx(angle, rel=1e-6, abs=1e-15)
     assert turned_angle(turn.T) == pytest.approx(angle, rel=1e-6, abs=1e-15)
-
-
-class TestOBJ:
-    """A face counts vertices from the first, or back from the last so far; texture and normal numbers say nothing."""
-
-    def read(self, tmp_path, text):
-        (tmp_path / "m.obj").write_text(text)
-        return read_mesh(tmp_path / "m.obj", name="m").mesh
-
-    def test_counting_back_from_where_the_face_stands_is_counting_on(self, tmp_path):
-        on = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 3 2 1\nf 1 2 4\nf 4 3 1\nf 2 3 4\n"
-        back = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -3\nv 0 0 1\nf -4 -3 -1\nf -1 -2 -4\nf -3 -2 -1\n"
-        mixed = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 3/2 2/3/2 1//4\nf 1 2 -1 # last\n# f 9\nf -1 3 1\nf 2 3 4\n"
-        wanted = self.read(tmp_path, on)
-        assert wanted.volume == pytest.approx(1.0 / 6.0)
-        for text in (back, mixed):
-            np.testing.assert_array_equal(self.read(tmp_path, text).vertices, wanted.vertices)
-            np.testing.assert_array_equal(self.read(tmp_path, text).faces, wanted.faces)
-
-    @pytest.mark.parametrize(
-        ("text", "words"),
-        [
-            ("v 0 0\n", "not a readable OBJ file|fewer than three coordinates"),
-            ("v 0 0 x\n", "not a readable OBJ file"),
-            ("v 0 0 0\nf 1 1 99999999999999999999\n", "not a readable OBJ file|out of bounds"),
-            ("\nf a b c\n", "not a readable OBJ file|the mesh is empty"),
-        ],
-    )
-    def test_what_is_no_obj_is_refused(self, tmp_path, text, words):
-        with pytest.raises(MeshError, match=rf"m\.obj.*({words})"):
-            self.read(tmp_path, text)
 
 
 @pytest.mark.parametrize(("muscles", "threads"), [(1, 4), (3, 4), (3, 1)])
