@@ -83,16 +83,24 @@ def test_free_bar_is_as_thick_as_its_volume_says(model, stretch):
     assert radius.mean() == pytest.approx(10.0 / np.sqrt(stretch), rel=0.01)  # as the issue asks
 
 
-def test_spindle_lies_near_finite_elements():
+@pytest.mark.parametrize(
+    ("model", "rms", "csa", "length"),
+    [
+        # Limits of the issue but for those of sections and lengths, which are 0.05 there; see docs/contraction.md.
+        (settings("rbf"), 1.0, (0.0, 0.10), 0.06),
+        ({"name": "rbf", "centres": 300, "nodes": 300}, 0.35, (-0.04, 0.04), 0.04),
+    ],
+)
+def test_spindle_lies_near_finite_elements(model, rms, csa, length):
     kept = np.load(DATA)
-    run = rm.simulate(spindle_scene(model=settings("rbf"), frames=2, tendon=TENDON))
+    run = rm.simulate(spindle_scene(model=model, frames=2, tendon=TENDON))
     surface = run.frames[-1].surfaces[MUSCLE]
     found = compare_spindle(surface.vertices, surface.faces, 1.0, kept)
-    assert found["rms"] < 1.0  # mm, as the issue asks
-    assert abs(found["place"]) < 0.05
-    assert 0.0 < found["csa"] < 0.10  # the issue asks for 0.05, see docs/contraction.md
+    assert found["rms"] < rms  # mm
+    assert abs(found["place"]) < 0.05 and csa[0] < found["csa"] < csa[1]
     theirs = belly_length(*(kept["vertices"][k].astype(float) for k in (0, -1)))
-    assert belly_length(carried(run, 0), carried(run, -1)) == pytest.approx(theirs, rel=0.06)  # asked: 0.05
+    assert belly_length(carried(run, 0), carried(run, -1)) == pytest.approx(theirs, rel=length)
+    assert np.abs(run.values(MUSCLE, "volume_error")).max() < 1e-10
 
 
 @pytest.mark.parametrize("model", ("rbf", "arap-volume"))

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.sparse as sparse
 from conftest import benchmark_script
 from scipy.optimize import brentq
 
@@ -93,36 +92,6 @@ class TestSolid:
         turn = (solid._assemble(u + h * way)[0] - solid._assemble(u - h * way)[0]) / (2 * h)
         # A quadrature point may change sides of the obstacle's edge within h, so not closer.
         assert np.abs(turn - stiffness @ way.ravel()).max() < 1e-5 * np.abs(turn).max()
-
-    def test_obstacle_keeps_the_block_out(self):
-        solid = block((3, 3, 6))
-        held = np.abs(solid.rest[:, 2]) > 19.99
-        # A plane that rises by 2 into the block's side.
-        solid.set_obstacles(lambda p: (p[:, 0] + 3.0, np.tile([1.0, 0.0, 0.0], (len(p), 1))), held)
-        state = solid.solve(np.zeros_like(solid.rest), held, np.zeros_like(solid.rest))
-        assert -0.1 < solid.gaps(state.displacement)[0].min() < 0.0
-        assert solid.volume(state.displacement) == pytest.approx(4000, rel=5e-3)
-
-
-def test_places_within_tetrahedra_are_those_of_a_quadratic_motion():
-    solid, rng = cut_block(), np.random.default_rng(1)
-    bend, points = rng.normal(size=(3, 3, 3)), rng.uniform(-1, 1, (200, 3)) * HALF
-    nodes, shares = solid.at(points)
-    moved = np.einsum("ni,nj,ijk->nk", solid.rest, solid.rest, bend)[nodes]
-    wanted = np.einsum("ni,nj,ijk->nk", points, points, bend)
-    np.testing.assert_allclose(np.einsum("nk,nki->ni", shares, moved), wanted, atol=1e-9)
-
-
-def test_a_factor_solves_and_a_matrix_that_is_not_positive_has_none():
-    from peers.finite_element import positive_factor
-
-    root = sparse.random(60, 60, density=0.1, random_state=2)
-    matrix, right = sparse.csr_array(root @ root.T + sparse.eye(60)), np.arange(60.0)
-    found = positive_factor(matrix).solve(right)
-    np.testing.assert_allclose(found, np.linalg.solve(matrix.toarray(), right))
-    for shift in (2.0, 1.0 + np.linalg.eigvalsh((root @ root.T).toarray())[30]):
-        with pytest.raises(np.linalg.LinAlgError):
-            positive_factor(matrix - shift * sparse.eye(60))
 
 
 class TestReference:

@@ -139,17 +139,6 @@ def test_deformation_of_an_affine_map_is_its_matrix_and_the_target_its_rotation(
         np.testing.assert_allclose(np.array(quaternion_matrix(q[i])), turn, atol=1e-9)
 
 
-def test_a_slack_fibre_asks_for_the_length_it_has_and_a_taut_one_for_the_nearest_end(cells):
-    # Both cells at rest: the fibres' length is 1.
-    def asked(slack):
-        return cells.stress(cells.rest, passive=2.0, slack=slack)[0] - cells.stress(cells.rest)[0]
-
-    taut = asked((1.0, 1.0))
-    np.testing.assert_allclose(asked((0.9, 1.2)), taut, atol=1e-12)
-    np.testing.assert_allclose(asked((0.7, 0.8)), 0.8 * taut, atol=1e-12)
-    np.testing.assert_allclose(asked((1.1, 1.2)), 1.1 * taut, atol=1e-12)
-
-
 def test_volumes_are_determinants_and_their_gradients_differences(rng, cells):
     y = cells.rest + 0.1 * rng.normal(size=(5, 3))
     _, gradient, volume = cells.stress(y)
@@ -160,25 +149,6 @@ def test_volumes_are_determinants_and_their_gradients_differences(rng, cells):
     swollen = np.empty(2)
     swell_loop(direction, cells.start, cells.node, gradient, swollen)
     np.testing.assert_allclose(swollen, (ahead - behind) / (2 * step), rtol=1e-8)
-
-
-def test_right_side_balances_the_laplacian_at_rest_and_carries_the_fibres(rng, cells):
-    """With F = T at rest, Σ w T ∇N is Σ w F ∇N: no force is left; a fibre adds its own stress along itself."""
-    out, _, _ = cells.stress(cells.rest)
-    laplacian = np.zeros((5, 5))
-    for q, nodes in enumerate(cells.columns):
-        laplacian[np.ix_(nodes, nodes)] += cells.weights[q] * cells.slopes[q] @ cells.slopes[q].T
-    np.testing.assert_allclose(out, laplacian @ cells.rest, atol=1e-12)
-    y = cells.rest + 0.1 * rng.normal(size=(5, 3))
-    given = {"passive": 2.5, "active": 1.5, "content": 0.6}
-    fibres = cells.stress(y, **given)[0] - cells.stress(y)[0]
-    _, f, _ = cells.turn(y)
-    expected = np.zeros((5, 3))
-    for q, nodes in enumerate(cells.columns):
-        along = f[q] @ cells.fibre[q]
-        pull = cells.weights[q] * (2.5 + 1.5 * 0.6) * along / np.linalg.norm(along)
-        expected[nodes] += np.outer(cells.slopes[q] @ cells.fibre[q], pull)
-    np.testing.assert_allclose(fibres, expected, atol=1e-11)
 
 
 def test_responses_are_those_of_the_inverse_and_their_gram_is_symmetric(rng, cells):

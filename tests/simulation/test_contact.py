@@ -52,14 +52,6 @@ def test_half_spaces_are_all_pairs_nearer_than_reach(reach):
         points = points + rng.normal(size=points.shape) * 0.4
 
 
-@pytest.mark.parametrize("points", [np.full((5, 3), 900.0), np.zeros((0, 3))], ids=["far", "none"])
-def test_nothing_near_is_no_contact_in_every_array(points):
-    found = _pair()[0].half_spaces(points, 0.5)
-    assert len(found) == 0 and found.normal.shape == (0, 3)
-    assert found.index.shape == found.gap.shape == found.source.shape == (0,)
-    assert found.index.dtype.kind == found.source.dtype.kind == "i"
-
-
 def test_attached_points_take_no_contact():
     held = np.where(np.arange(400) % 2 == 0, 0, -1)
     contacts, poses = _pair(contact_bone=held)
@@ -67,18 +59,6 @@ def test_attached_points_take_no_contact():
     expected = _literal(contacts, poses, _points(), 1.0)
     assert set(found.index) == {i for i, _ in expected if i % 2}
     assert found.gap.min() == pytest.approx(min(d for (i, _), (d, _) in expected.items() if i % 2))
-
-
-def test_allowed_depth_is_added_to_the_gap():
-    contacts, _ = _pair()
-    before = contacts.half_spaces(_points(), 0.5)
-    contacts.allow(0, np.full(len(_points()), 0.2))
-    after = contacts.half_spaces(_points(), 0.5)
-    kept = (before.source == 1) | (before.gap < 0.3)
-    np.testing.assert_array_equal(after.index, before.index[kept])
-    np.testing.assert_allclose(after.gap, (before.gap + 0.2 * (before.source == 0))[kept])
-    contacts.allow(0, np.zeros(len(_points())))
-    assert len(contacts.half_spaces(_points(), 0.5)) == len(before)
 
 
 def test_nearest_is_the_smallest_over_bones_and_infinite_without():
@@ -96,7 +76,7 @@ def test_nearest_is_the_smallest_over_bones_and_infinite_without():
     assert 0 < below.sum() < len(points)
     assert np.array_equal(found[below], distance[below])
     assert np.array_equal(slope[below], gradient[below])
-    assert np.all(found[~below] >= limit[~below])
+    assert np.all(found[~below] >= limit[~below]) and np.all(found <= distance + 1e-9)
 
 
 def test_boxes_are_apart_by_no_more_than_what_is_in_them():
@@ -117,14 +97,6 @@ def test_boxes_are_apart_by_no_more_than_what_is_in_them():
     # Side by side along the axes they are as far apart as they look.
     two = np.array([[0.0, 0, 0], [1, 1, 1]])
     assert boxes_apart(two, np.eye(4), two + [3.0, 0, 5.0]) == pytest.approx(np.hypot(2.0, 4.0))
-
-
-def test_beyond_a_limit_a_lower_bound_of_the_distance_stands():
-    contacts, _ = _pair()
-    points = _points() + [0, 0, 40.0]
-    true = contacts.nearest(points)
-    for found in (contacts.nearest(points, 5.0), contacts.nearest_with_gradient(points, 5.0)[0]):
-        assert np.all(found > 5.0) and np.all(found <= true + 1e-9)
 
 
 def test_point_with_no_direction_still_gets_one():

@@ -10,13 +10,12 @@ from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.options import SlidingOptions
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames
-from rbfmuscle.simulation.neighbour_surface import DEEPER, NeighbourSurface
+from rbfmuscle.simulation.neighbour_surface import NeighbourSurface
 from rbfmuscle.simulation.neighbours import pairs as links
 from rbfmuscle.simulation.neighbours.extrapolation import MotionExtrapolator
 from rbfmuscle.simulation.neighbours.pairs import MOST
 from rbfmuscle.simulation.sliding import Sliding, sliding_pairs
 from rbfmuscle.simulation.stepper import MuscleStepper
-from rbfmuscle.simulation.substeps import SubSteps
 from rbfmuscle.validation import SceneError
 
 
@@ -110,14 +109,6 @@ def test_a_folded_triangle_makes_no_point_outside_deep():
     assert distance.min() > -0.5 * surface.edge
 
 
-def test_nothing_is_deeper_than_the_muscle_is_thick_or_than_is_asked_for():
-    for reach, low, high in ((50.0, 8.5, 10.0), (4.0, 4.0, 4.0)):
-        surface = NeighbourSurface(_ball(10.0), reach=reach)
-        radius = (surface.deepest - surface.edge) / DEEPER
-        # The normals of its triangles tilt those at the corners where six meet five.
-        assert radius.min() > low - 1e-9 and radius.max() < high + 1e-9
-
-
 def _run(angles, sliding, **options):
     made, fields = toy.neighbour_scene(angles, sliding=sliding, **options)
     parts = toy.neighbour_parts(made)
@@ -179,22 +170,6 @@ def test_planes_ask_for_little_in_one_sub_step_however_deep_the_overlap():
     assert _overlap(parts) < 0.2
 
 
-def test_each_muscle_takes_its_own_sub_steps_and_all_meet_at_the_frame():
-    path = [{"hinge.press": np.radians(angle)} for angle in (0, 5)]
-    made, fields = toy.neighbour_scene([{"press": 5}], sliding=SlidingOptions())
-    parts = toy.neighbour_parts(made)
-    with FrameLoop(made, parts, fields=fields) as loop:
-        # As for a muscle that cannot meet the arm: nothing that moves is its own.
-        loop._together.cuts["lower"] = SubSteps(made, made.muscles[0])
-        for coordinates in path:
-            work = loop.advance(coordinates).work
-    assert work["lower"].substeps == 1 < work["upper"].substeps
-    assert _overlap(parts) < 0.1
-    _, fine = _run([{"press": a} for a in np.linspace(0, 5, 11)], SlidingOptions())
-    for name in parts:
-        assert np.sqrt(np.square(parts[name].x - fine[name].x).sum(axis=1).mean()) < 0.1
-
-
 def test_pairs_say_how_they_overlap_and_come_apart(monkeypatch, pressed):
     frames, parts = pressed
     assert list(frames[-1].neighbours) == [("lower", "upper")]
@@ -206,15 +181,6 @@ def test_pairs_say_how_they_overlap_and_come_apart(monkeypatch, pressed):
     lifted, _ = _run([{"lift": a} for a in (0, 6, 12)], SlidingOptions())
     gaps = [frame.neighbours["lower", "upper"][1] for frame in lifted]
     assert gaps[0] == 0.0 and 0.5 < gaps[1] < gaps[2]
-
-
-def test_muscles_far_apart_are_known_by_their_boxes_alone():
-    near, far = NeighbourSurface(_ball(), reach=3.0), NeighbourSurface(_ball(), reach=3.0)
-    assert not near.apart(far, 3.0)
-    far.reach_box = far.reach_box + [0, 0, 30.0]
-    assert near.apart(far, 3.0)
-    frames, _ = _run([{"press": a} for a in (0, 2)], SlidingOptions(), gap=80.0)
-    assert "sliding_gap_max" not in frames[-1].surfaces["upper"].quantities
 
 
 def test_linked_points_keep_near_their_neighbour(monkeypatch):

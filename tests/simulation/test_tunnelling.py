@@ -5,7 +5,6 @@ import pytest
 import trimesh
 from toy_scene import ToyMuscle, attach, bone, box, cylinder, ellipsoid, joint, muscle, scene, sphere
 
-from rbfmuscle.geometry.rotations import rigid_fit
 from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.options import TunnellingOptions
@@ -136,22 +135,6 @@ def test_paths_are_relative_to_the_bone(angle, count):
     assert crossing.depth == pytest.approx(0.2, rel=0.5)
     carried = points + (turn @ [0, 0, 4.0, 0])[:3]
     assert find_crossings(contacts, points, carried, *poses, options, tolerance=TOLERANCE) == []
-
-
-def test_earlier_distances_spare_the_field_and_change_nothing():
-    contacts, points, poses = _moving_plate(np.eye(4))
-    contacts.half_spaces(points, 50.0)
-    (crossing,) = find_crossings(contacts, points, points, *poses, TunnellingOptions(), tolerance=TOLERANCE)
-    assert crossing.index.tolist() == [0]
-
-
-def test_rigid_fit_gives_back_the_motion():
-    rng = np.random.default_rng(0)
-    points = rng.normal(size=(9, 3))
-    motion = rotation_about([1, -1, 2], 2.5, np.array([3.0, 0, 1]))
-    assert np.allclose(rigid_fit(points, points @ motion[:3, :3].T + motion[:3, 3]), motion)
-    shift = rigid_fit(points[:1], points[:1] + 3.0)
-    assert np.allclose(shift[:3, 3], 3.0)
 
 
 def _swing(action):
