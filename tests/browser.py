@@ -110,12 +110,6 @@ class Tab:
     def mouse(self, kind, place):
         self.call("Input.dispatchMouseEvent", type=kind, x=place[0], y=place[1], button="left", clickCount=1)
 
-    def click(self, text):
-        """Click on what has this text."""
-        place = wait_for(lambda: self.place(f"!e.children.length && e.textContent.trim() == {text!r}"), 20)
-        self.mouse("mousePressed", place)
-        self.mouse("mouseReleased", place)
-
     def tick(self, label):
         """Click on the checkbox in the row of a label."""
         row = f"e.type == 'checkbox' && e.closest('.mantine-Flex-root')?.innerText.trim() == {label!r}"

@@ -50,8 +50,3 @@ def test_run_reports_what_contracts():
         assert sign * (np.diff(run.values(MUSCLE, quantity))[-1]) > 0.0, quantity
     assert run.values(MUSCLE, "csa_place") == pytest.approx([0.5] * 3, abs=0.02)
     assert {row.unit for row in run.metrics if row.quantity == "csa_max"} == {"mm^2"}
-
-
-def test_plain_muscles_report_nothing_of_it():
-    run = rm.simulate(rm.phantom_scene(end=2.0, step=2.0, spacing=6.0), model="pbd", frames="0:1")
-    assert not {"activation", "fibre_stretch", "csa_max"} & {row.quantity for row in run.metrics}

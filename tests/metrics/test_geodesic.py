@@ -59,13 +59,6 @@ def test_string_goes_along_with_the_scene():
     assert np.allclose(after, before @ motion[:3, :3].T + motion[:3, 3], atol=1e-6)
 
 
-def test_path_is_no_longer_than_a_line_beside_the_bones():
-    rng = np.random.default_rng(2)
-    line = over_the_ball(18.0)
-    line[1:-1] += rng.uniform(0.0, 2.0, (len(line) - 2, 3)) * [0.0, 1.0, 1.0]
-    assert path_length(shortest_path(line, [ball()], {"ball": np.eye(4)})) < path_length(line)
-
-
 def test_string_that_begins_as_in_the_frame_before_ends_in_the_same_place():
     poses = {"ball": np.eye(4)}
     before, line = over_the_ball(15.0), over_the_ball(15.0) + [0.0, 2.0, 0.0]

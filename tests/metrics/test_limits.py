@@ -1,7 +1,5 @@
 """The limits that a run is held to, row by row, and the sentence that says which muscles keep to them."""
 
-import re
-
 import numpy as np
 import pytest
 import trimesh
@@ -110,12 +108,6 @@ def test_the_worst_by_its_limit_is_named_first_and_bones_are_named_too():
     assert [said.count(LIMITS[name].remedy) for name in ("flicker", "joint_gap")] == [1, 1]
 
 
-def test_numbers_are_shown_as_people_read_them():
-    assert [shown_number(v) for v in (4.11e-15, -2e-13, 0.0, 0.12345, -31.26)] == [
-        "< 1e-12", "< 1e-12", "0", "0.123", "-31.3",
-    ]  # fmt: skip
-
-
 def test_limits_of_the_command_line_follow_the_unit():
     limits = parse_limits("all", arm_scene(units="m"))
     assert limits["penetration_max"] == pytest.approx(0.0001) and limits["volume_error"] == 1e-9
@@ -160,12 +152,3 @@ def test_a_joint_that_opens_is_measured_and_one_that_is_apart_at_rest_is_not():
     assert opened == pytest.approx(gaps.min() - rest) and opened > 5.0
     scene.bones[1].mesh.apply_translation([20.0, 0.0, 0.0])
     assert joint_gaps(scene, [0, 2]) == []
-
-
-def test_terminal_and_report_say_the_same(monkeypatch, tmp_path):
-    use_blend_model(monkeypatch)
-    info = stream_run(arm_scene(end=10), tmp_path, settings={"output.report": True}, pictures=False)
-    page = re.sub(r"<small>|\s+", " ", (tmp_path / "report.html").read_text(encoding="utf-8"))
-    page = re.sub(" +", " ", page)
-    sentence = info["verdict"][1:]  # capitalised on the page
-    assert sentence.replace("<", "&lt;") in page

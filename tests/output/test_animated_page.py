@@ -84,11 +84,3 @@ def test_every_vertex_and_triangle_of_every_frame_is_unpacked(written, moving):
         poses = np.reshape(part["poses"], (-1, 3, 4))
         np.testing.assert_allclose(poses, bone.poses[: len(poses), :3], atol=1e-6)
         assert len(poses) == (4 if bone.moves else 1)
-
-
-def test_models_beside_each_other_share_their_bones(moving):
-    facts = json.loads(page.pack_runs({"one": moving, "two": moving}, CAPTIONS, colours={"knee": "#123456"}))
-    assert facts["panels"] == ["one", "two"]
-    assert [part["panel"] for part in facts["parts"]] == [0, 0, 1, 1, -1, -1]
-    assert [part["colour"] for part in facts["parts"] if part["name"] == "knee"] == ["#123456"] * 2
-    assert len(facts["bytes"]) < 2 * len(json.loads(page.pack_runs({"": moving}, CAPTIONS))["bytes"])

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from rbfmuscle.report.appearance import motion_direction
-from rbfmuscle.report.raster import Solid, aim, draw_layer, draw_solids, fitted_size, view_axes
+from rbfmuscle.report.raster import Solid, aim, draw_solids, fitted_size, view_axes
 
 RED, BLUE, WHITE = np.eye(3)[0], np.eye(3)[2], np.ones(3)
 
@@ -30,15 +30,6 @@ def test_what_is_nearer_hides_what_is_behind_whatever_the_order():
     image = draw_solids(solids, camera, WHITE).astype(int)
     np.testing.assert_array_equal(image, draw_solids(solids[::-1], camera, WHITE))
     assert image[50, 50, 0] > image[50, 50, 2] and image[50, 15, 2] > image[50, 15, 0]
-
-
-def test_what_is_drawn_once_for_all_frames_looks_the_same():
-    still, moving = Solid(*ball(10.0), RED), Solid(*ball(6.0, (8, 0, 0)), BLUE)
-    camera = aim((0, -1, 0), still.vertices, (60, 60))
-    behind = draw_layer([still], camera, WHITE)
-    for _ in range(2):
-        found = draw_solids([moving], camera, WHITE, behind=behind)
-        np.testing.assert_array_equal(found, draw_solids([still, moving], camera, WHITE))
 
 
 def test_veil_lets_a_solid_behind_it_show_and_not_one_before_it():

@@ -84,12 +84,3 @@ def test_address_is_printed_and_answers_until_interrupted(run_folder):
         out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
     assert "Traceback" not in err and out == ""
-
-
-def test_runs_of_a_comparison_are_offered_by_model(run_folder, tmp_path):
-    from rbfmuscle.cli.view import _open_runs
-
-    for model in ("rbf", "pbd"):
-        (tmp_path / model).symlink_to(run_folder)
-    assert list(_open_runs(tmp_path)) == ["pbd", "rbf"]
-    assert list(_open_runs(run_folder)) == [run_folder.name]
