@@ -1,6 +1,5 @@
 """How a command ends when it may not go on: signals at any moment, full and closed outputs, a kill."""
 
-import errno
 import json
 import os
 import re
@@ -11,8 +10,7 @@ import sys
 
 import numpy as np
 import pytest
-import trimesh
-from blend_model import arm_scene, use_blend_model
+from blend_model import arm_files, arm_scene, use_blend_model
 from command_line import call
 
 from rbfmuscle.output.export import export_run
@@ -25,20 +23,7 @@ PROGRAM = [sys.executable, "-m", "rbfmuscle"]
 
 def write_scene(folder, *, end):
     """A quick scene whose motion goes on for ``end`` degrees by one degree a frame."""
-    trimesh.creation.box((20, 20, 20)).apply_translation([0, 0, 40]).export(folder / "upper.ply")
-    trimesh.creation.box((20, 20, 60)).apply_translation([0, 0, -60]).export(folder / "lower.ply")
-    muscle = trimesh.creation.icosphere(subdivisions=2).apply_scale([14, 12, 55])
-    muscle.apply_translation([34, 0, -10]).export(folder / "muscle.ply")
-    (folder / "scene.toml").write_text(
-        '[scene]\nformat = 1\nunits = "mm"\n[[bone]]\nname = "upper"\nmesh = "upper.ply"\n[[bone]]\nname = "lower"\n'
-        'mesh = "lower.ply"\n[[joint]]\nname = "hip"\nparent = "upper"\nchild = "lower"\ncentre = [0, 0, 0]\n'
-        f"axes = {{ flexion = [0, 0, 1] }}\n[motion]\nramp = {{ flexion = {{ to = {end}, step = 1 }} }}\n"
-        '[[muscle]]\nname = "m"\nmesh = "muscle.ply"\nmodel = { name = "pbd" }\n'
-        "attach = [{ bone = 'upper', sphere = { centre = [34, 0, 45], radius = 22 } },\n"
-        "{ bone = 'lower', sphere = { centre = [34, 0, -65], radius = 22 } }]\n"
-        "[output]\nreport = false\n"
-    )
-    return folder / "scene.toml"
+    return arm_files(folder, end=end, step=1, defaults='model = "pbd"\n')
 
 
 def ends_clean(process, code=130):
@@ -170,19 +155,6 @@ class TestOutputs:
         )
         os.close(writer)
         assert done.returncode == 0 and "Traceback" not in done.stderr and "Error" not in done.stderr
-
-    def test_full_disk_for_kernels_names_the_folder(self, tmp_path, capsys, monkeypatch):
-        from rbfmuscle.report import kernel_page
-
-        def full(path, *args, **options):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-        trimesh.creation.icosphere(subdivisions=2, radius=20).export(tmp_path / "ball.ply")
-        monkeypatch.setattr(kernel_page.Path, "write_text", full)
-        words = ["--kernels", "cubic", "--centres", "40", "--resolution", "16"]
-        code, _, err = call(capsys, "kernels", tmp_path / "ball.ply", "-o", tmp_path / "o", *words)
-        (line,) = [line for line in err.splitlines() if line.startswith("rbfmuscle: cannot")]
-        assert code == 2 and "No space left" in line and str(tmp_path / "o") in line
 
 
 class TestKilledRuns:

@@ -13,8 +13,6 @@ import trimesh
 from command_line import call
 
 import rbfmuscle as rm
-from rbfmuscle.experiments import kernel_study
-from rbfmuscle.experiments.kernel_row import ReferenceSurface
 from rbfmuscle.experiments.kernel_study import describe, recommend, row_toml
 from rbfmuscle.report.kernel_page import answer, write_studies
 from rbfmuscle.validation import MeshError, UsageError
@@ -93,25 +91,6 @@ def test_a_study_on_several_threads_is_that_of_one():
             assert same["fit_time"] > 0.0 and same["evaluation_time"] > 0.0
 
 
-def test_fitted_centres_halve_the_error_of_greedy_ones(ellipsoid):
-    """Bumps that 80 centres cannot follow are met on average."""
-    vertices, faces = np.array(ellipsoid.vertices), np.asarray(ellipsoid.faces)
-    vertices[:, 2] += 0.8 * np.sin(vertices[:, 0] / 2.5) * np.sin(vertices[:, 1] / 2.5)
-    settings = {"kernels": ["cubic"], "centres": [80], "resolution": 48}
-    greedy, fitted = (
-        rm.study_kernels((vertices, faces), placement=placement, **settings).rows[0]
-        for placement in ("greedy", "fitted")
-    )
-    assert fitted["rms"] < 0.8 * greedy["rms"]
-
-
-def test_slender_muscles_are_looked_at_with_finer_cells(ellipsoid):
-    """With 128 cells along it a spindle of 40 times its width is three cells thick."""
-    rod = trimesh.creation.icosphere(subdivisions=4).apply_scale([200.0, 5.0, 5.0])
-    assert ReferenceSurface(np.array(rod.vertices), np.asarray(rod.faces)).resolution == 320
-    assert ReferenceSurface(ellipsoid.vertices, ellipsoid.faces).resolution == 128
-
-
 def row(kernel, rms, milliseconds, *, condition=1e6, epsilon=0.0, unfit=""):
     return {
         "kernel": kernel, "rms": rms, "fit_time": milliseconds * 1e-3, "evaluation_time": 0.0, "condition": condition,
@@ -135,14 +114,6 @@ def row(kernel, rms, milliseconds, *, condition=1e6, epsilon=0.0, unfit=""):
 def test_the_quickest_of_those_alike_is_recommended(rows, wanted):
     found = recommend(rows)
     assert (found and found["kernel"]) == wanted
-
-
-def test_rows_that_err_more_than_the_coarsest_kernel_are_unfit():
-    rows = [row("linear", 0.4, 1.0), row("buhmann", 0.9, 1.0), row("cubic", 0.1, 1.0)]
-    kernel_study._refuse_coarse([one | {"centres": 80} for one in rows])
-    rows = [one | {"centres": 80} for one in rows]
-    kernel_study._refuse_coarse(rows)
-    assert [one["unfit"] for one in rows] == ["", "an error of 0.9, beyond that of linear, 0.4", ""]
 
 
 def test_files_hold_the_table(study, ellipsoid, tmp_path):

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,10 +16,10 @@ from hypothesis import strategies as st
 
 from rbfmuscle.cli.app import run_command as command
 from rbfmuscle.cli.sweep import run_point
-from rbfmuscle.experiments.sweep import SweepPoint, parse_grid, plan_sweep
+from rbfmuscle.experiments.sweep import parse_grid, plan_sweep
 from rbfmuscle.experiments.sweep_run import SweepFolder, run_sweep
-from rbfmuscle.experiments.sweep_table import mark_front, pareto_front, sweep_rows, write_table
-from rbfmuscle.report.sweep_page import front_picture, inside_grid, write_page
+from rbfmuscle.experiments.sweep_table import mark_front, pareto_front, write_table
+from rbfmuscle.report.sweep_page import write_page
 from rbfmuscle.validation import UsageError
 
 GRID = ["model.centres=40,60", "model.resolution=16,24"]
@@ -151,37 +150,6 @@ class TestFront:
             bool(faster),
             bool(better),
         )
-
-    def test_picture_marks_the_default_and_leaves_out_the_reference(self):
-        rows = [row(0.5, 0.02), row(0.3, 0.03, "default"), row(0.1, 0.5, "reference")]
-        mark_front(rows)
-        picture = front_picture(rows, "error_rms")
-        assert (picture.count("<circle"), picture.count("<polygon")) == (
-            1,
-            1,
-        ) and ">default</text>" in picture
-
-    def test_reference_within_its_own_grid_is_noticed(self):
-        points = [
-            {"role": role, "settings": {"a": a}} for role, a in (("", 1), ("default", 2), ("reference", 2))
-        ]
-        assert inside_grid(points)
-        assert not inside_grid([*points[:2], {"role": "reference", "settings": {"a": 3}}])
-
-
-def test_rows_are_those_of_their_points_in_order():
-    points = [
-        SweepPoint(f"k{n}", "s", {"a": n} if n else {}, "", "" if n else "default", "r") for n in range(3)
-    ]
-    results = {
-        "k0": {"status": "done", "values": {"error_rms": 0.25}},
-        "k1": {"status": "failed", "error": "no"},
-    }
-    rows = sweep_rows(points, SimpleNamespace(read=lambda key: results.get(key, {})), {"s": "cm"})
-    assert [r["status"] for r in rows] == ["done", "failed", "missing"]
-    assert [r["label"] for r in rows] == ["default", "a=1", "a=2"]
-    assert [r["error"] for r in rows] == ["", "no", ""] and rows[0]["units"] == "cm"
-    np.testing.assert_array_equal([r["error_rms"] for r in rows], [0.25, np.nan, np.nan])
 
 
 class TestRun:

@@ -310,6 +310,7 @@ def test_what_is_written_of_meshes_in_metres_passes_check_and_runs(tmp_path, cap
     file = tmp_path / "scene.toml"
     assert run_command(["new", str(tmp_path)]) == 0
     assert "units are m: " in capsys.readouterr().out
+    assert run_command(["new", str(tmp_path)]) == 2 and "--force" in capsys.readouterr().err
     assert run_command(["check", str(file)]) == 0
     quick = ["--set", "output.report=false", "--model", "pbd"]
     assert run_command(["run", str(file), "-o", str(tmp_path / "out"), "--frames", "0:5", *quick]) == 0

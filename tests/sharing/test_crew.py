@@ -1,7 +1,6 @@
 """Muscles dealt out to processes: what comes together is what one process finds, whatever ends the run."""
 
 import io
-import logging
 import os
 import pickle
 import queue
@@ -9,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import warnings
 from types import SimpleNamespace
 
 import numpy as np
@@ -27,7 +25,7 @@ from rbfmuscle.sharing import crew as sharing
 from rbfmuscle.sharing.crew import WorkerPool
 from rbfmuscle.sharing.share import MuscleGroup
 from rbfmuscle.simulation.plan.processes import helpers_for
-from rbfmuscle.validation import MeshError, SceneWarning, SolveError
+from rbfmuscle.validation import MeshError, SolveError
 
 
 @pytest.fixture
@@ -120,13 +118,6 @@ def test_helper_that_is_killed_ends_the_run_with_the_frames_so_far(tmp_path, two
     assert {row.muscle for row in saved.metrics if row.frame == 0} >= set(saved.muscles)
 
 
-def test_folder_that_cannot_be_written_starts_no_helper(tmp_path, two_helpers, crews):
-    (tmp_path / "taken").write_text("a file")
-    with pytest.raises(ValueError, match="cannot write"):
-        stream_run(small_scene(), tmp_path / "taken", pictures=False)
-    assert crews == []
-
-
 def test_helper_ends_with_the_process_that_started_it():
     """It waits for the word to begin, and nobody is left to say it: its standard input is closed."""
     scene = small_scene()
@@ -193,23 +184,6 @@ class TestHelpersFor:
 
     def test_muscles_that_slide_stay_together(self):
         assert helpers_for(self.scene(38, 37, sliding=object()), 4) < 2
-
-
-def test_what_helpers_say_is_said_once(caplog):
-    def helper(*messages):
-        found = iter(messages)
-        return SimpleNamespace(take=lambda: next(found))
-
-    crew = WorkerPool.__new__(WorkerPool)
-    crew._told = set()
-    warning, line = SceneWarning("bones meet"), ("rbfmuscle.bones", logging.WARNING, "bone: is open")
-    one = helper(("warned", warning), ("logged", line), ("done", 1))
-    other = helper(("logged", line), ("warned", SceneWarning("bones meet")), ("done", 2))
-    with warnings.catch_warnings(record=True) as heard:
-        warnings.simplefilter("always")
-        assert [crew._next(one), crew._next(other)] == [1, 2]
-    assert [str(w.message) for w in heard] == ["bones meet"]
-    assert [record.getMessage() for record in caplog.records] == ["bone: is open"]
 
 
 def test_muscles_are_dealt_whole():
