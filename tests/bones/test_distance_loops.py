@@ -5,10 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.bones import build, lists, query
-from rbfmuscle.bones.query import _mixed_side
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.geometry.exact_distance import ExactDistance, record_square
 
 
 def angle_iron():
@@ -63,43 +60,3 @@ def test_gradient_points_away_from_the_nearest_point_outside_and_to_it_inside(fi
     expected = (points - nearest) / np.where(distance == 0, 1.0, distance)[:, None]
     agree = np.linalg.norm(gradient - expected, axis=1)[clear] < 1e-4
     assert agree.mean() > 0.98
-
-
-def test_reach_leaves_what_is_near_exact_and_bounds_what_is_far(field, solid):
-    points = around(seed=4, pad=2.0)
-    distance, _ = exact(points, solid)
-    for reach in (0.0, 0.3, 1.0):
-        found = field.distance(points, reach=reach)
-        near = distance <= reach
-        np.testing.assert_allclose(found[near], distance[near], atol=1e-6)
-        assert (found[~near] > reach - 1e-9).all() and (found[~near] <= distance[~near] + 1e-6).all()
-
-
-def test_a_mixed_cell_interpolates_what_its_corners_say_and_ends_at_its_sides():
-    low, size = np.array([2.0, -1.0, 4.0]), 0.5
-    corner = np.array([[k >> 2 & 1, k >> 1 & 1, k & 1] for k in range(8)], dtype=float)
-
-    def asked(place):
-        return 1.0 + 2.0 * place[0] - 3.0 * place[1] + place[2] + 5.0 * place[0] * place[1] * place[2]
-
-    row = np.array([[*(asked(c) for c in corner), *low, 1.0 / size]])
-    lists = np.zeros(2, dtype=np.int32)  # no triangle, then the number of the corners' row
-    for place in np.random.default_rng(0).uniform(-1.0, 2.0, (50, 3)):
-        found = _mixed_side(*(low + size * place), 0, lists, row)
-        assert found == pytest.approx(asked(np.clip(place, 0.0, 1.0)))
-
-
-def test_walks_from_beside_the_nearest_triangle_lead_to_it():
-    """On a convex body every way downhill ends at the nearest triangle, whichever neighbour it begins at."""
-    ball = trimesh.creation.icosphere(subdivisions=1)
-    vertices, faces = np.array(ball.vertices) * [2.0, 1.0, 0.7], np.array(ball.faces)
-    exact = ExactDistance(vertices, faces)
-    builder = build._Builder(exact, np.zeros(3), 1.0, None, None)
-    records, across = exact.records, builder.across
-    for point in 1.5 * np.random.default_rng(5).normal(size=(60, 3)) + [0.0, 0.0, 2.5]:
-        squares = np.array([record_square(records, n, *point) for n in range(len(faces))])
-        nearest = int(squares.argmin())
-        for start in across[nearest]:
-            for walk in (query._walk, lists._walk):
-                end = walk(int(start), squares[start], *point, records, across)
-                assert squares[end] == pytest.approx(squares[nearest], rel=1e-5)

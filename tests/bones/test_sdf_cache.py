@@ -6,7 +6,7 @@ import trimesh
 
 from rbfmuscle.bones import sdf
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.cache import SUFFIX, cache_path, load_arrays, store_arrays
+from rbfmuscle.cache import SUFFIX, cache_path
 
 
 @pytest.fixture(autouse=True)
@@ -89,22 +89,3 @@ def test_cache_that_cannot_be_written_does_no_harm(ball, folder, caplog):
     field = BoneSDF.from_mesh(ball)
     assert field.distance(np.zeros((1, 3)))[0] < -19.0
     assert "cannot be written" in caplog.text
-
-
-def test_arrays_come_back_as_loops_are_compiled_for_them(folder):
-    rng = np.random.default_rng(3)
-    arrays = {
-        "rows": rng.random((100, 3)),
-        "columns": np.asfortranarray(rng.random((4, 5))),
-        "none": np.zeros((0, 3)),
-        "one": np.float64(3.0),
-        "flags": np.array([True, False, True]),
-        "numbers": np.arange(7, dtype=np.int32),
-    }
-    store_arrays("some", arrays)
-    found = load_arrays("some")
-    assert set(found) == set(arrays)
-    for name, array in arrays.items():
-        np.testing.assert_array_equal(found[name], array)
-        assert found[name].dtype == np.asarray(array).dtype
-        assert found[name].flags.aligned and found[name].flags.writeable and found[name].flags.c_contiguous

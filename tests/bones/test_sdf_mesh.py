@@ -71,13 +71,6 @@ def test_duplicate_and_degenerate_faces_are_left_out(ball):
     np.testing.assert_array_equal(field.distance(_random(2000)), clean.distance(_random(2000)))
 
 
-def test_one_triangle_is_outside_everywhere():
-    field = BoneSDF.from_mesh(([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]), cache=False)
-    assert not field.closed
-    points = np.array([[0.2, 0.2, 0.5], [0.2, 0.2, -0.5], [5.0, 0.0, 0.0]])
-    np.testing.assert_allclose(field.distance(points), [0.5, 0.5, 4.0], atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("vertices", "faces", "message"),
     [

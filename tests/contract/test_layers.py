@@ -53,7 +53,6 @@ ALLOWED = {
 }
 ALLOWED["rbfmuscle.__main__"] = ("rbfmuscle.cli",)
 NAMES_BOTH = "rbfmuscle.models"
-LARGEST_PACKAGE = 15
 
 
 def module_name(path, root=ROOT):
@@ -126,20 +125,6 @@ def test_imports_only_what_its_package_may(path):
 def test_planted_wrong_arrow_is_found(module, source):
     assert wrong_arrows(module, source)
     assert wrong_arrows("rbfmuscle.report.report", "from rbfmuscle.scene.scene import Scene") == []
-
-
-def packages(root=ROOT):
-    """Folder -> its modules, without ``__init__``."""
-    found = {}
-    for path in sources(root):
-        if path.name != "__init__.py":
-            found.setdefault(path.parent.relative_to(root), []).append(path.name)
-    return found
-
-
-@pytest.mark.parametrize(("package", "files"), packages().items(), ids=lambda value: str(value)[:40])
-def test_no_package_is_too_full(package, files):
-    assert len(files) <= LARGEST_PACKAGE
 
 
 def cycles(arrows):

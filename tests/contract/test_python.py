@@ -10,7 +10,6 @@ import pytest
 from conftest import ROOT
 
 import rbfmuscle as rm
-from rbfmuscle.experiments.kernel_study import KernelStudy
 
 SCRIPT = ROOT / "tests" / "data" / "user_script.py"
 
@@ -130,25 +129,6 @@ def test_notebooks_show_a_small_picture(run, loaded):
         html = shown._repr_html_()
         assert html.startswith("<figure><img src") and len(html) < 200_000 and "abductor" in html
     assert "no muscles" in rm.Scene("bare")._repr_html_()
-
-
-def test_no_repr_fills_the_screen(run):
-    frame = run.frames[-1]
-    scene = run.scene
-    things = [
-        scene,
-        run,
-        frame,
-        frame.surfaces["abductor"],
-        scene.bones[0],
-        scene.muscles[0],
-        scene.joints[0],
-    ]
-    things += [run["abductor"], scene.motion, rm.BoneSDF.from_mesh(scene.bones[1].mesh)]
-    mesh = scene.muscles[0].mesh
-    things.append(KernelStudy([{"rms": 0.1}] * 200, [(mesh.vertices, mesh.faces)]))
-    things.append(rm.RBFField.fit_hermite(mesh.vertices[::40], mesh.vertex_normals[::40], kernel="cubic"))
-    assert {type(thing).__name__: len(repr(thing)) for thing in things if len(repr(thing)) > 1000} == {}
 
 
 def test_setting_without_its_table_is_named_with_it():

@@ -41,17 +41,37 @@ def test_what_is_shown_is_whole_or_its_beginning_and_end():
     assert shown_path("/" + "p" * 399) == "/" + "p" * 399 and len(shown_path("p" * 401)) == 400
 
 
-def test_points_come_back_as_contiguous_doubles():
+def test_what_passes_comes_back_as_contiguous_doubles():
     points = check_points(np.asfortranarray(np.arange(12, dtype=np.int32).reshape(4, 3)))
     assert points.dtype == np.float64 and points.flags.c_contiguous
     np.testing.assert_array_equal(points, np.arange(12).reshape(4, 3))
-    assert check_points(np.zeros((0, 3))).shape == (0, 3)
+    assert check_points(np.zeros((0, 3))).shape == (0, 3) and check_vectors(np.ones((2, 3)), 2).shape == (
+        2,
+        3,
+    )
+    assert check_values([1, 2], 2).tolist() == [1.0, 2.0] and check_positive("0.5", name="x") == 0.5
+    vertices, faces = check_mesh(*TETRAHEDRON)
+    assert vertices.dtype == np.float64 and faces.dtype == np.int64 and faces.tolist() == TETRAHEDRON[1]
 
 
-@pytest.mark.parametrize("shape", [(3,), (2, 2), (2, 4), (1, 3, 3), (2, 3, 1)])
-def test_points_of_another_shape_are_refused(shape):
-    with pytest.raises(ValueError, match=r"dots must have shape \(n, 3\), got \("):
-        check_points(np.zeros(shape), name="dots")
+@pytest.mark.parametrize(
+    ("check", "words", "wrong"),
+    [
+        (
+            check_points,
+            r"must have shape \(n, 3\), got \(",
+            [np.zeros(s) for s in ((3,), (2, 2), (2, 4), (1, 3, 3))],
+        ),
+        (lambda given: check_vectors(given, 3), r"one row a point \(3\), got 2", [np.ones((2, 3))]),
+        (lambda given: check_values(given, 2), r"must have shape \(2,\)", [[1.0], [[1.0, 2.0]], 1.0]),
+        (lambda given: check_values(given, 2), "must be an array of numbers", [["a", "b"]]),
+        (lambda given: check_positive(given, name="x"), "x must be a positive", [0.0, -1.0, np.nan, np.inf]),
+    ],
+)
+def test_what_is_of_another_kind_is_refused(check, words, wrong):
+    for given in wrong:
+        with pytest.raises(ValueError, match=words):
+            check(given)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -62,33 +82,6 @@ def test_first_row_that_is_not_finite_is_named(value):
         check_points(points)
     with pytest.raises(NotFiniteError, match="values must be finite, row 3 is"):
         check_values(points[:, 1], 5)
-
-
-def test_one_vector_or_value_a_point():
-    assert check_vectors(np.ones((2, 3)), 2).shape == (2, 3) and check_values([1, 2], 2).tolist() == [
-        1.0,
-        2.0,
-    ]
-    with pytest.raises(ValueError, match=r"one row a point \(3\), got 2"):
-        check_vectors(np.ones((2, 3)), 3)
-    for wrong in ([1.0], [[1.0, 2.0]], 1.0):
-        with pytest.raises(ValueError, match=r"must have shape \(2,\)"):
-            check_values(wrong, 2)
-    with pytest.raises(ValueError, match="must be an array of numbers"):
-        check_values(["a", "b"], 2)
-
-
-def test_positive_numbers():
-    assert check_positive("0.5", name="x") == 0.5
-    for wrong in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(ValueError, match="x must be a positive number"):
-            check_positive(wrong, name="x")
-
-
-def test_mesh_comes_back_in_kind():
-    vertices, faces = check_mesh(*TETRAHEDRON)
-    assert vertices.dtype == np.float64 and faces.dtype == np.int64
-    assert faces.tolist() == TETRAHEDRON[1]
 
 
 @pytest.mark.parametrize(
@@ -121,12 +114,7 @@ def test_nearest_name_or_all_names():
 def test_only_regular_files_are_files(tmp_path):
     (tmp_path / "a").write_text("")
     assert is_file(tmp_path / "a")
-    assert (
-        not is_file(tmp_path)
-        and not is_file(tmp_path / "b")
-        and not is_file("a\0b")
-        and not is_file("/dev/null")
-    )
+    assert not any(map(is_file, (tmp_path, tmp_path / "b", "a\0b", "/dev/null")))
 
 
 def test_every_default_of_an_option_is_a_value_that_may_be_given():

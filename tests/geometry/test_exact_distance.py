@@ -66,12 +66,6 @@ def test_beyond_reach_the_reach_is_returned_and_nearer_distances_are_exact(shape
     assert np.all(near[~within] == 3.0)
 
 
-def test_points_on_corners_edges_and_faces_are_at_zero():
-    box = trimesh.creation.box((2.0, 2.0, 2.0))
-    points = np.array([[1.0, 1.0, 1.0], [1.0, 1.0, 0.3], [1.0, 0.2, 0.3]])
-    assert np.abs(tree(box).signed_distance(points)).max() < 1e-15
-
-
 @pytest.mark.parametrize("axis", range(3))
 def test_triangles_without_area_count_as_their_longest_edge(axis):
     vertices = np.roll([[0.0, 0, 0], [2, 0, 0], [1, 0, 0], [5, 5, 5]], axis, axis=1)

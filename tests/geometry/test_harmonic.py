@@ -103,11 +103,6 @@ class TestGradient:
         gradient = surface_gradient(vertices, Delaunay(flat).simplices, flat @ [2.0, -3.0] + 7)
         assert gradient == pytest.approx(np.broadcast_to([2.0, -3.0, 0.0], gradient.shape), abs=1e-9)
 
-    def test_along_a_cylinder(self):
-        vertices, faces, _ = cylinder()
-        gradient = surface_gradient(vertices, faces, vertices[:, 2] / LENGTH)
-        assert gradient == pytest.approx(np.broadcast_to([0, 0, 1 / LENGTH], gradient.shape), abs=1e-12)
-
 
 class TestBlend:
     POINTS = np.random.default_rng(5).normal(size=(30, 3)) * 40

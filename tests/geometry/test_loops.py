@@ -6,10 +6,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from pbd_baseline.contraction import _stretch_loop
-from pbd_baseline.shapes import _scale_loop
 from rbfmuscle.geometry.crossing import FaceTree
-from rbfmuscle.geometry.fields import LevelField
 from rbfmuscle.geometry.rest_frame import BoneFrame
 from rbfmuscle.geometry.surfaces import touching_balls
 from rbfmuscle.geometry.triangles import nearest_weights
@@ -54,54 +51,6 @@ def test_touching_balls_are_those_of_the_definition_and_of_the_sphere():
     steps, nearest = np.empty((2, len(grid))), np.empty(len(grid))
     touching_balls(grid, np.sign(grid) * (0.0, 0.0, 1.0), steps, nearest)
     np.testing.assert_allclose(steps[1], 1.5)
-
-
-def test_fibre_stretch_of_an_affine_stretch_is_its_own():
-    rng = np.random.default_rng(4)
-    rest = rng.normal(size=(6, 3))
-    edges = np.array([[0, 1], [1, 2], [2, 3], [3, 4], [4, 5], [5, 0], [0, 3]])
-    lengths = np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1)
-    stretch = np.empty(6)
-    _stretch_loop(1.3 * rest, edges, lengths, rng.uniform(0.1, 1.0, len(edges)), stretch)
-    np.testing.assert_allclose(stretch, 1.3, rtol=1e-7)
-    says = np.array([1.0, 0, 0, 0, 0, 0, 0])  # one edge lies along the fibre: its ends alone are told
-    moved = rest.copy()
-    moved[1] = rest[0] + 0.8 * (rest[1] - rest[0])
-    _stretch_loop(moved, edges, lengths, says, stretch)
-    np.testing.assert_allclose(stretch[:2], 0.8, rtol=1e-7)
-    np.testing.assert_allclose(stretch[3:5], 1.0, rtol=1e-7)
-
-
-def test_fibre_stretch_weighs_edges_by_what_they_say():
-    rest = np.array([[0.0, 0, 0], [1.0, 0, 0], [0, 2.0, 0]])
-    edges, lengths = np.array([[0, 1], [0, 2]]), np.array([1.0, 2.0])
-    stretch = np.empty(3)
-    _stretch_loop(rest * [1.2, 0.9, 1.0], edges, lengths, np.array([0.75, 0.25]), stretch)
-    np.testing.assert_allclose(stretch, [0.75 * 1.2 + 0.25 * 0.9, 1.2, 0.9], rtol=1e-7)
-
-
-def test_scaled_directions_have_the_length_asked_for_and_nothing_stays_nothing():
-    direction = np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 0.0], [1.0, 2.0, 2.0]])
-    before = direction.copy()
-    length = np.array([10.0, 5.0, 0.5])
-    _scale_loop(direction, length)
-    np.testing.assert_allclose(np.linalg.norm(direction, axis=1), [10.0, 0.0, 0.5])
-    np.testing.assert_allclose(np.cross(direction, before), 0.0, atol=1e-12)
-
-
-def test_a_field_less_a_level_is_zero_where_the_field_has_the_level():
-    class Ball:
-        def __call__(self, points):
-            return np.linalg.norm(points, axis=1) - 1.0
-
-        def value_and_gradient(self, points):
-            return self(points), points / np.linalg.norm(points, axis=1, keepdims=True)
-
-    field, points = LevelField(Ball(), 0.5), np.array([[1.5, 0, 0], [0, 2.0, 0]])
-    np.testing.assert_allclose(field(points), [0.0, 0.5])
-    value, gradient = field.value_and_gradient(points)
-    np.testing.assert_allclose(value, [0.0, 0.5])
-    np.testing.assert_allclose(gradient, [[1, 0, 0], [0, 1, 0]])
 
 
 def test_a_mesh_winds_around_what_is_inside_it_and_once_only():

@@ -2,7 +2,6 @@
 
 import gzip
 import json
-import sys
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from command_line import call
 from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.importers.labels import surfaces
 from rbfmuscle.importers.labels.read import LabelVolume, read_labels, read_names
-from rbfmuscle.importers.labels.surfaces import label_surface, smooth_mask
+from rbfmuscle.importers.labels.surfaces import label_surface
 from rbfmuscle.validation import MeshError, UsageError
 
 nibabel = pytest.importorskip("nibabel")
@@ -122,19 +121,6 @@ def test_thin_walls_do_not_go_through_themselves(monkeypatch):
     assert crossings(2.0)[0] > 0 and hopeless <= crossings(1.2)[0]
 
 
-def test_islands_and_holes_are_told():
-    labels = ball_labels()
-    labels[1:3, 1:3, 1:3] = 1
-    labels[22:26, 22:26, 22:26] = 0
-    surface = label_surface(LabelVolume(labels, np.eye(4), {}, "x.nii"), 1)
-    assert (
-        len(surface.notes) == 2
-        and "1 islands of 8 voxels" in surface.notes[0]
-        and "64 voxels" in surface.notes[1]
-    )
-    assert surface.mesh.euler_number == 2
-
-
 def test_names_from_header_and_tables(tmp_path):
     labels = ball_labels(split=np.array([1.0, 0, 0])).astype(np.int16)
     header = {"space": "left-posterior-superior", "space directions": np.eye(3), "space origin": np.zeros(3)}
@@ -154,24 +140,6 @@ def test_names_from_header_and_tables(tmp_path):
     (tmp_path / "none.csv").write_text("nothing\n")
     with pytest.raises(UsageError, match="names no label"):
         read_names(tmp_path / "none.csv")
-
-
-def test_folder_of_masks_is_a_volume(tmp_path):
-    labels = ball_labels(split=np.array([1.0, 0, 0])).astype(np.uint8)
-    for value, name in ((1, "soleus"), (2, "tibia")):
-        write_nifti(tmp_path / f"{name}.nii.gz", (labels == value).astype(np.uint8), np.eye(4))
-    volume = read_labels(tmp_path)
-    assert sorted(volume.names.values()) == ["soleus", "tibia"] and len(volume.values()) == 2
-
-
-def test_two_labels_of_one_name_are_two_meshes(tmp_path):
-    from rbfmuscle.cli.new import _write_surfaces
-
-    labels = ball_labels(split=np.array([1.0, 0, 0])).astype(np.int16)
-    source = write_nifti(tmp_path / "a.nii", labels, np.eye(4))
-    (tmp_path / "names.csv").write_text("1,Soleus\n2,soleus\n")
-    folder = _write_surfaces(source, tmp_path / "names.csv", tmp_path / "out")
-    assert sorted(path.name for path in folder.iterdir()) == ["Soleus.ply", "soleus_2.ply"]
 
 
 def _hostile(tmp_path):
@@ -216,24 +184,3 @@ def test_a_volume_larger_than_the_limit_is_refused_unread(tmp_path):
         header.write_to(file)
     with pytest.raises(MeshError, match="bytes unpacked, at most"):
         read_labels(tmp_path / "huge.nii")
-
-
-def test_without_the_reader_the_message_names_the_extra(tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "nibabel", None)
-    (tmp_path / "a.nii").write_bytes(b"")
-    code, _, err = call(capsys, "new", tmp_path / "a.nii")
-    assert code == 7 and "'.[labels]'" in err
-
-
-def test_smoothing_treats_inside_and_outside_alike():
-    """The field of what is left out is the field with the other sign; a plane stays half-way between voxels."""
-    mask = np.zeros((12, 10, 9), dtype=bool)
-    mask[3:9, 2:7, 3:6] = True
-    mask[5, 4, 6] = True
-    np.testing.assert_allclose(smooth_mask(~mask), -smooth_mask(mask), atol=1e-6)
-    half = np.zeros((12, 4, 4), dtype=bool)
-    half[:6] = True
-    field = smooth_mask(half)
-    np.testing.assert_allclose(field[5], -field[6], atol=1e-6)
-    assert (field[:6] > 0).all() and (field[6:] < 0).all()
-    np.testing.assert_allclose(field, field[:, :1, :1] * np.ones_like(field), atol=1e-6)

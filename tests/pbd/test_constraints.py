@@ -8,11 +8,9 @@ import trimesh
 
 from pbd_baseline.bending import BendingConstraint
 from pbd_baseline.constraints import EdgeConstraint, VolumeConstraint
-from pbd_baseline.factor import SymmetricFactor
 from pbd_baseline.topology import Topology, colour
 from pbd_baseline.weights import even_weights
-from rbfmuscle.geometry.harmonic import cotangent_laplacian, harmonic_weights
-from rbfmuscle.validation import MeshError
+from rbfmuscle.geometry.harmonic import harmonic_weights
 
 
 def ellipsoid(subdivisions=3, axes=(3.0, 2.0, 1.0)):
@@ -39,12 +37,6 @@ def test_each_undirected_edge_is_found_once_with_its_two_wings(body):
     for (i, j), (k, m) in zip(topology.edges, topology.wings):
         for face in ((i, j, k), (j, i, m)):
             assert tuple(np.roll(face, -int(np.argmin(face)))) in triangles
-
-
-def test_open_mesh_is_refused():
-    vertices, faces = ellipsoid(1)
-    with pytest.raises(MeshError, match="not a closed"):
-        Topology.from_mesh(vertices, faces[1:])
 
 
 def test_constraints_of_one_colour_share_no_vertex(body):
@@ -97,18 +89,6 @@ def test_projection_follows_the_gradient(body, rng, family, number):
     np.testing.assert_allclose((moved - points)[members], expected, atol=1e-7)
 
 
-def test_collapsed_and_folded_elements_stay_finite(body):
-    vertices, _, topology = body
-    points = vertices * [1.0, 1.0, 0.0]
-    points[topology.edges[7, 0]] = points[topology.edges[7, 1]]
-    for constraint in (
-        EdgeConstraint(vertices, topology.edges),
-        BendingConstraint(vertices, topology.edges, topology.wings),
-    ):
-        constraint.project(points, np.ones(len(points)))
-        assert np.isfinite(points).all()
-
-
 @pytest.mark.parametrize(("stretch", "wanted"), [(3.0, 2.2), (0.2, 0.6), (1.5, 1.5)])
 @pytest.mark.parametrize("inverse_mass", [(1.0, 1.0), (0.0, 0.5), (3.0, 1.0)])
 def test_edge_beyond_its_limits_is_hard_whatever_its_stiffness(stretch, wanted, inverse_mass):
@@ -117,13 +97,6 @@ def test_edge_beyond_its_limits_is_hard_whatever_its_stiffness(stretch, wanted, 
     points = vertices * stretch
     EdgeConstraint(vertices, edge, stiffness=0.0, limits=(0.6, 2.2)).project(points, np.array(inverse_mass))
     assert np.linalg.norm(points[1] - points[0]) == pytest.approx(wanted)
-
-
-def test_volume_is_that_of_the_ellipsoid_far_from_the_origin():
-    vertices, faces = ellipsoid(5)
-    volume = VolumeConstraint(vertices, faces).rest
-    assert volume == pytest.approx(4 / 3 * np.pi * 6, rel=2e-3)  # inscribed facets: O(h^2)
-    assert VolumeConstraint(vertices + 1e4, faces).rest == pytest.approx(volume, rel=1e-10)
 
 
 def test_volume_gradient_agrees_with_differences_and_sums_to_nothing(body, rng):
@@ -152,14 +125,6 @@ def test_volume_is_met_quadratically_and_by_restoring_in_one_step(rng):
     points = vertices * 0.9 + 0.01 * rng.normal(size=vertices.shape)
     constraint.restore(points, constraint.gradient(points))
     assert constraint.volume(points) == pytest.approx(constraint.rest, rel=1e-14)
-
-
-def test_factor_agrees_with_a_dense_solve(rng):
-    vertices, faces = ellipsoid(2)
-    matrix = cotangent_laplacian(vertices, faces)[10:, 10:]
-    right = rng.normal(size=(matrix.shape[0], 3))
-    solution = SymmetricFactor(matrix).solve(right)
-    np.testing.assert_allclose(solution, np.linalg.solve(matrix.toarray(), right), rtol=1e-9, atol=1e-10)
 
 
 def test_even_weights_stretch_less_than_harmonic_ones(body):

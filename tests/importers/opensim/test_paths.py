@@ -1,16 +1,14 @@
 """Fitted paths: the fit itself, the file that OpenSim takes, and the command."""
 
-import subprocess
-import sys
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
-from rbfmuscle.cli.sampling import Samples, parse_ranges, report_fits, sample_muscles
-from rbfmuscle.importers.opensim.fitted import FittedPath, exponents, fit_path, write_paths
+from rbfmuscle.cli.sampling import Samples, report_fits, sample_muscles
+from rbfmuscle.importers.opensim.fitted import FittedPath, fit_path, write_paths
 from rbfmuscle.scene.phantom import phantom_scene
-from rbfmuscle.validation import SolveError, UsageError
+from rbfmuscle.validation import SolveError
 
 
 def smooth(q):
@@ -38,19 +36,6 @@ def test_arms_are_minus_the_derivative_of_the_length():
     for k, step in enumerate(np.eye(2) * h):
         slope = (path.length(q + step) - path.length(q - step)) / (2 * h)
         assert path.arms(q)[0, k] == pytest.approx(-slope[0], rel=1e-6)
-
-
-def test_order_is_no_higher_than_the_data_bear():
-    values, length, arms = made(40)
-    noise = np.random.default_rng(5)
-    noisy = fit_path(
-        "m", ("a.x", "b.y"), values, length + noise.normal(0, 1, 40), arms + noise.normal(0, 3, (40, 2))
-    )
-    assert noisy.order < fit_path("m", ("a.x", "b.y"), values, length, arms).order
-
-
-def test_terms_are_in_the_order_of_opensim():
-    assert exponents(2, 2).tolist() == [[0, 0], [0, 1], [0, 2], [1, 0], [1, 1], [2, 0]]
 
 
 def test_file_is_in_metres(tmp_path):
@@ -140,19 +125,3 @@ def test_poses_that_fail_are_left_out_and_too_many_are_refused(tmp_path, scene):
     lengths[:15] = np.nan
     with pytest.raises(SolveError, match="15 of 20 poses failed"):
         report_fits(scene, [found], tmp_path)
-
-
-def test_ranges_are_checked(scene):
-    assert parse_ranges(scene, ["flexion=0:90"])["hip.flexion"] == pytest.approx((0.0, np.pi / 2))
-    for text in ("flexion", "flexion=1", "flexion=9:1", "flexion=a:b", "flexion=0:inf"):
-        with pytest.raises(UsageError, match="--range"):
-            parse_ranges(scene, [text])
-
-
-def test_command_refuses_too_few_samples(tmp_path):
-    code = "from rbfmuscle.cli import main; main()"
-    done = subprocess.run(
-        [sys.executable, "-c", code, "paths", str(tmp_path / "no.toml"), "-o", str(tmp_path), "--samples", "3"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 2 and "too few" in done.stderr and len(done.stderr.splitlines()) == 1

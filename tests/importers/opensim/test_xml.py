@@ -77,19 +77,3 @@ def test_two_colons_in_a_name_and_what_is_not_ascii_are_read(tmp_path):
     path.write_text('<A::B name="é"><!-- x::y --><c> 1 </c></A::B>', encoding="utf-8")
     root = read_xml(path)
     assert root.tag == "A__B" and root.name == "é" and root.word("c") == "1"
-
-
-def test_missing_file(tmp_path):
-    with pytest.raises(SceneError, match="cannot read the model"):
-        read_xml(tmp_path / "none.osim")
-
-
-def test_the_command_line_says_one_line_and_three(tmp_path):
-    path = tmp_path / "bad.osim"
-    path.write_text(LAUGHS + "]><x>&u;</x>")
-    code = "from rbfmuscle.cli import main; main()"
-    done = subprocess.run(
-        [sys.executable, "-c", code, "import", str(path), "-o", str(tmp_path / "o")],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 3 and len(done.stderr.strip().splitlines()) == 1
