@@ -98,19 +98,6 @@ class TestInterrupts:
         assert "frames are kept" in ends_clean(process)
         assert len(SavedRun(tmp_path / "out").frames) < 60
 
-    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-    def test_signal_as_python_ends_leaves_the_code(self, number):
-        """What lives until modules are torn down strikes then, when Python has taken its handlers away."""
-        code = (
-            "import os, sys\n"
-            "class Last:\n"
-            f"    def __del__(self, kill=os.kill, me=os.getpid()): kill(me, {int(number)}); print('late', flush=True)\n"
-            "sys.argv, last = ['rbfmuscle', '--version'], Last()\n"
-            "import rbfmuscle.cli as cli\ncli.main()\n"
-        )
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-        assert done.returncode == 0 and done.stderr == "" and "late" in done.stdout
-
     def test_json_is_told_of_an_interrupt(self, tmp_path):
         code = (
             "import os, signal, sys, rbfmuscle.cli as cli\n"

@@ -13,7 +13,6 @@ from rbfmuscle.compare import compare_models
 from rbfmuscle.experiments.comparison import MEASURES, best_models, describe
 from rbfmuscle.metrics.comparison_measures import MaterialProbe
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.comparison_page import shown
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.validation import SolveError, UsageError
 
@@ -57,13 +56,6 @@ class TestAnswer:
         found = results(a={"rest_error_rms": 0.0}, b={"rest_error_rms": 0.01}, c={"rest_error_rms": 0.5})
         assert best_models(found, "rest_error_rms", "mm") == ["a", "b"]
         assert best_models(found, "rest_error_rms", "m") == ["a"]
-
-    def test_values_have_their_unit(self):
-        units = {"time_frame": "s", "volume_error": "1", "penetration_max": "mm", "components": "1"}
-        table = {"units": "mm", "measures": {name: {"unit": unit} for name, unit in units.items()}}
-        assert shown(table, "time_frame", 0.0234) == "23.4 ms" and shown(table, "time_frame", None) == "–"
-        assert shown(table, "penetration_max", 1.234) == "1.23 mm" and shown(table, "components", 3.0) == "3"
-        assert shown(table, "penetration_max", 0.009) == "0 mm"  # below half of what counts
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ import html
 import json
 import tomllib
 import warnings
-from dataclasses import replace
 
 import numba
 import numpy as np
@@ -14,7 +13,7 @@ from command_line import call
 
 import rbfmuscle as rm
 from rbfmuscle.experiments.kernel_study import describe, recommend, row_toml
-from rbfmuscle.report.kernel_page import answer, write_studies
+from rbfmuscle.report.kernel_page import write_studies
 from rbfmuscle.validation import MeshError, UsageError
 
 
@@ -127,26 +126,6 @@ def test_files_hold_the_table(study, ellipsoid, tmp_path):
     text = html.unescape(page.split("<pre>")[1].split("</pre>")[0])
     assert tomllib.loads(text)["muscle"]["model"]["kernel"] == study.recommended["kernel"]
     assert page.count("✓") >= 1 and study.recommended["kernel"] in page
-
-
-def test_several_surfaces_share_a_page_and_an_answer(study, ellipsoid, tmp_path):
-    studies = {"one": study, "two": study}
-    write_studies(studies, tmp_path, dict.fromkeys(studies, ellipsoid))
-    best = study.recommended["kernel"]
-    assert answer(studies).startswith(f"Use {best}: within 5 % of the least error on 2 of 2 muscles")
-    page = (tmp_path / "kernels.html").read_text(encoding="utf-8")
-    assert "Kernels for all 2 muscles" in page and "Every row of two" in page
-    assert {path.name for path in tmp_path.glob("*.vtp")} == {"recommended_one.vtp", "recommended_two.vtp"}
-
-
-@pytest.mark.parametrize("left", [0, 1])
-def test_page_of_few_fit_rows_is_written(study, ellipsoid, tmp_path, left):
-    rows = [{**row, "unfit": "" if k < left else "too few centres"} for k, row in enumerate(study.rows)]
-    few = replace(study, rows=rows, recommended=recommend(rows))
-    write_studies({"egg": few}, tmp_path, {"egg": ellipsoid})
-    page = (tmp_path / "kernels.html").read_text(encoding="utf-8")
-    assert page.count("too few centres") == len(rows) - left
-    assert ("Every field is unfit" in page) is (left == 0)
 
 
 def test_wrong_requests_are_answered(ellipsoid):

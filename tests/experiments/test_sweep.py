@@ -11,8 +11,6 @@ import time
 import numpy as np
 import pytest
 from blend_model import arm_files, arm_scene, use_blend_model
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from rbfmuscle.cli.app import run_command as command
 from rbfmuscle.cli.sweep import run_point
@@ -131,25 +129,6 @@ class TestFront:
         assert verdict["factor"] == pytest.approx(factor)
         assert verdict["near"] is near
         assert ("lies on the Pareto front" in verdict["text"]) is rows[2]["front"]
-
-    @settings(deadline=None, derandomize=True)
-    @given(st.lists(st.tuples(st.integers(0, 4), st.integers(1, 5)), min_size=2, max_size=8))
-    def test_advice_names_what_is_better_and_no_worse(self, pairs):
-        rows = [row(float(e), float(t), "" if k else "default") for k, (e, t) in enumerate(pairs)]
-        (verdict,) = mark_front(rows)
-        (error, time), others = pairs[0], pairs[1:]
-        better = [e for e, t in others if e < error and t <= time]
-        faster = [t for e, t in others if t < time and e <= error]
-        assert (verdict["better"] and float(verdict["better"].split()[0])) == (
-            min(better) if better else None
-        )
-        assert (verdict["faster"] and float(verdict["faster"].split()[1])) == (
-            min(faster) if faster else None
-        )
-        assert ("and quicker" in verdict["text"], "more accurate" in verdict["text"]) == (
-            bool(faster),
-            bool(better),
-        )
 
 
 class TestRun:

@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import tomllib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,15 +13,11 @@ from conftest import ROOT
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.cli.app import run_command
-from rbfmuscle.importers.guess.anatomy import JointGuess
-from rbfmuscle.importers.guess.attachments import AttachmentGuess, MuscleGuess
-from rbfmuscle.importers.guess.guess import SceneGuess, guess_scene, write_scene
+from rbfmuscle.importers.guess.guess import guess_scene, write_scene
 from rbfmuscle.importers.guess.joints import Face, fit_ball, fit_hinge, guess_joints
 from rbfmuscle.importers.guess.names import name_facts
 from rbfmuscle.importers.guess.orientation import find_orientation
 from rbfmuscle.importers.guess.parts import Part
-from rbfmuscle.importers.guess.tendons import guess_tendons
-from rbfmuscle.importers.guess.text import scene_text
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.scene.scene import Scene
@@ -125,18 +120,6 @@ def test_a_folder_without_muscles_is_refused(tmp_path):
     phantom_scene().bones[0].mesh.export(tmp_path / "femur.ply")
     with pytest.raises(UsageError, match="holds no muscle"):
         guess_scene(tmp_path, "mm", tmp_path)
-
-
-def test_muscle_that_cannot_be_loaded_is_commented_out_with_its_reason(tmp_path):
-    _phantom_meshes(tmp_path)
-    guess = guess_scene(tmp_path, "mm", tmp_path)
-    guess.muscles[0].holds[0].vertices = guess.muscles[0].holds[1].vertices
-    name = guess.muscles[0].muscle.name
-    scene = write_scene(guess, tmp_path / "scene.toml")
-    assert name not in [muscle.name for muscle in scene.muscles]
-    text = (tmp_path / "scene.toml").read_text(encoding="utf-8")
-    assert f'# name = "{name}"' in text and "# NOT RUN: " in text
-    assert any(name in doubt for doubt in guess.doubts())
 
 
 @pytest.fixture(scope="module")
@@ -261,33 +244,6 @@ def test_what_is_written_of_meshes_in_metres_passes_check_and_runs(tmp_path, cap
     quick = ["--set", "output.report=false", "--model", "pbd"]
     assert run_command(["run", str(file), "-o", str(tmp_path / "out"), "--frames", "0:5", *quick]) == 0
     assert len(SavedRun(tmp_path / "out").frames) == 5
-
-
-def test_an_end_far_from_its_bone_gets_a_tendon_straight_to_the_nearest_place():
-    upper, lower = (trimesh.creation.cylinder(radius=8, height=100, sections=48) for _ in range(2))
-    upper.apply_translation([0, 0, 55])
-    lower.apply_translation([0, 0, -55])
-    belly = trimesh.creation.capsule(height=30, radius=4).apply_translation([40, 0, 45])
-    bones = [
-        Part(name, f"{name}.ply", SimpleNamespace(mesh=mesh), facts=None)
-        for name, mesh in (("upper", upper), ("lower", lower))
-    ]
-    hinge = JointGuess(
-        bones[0], bones[1], "hinge", np.zeros(3), {"angle": np.array([0.0, 1, 0])}, 0.9, "", "elbow"
-    )
-    muscle, z = Part("belly", "belly.ply", SimpleNamespace(mesh=belly)), belly.vertices[:, 2]
-    near = AttachmentGuess(bones[0], np.flatnonzero(z > z.max() - 3), 5.0, "")
-    far = AttachmentGuess(bones[1], np.flatnonzero(z < z.min() + 3), 60.0, "")
-    made = SceneGuess("", "arm", "mm", bones, bones[0], [hinge])
-    made.muscles = [MuscleGuess(muscle, [near, far], 0.5)]
-    guess_tendons(made)
-    assert near.tendon is None and far.tendon.bone is bones[1] and not far.tendon.via
-    end = belly.vertices[far.vertices].mean(axis=0)
-    np.testing.assert_array_equal(
-        far.tendon.to, lower.vertices[np.argmin(((lower.vertices - end) ** 2).sum(axis=1))]
-    )
-    held = tomllib.loads(scene_text(made))["muscle"][0]["attach"]
-    assert held[1]["bone"] == "lower" and held[1]["tendon"]["to"] == pytest.approx(far.tendon.to, abs=1e-6)
 
 
 def test_tendons_of_the_leg_go_where_the_bellies_end_short(leg_guess):

@@ -183,15 +183,6 @@ class TestAnimatedGlb:
             up = np.column_stack([expected[:, 0], expected[:, 2], -expected[:, 1]])
             np.testing.assert_allclose(vertices, up, rtol=0, atol=TOLERANCE)
 
-    def test_bones_are_nodes_and_what_stands_still_is_not_animated(self, folder, tmp_path):
-        (path,) = export_run(folder, "animated-glb", output=tmp_path)
-        tree, _ = read_glb(path)
-        moving = {
-            (tree["nodes"][c["target"]["node"]]["name"], c["target"]["path"])
-            for c in tree["animations"][0]["channels"]
-        }
-        assert moving == {("fore", "rotation"), ("fore", "translation"), ("biceps", "weights")}
-
     def test_changing_surface_is_refused_with_a_remedy(self, changing, tmp_path):
         with pytest.raises(
             UsageError, match=r"'biceps' do not; run with surface = 'material', or export to usd"

@@ -7,14 +7,13 @@ from arap_energy import energy, gradient
 from spindle_scene import CENTRE, build_scene
 
 from pbd_baseline.arap import ARAP
-from pbd_baseline.contact import ContactConstraint
 from pbd_baseline.contraction import MeshFibres
 from pbd_baseline.muscle import PBDMuscle
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.topology import Topology
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.scene.joints.joint import rotation_about
-from rbfmuscle.simulation.contact import BoneContacts, HalfSpaces
+from rbfmuscle.simulation.contact import BoneContacts
 
 METHODS = ["pbd", "pbd-paper", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved"]
 
@@ -121,20 +120,6 @@ def test_vertices_of_the_papers_model_keep_their_velocity():
         rig.model.predict(rig.at, rig.at)
         free = rig.model.rest.attached_bone < 0
         assert (np.abs(rig.model.points - before)[free].max() > 0.01) == goes_on
-
-
-def test_sum_of_ways_out_leaves_two_bones_where_one_does_not():
-    class Corner:
-        def half_spaces(self, points, reach):
-            gap = np.array([points[0, 0], points[0, 1]])
-            return HalfSpaces(np.zeros(2, dtype=np.int64), gap, np.eye(3)[:2].copy(), np.arange(2))
-
-    for nearest_only, expected in ((False, [0.0, 0.0, 0.0]), (True, [0.0, -1.0, 0.0])):
-        point = np.array([[-2.0, -1.0, 0.0]])
-        collision = ContactConstraint(np.zeros(0, dtype=int), reach=5.0, nearest_only=nearest_only)
-        collision.find(Corner(), point)
-        collision.project(point)
-        np.testing.assert_allclose(point[0], expected)
 
 
 def sweeps_of(rig, *stops):

@@ -259,11 +259,6 @@ class TestOptions:
 
 
 class TestCheck:
-    def test_mended_meshes_are_reported(self):
-        upper, lower, _ = meshes()
-        scene = Scene().add_bone("upper", upper).add_bone("lower", (lower.vertices, lower.faces[:, ::-1]))
-        assert any(f.place == "lower" and "inward" in f.message for f in scene.check())
-
     def test_muscle_that_starts_inside_a_bone(self):
         scene = built()
         scene.muscles[0].mesh.apply_translation([0, 0, -4])  # 1 mm into the bones in the middle of each
@@ -276,15 +271,6 @@ class TestCheck:
         scene.muscles[0].mesh.apply_scale(0.5)
         with pytest.raises(SceneError, match="start inside bone 'upper'"):
             check_initial(scene)
-
-    def test_motion_that_drives_bones_into_each_other(self):
-        upper, lower = (mesh.subdivide_to_size(5.0) for mesh in meshes()[:2])  # vertices are what is tested
-        scene = Scene().add_bone("upper", upper).add_bone("lower", lower)
-        scene.add_joint("elbow", "upper", "lower", (0, 0, 0), {"flexion": (0, -1, 0)})
-        scene.set_motion(ramp={"elbow.flexion": {"to": 140, "step": 10}})
-        collisions = bone_collisions(scene)
-        assert collisions and collisions[0][1:3] == ("upper", "lower")
-        assert any("into each other" in f.message and f.level == "warning" for f in scene.check())
 
     def test_real_hip_collisions_are_those_of_its_readme(self, hip_data):
         scene = Scene.load(hip_data / "adduction.toml")

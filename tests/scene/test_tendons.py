@@ -1,6 +1,5 @@
 """Tendons against known answers: straight, around a pulley, of kept length, the same by every path."""
 
-import itertools
 import math
 
 import numpy as np
@@ -10,10 +9,9 @@ import trimesh
 import rbfmuscle as rm
 from rbfmuscle.output.export import export_run
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.output.tubes import tendon_mesh
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.taut_line import line_length, taut_line
-from rbfmuscle.scene.tendons import AT_REST, STIFFNESS_RATIO, TENDON_STRAIN, TendonLine
+from rbfmuscle.scene.tendons import STIFFNESS_RATIO, TENDON_STRAIN
 
 END = "strap tendon 2 to limb"
 
@@ -214,17 +212,3 @@ def test_via_points_of_another_bone_hold_the_line():
         arm(via=[{"bone": "trunc", "point": [0.0, 0.0, 0.0]}])
     with pytest.raises(rm.SceneError, match="tendon"):
         arm(to=[0.0, 0.0])
-
-
-def test_a_tube_tapers_from_the_belly_to_the_tendon():
-    line = np.stack([np.zeros(33), np.zeros(33), np.linspace(0.0, 100.0, 33)], axis=1)
-    muscle = arm().muscles[0]
-    vertices, faces = tendon_mesh(muscle, {END: TendonLine(line, (8.0, 2.0))})
-    away = np.hypot(vertices[:, 0], vertices[:, 1])
-    assert away[vertices[:, 2] == 0.0].max() == pytest.approx(8.0)
-    assert away[vertices[:, 2] == 100.0].max() == pytest.approx(2.0)
-    at = [away[np.isclose(vertices[:, 2], z)].max() for z in line[:, 2]]
-    assert all(a >= b for a, b in itertools.pairwise(at))
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    assert mesh.is_watertight and mesh.volume > 0.0
-    assert tendon_mesh(muscle, {}) is None and AT_REST["any"].shape == (4, 4)

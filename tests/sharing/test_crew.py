@@ -1,13 +1,10 @@
 """Muscles dealt out to processes: what comes together is what one process finds, whatever ends the run."""
 
-import io
 import os
 import pickle
-import queue
 import signal
 import subprocess
 import sys
-import threading
 from types import SimpleNamespace
 
 import numpy as np
@@ -207,20 +204,3 @@ box.put(("failed", "next"))
 """
     done = subprocess.run([sys.executable, "-c", said], capture_output=True, check=False)
     assert done.returncode == 1 and b"pickle" in done.stderr and b"next" not in done.stdout
-
-
-class TooLarge:
-    """What does not fit into memory where it is read."""
-
-    def __reduce__(self):
-        return bytearray, (1 << 62,)
-
-
-def test_a_message_that_does_not_fit_is_told_and_not_waited_for():
-    helper = sharing._Worker.__new__(sharing._Worker)
-    message = io.BytesIO(pickle.dumps(("done", TooLarge(), {})))
-    helper.process = SimpleNamespace(stdin=io.BytesIO(), stdout=message)
-    helper._inbox, helper._room, helper._closed = queue.Queue(), threading.Semaphore(1), False
-    helper._listen(None)
-    kind, error = helper._inbox.get_nowait()
-    assert kind == "failed" and isinstance(error, MemoryError)

@@ -9,11 +9,9 @@ import trimesh
 from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.options import SlidingOptions
 from rbfmuscle.simulation.contact import BoneContacts
-from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames
+from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.simulation.neighbour_surface import NeighbourSurface
 from rbfmuscle.simulation.neighbours import pairs as links
-from rbfmuscle.simulation.neighbours.extrapolation import MotionExtrapolator
-from rbfmuscle.simulation.neighbours.pairs import MOST
 from rbfmuscle.simulation.sliding import Sliding, sliding_pairs
 from rbfmuscle.simulation.stepper import MuscleStepper
 from rbfmuscle.validation import SceneError
@@ -95,20 +93,6 @@ def test_side_and_distance_around_a_sharp_rim_are_those_of_the_mesh():
     assert (np.einsum("ij,ij->i", normal[far], way[far]) > 0.0).all()
 
 
-def test_a_folded_triangle_makes_no_point_outside_deep():
-    model = _ball()
-    surface = NeighbourSurface(model, reach=6.0)
-    corner = int(model.vertices[:, 0].argmax())
-    model.vertices = model.vertices.copy()
-    # A vertex that was driven out through the rim it belongs to: its triangles are turned inside out.
-    model.vertices[corner] = (10.0, 3.0 * surface.edge, 0.0)
-    surface.refresh()
-    points = np.array([12.0, 0, 0]) + np.random.default_rng(2).normal(scale=2.0, size=(300, 3))
-    points = points[np.linalg.norm(points, axis=1) > 10.6]
-    _, distance, _, _ = surface.query(points, _all(points), 6.0)
-    assert distance.min() > -0.5 * surface.edge
-
-
 def _run(angles, sliding, **options):
     made, fields = toy.neighbour_scene(angles, sliding=sliding, **options)
     parts = toy.neighbour_parts(made)
@@ -153,21 +137,6 @@ def test_result_does_not_depend_on_order_or_run_or_named_pairs(pressed, order):
 def test_unknown_names_of_pairs_are_refused():
     with pytest.raises(SceneError, match="unknown muscle 'uper', known: lower, upper"):
         _run([{}], SlidingOptions(pairs=[["lower", "uper"]]))
-
-
-def test_planes_ask_for_little_in_one_sub_step_however_deep_the_overlap():
-    made, fields = toy.neighbour_scene(PRESS, gap=-3.0, sliding=SlidingOptions())
-    parts = toy.neighbour_parts(made)
-    with FrameLoop(made, parts, fields=fields) as loop:
-        assert _overlap(parts) > 2.5
-        for links in loop._sliding.links.values():
-            for link in links:
-                link.update()
-                assert link.push.gap.min() == -MOST
-        for coordinates in made.motion.frames[::-1]:
-            loop.advance(coordinates)
-    # What keeps them near asks for half a millimetre at the same time.
-    assert _overlap(parts) < 0.2
 
 
 def test_pairs_say_how_they_overlap_and_come_apart(monkeypatch, pressed):
@@ -292,20 +261,6 @@ def test_who_slides_does_not_depend_on_the_order_of_bones(order):
     made.muscles[1].attachments.pop()
     assert sliding_pairs(made, ["lower", "upper"], 5.0) == set()
     assert sliding_pairs(made, ["lower", "upper"], 35.0) == {frozenset(("lower", "upper"))}
-
-
-@pytest.mark.parametrize(
-    ("way", "share"),
-    [({"q": 2.0}, 1.0), ({"q": 1.0}, 0.5), ({"p": 1.0}, 0.0), ({"q": -2.0}, 0.0), ({"q": 9.0}, 1.0)],
-)
-def test_what_settling_does_is_expected_again_as_far_as_the_motion_goes_on(way, share):
-    lead, rng = MotionExtrapolator(), np.random.default_rng(4)
-    before, moved = rng.normal(size=(2, 5, 3))
-    assert lead.ahead([before], way)[0] is before
-    lead.learn({"q": 2.0, "p": 0.0}, [before], [before + moved])
-    np.testing.assert_allclose(lead.ahead([before], way)[0], before + share * moved, atol=1e-12)
-    lead.learn({"q": 0.0}, [before], [before + moved])
-    assert lead.share(way) == 0.0
 
 
 def _spike_into_a_belly(sliding):

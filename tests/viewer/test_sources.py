@@ -112,15 +112,6 @@ def test_depth_in_a_box(ball):
     np.testing.assert_allclose(values, np.maximum(vertices[:, 2] - 8.0, 0.0), atol=1e-9)
 
 
-def test_distance_to_the_other_model(ball):
-    vertices, faces = ball
-    moved = picture_of(vertices + [0.0, 0.0, 1.0], faces)
-    values = vertex_values("distance", "ball", picture_of(vertices, faces), [], moved)
-    # A chord of the polyhedron lies up to 0.05 inside the sphere of radius 10.
-    np.testing.assert_allclose(values.max(), 1.0, atol=0.05)
-    assert np.isnan(vertex_values("distance", "ball", picture_of(vertices, faces), [], None)).all()
-
-
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")

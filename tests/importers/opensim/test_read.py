@@ -148,18 +148,6 @@ def test_ground_may_be_the_child(small):
     assert pose == pytest.approx(forth["shank"], abs=1e-14)
 
 
-def test_a_body_keeps_the_meshes_that_can_be_read_beside_one_that_cannot(small):
-    both = '<Mesh name="bad"><mesh_file>bad.obj</mesh_file></Mesh><Mesh name="n">'
-    small.write_text(small.read_text(encoding="utf-8").replace('<Mesh name="n">', both))
-    torn = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 99\n"
-    (small.parent / "bad.obj").write_text(torn)
-    found = import_osim(small)
-    assert [bone.name for bone in found.scene.bones] == ["thigh", "shank"]
-    assert sum("body 'thigh': mesh 'bad.obj' is not taken" in note for note in found.notes) == 1
-    (small.parent / "wedge.obj").write_text(torn)
-    assert not import_osim(small).scene.bones
-
-
 @pytest.mark.parametrize("sort", ["rotation", "translation"])
 @pytest.mark.parametrize("place", [0, 1, 2])
 def test_a_coordinate_is_what_it_drives_alone_with_a_slope_of_one_on_any_axis(sort, place):
