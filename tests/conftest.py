@@ -87,6 +87,21 @@ def leg_data():
 
 
 @pytest.fixture(scope="session")
+def arm_run(tmp_path_factory):
+    """A run of the blended arm, seven frames to 60 degrees in mm, and its folder; copy before changing it."""
+    from blend_model import arm_scene, use_blend_model
+
+    from rbfmuscle.run import simulate
+
+    folder = tmp_path_factory.mktemp("arm")
+    with pytest.MonkeyPatch.context() as patch:
+        use_blend_model(patch)
+        made = simulate(arm_scene(end=60))
+    made.save(folder)
+    return made, folder
+
+
+@pytest.fixture(scope="session")
 def graphics():
     """Skip where VTK cannot draw; asked in a process of its own, which it may end."""
     code = "import pyvista as p; q = p.Plotter(off_screen=True); q.add_mesh(p.Cube()); q.screenshot(None)"

@@ -7,7 +7,6 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.crossing import FaceTree
-from rbfmuscle.geometry.rest_frame import BoneFrame
 from rbfmuscle.geometry.surfaces import touching_balls
 from rbfmuscle.geometry.triangles import nearest_weights
 from rbfmuscle.geometry.winding import wound_around
@@ -60,27 +59,6 @@ def test_a_mesh_winds_around_what_is_inside_it_and_once_only():
         found = np.empty(2, dtype=bool)
         wound_around(points, vertices, np.ascontiguousarray(triangles), found)
         np.testing.assert_array_equal(found, expected)
-
-
-@pytest.mark.parametrize("scale", [1.0, 40.0])
-def test_local_units_are_the_same_wherever_a_bone_is_and_however_large(scale):
-    """A slab of three lengths, turned: its local vertices come back from every pose, and its box holds them."""
-    turn = Rotation.from_rotvec([0.7, -0.4, 1.1]).as_matrix()
-    vertices = scale * (np.array(trimesh.creation.box((5.0, 2.0, 1.0)).vertices) @ turn.T + [3.0, 1.0, -2.0])
-    frame = BoneFrame(vertices)
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec([0.2, 0.9, -0.3]).as_matrix(), [10.0, -4.0, 7.0]
-    for at in (np.eye(4), pose):
-        placed = frame.placed(at)
-        world = vertices @ at[:3, :3].T + at[:3, 3]
-        np.testing.assert_allclose((world - placed[:3, 3]) @ placed[:3, :3], frame.local, atol=1e-7)
-    low, high = frame.box(np.array([vertices.min(axis=0), vertices.max(axis=0)]))
-    assert (frame.local >= low - 1e-7).all() and (frame.local <= high + 1e-7).all()
-    # Along its principal axes the slab fills its own box.
-    sides = np.sort(np.ptp(frame.local, axis=0)) * frame.size
-    np.testing.assert_allclose(sides, scale * np.array([1.0, 2.0, 5.0]), rtol=1e-5)
-    np.testing.assert_allclose(frame.axes @ frame.axes.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(frame.axes) == pytest.approx(1.0)
 
 
 def test_nearest_point_of_a_triangle_is_a_mean_of_its_corners_in_every_region():

@@ -57,15 +57,6 @@ def test_areas_of_vertices_are_those_of_the_faces():
     np.testing.assert_allclose(areas, slow)
 
 
-def test_each_edge_comes_once():
-    edges = unique_edges(FACES)
-    assert len(edges) == 3 * len(FACES) // 2 == len({tuple(e) for e in edges.tolist()})
-    assert (edges[:, 0] < edges[:, 1]).all()
-    assert {tuple(e) for e in edges.tolist()} == {
-        tuple(e) for e in np.sort(BOX.edges_unique, axis=1).tolist()
-    }
-
-
 def test_weights_give_the_point_back_inside_and_the_nearest_side_weighs_nothing_outside():
     corners = np.array([[[0.0, 0, 0], [4.0, 0, 1], [1.0, 3, 0]]])
     rng = np.random.default_rng(0)

@@ -1,8 +1,5 @@
 """Centres on closed meshes: cover, normals, control triangulation."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -13,9 +10,6 @@ from rbfmuscle.implicit.field_fit import off_surface_points
 from rbfmuscle.implicit.placement.control_mesh import contract_clusters
 from rbfmuscle.implicit.placement.sampling import sample_surface, spread_points
 from rbfmuscle.validation import MeshError
-
-HIP = Path(os.environ.get("RBFMUSCLE_DATA", Path(__file__).parents[3] / "shared" / "data")) / "hip"
-needs_hip = pytest.mark.skipif(not HIP.exists(), reason="real hip not present (RBFMUSCLE_DATA)")
 
 
 def plate(thickness=1.0):
@@ -143,10 +137,9 @@ def test_what_cannot_be_sampled_is_refused(error, words, count, placement, dropp
         sample_surface(mesh.vertices, mesh.faces[dropped:], count, placement=placement)
 
 
-@needs_hip
 @pytest.mark.parametrize("muscle, count", [("gluteus_maximus", 300), ("iliacus", 150)])
-def test_adapted_placements_halve_the_largest_miss_of_a_fit(muscle, count):
-    mesh = trimesh.load(HIP / f"{muscle}.ply", process=False)
+def test_adapted_placements_halve_the_largest_miss_of_a_fit(hip_data, muscle, count):
+    mesh = trimesh.load(hip_data / f"{muscle}.ply", process=False)
     misses = []
     for placement in ("even", "adaptive", "greedy"):
         sample = sample_surface(mesh.vertices, mesh.faces, count, placement=placement)

@@ -16,7 +16,7 @@ def in_units_of_last_place(found, exact):
         )
 
 
-def test_exponential_is_right_to_two_units_in_the_last_place():
+def test_exponential_and_logarithm_are_right_to_two_units_in_the_last_place():
     rng = np.random.default_rng(0)
     x = np.concatenate([rng.uniform(-700, 700, 1500), rng.uniform(-1, 1, 500), [0.0, -1e-300, 1e-17]])
     out = np.empty_like(x)
@@ -24,16 +24,10 @@ def test_exponential_is_right_to_two_units_in_the_last_place():
     assert in_units_of_last_place(out, [mpmath.exp(mpmath.mpf(v)) for v in x]) < 2
     _exp_loop(-1.0, np.array([708.5, 1e5, np.inf]), out[:3])
     assert not out[:3].any()
-
-
-def test_logarithm_is_right_to_two_units_in_the_last_place():
-    rng = np.random.default_rng(1)
-    x = np.concatenate([np.exp(rng.uniform(-700, 700, 1500)), 1 + rng.uniform(-0.3, 0.4, 500), [1 + 1e-13]])
-    out = np.empty_like(x)
-    _log_loop(x, out)
-    assert in_units_of_last_place(out, [mpmath.log(mpmath.mpf(v)) for v in x]) < 2
-    _log_loop(np.zeros(1), out[:1])
-    assert np.isfinite(out[0])
+    x = np.concatenate([np.exp(x[:1500]), 1 + rng.uniform(-0.3, 0.4, 500), [1 + 1e-13, 0.0]])
+    _log_loop(x, out[:-1])
+    assert in_units_of_last_place(out[:-2], [mpmath.log(mpmath.mpf(v)) for v in x[:-1]]) < 2
+    assert np.isfinite(out[-2])
 
 
 def field_terms(centres, weights, epsilon, frame=None, polynomial=None):
@@ -41,21 +35,6 @@ def field_terms(centres, weights, epsilon, frame=None, polynomial=None):
     coefficients, powers = polynomial or (np.zeros(0), np.zeros((0, 3), dtype=np.int64))
     b = weights[1:] if len(weights) > 1 else np.zeros((3, centres.shape[1]))
     return Terms(origin, scale, centres, weights[0], b, len(weights) > 1, epsilon, coefficients, powers)
-
-
-@pytest.mark.parametrize("epsilon", [0.7, 3.0])
-@pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)
-def test_values_are_sums_of_the_kernel(kernel, epsilon):
-    rng = np.random.default_rng(2)
-    centres = rng.uniform(-1, 1, (250, 3))
-    # the centres themselves as well, and a number of points that fills no whole block
-    points = np.vstack([rng.uniform(-1, 1, (1500, 3)), centres])
-    weights = rng.normal(size=(1, 250))
-    phi = kernel.phi(np.linalg.norm(points[:, None] - centres, axis=2), epsilon)
-    terms = field_terms(centres.T.copy(), weights, epsilon)
-    for with_gradient in (False, True):
-        found = evaluate(points, terms, kernel, with_gradient)[0]
-        assert np.abs(found - phi @ weights[0]).max() < 1e-14 * (np.abs(phi) @ np.abs(weights[0])).max()
 
 
 @pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)

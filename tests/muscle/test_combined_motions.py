@@ -45,13 +45,6 @@ def test_what_folds_does_not_flicker():
     assert run.values("abductor", "self_crossings").max() == 0
 
 
-def test_phantom_from_a_start_away_from_rest():
-    scene = phantom_scene()
-    scene.muscles = [scene.muscle("extensor")]
-    scene.set_motion(ramp={"hip.flexion": {"from": 45, "to": 51, "step": 2}})
-    check_shapes(rm.simulate(scene), "extensor")
-
-
 def test_gluteus_maximus_in_a_combined_motion(hip_scene):
     """22 of 61 frames of such motions had a handle by marching cubes of 48 cells, rims flickered by 6 mm."""
     scene = hip_scene.copy()

@@ -51,23 +51,6 @@ def method(request):
     return request.param
 
 
-def test_volume_contact_and_held_ends_hold_while_the_muscle_wraps_the_ball(method):
-    rig = Rig(method=method)
-    before = rig.model.material_mesh()[0].copy()
-    np.testing.assert_allclose(rig.go(0, 0, 0), before, atol=1e-9)
-    held = rig.model.rest.attached_bone == 1
-    for degrees in range(2, 62, 2):
-        rig.go(degrees)
-        points = rig.model.contact_points()
-        assert rig.contacts.nearest(points[rig.model.contact_bone < 0]).min() > -0.5
-        assert rig.model.penetration <= 0.5
-        # the interleaved model takes one plain Newton step a sweep, so some of the error stays
-        assert rig.volume_error() <= (1e-2 if method == "arap-interleaved" else 1e-9)
-        pose = rig.poses(degrees)["lower"]
-        expected = rig.model.rest.vertices[held] @ pose[:3, :3].T + pose[:3, 3]
-        np.testing.assert_array_equal(points[held], expected)
-
-
 @pytest.mark.parametrize("step", [10, 30, 90])
 def test_large_steps_stay_finite_and_keep_the_volume(method, step):
     rig = Rig(method=method)

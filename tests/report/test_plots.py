@@ -6,13 +6,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from blend_model import arm_scene, use_blend_model
 
 from rbfmuscle.output.runinfo import Stages
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report.plots import Point, Track, front_plot, line_plot, motion_axis
 from rbfmuscle.report.report import _tracks
-from rbfmuscle.run import simulate
 from rbfmuscle.simulation.rigid_transport import MuscleStatus
 
 
@@ -65,16 +63,8 @@ def test_front_labels_the_front_and_the_default_and_no_label_covers_another():
     assert front_plot([Point(1.0, 0.0, "exact", "#000000")], ("ms", "mm")) == ""
 
 
-@pytest.fixture(scope="module")
-def saved(tmp_path_factory):
-    place = tmp_path_factory.mktemp("run")
-    with pytest.MonkeyPatch.context() as patch:
-        use_blend_model(patch)
-        simulate(arm_scene(end=60)).save(place)
-    return SavedRun(place)
-
-
-def test_tracks_are_the_series_of_the_run_and_times_leave_out_the_first_frame(saved):
+def test_tracks_are_the_series_of_the_run_and_times_leave_out_the_first_frame(arm_run):
+    saved = SavedRun(arm_run[1])
     axis, label = motion_axis(saved)
     assert label == "elbow.flexion [degree]" and axis[6] == pytest.approx(60)
     angles = [math.degrees(math.radians(row["coordinates"]["elbow.flexion"])) for row in saved.info["frames"]]

@@ -2,11 +2,11 @@
 
 import json
 import re
+import shutil
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from blend_model import arm_scene, use_blend_model
 from PIL import Image
 
 from rbfmuscle.metrics.summary import describe_verdict, within
@@ -15,18 +15,13 @@ from rbfmuscle.report import render
 from rbfmuscle.report.appearance import muscle_groups
 from rbfmuscle.report.page import limit_state, number
 from rbfmuscle.report.report import write_report
-from rbfmuscle.run import simulate
 from rbfmuscle.validation import UsageError
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def folder(arm_run, tmp_path_factory):
     """Folder of a saved run without a report."""
-    place = tmp_path_factory.mktemp("run")
-    with pytest.MonkeyPatch.context() as patch:
-        use_blend_model(patch)
-        simulate(arm_scene(end=60)).save(place)
-    return place
+    return shutil.copytree(arm_run[1], tmp_path_factory.mktemp("report") / "run")
 
 
 class Outline(HTMLParser):

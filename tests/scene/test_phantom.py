@@ -5,8 +5,7 @@ import pytest
 import trimesh
 
 from rbfmuscle.scene.attachments import signed_distances
-from rbfmuscle.scene.check import bone_collisions
-from rbfmuscle.scene.phantom import HEAD_RADIUS, MUSCLES, SOCKET_RADIUS, phantom_scene
+from rbfmuscle.scene.phantom import MUSCLES, phantom_scene
 from rbfmuscle.scene.phantom_shapes import Tube
 
 
@@ -41,21 +40,11 @@ class TestTube:
 
 
 class TestScene:
-    def test_meshes_are_closed_outward_and_small(self, scene):
-        for item in [*scene.bones, *scene.muscles]:
-            assert item.mesh.is_watertight and item.mesh.volume > 0 and item.mesh.body_count == 1
-            assert len(item.mesh.vertices) < 10_000 and item.notes == []
-
     def test_bones_are_a_femur_and_a_hip_bone_with_its_ring(self, scene):
         assert scene.bone("femur").mesh.euler_number == 2
         assert scene.bone("pelvis").mesh.euler_number == 0  # the obturator foramen
         litres = {bone.name: bone.mesh.volume / 1000 for bone in scene.bones}
         assert litres == pytest.approx({"pelvis": 413, "femur": 502}, rel=0.01)
-
-    def test_ball_in_socket(self, scene):
-        gap = signed_distances(np.asarray(scene.bone("femur").mesh.vertices), scene.bone("pelvis").mesh).min()
-        assert gap == pytest.approx(SOCKET_RADIUS - HEAD_RADIUS, abs=0.5)  # meshes of 3.5 mm cells
-        assert bone_collisions(scene) == []
 
     def test_muscles_touch_bones_only_where_they_are_attached(self, scene):
         for muscle in scene.muscles:
@@ -70,14 +59,3 @@ class TestScene:
 
     def test_check_finds_nothing_wrong(self, scene):
         assert [finding for finding in scene.check() if finding.level != "note"] == []
-
-    def test_pair_of_neighbours_has_a_small_gap(self, scene):
-        first, second = (scene.muscle(f"adductor_{side}").mesh for side in ("anterior", "posterior"))
-        gap = signed_distances(np.asarray(first.vertices), second).min()
-        assert 0.5 < gap < 2.0
-
-    def test_fibres_lie_inside(self, scene):
-        for muscle in scene.muscles:
-            for line in muscle.fibres:
-                assert line.shape == (15, 3)
-                assert signed_distances(line, muscle.mesh).max() < 0.5  # chords of a mesh of 3 mm

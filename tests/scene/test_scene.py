@@ -126,14 +126,6 @@ class TestLoading:
             metres.muscles[0].attachments[0].vertices, load(folder).muscles[0].attachments[0].vertices
         )
 
-    def test_fibres(self, folder):
-        (folder / "f.json").write_text('{"polylines": [[[0, 0, 1], [1, 0, 1], [2, 0, 1]]]}')
-        scene = load(folder, ('mesh = "biceps.ply"', 'mesh = "biceps.ply"\nfibres = "f.json"\nscale = 1.0'))
-        assert [len(line) for line in scene.muscles[0].fibres] == [3]
-        (folder / "f.json").write_text('{"polylines": [[[0, 0, 1]]]}')
-        with pytest.raises(SceneError, match=r"f\.json: polyline 0 has 1 points"):
-            Scene.load(folder / "arm.toml")
-
 
 class TestMistakes:
     @pytest.mark.parametrize(

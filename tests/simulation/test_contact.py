@@ -4,7 +4,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, joint, muscle, scene, sphere
+from toy_scene import ToyMuscle, attach, bone, box, ellipsoid, muscle, scene, sphere
 
 from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.joints.joint import rotation_about
@@ -13,7 +13,6 @@ from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.simulation.overlap import resolve_initial_overlap
 from rbfmuscle.simulation.stepper import MuscleStepper
-from rbfmuscle.validation import SceneError
 
 
 def _points(count=400, seed=0):
@@ -120,12 +119,6 @@ def _sunk(initial):
     return made, fields, model, MuscleStepper(model, contacts, made)
 
 
-def test_error_names_muscle_bone_and_depth():
-    *_, stepper = _sunk("error")
-    with pytest.raises(SceneError, match=r"'belly' overlaps bone 'plate' at rest: \d+ points, 2 mm deep"):
-        resolve_initial_overlap(stepper)
-
-
 def test_kept_overlap_is_no_contact_and_deeper_is():
     made, fields, model, stepper = _sunk("keep")
     points = model.contact_points().copy()
@@ -138,46 +131,3 @@ def test_kept_overlap_is_no_contact_and_deeper_is():
     (frame,) = simulate_frames(made, [model], fields=fields)
     assert [event.action for event in frame.events] == ["overlap_kept"]
     assert np.array_equal(model.contact_points(), model.rest)
-
-
-def test_resolve_brings_everything_out_and_leaves_the_rest_alone():
-    made, fields, model, _ = _sunk("resolve")
-    (frame,) = simulate_frames(made, [model], fields=fields)
-    assert [event.action for event in frame.events] == ["overlap_resolved"]
-    free = model.contact_bone < 0
-    assert fields["plate"].distance(model.x[free]).min() > -0.02
-    moved = np.linalg.norm(model.x - model.rest, axis=1)
-    assert moved.max() < 2.5
-    assert moved[np.abs(model.rest[:, 0]) > 20].max() < 0.5
-
-
-def _shears(angles):
-    """Two plates, hinged far away, that close on a muscle between them and open again."""
-    fields = {"fixed": box((30, 30, 2), (0, 0, -8.0)), "blade": box((30, 30, 2), (0, 0, 8.0))}
-    mesh = ellipsoid((20, 5, 5), subdivisions=3)
-    ends = [attach(mesh, "fixed", lambda v: np.abs(v[:, 0]) > 17)]
-    made = scene(
-        [bone(n, f) for n, f in fields.items()],
-        [joint("hinge", "fixed", "blade", (0, -40, 0), close=(-1, 0, 0))],
-        [muscle("meat", mesh, ends)],
-        [{"hinge.close": np.radians(a)} for a in angles],
-    )
-    return made, fields
-
-
-def test_shears_leave_the_best_compromise_and_open_to_the_rest_shape():
-    made, fields = _shears([0, 4, 8, 12, 16, 18, 18, 18, 8, 0])
-    model = ToyMuscle(made.muscles[0], made)
-    free = model.contact_bone < 0
-    contacts = BoneContacts(list(fields), list(fields.values()), contact_bone=model.contact_bone)
-    for frame in simulate_frames(made, [model], fields=fields):
-        assert np.isfinite(model.x).all()
-        if frame.index == 7:
-            contacts.move(frame.poses)
-            before, state = model.x.copy(), model.snapshot()
-            model.solve(contacts)
-            # The toy's sweeps stop at a fixed number; a tenth of a millimetre at a thickness of ten has settled.
-            assert np.abs(model.x - before).max() < 0.1
-            model.restore(state)
-            assert max(-fields[n].distance(model.x[free], frame.poses[n]).min() for n in fields) < 4.0
-    assert np.sqrt(((model.x - model.rest) ** 2).sum(axis=1).mean()) < 0.5
