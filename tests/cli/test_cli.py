@@ -11,9 +11,12 @@ import trimesh
 from blend_model import arm_files
 from command_line import call
 
+import rbfmuscle as rm
 from rbfmuscle.cli.app import GROUPS
 from rbfmuscle.cli.run import SHOWN
 from rbfmuscle.metrics.summary import shown_number
+from rbfmuscle.scene.check import check_extents
+from rbfmuscle.validation import MeshError
 
 
 @pytest.fixture(scope="module")
@@ -219,3 +222,16 @@ class TestOtherCommands:
                 name = command.__name__.rstrip("_")
                 assert f" {name} " in part[: part.index("╰")]
                 assert "Usage" in call(capsys, name, "--help")[1]
+
+
+@pytest.mark.parametrize(("factor", "remedy"), [(1e-3, 1000.0), (100.0, 0.01), (1e3, 0.001)])
+def test_remedy_of_a_wrong_unit_makes_the_size_it_says(factor, remedy):
+    scene = rm.Scene(units="mm").add_bone(
+        "rod", trimesh.creation.box((300.0 * factor, 1 * factor, 1 * factor))
+    )
+    with pytest.raises(MeshError) as caught:
+        check_extents(scene)
+    size = factor * np.linalg.norm([300.0, 1.0, 1.0])
+    text = str(caught.value)
+    assert f"is {size:.4g} mm across" in text
+    assert f"({remedy:g} times the present one would make it {size * remedy:.4g} mm)" in text

@@ -1,4 +1,4 @@
-"""Every public function says what it takes and gives; few take more than eight things."""
+"""Every public function says what it takes and gives."""
 
 import ast
 from pathlib import Path
@@ -9,8 +9,6 @@ ROOT = Path(__file__).resolve().parents[2]
 MODULES = sorted([*(ROOT / "rbfmuscle").rglob("*.py"), *(ROOT / "pbd_baseline").rglob("*.py")])
 # Loops that are compiled take plain arrays; their public half is annotated.
 COMPILED = ("compiled", "njit", "vectorize")
-MOST_PARAMETERS = 8
-MODULES_WITH_TRAINS = 11
 
 
 def is_compiled(function):
@@ -43,21 +41,9 @@ def lacking(source):
     ]
 
 
-def trains(source):
-    """Functions of a source with more than eight parameters."""
-    functions = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef)]
-    return [f.name for f in functions if len(parameters(f)) > MOST_PARAMETERS]
-
-
 def test_public_functions_are_annotated():
     found = {str(p.relative_to(ROOT)): lacking(p.read_text(encoding="utf-8")) for p in MODULES}
     assert {path: names for path, names in found.items() if names} == {}
-
-
-def test_few_modules_hold_functions_of_many_parameters():
-    found = {str(p.relative_to(ROOT)): trains(p.read_text(encoding="utf-8")) for p in MODULES}
-    found = {path: names for path, names in found.items() if names}
-    assert len(found) <= MODULES_WITH_TRAINS, found
 
 
 def vague(source):
@@ -83,10 +69,5 @@ def test_planted_faults_are_found():
     source = "def given(a: int) -> int: ...\ndef lacks(a) -> int: ...\n"
     source += "class A:\n    def b(self): ...\n    def _c(self): ...\n"
     assert lacking(source) == ["lacks", "A.b"]
-    assert trains("def f(a, b, c, d, *, e, g, h, i, j): ...\ndef g(self, a, b, c, d, e, f, g, h): ...") == [
-        "f"
-    ]
-    assert vague("def a(x: int) -> dict[str, Any]: ...\ndef b(x: Any) -> int: ...\ndef c(x: int): ...") == [
-        "a",
-        "b",
-    ]
+    source = "def a(x: int) -> dict[str, Any]: ...\ndef b(x: Any) -> int: ...\ndef c(x: int): ..."
+    assert vague(source) == ["a", "b"]

@@ -14,7 +14,7 @@ sys.path.insert(0, str(DOCS))
 import gallery  # noqa: E402
 
 
-def listed():
+def pages():
     """Pages in the toctrees of the index."""
     text = (DOCS / "index.md").read_text(encoding="utf-8")
     trees = re.findall(r"```\{toctree\}\n(.*?)```", text, flags=re.S)
@@ -22,7 +22,7 @@ def listed():
 
 
 def test_index_names_every_page_once():
-    names = listed()
+    names = pages()
     assert len(names) == len(set(names))
     assert {name for name in names if "/" not in name} == set(gallery.pages(ROOT))
 
@@ -32,29 +32,6 @@ def test_links_and_pictures_lead_to_files(page):
     text = page.read_text(encoding="utf-8")
     for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", text):
         assert target.startswith("https://") or (page.parent / target).exists(), target
-
-
-def test_scene_reference_holds_every_key_with_its_default(tmp_path):
-    from rbfmuscle.scene.file import SceneFile
-
-    (tmp_path / "docs" / "gallery").mkdir(parents=True)
-    gallery.write_scene_reference(tmp_path)
-    text = (tmp_path / "docs" / "gallery" / "scene_reference.md").read_text(encoding="utf-8")
-    for table in SceneFile.model_json_schema()["$defs"].values():
-        assert all(f"| `{key}` |" in text for key in table["properties"])
-    assert "| `substep_angle` | number, at most 90, above 0 | `2.0` |" in text
-    assert '`greedy`, `fitted` | `"greedy"` |' in text
-    assert "| `method` | `pbd`, " in text
-
-
-def test_reference_holds_every_public_name(tmp_path):
-    import rbfmuscle
-
-    (tmp_path / "docs").mkdir()
-    gallery.write_reference(tmp_path, rbfmuscle)
-    text = (tmp_path / "docs" / "gallery" / "reference.md").read_text(encoding="utf-8")
-    for name in set(rbfmuscle.__all__) - {"__version__"}:
-        assert f"## {name}\n" in text
 
 
 def test_pages_build_without_warnings(tmp_path):
@@ -74,3 +51,24 @@ def test_pages_build_without_warnings(tmp_path):
     assert not re.findall(
         r'(?:src|href)="https?://(?!www\.sphinx-doc|pradyunsg|github)[^"]*\.(?:js|css)"', html
     )
+
+
+def listed(name):
+    lines = (ROOT / "tests" / name).read_text(encoding="utf-8").splitlines()
+    return [line for line in lines if line and not line.startswith("#")]
+
+
+@pytest.mark.parametrize("name", ["fast.txt", "nojit.txt"])
+def test_what_is_listed_is_there_and_named_once(name):
+    lines = listed(name)
+    assert len(set(lines)) == len(lines)
+    for line in lines:
+        path, *names = line.split("::")
+        assert (ROOT / path).exists(), line
+        text = (ROOT / path).read_text(encoding="utf-8") if names else ""
+        assert all(re.search(rf"^ *(def|class) {word}\b", text, flags=re.M) for word in names), line
+
+
+def test_quick_tests_are_of_every_package():
+    packages = {path.relative_to(ROOT / "tests").parts[0] for path in (ROOT / "tests").rglob("test_*.py")}
+    assert {line.split("/")[1] for line in listed("fast.txt")} == packages

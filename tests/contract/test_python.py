@@ -57,18 +57,6 @@ def test_user_script_is_typed_and_runs(tmp_path):
     )
 
 
-def test_scene_is_given_as_a_word_or_a_path(run, monkeypatch, tmp_path):
-    given = []
-    monkeypatch.setattr(
-        "rbfmuscle.run.Recording", lambda scene, **options: given.append(scene) or pytest.skip
-    )
-    with pytest.raises(AttributeError):
-        rm.simulate("phantom", frames="0:1")
-    assert given[0].name == "phantom_hip" and len(given[0].motion) == 1
-    with pytest.raises(rm.SceneError, match=r"none\.toml: no such scene file"):
-        rm.simulate(tmp_path / "none.toml")
-
-
 def test_run_answers_as_a_container(run):
     assert len(run) == len(run.frames) == 3
     assert "abductor" in run and "abducter" not in run
@@ -94,13 +82,6 @@ def test_run_that_is_loaded_is_the_run_that_was_saved(run, loaded, tmp_path):
     assert len(rm.Run.load(tmp_path / "copy")) == 3
     with pytest.raises(rm.UsageError, match="holds no run"):
         rm.Run.load(tmp_path)
-
-
-def test_run_in_memory_is_exported_like_a_saved_one(run, loaded, tmp_path):
-    names = [
-        [file.name for file in one.export(tmp_path / str(k), ["stl"])] for k, one in enumerate((run, loaded))
-    ]
-    assert names[0] == names[1] and "abductor_0002.stl" in names[0]
 
 
 def test_metrics_as_a_table_where_pandas_is_there(run, monkeypatch):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.metrics.centreline import Centreline, MuscleAtRest, split_ends
 from rbfmuscle.metrics.columns import Columns
 from rbfmuscle.metrics.mesh_distance import MeshDistance
@@ -15,7 +16,8 @@ from rbfmuscle.metrics.metrics import MuscleMeasures
 from rbfmuscle.metrics.moment_arms import moment_arms
 from rbfmuscle.metrics.penetration import BoneProbe, bone_depth, surface_depth
 from rbfmuscle.metrics.rows import frame_rows, moment_arm_rows
-from rbfmuscle.metrics.topology import SurfaceForm
+from rbfmuscle.metrics.topology import SurfaceForm, euler_characteristic
+from rbfmuscle.run import simulate
 from rbfmuscle.scene.joints.joint import Coordinate
 from rbfmuscle.scene.objects import Attachment, Motion
 from rbfmuscle.simulation.frame_loop import Event, Frame, ModelSurface
@@ -313,3 +315,60 @@ class TestRows:
         before, after = (measures.measure(each)["rod"] for each in (frame, moved))
         for name in ("volume", "penetration_max", "penetration_fraction", "length", "components"):
             assert after[name] == pytest.approx(before[name], rel=1e-8)
+
+
+def test_euler_of_sphere_torus_and_two_spheres():
+    sphere = trimesh.creation.icosphere(2)
+    torus = trimesh.creation.torus(3.0, 1.0)
+    two = trimesh.util.concatenate([sphere, sphere.copy().apply_translation([5, 0, 0])])
+    assert euler_characteristic(sphere.faces) == 2
+    assert euler_characteristic(torus.faces) == 0
+    assert euler_characteristic(two.faces) == 4
+
+
+def literal_crossings(vertices, faces):
+    """Every edge against every triangle, one by one."""
+    marked = np.zeros(len(faces), dtype=bool)
+    volume = lambda a, b, c, d: np.linalg.det([b - a, c - a, d - a])  # noqa: E731
+    for f, face in enumerate(faces):
+        for g, other in enumerate(faces):
+            if f == g or len({*face, *other}) < 5:
+                continue
+            for k in range(3):
+                p, q = face[k], face[(k + 1) % 3]
+                if p in other or q in other:
+                    continue
+                a, b, c, p, q = (vertices[i] for i in (*other, p, q))
+                if volume(a, b, c, p) * volume(a, b, c, q) >= 0:
+                    continue
+                sides = {np.sign(volume(p, q, *pair)) for pair in ((a, b), (b, c), (c, a))}
+                if sides in ({1.0}, {-1.0}):
+                    marked[f] = marked[g] = True
+    return marked
+
+
+def test_crossings_are_those_of_a_literal_search():
+    mesh = trimesh.creation.icosphere(1)
+    rng = np.random.default_rng(3)
+    vertices = mesh.vertices + 0.35 * rng.normal(size=mesh.vertices.shape)
+    expected = literal_crossings(vertices, mesh.faces)
+    assert 0 < expected.sum() < len(expected)
+    np.testing.assert_array_equal(crossing_faces(vertices, mesh.faces), expected)
+
+
+def test_moment_arms_of_the_real_hip_have_the_right_signs_and_sum(hip_scene):
+    """Gluteus maximus and medius extend, the iliacus flexes; the adductor brevis flexes first, then extends."""
+    wanted = {
+        "gluteus_maximus": (-1, -1),
+        "gluteus_medius": (-1, -1),
+        "iliacus": (1, 1),
+        "adductor_brevis": (1, -1),
+    }
+    made = simulate(hip_scene, settings={"output.surfaces": False}, frames="0:46:3")
+    angle = np.array([frame.coordinates["hip.flexion"] for frame in made.frames])
+    for muscle, signs in wanted.items():
+        length, arm = made.values(muscle, "length"), made.values(muscle, "moment_arm")
+        assert tuple(np.sign([arm[0], arm[-1]])) == signs
+        change = -np.cumsum(0.5 * (arm[1:] + arm[:-1]) * np.diff(angle))
+        # 6 degrees a frame: the one-sided arms at both ends err by half a step's change.
+        assert np.abs(length[1:] - length[0] - change).max() <= 0.01 * length[0]

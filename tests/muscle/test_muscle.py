@@ -6,6 +6,7 @@ import igl
 import numpy as np
 import pytest
 import trimesh
+from contraction_scenes import spindle_scene
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -193,3 +194,16 @@ def test_a_chosen_epsilon_never_gives_a_broken_field():
         scene.muscles[0].options |= {"kernel": "quintic", "condition": 1e6}
         model = build_model(scene.muscles[0], scene, "rbf")
         assert model.rest.fit.condition == 1e6  # without a shape parameter a ridge keeps the bound
+
+
+def test_fibres_through_a_unit_area_are_those_of_the_belly_over_its_girth():
+    scene = spindle_scene(tendon={"length": 100.0, "strain": 0.08})
+    model = RBFMuscle(scene.muscles[0], scene, RBFOptions(centres=150, nodes=600))
+    x = np.abs(model.solid.quad_points[:, 0])
+    middle, tendon = (
+        np.average(model.law.density[there], weights=model.solid.weights[there])
+        for there in (x < 10.0, (x > 90.0) & (x < 120.0))
+    )
+    assert middle == pytest.approx(1.0, abs=0.1)
+    # Radii of 15 and 9 mm; a cell is 10 mm wide.
+    assert tendon == pytest.approx((15.0 / 9.0) ** 2, rel=0.1)

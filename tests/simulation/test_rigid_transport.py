@@ -1,14 +1,17 @@
 """A muscle whose bones move as one is carried, not solved; what is solved comes out as it ever did."""
 
+import json
+
 import numpy as np
 import pytest
 import trimesh
+from command_line import call
 from toy_scene import box_mesh
 
 import rbfmuscle as rm
-from rbfmuscle.models import build_model
+from rbfmuscle.models import build_model, build_models
 from rbfmuscle.scene.objects import Motion
-from rbfmuscle.simulation.frame_loop import simulate_frames
+from rbfmuscle.simulation.frame_loop import simulate_frames, solve_pose
 from rbfmuscle.simulation.plan.plan import plan_scene
 from rbfmuscle.simulation.substeps import SubSteps
 
@@ -134,3 +137,33 @@ def test_plan_counts_what_a_run_then_does():
         np.testing.assert_array_equal(*(frame.surfaces[muscle].vertices for frame in frames[-2:]))
     assert (planned["brachialis"]["carried"], planned["deltoid"]["carried"]) == (2, 0)
     assert planned["deltoid"]["reason"] == "upper against trunk"
+
+
+def test_command_prints_the_plan(capsys):
+    code, out, _ = call(capsys, "plan", "phantom", "--json", "--time")
+    made = json.loads(out)
+    assert code == 0
+    assert {field["bone"] for field in made["fields"]} == {"pelvis", "femur"}
+    assert made["time"]["total"] > made["time"]["build"] > 0 and made["time"]["frame"] > 0
+    assert "centres" in made["muscles"][0]["points"]
+
+
+POSE = {"hip.flexion": np.radians(24.0), "hip.adduction": np.radians(-10.0)}
+OTHER = {"hip.flexion": np.radians(30.0)}
+
+
+@pytest.mark.parametrize("model", ["pbd", {"name": "rbf", "centres": 80, "samples": 300, "resolution": 16}])
+def test_a_pose_is_the_same_whatever_was_solved_before(model):
+    scene = rm.phantom_scene(model=model, spacing=6.0)
+    scene.muscles = [scene.muscle("extensor")]
+    scene.motion = Motion([POSE, OTHER])
+    models = build_models(scene)
+    first = solve_pose(scene, models, POSE)
+    solve_pose(scene, models, OTHER)
+    again = solve_pose(scene, models, POSE)
+    (alone, _) = simulate_frames(scene, build_models(scene))
+    for frame in (again, alone):
+        np.testing.assert_array_equal(frame.carried["extensor"][0], first.carried["extensor"][0])
+    assert (
+        np.abs(first.surfaces["extensor"].vertices - scene.muscles[0].mesh.vertices.mean(axis=0)).max() > 1.0
+    )
