@@ -11,7 +11,7 @@ from rbfmuscle.output.export import MESHES, export_run
 from rbfmuscle.output.light_mesh import light_mesh
 from rbfmuscle.output.meshfiles import SUFFIXES, read_mesh, write_mesh
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.output.vtp import Collection, read_vtp, write_vtp
+from rbfmuscle.output.vtp import read_vtp, write_vtp
 from rbfmuscle.output.writer import write_json
 from rbfmuscle.validation import MeshError, UsageError
 
@@ -54,19 +54,6 @@ class TestVtp:
         path.write_bytes(path.read_bytes()[:size])
         with pytest.raises(MeshError, match="damaged or was not written by a run"):
             read_vtp(path)
-
-
-class TestCollection:
-    def test_complete_after_every_frame(self, tmp_path, mesh):
-        write_vtp(tmp_path / "a.vtp", *mesh)
-        collection = Collection(tmp_path / "all.pvd")
-        for time in range(3):
-            collection.add(time, [("a<b", "a.vtp"), ("c", "a.vtp")])
-            reader = pyvista.get_reader(tmp_path / "all.pvd")
-            assert list(reader.time_values) == list(range(time + 1))
-        reader.set_active_time_value(2.0)
-        assert reader.read().n_blocks == 2
-        collection.close()
 
 
 class TestMeshFiles:

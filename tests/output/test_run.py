@@ -26,16 +26,6 @@ def table(path):
 
 
 class TestSimulate:
-    def test_surfaces_and_values(self):
-        scene = arm_scene()
-        run = simulate(scene)
-        assert [f.coordinates["elbow.flexion"] for f in run.frames] == pytest.approx(np.radians([0, 10, 20]))
-        first = run["biceps"].surface(frame=0)
-        assert first.is_watertight
-        assert first.volume == pytest.approx(scene.muscles[0].mesh.volume)
-        assert run["biceps"].surface().volume == pytest.approx(run["biceps"].values("volume")[-1])
-        assert len(run["biceps"].values("length")) == 3
-
     def test_flexor_has_a_positive_moment_arm(self):
         # The muscle runs 9.5 above the hinge and shortens as the forearm rises.
         arms = simulate(arm_scene(step=5))["biceps"].values("moment_arm")

@@ -160,22 +160,23 @@ class TestMistakes:
         text = str(caught.value)
         assert "\n" not in text and text.startswith(str(folder / "arm.toml"))
 
-    def test_muscle_with_no_or_one_attachment(self, folder):
+    def test_muscle_and_scene_without_what_they_need(self, folder):
         both = re.search(r"attach = \[.*\]", TEXT).group()
-        with pytest.raises(SceneError, match="muscle 'biceps' has no attachment"):
-            load(folder, (both, ""))
-        with pytest.raises(SceneError, match="attached to 'upper' only"):
-            load(folder, (', { bone = "lower", vertices = "lower.txt" }', ""))
-
-    def test_no_muscles_and_missing_file(self, folder):
-        with pytest.raises(SceneError, match=r"has no muscles, add a \[\[muscle\]\]$"):
-            load(folder, (TEXT[TEXT.index("[[muscle]]") : TEXT.index("[contact]")], ""))
-        with pytest.raises(SceneError, match=r"has no bones, add a \[\[bone\]\]$"):
-            Scene("bare").validate()
-        with pytest.raises(SceneError, match="no such scene file"):
-            Scene.load(folder / "none.toml")
-        with pytest.raises(SceneError, match="is a folder"):
-            Scene.load(folder)
+        muscle = TEXT[TEXT.index("[[muscle]]") : TEXT.index("[contact]")]
+        for old, words in (
+            (both, "muscle 'biceps' has no attachment"),
+            (', { bone = "lower", vertices = "lower.txt" }', "attached to 'upper' only"),
+            (muscle, r"has no muscles, add a \[\[muscle\]\]$"),
+        ):
+            with pytest.raises(SceneError, match=words):
+                load(folder, (old, ""))
+        for act, words in (
+            (Scene("bare").validate, r"has no bones, add a \[\[bone\]\]$"),
+            (lambda: Scene.load(folder / "none.toml"), "no such scene file"),
+            (lambda: Scene.load(folder), "is a folder"),
+        ):
+            with pytest.raises(SceneError, match=words):
+                act()
 
     def test_joints_form_a_tree(self):
         scene = built()
