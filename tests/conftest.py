@@ -124,14 +124,10 @@ def pytest_terminal_summary(terminalreporter):
     reasons = [str(report.longrepr[-1]) for report in terminalreporter.stats.get("skipped", [])]
     if reasons:
         data = sum("RBFMUSCLE_DATA" in reason for reason in reasons)
-        packages = sorted(
-            {m[1] for reason in reasons if (m := re.search(r"could not import '(\w+)", reason))}
+        missing = sorted({m[1] for reason in reasons if (m := re.search(r"could not import '(\w+)", reason))})
+        parts = [f"{data} need data (RBFMUSCLE_DATA names the folder that holds hip/, leg/ and osim/)"] * (
+            data > 0
         )
-        parts = (
-            [f"{data} need data (RBFMUSCLE_DATA names the folder that holds hip/, leg/ and osim/)"]
-            if data
-            else []
-        )
-        parts += [f"packages not installed: {', '.join(packages)}"] if packages else []
+        parts += [f"packages not installed: {', '.join(missing)}"] * bool(missing)
         line = f"{len(reasons)} skipped: {'; '.join([*parts, 'pytest -rs lists all'])}"
         terminalreporter.write_line(line)

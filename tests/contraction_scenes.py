@@ -25,16 +25,9 @@ HEIGHT, LEAN = FIBRE * math.sin(math.radians(PENNATION)), FIBRE * math.cos(math.
 
 @dataclass(frozen=True)
 class Spindle:
-    """A belly between two tendons, round, of radius
+    """A belly between two tendons, round, with flat ends and a dome of the tendon's radius beyond each, of radius
 
-        r(x) = tendon + (belly - tendon) cos²(π x / belly_length)    for |x| < belly_length / 2, else tendon.
-
-    Parameters
-    ----------
-    length : float
-        Between the two flat ends; a dome of the tendon's radius lies beyond each.
-    belly_length, belly, tendon : float
-        Length of the belly, radius of its middle, radius of the tendons.
+    r(x) = tendon + (belly - tendon) cos²(π x / belly_length)    for |x| < belly_length / 2, else tendon.
     """
 
     length: float = 320.0
@@ -180,22 +173,10 @@ def settings(model):
 
 
 def compare_spindle(vertices, faces, activation, kept):
-    """Distances [mm] and relative errors of a spindle's surface against finite elements.
+    """Errors of a spindle's closed surface against the arrays of finite elements that the data file kept.
 
-    Parameters
-    ----------
-    vertices, faces : (n, 3) and (m, 3) ndarray
-        Closed, outward.
-    activation : float
-        One of ``kept["activations"]``.
-    kept : mapping
-        The arrays of the data file.
-
-    Returns
-    -------
-    dict
-        ``rms`` and ``worst`` [mm] of the reference's vertices between the held ends, ``csa`` (relative error of the
-        greatest section) and ``place`` (its place, error as a share of the length).
+    ``rms`` and ``worst`` [mm] of the vertices between the held ends, ``csa`` (relative error of the greatest
+    section) and ``place`` (its place, error as a share of the length).
     """
     row = int(np.argmin(np.abs(kept["activations"] - activation)))
     wanted = kept["vertices"][row].astype(float)

@@ -41,12 +41,7 @@ class WrongResult(Exception):
 def run_case(action: Callable[[], int], folder: Path) -> tuple[str, str, float]:
     """Run one case in a forked process; its outcome, what it said, and the processor time it took [s].
 
-    Parameters
-    ----------
-    action : callable
-        Returns an exit code, and prints what a user would see.
-    folder : path
-        Made for the case, and removed after it.
+    The action prints what a user would see and returns an exit code; the folder is made for the case and removed after.
     """
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
