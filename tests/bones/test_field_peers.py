@@ -59,8 +59,6 @@ def test_detectors_agree_on_a_ball_in_any_pose(name):
 
 
 def test_measured_errors_are_those_of_the_field():
-    found = measure_field(BoneSDF.from_mesh(trimesh.creation.torus(20.0, 5.0), cache=False))
-    assert found["error_rms"] < 0.01 and found["sign_wrong"] < 1e-3 and found["angle_median"] < 0.5
     field = BoneSDF.from_mesh(trimesh.creation.icosphere(3, 20.0), cache=False)
 
     class Shifted:

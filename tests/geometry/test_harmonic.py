@@ -117,13 +117,6 @@ class TestBlend:
         found = blended_motion(self.POINTS, self.weights(3), np.array([motion] * 3))
         assert found == pytest.approx(moved(self.POINTS, motion), abs=1e-6 if angle == np.pi else 1e-10)
 
-    def test_weight_of_one_gives_the_bone_exactly(self):
-        motions = np.array([pose(seed) for seed in (1, 2, 3)])
-        for k, motion in enumerate(motions):
-            weights = np.broadcast_to(np.eye(3)[k], (len(self.POINTS), 3))
-            found = blended_motion(self.POINTS, weights, motions)
-            assert found == pytest.approx(moved(self.POINTS, motion), abs=1e-10)
-
     def test_does_not_depend_on_the_origin(self):
         # Moving everything by the same rigid motion changes nothing but the place.
         motions, weights = np.array([pose(7, angle=0.4), pose(8, angle=0.7)]), self.weights(2)

@@ -7,6 +7,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.crossing import FaceTree
+from rbfmuscle.geometry.fields import LevelField
+from rbfmuscle.geometry.rest_frame import BoneFrame
 from rbfmuscle.geometry.triangles import nearest_weights
 from rbfmuscle.geometry.winding import wound_around
 
@@ -14,6 +16,35 @@ from rbfmuscle.geometry.winding import wound_around
 def solid():
     mesh = trimesh.creation.icosphere(subdivisions=1)
     return np.array(mesh.vertices) * [2.0, 1.0, 0.7] + [5.0, 0.0, 1.0], np.array(mesh.faces)
+
+
+def test_a_field_less_a_level_is_zero_where_the_field_has_the_level():
+    def ball(points):
+        return np.linalg.norm(points, axis=1) - 1.0
+
+    ball.value_and_gradient = lambda points: (ball(points), points)
+    field, points = LevelField(ball, 0.5), np.array([[1.5, 0, 0], [0, 2.0, 0]])
+    np.testing.assert_allclose(field(points), [0.0, 0.5])
+    value, gradient = field.value_and_gradient(points)
+    np.testing.assert_allclose(value, [0.0, 0.5])
+    np.testing.assert_array_equal(gradient, points)
+
+
+@pytest.mark.parametrize("scale", [1.0, 40.0])
+def test_local_units_are_the_same_wherever_a_bone_is_and_however_large(scale):
+    """A slab of three lengths, turned: its local vertices come back from every pose, and its box holds them."""
+    turn = Rotation.from_rotvec([0.7, -0.4, 1.1]).as_matrix()
+    vertices = scale * (np.array(trimesh.creation.box((5.0, 2.0, 1.0)).vertices) @ turn.T + [3.0, 1.0, -2.0])
+    frame, pose = BoneFrame(vertices), np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec([0.2, 0.9, -0.3]).as_matrix(), [10.0, -4.0, 7.0]
+    placed = frame.placed(pose)
+    world = vertices @ pose[:3, :3].T + pose[:3, 3]
+    np.testing.assert_allclose((world - placed[:3, 3]) @ placed[:3, :3], frame.local, atol=1e-7)
+    low, high = frame.box(np.array([vertices.min(axis=0), vertices.max(axis=0)]))
+    assert (frame.local >= low - 1e-7).all() and (frame.local <= high + 1e-7).all()
+    # Along its principal axes the slab fills its own box.
+    sides = np.sort(np.ptp(frame.local, axis=0)) * frame.size
+    np.testing.assert_allclose(sides, scale * np.array([1.0, 2.0, 5.0]), rtol=1e-5)
 
 
 def test_a_mesh_winds_around_what_is_inside_it_and_once_only():

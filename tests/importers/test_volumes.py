@@ -121,6 +121,22 @@ def test_thin_walls_do_not_go_through_themselves(monkeypatch):
     assert crossings(2.0)[0] > 0 and hopeless <= crossings(1.2)[0]
 
 
+def test_islands_and_holes_are_left_out_and_told():
+    labels = ball_labels()
+    labels[1:3, 1:3, 1:3], labels[22:26, 22:26, 22:26] = 1, 0
+    surface = label_surface(LabelVolume(labels, np.eye(4), {}, "x.nii"), 1)
+    island, hole = surface.notes
+    assert "1 islands of 8 voxels" in island and "64 voxels" in hole and surface.mesh.euler_number == 2
+
+
+def test_folder_of_masks_is_a_volume(tmp_path):
+    labels = ball_labels(split=np.array([1.0, 0, 0])).astype(np.uint8)
+    for value, name in ((1, "soleus"), (2, "tibia")):
+        write_nifti(tmp_path / f"{name}.nii.gz", (labels == value).astype(np.uint8), np.eye(4))
+    volume = read_labels(tmp_path)
+    assert sorted(volume.names.values()) == ["soleus", "tibia"] and len(volume.values()) == 2
+
+
 def test_names_from_header_and_tables(tmp_path):
     labels = ball_labels(split=np.array([1.0, 0, 0])).astype(np.int16)
     header = {"space": "left-posterior-superior", "space directions": np.eye(3), "space origin": np.zeros(3)}

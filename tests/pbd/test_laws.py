@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from pbd_baseline.arap import ARAP, ARAPConstraint
 from pbd_baseline.constraints import _cubic_step
-from pbd_baseline.fibres import edge_stiffness
 from pbd_baseline.topology import Topology
 
 
@@ -79,15 +78,3 @@ def test_step_to_a_volume_meets_it_or_is_none(error, slope, sign, bend, turn):
     if abs(error) < 0.05 * slope**2:  # so near that the first turn of the cubic lies far behind
         assert cubic[0] == 1.0 or s != 0.0
         assert s * sign * error <= 0.0
-
-
-def test_edges_along_the_fibres_are_soft_and_those_across_as_stiff_as_any(rest):
-    vertices, topology = rest
-    edges, along = topology.edges, np.tile([1.0, 0.0, 0.0], (len(vertices), 1))
-    assert (edge_stiffness(vertices, edges, along, 0.0) == 1.0).all()
-    steps = vertices[edges[:, 1]] - vertices[edges[:, 0]]
-    cosine = np.abs(steps[:, 0]) / np.linalg.norm(steps, axis=1)
-    found = [edge_stiffness(vertices, edges, sign * along, 0.5) for sign in (1.0, -1.0)]
-    np.testing.assert_array_equal(*found)
-    np.testing.assert_allclose(found[0], np.sqrt(1.0 - cosine), atol=1e-7)
-    assert found[0].min() < 0.3 and found[0].max() > 0.9

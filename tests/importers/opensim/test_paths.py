@@ -5,10 +5,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from rbfmuscle.cli.sampling import Samples, report_fits, sample_muscles
-from rbfmuscle.importers.opensim.fitted import FittedPath, fit_path, write_paths
+from rbfmuscle.cli.sampling import Samples, parse_ranges, report_fits, sample_muscles
+from rbfmuscle.importers.opensim.fitted import FittedPath, exponents, fit_path, write_paths
 from rbfmuscle.scene.phantom import phantom_scene
-from rbfmuscle.validation import SolveError
+from rbfmuscle.validation import SolveError, UsageError
 
 
 def smooth(q):
@@ -38,7 +38,8 @@ def test_arms_are_minus_the_derivative_of_the_length():
         assert path.arms(q)[0, k] == pytest.approx(-slope[0], rel=1e-6)
 
 
-def test_file_is_in_metres(tmp_path):
+def test_file_is_in_metres_with_terms_in_the_order_of_opensim(tmp_path):
+    assert exponents(2, 2).tolist() == [[0, 0], [0, 1], [0, 2], [1, 0], [1, 1], [2, 0]]
     path = FittedPath("soleus", ("ankle.angle", "rail.s"), 1, np.array([300.0, 2.0, -40.0]))
     write_paths(tmp_path / "p.xml", [path], 1000.0, {"ankle.angle": True, "rail.s": False})
     root = ElementTree.parse(tmp_path / "p.xml").getroot()
@@ -125,3 +126,10 @@ def test_poses_that_fail_are_left_out_and_too_many_are_refused(tmp_path, scene):
     lengths[:15] = np.nan
     with pytest.raises(SolveError, match="15 of 20 poses failed"):
         report_fits(scene, [found], tmp_path)
+
+
+def test_ranges_are_checked(scene):
+    assert parse_ranges(scene, ["flexion=0:90"])["hip.flexion"] == pytest.approx((0.0, np.pi / 2))
+    for text in ("flexion", "flexion=1", "flexion=9:1", "flexion=a:b", "flexion=0:inf"):
+        with pytest.raises(UsageError, match="--range"):
+            parse_ranges(scene, [text])
