@@ -122,6 +122,7 @@ def variants(folder):
         ("model", "[defaults]", '[defaults]\nmodel = "rbff"'),
         ("setting", "[defaults]", '[defaults]\nmodel = { name = "rbf", centers = 80 }'),
         ("number", "[defaults]", '[defaults]\nmodel = { name = "rbf", centres = -5 }'),
+        ("kernel", "[defaults]", '[defaults]\nmodel = { name = "rbf", kernel = "cubik" }'),
         ("inside", "biceps.ply", "ball.ply"),
     ):
         (folder / f"{name}.toml").write_text(scene.replace(old, new))
@@ -141,6 +142,8 @@ class TestErrors:
             ("run model.toml -o o", 3, "unknown model 'rbff', did you mean 'rbf'"),
             ("check setting.toml", 3, "model: unknown key 'centers', did you mean 'centres'"),
             ("check number.toml", 3, "centres: input should be greater than or equal to 0, got -5"),
+            ("check kernel.toml", 3, "unknown kernel 'cubik', did you mean 'cubic'"),
+            ("paths phantom -o o --samples 3", 2, "--samples 3 is too few"),
             ("check metres.toml", 4, "cannot be right; correct the scene's units, or set its scale (0.01"),
             (
                 "check bare.toml",

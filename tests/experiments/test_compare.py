@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from blend_model import BlendMuscle, arm_scene
 
+from rbfmuscle import compare
 from rbfmuscle.compare import compare_models
 from rbfmuscle.experiments.comparison import MEASURES, best_models, describe
 from rbfmuscle.metrics.comparison_measures import MaterialProbe
@@ -160,3 +161,15 @@ class TestFailure:
         assert table["models"] == ["pbd", "arap-pbd"] and "planted" in table["failed"]["xpbd"]
         assert "xpbd did not finish" in (tmp_path / "report.html").read_text(encoding="utf-8")
         assert not math.isnan(table["results"]["pbd"]["all"]["volume_error"])
+
+
+def test_labels_say_what_ran():
+    scene = arm_scene()
+    settings = {"pbd:model.iterations": 7}
+    variants = compare._variants(scene, ["rbf", "pbd", "xpbd-converged"], {})
+    assert [compare._label(name, variant) for name, variant in variants.items()] == [
+        "RBF", "PBD, 3 sweeps as in the paper", "XPBD, converged"
+    ]  # fmt: skip
+    assert variants["xpbd-converged"].muscles[0].model == "xpbd-converged"
+    many = compare._variants(scene, ["rbf", "pbd"], settings)["pbd"]
+    assert compare._label("pbd", many) == "PBD, 7 sweeps"

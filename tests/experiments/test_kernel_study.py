@@ -12,8 +12,9 @@ import trimesh
 from command_line import call
 
 import rbfmuscle as rm
+from rbfmuscle.experiments import kernel_study
 from rbfmuscle.experiments.kernel_study import describe, recommend, row_toml
-from rbfmuscle.report.kernel_page import write_studies
+from rbfmuscle.report.kernel_page import answer, write_studies
 from rbfmuscle.validation import MeshError, UsageError
 
 
@@ -148,3 +149,21 @@ def test_command_ranks_and_prints(tmp_path, capsys):
     assert code == 0 and "use " in out.lower() and "[muscle.model]" in out
     code, _, err = call(capsys, "kernels", "phantom", "--centres", "150,some", "-o", tmp_path)
     assert code == 2 and "--centres must be whole numbers of 8 and more, got '150 some'" in err
+
+
+def test_several_surfaces_share_a_page_and_an_answer(study, ellipsoid, tmp_path):
+    studies = {"one": study, "two": study}
+    write_studies(studies, tmp_path, dict.fromkeys(studies, ellipsoid))
+    best = study.recommended["kernel"]
+    assert answer(studies).startswith(f"Use {best}: within 5 % of the least error on 2 of 2 muscles")
+    page = (tmp_path / "kernels.html").read_text(encoding="utf-8")
+    assert "Kernels for all 2 muscles" in page and "Every row of two" in page
+    assert {path.name for path in tmp_path.glob("*.vtp")} == {"recommended_one.vtp", "recommended_two.vtp"}
+
+
+def test_rows_that_err_more_than_the_coarsest_kernel_are_unfit():
+    rows = [row("linear", 0.4, 1.0), row("buhmann", 0.9, 1.0), row("cubic", 0.1, 1.0)]
+    kernel_study._refuse_coarse([one | {"centres": 80} for one in rows])
+    rows = [one | {"centres": 80} for one in rows]
+    kernel_study._refuse_coarse(rows)
+    assert [one["unfit"] for one in rows] == ["", "an error of 0.9, beyond that of linear, 0.4", ""]

@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import (
     BOUND,
     SPAN,
+    _first_sound,
     choose_epsilon,
     spacing,
     surface_error,
@@ -155,3 +157,25 @@ def test_stray_and_open_sheets_in_the_box_are_seen():
     halved = Shape(lambda at: np.minimum(ball(at), at[:, 0] - 11.0))
     assert find_sheets(halved, points, ball).is_open
     assert not find_sheets(Shape(lambda at: 1.0 + 0.0 * at[:, 0]), points, ball).found
+
+
+@pytest.fixture
+def first_sound():
+    """``first_sound(tried, field_of)``: of trials around a ball; ``field_of(epsilon)`` gives the field."""
+    points = np.vstack([10.0 * trimesh.creation.icosphere(subdivisions=2).vertices, [[15.0, 0.0, 0.0]]])
+
+    def ask(tried, field_of):
+        fields = {epsilon: field_of(epsilon) for epsilon, *_ in tried}
+        search = SimpleNamespace(points=points, reach=spacing(points).mean(), fields=fields)
+        return _first_sound(search, [tuple(row) for row in tried], ball)
+
+    return ask
+
+
+def test_what_is_open_or_flat_is_reported(first_sound):
+    tried = np.c_[[1.0, 2.0, 3.0], [0.1, 0.11, 0.12], [1e6, 1e6, 1e6]]
+    found, broken = first_sound(tried, lambda epsilon: Shape(lambda at: at[:, 0] - 11.0))
+    assert found is None and broken.startswith("the level set is open")
+    tried[:, 1] = 4.0  # the centres are 5 apart
+    found, broken = first_sound(tried, lambda epsilon: Shape(lambda at: pytest.fail("extracted")))
+    assert found is None and broken.startswith("the field is flat between the centres")

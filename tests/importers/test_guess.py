@@ -11,11 +11,12 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.cli.app import run_command
+from rbfmuscle.importers.guess.attachments import _best_of
 from rbfmuscle.importers.guess.guess import guess_scene, write_scene
 from rbfmuscle.importers.guess.joints import Face, fit_ball, fit_hinge, guess_joints
 from rbfmuscle.importers.guess.names import name_facts
-from rbfmuscle.importers.guess.orientation import find_orientation
-from rbfmuscle.importers.guess.parts import Part
+from rbfmuscle.importers.guess.orientation import HEADER, find_orientation
+from rbfmuscle.importers.guess.parts import Part, clustered
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.scene.scene import Scene
@@ -264,3 +265,41 @@ def test_what_cannot_be_used_is_left_out_with_its_reason_and_the_rest_loads(tmp_
     scene = write_scene(guess, tmp_path / "scene.toml")
     text = (tmp_path / "scene.toml").read_text(encoding="utf-8")
     assert "# NOT USED: gracilis.ply: " in text and len(scene.muscles) == 4
+
+
+def test_muscle_that_cannot_be_loaded_is_commented_out_with_its_reason(tmp_path):
+    _phantom_meshes(tmp_path)
+    guess = guess_scene(tmp_path, "mm", tmp_path)
+    guess.muscles[0].holds[0].vertices = guess.muscles[0].holds[1].vertices
+    name = guess.muscles[0].muscle.name
+    scene = write_scene(guess, tmp_path / "scene.toml")
+    assert name not in [muscle.name for muscle in scene.muscles]
+    text = (tmp_path / "scene.toml").read_text(encoding="utf-8")
+    assert f'# name = "{name}"' in text and "# NOT RUN: " in text
+    assert any(name in doubt for doubt in guess.doubts())
+
+
+def test_header_counts_and_bones_against_it_are_named(leg):
+    bones, _ = _leg_bones(leg, np.eye(4))  # its front is -y, the header's +y
+    found = find_orientation(bones, HEADER)
+    assert (found.anterior == [0, 1, 0]).all() and any(
+        "anterior by the bones" in doubt for doubt in found.doubts
+    )
+    bones[1].side = "l"
+    assert any("is it mirrored" in doubt for doubt in find_orientation(bones).doubts)
+
+
+def test_clustered_mesh_keeps_its_shape():
+    mesh = trimesh.creation.icosphere(subdivisions=6, radius=30.0)
+    coarse = trimesh.Trimesh(*clustered(mesh.vertices, mesh.faces, 8000), process=False)
+    assert 4000 < len(coarse.faces) < 12000
+    away = np.linalg.norm(coarse.vertices, axis=1) - 30.0
+    # The mean of a cell of 1.7 mm lies below the sphere by less than its sagitta, 1.7^2 / (4 * 30).
+    assert away.min() > -0.03 and away.max() < 0.01
+
+
+def test_side_of_the_body_is_kept():
+    bones = [Part(f"femur_{side}", "", None, kind="femur", side=side) for side in "lr"]
+    distances = {bones[0]: np.zeros(3), bones[1]: np.ones(3)}
+    assert _best_of(("femur",), Part("m", "", None, side="r"), distances) is bones[1]
+    assert _best_of(("femur",), Part("m", "", None), distances) is bones[0]

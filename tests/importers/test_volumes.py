@@ -200,3 +200,13 @@ def test_a_volume_larger_than_the_limit_is_refused_unread(tmp_path):
         header.write_to(file)
     with pytest.raises(MeshError, match="bytes unpacked, at most"):
         read_labels(tmp_path / "huge.nii")
+
+
+def test_two_labels_of_one_name_are_two_meshes(tmp_path):
+    from rbfmuscle.cli.new import _write_surfaces
+
+    labels = ball_labels(split=np.array([1.0, 0, 0])).astype(np.int16)
+    source = write_nifti(tmp_path / "a.nii", labels, np.eye(4))
+    (tmp_path / "names.csv").write_text("1,Soleus\n2,soleus\n")
+    folder = _write_surfaces(source, tmp_path / "names.csv", tmp_path / "out")
+    assert sorted(path.name for path in folder.iterdir()) == ["Soleus.ply", "soleus_2.ply"]

@@ -203,3 +203,13 @@ def test_times_of_a_motion_are_those_of_the_files(folder, tmp_path):
     tree, numbers = read_glb(next((tmp_path / "out" / "animated-glb").iterdir()))
     times = numbers(tree["animations"][0]["samplers"][0]["input"])[:, 0]
     np.testing.assert_allclose(times, np.array(TIMES) - 1.0)
+
+
+def test_names_that_usd_does_not_know_stay_apart():
+    pytest.importorskip("pxr.UsdGeom")
+    from rbfmuscle.output.animation.usd import identifier
+
+    used = set()
+    assert [identifier(name, used) for name in ("a-b", "a_b", "1x", "materials")] == [
+        "a_b", "a_b_2", "_x", "materials_2",
+    ]  # fmt: skip

@@ -9,6 +9,9 @@ import trimesh
 from pbd_baseline.bending import BendingConstraint
 from pbd_baseline.constraints import EdgeConstraint, VolumeConstraint
 from pbd_baseline.topology import Topology, colour
+from pbd_baseline.weights import even_weights
+from rbfmuscle.geometry.harmonic import harmonic_weights
+from rbfmuscle.validation import MeshError
 
 
 def ellipsoid(subdivisions=3, axes=(3.0, 2.0, 1.0)):
@@ -103,3 +106,23 @@ def test_volume_is_met_quadratically_and_by_restoring_in_one_step(rng):
     points = vertices * 0.9 + 0.01 * rng.normal(size=vertices.shape)
     constraint.restore(points, constraint.gradient(points))
     assert constraint.volume(points) == pytest.approx(constraint.rest, rel=1e-14)
+
+
+def test_open_mesh_is_refused():
+    vertices, faces = ellipsoid(1)
+    with pytest.raises(MeshError, match="not a closed"):
+        Topology.from_mesh(vertices, faces[1:])
+
+
+def test_even_weights_stretch_less_than_harmonic_ones(body):
+    vertices, faces, topology = body
+    groups = [np.flatnonzero(vertices[:, 0] < -2.9), np.flatnonzero(vertices[:, 0] > 2.9)]
+    even, harmonic = even_weights(vertices, faces, groups), harmonic_weights(vertices, faces, groups)
+    i, j = topology.edges.T
+    length = np.linalg.norm(vertices[i] - vertices[j], axis=1)
+    steepest = [np.abs((w[i, 0] - w[j, 0]) / length).max() for w in (even, harmonic)]
+    assert steepest[0] < 0.7 * steepest[1]
+    np.testing.assert_allclose(even.sum(axis=1), 1.0)
+    assert even.min() >= 0.0
+    assert (even[groups[0], 0] == 1.0).all()
+    np.testing.assert_allclose(even_weights(vertices, faces, groups[:1]), 1.0, atol=1e-12)

@@ -10,7 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from pbd_baseline.arap import ARAP, ARAPConstraint
 from pbd_baseline.constraints import _cubic_step
+from pbd_baseline.fibres import swelling_room
 from pbd_baseline.topology import Topology
+from rbfmuscle.geometry.surfaces import vertex_normals
 
 
 @pytest.fixture
@@ -78,3 +80,13 @@ def test_step_to_a_volume_meets_it_or_is_none(error, slope, sign, bend, turn):
     if abs(error) < 0.05 * slope**2:  # so near that the first turn of the cubic lies far behind
         assert cubic[0] == 1.0 or s != 0.0
         assert s * sign * error <= 0.0
+
+
+def test_room_to_swell_grows_with_the_muscle_and_is_none_where_it_is_held(rest):
+    vertices, topology = rest
+    normals = vertex_normals(vertices, topology.faces)
+    held = vertices[:, 0] < -2.5
+    room = swelling_room(vertices, topology.faces, normals, held)
+    larger = swelling_room(50.0 * vertices + [3.0, -4.0, 5.0], topology.faces, normals, held)
+    np.testing.assert_allclose(larger, 50.0 * room, rtol=1e-6, atol=1e-9)
+    assert (room[held] == 0.0).all() and room[~held].max() > 0.5

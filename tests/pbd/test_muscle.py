@@ -13,6 +13,7 @@ from pbd_baseline.topology import Topology
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.validation import SceneError
 
 METHODS = ["pbd", "pbd-paper", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved"]
 
@@ -109,3 +110,10 @@ def test_sweeps_go_on_until_no_vertex_moves_by_more_than_the_tolerance(method):
     # the last solve ended with contact and volume, so another sweep may move a little more than its own last one
     assert rig.model._sweep() < 3.0 * still
     assert np.linalg.norm(rig.model.points - before, axis=1).max() < 3.0 * still
+
+
+def test_muscle_that_nothing_holds_is_refused():
+    scene = build_scene()
+    scene.muscles[0].attachments = []
+    with pytest.raises(SceneError, match="no attachment"):
+        PBDMuscle(scene.muscles[0], scene)

@@ -9,6 +9,7 @@ import pytest
 
 from rbfmuscle.output.runinfo import Stages
 from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.report.comparison_page import worst_series
 from rbfmuscle.report.plots import Point, Track, front_plot, line_plot, motion_axis
 from rbfmuscle.report.report import _tracks
 from rbfmuscle.simulation.rigid_transport import MuscleStatus
@@ -106,3 +107,21 @@ def test_stages_sum_times_and_work_and_keep_the_worst_of_neighbours():
     assert [work[key] for key in ("solved", "carried", "skipped", "substeps")] == [4, 1, 0, 8]
     found = [[*row.pop("muscles"), *row.values()] for row in stages.neighbours()]
     assert found == [["a", "c", 0.5, 2, 0.0, 2], ["a", "b", 0.4, 2, 0.7, 4]]
+
+
+def test_line_is_broken_where_there_is_no_number():
+    y = np.array([1.0, 2.0, np.nan, 4.0, 5.0])
+    path = re.search(
+        r'<path d="(M[^"]*)" fill="none"',
+        line_plot("a", [Track("m", "#000000", np.arange(5.0), y)], ("x", "y")),
+    )
+    assert path[1].count("M") == 2 and path[1].count("L") == 2
+
+
+def test_worst_of_several_muscles_is_the_greatest_in_size_with_its_sign():
+    rows = {"a": [0.1, -0.5, 0.2], "b": [-0.3, 0.4, 0.1]}
+    run = SimpleNamespace(
+        muscles=list(rows), series=lambda muscle, quantity: (np.array([0, 2, 4]), np.array(rows[muscle]))
+    )
+    frames, values = worst_series(run, "volume_error")
+    assert list(values) == [-0.3, -0.5, 0.2] and list(frames) == [0, 2, 4]

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from rbfmuscle.report.appearance import motion_direction
-from rbfmuscle.report.raster import Solid, aim, draw_solids, fitted_size, view_axes
+from rbfmuscle.report.raster import Solid, aim, draw_layer, draw_solids, fitted_size, view_axes
 
 RED, BLUE, WHITE = np.eye(3)[0], np.eye(3)[2], np.ones(3)
 
@@ -72,3 +72,12 @@ def test_motion_is_seen_along_the_axis_of_the_bone_that_turns_most():
     upright = [{"femur": turned((0, 0, 1), a)} for a in (0, 40)]
     for poses in (upright, frames[:1]):
         np.testing.assert_array_equal(motion_direction(poses), (-1.0, -0.12, 0.12))
+
+
+def test_what_is_drawn_once_for_all_frames_looks_the_same():
+    still, moving = Solid(*ball(10.0), RED), Solid(*ball(6.0, (8, 0, 0)), BLUE)
+    camera = aim((0, -1, 0), still.vertices, (60, 60))
+    behind = draw_layer([still], camera, WHITE)
+    for _ in range(2):
+        found = draw_solids([moving], camera, WHITE, behind=behind)
+        np.testing.assert_array_equal(found, draw_solids([still, moving], camera, WHITE))

@@ -14,7 +14,7 @@ from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report import render
 from rbfmuscle.report.appearance import muscle_groups
 from rbfmuscle.report.page import limit_state, number
-from rbfmuscle.report.report import write_report
+from rbfmuscle.report.report import _events, write_report
 from rbfmuscle.validation import UsageError
 
 
@@ -156,3 +156,10 @@ def test_lights_are_green_amber_from_four_fifths_and_red_beyond():
     assert [limit_state(v, 1.0, count=True) for v in (1.0, 2.0)] == ["good", "bad"]
     assert [limit_state(v, 2.0, least=True) for v in (2.0, 0.0)] == ["good", "bad"]
     assert limit_state(5.0, None) == "plain"
+
+
+def test_events_are_listed_by_kind_and_names_stay_text():
+    events = [(k, "<b>one", "bone", 1, "halved") for k in range(70)] + [(3, "", "bone", 1, "bones_overlap")]
+    text = _events(events)
+    assert text.index("halved") < text.index("bones_overlap") and "and 10 more" in text
+    assert text.count("<tr>") == 60 + 1 + 2 and "<b>" not in text and "&lt;b&gt;one 70" in text

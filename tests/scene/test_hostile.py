@@ -85,6 +85,7 @@ class TestNumbers:
             f"[[[{'9' * 400}, 0, 0], [1, 0, 0]]]",
             '[["a"]]',
             "[[1]]",
+            "[[[0, 0, 1]]]",
         ):
             (folder / "odd.json").write_text(lines)
             refused(folder, put("muscle", 0, "fibres", "odd.json"), "polyline 0")

@@ -13,7 +13,7 @@ from rbfmuscle.scene.joints.functions import Linear, PiecewiseLinear, Polynomial
 from rbfmuscle.scene.joints.joint import KINDS, frame_at
 from rbfmuscle.scene.joints.skeleton import rest_values
 from rbfmuscle.scene.joints.tables import JointTable, joint_row
-from rbfmuscle.scene.motion import bone_poses, turned_angle
+from rbfmuscle.scene.motion import bone_poses, step_angle, turned_angle
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.plan.contact_pairs import find_contact_pairs
@@ -204,3 +204,11 @@ class TestSteps:
         assert values[-1] == 40.0 and max(b - a for a, b in itertools.pairwise(values)) < 60 / 27 * 1.01
         box = find_contact_pairs(scene)["m", "b"]
         assert box[0, 0] <= -70.0 + 1e-9  # seen from b, the muscle's other end is 40 further away
+
+
+def test_step_angle_counts_turns_and_shifts():
+    scene = knee()
+    turn = step_angle(scene, {"j.q": 0.0}, {"j.q": -0.1}, shifts=False)
+    assert turn == pytest.approx(0.1, rel=1e-9)
+    slide = pair(type="slider", axes={"s": (0, 1, 0)})
+    assert step_angle(slide, {}, {"j.s": 5.0}) == pytest.approx(0.1)

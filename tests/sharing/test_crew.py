@@ -1,10 +1,12 @@
 """Muscles dealt out to processes: what comes together is what one process finds, whatever ends the run."""
 
+import logging
 import os
 import pickle
 import signal
 import subprocess
 import sys
+import warnings
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,7 +24,7 @@ from rbfmuscle.sharing import crew as sharing
 from rbfmuscle.sharing.crew import WorkerPool
 from rbfmuscle.sharing.share import MuscleGroup
 from rbfmuscle.simulation.plan.processes import helpers_for
-from rbfmuscle.validation import MeshError, SolveError
+from rbfmuscle.validation import MeshError, SceneWarning, SolveError
 
 
 @pytest.fixture
@@ -204,3 +206,20 @@ box.put(("failed", "next"))
 """
     done = subprocess.run([sys.executable, "-c", said], capture_output=True, check=False)
     assert done.returncode == 1 and b"pickle" in done.stderr and b"next" not in done.stdout
+
+
+def test_what_helpers_say_is_said_once(caplog):
+    def helper(*messages):
+        found = iter(messages)
+        return SimpleNamespace(take=lambda: next(found))
+
+    crew = WorkerPool.__new__(WorkerPool)
+    crew._told = set()
+    warning, line = SceneWarning("bones meet"), ("rbfmuscle.bones", logging.WARNING, "bone: is open")
+    one = helper(("warned", warning), ("logged", line), ("done", 1))
+    other = helper(("logged", line), ("warned", SceneWarning("bones meet")), ("done", 2))
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        assert [crew._next(one), crew._next(other)] == [1, 2]
+    assert [str(w.message) for w in heard] == ["bones meet"]
+    assert [record.getMessage() for record in caplog.records] == ["bone: is open"]
