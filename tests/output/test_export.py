@@ -74,13 +74,6 @@ class TestMeshFiles:
 
 
 class TestSaved:
-    def test_surfaces_come_back(self, run):
-        made, folder = run
-        vertices, faces = SavedRun(folder).surface("biceps", 1)
-        expected = made.frames[1].surfaces["biceps"].vertices
-        np.testing.assert_allclose(vertices, expected, rtol=ROUNDING, atol=0)
-        np.testing.assert_array_equal(faces, made.frames[1].surfaces["biceps"].faces)
-
     def test_paraview_collection_has_every_frame_and_muscle(self, run):
         reader = pyvista.get_reader(run[1] / "surfaces.pvd")
         assert list(reader.time_values) == list(range(7))
@@ -90,12 +83,6 @@ class TestSaved:
         pose = run[0].frames[2].poses["fore"]
         expected = np.array(run[0].scene.bones[1].mesh.vertices) @ pose[:3, :3].T + pose[:3, 3]
         np.testing.assert_allclose(bones.read()[1].points, expected, atol=1e-5)  # single precision
-
-    def test_bones_at_rest_come_back(self, run):
-        for bone in run[0].scene.bones:
-            vertices, faces = SavedRun(run[1]).bone(bone.name)
-            np.testing.assert_allclose(vertices, bone.mesh.vertices, rtol=ROUNDING, atol=0)
-            np.testing.assert_array_equal(faces, bone.mesh.faces)
 
     def test_a_bone_that_moves_is_light_in_the_series(self, tmp_path):
         ball = trimesh.creation.icosphere(subdivisions=6, radius=20.0)
