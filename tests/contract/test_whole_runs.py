@@ -17,6 +17,14 @@ if MOVED:
     TOLERANCE = 1e7 * MOVED
 
 
+@pytest.fixture(scope="module", autouse=True)
+def cold_cache(tmp_path_factory):
+    """What a cache keeps (fields, weights, numbers of centres) is found anew, so that its faults show."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RBFMUSCLE_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 @pytest.mark.parametrize("name", SCENES)
 def test_run_gives_what_is_kept(name):
     worst = differences(read(name), measure(name), name)
