@@ -13,6 +13,7 @@ from command_line import call
 
 import rbfmuscle as rm
 from rbfmuscle.experiments import kernel_study
+from rbfmuscle.experiments.kernel_row import ReferenceSurface
 from rbfmuscle.experiments.kernel_study import describe, recommend, row_toml
 from rbfmuscle.report.kernel_page import answer, write_studies
 from rbfmuscle.validation import MeshError, UsageError
@@ -167,3 +168,10 @@ def test_rows_that_err_more_than_the_coarsest_kernel_are_unfit():
     rows = [one | {"centres": 80} for one in rows]
     kernel_study._refuse_coarse(rows)
     assert [one["unfit"] for one in rows] == ["", "an error of 0.9, beyond that of linear, 0.4", ""]
+
+
+def test_slender_muscles_are_looked_at_with_finer_cells(ellipsoid):
+    """With 128 cells along it a spindle of 40 times its width is three cells thick."""
+    rod = trimesh.creation.icosphere(subdivisions=4).apply_scale([200.0, 5.0, 5.0])
+    assert ReferenceSurface(np.array(rod.vertices), np.asarray(rod.faces)).resolution == 320
+    assert ReferenceSurface(ellipsoid.vertices, ellipsoid.faces).resolution == 128

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,10 +15,10 @@ from blend_model import arm_files, arm_scene, use_blend_model
 
 from rbfmuscle.cli.app import run_command as command
 from rbfmuscle.cli.sweep import run_point
-from rbfmuscle.experiments.sweep import parse_grid, plan_sweep
+from rbfmuscle.experiments.sweep import SweepPoint, parse_grid, plan_sweep
 from rbfmuscle.experiments.sweep_run import SweepFolder, run_sweep
-from rbfmuscle.experiments.sweep_table import mark_front, pareto_front, write_table
-from rbfmuscle.report.sweep_page import write_page
+from rbfmuscle.experiments.sweep_table import mark_front, pareto_front, sweep_rows, write_table
+from rbfmuscle.report.sweep_page import inside_grid, write_page
 from rbfmuscle.validation import UsageError
 
 GRID = ["model.centres=40,60", "model.resolution=16,24"]
@@ -254,3 +255,24 @@ class TestCommand:
     def test_wrong_usage(self, scene_file, tmp_path, words):
         grid = ["--grid", "contact.substep_angle=1,2"] if words else []
         assert command(["sweep", str(scene_file), "-o", str(tmp_path / "out"), *grid, *words]) == 2
+
+
+def test_reference_within_its_own_grid_is_noticed():
+    points = [{"role": role, "settings": {"a": a}} for role, a in (("", 1), ("default", 2), ("reference", 2))]
+    assert inside_grid(points)
+    assert not inside_grid([*points[:2], {"role": "reference", "settings": {"a": 3}}])
+
+
+def test_rows_are_those_of_their_points_in_order():
+    points = [
+        SweepPoint(f"k{n}", "s", {"a": n} if n else {}, "", "" if n else "default", "r") for n in range(3)
+    ]
+    results = {
+        "k0": {"status": "done", "values": {"error_rms": 0.25}},
+        "k1": {"status": "failed", "error": "no"},
+    }
+    rows = sweep_rows(points, SimpleNamespace(read=lambda key: results.get(key, {})), {"s": "cm"})
+    assert [r["status"] for r in rows] == ["done", "failed", "missing"]
+    assert [r["label"] for r in rows] == ["default", "a=1", "a=2"]
+    assert [r["error"] for r in rows] == ["", "no", ""] and rows[0]["units"] == "cm"
+    np.testing.assert_array_equal([r["error_rms"] for r in rows], [0.25, np.nan, np.nan])

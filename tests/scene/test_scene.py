@@ -257,7 +257,10 @@ class TestCheck:
         scene = built()
         scene.muscles[0].mesh.apply_translation([0, 0, -4])  # 1 mm into the bones in the middle of each
         (note, *_) = [f for f in scene.check() if "start inside" in f.message]
-        assert note.level == "note"
+        # The free ones over the lower arm, whose top and end are at z = 10 and x = 10.
+        x, _, z = scene.muscles[0].mesh.vertices.T
+        deep = np.minimum(10.0 - z, x - 10.0)[(z < 10.0) & (x > 10.0)].max()
+        assert note.level == "note" and f"up to {deep:.3g} mm deep" in note.message
         strict = scene.with_options({"contact.initial": "error"})
         with pytest.raises(SceneError, match=r"muscle 'biceps': .*start inside bone"):
             check_initial(strict)
