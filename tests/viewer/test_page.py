@@ -32,7 +32,9 @@ def wait_for(find, seconds=120.0):
 
 @pytest.fixture(scope="module")
 def opened():
-    made = Page(LiveSource(rm.phantom_scene(end=8.0, step=2.0, spacing=6.0), "pbd"))
+    scene = rm.phantom_scene(end=8.0, step=2.0, spacing=6.0)
+    scene.joints[0].frame[:3, 3] = [0.0, 5.0, 0.0]  # so that the femur is shifted as it turns
+    made = Page(LiveSource(scene, "pbd"))
     yield made
     made.close()
 
