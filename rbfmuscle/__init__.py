@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from rbfmuscle.experiments.kernel_study import study_kernels as study_kernels
     from rbfmuscle.experiments.wanted_error import reach_error as reach_error
     from rbfmuscle.implicit.field import RBFField as RBFField
+    from rbfmuscle.importers.guess.orientation import orient_scene as orient_scene
     from rbfmuscle.muscle.muscle import RBFMuscle as RBFMuscle
     from rbfmuscle.report.figure import figure_html as figure_html
     from rbfmuscle.run import Run as Run
@@ -53,7 +54,11 @@ _HOME = {
     **dict.fromkeys(_ERRORS, "rbfmuscle.validation"),
 }
 # For modules that may not import it themselves.
-_INNER = {"figure_html": "rbfmuscle.report.figure", "Page": "rbfmuscle.viewer.page"}
+_INNER = {
+    "figure_html": "rbfmuscle.report.figure",
+    "orient_scene": "rbfmuscle.importers.guess.orientation",
+    "Page": "rbfmuscle.viewer.page",
+}
 
 __all__ = [*_HOME, "__version__"]
 

@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 import numba
 
 from rbfmuscle.geometry.fields import BoneField
+from rbfmuscle.importers.guess.orientation import orient_scene
 from rbfmuscle.metrics.joint_gaps import joint_gaps
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.rows import frame_rows, moment_arm_rows
@@ -52,7 +53,7 @@ class Recording:
         fields: Mapping[str, BoneField] | None = None,
     ) -> None:
         self.started, self._start = datetime.now(UTC), time.perf_counter()
-        self.scene = scene.validate()
+        self.scene = orient_scene(scene.validate())
         self.options = options or {}
         self.times: dict[str, float] = {}
         self.status, self.message = "running", ""

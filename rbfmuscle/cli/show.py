@@ -17,7 +17,6 @@ def export(
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     units: str | None = None,
     frames: str | None = None,
-    up: str = "z",
 ) -> None:
     """Write the surfaces of a run in other formats and units.
 
@@ -34,15 +33,13 @@ def export(
         m, cm or mm; the scene's by default (glb, animated-glb, html: m).
     frames
         Of the written frames, as A:B:S.
-    up
-        z or y: the scene's axis that points up, for usd, glb, animated-glb and html.
     """
     with Progress(f"export {directory}"):
         from rbfmuscle.output.export import export_run
         from rbfmuscle.scene.settings import parse_slice
 
         chosen = parse_slice(frames) if frames is not None else None
-        written = export_run(directory, formats, output=output, units=units, frames=chosen, up=up)
+        written = export_run(directory, formats, output=output, units=units, frames=chosen)
     folders = sorted({str(path.parent) for path in written})
     print(f"{len(written)} file{'s'[: len(written) != 1]} in {', '.join(folders)}")
 
@@ -67,7 +64,7 @@ def render(
     frame
         Of a picture; the last one by default.
     view
-        front, side, back or far (the other side); may be repeated; the first three by default.
+        front, back, left, right, top or bottom; may be repeated; front, right and back by default.
     seconds
         Length of an animation.
     colour

@@ -17,6 +17,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.output.meshfiles import SUFFIXES, read_mesh
 from rbfmuscle.output.tubes import tendon_name
+from rbfmuscle.scene.objects import body_axes
 from rbfmuscle.simulation.frame import Event, Frame, ModelSurface
 from rbfmuscle.validation import UsageError
 
@@ -48,6 +49,8 @@ class SavedRun:
     tendons : list of str
         Names of the meshes of tendons, which `surface` takes as it takes muscles.
     units : str
+    body : (3, 3) ndarray
+        Left, posterior and superior; x, y and z where they are not known.
     """
 
     def __init__(self, directory: str | Path) -> None:
@@ -56,6 +59,7 @@ class SavedRun:
         try:
             self.info = json.loads(path.read_text(encoding="utf-8"))
             self.units = self.info["scene"]["units"]
+            self.body = body_axes(*(self.info["scene"].get(word) for word in ("superior", "anterior")))
             self.muscles = [muscle["name"] for muscle in self.info["scene"]["muscles"]]
             self.bones = [bone["name"] for bone in self.info["scene"]["bones"]]
             output = self.info["scene"]["output"]

@@ -10,8 +10,7 @@ from html import escape
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.output.colours import BONE_COLOUR, muscle_colours, rgb
-from rbfmuscle.report.appearance import BACKGROUND
+from rbfmuscle.output.appearance import BACKGROUND, BONE_COLOUR, muscle_colours, rgb, view_axes
 from rbfmuscle.report.raster import Solid, aim, draw_solids
 
 SIZE = (300, 340)
@@ -20,7 +19,7 @@ DIRECTION = (1.4, -1.6, 0.5)
 Meshes = Mapping[str, tuple[Floats, Integers]]
 
 
-def figure_html(bones: Meshes, muscles: Meshes, caption: str) -> str:
+def figure_html(bones: Meshes, muscles: Meshes, caption: str, body: Floats) -> str:
     """HTML of a picture.
 
     Parameters
@@ -28,6 +27,8 @@ def figure_html(bones: Meshes, muscles: Meshes, caption: str) -> str:
     bones, muscles : mapping of str to (vertices, faces)
         Where they are drawn.
     caption : str
+    body : (3, 3) ndarray
+        Left, posterior and superior.
     """
     from PIL import Image
 
@@ -36,7 +37,7 @@ def figure_html(bones: Meshes, muscles: Meshes, caption: str) -> str:
     solids += [Solid(np.asarray(v), np.asarray(f), rgb(colours[name])) for name, (v, f) in muscles.items()]
     picture = ""
     if solids:
-        camera = aim(DIRECTION, np.concatenate([solid.vertices for solid in solids]), SIZE)
+        camera = aim(view_axes(DIRECTION, body), np.concatenate([s.vertices for s in solids]), SIZE)
         file = io.BytesIO()
         Image.fromarray(draw_solids(solids, camera, rgb(BACKGROUND))).save(file, format="PNG")
         source = base64.b64encode(file.getvalue()).decode()

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from rbfmuscle.geometry.arrays import Integers
-from rbfmuscle.report.appearance import BACKGROUND
+from rbfmuscle.output.appearance import BACKGROUND
 
 if TYPE_CHECKING:
     from PIL.Image import Image

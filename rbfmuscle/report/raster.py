@@ -42,22 +42,8 @@ class Camera(NamedTuple):
         return found
 
 
-def view_axes(direction: Sequence[float] | Floats) -> Floats:
-    """Right, up and towards the camera (3, 3), seen from a direction with z up."""
-    ahead = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
-    right = np.cross([0.0, 0.0, 1.0], ahead)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(ahead, right), ahead])
-
-
-def aim(
-    direction: Sequence[float] | Floats, points: Floats, size: tuple[int, int], body: Floats | None = None
-) -> Camera:
-    """A camera that sees all points (n, 3) from a direction, as large as a picture of ``size`` holds them.
-
-    ``body`` (3, 3) holds the axes that the direction is given in; those of the points where it is None.
-    """
-    axes = view_axes(direction) if body is None else view_axes(direction) @ body
+def aim(axes: Floats, points: Floats, size: tuple[int, int]) -> Camera:
+    """A camera of these axes that sees all points (n, 3), as large as a picture of ``size`` holds them."""
     seen = points @ axes.T
     low, high = seen.min(axis=0), seen.max(axis=0)
     wide, tall, _ = np.maximum(high - low, 1e-9)
@@ -65,9 +51,9 @@ def aim(
     return Camera(axes, 0.5 * (low + high) @ axes, float(scale), size)
 
 
-def fitted_size(direction: Sequence[float] | Floats, points: Floats, area: float) -> tuple[int, int]:
+def fitted_size(axes: Floats, points: Floats, area: float) -> tuple[int, int]:
     """Width and height of so many pixels, in the proportions of what is seen; even numbers, as films ask for."""
-    wide, tall, _ = np.maximum(np.ptp(points @ view_axes(direction).T, axis=0), 1e-9)
+    wide, tall, _ = np.maximum(np.ptp(points @ axes.T, axis=0), 1e-9)
     shape = float(np.clip(tall / wide, 0.6, 2.2))
     return 2 * round(0.5 * (area / shape) ** 0.5), 2 * round(0.5 * (area * shape) ** 0.5)
 

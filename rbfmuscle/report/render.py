@@ -10,9 +10,20 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.output.colours import BONE_COLOUR, MUSCLE_COLOURS, TENDON_COLOUR, muscle_colours, rgb
+from rbfmuscle.output.appearance import (
+    BACKGROUND,
+    BONE_COLOUR,
+    MUSCLE_COLOURS,
+    TENDON_COLOUR,
+    USUAL_VIEWS,
+    VIEWS,
+    motion_direction,
+    muscle_colours,
+    muscle_groups,
+    rgb,
+    view_axes,
+)
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.appearance import BACKGROUND, USUAL_VIEWS, VIEWS, motion_direction, muscle_groups
 from rbfmuscle.report.labels import labelled
 from rbfmuscle.report.raster import Solid, aim, draw_layer, draw_solids, fitted_size
 from rbfmuscle.validation import SolveError, UsageError
@@ -33,8 +44,8 @@ class Panel:
     Parameters
     ----------
     saved : SavedRun
-    direction : (3,) sequence of float
-        From the subject to the camera.
+    axes : (3, 3) ndarray
+        Right, up and towards the camera.
     size : (width, height)
         Pixels.
     seen : (n, 3) ndarray
@@ -46,14 +57,14 @@ class Panel:
     def __init__(
         self,
         saved: SavedRun,
-        direction: Sequence[float] | Floats,
+        axes: Floats,
         size: tuple[int, int],
         seen: Floats,
         activation: Mapping[tuple[str, int], float] | None = None,
     ) -> None:
         self.saved, self.activation = saved, activation
         self.colours = muscle_colours(saved.muscles, muscle_groups(saved.info))
-        self.camera = aim(direction, seen, size)
+        self.camera = aim(axes, seen, size)
         bones, first = {name: saved.bone(name) for name in saved.bones}, saved.poses[saved.frames[0]]
         moving = {
             name
@@ -105,11 +116,11 @@ def draw_preview(runs: Mapping[str, SavedRun], path: Path, *, area: float = _PRE
     first = next(iter(runs.values()))
     frames = chosen_frames(first.frames, _PREVIEW_FRAMES)
     seen = muscle_points(list(runs.values()), frames)
-    side = motion_direction([first.poses[frame] for frame in frames])
+    side = view_axes(motion_direction([first.poses[frame] for frame in frames], first.body), first.body)
     size = fitted_size(side, seen, area)
     panels, titles = [Panel(run, side, size, seen) for run in runs.values()], list(runs)
     if len(runs) == 1:
-        panels.append(Panel(first, VIEWS["front"][0], size, seen))
+        panels.append(Panel(first, view_axes(VIEWS["front"], first.body), size, seen))
         titles = ["plane of the motion", "front"]
     chips = _chips(first) if len(runs) == 1 else {}
     save_images(draw_panels(panels, frames, titles, chips), path, _PREVIEW_SECONDS)
@@ -172,10 +183,11 @@ def render_run(
             f"frame {frame} was not written; the run has {saved.frames[0]} to {saved.frames[-1]}"
         )
     seen = muscle_points([saved], saved.frames)
-    size = fitted_size(VIEWS[views[0]][0], seen, area)
-    panels = [Panel(saved, VIEWS[view][0], size, seen, activation) for view in views]
+    axes = [view_axes(VIEWS[view], saved.body) for view in views]
+    size = fitted_size(axes[0], seen, area)
+    panels = [Panel(saved, one, size, seen, activation) for one in axes]
     frames = [frame] if output.suffix == ".png" else saved.frames
-    images = draw_panels(panels, frames, [f"{view} ({VIEWS[view][1]})" for view in views], chips)
+    images = draw_panels(panels, frames, views, chips)
     save_images(images, output, seconds)
 
 

@@ -14,9 +14,8 @@ from rbfmuscle.metrics.quantities import ALL, QUANTITIES
 from rbfmuscle.metrics.summary import LEAST, exceeded, excess, muscle_limit, within
 from rbfmuscle.output.animation.moving import read_moving
 from rbfmuscle.output.animation.page import pack_runs
-from rbfmuscle.output.colours import muscle_colours
+from rbfmuscle.output.appearance import motion_direction, muscle_colours, muscle_groups
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.appearance import motion_direction, muscle_groups
 from rbfmuscle.report.page import (
     BAD,
     GOOD,
@@ -114,7 +113,7 @@ def packed_scene(runs: Mapping[str, SavedRun]) -> str:
     return pack_runs(
         {title: read_moving(run, frames, unit=run.units) for title, run in runs.items()},
         [first.caption(frame) for frame in frames],
-        direction=motion_direction([first.poses[frame] for frame in frames]),
+        direction=motion_direction([first.poses[frame] for frame in frames], first.body),
         groups=groups | dict.fromkeys(first.tendons, "tendons") if len(first.muscles) > 1 else {},
         colours=muscle_colours(first.muscles, groups),
     )

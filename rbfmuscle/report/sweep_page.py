@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rbfmuscle.experiments.sweep_table import LENGTHS
-from rbfmuscle.output.colours import MUSCLE_COLOURS
+from rbfmuscle.output.appearance import MUSCLE_COLOURS
 from rbfmuscle.report.page import GOOD, NEAR, PLAIN, Cell, Light, Page, Section, number, table
 from rbfmuscle.report.plots import Point, front_plot
 

@@ -257,6 +257,8 @@ def describe_scene(scene: SceneData) -> dict[str, Any]:
         "name": scene.name,
         "units": scene.units,
         "file": str(scene.path) if scene.path else None,
+        "superior": scene.superior,
+        "anterior": scene.anterior,
         "bones": [{"name": bone.name, **_describe_mesh(bone)} for bone in scene.bones],
         "links": list(scene.links),
         "joints": [joint_row(joint) for joint in scene.joints],

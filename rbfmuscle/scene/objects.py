@@ -195,7 +195,7 @@ class SceneData:
     path : pathlib.Path or None
         The file it was loaded from.
     superior, anterior : list of float or None
-        Anatomical directions (3,) at rest, where the file gives them.
+        Anatomical directions (3,) at rest: those of the file, or found from the bones before a run or a picture.
     """
 
     name: str = "scene"
@@ -223,6 +223,11 @@ class SceneData:
         """Return a length given in millimetres in the scene's unit."""
         return millimetres / MM_PER_UNIT[self.units]
 
+    @property
+    def body(self) -> Floats:
+        """Left, posterior and superior (3, 3); x, y and z where the directions are not known."""
+        return body_axes(self.superior, self.anterior)
+
     def bone(self, name: str) -> Bone:
         """Return the bone of that name, or raise SceneError naming the nearest."""
         return find_named(self.bones, name, "bone")
@@ -247,6 +252,16 @@ class SceneData:
         muscles = ", ".join(f"{muscle.name} ({muscle.model})" for muscle in self.muscles) or "no muscles"
         counts = f"{len(self.bones)} bones, {muscles}, {len(self.motion)} frames"
         return f"<Scene {self.name!r}, {self.units}: {counts}>"
+
+
+def body_axes(superior: Sequence[float] | None, anterior: Sequence[float] | None) -> Floats:
+    """Left, posterior and superior (3, 3) of a body with these directions; x, y and z where one is None."""
+    if superior is None or anterior is None:
+        return np.eye(3)
+    up = np.asarray(superior, dtype=float) / np.linalg.norm(superior)
+    left = np.cross(up, anterior)
+    left /= np.linalg.norm(left)
+    return np.stack([left, np.cross(up, left), up])
 
 
 def find_named(items: list[Any], name: str, what: str, *, place: str = "") -> Any:

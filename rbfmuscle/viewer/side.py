@@ -9,7 +9,7 @@ import numpy as np
 
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.metrics.penetration import BoneProbe
-from rbfmuscle.output.colours import BONE_COLOUR, TENDON_COLOUR, linear_rgb
+from rbfmuscle.output.appearance import BONE_COLOUR, TENDON_COLOUR, linear_rgb
 from rbfmuscle.output.tubes import tendon_name
 from rbfmuscle.viewer.colours import COLOURINGS, shades, vertex_values
 from rbfmuscle.viewer.sources import LiveSource, Mesh, Picture, SavedSource

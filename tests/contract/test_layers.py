@@ -36,9 +36,9 @@ ALLOWED = {
     "rbfmuscle.output": (*CORE, "rbfmuscle.metrics", "rbfmuscle.output"),
     "rbfmuscle.experiments": MEASURED,
     "rbfmuscle.report": ABOVE,
-    "rbfmuscle.viewer": (*ABOVE, "rbfmuscle.models", "rbfmuscle.viewer"),
+    "rbfmuscle.viewer": (*ABOVE, "rbfmuscle.importers", "rbfmuscle.models", "rbfmuscle.viewer"),
     "rbfmuscle.sharing": (*ABOVE, "rbfmuscle.models", "rbfmuscle.sharing"),
-    "rbfmuscle.recording": (*ABOVE, "rbfmuscle.sharing"),
+    "rbfmuscle.recording": (*ABOVE, "rbfmuscle.importers", "rbfmuscle.sharing"),
     "rbfmuscle.run": (*ABOVE, "rbfmuscle.models", "rbfmuscle.recording"),
     "rbfmuscle.compare": (*ABOVE, "rbfmuscle.models", "rbfmuscle.run"),
     "rbfmuscle.cli": (

@@ -85,10 +85,10 @@ class TestUsd:
     def test_topology_once_bones_rigid_units_and_axis_told(self, folder, tmp_path):
         from pxr import UsdGeom
 
-        (path,) = export_run(folder, "usd", output=tmp_path, units="cm", up="y")
+        (path,) = export_run(folder, "usd", output=tmp_path, units="cm")
         stage, meshes = self.read(path)
         assert UsdGeom.GetStageMetersPerUnit(stage) == pytest.approx(0.01)
-        assert UsdGeom.GetStageUpAxis(stage) == "Y"
+        assert UsdGeom.GetStageUpAxis(stage) == "Z"
         assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0.0, 2.0)
         muscle, bone = UsdGeom.Mesh(meshes["biceps"]), UsdGeom.Mesh(meshes["fore"])
         assert muscle.GetFaceVertexIndicesAttr().GetNumTimeSamples() == 0
@@ -112,8 +112,8 @@ class TestUsd:
         from rbfmuscle.output.animation.usd import identifier
 
         used = set()
-        assert [identifier(name, used) for name in ("a-b", "a_b", "1x", "materials")] == [
-            "a_b", "a_b_2", "_x", "materials_2",
+        assert [identifier(name, used) for name in ("a-b", "a_b", "1x")] == [
+            "a_b", "a_b_2", "_x",
         ]  # fmt: skip
 
 
@@ -211,6 +211,26 @@ class TestAnimatedGlb:
             UsageError, match=r"'biceps' do not; run with surface = 'material', or export to usd"
         ):
             export_run(changing[0], "animated-glb", output=tmp_path)
+
+
+def test_files_with_y_up_or_z_up_stand_upright_whatever_the_data(folder, truth, tmp_path):
+    """x up and -z in front in the data: +y and +z in glTF, +z and -y in USD."""
+    import shutil
+
+    copy = shutil.copytree(folder, tmp_path / "run")
+    info = json.loads((copy / "run.json").read_text(encoding="utf-8"))
+    info["scene"] |= {"superior": [1.0, 0, 0], "anterior": [0, 0, -1.0]}
+    (copy / "run.json").write_text(json.dumps(info))
+    (path,) = export_run(copy, "animated-glb", output=tmp_path)
+    tree, numbers = read_glb(path)
+    x, y, z = truth["biceps", 1].T
+    upright = np.column_stack([y, x, -z])
+    np.testing.assert_allclose(morphed(tree, numbers, "biceps", 1)[0], upright, rtol=0, atol=TOLERANCE)
+    pytest.importorskip("pxr.UsdGeom")
+    (path,) = export_run(copy, "usd", output=tmp_path)
+    stage, meshes = TestUsd().read(path)
+    found = TestUsd().world(stage, meshes["biceps"], 1)
+    np.testing.assert_allclose(found, np.column_stack([y, z, x]), rtol=0, atol=TOLERANCE)
 
 
 def test_a_page_of_a_run_says_frame_and_coordinates(folder, tmp_path):

@@ -10,9 +10,9 @@ from blend_model import arm_scene, use_blend_model
 from PIL import Image
 
 from rbfmuscle.metrics.summary import describe_verdict, within
+from rbfmuscle.output.appearance import muscle_groups
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report import render
-from rbfmuscle.report.appearance import muscle_groups
 from rbfmuscle.report.page import Cell, limit_state, number, table
 from rbfmuscle.report.report import _events, write_report
 from rbfmuscle.run import simulate
@@ -125,7 +125,7 @@ def test_preview_shows_bone_and_muscle_move(folder):
 
 @pytest.mark.parametrize("name", ["a.png", "a.gif", "a.webp"])
 def test_render_writes_what_the_suffix_says(folder, tmp_path, name):
-    render.render_run(folder, tmp_path / name, views=["side"], area=40_000)
+    render.render_run(folder, tmp_path / name, views=["right"], area=40_000)
     with Image.open(tmp_path / name) as image:
         assert getattr(image, "n_frames", 1) == (1 if name == "a.png" else 7)
 
@@ -133,7 +133,7 @@ def test_render_writes_what_the_suffix_says(folder, tmp_path, name):
 def test_render_refuses_wrong_words(folder, tmp_path):
     for wrong in (
         {"output": "a.bmp"},
-        {"output": "a.png", "views": ["top"]},
+        {"output": "a.png", "views": ["side"]},
         {"output": "a.png", "frame": 99},
         {"output": "a.png", "colour": "activation"},
     ):
