@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
+from command_line import call
 from conftest import ROOT
 from scipy.spatial.transform import Rotation
 
@@ -378,6 +379,24 @@ def test_what_cannot_be_used_is_left_out_with_its_reason_and_the_rest_loads(tmp_
     scene = write_scene(guess, tmp_path / "scene.toml")
     text = (tmp_path / "scene.toml").read_text(encoding="utf-8")
     assert "# NOT USED: gracilis.ply: " in text and len(scene.muscles) == 4
+
+
+def test_a_bone_that_cannot_be_used_is_in_the_verdict_wherever_it_is_said(tmp_path, capsys):
+    _phantom_meshes(tmp_path)
+    (tmp_path / "sacrum.stl").write_bytes(b"nothing")
+    scene, out = tmp_path / "scene.toml", tmp_path / "out"
+    assert call(capsys, "new", tmp_path, "--units", "mm")[0] == 0
+    assert "sacrum: no mesh of this bone could be used" in call(capsys, "check", scene)[1]
+    run = ("run", scene, "-o", out, "--model", "pbd", "--frames", "0:1", "--set", "output.surfaces=false")
+    code, printed, _ = call(capsys, *run)
+    verdict = json.loads((out / "run.json").read_text(encoding="utf-8"))["verdict"]
+    assert code == 0 and f"verdict: {verdict}" in printed
+    assert "the bones, bones left out (sacrum) 1 at frame 0 (limit 0)" in verdict
+    report = (out / "report.html").read_text(encoding="utf-8")
+    answer, _, detail = verdict.partition(". ")
+    assert 'class="answer bad"' in report and answer[1:] in report and detail in report
+    code, _, err = call(capsys, *run, "--fail-on", "bones_left_out")
+    assert code == 6 and "bones_left_out = 1 > 0" in err
 
 
 def test_a_bone_with_two_bad_edges_is_used(tmp_path):

@@ -88,12 +88,14 @@ class Part:
 class Parts:
     """What is in a folder.
 
-    ``unusable`` gives reasons by file; ``notes`` name what was left out, misspelt or made coarser.
+    ``unusable`` gives reasons by file, ``left_out`` names those that are no muscles;
+    ``notes`` name what was left out, misspelt or made coarser.
     """
 
     bones: list[Part] = field(default_factory=list)
     muscles: list[Part] = field(default_factory=list)
     unusable: dict[str, str] = field(default_factory=dict)
+    left_out: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
@@ -111,6 +113,7 @@ def read_parts(folder: Path, base: Path) -> Parts:
             part = _read_part(path, base, names, facts, found.notes, closed=tissue == "muscle")
         except MeshError as error:
             found.unusable[path.name] = str(error).removeprefix(f"{path}: ")
+            found.left_out += [path.stem] if tissue != "muscle" else []
             continue
         if facts.spelling:
             found.notes.append(f"{path.name}: {facts.spelling}")
