@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.output.animation.moving import MovingBone, MovingMuscle, MovingRun, read_moving
-from rbfmuscle.output.meshfiles import SUFFIXES, write_mesh
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.output.vtp import Collection
+from rbfmuscle.output.vtp import Collection, write_vtp
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import SolveError, UsageError
 
@@ -127,7 +127,9 @@ def _export_meshes(run: MovingRun, folder: Path, name: str, frames: list[int]) -
     for group, parts in groups.items():
         collection = Collection(folder / f"{group}.pvd") if name == "pvd" else None
         for k, frame in enumerate(frames):
-            files = [(part.name, f"{part.name}_{frame:04d}{SUFFIXES[name]}") for part in parts]
+            files = [
+                (part.name, f"{part.name}_{frame:04d}.{'vtp' if name == 'pvd' else name}") for part in parts
+            ]
             for part, (_, file) in zip(parts, files):
                 write_mesh(folder / file, *part.mesh(k))
                 written.append(folder / file)
@@ -137,3 +139,19 @@ def _export_meshes(run: MovingRun, folder: Path, name: str, frames: list[int]) -
             collection.close()
             written.append(folder / f"{group}.pvd")
     return written
+
+
+def write_mesh(path: Path, vertices: Floats, faces: Integers) -> None:
+    """Write a triangle mesh as ``.vtp``, ``.ply``, ``.stl`` or ``.obj``, by suffix; PLY and STL in single precision."""
+    if path.suffix == ".vtp":
+        write_vtp(path, vertices, faces)
+        return
+    import trimesh
+
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    if path.suffix == ".obj":
+        path.write_text(
+            trimesh.exchange.obj.export_obj(mesh, include_normals=False, digits=12), encoding="ascii"
+        )
+    else:
+        path.write_bytes(mesh.export(file_type=path.suffix[1:]))

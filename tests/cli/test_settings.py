@@ -35,11 +35,10 @@ TABLES = {
         options.TunnellingOptions,
         {"angle": 120.0, "action": "report", "swept": False},
     ),
-    "output.surfaces": (options.SurfaceOptions, {"format": "stl"}),
     "output": (
         options.OutputOptions,
         {
-            "surfaces": {"format": "ply"}, "tendons": False, "report": False,
+            "surfaces": False, "tendons": False, "report": False,
         },
     ),
 }  # fmt: skip

@@ -15,6 +15,7 @@ from conftest import ROOT
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.cli.app import run_command
+from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.importers.guess.anatomy import JointGuess
 from rbfmuscle.importers.guess.attachments import AttachmentGuess, Ends, MuscleGuess, _best_of
 from rbfmuscle.importers.guess.guess import SceneGuess, guess_scene, write_scene
@@ -22,7 +23,7 @@ from rbfmuscle.importers.guess.joints import Face, fit_ball, fit_hinge, guess_jo
 from rbfmuscle.importers.guess.landmarks import CONDYLE, fit_condyles
 from rbfmuscle.importers.guess.names import name_facts
 from rbfmuscle.importers.guess.orientation import HEADER, find_orientation
-from rbfmuscle.importers.guess.parts import Part, clustered
+from rbfmuscle.importers.guess.parts import Part
 from rbfmuscle.importers.guess.tendons import guess_tendons
 from rbfmuscle.importers.guess.text import scene_text
 from rbfmuscle.output.saved import SavedRun

@@ -11,8 +11,8 @@ import trimesh
 from blend_model import arm_scene, use_blend_model
 
 from rbfmuscle.output.export import export_run
-from rbfmuscle.output.meshfiles import write_mesh
 from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.output.vtp import write_vtp
 from rbfmuscle.run import simulate
 from rbfmuscle.validation import MissingPartError, UsageError
 
@@ -49,7 +49,7 @@ def changing(folder, tmp_path):
 
     copy = shutil.copytree(folder, tmp_path / "changing")
     ball = trimesh.creation.icosphere(subdivisions=2, radius=9.0)
-    write_mesh(copy / "surfaces" / "biceps_0002.vtp", ball.vertices, ball.faces)
+    write_vtp(copy / "surfaces" / "biceps_0002.vtp", ball.vertices, ball.faces)
     return copy, np.array(ball.vertices), np.array(ball.faces)
 
 

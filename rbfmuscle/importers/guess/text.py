@@ -13,9 +13,6 @@ initial = "resolve"   # muscles that start inside a bone are pushed out; or "kee
 
 [detect]
 tunnelling = { angle = 135, action = "substep" }   # points that pass through a bone in one step
-
-[output]
-surfaces = { format = "pvd" }   # or vtp, ply, stl, obj, glb
 """
 
 
