@@ -169,7 +169,7 @@ def _finish(recording, writer, limits, pictures):
         if recording.scene.output.report:
             from rbfmuscle.report.report import write_report
 
-            write_report(writer.directory, preview=pictures, pictures=pictures)
+            write_report(writer.directory, pictures=pictures)
     info = recording.info()
     writer.write_info(info)
     require_limits(recording.summary.table(), limits)

@@ -157,17 +157,8 @@ def sentence(text: str) -> str:
     return text[:1].upper() + text[1:] + ("" if text.endswith(".") else ".")
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[Cell | str]], *, find: bool = False) -> str:
-    """Markup of a table that a click on a heading sorts.
-
-    Parameters
-    ----------
-    head : sequence of str
-    rows : iterable of sequences of Cell or str
-        The first cell of a row names it.
-    find : bool
-        With a field that shows the rows whose names hold what is typed.
-    """
+def table(head: Sequence[str], rows: Iterable[Sequence[Cell | str]]) -> str:
+    """Markup of a table that a click on a heading sorts; the first cell of a row names it."""
     from markupsafe import escape
 
     lines = []
@@ -181,9 +172,8 @@ def table(head: Sequence[str], rows: Iterable[Sequence[Cell | str]], *, find: bo
             cells.append(f"<{kind}{data}{style}>{escape(cell.text)}</{kind}>")
         lines.append(f"<tr>{''.join(cells)}</tr>")
     headings = "".join(f"<th>{escape(text)}</th>" for text in head)
-    field = '<input class="find" placeholder="find names, as: gluteus, vastus">' if find else ""
     return (
-        f'{field}<div class="wide"><table class="sortable"><thead><tr>{headings}</tr></thead>'
+        f'<div class="wide"><table class="sortable"><thead><tr>{headings}</tr></thead>'
         f"<tbody>{''.join(lines)}</tbody></table></div>"
     )
 

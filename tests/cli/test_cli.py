@@ -11,8 +11,6 @@ import trimesh
 from command_line import call
 
 from rbfmuscle.cli.app import GROUPS
-from rbfmuscle.cli.run import SHOWN
-from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.scene.phantom import phantom_scene
 
 
@@ -71,12 +69,9 @@ class TestRun:
         names = {path.name for path in (tmp_path / "out").iterdir()}
         assert {"run.json", "metrics.csv", "events.csv", "poses.csv", "surfaces.pvd", "bones.pvd"} <= names
         assert len(list((tmp_path / "out" / "surfaces").iterdir())) == 5
-        title, head, row, verdict, end = out.splitlines()
-        facts = json.loads((tmp_path / "out" / "run.json").read_text(encoding="utf-8"))["muscles"]["adductor"]
-        worst = [shown_number(abs(facts[key]["worst"])) for key in SHOWN]
-        assert title.endswith("lengths in mm") and head.split() == list(SHOWN)
-        assert re.split(r"\s{2,}", row) == ["adductor", *worst]
-        assert verdict.startswith("verdict: ") and re.match(r"5 frames in [\d.]+ s, in ", end)
+        verdict, end = out.splitlines()
+        said = json.loads((tmp_path / "out" / "run.json").read_text(encoding="utf-8"))["verdict"]
+        assert verdict == f"verdict: {said}" and re.match(r"5 frames in [\d.]+ s, in ", end)
 
     def test_spike_in_a_mesh_is_in_the_verdict(self, phantom_folder, tmp_path, capsys):
         """A vertex 60 mm off the muscle, which no field follows; without it all is well."""
@@ -124,7 +119,7 @@ class TestRun:
             (("compare",), "rbfmuscle.compare._measure"),
             (("kernels",), "rbfmuscle.experiments.kernel_study.study_kernels"),
             (("kernels", "--error", "1"), "rbfmuscle.experiments.wanted_error.reach_error"),
-            (("paths",), "rbfmuscle.cli.sampling.sample_muscles"),
+            (("paths",), "rbfmuscle.paths.sample_muscles"),
         ],
     )
     def test_output_that_cannot_be_written_is_told_before_any_work(

@@ -61,7 +61,7 @@ def read(folder, name="report.html"):
 
 
 def test_answer_picture_and_rows_come_before_what_is_folded(folder):
-    write_report(folder, preview=False)
+    write_report(folder)
     text, outline = read(folder)
     verdict = describe_verdict(SavedRun(folder).info["muscles"], SavedRun(folder).info["limits"])
     order = [
@@ -74,12 +74,13 @@ def test_answer_picture_and_rows_come_before_what_is_folded(folder):
     ]
     places = [text.index(part) for part in order]
     assert places == sorted(places)
-    assert len(outline.lights) == 5 and outline.sources == [] and "http" not in text
+    assert len(outline.lights) == 5 and "http" not in text
+    assert all(source.startswith("data:") for source in outline.sources)
     assert len(text) < 6_000_000
 
 
 def test_lights_and_red_cells_are_those_beyond_their_limits(folder):
-    write_report(folder, preview=False, pictures=False)
+    write_report(folder, pictures=False)
     text, outline = read(folder)
     info = SavedRun(folder).info
     found, limits = info["muscles"]["biceps"], info["limits"]
@@ -94,7 +95,7 @@ def test_lights_and_red_cells_are_those_beyond_their_limits(folder):
 
 
 def test_scene_holds_every_frame_and_colour_of_the_plots(folder):
-    write_report(folder, preview=False)
+    write_report(folder)
     text, _ = read(folder)
     facts = json.loads(re.search(r'<script id="scene"[^>]*>(.*?)</script>', text, re.S)[1])
     assert len(facts["captions"]) == 7 and facts["captions"][6] == "frame 6, elbow.flexion 60°"
@@ -110,7 +111,7 @@ def colours_of(image):
 
 
 def test_preview_shows_bone_and_muscle_move(folder):
-    write_report(folder, report=False)
+    write_report(folder)
     with Image.open(folder / "preview.webp") as preview:
         assert preview.n_frames == 7
         first = colours_of(preview)
@@ -172,11 +173,11 @@ def test_muscles_are_grouped_by_the_joints_that_they_cross():
     }
 
 
-def test_events_are_listed_by_kind_and_names_stay_text():
+def test_events_are_counted_by_kind_and_names_stay_text():
     events = [(k, "<b>one", "bone", 1, "halved") for k in range(70)] + [(3, "", "bone", 1, "bones_overlap")]
     text = _events(events)
-    assert text.index("halved") < text.index("bones_overlap") and "and 10 more" in text
-    assert text.count("<tr>") == 60 + 1 + 2 and "<b>" not in text and "&lt;b&gt;one 70" in text
+    assert text.index("halved") < text.index("bones_overlap") and text.count("<tr>") == 1 + 2
+    assert "<b>" not in text and "&lt;b&gt;one 70" in text and "bone 1" in text
 
 
 @pytest.mark.parametrize(
@@ -204,5 +205,5 @@ def test_lights_are_green_amber_from_four_fifths_and_red_beyond():
 
 
 def test_tables_sort_by_value_and_names_stay_text():
-    text = table(["a", "b"], [["<i>x", Cell("1.2 mm", 1.2, "bad")], ["y", "n/a"]], find=True)
-    assert "&lt;i&gt;x" in text and 'data-value="1.2" class="bad">1.2 mm<' in text and "<input" in text
+    text = table(["a", "b"], [["<i>x", Cell("1.2 mm", 1.2, "bad")], ["y", "n/a"]])
+    assert "&lt;i&gt;x" in text and 'data-value="1.2" class="bad">1.2 mm<' in text
