@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rbfmuscle.implicit.field import RBFField as RBFField
     from rbfmuscle.importers.guess.orientation import orient_scene as orient_scene
     from rbfmuscle.muscle.muscle import RBFMuscle as RBFMuscle
-    from rbfmuscle.report.figure import figure_html as figure_html
+    from rbfmuscle.report.render import figure_html as figure_html
     from rbfmuscle.run import Run as Run
     from rbfmuscle.run import simulate as simulate
     from rbfmuscle.scene.phantom import phantom_scene as phantom_scene
@@ -55,7 +55,7 @@ _HOME = {
 }
 # For modules that may not import it themselves.
 _INNER = {
-    "figure_html": "rbfmuscle.report.figure",
+    "figure_html": "rbfmuscle.report.render",
     "orient_scene": "rbfmuscle.importers.guess.orientation",
     "Page": "rbfmuscle.viewer.page",
 }

@@ -389,7 +389,7 @@ class Run:
         return f"<Run of {self.info['scene']['name']!r}: {len(self)} frames, {', '.join(self.muscles)}>"
 
     def _repr_html_(self) -> str:
-        from rbfmuscle.report.figure import figure_html
+        from rbfmuscle.report.render import figure_html
 
         body = self.saved.body if self.scene is None else self.scene.body
 

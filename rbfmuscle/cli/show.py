@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
 
@@ -51,7 +51,6 @@ def render(
     frame: int | None = None,
     view: Annotated[list[str] | None, Parameter(negative="")] = None,
     seconds: float = 5.0,
-    colour: Literal["muscle", "activation"] = "muscle",
 ) -> None:
     """Draw a run: a picture (.png) or an animation (.gif, .webp).
 
@@ -67,12 +66,10 @@ def render(
         front, back, left, right, top or bottom; may be repeated; front, right and back by default.
     seconds
         Length of an animation.
-    colour
-        What muscles are coloured by: themselves, or their activation.
     """
     with Progress(f"render {directory}"):
         from rbfmuscle.report.render import render_run
 
         with stage("drawing pictures"):
-            render_run(directory, output, frame=frame, views=view, seconds=seconds, colour=colour)
+            render_run(directory, output, frame=frame, views=view, seconds=seconds)
     print(output)

@@ -47,29 +47,9 @@ class Section(NamedTuple):
 class Page:
     """What a page says, in its order.
 
-    Attributes
-    ----------
-    title : str
-    facts : list of str
-        Few words each, beside the title.
-    answer : str
-        One sentence.
-    detail : str
-        What stands below it.
-    state : {"good", "near", "bad", "plain"}
-    scene : str
-        From `pack_runs`; moves.
-    picture : str
-        Markup; in place of the scene where a browser cannot show it.
-    missing : str
-        Why there is no picture.
-    lights : list of Light
-    heads : sequence of str
-        Of the lights' cells.
-    sections : list of Section
-    footer : str
-    layout : {"beside", "below"}
-        Where the lights stand.
+    The ``answer`` is one sentence, ``detail`` stands below it. ``scene``, from `pack_runs`, moves; ``picture`` is
+    markup, in place of the scene where a browser cannot show it; ``missing`` says why there is neither. ``heads`` are
+    those of the lights' columns; the lights stand beside or below the picture.
     """
 
     title: str

@@ -18,8 +18,7 @@ from rbfmuscle.output.appearance import (
     view_axes,
 )
 from rbfmuscle.output.tubes import tendon_mesh
-from rbfmuscle.report.labels import labelled
-from rbfmuscle.report.raster import Camera, Solid, aim, draw_solids
+from rbfmuscle.report.raster import Camera, Solid, aim, draw_solids, labelled
 from rbfmuscle.scene.tendons import AT_REST
 
 if TYPE_CHECKING:

@@ -136,7 +136,6 @@ def test_render_refuses_wrong_words(folder, tmp_path):
         {"output": "a.bmp"},
         {"output": "a.png", "views": ["side"]},
         {"output": "a.png", "frame": 99},
-        {"output": "a.png", "colour": "activation"},
     ):
         words = dict(wrong)
         with pytest.raises(UsageError):
