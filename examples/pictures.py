@@ -20,7 +20,7 @@ def folder(name):
     return path
 
 
-def draw(run, file, *, frame=None, views=("side", "back")):
+def draw(run, file, *, frame=None, views=("right", "back")):
     """Picture of a frame of a run, or of the folder of one."""
     file = Path(file)
     if not isinstance(run, Path) and id(run) not in _SAVED:

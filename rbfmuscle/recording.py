@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 import numba
 
 from rbfmuscle.geometry.fields import BoneField
+from rbfmuscle.importers.guess.orientation import orient_scene
 from rbfmuscle.metrics.joint_gaps import joint_gaps
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.rows import frame_rows, moment_arm_rows
@@ -52,7 +53,7 @@ class Recording:
         fields: Mapping[str, BoneField] | None = None,
     ) -> None:
         self.started, self._start = datetime.now(UTC), time.perf_counter()
-        self.scene = scene.validate()
+        self.scene = orient_scene(scene.validate())
         self.options = options or {}
         self.times: dict[str, float] = {}
         self.status, self.message = "running", ""
@@ -168,7 +169,7 @@ class Recording:
             options=self.options,
             times=self._spent(),
             limits=limits,
-            verdict=describe_verdict(table, limits),
+            verdict=describe_verdict(table, limits, self.scene.left_out),
             beyond=exceeded(table, limits),
             frames=self.written,
         )
@@ -189,6 +190,10 @@ def _check_skeleton(scene: Scene) -> dict[int, Found]:
         events, values = found.setdefault(frame, ([], {}))
         events.append(Event(frame, "", f"{first} and {second}", 1, "bones_overlap"))
         values["bone_overlap"] = max(values.get("bone_overlap", 0.0), depth)
+    if scene.left_out:
+        events, values = found.setdefault(0, ([], {}))
+        events.extend(Event(0, "", name, 1, "bone_left_out") for name in scene.left_out)
+        values["bones_left_out"] = float(len(scene.left_out))
     opened = scene.length(LIMITS["joint_gap"].value)
     for frame, parent, child, opening in joint_gaps(scene, sampled_frames(scene)):
         events, values = found.setdefault(frame, ([], {}))

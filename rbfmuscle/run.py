@@ -169,7 +169,7 @@ def _finish(recording, writer, limits, pictures):
         if recording.scene.output.report:
             from rbfmuscle.report.report import write_report
 
-            write_report(writer.directory, preview=pictures, pictures=pictures)
+            write_report(writer.directory, pictures=pictures)
     info = recording.info()
     writer.write_info(info)
     require_limits(recording.summary.table(), limits)
@@ -347,7 +347,7 @@ class Run:
             _finish(self._recording, self._write(directory), {}, pictures)
 
     def export(
-        self, directory: str | Path, formats: str | Sequence[str], *, units: str | None = None, up: str = "z"
+        self, directory: str | Path, formats: str | Sequence[str], *, units: str | None = None
     ) -> list[Path]:
         """Write the surfaces in other formats and return the files.
 
@@ -359,11 +359,9 @@ class Run:
             ``pvd``, ``vtp``, ``ply``, ``stl``, ``obj``, ``glb``, ``usd``, ``animated-glb`` or ``html``.
         units : {"m", "cm", "mm"}, optional
             The scene's where not given; glTF and html are in metres.
-        up : {"z", "y"}
-            The scene's axis that points up, for usd, glb, animated-glb and html.
         """
         names = [formats] if isinstance(formats, str) else list(formats)
-        return export_run(self.saved.directory, names, output=directory, units=units, up=up)
+        return export_run(self.saved.directory, names, output=directory, units=units)
 
     def show(self) -> rbfmuscle.Page:
         """Show the frames in a browser or a notebook; see `rbfmuscle.show`."""
@@ -391,13 +389,15 @@ class Run:
         return f"<Run of {self.info['scene']['name']!r}: {len(self)} frames, {', '.join(self.muscles)}>"
 
     def _repr_html_(self) -> str:
-        from rbfmuscle.report.figure import figure_html
+        from rbfmuscle.report.render import figure_html
+
+        body = self.saved.body if self.scene is None else self.scene.body
 
         if not self.frames:
-            return figure_html({}, {}, repr(self))
+            return figure_html({}, {}, repr(self), np.eye(3))
         surfaces = self.frames[-1].surfaces
         muscles = {name: (surfaces[name].vertices, surfaces[name].faces) for name in surfaces}
-        return figure_html(dict(self._bones()), muscles, f"{self!r} {self.verdict}")
+        return figure_html(dict(self._bones()), muscles, f"{self!r} {self.verdict}", body)
 
 
 class MuscleRun:

@@ -17,25 +17,20 @@ def check(scene: SceneName, *, picture: Flag = False, fields: Flag = False, as_j
     Parameters
     ----------
     picture
-        Draw patches, joint axes, far ends and overlaps to a PNG beside the scene file.
+        Draw held patches, tendons and joint axes to a PNG beside the scene file.
     fields
         Measure the bones' distance fields against exact distances.
     """
     with Progress(f"check {scene.name}"):
         loaded, findings = _findings(scene)
         errors_of = _measure_fields(loaded) if fields else {}
-    drawn = _draw(loaded, scene.with_suffix(".png")) if picture else None
+    drawn = _draw(loaded, scene.with_suffix(".png")) if picture else {}
     if as_json:
-        more = {"picture": drawn, "fields": errors_of}
         facts = {"scene": loaded.resolved(), "findings": [vars(finding) for finding in findings]}
-        print(json.dumps({**facts, **{key: value for key, value in more.items() if value}}, indent=1))
+        print(json.dumps(facts | drawn | ({"fields": errors_of} if errors_of else {}), indent=1))
     else:
         of_fields = [_describe_field(name, found, loaded.units) for name, found in errors_of.items()]
-        print("\n".join([*_scene_lines(loaded), *of_fields, *map(str, findings)]))
-        if drawn is not None:
-            print(
-                f"{drawn['file']}: {drawn['far_ends']} ends far from their bone, {drawn['overlaps']} overlaps"
-            )
+        print("\n".join([*_scene_lines(loaded), *of_fields, *map(str, findings), *drawn.values()]))
     usable = not any(finding.level == "error" for finding in findings)
     if not as_json:
         print("usable" if usable else "not usable", file=sys.stderr)
@@ -43,11 +38,11 @@ def check(scene: SceneName, *, picture: Flag = False, fields: Flag = False, as_j
 
 
 def _draw(scene, file):
-    """Draw a scene; return the file and what is marked."""
     from rbfmuscle.report.scene_picture import draw_scene
 
     with Progress(f"picture of {scene.name}"):
-        return {"file": str(file), **draw_scene(scene, file)}
+        draw_scene(scene, file)
+    return {"picture": str(file)}
 
 
 def _findings(path):
@@ -112,9 +107,9 @@ def _describe_field(name, found, units):
 
 def _scene_lines(scene):
     yield f"{scene.name}: {len(scene.motion)} frames, lengths in {scene.units}"
-    if scene.superior is not None:
-        up, front = (", ".join(f"{x:.3g}" for x in v) for v in (scene.superior, scene.anterior))
-        yield f"  superior is ({up}), anterior ({front})"
+    up, front = (", ".join(f"{x:.3g}" for x in v + 0.0) for v in (scene.body[2], -scene.body[1]))
+    unknown = " (taken for want of a femur that shows it; set superior and anterior in [scene])"
+    yield f"  superior is ({up}), anterior ({front}){unknown if scene.superior is None else ''}"
     for bone in scene.bones:
         yield f"  bone {bone.name}: {len(bone.mesh.vertices)} vertices, {len(bone.mesh.faces)} triangles"
     for joint in scene.joints:

@@ -8,22 +8,6 @@ from rbfmuscle.cli.options import Frames, Json, Output, SceneName, Settings
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import SolveError
 
-# What the table on the terminal holds.
-SHOWN = (
-    "volume_error",
-    "penetration_max",
-    "bone_penetration_max",
-    "euler",
-    "self_crossings",
-    "flicker",
-    "rest_error_rms",
-    "step_rms",
-    "return_rms",
-    "strain_rms",
-    "distance_rms",
-    "time_frame",
-)
-
 
 def compare(
     scene: SceneName,
@@ -79,15 +63,11 @@ def compare(
 
 
 def _print_table(table, output):
-    from rbfmuscle.metrics.summary import shown_number
+    from rbfmuscle.report.comparison_page import LIGHTS, shown
 
-    width = max(len(name) for name in (*table["models"], *SHOWN)) + 2
-    print(" " * width + "".join(f"{name:>18}" for name in table["models"]))
-    for quantity in SHOWN:
-        cells = [table["results"][name]["all"].get(quantity) for name in table["models"]]
-        if any(value is not None for value in cells):
-            texts = ("-" if value is None else shown_number(value) for value in cells)
-            unit = table["measures"][quantity]["unit"]
-            print(f"{quantity:{width}}" + "".join(f"{text:>18}" for text in texts) + f"  {unit}")
+    print(" " * 24 + "".join(f"{name:>18}" for name in table["models"]))
+    for quantity in LIGHTS:
+        values = [table["results"][name]["all"].get(quantity) for name in table["models"]]
+        print(f"{quantity:24}" + "".join(f"{shown(table, quantity, value):>18}" for value in values))
     print(table["answer"])
     print(f"{table['frames']} frames, in {output}, open {output / 'report.html'}")

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
 from rbfmuscle.cli.options import Json, Output, Texts
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import UsageError
-
-if TYPE_CHECKING:
-    from rbfmuscle.experiments.kernel_study import KernelStudy
 
 
 def kernels(
@@ -86,7 +83,7 @@ def _meshes(source, muscle, units):
 
 
 def _study(meshes, output, options, as_json):
-    from rbfmuscle.experiments.kernel_study import study_kernels
+    from rbfmuscle.experiments.kernel_study import describe, row_toml, study_kernels
     from rbfmuscle.output.writer import json_text
     from rbfmuscle.report.kernel_page import answer, write_studies
 
@@ -100,7 +97,9 @@ def _study(meshes, output, options, as_json):
         print(json_text({"rows": rows}))
         return
     for name, study in studies.items():
-        _print(study, name)
+        if study.recommended is not None:
+            print(f"{name}: {describe(study.rows)}")
+            print(f"to paste at the end of its [[muscle]]:\n\n{row_toml(study.recommended)}\n")
     print(f"{answer(studies)}\npage in {output / 'kernels.html'}")
 
 
@@ -128,22 +127,3 @@ def _find_wanted(meshes, output, error, options, units, as_json):
     for name, found in facts.items():
         if found["reached"]:
             print(f"\nto paste at the end of the [[muscle]] {json.dumps(name)}:\n\n{found['toml']}")
-
-
-def _print(study: KernelStudy, name: str) -> None:
-    from rbfmuscle.experiments.kernel_study import describe, row_toml
-    from rbfmuscle.metrics.summary import shown_number
-
-    print(f"{name + ' [' + (study.units or 'mesh units') + ']':26s} {'centres':>7s} {'eps h':>6s} {'RMS':>8s} "
-          f"{'Hausd.':>8s} {'vol %':>7s} {'cond.':>8s} {'fit ms':>7s}")  # fmt: skip
-    for row in study.rows:
-        shape = "" if row["shape"] is None else f"{row['shape']:.3g}"
-        start = f"{row['kernel']:26s} {row['centres']:7d} {shape:>6s} "
-        if row["unfit"]:
-            print(f"{start} unfit: {row['unfit'][:90]}")
-            continue
-        print(f"{start}{row['rms']:8.3g} {row['hausdorff']:8.3g} {shown_number(100 * row['volume_error']):>7s} "
-              f"{row['condition']:8.1e} {1e3 * row['fit_time']:7.3g}")  # fmt: skip
-    print(describe(study.rows))
-    if study.recommended is not None:
-        print(f"to paste at the end of the [[muscle]] {json.dumps(name)}:\n\n{row_toml(study.recommended)}\n")

@@ -31,9 +31,9 @@ def paths(
     ranges
         COORDINATE=LOW:HIGH in degrees or scene units; else the coordinate's range, or what the motion covers.
     """
-    from rbfmuscle.cli.sampling import parse_ranges, report_fits, sample_muscles
     from rbfmuscle.models import configure_scene
     from rbfmuscle.output.writer import check_writable
+    from rbfmuscle.paths import parse_ranges, report_fits, sample_muscles
     from rbfmuscle.progress import Progress
     from rbfmuscle.scene.phantom import open_scene
     from rbfmuscle.scene.settings import parse_settings

@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import time
 from pathlib import Path
+from typing import Any
 
 from rbfmuscle.cli.options import Frames, Json, Model, Output, SceneName, Settings
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import SolveError
-
-SHOWN = (
-    "volume_error",
-    "penetration_max",
-    "bone_penetration_max",
-    "solver_penetration_max",
-    "rest_error_rms",
-)
 
 
 def demo(
@@ -63,16 +55,8 @@ def run(
 
         try:
             changes = parse_settings(settings)
-            loaded = open_scene(scene)
-            info = stream_run(
-                loaded,
-                output,
-                model=model,
-                settings=changes,
-                frames=frames,
-                fail_on=fail_on,
-                progress=advance,
-            )
+            options: dict[str, Any] = {"model": model, "frames": frames, "fail_on": fail_on}
+            info = stream_run(open_scene(scene), output, settings=changes, progress=advance, **options)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"interrupted, {done} frames are kept in {output}") from None
         except SolveError as error:
@@ -82,20 +66,7 @@ def run(
 
         print(json_text({"directory": str(output), **info}))
         return
-    _print_summary(info["muscles"], loaded.units)
     print(f"verdict: {info['verdict']}")
     report = output / "report.html"
     there = f"in {output}, open {report}" if report.exists() else f"in {output}"
     print(f"{len(info['frames'])} frames in {time.perf_counter() - start:.1f} s, {there}")
-
-
-def _print_summary(muscles, units):
-    """The worst of each muscle over all frames; lengths in the scene's unit."""
-    from rbfmuscle.metrics.summary import shown_number
-
-    width = max(len(name) for name in muscles)
-    print(f"worst over the frames; lengths in {units}")
-    print(" ".join([" " * width, *(f"{key:>22}" for key in SHOWN)]))
-    for name, facts in muscles.items():
-        worst = [abs(facts.get(key, {}).get("worst", math.nan)) for key in SHOWN]
-        print(" ".join([f"{name:{width}}", *(f"{shown_number(value):>22}" for value in worst)]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
 
@@ -17,7 +17,6 @@ def export(
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     units: str | None = None,
     frames: str | None = None,
-    up: str = "z",
 ) -> None:
     """Write the surfaces of a run in other formats and units.
 
@@ -34,15 +33,13 @@ def export(
         m, cm or mm; the scene's by default (glb, animated-glb, html: m).
     frames
         Of the written frames, as A:B:S.
-    up
-        z or y: the scene's axis that points up, for usd, glb, animated-glb and html.
     """
     with Progress(f"export {directory}"):
         from rbfmuscle.output.export import export_run
         from rbfmuscle.scene.settings import parse_slice
 
         chosen = parse_slice(frames) if frames is not None else None
-        written = export_run(directory, formats, output=output, units=units, frames=chosen, up=up)
+        written = export_run(directory, formats, output=output, units=units, frames=chosen)
     folders = sorted({str(path.parent) for path in written})
     print(f"{len(written)} file{'s'[: len(written) != 1]} in {', '.join(folders)}")
 
@@ -54,7 +51,6 @@ def render(
     frame: int | None = None,
     view: Annotated[list[str] | None, Parameter(negative="")] = None,
     seconds: float = 5.0,
-    colour: Literal["muscle", "activation"] = "muscle",
 ) -> None:
     """Draw a run: a picture (.png) or an animation (.gif, .webp).
 
@@ -67,15 +63,13 @@ def render(
     frame
         Of a picture; the last one by default.
     view
-        front, side, back or far (the other side); may be repeated; the first three by default.
+        front, back, left, right, top or bottom; may be repeated; front, right and back by default.
     seconds
         Length of an animation.
-    colour
-        What muscles are coloured by: themselves, or their activation.
     """
     with Progress(f"render {directory}"):
         from rbfmuscle.report.render import render_run
 
         with stage("drawing pictures"):
-            render_run(directory, output, frame=frame, views=view, seconds=seconds, colour=colour)
+            render_run(directory, output, frame=frame, views=view, seconds=seconds)
     print(output)

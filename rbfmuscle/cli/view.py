@@ -34,7 +34,7 @@ def view(
     at
         COORDINATE=DEGREES to begin at, for instance hip.flexion=60; may be repeated. Of a saved run: frame=N.
     colour
-        What muscles are coloured by at first.
+        What muscles are coloured by at first, in the browser.
     browser
         Open the browser; without, the address is printed only.
     port
@@ -49,7 +49,7 @@ def view(
         opened = _open_runs(scene) if scene.is_dir() else open_scene(scene)
         if screenshot is not None:
             with stage("drawing the picture"):
-                _draw(opened, model, stops, screenshot, colour)
+                _draw(opened, model, stops, screenshot)
             print(screenshot)
             return
         from rbfmuscle.viewer.page import Page
@@ -89,22 +89,19 @@ def _open_runs(folder):
     return {path.name: SavedRun(path) for path in inside}
 
 
-def _draw(opened, model, stops, path, colour):
+def _draw(opened, model, stops, path):
     """Draw a run's frame, or a scene's pose after a run to it, in the way `rbfmuscle render` does."""
     from rbfmuscle.report.render import render_run
 
-    if colour not in ("group", "activation"):
-        raise UsageError("--screenshot colours muscles by group or activation")
-    colour = "muscle" if colour == "group" else colour
     path.parent.mkdir(parents=True, exist_ok=True)
     if isinstance(opened, dict):
         _check_stops(stops, ["frame"])
         saved = next(iter(opened.values()))
-        render_run(saved.directory, path, frame=int(stops.get("frame", saved.frames[0])), colour=colour)
+        render_run(saved.directory, path, frame=int(stops.get("frame", saved.frames[0])))
         return
     with tempfile.TemporaryDirectory() as folder:
         _run_to(opened, model, stops, folder)
-        render_run(folder, path, colour=colour)
+        render_run(folder, path)
 
 
 def _run_to(scene, model, stops, folder):

@@ -53,6 +53,7 @@ QUANTITIES = {
         "length",
         "how much wider than at rest a joint's bones are apart; muscle 'all', some frames",
     ),
+    "bones_left_out": ("1", "bones of which no mesh could be used; muscle 'all', first frame"),
     "time": ("s", "time of the frame in the motion file; muscle 'all'"),
     "time_solve": ("s", "prediction, solution and contacts"),
     "time_fit": ("s", "fit of the field"),

@@ -47,6 +47,7 @@ LIMITS = {
     "end_gap": Limit(25.0, "end away from its bone", "correct the attachment, or give it a tendon"),
     "bone_overlap": Limit(0.0, "bones in each other", _JOINT),
     "joint_gap": Limit(5.0, "joint that opens", _JOINT),
+    "bones_left_out": Limit(0.0, "bones left out", "mend their meshes and add them to the scene"),
 }
 # Quantities of which too little is wrong: their limit is the least allowed value.
 LEAST = {"euler"}
@@ -220,8 +221,11 @@ def excess(quantity: str, worst: float, limit: float) -> float:
     return abs(worst) / limit
 
 
-def describe_verdict(table: Table, limits: Mapping[str, float]) -> str:
-    """Which muscles are within all limits and which are not, the worst value of each, and what to do."""
+def describe_verdict(table: Table, limits: Mapping[str, float], left_out: Sequence[str] = ()) -> str:
+    """Which muscles are within all limits and which are not, the worst value of each, and what to do.
+
+    ``left_out`` are the names of the bones that were.
+    """
     muscles, found = [name for name in table if name != ALL], exceeded(table, limits)
     wrong = [name for name in dict.fromkeys(row[0] for row in found) if name != ALL]
     if not muscles:
@@ -235,6 +239,7 @@ def describe_verdict(table: Table, limits: Mapping[str, float]) -> str:
         text = f"{right} of {len(muscles)} muscles are within all limits, not {_listed(wrong)}"
     if not found:
         return text
+    text += "; the bones are not" if any(row[0] == ALL for row in found) and not wrong else ""
     # The worst of each muscle first, then whatever else is beyond a limit.
     first = sorted(
         {row[0]: row for row in reversed(found)}.values(), key=lambda row: excess(*row[1:4]), reverse=True
@@ -242,6 +247,7 @@ def describe_verdict(table: Table, limits: Mapping[str, float]) -> str:
     named = [*first, *(row for row in found if row not in first)][:MOST_NAMED]
     remedies = dict.fromkeys(LIMITS[quantity].remedy for _, quantity, *_ in named if quantity in LIMITS)
     values = "; ".join(_describe_excess(row, table) for row in named)
+    values = values.replace("bones left out", f"bones left out ({_listed(left_out)})") if left_out else values
     more = f" and {len(found) - len(named)} more" if len(found) > len(named) else ""
     to_do = f". What to do: {'; '.join(remedies)}" if remedies else ""
     return f"{text}. Worst: {values}{more}{to_do}"

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.output.animation.moving import MovingBone, MovingMuscle, MovingRun, read_moving
-from rbfmuscle.output.meshfiles import SUFFIXES, write_mesh
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.output.vtp import Collection
+from rbfmuscle.output.vtp import Collection, write_vtp
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import SolveError, UsageError
 
@@ -26,7 +26,6 @@ def export_run(
     output: str | Path | None = None,
     units: str | None = None,
     frames: slice | None = None,
-    up: str = "z",
 ) -> list[Path]:
     """Write the muscles and bones of a saved run in one or more formats.
 
@@ -43,8 +42,6 @@ def export_run(
         The scene's unit where not given; metres for ``glb``, ``animated-glb`` and ``html``, which know no other.
     frames : slice, optional
         Of the written frames; all where not given.
-    up : {"z", "y"}
-        The axis of the scene that points up, for ``usd``, ``glb``, ``animated-glb`` and ``html``.
 
     Returns
     -------
@@ -62,7 +59,7 @@ def export_run(
     """
     saved = SavedRun(directory)
     formats = [formats] if isinstance(formats, str) else list(formats)
-    _check_words(formats, units, up)
+    _check_words(formats, units)
     chosen = saved.frames[frames] if frames is not None else saved.frames
     if not chosen or not saved.has_surfaces():
         raise UsageError(f"{directory} has no surfaces to export")
@@ -74,17 +71,17 @@ def export_run(
             folder.mkdir(parents=True, exist_ok=True)
             unit = units or ("m" if name in IN_METRES else saved.units)
             if name in MESHES:
-                written += _export_meshes(read_moving(saved, chosen, unit=unit, up=up), folder, name, chosen)
+                written += _export_meshes(read_moving(saved, chosen, unit=unit), folder, name, chosen)
             elif name == "glb":
-                written += [_export_frame(saved, folder, frame, up) for frame in chosen]
+                written += [_export_frame(saved, folder, frame) for frame in chosen]
             else:
-                written.append(_export_animation(saved, folder, name, chosen, unit, up))
+                written.append(_export_animation(saved, folder, name, chosen, unit))
     except OSError as error:
         raise SolveError(f"cannot write to {base}: {error.strerror}") from None
     return written
 
 
-def _check_words(formats, units, up):
+def _check_words(formats, units):
     for name in formats:
         if name not in FORMATS:
             raise UsageError(f"unknown format {name!r}; known: {', '.join(FORMATS)}")
@@ -92,18 +89,14 @@ def _check_words(formats, units, up):
             raise UsageError(f"{name} is in metres by its standard; leave out --units {units}")
     if units is not None and units not in MM_PER_UNIT:
         raise UsageError(f"units must be m, cm or mm, got {units!r}")
-    if up not in ("z", "y"):
-        raise UsageError(f"up must be z or y, got {up!r}")
     if "usd" in formats:
         from rbfmuscle.output.animation.usd import check_usd
 
         check_usd()
 
 
-def _export_animation(
-    saved: SavedRun, folder: Path, name: str, frames: list[int], unit: str, up: str
-) -> Path:
-    run = read_moving(saved, frames, unit=unit, up=up)
+def _export_animation(saved: SavedRun, folder: Path, name: str, frames: list[int], unit: str) -> Path:
+    run = read_moving(saved, frames, unit=unit)
     path = folder / f"{run.name}{SUFFIX_OF[name]}"
     if name == "html":
         from rbfmuscle.output.animation.page import write_animated_page
@@ -120,11 +113,11 @@ def _export_animation(
     return path
 
 
-def _export_frame(saved: SavedRun, folder: Path, frame: int, up: str) -> Path:
+def _export_frame(saved: SavedRun, folder: Path, frame: int) -> Path:
     from rbfmuscle.output.animation.gltf import animated_glb
 
     path = folder / f"frame_{frame:04d}.glb"
-    path.write_bytes(animated_glb(read_moving(saved, [frame], unit="m", up=up)))
+    path.write_bytes(animated_glb(read_moving(saved, [frame], unit="m")))
     return path
 
 
@@ -134,7 +127,9 @@ def _export_meshes(run: MovingRun, folder: Path, name: str, frames: list[int]) -
     for group, parts in groups.items():
         collection = Collection(folder / f"{group}.pvd") if name == "pvd" else None
         for k, frame in enumerate(frames):
-            files = [(part.name, f"{part.name}_{frame:04d}{SUFFIXES[name]}") for part in parts]
+            files = [
+                (part.name, f"{part.name}_{frame:04d}.{'vtp' if name == 'pvd' else name}") for part in parts
+            ]
             for part, (_, file) in zip(parts, files):
                 write_mesh(folder / file, *part.mesh(k))
                 written.append(folder / file)
@@ -144,3 +139,19 @@ def _export_meshes(run: MovingRun, folder: Path, name: str, frames: list[int]) -
             collection.close()
             written.append(folder / f"{group}.pvd")
     return written
+
+
+def write_mesh(path: Path, vertices: Floats, faces: Integers) -> None:
+    """Write a triangle mesh as ``.vtp``, ``.ply``, ``.stl`` or ``.obj``, by suffix; PLY and STL in single precision."""
+    if path.suffix == ".vtp":
+        write_vtp(path, vertices, faces)
+        return
+    import trimesh
+
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    if path.suffix == ".obj":
+        path.write_text(
+            trimesh.exchange.obj.export_obj(mesh, include_normals=False, digits=12), encoding="ascii"
+        )
+    else:
+        path.write_bytes(mesh.export(file_type=path.suffix[1:]))

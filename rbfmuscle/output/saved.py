@@ -15,8 +15,9 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.quantities import Row
-from rbfmuscle.output.meshfiles import SUFFIXES, read_mesh
 from rbfmuscle.output.tubes import tendon_name
+from rbfmuscle.output.vtp import read_vtp
+from rbfmuscle.scene.objects import body_axes
 from rbfmuscle.simulation.frame import Event, Frame, ModelSurface
 from rbfmuscle.validation import UsageError
 
@@ -48,6 +49,8 @@ class SavedRun:
     tendons : list of str
         Names of the meshes of tendons, which `surface` takes as it takes muscles.
     units : str
+    body : (3, 3) ndarray
+        Left, posterior and superior; x, y and z where they are not known.
     """
 
     def __init__(self, directory: str | Path) -> None:
@@ -56,10 +59,11 @@ class SavedRun:
         try:
             self.info = json.loads(path.read_text(encoding="utf-8"))
             self.units = self.info["scene"]["units"]
+            self.body = body_axes(*(self.info["scene"].get(word) for word in ("superior", "anterior")))
             self.muscles = [muscle["name"] for muscle in self.info["scene"]["muscles"]]
             self.bones = [bone["name"] for bone in self.info["scene"]["bones"]]
             output = self.info["scene"]["output"]
-            surfaces = output["surfaces"]
+            self._meshes = bool(output["surfaces"])
             self.tendons = [
                 tendon_name(muscle["name"])
                 for muscle in self.info["scene"]["muscles"]
@@ -74,7 +78,6 @@ class SavedRun:
             raise UsageError(
                 f"{path} is not the run.json of a run ({error!r}); run the scene again"
             ) from None
-        self.suffix = SUFFIXES[surfaces["format"]] if surfaces else None
         if self.info.get("status") == "running":
             self.info["frames"] = self._whole_frames()
             self.frames = [frame["frame"] for frame in self.info["frames"]]
@@ -108,12 +111,12 @@ class SavedRun:
 
     def surface(self, muscle: str, frame: int) -> tuple[Floats, Integers]:
         """Vertices and faces of a muscle in a frame."""
-        return read_mesh(self._file("surfaces", muscle, frame))
+        return read_vtp(self._file("surfaces", muscle, frame))
 
     def bone(self, name: str) -> tuple[Floats, Integers]:
         """Vertices and faces of a bone at rest."""
         self._check_surfaces()
-        return read_mesh(self.directory / "bones" / f"{name}{self.suffix}")
+        return read_vtp(self.directory / "bones" / f"{name}.vtp")
 
     def series(self, muscle: str, quantity: str, coordinate: str | None = None) -> tuple[Integers, Floats]:
         """Frames and values of a quantity of a muscle, of moment arms those of a coordinate, as two arrays."""
@@ -141,7 +144,7 @@ class SavedRun:
 
     def has_surfaces(self) -> bool:
         """Whether there is something to draw."""
-        return self.suffix is not None and bool(self.frames)
+        return self._meshes and bool(self.frames)
 
     def _whole_frames(self):
         """Entries of ``run.json`` for the frames of which every file is there.
@@ -156,17 +159,17 @@ class SavedRun:
         ]
 
     def _has_files(self, frame):
-        return self.suffix is None or all(
+        return not self._meshes or all(
             self._file("surfaces", m, frame).is_file() for m in [*self.muscles, *self.tendons]
         )
 
     def _check_surfaces(self):
-        if self.suffix is None:
+        if not self._meshes:
             raise UsageError(f"{self.directory} has no surfaces: the run's scene had output.surfaces = false")
 
     def _file(self, folder, name, frame):
         self._check_surfaces()
-        return self.directory / folder / f"{name}_{frame:04d}{self.suffix}"
+        return self.directory / folder / f"{name}_{frame:04d}.vtp"
 
     def _table(self, name):
         path = self.directory / name
@@ -187,7 +190,7 @@ class _SavedSurfaces(Mapping[str, ModelSurface]):
         return ModelSurface(*self._saved.surface(muscle, self._frame))
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._saved.muscles if self._saved.suffix is not None else [])
+        return iter(self._saved.muscles if self._saved.has_surfaces() else [])
 
     def __len__(self) -> int:
         return len(list(iter(self)))

@@ -63,7 +63,7 @@ def read_vtp(path: str | Path) -> tuple[Floats, Integers]:
     Raises
     ------
     MeshError
-        If it is another file, or damaged.
+        If it is missing, another file, or damaged.
     """
     try:
         text, _, data = Path(path).read_bytes().partition(_BEFORE_DATA)
@@ -72,6 +72,8 @@ def read_vtp(path: str | Path) -> tuple[Floats, Integers]:
         return found[b"Points"].reshape(-1, 3).astype(float), found[b"connectivity"].reshape(-1, 3).astype(
             int
         )
+    except FileNotFoundError:
+        raise MeshError(f"{path} is missing") from None
     except (KeyError, ValueError, IndexError, zlib.error):
         raise MeshError(f"{path} is damaged or was not written by a run; run the scene again") from None
 

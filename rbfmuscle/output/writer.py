@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.quantities import Row
-from rbfmuscle.output.light_mesh import light_mesh
-from rbfmuscle.output.meshfiles import SUFFIXES, write_mesh
 from rbfmuscle.output.tubes import tendon_mesh, tendon_name
-from rbfmuscle.output.vtp import Collection
+from rbfmuscle.output.vtp import Collection, write_vtp
 from rbfmuscle.validation import SolveError, UsageError
 
 if TYPE_CHECKING:
@@ -34,6 +33,7 @@ TABLES = {
     "metrics.csv": Row._fields,
 }
 
+LIGHT = 1600  # triangles of a bone that moves
 # Of an earlier run in the same folder.
 _OLD_FILES = ("run.json", "surfaces.pvd", "bones.pvd", "metrics.csv", "report.html", "preview.webp")
 
@@ -74,8 +74,7 @@ class RunWriter:
     def __init__(self, directory: str | Path, scene: Scene) -> None:
         self.directory = Path(directory)
         self.scene = scene
-        output = scene.output
-        self.format = output.surfaces.format if output.surfaces else None
+        self.meshes = bool(scene.output.surfaces)
         self.count, self._failed = 0, False
         # Pose of the file that shows a bone now, and its meshes for a series.
         self._bone_files: dict[str, tuple[Floats, str]] = {}
@@ -83,7 +82,7 @@ class RunWriter:
         try:
             self._clear()
             self._tables = {name: self._table(name) for name in TABLES}
-            names = ("surfaces", "bones") if self.format == "pvd" else ()
+            names = ("surfaces", "bones") if self.meshes else ()
             self._collections = {name: Collection(self.directory / f"{name}.pvd") for name in names}
         except OSError as error:
             raise UsageError(
@@ -141,12 +140,11 @@ class RunWriter:
         write_json(self.directory / "run.json", info)
 
     def _write(self, frame, rows):
-        surfaces = self._write_surfaces(frame) if self.format is not None else []
-        bones = self._write_bones(frame) if self.format is not None else []
-        if "bones" in self._collections:
+        if self.meshes:
             times = self.scene.motion.times
             step = frame.index if times is None else times[frame.index]
-            self._collections["bones"].add(step, bones)
+            surfaces = self._write_surfaces(frame)
+            self._collections["bones"].add(step, self._write_bones(frame))
             self._collections["surfaces"].add(step, surfaces)
         (poses, poses_file), (events, events_file) = self._tables["poses.csv"], self._tables["events.csv"]
         poses.writerows(
@@ -169,8 +167,8 @@ class RunWriter:
         if self.scene.output.tendons:
             tendons = {muscle.name: tendon_mesh(muscle, frame.tendons) for muscle in self.scene.muscles}
             meshes |= {tendon_name(name): mesh for name, mesh in tendons.items() if mesh is not None}
-        entries = [(name, f"surfaces/{name}_{frame.index:04d}{SUFFIXES[self.format]}") for name in meshes]
-        each(lambda entry: write_mesh(self.directory / entry[1], *meshes[entry[0]]), entries)
+        entries = [(name, f"surfaces/{name}_{frame.index:04d}.vtp") for name in meshes]
+        each(lambda entry: write_vtp(self.directory / entry[1], *meshes[entry[0]]), entries)
         return entries
 
     def _write_bones(self, frame):
@@ -182,22 +180,22 @@ class RunWriter:
         for bone in self.scene.bones:
             pose = frame.poses[bone.name]
             if bone.name not in self._bone_files:
-                file = f"bones/{bone.name}{SUFFIXES[self.format]}"
-                write_mesh(self.directory / file, bone.mesh.vertices, bone.mesh.faces)
+                file = f"bones/{bone.name}.vtp"
+                write_vtp(self.directory / file, bone.mesh.vertices, bone.mesh.faces)
                 self._bone_files[bone.name] = (np.eye(4), file)
             stood, file = self._bone_files[bone.name]
-            if self.format == "pvd" and not np.array_equal(stood, pose):
+            if not np.array_equal(stood, pose):
                 vertices, faces = self._light_bone(bone)
                 moved = vertices @ pose[:3, :3].T + pose[:3, 3]
                 file = f"bones/{bone.name}_{frame.index:04d}.vtp"
-                write_mesh(self.directory / file, moved.astype(np.float32), faces)
+                write_vtp(self.directory / file, moved.astype(np.float32), faces)
                 self._bone_files[bone.name] = (pose.copy(), file)
             entries.append((bone.name, file))
         return entries
 
     def _light_bone(self, bone):
         if bone.name not in self._light:
-            self._light[bone.name] = light_mesh(bone.mesh.vertices, bone.mesh.faces)
+            self._light[bone.name] = clustered(bone.mesh.vertices, bone.mesh.faces, LIGHT)
         return self._light[bone.name]
 
     def _remove(self, last):
@@ -213,10 +211,9 @@ class RunWriter:
         for old in _OLD_FILES:
             (self.directory / old).unlink(missing_ok=True)
         self._remove(-1)
-        for suffix in SUFFIXES.values():
-            for old in (self.directory / "bones").glob(f"*{suffix}"):
-                old.unlink()
-        for folder in ("surfaces", "bones") if self.format is not None else ():
+        for old in (self.directory / "bones").glob("*.vtp"):
+            old.unlink()
+        for folder in ("surfaces", "bones") if self.meshes else ():
             (self.directory / folder).mkdir(exist_ok=True)
 
     def _table(self, name):

@@ -13,7 +13,7 @@ import numpy as np
 from rbfmuscle.experiments.comparison import AGAINST, MEASURES, best_models
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.quantities import ALL
-from rbfmuscle.output.colours import MUSCLE_COLOURS
+from rbfmuscle.output.appearance import MUSCLE_COLOURS
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report.page import (
     BAD,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from rbfmuscle.experiments.kernel_study import ALIKE, cost, describe, row_name, row_toml
 from rbfmuscle.metrics.mesh_distance import MeshDistance
-from rbfmuscle.output.colours import MUSCLE_COLOURS
+from rbfmuscle.output.appearance import MUSCLE_COLOURS
 from rbfmuscle.output.vtp import write_vtp
 from rbfmuscle.output.writer import json_text
 from rbfmuscle.report.page import BAD, GOOD, PLAIN, Cell, Light, Page, Section, number, table

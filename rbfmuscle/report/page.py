@@ -47,29 +47,9 @@ class Section(NamedTuple):
 class Page:
     """What a page says, in its order.
 
-    Attributes
-    ----------
-    title : str
-    facts : list of str
-        Few words each, beside the title.
-    answer : str
-        One sentence.
-    detail : str
-        What stands below it.
-    state : {"good", "near", "bad", "plain"}
-    scene : str
-        From `pack_runs`; moves.
-    picture : str
-        Markup; in place of the scene where a browser cannot show it.
-    missing : str
-        Why there is no picture.
-    lights : list of Light
-    heads : sequence of str
-        Of the lights' cells.
-    sections : list of Section
-    footer : str
-    layout : {"beside", "below"}
-        Where the lights stand.
+    The ``answer`` is one sentence, ``detail`` stands below it. ``scene``, from `pack_runs`, moves; ``picture`` is
+    markup, in place of the scene where a browser cannot show it; ``missing`` says why there is neither. ``heads`` are
+    those of the lights' columns; the lights stand beside or below the picture.
     """
 
     title: str
@@ -157,17 +137,8 @@ def sentence(text: str) -> str:
     return text[:1].upper() + text[1:] + ("" if text.endswith(".") else ".")
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[Cell | str]], *, find: bool = False) -> str:
-    """Markup of a table that a click on a heading sorts.
-
-    Parameters
-    ----------
-    head : sequence of str
-    rows : iterable of sequences of Cell or str
-        The first cell of a row names it.
-    find : bool
-        With a field that shows the rows whose names hold what is typed.
-    """
+def table(head: Sequence[str], rows: Iterable[Sequence[Cell | str]]) -> str:
+    """Markup of a table that a click on a heading sorts; the first cell of a row names it."""
     from markupsafe import escape
 
     lines = []
@@ -181,9 +152,8 @@ def table(head: Sequence[str], rows: Iterable[Sequence[Cell | str]], *, find: bo
             cells.append(f"<{kind}{data}{style}>{escape(cell.text)}</{kind}>")
         lines.append(f"<tr>{''.join(cells)}</tr>")
     headings = "".join(f"<th>{escape(text)}</th>" for text in head)
-    field = '<input class="find" placeholder="find names, as: gluteus, vastus">' if find else ""
     return (
-        f'{field}<div class="wide"><table class="sortable"><thead><tr>{headings}</tr></thead>'
+        f'<div class="wide"><table class="sortable"><thead><tr>{headings}</tr></thead>'
         f"<tbody>{''.join(lines)}</tbody></table></div>"
     )
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,16 @@ from numpy.typing import NDArray
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.jit import compiled
+from rbfmuscle.output.appearance import BACKGROUND
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 # Each pixel is the mean of so many by so many.
 _FINER = 2
 _MARGIN = 0.05
+# Height of a row of labels, and width of a colour before one [pixel].
+_LINE, _CHIP = 22, 17
 
 
 class Solid(NamedTuple):
@@ -42,22 +48,8 @@ class Camera(NamedTuple):
         return found
 
 
-def view_axes(direction: Sequence[float] | Floats) -> Floats:
-    """Right, up and towards the camera (3, 3), seen from a direction with z up."""
-    ahead = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
-    right = np.cross([0.0, 0.0, 1.0], ahead)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(ahead, right), ahead])
-
-
-def aim(
-    direction: Sequence[float] | Floats, points: Floats, size: tuple[int, int], body: Floats | None = None
-) -> Camera:
-    """A camera that sees all points (n, 3) from a direction, as large as a picture of ``size`` holds them.
-
-    ``body`` (3, 3) holds the axes that the direction is given in; those of the points where it is None.
-    """
-    axes = view_axes(direction) if body is None else view_axes(direction) @ body
+def aim(axes: Floats, points: Floats, size: tuple[int, int]) -> Camera:
+    """A camera of these axes that sees all points (n, 3), as large as a picture of ``size`` holds them."""
     seen = points @ axes.T
     low, high = seen.min(axis=0), seen.max(axis=0)
     wide, tall, _ = np.maximum(high - low, 1e-9)
@@ -65,9 +57,9 @@ def aim(
     return Camera(axes, 0.5 * (low + high) @ axes, float(scale), size)
 
 
-def fitted_size(direction: Sequence[float] | Floats, points: Floats, area: float) -> tuple[int, int]:
+def fitted_size(axes: Floats, points: Floats, area: float) -> tuple[int, int]:
     """Width and height of so many pixels, in the proportions of what is seen; even numbers, as films ask for."""
-    wide, tall, _ = np.maximum(np.ptp(points @ view_axes(direction).T, axis=0), 1e-9)
+    wide, tall, _ = np.maximum(np.ptp(points @ axes.T, axis=0), 1e-9)
     shape = float(np.clip(tall / wide, 0.6, 2.2))
     return 2 * round(0.5 * (area / shape) ** 0.5), 2 * round(0.5 * (area * shape) ** 0.5)
 
@@ -123,6 +115,42 @@ def _shaded(solid: Solid, axes: Floats) -> Floats:
     facing = np.clip(normals @ lamp, 0.0, 1.0)[:, None]
     gloss = np.clip(normals @ (half / np.linalg.norm(half)), 0.0, 1.0)[:, None] ** 24
     return solid.colour * (0.42 + 0.62 * facing) + 0.1 * gloss
+
+
+def labelled(image: Integers, text: str, titles: Sequence[str], chips: Mapping[str, str]) -> Image:
+    """Image with a strip above that has a title for each column, and one below with text and what colours mean.
+
+    Parameters
+    ----------
+    image : (h, w, 3) ndarray of uint8
+    text : str
+    titles : sequence of str
+    chips : dict of str to colour
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    font = ImageFont.load_default(13)
+    height, width = image.shape[:2]
+    pen = ImageDraw.Draw(Image.new("RGB", (1, 1)))
+    x, y, places = 8, height + _LINE + 5, []
+    parts = [text] if pen.textlength(text, font=font) <= width - 16 else text.split(", ")
+    for name in [*parts, *chips]:
+        wide = int(pen.textlength(name, font=font)) + (_CHIP if len(places) >= len(parts) else 0)
+        if places and x + wide > width:
+            x, y = 8, y + _LINE
+        places.append((x, y))
+        x += wide + 20
+    sheet = Image.new("RGB", (width, y + _LINE + 3), BACKGROUND)
+    sheet.paste(Image.fromarray(image), (0, _LINE))
+    pen = ImageDraw.Draw(sheet)
+    for k, title in enumerate(titles):
+        pen.text((k * width // len(titles) + 8, 4), title, fill="#5f646b", font=font)
+    for place, part in zip(places, parts):
+        pen.text(place, part, fill="#26282b", font=font)
+    for (x, y), (name, colour) in zip(places[len(parts) :], chips.items()):
+        pen.rectangle((x, y + 2, x + 12, y + 14), fill=colour)
+        pen.text((x + _CHIP, y), name, fill="#26282b", font=font)
+    return sheet
 
 
 @compiled

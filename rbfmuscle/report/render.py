@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,19 +12,31 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.output.colours import BONE_COLOUR, MUSCLE_COLOURS, TENDON_COLOUR, muscle_colours, rgb
+from rbfmuscle.output.appearance import (
+    BACKGROUND,
+    BONE_COLOUR,
+    MUSCLE_COLOURS,
+    TENDON_COLOUR,
+    USUAL_VIEWS,
+    VIEWS,
+    motion_direction,
+    muscle_colours,
+    muscle_groups,
+    rgb,
+    view_axes,
+)
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.appearance import BACKGROUND, USUAL_VIEWS, VIEWS, motion_direction, muscle_groups
-from rbfmuscle.report.labels import labelled
-from rbfmuscle.report.raster import Solid, aim, draw_layer, draw_solids, fitted_size
+from rbfmuscle.report.page import embedded_image
+from rbfmuscle.report.raster import Solid, aim, draw_layer, draw_solids, fitted_size, labelled
 from rbfmuscle.validation import SolveError, UsageError
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-ANIMATIONS, COLOURINGS = (".webp", ".gif"), ("muscle", "activation")
-# Of activations from 0 to 1: viridis, which people who are colour-blind can read and which prints in grey.
-_SCALE = ("#440154", "#3b528b", "#21918c", "#5ec962", "#fde725")
+ANIMATIONS = (".webp", ".gif")
+Meshes = Mapping[str, tuple[Floats, Integers]]
+# Pixels of a figure in a notebook, and from where it is seen.
+_FIGURE, _DIRECTION = (300, 340), (1.4, -1.6, 0.5)
 # Pixels of a panel, and of one of a preview; frames of a preview, and how many a second.
 _AREA, _PREVIEW_AREA, _PREVIEW_FRAMES, _PREVIEW_SECONDS = 220_000, 110_000, 12, 4.0
 
@@ -33,27 +47,18 @@ class Panel:
     Parameters
     ----------
     saved : SavedRun
-    direction : (3,) sequence of float
-        From the subject to the camera.
+    axes : (3, 3) ndarray
+        Right, up and towards the camera.
     size : (width, height)
         Pixels.
     seen : (n, 3) ndarray
         What is to be seen.
-    activation : dict of (muscle, frame) to float, optional
-        Muscles are coloured by it.
     """
 
-    def __init__(
-        self,
-        saved: SavedRun,
-        direction: Sequence[float] | Floats,
-        size: tuple[int, int],
-        seen: Floats,
-        activation: Mapping[tuple[str, int], float] | None = None,
-    ) -> None:
-        self.saved, self.activation = saved, activation
+    def __init__(self, saved: SavedRun, axes: Floats, size: tuple[int, int], seen: Floats) -> None:
+        self.saved = saved
         self.colours = muscle_colours(saved.muscles, muscle_groups(saved.info))
-        self.camera = aim(direction, seen, size)
+        self.camera = aim(axes, seen, size)
         bones, first = {name: saved.bone(name) for name in saved.bones}, saved.poses[saved.frames[0]]
         moving = {
             name
@@ -68,8 +73,7 @@ class Panel:
         """Picture (h, w, 3) of a frame."""
         solids = [_posed(*mesh, self.saved.poses[frame][name]) for name, mesh in self.moving.items()]
         for name, colour in self.colours.items():
-            shade = rgb(colour) if self.activation is None else _shade(self.activation.get((name, frame), 0))
-            solids.append(Solid(*self.saved.surface(name, frame), shade))
+            solids.append(Solid(*self.saved.surface(name, frame), rgb(colour)))
         tendons = (self.saved.surface(name, frame) for name in self.saved.tendons)
         solids += [Solid(vertices, faces, rgb(TENDON_COLOUR)) for vertices, faces in tendons]
         return draw_solids(solids, self.camera, rgb(BACKGROUND), behind=self._behind)
@@ -77,11 +81,6 @@ class Panel:
 
 def _posed(vertices: Floats, faces: Integers, pose: Floats) -> Solid:
     return Solid(vertices @ pose[:3, :3].T + pose[:3, 3], faces, rgb(BONE_COLOUR))
-
-
-def _shade(activation: float) -> Floats:
-    table = np.array([rgb(colour) for colour in _SCALE])
-    return np.array([np.interp(activation, np.linspace(0, 1, len(table)), column) for column in table.T])
 
 
 def muscle_points(runs: Sequence[SavedRun], frames: Sequence[int]) -> Floats:
@@ -105,11 +104,11 @@ def draw_preview(runs: Mapping[str, SavedRun], path: Path, *, area: float = _PRE
     first = next(iter(runs.values()))
     frames = chosen_frames(first.frames, _PREVIEW_FRAMES)
     seen = muscle_points(list(runs.values()), frames)
-    side = motion_direction([first.poses[frame] for frame in frames])
+    side = view_axes(motion_direction([first.poses[frame] for frame in frames], first.body), first.body)
     size = fitted_size(side, seen, area)
     panels, titles = [Panel(run, side, size, seen) for run in runs.values()], list(runs)
     if len(runs) == 1:
-        panels.append(Panel(first, VIEWS["front"][0], size, seen))
+        panels.append(Panel(first, view_axes(VIEWS["front"], first.body), size, seen))
         titles = ["plane of the motion", "front"]
     chips = _chips(first) if len(runs) == 1 else {}
     save_images(draw_panels(panels, frames, titles, chips), path, _PREVIEW_SECONDS)
@@ -123,7 +122,6 @@ def render_run(
     views: Sequence[str] | None = None,
     area: int = _AREA,
     seconds: float = 5.0,
-    colour: str = "muscle",
 ) -> None:
     """Draw a saved run to a picture or an animation.
 
@@ -141,8 +139,6 @@ def render_run(
         Pixels of one view.
     seconds : float
         Length of an animation.
-    colour : {"muscle", "activation"}
-        What muscles are coloured by.
 
     Raises
     ------
@@ -158,24 +154,17 @@ def render_run(
         raise UsageError(f"{output}: the suffix must be .png, .gif or .webp")
     if not saved.has_surfaces():
         raise UsageError(f"{directory} has no surfaces to draw")
-    if colour not in COLOURINGS:
-        raise UsageError(f"unknown colouring {colour!r}; known: {', '.join(COLOURINGS)}")
-    activation, chips = None, _chips(saved)
-    if colour == "activation":
-        activation = {(row.muscle, row.frame): row.value for row in saved.metrics if row.quantity == colour}
-        chips = {f"activation {share:g}": _SCALE[k] for k, share in enumerate(np.linspace(0, 1, 5))}
-        if not activation:
-            raise UsageError(f"{saved.directory} has no activation: none of its muscles contracts")
     frame = saved.frames[-1] if frame is None else frame
     if frame not in saved.frames:
         raise UsageError(
             f"frame {frame} was not written; the run has {saved.frames[0]} to {saved.frames[-1]}"
         )
     seen = muscle_points([saved], saved.frames)
-    size = fitted_size(VIEWS[views[0]][0], seen, area)
-    panels = [Panel(saved, VIEWS[view][0], size, seen, activation) for view in views]
+    axes = [view_axes(VIEWS[view], saved.body) for view in views]
+    size = fitted_size(axes[0], seen, area)
+    panels = [Panel(saved, one, size, seen) for one in axes]
     frames = [frame] if output.suffix == ".png" else saved.frames
-    images = draw_panels(panels, frames, [f"{view} ({VIEWS[view][1]})" for view in views], chips)
+    images = draw_panels(panels, frames, views, _chips(saved))
     save_images(images, output, seconds)
 
 
@@ -213,3 +202,28 @@ def save_images(images: Sequence[Image], path: Path, seconds: float) -> None:
         sheets[0].save(path, **kind)
     except OSError as error:
         raise SolveError(f"cannot write {path}: {error.strerror}") from None
+
+
+def figure_html(bones: Meshes, muscles: Meshes, caption: str, body: Floats) -> str:
+    """HTML of a picture.
+
+    Parameters
+    ----------
+    bones, muscles : mapping of str to (vertices, faces)
+        Where they are drawn.
+    caption : str
+    body : (3, 3) ndarray
+        Left, posterior and superior.
+    """
+    from PIL import Image
+
+    colours = muscle_colours(list(muscles))
+    solids = [Solid(np.asarray(v), np.asarray(f), rgb(BONE_COLOUR)) for v, f in bones.values()]
+    solids += [Solid(np.asarray(v), np.asarray(f), rgb(colours[name])) for name, (v, f) in muscles.items()]
+    picture = ""
+    if solids:
+        camera = aim(view_axes(_DIRECTION, body), np.concatenate([s.vertices for s in solids]), _FIGURE)
+        file = io.BytesIO()
+        Image.fromarray(draw_solids(solids, camera, rgb(BACKGROUND))).save(file, format="PNG")
+        picture = embedded_image(file.getvalue(), "png", caption)
+    return f"<figure>{picture}<figcaption>{escape(caption)}</figcaption></figure>"

@@ -14,9 +14,8 @@ from rbfmuscle.metrics.quantities import ALL, QUANTITIES
 from rbfmuscle.metrics.summary import LEAST, exceeded, excess, muscle_limit, within
 from rbfmuscle.output.animation.moving import read_moving
 from rbfmuscle.output.animation.page import pack_runs
-from rbfmuscle.output.colours import muscle_colours
+from rbfmuscle.output.appearance import motion_direction, muscle_colours, muscle_groups
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.appearance import motion_direction, muscle_groups
 from rbfmuscle.report.page import (
     BAD,
     GOOD,
@@ -57,9 +56,8 @@ PANELS = (
 _MECHANICS = ("length", "activation")
 # Below this share of its limit a quantity is flat, and named in place of a plot.
 _FLAT = 0.01
-# Points of all muscles in all frames that a page holds, and events of each kind.
-_MOST_POINTS, _MOST_EVENTS = 2_600_000, 60
-_WORK = ("solved", "carried", "skipped", "substeps")
+# Points of all muscles in all frames that a page holds.
+_MOST_POINTS = 2_600_000
 # Tables or plots of their own.
 _ELSEWHERE = ("volume", "moment_arm", "time_solve", "time_fit", "time_extract")
 _READING = """<p>Each muscle is one closed surface in each frame. Depths in bones are exact distances to the bone
@@ -68,19 +66,8 @@ four fifths of its limit. Times are medians, as the first frame may load and com
 or pinch to zoom, drag with shift to move it; names below it switch muscles and their lines on and off.</p>"""
 
 
-def write_report(
-    directory: str | Path, *, report: bool = True, preview: bool = True, pictures: bool = True
-) -> None:
-    """Write ``report.html`` and ``preview.webp`` for a saved run.
-
-    Parameters
-    ----------
-    directory : path
-        Folder of the run.
-    report, preview : bool
-        Which of both.
-    pictures : bool
-        With the moving scene in the report.
+def write_report(directory: str | Path, *, pictures: bool = True) -> None:
+    """Write ``report.html`` of a saved run, and with ``pictures`` its moving scene and ``preview.webp``.
 
     Raises
     ------
@@ -88,20 +75,16 @@ def write_report(
         If the files cannot be written.
     """
     saved = SavedRun(directory)
-    animation = saved.directory / "preview.webp"
-    if preview and saved.has_surfaces() and len(saved.frames) > 1:
-        draw_preview({"": saved}, animation)
-    if not report:
-        return
     page = _page(saved)
     if not pictures or not saved.has_surfaces():
-        page.missing = "No pictures: " + (
-            "they were switched off." if saved.has_surfaces() else "this run kept no surfaces."
-        )
+        why = "they were switched off." if saved.has_surfaces() else "this run kept no surfaces."
+        page.missing = f"No pictures: {why}"
     else:
         page.scene = packed_scene({"": saved})
-        if animation.is_file():
-            page.picture = embedded_image(animation.read_bytes(), "webp", "the motion")
+        if len(saved.frames) > 1:
+            moving = saved.directory / "preview.webp"
+            draw_preview({"": saved}, moving)
+            page.picture = embedded_image(moving.read_bytes(), "webp", "the motion")
     page.write(saved.directory / "report.html")
 
 
@@ -114,7 +97,7 @@ def packed_scene(runs: Mapping[str, SavedRun]) -> str:
     return pack_runs(
         {title: read_moving(run, frames, unit=run.units) for title, run in runs.items()},
         [first.caption(frame) for frame in frames],
-        direction=motion_direction([first.poses[frame] for frame in frames]),
+        direction=motion_direction([first.poses[frame] for frame in frames], first.body),
         groups=groups | dict.fromkeys(first.tendons, "tendons") if len(first.muscles) > 1 else {},
         colours=muscle_colours(first.muscles, groups),
     )
@@ -126,17 +109,13 @@ def _page(saved: SavedRun) -> Page:
     answer, _, detail = info["verdict"].partition(". ")
     if not complete:
         answer, detail = f"the run ended early ({info['status']}): {info['message'] or ''}", ""
+    reading = _READING + definitions((n, meaning) for n, (_, meaning) in QUANTITIES.items())
     sections = [
         *_plots(saved),
         Section("Every quantity of every muscle", _summary(saved), "worst over the frames"),
-    ]
-    sections += [
         Section("Neighbours", _neighbours(saved)),
-        Section("Events", _events(saved.events), f"{len(saved.events)}"),
-        Section("Time of each stage", _stages(saved), "median per frame"),
-        Section(
-            "How to read this", _READING + definitions((n, meaning) for n, (_, meaning) in QUANTITIES.items())
-        ),
+        Section("Events", _events(saved.events), "each with its frame in events.csv"),
+        Section("How to read this", reading),
     ]
     return Page(
         info["scene"]["name"],
@@ -266,7 +245,7 @@ def _summary(saved: SavedRun) -> str:
         }
         cells = [_cell(name, found.get(name), own.get(name)) for name in used]
         rows.append((-sum(cell.state == BAD for cell in cells), [muscle, *cells]))
-    return table(head, [row for _, row in sorted(rows, key=lambda row: row[0])], find=len(rows) > 8)
+    return table(head, [row for _, row in sorted(rows, key=lambda row: row[0])])
 
 
 def _cell(name: str, facts: Mapping[str, Any] | None, limit: float | None) -> Cell:
@@ -278,21 +257,6 @@ def _cell(name: str, facts: Mapping[str, Any] | None, limit: float | None) -> Ce
         return Cell(number(facts["median"], "s"), facts["median"])
     state = limit_state(facts["worst"], limit, least=name in LEAST, count=name in COUNTS)
     return Cell(number(facts["worst"]), facts["worst"], BAD if state == BAD else PLAIN)
-
-
-def _stages(saved: SavedRun) -> str:
-    """What each stage took of each muscle, the most expensive first, and in how many frames it was solved."""
-    stages, work = saved.info.get("stages") or {}, saved.info.get("work") or {}
-    names = list(dict.fromkeys(key for found in stages.values() for key in found))
-    rows = []
-    for muscle, found in sorted(
-        stages.items(), key=lambda row: -max(part["median"] for part in row[1].values())
-    ):
-        medians = [found[name]["median"] if name in found else None for name in names]
-        cells = [Cell(number(value, "s"), value) for value in medians]
-        counts = [work.get(muscle, {}).get(name) for name in _WORK]
-        rows.append([muscle, *cells, *(Cell("–" if n is None else str(n), n) for n in counts)])
-    return table(["muscle", *(name.removeprefix("time_") for name in names), *_WORK], rows) if rows else ""
 
 
 def _neighbours(saved: SavedRun) -> str:
@@ -310,17 +274,12 @@ def _neighbours(saved: SavedRun) -> str:
 
 
 def _events(events: Iterable[Sequence[Any]]) -> str:
-    """Events by action, the commonest first, with the muscles that have most of them."""
-    from markupsafe import escape
-
-    kinds: dict[str, list[Sequence[Any]]] = {}
+    """How many events of each kind, the commonest first, and the muscles that have most of them."""
+    kinds: dict[str, Counter[str]] = {}
     for event in events:
-        kinds.setdefault(event[4], []).append(event)
-    parts = []
-    for action, found in sorted(kinds.items(), key=lambda kind: -len(kind[1])):
-        often = ", ".join(f"{name or 'bones'} {n}" for name, n in Counter(e[1] for e in found).most_common(6))
-        rows = [[Cell(str(value)) for value in event[:4]] for event in found[:_MOST_EVENTS]]
-        left = f"<p>and {len(found) - len(rows)} more in events.csv</p>" if len(found) > len(rows) else ""
-        shown = table(["frame", "muscle", "bone", "count"], rows)
-        parts.append(f"<h4>{escape(f'{action}: {often}')}</h4>{shown}{left}")
-    return "".join(parts)
+        kinds.setdefault(event[4], Counter()).update([event[1] or event[2]])
+    rows: list[list[Cell | str]] = [
+        [kind, Cell(str(n := found.total()), n), ", ".join(f"{name} {k}" for name, k in found.most_common(6))]
+        for kind, found in sorted(kinds.items(), key=lambda row: -row[1].total())
+    ]
+    return table(["event", "how often", "most often"], rows) if rows else ""

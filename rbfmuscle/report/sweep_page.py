@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rbfmuscle.experiments.sweep_table import LENGTHS
-from rbfmuscle.output.colours import MUSCLE_COLOURS
+from rbfmuscle.output.appearance import MUSCLE_COLOURS
 from rbfmuscle.report.page import GOOD, NEAR, PLAIN, Cell, Light, Page, Section, number, table
 from rbfmuscle.report.plots import Point, front_plot
 
@@ -20,20 +20,9 @@ one (<code>--reference</code>) to judge the default.</p>"""
 
 
 def write_page(found: dict[str, Any], directory: str | Path) -> None:
-    """Write the self-contained ``sweep.html``, and ``pareto.svg`` where there is a front.
-
-    Parameters
-    ----------
-    found : dict
-        From `write_table`.
-    directory : path
-    """
-    directory, rows, quantity = Path(directory), found["rows"], found["quantity"]
+    """Write the self-contained ``sweep.html`` of what `write_table` returns."""
+    rows, quantity = found["rows"], found["quantity"]
     picture = front_picture(rows, quantity)
-    if picture:
-        (directory / "pareto.svg").write_text(
-            picture.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1), encoding="utf-8"
-        )
     verdicts, inside = found["verdicts"], inside_grid(rows)
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     judged = PLAIN if inside or not verdicts else GOOD if all(v["near"] for v in verdicts) else NEAR
@@ -50,7 +39,7 @@ def write_page(found: dict[str, Any], directory: str | Path) -> None:
             Section("Every point", _points(rows)),
             Section("How to read this", _READING + (_INSIDE if inside else "")),
         ],
-    ).write(directory / "sweep.html")
+    ).write(Path(directory) / "sweep.html")
 
 
 def inside_grid(rows: Iterable[dict[str, Any]]) -> bool:

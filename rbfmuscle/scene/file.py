@@ -52,6 +52,7 @@ class SceneTable(Table):
     format: Literal[1]
     name: str | None = None
     units: Literal["m", "cm", "mm"]
+    left_out: list[str] = Field(default=[])
     superior: Vector | None = None
     anterior: Vector | None = None
 
@@ -173,6 +174,7 @@ def load_scene(cls: type[S], path: str | Path, *, skeleton: bool = False) -> S:
 
 
 def _fill(scene: SceneData, tables: SceneFile) -> None:
+    scene.left_out = tables.scene.left_out
     scene.superior, scene.anterior = tables.scene.superior, tables.scene.anterior
     for bone in tables.bone:
         if bone.mesh is None:
@@ -257,8 +259,11 @@ def describe_scene(scene: SceneData) -> dict[str, Any]:
         "name": scene.name,
         "units": scene.units,
         "file": str(scene.path) if scene.path else None,
+        "superior": scene.superior,
+        "anterior": scene.anterior,
         "bones": [{"name": bone.name, **_describe_mesh(bone)} for bone in scene.bones],
         "links": list(scene.links),
+        "left_out": list(scene.left_out),
         "joints": [joint_row(joint) for joint in scene.joints],
         "couplings": [coupling_row(coupling, scene.joints) for coupling in scene.couplings],
         "coordinate_units": {name: unit for name, unit in units.items() if unit != "°"},

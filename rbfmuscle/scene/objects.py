@@ -194,8 +194,10 @@ class SceneData:
     output : OutputOptions
     path : pathlib.Path or None
         The file it was loaded from.
+    left_out : list of str
+        Bones of which no mesh could be used; they count in the verdict of a run.
     superior, anterior : list of float or None
-        Anatomical directions (3,) at rest, where the file gives them.
+        Anatomical directions (3,) at rest: those of the file, or found from the bones before a run or a picture.
     """
 
     name: str = "scene"
@@ -212,6 +214,7 @@ class SceneData:
     detect: DetectOptions | None = None
     output: OutputOptions = field(default_factory=OutputOptions)
     path: Path | None = None
+    left_out: list[str] = field(default_factory=list)
     superior: list[float] | None = None
     anterior: list[float] | None = None
 
@@ -222,6 +225,11 @@ class SceneData:
     def length(self, millimetres: float) -> float:
         """Return a length given in millimetres in the scene's unit."""
         return millimetres / MM_PER_UNIT[self.units]
+
+    @property
+    def body(self) -> Floats:
+        """Left, posterior and superior (3, 3); x, y and z where the directions are not known."""
+        return body_axes(self.superior, self.anterior)
 
     def bone(self, name: str) -> Bone:
         """Return the bone of that name, or raise SceneError naming the nearest."""
@@ -238,7 +246,7 @@ class SceneData:
     def copy(self) -> Self:
         """Return a copy whose lists and tables are its own; meshes are shared."""
         other = copy.copy(self)
-        for name in ("bones", "joints", "couplings", "links"):
+        for name in ("bones", "joints", "couplings", "links", "left_out"):
             setattr(other, name, list(getattr(self, name)))
         other.muscles = [replace(muscle, options=dict(muscle.options)) for muscle in self.muscles]
         return other
@@ -247,6 +255,16 @@ class SceneData:
         muscles = ", ".join(f"{muscle.name} ({muscle.model})" for muscle in self.muscles) or "no muscles"
         counts = f"{len(self.bones)} bones, {muscles}, {len(self.motion)} frames"
         return f"<Scene {self.name!r}, {self.units}: {counts}>"
+
+
+def body_axes(superior: Sequence[float] | None, anterior: Sequence[float] | None) -> Floats:
+    """Left, posterior and superior (3, 3) of a body with these directions; x, y and z where one is None."""
+    if superior is None or anterior is None:
+        return np.eye(3)
+    up = np.asarray(superior, dtype=float) / np.linalg.norm(superior)
+    left = np.cross(up, anterior)
+    left /= np.linalg.norm(left)
+    return np.stack([left, np.cross(up, left), up])
 
 
 def find_named(items: list[Any], name: str, what: str, *, place: str = "") -> Any:

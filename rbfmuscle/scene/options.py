@@ -235,9 +235,9 @@ class DetectOptions(Table):
 
 
 class SurfaceOptions(Table):
-    """``output.surfaces``: the surfaces written for every frame."""
+    """``output.surfaces``: the surfaces written for every frame; `export` writes other formats."""
 
-    format: Literal["pvd", "vtp", "ply", "stl", "obj", "glb"] = "pvd"
+    format: Literal["pvd"] = "pvd"
 
 
 class OutputOptions(Table):

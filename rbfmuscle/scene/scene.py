@@ -59,4 +59,4 @@ class Scene(SceneData):
             {item.name: (item.mesh.vertices, item.mesh.faces) for item in items}
             for items in (self.bones, self.muscles)
         )
-        return rbfmuscle.figure_html(bones, muscles, repr(self))
+        return rbfmuscle.figure_html(bones, muscles, repr(self), rbfmuscle.orient_scene(self.copy()).body)

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.metrics.penetration import BoneProbe
+from rbfmuscle.output.appearance import VIEWS, view_axes
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import RBFMuscleError, SolveError
-from rbfmuscle.viewer.panel import VIEWS, Panel
+from rbfmuscle.viewer.panel import Panel
 from rbfmuscle.viewer.server import open_server
 from rbfmuscle.viewer.side import Side
 from rbfmuscle.viewer.sources import LiveSource, SavedSource
@@ -24,9 +25,7 @@ COSTLY = 0.1  # While controls are moved, a picture that takes longer [s] is dra
 MOVED = 0.25  # A control counts as moved for so long [s].
 PACE = 0.04  # Least time of a picture while a motion is played [s].
 FIELD_OF_VIEW = 0.5
-# Where the camera stands, of `VIEWS` and at first; as in the medical axes (left, posterior, superior).
-STANDS = dict(zip(VIEWS, ((0, -1, 0), (0, 1, 0), (1, 0, 0), (-1, 0, 0), (0, 0, 1), (0, 0, -1))))
-FIRST = (-1.4, 1.6, 0.5)
+FIRST = (-1.4, 1.6, 0.5)  # Where the camera stands at first, along the body's axes.
 
 
 def show(shown: Scene | SavedRun, *, model: str | None = None) -> Page:
@@ -88,7 +87,10 @@ class Page:
         self.sides = [Side(self.server, f"/{name}", source) for name in ("first", "second")]
         self.panel = Panel(self.server, source, at or {}, colour, self._touch)
         self.panel.rest.on_click(lambda _: self._touch(rest=True))
-        self.panel.view.on_click(lambda event: self._aim(STANDS[event.target.value], event.client.camera))
+        self.panel.view.on_click(
+            lambda event: self._aim(VIEWS[event.target.value.lower()], event.client.camera)
+        )
+        self.server.scene.set_up_direction(source.body[2])
         self._aim(FIRST, self.server.initial_camera)
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -118,17 +120,16 @@ class Page:
         """Let a camera look at everything; models then stand side by side across its direction."""
         points = (0.001 / self.source.millimetre) * np.concatenate(self.sides[0].points())
         middle, size = (points.min(axis=0) + points.max(axis=0)) / 2, np.ptp(points, axis=0)
-        ahead = np.asarray(direction) / np.linalg.norm(direction)
-        up = np.array([0.0, -1.0, 0.0] if abs(ahead[2]) > 0.9 else [0.0, 0.0, 1.0])
-        right = np.cross(up, ahead) / np.linalg.norm(np.cross(up, ahead))
-        wide, tall, deep = (float(np.abs(axis) @ size) for axis in (right, np.cross(ahead, right), ahead))
+        right, up, ahead = view_axes(direction, self.source.body)
+        wide, tall, deep = (float(np.abs(axis) @ size) for axis in (right, up, ahead))
         both = self.panel.models[1].value != "none"
         apart = 1.1 * max(wide, 0.7 * tall) * right
         self.sides[1].frame.position = apart
         middle = middle + both * apart / 2
         away = 0.55 * max(tall, wide + both * np.linalg.norm(apart)) / math.tan(FIELD_OF_VIEW / 2) + deep / 2
+        pole = self.source.body[2] if abs(ahead @ self.source.body[2]) < 0.99 else up
         with self.server.atomic():
-            setattr(camera, "up_direction" if hasattr(camera, "up_direction") else "up", up)
+            setattr(camera, "up_direction" if hasattr(camera, "up_direction") else "up", pole)
             camera.fov, camera.position = FIELD_OF_VIEW, middle + away * ahead
             camera.look_at = middle  # a camera that is moved takes along what it looks at
 

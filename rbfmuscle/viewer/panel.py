@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from rbfmuscle.output.appearance import VIEWS
 from rbfmuscle.viewer.colours import COLOURINGS, legend
 from rbfmuscle.viewer.side import Side
 from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
-VIEWS = ("Front", "Back", "Left", "Right", "Top", "Bottom")
 WIDTH = 350  # [pixel]
 HISTORY, LINES = 200, 8  # Pictures and lines in a plot.
 
@@ -83,7 +83,7 @@ class Panel:
             self._watch(gui.add_dropdown("Beside it", ("none", *choices))),
         ]
         self.colour = self._watch(gui.add_dropdown("Colour", tuple(COLOURINGS), initial_value=colour))
-        self.view = gui.add_button_group("View", VIEWS)
+        self.view = gui.add_button_group("View", [view.capitalize() for view in VIEWS])
         self.cut = self._watch(gui.add_dropdown("Cut along", ("none", "x", "y", "z")))
         self.place = self._watch(gui.add_slider("Cut at", 0.0, 1.0, 0.01, 0.5))
         self.eyes = {}

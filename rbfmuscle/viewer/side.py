@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.metrics.penetration import BoneProbe
-from rbfmuscle.output.colours import BONE_COLOUR, TENDON_COLOUR, linear_rgb
+from rbfmuscle.output.appearance import BONE_COLOUR, TENDON_COLOUR, linear_rgb
 from rbfmuscle.output.tubes import tendon_name
 from rbfmuscle.viewer.colours import COLOURINGS, shades, vertex_values
 from rbfmuscle.viewer.sources import LiveSource, Mesh, Picture, SavedSource
@@ -38,7 +39,9 @@ class Side:
         self.picture: Any = None
         self.numbers: dict[str, dict[str, float]] = {}
         self.frame = server.scene.add_frame(root, show_axes=False, visible=False)
-        self._bones = {name: _decimated(mesh) for name, mesh in source.bones.items()}
+        self._bones = {
+            name: clustered(mesh[0], mesh[1], BONE_TRIANGLES) for name, mesh in source.bones.items()
+        }
         self._volumes = {name: mesh_volume(*mesh) for name, mesh in source.muscles.items()}
         self._nodes: dict[str, Any] = {}
         self._painted: list[Any] = []
@@ -142,12 +145,3 @@ class Side:
         """End the figure's threads."""
         if self.figure is not None:
             self.figure.close()
-
-
-def _decimated(mesh: Mesh) -> Mesh:
-    import pyvista
-
-    data = pyvista.make_tri_mesh(*mesh)
-    if data.n_cells > BONE_TRIANGLES:
-        data = data.decimate(1.0 - BONE_TRIANGLES / data.n_cells)
-    return np.asarray(data.points), np.asarray(data.regular_faces)

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.importers.guess.orientation import orient_scene
 from rbfmuscle.models import MODEL_NAMES, build_models, configure_scene
-from rbfmuscle.output.colours import muscle_colours
+from rbfmuscle.output.appearance import muscle_colours, muscle_groups
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.tubes import tendon_mesh, tendon_name
-from rbfmuscle.report.appearance import muscle_groups
 from rbfmuscle.scene.motion import inner_value, shown_value, unit_sign
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
@@ -56,6 +56,8 @@ class LiveSource:
     ----------
     choices : list of str
         Models.
+    body : (3, 3) ndarray
+        Left, posterior and superior.
     bones, muscles : dict of str to (vertices, faces)
         At rest.
     controls : dict of str to Control
@@ -64,8 +66,9 @@ class LiveSource:
     """
 
     def __init__(self, scene: Scene, model: str | None = None) -> None:
-        self.scene = scene = configure_scene(scene, model=model).validate()
+        self.scene = scene = orient_scene(configure_scene(scene, model=model).validate())
         self.title, self.units, self.millimetre = scene.name, scene.units, scene.length(1.0)
+        self.body = scene.body
         first = scene.muscles[0].model
         self.choices = [first, *(name for name in MODEL_NAMES if name != first)]
         self.bones, self.muscles = (
@@ -155,7 +158,7 @@ class SavedSource:
             if not saved.has_surfaces():
                 raise UsageError(f"{saved.directory} has no surfaces to show; run it with output.surfaces")
         self.runs, self.choices, first = runs, list(runs), next(iter(runs.values()))
-        self.title, self.units = str(first.directory), first.units
+        self.title, self.units, self.body = str(first.directory), first.units, first.body
         self.millimetre = 1.0 / MM_PER_UNIT[first.units]
         self.bones = {name: first.bone(name) for name in first.bones}
         self.muscles = {name: first.surface(name, first.frames[0]) for name in first.muscles}

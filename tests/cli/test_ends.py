@@ -45,7 +45,7 @@ class TestInterrupts:
             "import": "import cyclopts",
             "load": "from rbfmuscle.scene.meshes import repair as m; name = 'repair'",
             "build": "import pbd_baseline.muscle as m; name = '_bone_numbers'",
-            "run": "import rbfmuscle.output.writer as m; name = 'write_mesh'",
+            "run": "import rbfmuscle.output.writer as m; name = 'write_vtp'",
         }[moment]
         code = (
             "import os, sys, builtins\n"
@@ -84,14 +84,14 @@ class TestInterrupts:
         scene = write_scene(tmp_path, end=60)
         code = (
             "import os, signal, sys\nimport rbfmuscle.cli as cli, rbfmuscle.output.writer as m\n"
-            "inner, count = m.write_mesh, [0]\n"
+            "inner, count = m.write_vtp, [0]\n"
             "def struck(*a, **k):\n"
             "    count[0] += 1\n"
             "    if count[0] == 8:\n"
             "        try: os.kill(os.getpid(), signal.SIGINT)\n"
             "        except KeyboardInterrupt: pass  # as ctypes does in a callback\n"
             "    return inner(*a, **k)\n"
-            "m.write_mesh = struck\n"
+            "m.write_vtp = struck\n"
             f"sys.argv = ['rbfmuscle', 'run', {str(scene)!r}, '-o', {str(tmp_path / 'out')!r}]\ncli.main()\n"
         )
         process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)

@@ -37,6 +37,7 @@ TABLE = {
     "tunnelled": (0, 1),
     "bone_overlap": (0.0, 0.06),
     "joint_gap": (5.0, 5.1),
+    "bones_left_out": (0, 1),
 }
 
 

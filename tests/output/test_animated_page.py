@@ -39,7 +39,7 @@ def moving():
         MovingMuscle("calf </script><b>", red, shapes, [faces] * 4),
         MovingMuscle("knee", red, other, kinds),
     ]
-    return MovingRun("knee & calf", "mm", np.array([2, 3, 4, 7]) / 24.0, False, muscles, bones, "z")
+    return MovingRun("knee & calf", "mm", np.array([2, 3, 4, 7]) / 24.0, False, muscles, bones, np.eye(3))
 
 
 @pytest.fixture(scope="module")

@@ -2,26 +2,31 @@
 
 import json
 import re
-import shutil
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from blend_model import arm_scene, use_blend_model
 from PIL import Image
 
 from rbfmuscle.metrics.summary import describe_verdict, within
+from rbfmuscle.output.appearance import muscle_groups
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report import render
-from rbfmuscle.report.appearance import muscle_groups
-from rbfmuscle.report.page import limit_state, number
+from rbfmuscle.report.page import Cell, limit_state, number, table
 from rbfmuscle.report.report import _events, write_report
+from rbfmuscle.run import simulate
 from rbfmuscle.validation import UsageError
 
 
 @pytest.fixture(scope="module")
-def folder(arm_run, tmp_path_factory):
+def folder(tmp_path_factory):
     """Folder of a saved run without a report."""
-    return shutil.copytree(arm_run[1], tmp_path_factory.mktemp("report") / "run")
+    place = tmp_path_factory.mktemp("run")
+    with pytest.MonkeyPatch.context() as patch:
+        use_blend_model(patch)
+        simulate(arm_scene(end=60)).save(place)
+    return place
 
 
 class Outline(HTMLParser):
@@ -56,18 +61,26 @@ def read(folder, name="report.html"):
 
 
 def test_answer_picture_and_rows_come_before_what_is_folded(folder):
-    write_report(folder, preview=False)
+    write_report(folder)
     text, outline = read(folder)
     verdict = describe_verdict(SavedRun(folder).info["muscles"], SavedRun(folder).info["limits"])
-    order = [verdict.partition(". ")[0][1:], 'data-scene="scene"', "Keeps its volume", "<details>"]
+    order = [
+        verdict.partition(". ")[0][1:],
+        'data-scene="scene"',
+        "Keeps its volume",
+        "<details>",
+        "Moment arms and lengths",
+        "How to read this",
+    ]
     places = [text.index(part) for part in order]
     assert places == sorted(places)
-    assert len(outline.lights) == 5 and outline.sources == [] and "http" not in text
+    assert len(outline.lights) == 5 and "http" not in text
+    assert all(source.startswith("data:") for source in outline.sources)
     assert len(text) < 6_000_000
 
 
 def test_lights_and_red_cells_are_those_beyond_their_limits(folder):
-    write_report(folder, preview=False, pictures=False)
+    write_report(folder, pictures=False)
     text, outline = read(folder)
     info = SavedRun(folder).info
     found, limits = info["muscles"]["biceps"], info["limits"]
@@ -82,7 +95,7 @@ def test_lights_and_red_cells_are_those_beyond_their_limits(folder):
 
 
 def test_scene_holds_every_frame_and_colour_of_the_plots(folder):
-    write_report(folder, preview=False)
+    write_report(folder)
     text, _ = read(folder)
     facts = json.loads(re.search(r'<script id="scene"[^>]*>(.*?)</script>', text, re.S)[1])
     assert len(facts["captions"]) == 7 and facts["captions"][6] == "frame 6, elbow.flexion 60°"
@@ -98,7 +111,7 @@ def colours_of(image):
 
 
 def test_preview_shows_bone_and_muscle_move(folder):
-    write_report(folder, report=False)
+    write_report(folder)
     with Image.open(folder / "preview.webp") as preview:
         assert preview.n_frames == 7
         first = colours_of(preview)
@@ -113,31 +126,57 @@ def test_preview_shows_bone_and_muscle_move(folder):
 
 @pytest.mark.parametrize("name", ["a.png", "a.gif", "a.webp"])
 def test_render_writes_what_the_suffix_says(folder, tmp_path, name):
-    render.render_run(folder, tmp_path / name, views=["side"], area=40_000)
+    render.render_run(folder, tmp_path / name, views=["right"], area=40_000)
     with Image.open(tmp_path / name) as image:
         assert getattr(image, "n_frames", 1) == (1 if name == "a.png" else 7)
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"views": ["top"]}, {"frame": 99}, {"colour": "activation"}, {"output": "a.bmp"}]
-)
-def test_render_refuses_wrong_words(folder, tmp_path, wrong):
-    words = {"output": "a.png", **wrong}
-    with pytest.raises(UsageError):
-        render.render_run(folder, tmp_path / words.pop("output"), **words)
+def test_render_refuses_wrong_words(folder, tmp_path):
+    for wrong in (
+        {"output": "a.bmp"},
+        {"output": "a.png", "views": ["side"]},
+        {"output": "a.png", "frame": 99},
+    ):
+        words = dict(wrong)
+        with pytest.raises(UsageError):
+            render.render_run(folder, tmp_path / words.pop("output"), **words)
+
+
+def scene_info(attached, joints):
+    return {
+        "scene": {
+            "joints": [{"name": n, "parent": p, "child": c} for n, p, c in joints],
+            "muscles": [{"name": n, "attach": [{"bone": b} for b in bones]} for n, bones in attached.items()],
+        }
+    }
 
 
 def test_muscles_are_grouped_by_the_joints_that_they_cross():
-    chain = {"hip": "pelvis femur", "knee": "femur tibia", "ankle": "tibia foot", "cap": "femur patella"}
-    joints = [{"name": n, **dict(zip(("parent", "child"), b.split()))} for n, b in chain.items()]
-    for bones, group in (
-        (("pelvis", "femur"), "across hip"),
-        (("pelvis", "tibia"), "across hip, knee"),
-        (("femur", "patella"), "along femur"),
-        (("femur", "foot"), "across knee"),
-    ):
-        muscle = {"name": "one", "attach": [{"bone": bone} for bone in bones]}
-        assert muscle_groups({"scene": {"joints": joints, "muscles": [muscle]}}) == {"one": group}
+    joints = [
+        ("hip", "pelvis", "femur"),
+        ("knee", "femur", "tibia"),
+        ("ankle", "tibia", "foot"),
+        ("cap", "femur", "patella"),
+    ]
+    attached = {
+        "gluteus": ("pelvis", "femur"),
+        "sartorius": ("pelvis", "tibia"),
+        "vastus": ("femur", "patella"),
+        "gastrocnemius": ("femur", "foot"),
+    }
+    assert muscle_groups(scene_info(attached, joints)) == {
+        "gluteus": "across hip",
+        "sartorius": "across hip, knee",
+        "vastus": "along femur",
+        "gastrocnemius": "across knee",
+    }
+
+
+def test_events_are_counted_by_kind_and_names_stay_text():
+    events = [(k, "<b>one", "bone", 1, "halved") for k in range(70)] + [(3, "", "bone", 1, "bones_overlap")]
+    text = _events(events)
+    assert text.index("halved") < text.index("bones_overlap") and text.count("<tr>") == 1 + 2
+    assert "<b>" not in text and "&lt;b&gt;one 70" in text and "bone 1" in text
 
 
 @pytest.mark.parametrize(
@@ -151,15 +190,19 @@ def test_numbers_have_the_digits_that_say_something(value, unit, text):
 
 
 def test_lights_are_green_amber_from_four_fifths_and_red_beyond():
-    states = [limit_state(v, 0.5) for v in (0.1, -0.4, 0.45, 0.5, -0.51, np.nan)]
-    assert states == ["good", "good", "near", "near", "bad", "bad"]
+    assert [limit_state(v, 0.5) for v in (0.1, -0.4, 0.45, 0.5, -0.51, np.nan)] == [
+        "good",
+        "good",
+        "near",
+        "near",
+        "bad",
+        "bad",
+    ]
     assert [limit_state(v, 1.0, count=True) for v in (1.0, 2.0)] == ["good", "bad"]
     assert [limit_state(v, 2.0, least=True) for v in (2.0, 0.0)] == ["good", "bad"]
     assert limit_state(5.0, None) == "plain"
 
 
-def test_events_are_listed_by_kind_and_names_stay_text():
-    events = [(k, "<b>one", "bone", 1, "halved") for k in range(70)] + [(3, "", "bone", 1, "bones_overlap")]
-    text = _events(events)
-    assert text.index("halved") < text.index("bones_overlap") and "and 10 more" in text
-    assert text.count("<tr>") == 60 + 1 + 2 and "<b>" not in text and "&lt;b&gt;one 70" in text
+def test_tables_sort_by_value_and_names_stay_text():
+    text = table(["a", "b"], [["<i>x", Cell("1.2 mm", 1.2, "bad")], ["y", "n/a"]])
+    assert "&lt;i&gt;x" in text and 'data-value="1.2" class="bad">1.2 mm<' in text

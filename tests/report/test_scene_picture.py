@@ -4,30 +4,12 @@ import numpy as np
 from PIL import Image
 
 from rbfmuscle.cli.app import run_command as command
-from rbfmuscle.report.scene_picture import draw_scene, find_faults
+from rbfmuscle.report.scene_picture import draw_scene
 from rbfmuscle.scene.phantom import phantom_scene
 
 
-def test_far_ends_and_overlaps_are_those_of_the_scene():
-    scene = phantom_scene(spacing=6.0)
-    assert find_faults(scene) == ([], [])
-    muscle = scene.muscles[0]
-    away = muscle.mesh.copy()
-    away.apply_translation([-400.0, 0, 0])
-    muscle.mesh = away
-    inside = scene.muscles[1].mesh.copy()
-    inside.apply_translation(np.asarray(scene.bones[1].mesh.centroid) - inside.centroid)
-    scene.muscles[1].mesh = inside
-    far, overlaps = find_faults(scene)
-    gaps = {(end.muscle, end.bone): end.size for end in far}
-    assert all(250.0 < gaps[muscle.name, a.bone] < 410.0 for a in muscle.attachments)
-    assert ("femur", scene.muscles[1].name) in {(one.bone, one.muscle) for one in overlaps}
-    deep = next(one for one in overlaps if one.bone == "femur")
-    assert scene.bones[1].mesh.contains(deep.points).all()
-
-
 def test_picture_shows_bones_and_patches_in_their_colours(tmp_path):
-    assert draw_scene(phantom_scene(spacing=6.0), tmp_path / "scene.png") == {"far_ends": 0, "overlaps": 0}
+    draw_scene(phantom_scene(spacing=6.0), tmp_path / "scene.png")
     image = np.asarray(Image.open(tmp_path / "scene.png").convert("RGB"), dtype=int)
     # The pelvis is pale rose and the femur pale indigo: both are in every one of the four views.
     for view in np.array_split(image[40:860], 4, axis=1):
@@ -43,4 +25,4 @@ def test_command_writes_it_beside_the_scene(tmp_path, capsys):
     assert command(["new", str(tmp_path), "--units", "mm"]) == 0
     assert command(["check", str(tmp_path / "scene.toml"), "--picture"]) == 0
     assert (tmp_path / "scene.png").is_file()
-    assert f"{tmp_path / 'scene.png'}: " in capsys.readouterr().out
+    assert f"{tmp_path / 'scene.png'}\n" in capsys.readouterr().out

@@ -55,7 +55,6 @@ def test_picture_of_a_scene_is_of_the_pose_asked_for(tmp_path, capsys, graphics)
         (["--at", "hip.flexion=3"], "unknown coordinate 'hip.flexion'"),
         (["--at", "frame=7", "--screenshot", "x.png"], "was not written"),
         (["--at", "hip.flexion=3", "--screenshot", "x.png"], "unknown coordinate 'hip.flexion'"),
-        (["--colour", "stretch", "--screenshot", "x.png"], "group or activation"),
     ],
 )
 def test_wrong_use_is_one_line(run_folder, capsys, arguments, says):

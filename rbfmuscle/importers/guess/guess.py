@@ -28,8 +28,8 @@ class SceneGuess:
     """What was guessed of a folder.
 
     ``title`` is what the comment at the top of the file calls the source, ``root`` the bone that stands still,
-    ``unusable`` says why a bone or a muscle is not in the scene, by file; ``notes`` what was left out, taken for
-    something or made coarser, and the unit where it was guessed.
+    ``unusable`` says why a bone or a muscle is not in the scene, by file, ``left_out`` names the bones of them;
+    ``notes`` what was left out, taken for something or made coarser, and the unit where it was guessed.
     """
 
     title: str
@@ -40,6 +40,7 @@ class SceneGuess:
     joints: list[JointGuess]
     orientation: Orientation | None = None
     unusable: dict[str, str] = field(default_factory=dict)
+    left_out: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     muscles: list[MuscleGuess] = field(default_factory=list)
 
@@ -86,7 +87,9 @@ def guess_scene(
     root, joints = guess_joints(bones, millimetre, orientation)
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", folder.resolve().name) or "scene"
     title = f"the meshes in {folder.name or folder}"
-    guess = SceneGuess(title, name, units, bones, root, joints, orientation, found.unusable, notes)
+    guess = SceneGuess(
+        title, name, units, bones, root, joints, orientation, found.unusable, found.left_out, notes
+    )
     bodies = {bone: bone for bone in bones}
     for joint in joints:  # parents come before their children
         if joint.kind == "fixed":

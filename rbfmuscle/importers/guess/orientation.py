@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
 from rbfmuscle.importers.guess.landmarks import Frame, across, femur_frame, long_axis, unit
 from rbfmuscle.importers.guess.names import name_facts
 from rbfmuscle.importers.guess.parts import Part
+from rbfmuscle.scene.objects import SceneData
+
+S = TypeVar("S", bound=SceneData)
 
 # Directions of bones and header that differ by more than this [degree] are named.
 AGREE = 45.0
+# Scans are saved along the body: an axis of the coordinates within this [degree] of what a thigh shows is taken.
+ALONG = 25.0
+# Of fewer triangles the shape of a bone says nothing.
+LEAST_TRIANGLES = 100
 _ABOVE = {"femur": ("pelvis", "ilium", "sacrum"), "tibia": ("femur", "patella")}
 _BELOW = {
     "femur": ("tibia", "patella", "fibula", "talus", "calcaneus", "foot"),
@@ -54,7 +61,8 @@ def find_orientation(bones: list[Part], header: Orientation | None = None) -> Or
     superior = unit(np.sum([frame.superior for frame in frames], axis=0))
     anterior = unit(across(np.sum([frame.anterior for frame in frames], axis=0), superior))
     if header is None:
-        return Orientation(superior, anterior, doubts=doubts)
+        up, front = _along_axes(superior, anterior)
+        return Orientation(up, front, doubts=doubts)
     for word, found, known in (
         ("superior", superior, header.superior),
         ("anterior", anterior, header.anterior),
@@ -65,13 +73,21 @@ def find_orientation(bones: list[Part], header: Orientation | None = None) -> Or
     return Orientation(header.superior, header.anterior, source=header.source, doubts=doubts)
 
 
-def orient_scene(scene: Any) -> None:
-    """Give a loaded scene the directions that its bones show, by their names and shapes, where its file has none."""
+def orient_scene(scene: S) -> S:
+    """Give a scene the directions that its bones show, by their names and shapes, where its file has none."""
     if scene.superior is None or scene.anterior is None:
-        bones = [Part(bone.name, "", bone, name_facts(bone.name).bone) for bone in scene.bones]
-        found = find_orientation(bones)
+        shapes = [bone for bone in scene.bones if len(bone.mesh.faces) >= LEAST_TRIANGLES]
+        found = find_orientation([Part(b.name, "", b, name_facts(b.name).bone) for b in shapes])
         if found is not None:
             scene.superior, scene.anterior = found.superior.tolist(), found.anterior.tolist()
+    return scene
+
+
+def _along_axes(superior, anterior):
+    """Directions, or in place of both the nearest axes of the coordinates."""
+    found = np.stack([superior, anterior])
+    axes = np.sign(found) * (np.abs(found) == np.abs(found).max(axis=1, keepdims=True))
+    return axes if ((found * axes).sum(axis=1) > np.cos(np.radians(ALONG))).all() else found
 
 
 def neighbours(bone: Part, bones: list[Part], table: dict[str, tuple[str, ...]]) -> list[Part]:

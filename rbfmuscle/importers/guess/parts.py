@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.importers.guess.names import MuscleFacts, name_facts
 from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, prepare_mesh, read_arrays
 from rbfmuscle.validation import MeshError, UsageError
@@ -88,12 +89,14 @@ class Part:
 class Parts:
     """What is in a folder.
 
-    ``unusable`` gives reasons by file; ``notes`` name what was left out, misspelt or made coarser.
+    ``unusable`` gives reasons by file, ``left_out`` names those that are no muscles;
+    ``notes`` name what was left out, misspelt or made coarser.
     """
 
     bones: list[Part] = field(default_factory=list)
     muscles: list[Part] = field(default_factory=list)
     unusable: dict[str, str] = field(default_factory=dict)
+    left_out: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
@@ -111,6 +114,7 @@ def read_parts(folder: Path, base: Path) -> Parts:
             part = _read_part(path, base, names, facts, found.notes, closed=tissue == "muscle")
         except MeshError as error:
             found.unusable[path.name] = str(error).removeprefix(f"{path}: ")
+            found.left_out += [path.stem] if tissue != "muscle" else []
             continue
         if facts.spelling:
             found.notes.append(f"{path.name}: {facts.spelling}")
@@ -155,21 +159,6 @@ def _read_part(path, base, names, facts, notes, *, closed):
     read = prepare_mesh(vertices, faces, place=str(path), name=path.stem, may_be_open=not closed)
     file = os.path.relpath(path, base).replace(os.sep, "/")
     return Part(name, file, read, facts.bone, facts.side, facts=facts.muscle, coarse=coarse)
-
-
-def clustered(vertices: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """A mesh of about as many triangles as wanted: the vertices of each cell of a grid become their mean.
-
-    Rossignac and Borrel 1993, "Multi-resolution 3D approximations for rendering complex scenes".
-    """
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-    cells = np.floor((vertices - vertices.min(axis=0)) / np.sqrt(2.0 * area / count)).astype(np.int64)
-    keys = np.ravel_multi_index(cells.T, cells.max(axis=0) + 1)
-    _, place, members = np.unique(keys, return_inverse=True, return_counts=True)
-    means = np.stack([np.bincount(place, vertices[:, k]) / members for k in range(3)], axis=1)
-    new = place[faces]
-    return means, new[(new != np.roll(new, 1, axis=1)).all(axis=1)]
 
 
 def guess_units(bones: list[Part]) -> tuple[str, str]:

@@ -13,9 +13,6 @@ initial = "resolve"   # muscles that start inside a bone are pushed out; or "kee
 
 [detect]
 tunnelling = { angle = 135, action = "substep" }   # points that pass through a bone in one step
-
-[output]
-surfaces = { format = "pvd" }   # or vtp, ply, stl, obj, glb
 """
 
 
@@ -40,6 +37,9 @@ def _head(guess):
     ]
     row = {"format": 1, "name": guess.name, "units": guess.units}
     comments = {"units": "of every length here; a mesh in another unit takes scale = ..."}
+    if guess.left_out:
+        row["left_out"] = guess.left_out
+        comments["left_out"] = "bones that cannot be used, and no run is within all limits"
     for word in ("superior", "anterior") if guess.orientation is not None else ():
         row[word] = rounded(getattr(guess.orientation, word), 5)
         comments[word] = f"by {guess.orientation.source}"

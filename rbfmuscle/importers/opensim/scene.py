@@ -92,6 +92,7 @@ def import_osim(
             notes += [f"body {body!r}: {note}" for note in meshes[body].notes]
         else:
             scene.add_link(names[body])
+            scene.left_out += [names[body]] if any(mesh.body == body for mesh in model.meshes) else []
     found = Imported(scene, model, {body: scaled(t, metre) for body, t in ground.items()}, names, notes)
     _add_joints(found, metre)
     scene.superior, scene.anterior = [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]

@@ -34,8 +34,9 @@ def write_scene(found: Imported, directory: Path, *, motion: Path | None = None)
             found.notes += scene.motion.notes
             tail = [table_text("[motion]", {"file": file})]
         parts = [_head(found)]
-        directions = {"superior": scene.superior, "anterior": scene.anterior}
-        parts.append(table_text("[scene]", {**facts, **directions}))
+        facts |= {"left_out": scene.left_out} if scene.left_out else {}
+        facts |= {"superior": scene.superior, "anterior": scene.anterior}
+        parts.append(table_text("[scene]", facts))
         for bone in scene.bones:
             row = {"name": bone.name, "mesh": _write_mesh(directory, "bones", bone)}
             parts.append(table_text("[[bone]]", row))

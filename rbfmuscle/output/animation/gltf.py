@@ -16,12 +16,11 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.output.animation.moving import MovingBone, MovingMuscle, MovingRun
-from rbfmuscle.output.colours import linear_rgb
+from rbfmuscle.output.appearance import linear_rgb
 from rbfmuscle.validation import UsageError
 
 _FLOAT, _INT = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963  # what a view is bound as
-_TURN_Z_UP = [-np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]  # quaternion (x, y, z, w) that brings z up to y up
 
 
 def animated_glb(run: MovingRun, name: str = "animated-glb") -> bytes:
@@ -43,8 +42,8 @@ def animated_glb(run: MovingRun, name: str = "animated-glb") -> bytes:
         file.times = file.add(run.times[:, None] - run.times[0], "SCALAR", bounds=True)
     children = [_add_bone(file, bone) for bone in run.bones] + [_add_muscle(file, m) for m in run.muscles]
     root: dict[str, Any] = {"name": run.name, "children": children}
-    if run.up == "z":
-        root["rotation"] = [float(x) for x in _TURN_Z_UP]
+    left, posterior, superior = run.body  # glTF looks at what faces +z, with y up
+    root["rotation"] = _quaternions(np.stack([left, superior, -posterior])[None])[0].tolist()
     return file.content({"name": run.name, "nodes": [file.append("nodes", root)]})
 
 

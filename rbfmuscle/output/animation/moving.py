@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.output.colours import BONE_COLOUR, TENDON_COLOUR, muscle_colours, rgb
+from rbfmuscle.output.appearance import BONE_COLOUR, TENDON_COLOUR, muscle_colours, rgb
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.objects import MM_PER_UNIT
 
@@ -74,8 +74,8 @@ class MovingRun:
         Of the frames [s].
     timed : bool
         Whether these are the motion's own.
-    up : {"z", "y"}
-        The axis that points up.
+    body : (3, 3) ndarray
+        Left, posterior and superior.
     """
 
     name: str
@@ -84,10 +84,10 @@ class MovingRun:
     timed: bool
     muscles: list[MovingMuscle]
     bones: list[MovingBone]
-    up: str
+    body: Floats
 
 
-def read_moving(saved: SavedRun, frames: list[int], *, unit: str, up: str = "z") -> MovingRun:
+def read_moving(saved: SavedRun, frames: list[int], *, unit: str) -> MovingRun:
     """Some frames of a saved run at once, lengths in ``unit``."""
     factor = MM_PER_UNIT[saved.units] / MM_PER_UNIT[unit]
     colours = {**muscle_colours(saved.muscles), **dict.fromkeys(saved.tendons, TENDON_COLOUR)}
@@ -101,7 +101,7 @@ def read_moving(saved: SavedRun, frames: list[int], *, unit: str, up: str = "z")
     times = saved.times or {frame: frame / FRAMES_A_SECOND for frame in frames}
     name = str(saved.info["scene"].get("name") or Path(saved.directory).name)
     at = np.array([times[frame] for frame in frames], dtype=float)
-    return MovingRun(name, unit, at, bool(saved.times), muscles, bones, up)
+    return MovingRun(name, unit, at, bool(saved.times), muscles, bones, saved.body)
 
 
 def _read_muscle(saved, name, frames, factor, colour):

@@ -19,11 +19,10 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.output.animation.moving import FRAMES_A_SECOND, MovingMuscle, MovingRun
+from rbfmuscle.output.appearance import VIEWS
 
 # Whole numbers of which the longest side of all that moves has so many: 0.03 mm of 900.
 _STEPS = 30_000
-# From which it is seen where nothing else is asked for.
-_USUAL = (-1.0, -0.12, 0.12)
 
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">
@@ -47,7 +46,7 @@ def write_animated_page(
     captions : list of str
         Of each frame.
     direction : (3,) ndarray, optional
-        From which it is first seen.
+        From which it is first seen, along the body's axes.
     """
     data = pack_runs({"": run}, captions, direction=direction)
     page = _PAGE.format(
@@ -78,7 +77,7 @@ def pack_runs(
     captions : list of str
         Of each frame.
     direction : (3,) ndarray, optional
-        From which they are first seen.
+        From which they are first seen, along the body's axes.
     groups, colours : dict of str to str, optional
         Of each muscle; the colours of the runs where not given.
     """
@@ -103,8 +102,9 @@ def pack_runs(
             }
         )
     facts = {
-        "panels": list(runs), "captions": captions, "parts": parts, "up": first.up, "step": packer.step,
-        "direction": [float(x) for x in (_USUAL if direction is None else direction)],
+        "panels": list(runs), "captions": captions, "parts": parts, "step": packer.step,
+        "views": VIEWS, "body": first.body.tolist(),
+        "direction": [float(x) for x in (VIEWS["right"] if direction is None else direction)],
         "origin": packer.origin.tolist(), "rate": FRAMES_A_SECOND / 2.0, "bytes": packer.text(),
     }  # fmt: skip
     # No name may end the script that holds it.

@@ -7,7 +7,6 @@ const FRAGMENT = `precision mediump float; varying vec3 facing; uniform vec3 col
 void main() { vec3 n = normalize(facing); float lit = max(dot(n, vec3(-0.3, 0.39, 0.87)), 0.0);
 float gloss = pow(max(dot(n, vec3(-0.155, 0.2, 0.967)), 0.0), 24.0);
 gl_FragColor = vec4(colour * (0.42 + 0.62 * lit) + 0.1 * gloss, 1.0); }`;
-const VIEWS = {front: [0, -1, 0.12], side: [-1, -0.12, 0.12], back: [0, 1, 0.12], far: [1, -0.12, 0.12]};
 
 const element = (kind, parent, words) => parent.appendChild(Object.assign(document.createElement(kind), words));
 const add = (a, b, share) => a.map((x, k) => x + share * b[k]);
@@ -90,7 +89,7 @@ class Scene {
     this.slider = element("input", bar, {type: "range", min: 0, max: last, value: 0, ariaLabel: "frame", hidden: last < 1});
     this.caption = element("span", bar, {className: "caption"});
     const views = element("div", bar, {className: "views"});
-    for (const [name, way] of Object.entries({motion: data.direction, ...VIEWS}))
+    for (const [name, way] of Object.entries({motion: data.direction, ...data.views}))
       element("button", views, {type: "button", textContent: name, onclick: () => this.look(way)});
     const names = element("div", this.home, {className: "names"}), groups = new Map();
     for (const part of data.parts) {
@@ -161,19 +160,16 @@ class Scene {
     requestAnimationFrame((later) => this.step(later));
   }
 
-  // Seen from a direction in which z (or y) is up.
-  look(way) {
-    const [x, y, z] = this.data.up === "y" ? [way[0], -way[2], way[1]] : way;
-    this.azimuth = Math.atan2(y, x); this.height = Math.atan2(z, Math.hypot(x, y));
+  // Seen from a direction along the body's axes: left, posterior, superior.
+  look([x, y, z]) {
+    this.azimuth = x || y ? Math.atan2(y, x) : Math.sign(z) * Math.PI / 2; this.height = Math.atan2(z, Math.hypot(x, y));
     this.zoom = 1; this.shift = [0, 0]; this.box = this.bounds(this.axes()); this.draw();
   }
 
   axes() {
-    const flat = Math.cos(this.height);
-    let ahead = [flat * Math.cos(this.azimuth), flat * Math.sin(this.azimuth), Math.sin(this.height)], up = [0, 0, 1];
-    if (this.data.up === "y") { ahead = [ahead[0], ahead[2], -ahead[1]]; up = [0, 1, 0]; }
-    const right = unit(cross(up, ahead));
-    return [right, cross(ahead, right), ahead];
+    const [c, s, rise, flat] = [Math.cos(this.azimuth), Math.sin(this.azimuth), Math.sin(this.height), Math.cos(this.height)];
+    const axes = [[-s, c, 0], [-c * rise, -s * rise, flat], [c * flat, s * flat, rise]];
+    return axes.map((axis) => [0, 1, 2].map((k) => axis.reduce((sum, x, j) => sum + x * this.data.body[j][k], 0)));
   }
 
   // Middle and half sizes of all muscles in all frames.

@@ -10,7 +10,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.output.animation.moving import FRAMES_A_SECOND, MovingBone, MovingMuscle, MovingRun
-from rbfmuscle.output.colours import linear_rgb
+from rbfmuscle.output.appearance import linear_rgb
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import MissingPartError
 
@@ -36,21 +36,26 @@ def write_usd(path: Path, run: MovingRun) -> None:
     Notes
     -----
     Time codes count 24 a second. A surface that keeps its vertices has its topology once and its points at every
-    time; another one has both at every time. Lengths stay in the run's unit, named by ``metersPerUnit``.
+    time; another one has both at every time. Lengths stay in the run's unit, named by ``metersPerUnit``;
+    the root brings superior to z.
     """
     check_usd()
-    from pxr import Usd, UsdGeom
+    from pxr import Gf, Usd, UsdGeom
 
     codes = (run.times * FRAMES_A_SECOND).tolist()
     stage = Usd.Stage.CreateInMemory()
-    UsdGeom.SetStageUpAxis(stage, run.up.upper())
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, MM_PER_UNIT[run.unit] / 1000.0)
     stage.SetTimeCodesPerSecond(FRAMES_A_SECOND)
     stage.SetFramesPerSecond(FRAMES_A_SECOND)
     stage.SetStartTimeCode(codes[0])
     stage.SetEndTimeCode(codes[-1])
     place = f"/{identifier(run.name, set())}"
-    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, place).GetPrim())
+    root = UsdGeom.Xform.Define(stage, place)
+    stage.SetDefaultPrim(root.GetPrim())
+    upright = np.eye(4)
+    upright[:3, :3] = run.body
+    root.AddTransformOp().Set(Gf.Matrix4d(upright.T))
     used: set[str] = set()
     parts: list[MovingBone | MovingMuscle] = [*run.bones, *run.muscles]
     for part in parts:
@@ -61,7 +66,8 @@ def write_usd(path: Path, run: MovingRun) -> None:
             _fill_bone(mesh, part, codes)
         else:
             _fill_muscle(mesh, part, codes)
-        _paint(stage, mesh, part, place)
+        mesh.CreateDisplayColorAttr([Gf.Vec3f(*linear_rgb(part.colour).tolist())])
+        mesh.GetPrim().SetDisplayName(part.name)
     stage.GetRootLayer().Export(str(path))
 
 
@@ -106,31 +112,13 @@ def _set_points(mesh: Any, vertices: Floats, at: tuple[float, ...]) -> None:
     mesh.CreateExtentAttr().Set(Vt.Vec3fArray.FromNumpy(extent), *at)
 
 
-def _paint(stage: Any, mesh: Any, part: MovingBone | MovingMuscle, place: str) -> None:
-    """The colour of a mesh, for those who draw materials and for those who draw none."""
-    from pxr import Gf, Sdf, UsdShade
-
-    colour = Gf.Vec3f(*linear_rgb(part.colour).tolist())
-    mesh.CreateDisplayColorAttr([colour])
-    mesh.GetPrim().SetDisplayName(part.name)
-    at = f"{place}/materials/{mesh.GetPrim().GetName()}"
-    material = UsdShade.Material.Define(stage, at)
-    shader: Any = UsdShade.Shader.Define(stage, f"{at}/surface")
-    shader.CreateIdAttr("UsdPreviewSurface")
-    shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(colour)
-    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.6)
-    output = shader.CreateOutput("surface", Sdf.ValueTypeNames.Token)
-    material.CreateSurfaceOutput().ConnectToSource(output)
-    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
-
-
 def identifier(name: str, used: set[str]) -> str:
     """A name as USD allows it, unlike those used before."""
     from pxr import Tf
 
     base = Tf.MakeValidIdentifier(name)
     found, count = base, 1
-    while found in used or found == "materials":
+    while found in used:
         count += 1
         found = f"{base}_{count}"
     used.add(found)

@@ -12,13 +12,5 @@ document.querySelectorAll("table.sortable thead th").forEach((head) => {
     body.append(...[...body.rows].sort((a, b) => order(value(a), value(b))));
   };
 });
-document.querySelectorAll("input.find").forEach((field) => {
-  field.oninput = () => {
-    const words = field.value.toLowerCase().split(/[ ,]+/).filter(Boolean);
-    field.closest("details").querySelectorAll("tbody tr").forEach((row) => {
-      row.hidden = words.length > 0 && !words.some((word) => row.cells[0].textContent.toLowerCase().includes(word));
-    });
-  };
-});
 window.addEventListener("beforeprint", () => document.querySelectorAll("details").forEach((one) => { one.open = true; }));
 })();

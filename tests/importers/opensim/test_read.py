@@ -117,6 +117,15 @@ class TestSmall:
         (note,) = [note for note in read_osim(small).notes if "closes a loop" in note]
         assert "joint 'strut' (ground to shank)" in note
 
+    def test_what_is_not_taken_is_named(self, small):
+        notes = "\n".join(import_osim(small).notes)
+        for text in (
+            "'rail' (PointOnLineConstraint)",
+            "'wedge.obj' is hidden",
+            "'nowhere.vtp' is not taken: it is not there",
+        ):
+            assert text in notes
+
     def test_scene_stands_in_the_default_pose(self, small):
         found = import_osim(small, units="mm")
         scene = found.scene
@@ -134,6 +143,12 @@ class TestSmall:
         assert mesh.volume == pytest.approx(2 * 0.1**3 / 6)
         assert mesh.bounds[0][2] == pytest.approx(-0.2)
 
+    def test_only_some_bodies(self, small):
+        scene = import_osim(small, bodies=["thigh"]).scene
+        assert [bone.name for bone in scene.bones] == ["thigh"] and len(scene.joints) == 1
+        with pytest.raises(SceneError, match=r"no body 'thig', did you mean 'thigh'"):
+            import_osim(small, bodies=["thig"])
+
 
 def test_ground_may_be_the_child(small):
     text = small.read_text(encoding="utf-8").replace(
@@ -149,6 +164,19 @@ def test_ground_may_be_the_child(small):
     assert pose == pytest.approx(forth["shank"], abs=1e-14)
 
 
+def test_a_body_keeps_the_meshes_that_can_be_read_beside_one_that_cannot(small):
+    both = '<Mesh name="bad"><mesh_file>bad.obj</mesh_file></Mesh><Mesh name="n">'
+    small.write_text(small.read_text(encoding="utf-8").replace('<Mesh name="n">', both))
+    torn = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 99\n"
+    (small.parent / "bad.obj").write_text(torn)
+    found = import_osim(small)
+    assert [bone.name for bone in found.scene.bones] == ["thigh", "shank"]
+    assert sum("body 'thigh': mesh 'bad.obj' is not taken" in note for note in found.notes) == 1
+    (small.parent / "wedge.obj").write_text(torn)
+    scene = import_osim(small).scene
+    assert not scene.bones and "thigh" in scene.left_out
+
+
 @pytest.mark.parametrize("sort", ["rotation", "translation"])
 @pytest.mark.parametrize("place", [0, 1, 2])
 def test_a_coordinate_is_what_it_drives_alone_with_a_slope_of_one_on_any_axis(sort, place):
@@ -159,10 +187,3 @@ def test_a_coordinate_is_what_it_drives_alone_with_a_slope_of_one_on_any_axis(so
 
     assert found(-1.0) == [sort, "coupled"]
     assert found(0.5) == found(1.0, ("q", "p")) == ["coupled", "coupled"]
-
-
-def test_only_some_bodies(small):
-    scene = import_osim(small, bodies=["thigh"]).scene
-    assert [bone.name for bone in scene.bones] == ["thigh"] and len(scene.joints) == 1
-    with pytest.raises(SceneError, match=r"no body 'thig', did you mean 'thigh'"):
-        import_osim(small, bodies=["thig"])

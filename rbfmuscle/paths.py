@@ -1,4 +1,4 @@
-"""What ``rbfmuscle paths`` does: sample muscles over their coordinates, fit, and say how well the fits hold."""
+"""Paths of muscles for OpenSim: sample muscles over their coordinates, fit, and say how well the fits hold."""
 
 import csv
 import math

@@ -1,0 +1,24 @@
+"""Meshes with fewer triangles, for looks and for guesses: they may have holes and touch themselves."""
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats, Integers
+
+
+def clustered(vertices: Floats, faces: Integers, count: int) -> tuple[Floats, Integers]:
+    """A mesh of about as many triangles as wanted; one that has no more as it is.
+
+    The vertices of each cell of a grid become their mean (Rossignac and Borrel 1993, "Multi-resolution 3D
+    approximations for rendering complex scenes").
+    """
+    vertices, faces = np.asarray(vertices, dtype=float), np.asarray(faces)
+    if len(faces) <= count:
+        return vertices, faces
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+    cells = np.floor((vertices - vertices.min(axis=0)) / np.sqrt(2.0 * area / count)).astype(np.int64)
+    keys = np.ravel_multi_index(cells.T, cells.max(axis=0) + 1)
+    _, place, members = np.unique(keys, return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(place, vertices[:, k]) / members for k in range(3)], axis=1)
+    new = place[faces]
+    return means, new[(new != np.roll(new, 1, axis=1)).all(axis=1)]

@@ -1,0 +1,134 @@
+"""How muscles, bones and views look in files, pictures, plots and pages: colours, groups, directions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats
+
+BACKGROUND = "#ffffff"
+BONE_COLOUR, TENDON_COLOUR = "#e9e0cd", "#cfd8dc"
+# People who are colour-blind can distinguish them (P. Tol, "muted"); its sand is left out, as bones have that colour.
+MUSCLE_COLOURS = ("#cc6677", "#332288", "#44aa99", "#882255", "#88ccee", "#117733", "#aa4499", "#999933")
+# How much nearer to white or black the muscles of one group are, one after the other.
+_SHADES = (0.0, 0.3, -0.25)
+# From the subject to the camera, along the body's axes: left, posterior, superior.
+VIEWS: dict[str, tuple[float, float, float]] = {
+    "front": (0.0, -1.0, 0.12),
+    "back": (0.0, 1.0, 0.12),
+    "left": (1.0, -0.12, 0.12),
+    "right": (-1.0, -0.12, 0.12),
+    "top": (0.0, 0.0, 1.0),
+    "bottom": (0.0, 0.0, -1.0),
+}
+# What is drawn where nothing else is asked for.
+USUAL_VIEWS = ("front", "right", "back")
+
+
+def muscle_groups(info: Mapping[str, Any]) -> dict[str, str]:
+    """Group of each muscle by the joints that it crosses.
+
+    Parameters
+    ----------
+    info : dict
+        What ``run.json`` holds. Joints that carry a single bone without another joint (a patella, a tendon's end) are
+        left out; a muscle that crosses no other belongs to the bone that it lies along.
+    """
+    joints = info["scene"].get("joints", [])
+    above = {joint["child"]: joint for joint in joints}
+    carrying = {joint["parent"] for joint in joints}
+
+    def chain(bone: str) -> list[str]:
+        found = []
+        while bone in above and bone not in found:
+            found.append(bone)
+            bone = above[bone]["parent"]
+        return [*found, bone]
+
+    groups = {}
+    for muscle in info["scene"]["muscles"]:
+        chains = [chain(part["bone"]) for part in muscle.get("attach", [])]
+        crossed = {bone for one in chains for bone in one if any(bone not in other for other in chains)}
+        names = [joint["name"] for joint in joints if joint["child"] in crossed & carrying]
+        if len(joints) == 1 and crossed:
+            names = [joints[0]["name"]]
+        shared = [bone for bone in (chains[0] if chains else []) if all(bone in one for one in chains)]
+        groups[muscle["name"]] = f"across {', '.join(names)}" if names else f"along {(shared or ['?'])[0]}"
+    return groups
+
+
+def muscle_colours(names: Sequence[str], groups: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Dict of muscle name to its colour in pictures and plots; of many muscles a hue for each group.
+
+    Parameters
+    ----------
+    names : sequence of str
+    groups : dict of str to str, optional
+        Of each muscle.
+    """
+    if groups is None or len(names) <= len(MUSCLE_COLOURS):
+        return {name: MUSCLE_COLOURS[k % len(MUSCLE_COLOURS)] for k, name in enumerate(names)}
+    kinds = list(dict.fromkeys(groups[name] for name in names))
+    found, seen = {}, dict.fromkeys(kinds, 0)
+    for name in names:
+        kind = groups[name]
+        hue = MUSCLE_COLOURS[kinds.index(kind) % len(MUSCLE_COLOURS)]
+        found[name] = mixed_colour(hue, _SHADES[seen[kind] % len(_SHADES)])
+        seen[kind] += 1
+    return found
+
+
+def mixed_colour(colour: str, share: float) -> str:
+    """A colour brought nearer to white (share above 0) or to black (below)."""
+    values = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+    end = 255 if share > 0 else 0
+    return "#" + "".join(f"{round(value + abs(share) * (end - value)):02x}" for value in values)
+
+
+def rgb(colour: str) -> Floats:
+    """Red, green and blue (3,) of a colour like "#cc6677", 0 to 1."""
+    return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255.0
+
+
+def linear_rgb(colour: Floats) -> Floats:
+    """A colour (3,) as screens show it in the linear light that USD and glTF count in."""
+    return np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
+
+
+def view_axes(direction: Sequence[float] | Floats, body: Floats) -> Floats:
+    """Right, up and towards the camera (3, 3) of a picture from a direction along the body's axes.
+
+    Superior is up; seen from above or below anterior is.
+    """
+    ahead = np.asarray(direction, dtype=float) @ body
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(body[2] if abs(ahead @ body[2]) < 0.99 else -body[1], ahead)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(ahead, right), ahead])
+
+
+def motion_direction(poses: Sequence[Mapping[str, Floats]], body: Floats) -> Floats:
+    """Direction (3,) from which the motion is seen in its plane: along the axis about which a bone turns most.
+
+    Parameters
+    ----------
+    poses : sequence of dict of str to (4, 4) ndarray
+        Of each frame, by bone. From the right where no bone turns, or about an axis that is nearly upright.
+    body : (3, 3) ndarray
+        Left, posterior and superior, along which the direction is given.
+    """
+    usual = np.array(VIEWS["right"])
+    widest, axis = np.radians(2.0), usual
+    for bone, start in poses[0].items():
+        for pose in poses[1:]:
+            turn = body @ pose[bone][:3, :3] @ start[:3, :3].T @ body.T
+            skew = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+            angle = float(np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0)))
+            if angle > widest and np.linalg.norm(skew) > 1e-9:
+                widest, axis = angle, skew / np.linalg.norm(skew)
+    if abs(axis[2]) > 0.8:
+        return usual
+    return axis if axis @ usual > 0 or (axis @ usual == 0 and axis[1] < 0) else -axis
