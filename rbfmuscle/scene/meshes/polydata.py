@@ -81,11 +81,13 @@ def _answer() -> None:
 
 def _read(path: str) -> tuple[Floats, Integers, list[Integers]]:
     import pyvista
-    from vtkmodules.vtkCommonCore import vtkOutputWindow
+    from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
     with pyvista.VtkErrorCatcher(raise_errors=True, send_to_logging=False):
         data = pyvista.read(path)
-        if "mismatch of datasize" in vtkOutputWindow.GetInstance().GetOutput():  # a warning before VTK 9.7
+        said = vtkOutputWindow.GetInstance()
+        assert isinstance(said, vtkStringOutputWindow)  # the catcher of errors has set it
+        if "mismatch of datasize" in said.GetOutput():  # before VTK 9.7 a warning, not an error
             raise ValueError("it holds fewer numbers than it declares")
         if not isinstance(data, pyvista.PolyData) or not data.n_points:
             raise ValueError("no points" if isinstance(data, pyvista.PolyData) else type(data).__name__)
