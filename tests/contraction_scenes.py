@@ -133,13 +133,15 @@ def panel_pennation(stretch):
     return math.degrees(math.asin(HEIGHT / (FIBRE * stretch)))
 
 
-def panel_scene(stretch, *, spacing=4.0, frames=5, model="rbf"):
+def panel_scene(stretch, *, frames=5, model="rbf"):
     """The panel with its upper plate slid so far that straight fibres have the stretch, fully active at the end.
 
     The line of action is along the plates: attachments are the lower and the upper face, and fibres are given.
     """
     length, width = PLATES
-    box = trimesh.creation.box((length, width, HEIGHT)).subdivide_to_size(1.5 * spacing)
+    box = trimesh.creation.box((length, width, HEIGHT))
+    for _ in range(4):
+        box = box.subdivide()
     vertices, faces = box.vertices + [0.0, 0.0, 0.5 * HEIGHT], box.faces
     vertices[:, 0] += LEAN * (vertices[:, 2] / HEIGHT)
     scene = Scene("panel", units="mm")

@@ -109,7 +109,7 @@ def test_pennate_panel_turns_its_fibres_as_its_volume_says(model):
     from rbfmuscle.metrics.contraction import ContractionStudy, pennation
     from rbfmuscle.models import build_model
 
-    scene = panel_scene(0.8, model=model, spacing=6.0)
+    scene = panel_scene(0.8, model=model)
     run = rm.simulate(scene, settings={"output.surfaces": False})
     rest = build_model(scene.muscles[0], scene).material_mesh()
     study = ContractionStudy(MuscleAtRest(scene.muscles[0], scene.joints, *rest))
