@@ -18,45 +18,28 @@ from rbfmuscle.scene import options
 
 # A value for every key, other than its default; model settings of quick muscles.
 TABLES = {
-    "contact": (
-        options.ContactOptions,
-        {
-            "initial": "keep",
-            "substep_angle": 4.0,
-        },
-    ),
+    "contact": (options.ContactOptions, {"initial": "keep", "substep_angle": 4.0}),
     "sliding": (
         options.SlidingOptions,
-        {
-            "threshold": 1.5, "bones": True, "pairs": [["biceps", "brachialis"]],
-        },
+        {"threshold": 1.5, "bones": True, "pairs": [["biceps", "brachialis"]]},
     ),
-    "detect.tunnelling": (
-        options.TunnellingOptions,
-        {"angle": 120.0, "action": "report", "swept": False},
-    ),
-    "output": (
-        options.OutputOptions,
-        {
-            "surfaces": False, "tendons": False, "report": False,
-        },
-    ),
-}  # fmt: skip
+    "detect.tunnelling": (options.TunnellingOptions, {"angle": 120.0, "action": "report", "swept": False}),
+    "output": (options.OutputOptions, {"surfaces": False, "tendons": False, "report": False}),
+}
 MODELS = {
     "rbf": (
         RBFOptions,
         {
             "centres": 60, "samples": 300, "iterations": 3, "nodes": 60, "resolution": 16, "kernel": "quintic",
-            "epsilon": 0.02, "slack": 1.3, "placement": "fitted",
-            "surface": "marching",
-            "fibre_ratio": 2.0, "condition": 1e12, "rest_error": 0.4,
+            "epsilon": 0.02, "slack": 1.3, "placement": "fitted", "surface": "marching", "fibre_ratio": 2.0,
+            "condition": 1e12, "rest_error": 0.4,
         },
     ),
     "pbd": (
         PBDOptions,
         {
-            "iterations": 2, "fibre_exponent": 1.0, "bending": 0.8,
-            "edge_compliance": 0.1, "bending_compliance": 0.1, "slack": 1.2, "self_collision": True,
+            "iterations": 2, "fibre_exponent": 1.0, "bending": 0.8, "edge_compliance": 0.1,
+            "bending_compliance": 0.1, "slack": 1.2, "self_collision": True,
         },
     ),
 }  # fmt: skip
@@ -160,12 +143,11 @@ def test_compare_takes_a_whole_model_as_the_file_would_give_it(scene_file, tmp_p
         "0:2", "--set", 'model={name = "xpbd", iterations = 4}', "--set", "pbd:model.bending=0.8",
     )  # fmt: skip
     assert code == 0, err
-    found = {
-        name: json.loads((tmp_path / name / "run.json").read_text(encoding="utf-8"))["scene"]["muscles"][0][
-            "model"
-        ]
+    infos = {
+        name: json.loads((tmp_path / name / "run.json").read_text(encoding="utf-8"))
         for name in ("pbd", "xpbd")
     }
+    found = {name: info["scene"]["muscles"][0]["model"] for name, info in infos.items()}
     assert found == {"pbd": {"name": "pbd", "bending": 0.8}, "xpbd": {"name": "xpbd", "iterations": 4}}
 
 
