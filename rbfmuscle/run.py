@@ -392,7 +392,6 @@ class Run:
         from rbfmuscle.report.render import figure_html
 
         body = self.saved.body if self.scene is None else self.scene.body
-
         if not self.frames:
             return figure_html({}, {}, repr(self), np.eye(3))
         surfaces = self.frames[-1].surfaces

@@ -224,7 +224,7 @@ def excess(quantity: str, worst: float, limit: float) -> float:
 def describe_verdict(table: Table, limits: Mapping[str, float], left_out: Sequence[str] = ()) -> str:
     """Which muscles are within all limits and which are not, the worst value of each, and what to do.
 
-    ``left_out`` are the names of the bones that were.
+    ``left_out`` names the bones of which no mesh could be used.
     """
     muscles, found = [name for name in table if name != ALL], exceeded(table, limits)
     wrong = [name for name in dict.fromkeys(row[0] for row in found) if name != ALL]
@@ -246,8 +246,7 @@ def describe_verdict(table: Table, limits: Mapping[str, float], left_out: Sequen
     )
     named = [*first, *(row for row in found if row not in first)][:MOST_NAMED]
     remedies = dict.fromkeys(LIMITS[quantity].remedy for _, quantity, *_ in named if quantity in LIMITS)
-    values = "; ".join(_describe_excess(row, table) for row in named)
-    values = values.replace("bones left out", f"bones left out ({_listed(left_out)})") if left_out else values
+    values = "; ".join(_describe_excess(row, table, left_out) for row in named)
     more = f" and {len(found) - len(named)} more" if len(found) > len(named) else ""
     to_do = f". What to do: {'; '.join(remedies)}" if remedies else ""
     return f"{text}. Worst: {values}{more}{to_do}"
@@ -258,12 +257,13 @@ def _listed(names):
     return f"{', '.join(names[:MOST_NAMED])}{more}"
 
 
-def _describe_excess(row, table):
+def _describe_excess(row, table, left_out):
     muscle, quantity, worst, limit, frame = row
     unit = table[muscle][quantity]["unit"]
     value = f"{shown_number(worst)}{'' if unit == '1' else f' {unit}'}"
     place = "the bones" if muscle == ALL else muscle
     title = LIMITS[quantity].title if quantity in LIMITS else quantity
+    title += f" ({_listed(left_out)})" if quantity == "bones_left_out" else ""
     return f"{place}, {title} {value} at frame {frame} (limit {limit:.3g})"
 
 

@@ -56,7 +56,8 @@ def muscle_groups(info: Mapping[str, Any]) -> dict[str, str]:
         if len(joints) == 1 and crossed:
             names = [joints[0]["name"]]
         shared = [bone for bone in (chains[0] if chains else []) if all(bone in one for one in chains)]
-        groups[muscle["name"]] = f"across {', '.join(names)}" if names else f"along {(shared or ['?'])[0]}"
+        along = f"along {shared[0]}" if shared else "without a joint"
+        groups[muscle["name"]] = f"across {', '.join(names)}" if names else along
     return groups
 
 

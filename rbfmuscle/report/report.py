@@ -137,7 +137,7 @@ def _facts(saved: SavedRun) -> list[str]:
     facts = [
         f"model {', '.join(models)}",
         f"{len(saved.muscles)} muscles",
-        f"{len(saved.frames)} frames",
+        f"{len(saved.frames)} frame{'s'[: len(saved.frames) != 1]}",
         time,
         f"{info['times']['wall']:.1f} s in all",
     ]

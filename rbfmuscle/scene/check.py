@@ -59,11 +59,7 @@ def check_scene(scene: SceneData, exact: ExactMeshes | None = None) -> list[Find
         if not bone.closed
     ]
     findings += [
-        Finding(
-            "warning",
-            name,
-            "no mesh of this bone could be used: muscles pass through it",
-        )
+        Finding("warning", name, "no mesh of this bone could be used: muscles pass through it")
         for name in scene.left_out
     ]
     findings += [Finding("warning", "motion", note) for note in scene.motion.notes]

@@ -39,7 +39,7 @@ def _head(guess):
     comments = {"units": "of every length here; a mesh in another unit takes scale = ..."}
     if guess.left_out:
         row["left_out"] = guess.left_out
-        comments["left_out"] = "bones that cannot be used, and no run is within all limits"
+        comments["left_out"] = "bones whose meshes cannot be used; every run counts them as beyond its limits"
     for word in ("superior", "anterior") if guess.orientation is not None else ():
         row[word] = rounded(getattr(guess.orientation, word), 5)
         comments[word] = f"by {guess.orientation.source}"
