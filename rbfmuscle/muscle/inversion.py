@@ -18,20 +18,35 @@ ROUNDS = 10  # of that search
 
 
 @compiled(error_model="numpy")
+def _determinant(m):
+    return (
+        m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])
+        - m[0, 1] * (m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0])
+        + m[0, 2] * (m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0])
+    )
+
+
+@compiled(error_model="numpy")
 def nearest_volume(f, out):
     """The nearest matrix to ``f`` (3, 3) with a determinant of at least `LEAST`: squared distance, and ``out``."""
     u, s, vt = np.linalg.svd(f)
-    if np.linalg.det(u) * np.linalg.det(vt) < 0.0:
-        s[2], u[:, 2] = -s[2], -u[:, 2]
-    d = np.maximum(s, SMALLEST)
-    if s[0] * s[1] * s[2] >= LEAST:
-        d[:] = s
-    else:
+    if _determinant(u) * _determinant(vt) < 0.0:
+        s[2] = -s[2]
+        for a in range(3):
+            u[a, 2] = -u[a, 2]
+    d, g = s.copy(), np.empty(3)
+    if s[0] * s[1] * s[2] < LEAST:
+        for k in range(3):
+            d[k] = max(s[k], SMALLEST)
         # Each round goes to the foot of the perpendicular on the tangent plane of d0 d1 d2 = LEAST.
         for _ in range(ROUNDS):
-            g = np.array([d[1] * d[2], d[0] * d[2], d[0] * d[1]])
-            lacking = LEAST - d[0] * d[1] * d[2] + g @ (d - s)
-            d = s + lacking / (g @ g) * g
+            lacking, square = LEAST - d[0] * d[1] * d[2], 0.0
+            g[0], g[1], g[2] = d[1] * d[2], d[0] * d[2], d[0] * d[1]
+            for k in range(3):
+                lacking += g[k] * (d[k] - s[k])
+                square += g[k] * g[k]
+            for k in range(3):
+                d[k] = s[k] + lacking / square * g[k]
     away = 0.0
     for k in range(3):
         away += (d[k] - s[k]) ** 2
@@ -51,17 +66,15 @@ def unfold_loop(f, stiffened, weights, columns, slopes, out):
     goal = np.empty((3, 3))
     for i in range(len(f)):
         m = f[i]
-        det = (
-            m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])
-            - m[0, 1] * (m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0])
-            + m[0, 2] * (m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0])
-        )
+        det = _determinant(m)
         if not stiffened[i]:
             if det >= LEAST or not np.isfinite(det):
                 continue
             stiffened[i] = True
             joined += 1
-        goal[:] = m
+        for a in range(3):
+            for b in range(3):
+                goal[a, b] = m[a, b]
         if det < LEAST:
             energy += 0.5 * weights[i] * STIFFNESS * nearest_volume(m, goal)
         share = STIFFNESS * weights[i]

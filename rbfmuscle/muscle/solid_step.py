@@ -53,7 +53,8 @@ def _mix_loop(state, image, steps, residuals, images, last_residual, last_image,
             images[row, i] = image[i] - last_image[i]
     for i in range(size):
         last_residual[i] = image[i] - state[i]
-    last_image[:] = image
+    for i in range(len(image)):
+        last_image[i] = image[i]
     count = min(steps, memory)
     if count == 0:
         return

@@ -46,9 +46,9 @@ def answer_loop(points, pose, box, near, distance, gradient, anchor, bound):
     at = np.empty((len(near), 3))
     for n in range(len(near)):
         i = near[n]
-        at[n] = points[i]
         bound[i] = TRUSTED_SHARE * distance[n]
         for k in range(3):
+            at[n, k] = points[i, k]
             anchor[i, k] = 0.0
             for j in range(3):
                 anchor[i, k] += pose[j, k] * (points[i, j] - pose[j, 3])
