@@ -195,7 +195,9 @@ def describe_error(error: Any, *, root: str = "", name_row: Callable[..., Any] |
     ``name_row`` turns the location (a tuple) into words.
     """
     first = error.errors(include_url=False)[0]
-    where = name_row(first["loc"]) if name_row else ".".join(str(part) for part in first["loc"])
+    # Of a value of several types, pydantic's place names the class that it tried.
+    parts = [str(part) for part in first["loc"] if not str(part).endswith("Options")]
+    where = name_row(first["loc"]) if name_row else ".".join(parts)
     message = first["msg"].removeprefix("Value error, ")
     message = re.sub(r"a valid dictionary( or instance of \w+)?", "a table", message[0].lower() + message[1:])
     given = first.get("input")
@@ -234,10 +236,16 @@ class DetectOptions(Table):
     tunnelling: TunnellingOptions | None = None
 
 
+def _refuse_other_formats(value: object) -> object:
+    if value != "pvd":
+        raise ValueError("runs are written as 'pvd'; rbfmuscle export writes other formats")
+    return value
+
+
 class SurfaceOptions(Table):
     """``output.surfaces``: the surfaces written for every frame; `export` writes other formats."""
 
-    format: Literal["pvd"] = "pvd"
+    format: Annotated[Literal["pvd"], BeforeValidator(_refuse_other_formats)] = "pvd"
 
 
 class OutputOptions(Table):

@@ -215,6 +215,7 @@ class TestOptions:
             ("muscle.bicep.model", "did you mean 'biceps'"),
             ("motion.ramp.x.y.step", "no ramp 'x.y'"),
             ("contact", "name a key"),
+            ("output.surfaces.format", "surfaces.format: .*rbfmuscle export writes other formats"),
         ],
     )
     def test_unknown_settings(self, key, message):
