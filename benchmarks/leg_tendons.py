@@ -135,7 +135,7 @@ def _patella(facts: dict) -> dict:
     def rows(values):
         functions = [{"x": list(angles), "y": [round(float(v), 4) for v in column]} for column in values]
         return [
-            {"axis": axis, "coordinates": ["flexion"], "natural_spline": function}
+            {"axis": axis, "coordinates": ["flexion"], "spline": function}
             for axis, function in zip(axes, functions)
         ]
 

@@ -108,8 +108,7 @@ def add_coupling(scene: S, coordinate: str, of: Sequence[str], **function: Any) 
     coordinate : str
     of : list of str
     **function
-        One of ``constant``, ``linear``, ``polynomial``, ``piecewise``, ``spline``, ``natural_spline``
-        [degree, scene unit].
+        One of ``constant``, ``linear``, ``polynomial``, ``piecewise`` and ``spline`` [degree, scene unit].
     """
     row = {"coordinate": coordinate, "of": list(of), **function}
     table = CouplingTable.build(row, place=f"coupling of {coordinate!r}: ")

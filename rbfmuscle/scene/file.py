@@ -15,6 +15,7 @@ from rbfmuscle.scene.activation.keys import KEYS, ContractionTable
 from rbfmuscle.scene.attachments import AttachTable
 from rbfmuscle.scene.build import add_bone, add_link, add_muscle, place_coupling, place_joint, validate
 from rbfmuscle.scene.check import check_centre, check_place, check_size
+from rbfmuscle.scene.joints.skeleton import all_coordinates
 from rbfmuscle.scene.joints.tables import (
     CouplingTable,
     JointTable,
@@ -23,7 +24,7 @@ from rbfmuscle.scene.joints.tables import (
     make_coupling,
 )
 from rbfmuscle.scene.meshes.read import read_mesh
-from rbfmuscle.scene.motion import coordinate_names, make_motion, unit_sign
+from rbfmuscle.scene.motion import make_motion, unit_sign
 from rbfmuscle.scene.objects import Attachment, Bone, Muscle, SceneData
 from rbfmuscle.scene.options import (
     ContactOptions,
@@ -252,7 +253,7 @@ def _place(location, data):
 
 def describe_scene(scene: SceneData) -> dict[str, Any]:
     """Return the scene as plain data for ``run.json``: names, counts, options, sources and hashes."""
-    units = {name: unit_sign(scene, name) for name in coordinate_names(scene.joints)}
+    units = {name: unit_sign(scene, name) for name in all_coordinates(scene.joints)}
     motion = scene.motion.options.model_dump(mode="json", by_alias=True, exclude_none=True)
     times = {} if scene.motion.times is None else {"times": scene.motion.times}
     return {

@@ -9,14 +9,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.scene.joints.joint import Coordinate, Joint
-from rbfmuscle.scene.joints.skeleton import (
-    all_coordinates,
-    beyond_range,
-    joint_poses,
-    joint_values,
-    rest_values,
-)
+from rbfmuscle.scene.joints.joint import Coordinate
+from rbfmuscle.scene.joints.skeleton import all_coordinates, joint_poses, joint_values, resolve
 from rbfmuscle.scene.joints.tables import FACTORS, full_name
 from rbfmuscle.scene.motion_file import read_motion_file
 from rbfmuscle.scene.objects import Motion, SceneData
@@ -27,6 +21,8 @@ from rbfmuscle.validation import SceneError, did_you_mean
 # Lever [mm] at which a shift of a joint is counted as a turn.
 SHIFT_LEVER = 50.0
 NOT_MOVED = 1e-9  # A locked coordinate may be given, at its rest value.
+# Share of a turn [radian] or of a length that rounding may take a coordinate beyond its range.
+RANGE_TOLERANCE = 1e-6
 
 
 def make_motion(scene: SceneData, options: MotionOptions) -> Motion:
@@ -51,7 +47,7 @@ def make_motion(scene: SceneData, options: MotionOptions) -> Motion:
         frames = _asked_frames(options, facts)
         _refuse_followers(frames, followers, facts)
     frames = [_with_defaults(frame, facts, followers) for frame in frames]
-    notes += _range_notes(frames, scene.joints)
+    notes += _range_notes(frames, facts)
     frames = [{name: facts[name].honoured(value) for name, value in frame.items()} for frame in frames]
     return Motion(frames, options=options, times=times, notes=notes)
 
@@ -60,25 +56,18 @@ def slice_motion(motion: Motion, frames: slice) -> Motion:
     """Return the motion of the frames in a slice, as ``frames[A:B:S]`` does."""
     chosen = motion.frames[frames]
     if not chosen:
-        text = ":".join(
-            "" if part is None else str(part) for part in (frames.start, frames.stop, frames.step)
-        )
+        text = f"{frames.start}:{frames.stop}:{frames.step}".replace("None", "")
         raise SceneError(f"frames {text} selects none of the {len(motion)} frames of the motion")
     times = None if motion.times is None else motion.times[frames]
     progress = motion.progress[frames]
     return Motion(chosen, options=motion.options, times=times, progress=progress, notes=motion.notes)
 
 
-def coordinate_names(joints: list[Joint]) -> list[str]:
-    """Return every "joint.coordinate" of the joints, in order."""
-    return list(all_coordinates(joints))
-
-
 def rest_coordinates(scene: SceneData) -> dict[str, float]:
     """Return the coordinates whose rest value is not zero, by full name [radian or scene unit]."""
     if not any(facts.rest for joint in scene.joints for facts in joint.coordinates.values()):
         return {}
-    return {name: value for name, value in rest_values(scene.joints, scene.couplings).items() if value}
+    return {name: value for name, value in resolve({}, scene.joints, scene.couplings).items() if value}
 
 
 def completed(scene: SceneData, coordinates: Mapping[str, float]) -> dict[str, float]:
@@ -150,14 +139,12 @@ def turned_angle(rotations: Floats) -> Floats:
 
 def shown_value(scene: SceneData, name: str, value: float) -> float:
     """Return a coordinate's value as files and tables show it: degrees, or scene units as it is."""
-    facts = all_coordinates(scene.joints).get(name)
-    return math.degrees(value) if facts is None or facts.motion == "rotation" else value
+    return math.degrees(value) if unit_sign(scene, name) == "°" else value
 
 
 def inner_value(scene: SceneData, name: str, value: float) -> float:
     """Return a coordinate's value [radian or scene unit] from what files and tables show."""
-    facts = all_coordinates(scene.joints).get(name)
-    return math.radians(value) if facts is None or facts.motion == "rotation" else value
+    return math.radians(value) if unit_sign(scene, name) == "°" else value
 
 
 def unit_sign(scene: SceneData, name: str) -> str:
@@ -168,17 +155,15 @@ def unit_sign(scene: SceneData, name: str) -> str:
 
 def _asked_frames(options, facts):
     """Frames of a ramp or of waypoints; the rest pose alone without either."""
-    known = list(facts)
+
+    def named(table):
+        return {full_name(name, list(facts), place="[motion]"): value for name, value in table.items()}
+
     if options.ramp is not None:
-        return _ramp_frames({_full(n, known): ramp for n, ramp in options.ramp.items()}, facts)
+        return _ramp_frames(named(options.ramp), facts)
     if options.waypoints is not None:
-        stops = [{_full(n, known): v for n, v in stop.items()} for stop in options.waypoints]
-        return _waypoint_frames(stops, options.step, facts)
+        return _waypoint_frames([named(stop) for stop in options.waypoints], options.step, facts)
     return [{}]
-
-
-def _full(name, known):
-    return full_name(name, known, place="[motion]")
 
 
 def _refuse_followers(frames, followers, facts):
@@ -196,27 +181,27 @@ def _with_defaults(frame, facts, followers):
     return {**unsaid, **{name: value for name, value in frame.items() if name not in followers}}
 
 
-def _range_notes(frames: list[dict[str, float]], joints: list[Joint]) -> list[str]:
-    facts, found = all_coordinates(joints), {}
-    for frame in frames:
-        for name, excess in beyond_range(frame, joints).items():
-            found.setdefault(name, []).append(excess)
+def _range_notes(frames: list[dict[str, float]], facts: dict[str, Coordinate]) -> list[str]:
     notes = []
-    for name, excesses in found.items():
-        coordinate = facts[name]
-        ends = [] if coordinate.range is None else [*coordinate.range, max(excesses)]
-        low, high, most = (x / FACTORS[coordinate.motion] for x in ends)
-        what = "is cut to" if coordinate.clamped else "leaves"
-        notes.append(
-            f"coordinate {name!r} {what} its range {low:.6g} to {high:.6g} in {len(excesses)} of {len(frames)} "
-            f"frames, by up to {most:.3g}"
-        )
+    for name, coordinate in facts.items():
+        if coordinate.range is None or coordinate.locked:
+            continue
+        low, high = coordinate.range
+        beyond = [max(low - frame[name], frame[name] - high) for frame in frames if name in frame]
+        beyond = [excess for excess in beyond if excess > RANGE_TOLERANCE * max(1.0, abs(low), abs(high))]
+        if beyond:
+            what = "is cut to" if coordinate.clamped else "leaves"
+            low, high, most = (x / FACTORS[coordinate.motion] for x in (low, high, max(beyond)))
+            notes.append(
+                f"coordinate {name!r} {what} its range {low:.6g} to {high:.6g} in {len(beyond)} of {len(frames)} "
+                f"frames, by up to {most:.3g}"
+            )
     return notes
 
 
 def _ramp_frames(ramps: dict[str, RampOptions], facts: dict[str, Coordinate]) -> list[dict[str, float]]:
     """All coordinates go together; the one that needs most steps sets the pace, its last may be short."""
-    start = {n: _start(ramp.start, facts[n]) for n, ramp in ramps.items()}
+    start = {n: _shown_default(facts[n]) if ramp.start is None else ramp.start for n, ramp in ramps.items()}
     pace = max((abs(ramp.end - start[n]) / ramp.step for n, ramp in ramps.items()), default=0.0)
     return [
         {n: (start[n] + t * (r.end - start[n])) * FACTORS[facts[n].motion] for n, r in ramps.items()}
@@ -224,16 +209,16 @@ def _ramp_frames(ramps: dict[str, RampOptions], facts: dict[str, Coordinate]) ->
     ]
 
 
-def _start(value, facts):
-    """A ramp without a start begins at the coordinate's default."""
-    return facts.resting / FACTORS[facts.motion] if value is None else value
+def _shown_default(facts):
+    """Where a coordinate begins when a motion does not say [degree or scene unit]."""
+    return facts.resting / FACTORS[facts.motion]
 
 
 def _waypoint_frames(stops, step, facts):
     names = list(dict.fromkeys(name for stop in stops for name in stop))
     table = np.array([[stop.get(name, np.nan) for name in names] for stop in stops])
     for column, name in enumerate(names):  # what a waypoint does not mention stays where it was
-        held = _start(None, facts[name])
+        held = _shown_default(facts[name])
         for row in range(len(stops)):
             held = table[row, column] = held if np.isnan(table[row, column]) else table[row, column]
     rows = [table[0]]

@@ -11,7 +11,7 @@ from rbfmuscle.scene.joints.joint import Coordinate
 from rbfmuscle.scene.options import MAX_FRAMES
 from rbfmuscle.validation import SceneError, is_file, shown_path
 
-ANSWERS = {"yes": True, "true": True, "1": True, "no": False, "false": False, "0": False}
+YES, NO = ("yes", "true", "1"), ("no", "false", "0")
 
 
 class Storage(NamedTuple):
@@ -96,22 +96,22 @@ def read_motion_file(
     if not columns:
         names = ", ".join(list(facts)[:20]) or "no joints"
         raise SceneError(f"[motion]: {path} has none of the scene's coordinates ({names})")
-    clock = [labels.index("time")] if "time" in labels else []
-    bad = np.argwhere(~np.isfinite(values[:, [*columns.values(), *clock]]))
+    used = [*columns.values(), *([labels.index("time")] if "time" in labels else [])]
+    bad = np.argwhere(~np.isfinite(values[:, used]))
     if len(bad):
-        label = [*columns, "time"][bad[0, 1]]
-        raise SceneError(f"[motion]: {path} row {bad[0, 0] + 1}: {label} is not a finite number")
-    in_degrees, notes = _angle_unit(path, header)
-    units = {"rotation": math.pi / 180 if in_degrees else 1.0, "translation": metre, "coupled": 1.0}
-    used = {}
+        row, column = bad[0]
+        raise SceneError(f"[motion]: {path} row {row + 1}: {labels[used[column]]} is not a finite number")
+    factor, notes = _angle_factor(path, header)
+    units = {"rotation": factor, "translation": metre, "coupled": 1.0}
+    tracks = {}
     for name, column in columns.items():
         if name in followers or facts[name].locked:
             why = "follows other coordinates" if name in followers else "is locked"
             notes.append(f"{path}: the column of {name!r} is not used, the coordinate {why}")
         else:
-            used[name] = (values[:, column] * units[facts[name].motion]).tolist()
-    frames = [{name: track[row] for name, track in used.items()} for row in range(len(values))]
-    return frames, values[:, clock[0]].tolist() if clock else None, notes
+            tracks[name] = (values[:, column] * units[facts[name].motion]).tolist()
+    frames = [{name: track[row] for name, track in tracks.items()} for row in range(len(values))]
+    return frames, values[:, labels.index("time")].tolist() if "time" in labels else None, notes
 
 
 def match_label(label: str, known: list[str]) -> str | None:
@@ -124,13 +124,12 @@ def match_label(label: str, known: list[str]) -> str | None:
     return None
 
 
-def _angle_unit(path, header):
-    """Whether angles are degrees, and a note where the header does not say."""
+def _angle_factor(path, header):
+    """Radians in the file's unit of angles, and a note where the header does not say it."""
     said = header.get("indegrees")
     if said is None:
-        return False, [
-            f"{path} does not say inDegrees: angles are taken as radians; add inDegrees=yes to its header"
-        ]
-    if said not in ANSWERS:
+        words = "angles are taken as radians; add inDegrees=yes to its header"
+        return 1.0, [f"{path} does not say inDegrees: {words}"]
+    if said not in (*YES, *NO):
         raise SceneError(f"[motion]: {path}: inDegrees={said} is neither yes nor no")
-    return ANSWERS[said], []
+    return math.pi / 180 if said in YES else 1.0, []

@@ -99,7 +99,7 @@ class TestLoading:
         scene = load(folder)
         assert (scene.name, scene.units) == ("arm", "mm")
         assert [bone.name for bone in scene.bones] == ["upper", "lower"]
-        assert scene.joints[0].axes["flexion"] == pytest.approx([0, -1, 0])
+        assert scene.joints[0].rotations[0].direction == pytest.approx([0, -1, 0])
         muscle = scene.muscle("biceps")
         assert (muscle.model, muscle.options) == ("rbf", {"centres": 60})
         assert [a.bone for a in muscle.attachments] == ["upper", "lower"]

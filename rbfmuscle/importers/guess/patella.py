@@ -63,7 +63,7 @@ def patella_path(
 
     def table(direction, values):
         spline = {"x": rounded(knee.rest + flexions, 3), "y": rounded(values, 6)}
-        return {"axis": rounded(direction, 6), "coordinates": ["flexion"], "natural_spline": spline}
+        return {"axis": rounded(direction, 6), "coordinates": ["flexion"], "spline": spline}
 
     tables = {
         "rotations": [table(axis, TURN * flexions)],

@@ -5,8 +5,10 @@ Each takes the values of its coordinates in order and returns one number; those 
 """
 
 import bisect
-from dataclasses import dataclass, field, replace
-from typing import Self
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -35,10 +37,7 @@ class Linear:
 
     def __call__(self, *values: float) -> float:
         """Value at these coordinates."""
-        total = 0.0
-        for slope, value in zip(self.slopes, values):
-            total += slope * value
-        return total + self.constant
+        return sum(slope * value for slope, value in zip(self.slopes, values)) + self.constant
 
     def rescaled(self, inputs: list[float], output: float) -> "Linear":
         """Return the function in other units."""
@@ -66,105 +65,58 @@ class Polynomial:
 
 
 @dataclass(frozen=True)
-class _Points:
+class PiecewiseLinear:
+    """Through points (x, y), straight between them; the first and the last piece go on beyond them."""
+
     x: tuple[float, ...]
     y: tuple[float, ...]
 
+    degree: ClassVar[int] = 1
+
+    @cached_property
+    def _pieces(self) -> list[list[float]]:
+        """Four coefficients of each piece, highest power first: before, between and beyond the points."""
+        from scipy.interpolate import make_interp_spline
+
+        x, y = np.array(self.x), np.array(self.y)
+        if self.degree == 1 or len(x) < 3:
+            curve = make_interp_spline(x, y, k=min(1, len(x) - 1))
+        else:  # three points: one parabola
+            ends = ([(3, 6.0 * _third(x[s], y[s]) if len(x) > 3 else 0.0)] for s in (np.s_[:4], np.s_[-4:]))
+            curve = make_interp_spline(x, y, k=3, bc_type=tuple(ends))
+        pieces = np.stack([curve(x, nu=n) / math.factorial(n) for n in (3, 2, 1, 0)], axis=1)
+        straight = pieces * [0.0, 0.0, 1.0, 1.0]
+        return np.stack([straight[0], *pieces[:-1], straight[-1]]).tolist()
+
+    def __call__(self, *values: float) -> float:
+        """Value at these coordinates."""
+        k = bisect.bisect_right(self.x, values[0])
+        a, b, c, d = self._pieces[k]
+        t = values[0] - self.x[max(k - 1, 0)]
+        return ((a * t + b) * t + c) * t + d
+
     def rescaled(self, inputs: list[float], output: float) -> Self:
         """Return the function in other units."""
-        x, y = (tuple(v * f for v in values) for values, f in ((self.x, inputs[0]), (self.y, output)))
-        return replace(self, x=x, y=y)
-
-    def _piece(self, q: float) -> tuple[int, float, float]:
-        """Number of the piece that holds q, its width, and the fraction of it before q."""
-        k = min(max(bisect.bisect_right(self.x, q) - 1, 0), len(self.x) - 2)
-        width = self.x[k + 1] - self.x[k]
-        return k, width, (q - self.x[k]) / width
+        return replace(self, x=tuple(v * inputs[0] for v in self.x), y=tuple(v * output for v in self.y))
 
 
-@dataclass(frozen=True)
-class PiecewiseLinear(_Points):
-    """Straight between the points; the first and the last piece go on beyond them."""
-
-    def __call__(self, *values: float) -> float:
-        """Value at these coordinates."""
-        if len(self.x) == 1:
-            return self.y[0]
-        k, _, t = self._piece(values[0])
-        return self.y[k] + t * (self.y[k + 1] - self.y[k])
-
-
-@dataclass(frozen=True)
-class Spline(_Points):
+class Spline(PiecewiseLinear):
     """Cubic spline through points; beyond them it goes on straight.
 
-    With ``natural`` false it is the spline of Forsythe, Malcolm and Moler (1977), which OpenSim calls SimmSpline:
-    the third derivative of the first and of the last piece is that of the cubic through the four points there.
-    With ``natural`` true the second derivative is zero at both ends.
+    It is the spline of Forsythe, Malcolm and Moler (1977), which OpenSim calls SimmSpline: the third derivative of the
+    first and of the last piece is that of the cubic through the four points there.
     """
 
-    natural: bool = False
-    _bend: tuple[float, ...] = field(init=False, repr=False, compare=False, default=())
-
-    def __post_init__(self) -> None:
-        bend = second_derivatives(np.array(self.x), np.array(self.y), natural=self.natural)
-        object.__setattr__(self, "_bend", tuple(bend.tolist()))
-
-    def __call__(self, *values: float) -> float:
-        """Value at these coordinates."""
-        q, x, y, m = values[0], self.x, self.y, self._bend
-        if len(x) == 1:
-            return y[0]
-        k, h, t = self._piece(q)
-        if q < x[0] or q > x[-1]:
-            # At an end of a piece the slope differs from the chord's by the bends at both.
-            slope, after = (y[k + 1] - y[k]) / h, q > x[-1]
-            slope += h * (m[k] + 2.0 * m[k + 1]) / 6.0 if after else -h * (2.0 * m[k] + m[k + 1]) / 6.0
-            return (y[-1] if after else y[0]) + slope * (q - (x[-1] if after else x[0]))
-        s = 1.0 - t
-        bend = (s**3 - s) * m[k] + (t**3 - t) * m[k + 1]
-        return s * y[k] + t * y[k + 1] + h * h * bend / 6.0
+    degree = 3
 
 
-Function = Constant | Linear | Polynomial | PiecewiseLinear | Spline
+Function = Constant | Linear | Polynomial | PiecewiseLinear
 
 
 def scaled(function: Function, factor: float) -> Function:
     """Return ``factor`` times a function."""
     count = len(function.slopes) if isinstance(function, Linear) else 1
     return function.rescaled([1.0] * count, factor)
-
-
-def second_derivatives(x: np.ndarray, y: np.ndarray, *, natural: bool) -> np.ndarray:
-    """Second derivatives of a cubic spline at its points.
-
-    Parameters
-    ----------
-    x, y : (n,) ndarray
-        Points, ``x`` increasing.
-    natural : bool
-        Zero at both ends, instead of the third derivatives of the cubics through four points.
-
-    Returns
-    -------
-    (n,) ndarray
-    """
-    n = len(x)
-    if n < 3:
-        return np.zeros(n)
-    h = np.diff(x)
-    matrix, right = np.zeros((n, n)), np.zeros(n)
-    inner = np.arange(1, n - 1)
-    matrix[inner, inner - 1], matrix[inner, inner + 1] = h[:-1], h[1:]
-    matrix[inner, inner] = 2.0 * (h[:-1] + h[1:])
-    right[1:-1] = 6.0 * np.diff(np.diff(y) / h)
-    if natural:
-        matrix[0, 0] = matrix[-1, -1] = 1.0
-    else:
-        matrix[0, :2], matrix[-1, -2:] = [-1.0, 1.0], [-1.0, 1.0]
-        if n > 3:  # three points: one parabola
-            right[0], right[-1] = 6.0 * h[0] * _third(x[:4], y[:4]), 6.0 * h[-1] * _third(x[-4:], y[-4:])
-    return np.linalg.solve(matrix, right)
 
 
 def _third(x, y):

@@ -93,6 +93,10 @@ class TransformAxis:
     coordinates: tuple[str, ...] = ()
     function: Function = IDENTITY
 
+    def amount(self, values: dict[str, float]) -> float:
+        """The turn [radian] or shift [scene unit] at values of the coordinates by bare name."""
+        return self.function(*(values[name] for name in self.coordinates))
+
 
 @dataclass
 class Joint:
@@ -120,21 +124,12 @@ class Joint:
     translations: tuple[TransformAxis, ...] = ()
     kind: str = "ball"
     backward: bool = False
-    _rest: tuple = field(default=(None, None), repr=False, compare=False)
+    _rest: tuple[dict[str, float], np.ndarray] | None = field(default=None, repr=False, compare=False)
 
     @property
     def centre(self) -> np.ndarray:
         """Origin (3,) of the frame [scene unit]: what a ball turns about."""
         return self.frame[:3, 3]
-
-    @property
-    def axes(self) -> dict[str, np.ndarray]:
-        """Axis (3,) in the scene of each coordinate that alone turns or shifts as much as its value says."""
-        found = {}
-        for axis in (*self.rotations, *self.translations):
-            if axis.function == IDENTITY:
-                found[axis.coordinates[0]] = self._turned(axis.direction)
-        return found
 
     def motion(self, values: dict[str, float], rest: dict[str, float]) -> np.ndarray:
         """Return the (4, 4) motion of the child against the parent, scene coordinates, the identity at rest.
@@ -144,37 +139,27 @@ class Joint:
         values, rest : dict of str to float
             Every coordinate of the joint by its bare name, now and in the rest pose.
         """
-        transform = self.displacement(values)
-        if self._rest[0] != rest:
-            start = self.displacement(rest)
-            self._rest = (dict(rest), None if start is None else np.linalg.inv(start))
-        if self._rest[1] is not None:
-            if values == rest:
-                return np.eye(4)
-            transform = self._rest[1] if transform is None else transform @ self._rest[1]
-        if transform is None:
+        if values == rest:
             return np.eye(4)
+        if self._rest is None or self._rest[0] != rest:
+            self._rest = dict(rest), np.linalg.inv(self.displacement(rest))
+        transform = self.displacement(values) @ self._rest[1]
         return np.linalg.inv(transform) if self.backward else transform
 
-    def displacement(self, values: dict[str, float]) -> np.ndarray | None:
-        """Return the (4, 4) motion from where every function is zero, in scene coordinates; None for none.
+    def displacement(self, values: dict[str, float]) -> np.ndarray:
+        """Return the (4, 4) motion from where every function is zero, in scene coordinates.
 
         Parameters
         ----------
         values : dict of str to float
             Every coordinate of the joint by its bare name.
         """
-        transform = None
+        transform = np.eye(4)
         for axis in self.translations:
-            amount = axis.function(*(values[name] for name in axis.coordinates))
-            if amount:
-                transform = np.eye(4) if transform is None else transform
-                transform[:3, 3] += amount * self._turned(axis.direction)
+            transform[:3, 3] += axis.amount(values) * self._turned(axis.direction)
         for axis in self.rotations:
-            angle = axis.function(*(values[name] for name in axis.coordinates))
-            if angle:
-                turn = rotation_about(self._turned(axis.direction), angle, self.frame[:3, 3])
-                transform = turn if transform is None else transform @ turn
+            if angle := axis.amount(values):
+                transform = transform @ rotation_about(self._turned(axis.direction), angle, self.centre)
         return transform
 
     def _turned(self, direction):

@@ -7,18 +7,10 @@ import numpy as np
 from rbfmuscle.scene.joints.joint import Coordinate, Coupling, Joint
 from rbfmuscle.validation import SceneError
 
-# Share of a turn [radian] or of a length that rounding may take a coordinate beyond its range.
-RANGE_TOLERANCE = 1e-6
-
 
 def all_coordinates(joints: list[Joint]) -> dict[str, Coordinate]:
     """Return every coordinate by its full name "joint.coordinate", in order."""
     return {f"{joint.name}.{name}": facts for joint in joints for name, facts in joint.coordinates.items()}
-
-
-def rest_values(joints: list[Joint], couplings: list[Coupling]) -> dict[str, float]:
-    """Return the value of every coordinate in the rest pose, those that follow others included."""
-    return resolve({}, joints, couplings)
 
 
 def resolve(
@@ -49,10 +41,10 @@ def ordered(couplings: list[Coupling]) -> list[Coupling]:
     SceneError
         If a coordinate follows itself, or is given twice.
     """
-    by_name = {coupling.coordinate: coupling for coupling in couplings}
-    for name in by_name:
-        if sum(coupling.coordinate == name for coupling in couplings) > 1:
-            raise SceneError(f"coupling of {name!r} is given twice")
+    by_name: dict[str, Coupling] = {}
+    for coupling in couplings:
+        if by_name.setdefault(coupling.coordinate, coupling) is not coupling:
+            raise SceneError(f"coupling of {coupling.coordinate!r} is given twice")
     try:
         order = list(TopologicalSorter({name: one.of for name, one in by_name.items()}).static_order())
     except CycleError as error:
@@ -102,16 +94,3 @@ def joint_values(
     return {
         joint.name: {name: values[f"{joint.name}.{name}"] for name in joint.coordinates} for joint in joints
     }
-
-
-def beyond_range(coordinates: dict[str, float], joints: list[Joint]) -> dict[str, float]:
-    """Return how far coordinates lie outside their ranges; those inside are left out."""
-    found = {}
-    for name, facts in all_coordinates(joints).items():
-        if name not in coordinates or facts.range is None or facts.locked:
-            continue
-        low, high = facts.range
-        excess = max(low - coordinates[name], coordinates[name] - high)
-        if excess > RANGE_TOLERANCE * max(1.0, abs(low), abs(high)):
-            found[name] = excess
-    return found

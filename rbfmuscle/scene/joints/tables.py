@@ -28,7 +28,7 @@ from rbfmuscle.validation import SceneError, did_you_mean
 
 # What a number in a file is multiplied by.
 FACTORS = {"rotation": math.pi / 180.0, "translation": 1.0, "coupled": 1.0}
-FUNCTIONS = ("constant", "linear", "polynomial", "piecewise", "spline", "natural_spline")
+FUNCTIONS = ("constant", "linear", "polynomial", "piecewise", "spline")
 
 
 class PointsTable(Table):
@@ -54,14 +54,13 @@ class FunctionTable(Table):
     polynomial: list[Finite] | None = Field(default=None, min_length=1)
     piecewise: PointsTable | None = None
     spline: PointsTable | None = None
-    natural_spline: PointsTable | None = None
 
     def function(self, inputs: list[str], output: str, *, place: str) -> Function:
         """Return the function in inner units; ``inputs`` and ``output`` are kinds of motion, keys of `FACTORS`."""
-        given = [name for name in FUNCTIONS if getattr(self, name) is not None]
+        given = [name for name in FUNCTIONS if getattr(self, name) is not None] or ["linear"]
         if len(given) > 1:
             raise SceneError(f"{place}: give one function, not {' and '.join(given)}")
-        found = self._plain(given[0] if given else "linear", len(inputs), place)
+        found = self._in_file_units(given[0], len(inputs), place)
         if found == IDENTITY and inputs == [output]:
             return found
         return found.rescaled([FACTORS[motion] for motion in inputs], FACTORS[output])
@@ -71,7 +70,7 @@ class FunctionTable(Table):
         plain = all(getattr(self, name) is None for name in FUNCTIONS)
         return 1.0 if plain else (self.linear or [0.0])[0]
 
-    def _plain(self, kind, count, place):
+    def _in_file_units(self, kind, count, place):
         if kind == "constant":
             return Constant(self.constant)
         if kind == "linear":
@@ -86,9 +85,7 @@ class FunctionTable(Table):
         if kind == "polynomial":
             return Polynomial(tuple(self.polynomial))
         points = getattr(self, kind)
-        if kind == "piecewise":
-            return PiecewiseLinear(tuple(points.x), tuple(points.y))
-        return Spline(tuple(points.x), tuple(points.y), natural=kind == "natural_spline")
+        return {"piecewise": PiecewiseLinear, "spline": Spline}[kind](tuple(points.x), tuple(points.y))
 
 
 class AxisTable(FunctionTable):
@@ -147,11 +144,13 @@ class JointTable(Table):
         place = f"joint {self.name!r}"
         if self.centre is None and self.type != "fixed":
             raise SceneError(f"{place}: centre is missing, give the joint's place at rest")
-        angles = tuple(math.radians(angle) for angle in self.orientation or (0.0, 0.0, 0.0))
-        frame = frame_at(np.array(self.centre or (0.0, 0.0, 0.0)), angles)
+        frame = frame_at(
+            np.array(self.centre or (0.0, 0.0, 0.0)), np.radians(self.orientation or (0.0, 0.0, 0.0))
+        )
         coordinates, turns, shifts = self._custom(place) if self.type == "custom" else self._of_kind(place)
-        bones = self.parent, self.child
-        return Joint(self.name, *bones, frame, coordinates, turns, shifts, self.type, self.backward)
+        return Joint(
+            self.name, self.parent, self.child, frame, coordinates, turns, shifts, self.type, self.backward
+        )
 
     def _of_kind(self, place):
         kind = KINDS[self.type]
@@ -165,36 +164,39 @@ class JointTable(Table):
                 f"{place}: a {self.type} joint has {words} coordinates, {count} are given; name them in axes"
             )
         self._check_known(axes, place)
-        turning = len(kind.rotations) if self.type != "ball" else count
-        made, coordinates = [], {}
-        for k, (name, axis) in enumerate(axes.items()):
+        turning = count if self.type == "ball" else len(kind.rotations)
+        coordinates = {}
+        for k, name in enumerate(axes):
             motion = "rotation" if k < turning else "translation"
             table = self.coordinates.get(name, CoordinateTable())
             if table.motion not in (None, motion):
                 raise SceneError(f"{place}: {name!r} is a {motion} here, not a {table.motion}")
             coordinates[name] = table.coordinate(motion)
-            made.append(TransformAxis(unit(axis), (name,)))
-        return coordinates, tuple(made[:turning]), tuple(made[turning:])
+        made = tuple(TransformAxis(unit(axis), (name,)) for name, axis in axes.items())
+        return coordinates, made[:turning], made[turning:]
 
     def _custom(self, place):
         if self.axes:
             raise SceneError(f"{place}: a custom joint has rotations and translations instead of axes")
-        tables = [
-            *(("rotation", t) for t in self.rotations),
-            *(("translation", t) for t in self.translations),
-        ]
+        groups = {"rotation": self.rotations, "translation": self.translations}
+        tables = [(motion, table) for motion, group in groups.items() for table in group]
         named = dict.fromkeys(name for _, table in tables for name in table.coordinates)
         self._check_known(named, place)
         coordinates = {
             name: self.coordinates.get(name, CoordinateTable()).coordinate(self._motion_of(name, tables))
             for name in {**self.coordinates, **named}
         }
-        made = {"rotation": [], "translation": []}
-        for motion, table in tables:
-            at = f"{place}: {motion} {len(made[motion]) + 1}"
-            function = table.function([coordinates[n].motion for n in table.coordinates], motion, place=at)
-            made[motion].append(TransformAxis(unit(table.axis), tuple(table.coordinates), function))
-        return coordinates, tuple(made["rotation"]), tuple(made["translation"])
+
+        def axis(motion, number, table):
+            inputs = [coordinates[name].motion for name in table.coordinates]
+            function = table.function(inputs, motion, place=f"{place}: {motion} {number}")
+            return TransformAxis(unit(table.axis), tuple(table.coordinates), function)
+
+        turns, shifts = (
+            tuple(axis(motion, number, table) for number, table in enumerate(group, 1))
+            for motion, group in groups.items()
+        )
+        return coordinates, turns, shifts
 
     def _motion_of(self, name, tables):
         declared = self.coordinates.get(name)
@@ -255,10 +257,9 @@ def joint_row(joint: Joint) -> dict:
     if not np.array_equal(turned, np.eye(3)):
         row["orientation"] = [math.degrees(angle) for angle in frame_angles(turned)]
     if joint.kind == "custom":
-        motions = {name: facts.motion for name, facts in joint.coordinates.items()}
-        for key, axes in (("rotations", joint.rotations), ("translations", joint.translations)):
+        for motion, axes in (("rotation", joint.rotations), ("translation", joint.translations)):
             if axes:
-                row[key] = [_axis_row(axis, motions, key[:-1]) for axis in axes]
+                row[f"{motion}s"] = [_axis_row(axis, joint.coordinates, motion) for axis in axes]
     elif joint.coordinates:
         axes = zip(joint.coordinates, (*joint.rotations, *joint.translations))
         row["axes"] = {name: list(axis.direction) for name, axis in axes}
@@ -272,9 +273,9 @@ def joint_row(joint: Joint) -> dict:
 
 def coupling_row(coupling: Coupling, joints: list[Joint]) -> dict:
     """Return a coupling as the plain table that makes it again."""
-    motions = {name: facts.motion for name, facts in all_coordinates(joints).items()}
-    inputs = [motions[name] for name in coupling.of]
-    function = _function_row(coupling.function, inputs, motions[coupling.coordinate])
+    facts = all_coordinates(joints)
+    inputs = [facts[name].motion for name in coupling.of]
+    function = _function_row(coupling.function, inputs, facts[coupling.coordinate].motion)
     return {"coordinate": coupling.coordinate, "of": list(coupling.of), **function}
 
 
@@ -291,12 +292,10 @@ def _coordinate_row(facts, kind):
     return row
 
 
-def _axis_row(axis, motions, output):
-    inputs = [motions[name] for name in axis.coordinates]
-    row: dict[str, Any] = {"axis": list(axis.direction)}
-    if axis.coordinates:
-        row["coordinates"] = list(axis.coordinates)
-    return {**row, **_function_row(axis.function, inputs, output)}
+def _axis_row(axis, coordinates, output):
+    function = _function_row(axis.function, [coordinates[name].motion for name in axis.coordinates], output)
+    names = {"coordinates": list(axis.coordinates)} if axis.coordinates else {}
+    return {"axis": list(axis.direction), **names, **function}
 
 
 def _function_row(function: Function, inputs: Sequence[str], output: str) -> dict[str, Any]:
@@ -310,6 +309,4 @@ def _function_row(function: Function, inputs: Sequence[str], output: str) -> dic
     if isinstance(function, Polynomial):
         return {"polynomial": list(function.coefficients)}
     points = {"x": list(function.x), "y": list(function.y)}
-    if isinstance(function, PiecewiseLinear):
-        return {"piecewise": points}
-    return {"natural_spline" if function.natural else "spline": points}
+    return {"spline" if isinstance(function, Spline) else "piecewise": points}
