@@ -49,7 +49,7 @@ def _findings(path):
     from rbfmuscle.importers.guess.orientation import orient_scene
     from rbfmuscle.models import check_models
     from rbfmuscle.scene.attachments import ExactMeshes
-    from rbfmuscle.scene.check import Finding, check_scene
+    from rbfmuscle.scene.check import Finding, check_scene, sort_findings
     from rbfmuscle.scene.phantom import open_scene
     from rbfmuscle.simulation.plan.motion_check import motion_findings
     from rbfmuscle.simulation.substeps import check_substeps
@@ -67,7 +67,7 @@ def _findings(path):
     if not any(finding.level == "error" for finding in findings):
         with stage("checking the motion"):
             findings += motion_findings(loaded, exact)
-    return loaded, sorted(findings, key=lambda finding: ("error", "warning", "note").index(finding.level))
+    return loaded, sort_findings(findings)
 
 
 def _field_notes(scene):

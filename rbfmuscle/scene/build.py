@@ -14,10 +14,10 @@ from rbfmuscle.scene.activation.curve import activation_curve
 from rbfmuscle.scene.activation.keys import contraction_keys
 from rbfmuscle.scene.activation.resolve import resolve_contraction
 from rbfmuscle.scene.attachments import AttachTable, resolve_attachments, tendon_ends
-from rbfmuscle.scene.fibres import read_fibres
 from rbfmuscle.scene.joints.joint import Coupling, Joint
 from rbfmuscle.scene.joints.skeleton import all_coordinates, ordered
 from rbfmuscle.scene.joints.tables import CouplingTable, JointTable, make_coupling
+from rbfmuscle.scene.meshes.fibres import read_fibres
 from rbfmuscle.scene.meshes.read import ReadMesh, as_mesh
 from rbfmuscle.scene.motion import make_motion
 from rbfmuscle.scene.objects import Attachment, Bone, Muscle, SceneData, find_named

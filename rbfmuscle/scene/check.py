@@ -53,28 +53,27 @@ def check_scene(scene: SceneData, exact: ExactMeshes | None = None) -> list[Find
     exact = exact or ExactMeshes()
     items: list[Bone | Muscle] = [*scene.bones, *scene.muscles]
     findings = [Finding("note", item.name, note) for item in items for note in item.notes]
-    findings += [
-        Finding("warning", bone.name, "the bone is open, its inside follows from winding numbers")
-        for bone in scene.bones
-        if not bone.closed
-    ]
-    findings += [
-        Finding("warning", name, "no mesh of this bone could be used: muscles pass through it")
-        for name in scene.left_out
-    ]
+    opened = "the bone is open, its inside follows from winding numbers"
+    unusable = "no mesh of this bone could be used: muscles pass through it"
+    findings += [Finding("warning", bone.name, opened) for bone in scene.bones if not bone.closed]
+    findings += [Finding("warning", name, unusable) for name in scene.left_out]
     findings += [Finding("warning", "motion", note) for note in scene.motion.notes]
     findings += _rest_overlaps(scene, exact)
-    wrong = []
-    for test in (validate, check_extents):
+    wrong = {}
+    for test in (
+        lambda: validate(scene),
+        lambda: check_extents(scene),
+        lambda: findings.extend(bone_findings(bone_collisions(scene, exact=exact), scene.units)),
+    ):
         try:
-            test(scene)
+            test()
         except RBFMuscleError as error:
-            wrong.append(str(error))
-    try:
-        findings += bone_findings(bone_collisions(scene, exact=exact), scene.units)
-    except SceneError as error:
-        wrong.append(str(error))
-    findings += [Finding("error", scene.name, message) for message in dict.fromkeys(wrong)]
+            wrong[str(error)] = Finding("error", scene.name, str(error))
+    return sort_findings([*findings, *wrong.values()])
+
+
+def sort_findings(findings: Iterable[Finding]) -> list[Finding]:
+    """Return findings, the worst first."""
     return sorted(findings, key=lambda finding: ("error", "warning", "note").index(finding.level))
 
 
@@ -140,24 +139,22 @@ def _likely_scale(millimetres):
 def _rest_overlaps(scene, exact):
     """Muscle vertices inside bones at rest."""
     findings = []
-    for muscle in scene.muscles:
-        points = np.asarray(muscle.mesh.vertices)
-        for bone in scene.bones:
-            depth = _depths(points, bone.mesh, exact)
-            for attachment in muscle.attachments:
-                depth[attachment.vertices] = 0.0
-            inside = np.count_nonzero(depth)
-            if not inside:
-                continue
-            share = inside / len(points)
-            message = (
-                f"{inside} free vertices ({100 * share:.2g} %) start inside bone {bone.name!r}, "
-                f"up to {depth.max():.3g} {scene.units} deep"
-            )
-            level = "note" if scene.contact.initial == "resolve" else "warning"
-            if scene.contact.initial == "error" or share > 0.5:
-                level = "error"
-            findings.append(Finding(level, muscle.name, message))
+    for muscle, bone in itertools.product(scene.muscles, scene.bones):
+        depth = _depths(np.asarray(muscle.mesh.vertices), bone.mesh, exact)
+        for attachment in muscle.attachments:
+            depth[attachment.vertices] = 0.0
+        inside = np.count_nonzero(depth)
+        if not inside:
+            continue
+        share = inside / len(depth)
+        level = "note" if scene.contact.initial == "resolve" else "warning"
+        if scene.contact.initial == "error" or share > 0.5:
+            level = "error"
+        message = (
+            f"{inside} free vertices ({100 * share:.2g} %) start inside bone {bone.name!r}, "
+            f"up to {depth.max():.3g} {scene.units} deep"
+        )
+        findings.append(Finding(level, muscle.name, message))
     return findings
 
 
@@ -198,14 +195,11 @@ def bone_collisions(
     exact : ExactMeshes, optional
         Distances to the bones' meshes.
     """
-    frames = sampled_frames(scene) if frames is None else frames
-    exact = exact or ExactMeshes()
-    found = []
-    for frame in frames:
+    exact, found = exact or ExactMeshes(), []
+    for frame in sampled_frames(scene) if frames is None else frames:
         depths = _pair_depths(scene, bone_poses(scene, scene.motion.frames[frame]), exact)
-        for pair, depth in depths.items():
-            if depth > scene.length(COUNTED_DEPTH_MM):
-                found.append((frame, *pair, depth))
+        least = scene.length(COUNTED_DEPTH_MM)
+        found += [(frame, *pair, depth) for pair, depth in depths.items() if depth > least]
     return found
 
 

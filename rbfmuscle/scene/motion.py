@@ -46,7 +46,7 @@ def make_motion(scene: SceneData, options: MotionOptions) -> Motion:
     else:
         frames = _asked_frames(options, facts)
         _refuse_followers(frames, followers, facts)
-    frames = [_with_defaults(frame, facts, followers) for frame in frames]
+    frames = [_with_rest(frame, facts, followers) for frame in frames]
     notes += _range_notes(frames, facts)
     frames = [{name: facts[name].honoured(value) for name, value in frame.items()} for frame in frames]
     return Motion(frames, options=options, times=times, notes=notes)
@@ -175,9 +175,9 @@ def _refuse_followers(frames, followers, facts):
             raise SceneError(f"[motion]: {name!r} is locked, unlock it in its joint or leave it out")
 
 
-def _with_defaults(frame, facts, followers):
-    """The frame without followers; coordinates that it does not mention are at their default."""
-    unsaid = {n: c.resting for n, c in facts.items() if n not in frame and n not in followers and c.resting}
+def _with_rest(frame, facts, followers):
+    """The frame without followers; coordinates that it does not mention are at rest."""
+    unsaid = {n: c.rest for n, c in facts.items() if n not in frame and n not in followers and c.rest}
     return {**unsaid, **{name: value for name, value in frame.items() if name not in followers}}
 
 
@@ -201,7 +201,7 @@ def _range_notes(frames: list[dict[str, float]], facts: dict[str, Coordinate]) -
 
 def _ramp_frames(ramps: dict[str, RampOptions], facts: dict[str, Coordinate]) -> list[dict[str, float]]:
     """All coordinates go together; the one that needs most steps sets the pace, its last may be short."""
-    start = {n: _shown_default(facts[n]) if ramp.start is None else ramp.start for n, ramp in ramps.items()}
+    start = {n: _shown_rest(facts[n]) if ramp.start is None else ramp.start for n, ramp in ramps.items()}
     pace = max((abs(ramp.end - start[n]) / ramp.step for n, ramp in ramps.items()), default=0.0)
     return [
         {n: (start[n] + t * (r.end - start[n])) * FACTORS[facts[n].motion] for n, r in ramps.items()}
@@ -209,16 +209,16 @@ def _ramp_frames(ramps: dict[str, RampOptions], facts: dict[str, Coordinate]) ->
     ]
 
 
-def _shown_default(facts):
-    """Where a coordinate begins when a motion does not say [degree or scene unit]."""
-    return facts.resting / FACTORS[facts.motion]
+def _shown_rest(facts):
+    """A coordinate's rest value as files have it [degree or scene unit]."""
+    return facts.rest / FACTORS[facts.motion]
 
 
 def _waypoint_frames(stops, step, facts):
     names = list(dict.fromkeys(name for stop in stops for name in stop))
     table = np.array([[stop.get(name, np.nan) for name in names] for stop in stops])
     for column, name in enumerate(names):  # what a waypoint does not mention stays where it was
-        held = _shown_default(facts[name])
+        held = _shown_rest(facts[name])
         for row in range(len(stops)):
             held = table[row, column] = held if np.isnan(table[row, column]) else table[row, column]
     rows = [table[0]]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -13,8 +12,8 @@ import numpy as np
 from pydantic import Field
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.scene.activation.keys import ContractionTable
+from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints.joint import Coupling, Joint
 from rbfmuscle.scene.options import (
     ContactOptions,
@@ -31,44 +30,7 @@ from rbfmuscle.validation import SceneError, did_you_mean
 if TYPE_CHECKING:
     import trimesh
 
-# About how many points cover a bone: 4.5 mm apart on a femur.
-SURFACE_POINTS = 2000
 MM_PER_UNIT = {"m": 1000.0, "cm": 10.0, "mm": 1.0}
-
-
-@dataclass
-class Bone:
-    """A rigid body: its mesh (outward, rest pose), where it came from, what was mended."""
-
-    name: str
-    mesh: trimesh.Trimesh = field(repr=False)
-    source: str = ""
-    closed: bool = True
-    notes: list[str] = field(default_factory=list)
-
-    @cached_property
-    def bounds(self) -> Floats:
-        """Box (2, 3) about the mesh."""
-        return np.array(self.mesh.bounds)
-
-    @cached_property
-    def _distance(self) -> ExactDistance:
-        return ExactDistance(self.mesh.vertices, self.mesh.faces)
-
-    def nearest(self, points: Floats) -> tuple[Floats, Floats]:
-        """Distances (n,) to the mesh, negative inside, and the nearest places (n, 3) on it, of points (n, 3)."""
-        distances, places, *_ = self._distance.nearest(points)
-        return distances, places
-
-    @cached_property
-    def surface_points(self) -> Floats:
-        """Points (n, 3) that cover the mesh evenly, one in each cell of a grid."""
-        from trimesh.remesh import subdivide_to_size
-
-        cell = float(np.sqrt(self.mesh.area / SURFACE_POINTS))
-        points, _ = subdivide_to_size(self.mesh.vertices, self.mesh.faces, cell, max_iter=30)
-        kept = np.unique(np.floor(points / cell), axis=0, return_index=True)[1]
-        return np.ascontiguousarray(points[kept], dtype=float)
 
 
 class ViaTable(Table):

@@ -56,6 +56,8 @@ REMOVED_KEYS: dict[str, str] = {
     "coupling.scale": "multiply the numbers of the function by it",
     "joint.rotations.natural_spline": "use spline",
     "joint.translations.natural_spline": "use spline",
+    "joint.coordinates.default": "delete the key: a coordinate that a motion does not mention is at rest",
+    "tendon.vertices": "use tendon.length, measured from the attachments",
     "coupling.natural_spline": "use spline",
     "model.seed": "delete the key: samples and centres are always the same",
     "model.tolerance": 'use a model whose sweeps go on until none moves a vertex, for instance "pbd-converged"',

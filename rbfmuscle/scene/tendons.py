@@ -12,12 +12,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.scene.activation.keys import TENDON_STRAIN
+from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.taut_line import line_length, points_along, taut_line
 
 # Strain of a passive belly at which it bears the force that strains its tendon by `TENDON_STRAIN` (Zajac 1989), and
@@ -33,23 +34,6 @@ NODES, PATCH = 33, 16
 
 # A bone and a point (3,) of it at rest [scene unit].
 BonePoint: TypeAlias = tuple[str, Floats]
-
-
-class Obstacle(Protocol):
-    """A bone that tendons go around."""
-
-    name: str
-
-    @property
-    def bounds(self) -> Floats:
-        """Box (2, 3) about it at rest."""
-
-    @property
-    def surface_points(self) -> Floats:
-        """Points (n, 3) on it at rest."""
-
-    def nearest(self, points: Floats) -> tuple[Floats, Floats]:
-        """Distances (n,) at rest, negative inside, and nearest places (n, 3) on it, of points (n, 3)."""
 
 
 class TendonLine(NamedTuple):
@@ -124,7 +108,7 @@ class TendonEnd:
         The muscle's other end: a point of its bone, or of its tendon the insertion and the via points.
     slack : float
         Length of that tendon at rest, zero where there is none.
-    obstacles : sequence of Obstacle
+    obstacles : sequence of Bone
         Bones that string and tendon go around.
     """
 
@@ -134,7 +118,7 @@ class TendonEnd:
         self.name, self.middle, self.radii, self.line = name, middle, radii, line
         self.patch = patch[:: -(-len(patch) // PATCH)]
         self.other: list[BonePoint] = []
-        self.obstacles: Sequence[Obstacle] = ()
+        self.obstacles: Sequence[Bone] = ()
         self.slack = 0.0
 
     @cached_property
@@ -282,7 +266,7 @@ def _with_nodes(line: Floats) -> Floats:
     return points_along(line, np.sort(places))
 
 
-def _depths(bone: Obstacle, points: Floats) -> Floats:
+def _depths(bone: Bone, points: Floats) -> Floats:
     """Depth (n,) of points (n, 3) in a bone at rest, 0 outside."""
     low, high = bone.bounds
     if np.any(points.min(axis=0) > high) or np.any(points.max(axis=0) < low):

@@ -67,7 +67,7 @@ def test_sub_steps_follow_activation_and_settle_where_bones_stand_still():
     assert steps[-SETTLING - 1 :] == pytest.approx([0.55] * (SETTLING + 1))
 
 
-def test_tendon_by_share_length_and_vertices_agree():
+def test_tendon_by_share_and_length_agree():
     made = scene(tendon={"length": 60.0})
     muscle = made.muscle(MUSCLE)
     x = np.asarray(muscle.mesh.vertices)[:, 0]
@@ -78,10 +78,6 @@ def test_tendon_by_share_length_and_vertices_agree():
     assert np.abs(x[tendon & ~held]).min() == pytest.approx(100.0, abs=6.0)  # an edge of the mesh
     share = resolve_contraction(scene(tendon=60.0 / 320.0).muscle(MUSCLE)).tendon
     assert np.mean(share != tendon) < 0.02  # ways along edges are longer than the axis
-    listed = resolve_contraction(
-        scene(tendon={"vertices": np.flatnonzero(tendon).tolist()}).muscle(MUSCLE)
-    ).tendon
-    assert np.array_equal(listed, tendon)
     one = resolve_contraction(scene(tendon={"length": 60.0, "at": "origin"}).muscle(MUSCLE)).tendon
     assert np.array_equal(one, tendon & (x < 0))
 
@@ -99,8 +95,6 @@ CONTROLS = STO.format(column=MUSCLE)
         ({"tendon": {"length": 400.0}}, "covers all"),
         ({"tendon": {"length": 0.01}}, "make it longer"),
         ({"tendon": {"length": 5.0, "at": "insertoin"}}, "did you mean 'insertion'"),
-        ({"tendon": {"vertices": [10**6]}}, "out of range"),
-        ({"tendon": {"length": 5.0, "vertices": [1]}}, "one of length and vertices"),
         ({"fibre_strech_at_rest": 0.5}, "did you mean 'fibre_stretch_at_rest'"),
         (STO.format(column="tibia"), "has no column 'muscle', known: tibia"),
         (CONTROLS.replace("0.8", "1.8"), "row 2"),

@@ -26,7 +26,7 @@ def read_muscles(model: OsimModel, node: Node, frames: Frames) -> list[ModelMusc
                 quadrant = shape.word("quadrant", "all").lower().removeprefix("+").replace("all", "")
                 body_name = body.name or GROUND
                 shapes[shape.name] = WrapShape(body_name, frame, np.array(radii), shape.tag, quadrant)
-    muscles, resting = [], {name: facts.resting for name, facts in model.coordinates().items()}
+    muscles, resting = [], {name: facts.rest for name, facts in model.coordinates().items()}
     for force in node.objects("ForceSet"):
         path = force.child("GeometryPath")
         if path is None or not force.word("optimal_fiber_length"):

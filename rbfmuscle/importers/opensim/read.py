@@ -219,7 +219,7 @@ def _coordinate(node, motion, model):
         what = f"coordinate {node.name!r} is prescribed by a function of time"
         model.notes.append(f"{what}: not taken, it stays at {rest:g}")
     clamped = node.truth("clamped") and limits is not None
-    return Coordinate(motion, rest, None, limits, clamped, node.truth("locked"))
+    return Coordinate(motion, rest, limits, clamped, node.truth("locked"))
 
 
 def _read_couplings(model, node):

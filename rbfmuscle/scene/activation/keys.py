@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag
 
 from rbfmuscle.geometry.arrays import Booleans
 from rbfmuscle.scene.options import FileName, Positive, Table
@@ -25,22 +25,13 @@ class CurveTable(Table):
 class TendonTable(Table):
     """``tendon`` as a table: where the tendon is, and its strain at full activation.
 
-    ``length`` from every attachment, or from the bone ``at`` alone; or ``vertices`` of the muscle's mesh. The strain
-    of 0.033 at the greatest isometric force is Zajac's (Critical Reviews in Biomedical Engineering 17, 1989).
+    ``length`` from every attachment, or from the bone ``at`` alone. The strain of 0.033 at the greatest isometric force
+    is Zajac's (Critical Reviews in Biomedical Engineering 17, 1989).
     """
 
-    length: Positive | None = None
-    vertices: FileName | list[int] | None = None
+    length: Positive
     at: str | None = None
     strain: Annotated[float, Field(ge=0, le=0.5)] = TENDON_STRAIN
-
-    @model_validator(mode="after")
-    def _check_one_place(self):
-        if (self.length is None) == (self.vertices is None):
-            raise ValueError("give one of length and vertices")
-        if self.at is not None and self.vertices is not None:
-            raise ValueError("at (a bone) belongs to length, not to vertices")
-        return self
 
 
 def _check_activation(value: Any) -> Any:

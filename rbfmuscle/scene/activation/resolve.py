@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.csgraph import dijkstra
@@ -11,7 +9,6 @@ from scipy.sparse.csgraph import dijkstra
 from rbfmuscle.geometry.arrays import Booleans
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.scene.activation.keys import TENDON_STRAIN, Contraction, ContractionTable, TendonTable
-from rbfmuscle.scene.attachments import listed_vertices
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.validation import SceneError, did_you_mean
 
@@ -50,39 +47,29 @@ def _check_fibres(muscle):
 
 
 def _tendon(muscle: Muscle, given: float | TendonTable | None) -> Booleans:
-    """Vertices (n,) that are tendon."""
+    """Vertices (n,) that are tendon: up to a length from the attachments, or a share of the way to the others."""
     vertices = np.asarray(muscle.mesh.vertices, dtype=float)
     tendon = np.zeros(len(vertices), dtype=bool)
     if given is None:
         return tendon
     place = f"muscle {muscle.name!r} tendon"
-    if isinstance(given, TendonTable) and given.vertices is not None:
-        listed = str(given.vertices) if isinstance(given.vertices, Path) else given.vertices
-        tendon[listed_vertices(listed, len(vertices), f"{place}: ")] = True
-    else:
-        tendon = _near_ends(muscle, given, place)
+    bones = [attachment.bone for attachment in muscle.attachments]
+    at, length = (given.at, given.length) if isinstance(given, TendonTable) else (None, None)
+    if at is not None and at not in bones:
+        raise SceneError(f"{place}: not attached to {at!r}, {did_you_mean(at, bones)}")
+    for bone in set(bones) if at is None else [at]:
+        here, others = (
+            np.concatenate([a.vertices for a in muscle.attachments if (a.bone == bone) is same])
+            for same in (True, False)
+        )
+        away = _along_surface(muscle.mesh, here)
+        tendon |= away <= (given * away[others].mean() if length is None else length)
     free = np.ones(len(vertices), dtype=bool)
     free[np.concatenate([a.vertices for a in muscle.attachments])] = False
     if not (free & ~tendon).any():
         raise SceneError(f"{place}: covers all of the muscle, leave a belly that can contract")
     if not (free & tendon).any():
         raise SceneError(f"{place}: holds no vertex beyond the attachments, make it longer")
-    return tendon
-
-
-def _near_ends(muscle, given, place):
-    """Vertices (n,) up to a length from the attachments, or a share of the way to the others."""
-    bones = [attachment.bone for attachment in muscle.attachments]
-    at, length = (None, None) if isinstance(given, float) else (given.at, given.length)
-    if at is not None and at not in bones:
-        raise SceneError(f"{place}: not attached to {at!r}, {did_you_mean(at, bones)}")
-    tendon = np.zeros(len(muscle.mesh.vertices), dtype=bool)
-    for bone in dict.fromkeys(bones if at is None else [at]):
-        ends = {True: [], False: []}
-        for attachment in muscle.attachments:
-            ends[attachment.bone == bone].append(attachment.vertices)
-        away = _along_surface(muscle.mesh, np.concatenate(ends[True]))
-        tendon |= away <= (given * away[np.concatenate(ends[False])].mean() if length is None else length)
     return tendon
 
 

@@ -54,9 +54,7 @@ class Coordinate:
     motion : {"rotation", "translation", "coupled"}
         What the number is; a coupled one drives several axes by functions and has no unit of its own.
     rest : float
-        Its value in the pose in which the meshes are.
-    default : float, optional
-        Its value in a motion that does not mention it; ``rest`` where not given.
+        Its value in the pose in which the meshes are, and in a motion that does not mention it.
     range : (float, float), optional
     clamped : bool
         Cut to the range; others may leave it, which is reported.
@@ -66,15 +64,9 @@ class Coordinate:
 
     motion: MotionKind = "rotation"
     rest: float = 0.0
-    default: float | None = None
     range: tuple[float, float] | None = None
     clamped: bool = False
     locked: bool = False
-
-    @property
-    def resting(self) -> float:
-        """Value in a motion that does not mention it."""
-        return self.rest if self.default is None or self.locked else self.default
 
     def honoured(self, value: float) -> float:
         """Return what the coordinate becomes when ``value`` is asked of it."""

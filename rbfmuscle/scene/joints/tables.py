@@ -100,7 +100,6 @@ class CoordinateTable(Table):
 
     motion: Literal["rotation", "translation", "coupled"] | None = None
     rest: Finite = 0.0
-    default: Finite | None = None
     range: list[Finite] | None = Field(default=None, min_length=2, max_length=2)
     clamped: bool = False
     locked: bool = False
@@ -111,17 +110,14 @@ class CoordinateTable(Table):
             raise ValueError(f"range must go upwards, got {self.range}")
         if self.clamped and self.range is None:
             raise ValueError("clamped needs a range")
-        if self.locked and self.default not in (None, self.rest):
-            raise ValueError("a locked coordinate stays at rest, it has no other default")
         return self
 
     def coordinate(self, motion: str) -> Coordinate:
         """Return it in inner units."""
         kind: Any = self.motion or motion
         factor = FACTORS[kind]
-        default = None if self.default is None else self.default * factor
         ends = None if self.range is None else (self.range[0] * factor, self.range[1] * factor)
-        return Coordinate(kind, self.rest * factor, default, ends, self.clamped, self.locked)
+        return Coordinate(kind, self.rest * factor, ends, self.clamped, self.locked)
 
 
 class JointTable(Table):
@@ -284,8 +280,6 @@ def _coordinate_row(facts, kind):
     row: dict[str, Any] = {"motion": facts.motion} if kind == "custom" else {}
     if facts.rest:
         row["rest"] = facts.rest / factor
-    if facts.default is not None:
-        row["default"] = facts.default / factor
     if facts.range is not None:
         row["range"] = [end / factor for end in facts.range]
     row.update({key: True for key in ("clamped", "locked") if getattr(facts, key)})

@@ -10,15 +10,13 @@ import os
 import re
 import struct
 import warnings
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.scene.meshes.polydata import read_polydata
-from rbfmuscle.scene.meshes.repair import repair
+from rbfmuscle.scene.meshes.repair import ReadMesh, repair
 from rbfmuscle.validation import (
     MeshError,
     SceneError,
@@ -29,9 +27,6 @@ from rbfmuscle.validation import (
     shown,
     shown_path,
 )
-
-if TYPE_CHECKING:
-    import trimesh
 
 # In any unit: beyond it, squares of squares of lengths leave the range in which volumes are exact.
 LARGEST_COORDINATE = 1e12
@@ -48,30 +43,6 @@ UNREADABLE = (
     DeprecationWarning,
     struct.error,
 )
-
-
-@dataclass
-class ReadMesh:
-    """A mesh as read and mended.
-
-    Attributes
-    ----------
-    mesh : trimesh.Trimesh
-        Faces outward, in scene units.
-    vertex_map : (n_file,) ndarray of int
-        The vertex that each vertex of the file became, -1 where it was dropped.
-    notes : list of str
-        What was mended.
-    closed : bool
-    source : str
-        The file.
-    """
-
-    mesh: trimesh.Trimesh = field(repr=False)
-    vertex_map: Integers = field(repr=False)
-    notes: list[str] = field(default_factory=list)
-    closed: bool = True
-    source: str = ""
 
 
 def read_mesh(
@@ -127,8 +98,6 @@ def prepare_mesh(
     vertices: Floats, faces: Integers, *, place: str, name: str, may_be_open: bool = False
 ) -> ReadMesh:
     """Return the ReadMesh of given arrays, mended like a file's; ``place`` begins each message."""
-    import trimesh
-
     vertices, faces = np.asarray(vertices), np.asarray(faces)
     if not len(vertices) or not len(faces):
         raise MeshError(f"{place}: the mesh is empty ({len(vertices)} vertices, {len(faces)} triangles)")
@@ -149,9 +118,7 @@ def prepare_mesh(
         vertices, faces = check_mesh(vertices, faces, name=name)
     except MeshError as error:
         raise MeshError(f"{place}: {error}") from None
-    result = repair(vertices, faces, place=place, may_be_open=may_be_open)
-    mesh = trimesh.Trimesh(result.vertices, result.faces, process=False)
-    return ReadMesh(mesh, result.vertex_map, result.notes, result.closed)
+    return repair(vertices, faces, place=place, may_be_open=may_be_open)
 
 
 def read_arrays(path: Path) -> tuple[Floats, Integers]:
@@ -210,9 +177,8 @@ def _read_trimesh(content, kind):
     if len(vertices) and vertices.shape[1] != 3:
         raise ValueError("a vertex has fewer than three coordinates")
     if kind == "stl":  # each triangle has its own vertices: merged in order of first use
-        rows = (
-            np.ascontiguousarray(vertices + 0.0).view("V24").ravel()
-        )  # bytes sort faster than rows; 0.0 is -0.0
+        # Bytes sort faster than rows; 0.0 is -0.0.
+        rows = np.ascontiguousarray(vertices + 0.0).view("V24").ravel()
         _, first, inverse = np.unique(rows, return_index=True, return_inverse=True)
         order = np.argsort(first)
         vertices, faces = vertices[first[order]], np.argsort(order)[inverse][faces]

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import igl
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.validation import MeshError
+
+if TYPE_CHECKING:
+    import trimesh
 
 MERGE_TOLERANCE = 1e-7  # of the diagonal: float32 files repeat vertices to about this
 HOLE_LIMIT = 0.1  # of the diagonal: a longer rim (of more than four edges) is not closed by guesswork
@@ -22,17 +27,40 @@ CRUMB_LIMIT = 0.01  # of the largest part's area: smaller loose parts are droppe
 
 
 @dataclass
-class Repaired:
-    """Arrays of a mended mesh; ``vertex_map`` takes old vertex numbers to new ones (-1: dropped)."""
+class ReadMesh:
+    """A mesh as read and mended.
 
-    vertices: Floats
-    faces: Integers
-    vertex_map: Integers
+    Attributes
+    ----------
+    vertices : (n, 3) ndarray
+        In scene units.
+    faces : (m, 3) ndarray of int
+        Outward.
+    vertex_map : (n_file,) ndarray of int
+        The vertex that each vertex of the file became, -1 where it was dropped.
+    notes : list of str
+        What was mended.
+    closed : bool
+    source : str
+        The file.
+    """
+
+    vertices: Floats = field(repr=False)
+    faces: Integers = field(repr=False)
+    vertex_map: Integers = field(repr=False)
     notes: list[str] = field(default_factory=list)
     closed: bool = True
+    source: str = ""
+
+    @cached_property
+    def mesh(self) -> trimesh.Trimesh:
+        """The surface."""
+        import trimesh
+
+        return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
 
-def repair(vertices: Floats, faces: Integers, *, place: str, may_be_open: bool = False) -> Repaired:
+def repair(vertices: Floats, faces: Integers, *, place: str, may_be_open: bool = False) -> ReadMesh:
     """Return the mesh closed, manifold and outward, with notes of what was done.
 
     Parameters
@@ -50,7 +78,7 @@ def repair(vertices: Floats, faces: Integers, *, place: str, may_be_open: bool =
         If holes, non-manifold edges or several parts remain that cannot be mended safely.
     """
     bad = _repeated(faces)
-    state = Repaired(vertices, faces[~bad], np.arange(len(vertices)))
+    state = ReadMesh(vertices, faces[~bad], np.arange(len(vertices)))
     if bad.any():
         state.notes.append(f"{int(bad.sum())} degenerate or repeated triangles dropped")
     if len(state.faces):
@@ -88,20 +116,15 @@ def _check_closed(state, place, may_be_open):
                 f"{place}: the surface has {len(sizes)} separate parts (triangles: "
                 f"{', '.join(map(str, sizes[:5]))}); a muscle is one closed surface, split or join them"
             )
-        wrong = _check_volume(state.vertices, state.faces, place=place)
-        if wrong > TWISTED_NOTED:
-            state.notes.append(f"the surface passes through itself over {100 * wrong:.2g} % of its area")
+        _check_inside(state, place)
 
 
-def _check_volume(vertices, faces, *, place):
-    """Refuse a closed surface that does not enclose a volume, once, over most of its area.
+def _check_inside(state, place):
+    """Refuse or note a closed surface that does not enclose a volume, once, over all of its area.
 
-    A flat or twisted surface may be closed and consistently oriented, and still have no inside. Returned is the
-    share of its area that does not bound the inside.
+    A flat or twisted surface may be closed and consistently oriented, and still have no inside.
     """
-    import trimesh
-
-    mesh, volume = trimesh.Trimesh(vertices, faces, process=False), float(_cones(vertices, faces).sum())
+    mesh, volume = state.mesh, float(_cones(state.vertices, state.faces).sum())
     if not volume > LEAST_COMPACTNESS * mesh.area**1.5:
         raise MeshError(
             f"{place}: the surface encloses no volume ({volume:.3g}, of an area of {mesh.area:.3g}): it is flat "
@@ -113,7 +136,8 @@ def _check_volume(vertices, faces, *, place):
             f"{place}: the surface passes through itself, {100 * wrong:.0f} % of it does not bound its inside, so its "
             f"volume ({volume:.4g}) means nothing; repair it, for instance by remeshing"
         )
-    return wrong
+    if wrong > TWISTED_NOTED:
+        state.notes.append(f"the surface passes through itself over {100 * wrong:.2g} % of its area")
 
 
 def _twisted_share(mesh):

@@ -48,27 +48,22 @@ def read_fibres(fibres: Any, *, scale: float = 1.0, muscle: str = "") -> list[Fl
 
 def _read_lines(path, place):
     suffix = path.suffix.lower()
-    if suffix in (".vtk", ".vtp", ".json") and not is_file(path):
-        raise SceneError(f"{place}: no such file")
-    if suffix in (".vtk", ".vtp"):
-        return _read_polydata_lines(path, place)
-    if suffix != ".json":
+    if suffix not in (".json", ".vtk", ".vtp"):
         raise SceneError(f"{place}: fibres are read from .json, .vtk or .vtp")
+    if not is_file(path):
+        raise SceneError(f"{place}: no such file")
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        if suffix != ".json":
+            data = read_polydata(path)
+            return [data.points[line] for line in data.lines]
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except MeshError as error:
+        raise SceneError(f"{place}: {error}") from None
     except OSError as error:
         raise SceneError(f"{place}: cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
         raise SceneError(f"{place}: not JSON ({shown(str(error))})") from None
-    lines = data.get("polylines") if isinstance(data, dict) else data
+    lines = found.get("polylines") if isinstance(found, dict) else found
     if not isinstance(lines, list):
         raise SceneError(f"{place}: needs a list 'polylines'")
     return lines
-
-
-def _read_polydata_lines(path, place):
-    try:
-        data = read_polydata(path)
-    except MeshError as error:
-        raise SceneError(f"{place}: {error}") from None
-    return [data.points[line] for line in data.lines]
