@@ -112,22 +112,22 @@ def tendon_ends(muscle: Muscle, scene: SceneData) -> list[TendonEnd]:
     """
     vertices = np.asarray(muscle.mesh.vertices, dtype=float)
     areas = vertex_areas(vertices, np.asarray(muscle.mesh.faces))
-    held = [attachment for attachment in muscle.attachments if attachment.tendon is None]
-    held.sort(key=lambda attachment: -areas[attachment.vertices].sum())
     ends = []
     for attachment in muscle.attachments:
         if attachment.tendon is not None:
-            line = _line(attachment)
+            line = _line(attachment.bone, attachment.tendon)
             middle, radius = _patch(vertices[attachment.vertices], areas[attachment.vertices], line[0][1])
             section = abs(muscle.mesh.volume) / np.linalg.norm(vertices - middle, axis=1).max()
             thin = float(np.sqrt(THIN * section / np.pi))
             radii = radius, min(thin, radius)
             ends.append(TendonEnd(attachment.holder, vertices[attachment.vertices], middle, radii, line))
+    held = [attachment for attachment in muscle.attachments if attachment.tendon is None]
+    widest = max(held, key=lambda attachment: areas[attachment.vertices].sum(), default=None)
     for end in ends:
         opposite = next((other for other in ends if other is not end), None)
-        if held:
-            patch = held[0].vertices
-            end.other = [(held[0].bone, np.average(vertices[patch], axis=0, weights=areas[patch]))]
+        if widest is not None:
+            patch = widest.vertices
+            end.other = [(widest.bone, np.average(vertices[patch], axis=0, weights=areas[patch]))]
         elif opposite is not None:
             end.other = opposite.line[::-1]
         names = bones_between(scene.joints, [bone for bone, _ in (*end.other, *end.line)])
@@ -137,16 +137,11 @@ def tendon_ends(muscle: Muscle, scene: SceneData) -> list[TendonEnd]:
     return ends
 
 
-def _line(attachment: Attachment) -> list[BonePoint]:
-    """Via points and insertion of a tendon."""
-    table = attachment.tendon
-    assert table is not None
-    points = [*table.via, table.to]
+def _line(bone: str, tendon: LineTable) -> list[BonePoint]:
+    """Via points and insertion of a tendon to a bone."""
     return [
-        (point.bone, np.array(point.point))
-        if isinstance(point, ViaTable)
-        else (attachment.bone, np.array(point))
-        for point in points
+        (point.bone, np.array(point.point)) if isinstance(point, ViaTable) else (bone, np.array(point))
+        for point in [*tendon.via, tendon.to]
     ]
 
 
@@ -163,7 +158,7 @@ def _select(table, read, bone, place):
     if len(given) != 1:
         raise SceneError(f"{place}give one of vertices, near and sphere, got {' and '.join(given) or 'none'}")
     if table.vertices is not None:
-        kept = read.vertex_map[listed_vertices(table.vertices, len(read.vertex_map), place)]
+        kept = read.vertex_map[_listed(table.vertices, len(read.vertex_map), place)]
         if not (kept >= 0).any():
             raise SceneError(f"{place}none of its vertices is part of the mended surface")
         return kept[kept >= 0]
@@ -192,27 +187,23 @@ class ExactMeshes:
     """Exact distances to meshes, each of which is sorted once for all questions."""
 
     def __init__(self) -> None:
-        self._known: dict[int, Any] = {}
+        # A mesh is kept too, so that no other one takes its number.
+        self._known: dict[int, tuple[Any, ExactDistance, Any]] = {}
 
     def distances(self, points: Floats, mesh: trimesh.Trimesh) -> Floats:
         """Distance of points (n, 3) to a mesh, negative inside, (n,)."""
         points = np.ascontiguousarray(points, dtype=np.float64)
         if id(mesh) not in self._known:
-            exact = ExactDistance(mesh.vertices, mesh.faces)
-            # The mesh is kept too, so that no other one takes its number.
-            self._known[id(mesh)] = (
-                mesh,
-                exact,
-                None if mesh.is_watertight else inside_test(mesh.vertices, mesh.faces),
-            )
+            inside = None if mesh.is_watertight else inside_test(mesh.vertices, mesh.faces)
+            self._known[id(mesh)] = mesh, ExactDistance(mesh.vertices, mesh.faces), inside
         _, exact, inside = self._known[id(mesh)]
         distance = exact.signed_distance(points)
         return distance if inside is None else np.where(inside(points), -1.0, 1.0) * np.abs(distance)
 
 
-def listed_vertices(listed: str | list[int], count: int, place: str) -> Integers:
-    """Return the vertex numbers of a list or of a text file, below ``count``; ``place`` begins each message."""
-    numbers: list[int] = []
+def _listed(listed: str | list[int], count: int, place: str) -> Integers:
+    """Vertex numbers of a list or of a text file, below ``count``; ``place`` begins each message."""
+    numbers = listed if isinstance(listed, list) else []
     if isinstance(listed, str):
         place = f"{place}{shown_path(listed)}: "
         if not is_file(listed):
@@ -226,13 +217,10 @@ def listed_vertices(listed: str | list[int], count: int, place: str) -> Integers
                 numbers.append(int(word))
             except ValueError:
                 raise SceneError(f"{place}{shown(repr(word))} is not a vertex number") from None
-    else:
-        numbers = list(listed)
     if not numbers:
         raise SceneError(f"{place}no vertex numbers")
-    wrong = [number for number in numbers if not 0 <= number < count]
-    if wrong:
-        raise SceneError(
-            f"{place}vertex {shown(wrong[0])} is out of range, the mesh has vertices 0 to {count - 1}"
-        )
+    for number in numbers:
+        if not 0 <= number < count:
+            words = f"out of range, the mesh has vertices 0 to {count - 1}"
+            raise SceneError(f"{place}vertex {shown(number)} is {words}")
     return np.array(numbers, dtype=np.int64)

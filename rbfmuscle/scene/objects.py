@@ -109,14 +109,14 @@ class Motion:
 
     def __init__(
         self,
-        frames: Sequence[dict[str, float]] | None = None,
+        frames: Sequence[dict[str, float]] = ({},),
         *,
         options: MotionOptions | None = None,
         times: Sequence[float] | None = None,
         progress: Floats | None = None,
         notes: Sequence[str] = (),
     ) -> None:
-        self.frames = [dict(frame) for frame in frames] if frames is not None else [{}]
+        self.frames = [dict(frame) for frame in frames]
         self.options = options or MotionOptions()
         self.times = None if times is None else list(times)
         self.progress = np.linspace(0.0, 1.0, len(self.frames)) if progress is None else progress
@@ -139,21 +139,12 @@ class SceneData:
 
     Attributes
     ----------
-    name : str
     units : {"mm", "cm", "m"}
         Unit of every length in the scene.
-    bones : list of Bone
-    joints : list of Joint
     couplings : list of Coupling
         Coordinates that follow others.
     links : list of str
         Bones without a mesh, which carry joints only.
-    muscles : list of Muscle
-    motion : Motion
-    contact : ContactOptions
-    sliding : SlidingOptions or None
-    detect : DetectOptions or None
-    output : OutputOptions
     path : pathlib.Path or None
         The file it was loaded from.
     left_out : list of str

@@ -196,7 +196,7 @@ def rotation_about(axis: np.ndarray, angle: float, centre: np.ndarray) -> np.nda
     return pose
 
 
-def frame_at(origin: np.ndarray, orientation: Sequence[float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+def frame_at(origin: np.ndarray, orientation: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)) -> np.ndarray:
     """Return the (4, 4) frame at ``origin`` (3,), turned about its own x, then y, then z [radian]."""
     frame = np.eye(4)
     for axis, angle in zip((X, Y, Z), orientation):
