@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import MeshLike
-from rbfmuscle.scene.activation.curve import activation_curve
 from rbfmuscle.scene.activation.keys import contraction_keys
 from rbfmuscle.scene.activation.resolve import resolve_contraction
 from rbfmuscle.scene.attachments import AttachTable, resolve_attachments, tendon_ends
@@ -193,7 +192,6 @@ def validate(scene: S) -> S:
             raise SceneError(f"{place} is attached to {bones[0]!r} only, give attach a second bone")
         if muscle.contraction is not None:
             resolve_contraction(muscle)
-            activation_curve(muscle, scene.motion)
     return scene
 
 

@@ -2,7 +2,6 @@
 
 import math
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -12,47 +11,6 @@ from rbfmuscle.scene.options import MAX_FRAMES
 from rbfmuscle.validation import SceneError, is_file, shown_path
 
 YES, NO = ("yes", "true", "1"), ("no", "false", "0")
-
-
-class Storage(NamedTuple):
-    """Header (lower case), labels of the columns, and values (rows, columns) of an OpenSim storage file."""
-
-    header: dict[str, str]
-    labels: list[str]
-    values: Floats
-
-
-def read_storage(path: Path, *, place: str) -> Storage:
-    """Read an OpenSim storage file; errors begin with ``place``.
-
-    Raises
-    ------
-    SceneError
-        Naming the file and what is wrong in it.
-    """
-    if not is_file(path):
-        raise SceneError(f"{place}: cannot read {shown_path(path)}: no such file")
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError as error:
-        raise SceneError(f"{place}: cannot read {path}: {error.strerror}") from None
-    end = next((row for row, line in enumerate(lines) if line.strip().lower() == "endheader"), len(lines))
-    if len(lines) < end + 3:
-        raise SceneError(
-            f"{place}: {path} is no OpenSim motion: no 'endheader' line with columns and rows after it"
-        )
-    header = dict(line.lower().split("=", 1) for line in lines[:end] if "=" in line)
-    labels, rows = lines[end + 1].split(), [line.split() for line in lines[end + 2 :] if line.strip()]
-    for number, row in enumerate(rows, 1):
-        if len(row) != len(labels):
-            raise SceneError(
-                f"{place}: {path} row {number} has {len(row)} values, the header names {len(labels)}"
-            )
-    try:
-        values = np.array(rows, dtype=float)
-    except ValueError as error:
-        raise SceneError(f"{place}: {path}: {error}") from None
-    return Storage({key.strip(): value.strip() for key, value in header.items()}, labels, values)
 
 
 def read_motion_file(
@@ -83,7 +41,7 @@ def read_motion_file(
     SceneError
         Naming the file and what is wrong in it.
     """
-    header, labels, values = read_storage(path, place="[motion]")
+    header, labels, values = _read_storage(path)
     if len(values) > MAX_FRAMES:
         raise SceneError(f"[motion]: {path} has {len(values)} rows, more than {MAX_FRAMES}")
     columns: dict[str, int] = {}
@@ -112,6 +70,31 @@ def read_motion_file(
             tracks[name] = (values[:, column] * units[facts[name].motion]).tolist()
     frames = [{name: track[row] for name, track in tracks.items()} for row in range(len(values))]
     return frames, values[:, labels.index("time")].tolist() if "time" in labels else None, notes
+
+
+def _read_storage(path: Path) -> tuple[dict[str, str], list[str], Floats]:
+    """Header (lower case), labels of the columns, and values (rows, columns) of an OpenSim storage file."""
+    if not is_file(path):
+        raise SceneError(f"[motion]: cannot read {shown_path(path)}: no such file")
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError as error:
+        raise SceneError(f"[motion]: cannot read {path}: {error.strerror}") from None
+    end = next((row for row, line in enumerate(lines) if line.strip().lower() == "endheader"), len(lines))
+    if len(lines) < end + 3:
+        words = "no 'endheader' line with columns and rows after it"
+        raise SceneError(f"[motion]: {path} is no OpenSim motion: {words}")
+    pairs = [line.lower().split("=", 1) for line in lines[:end] if "=" in line]
+    labels, rows = lines[end + 1].split(), [line.split() for line in lines[end + 2 :] if line.strip()]
+    for number, row in enumerate(rows, 1):
+        if len(row) != len(labels):
+            words = f"row {number} has {len(row)} values, the header names {len(labels)}"
+            raise SceneError(f"[motion]: {path} {words}")
+    try:
+        values = np.array(rows, dtype=float)
+    except ValueError as error:
+        raise SceneError(f"[motion]: {path}: {error}") from None
+    return {key.strip(): value.strip() for key, value in pairs}, labels, values
 
 
 def match_label(label: str, known: list[str]) -> str | None:

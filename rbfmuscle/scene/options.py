@@ -47,6 +47,7 @@ REMOVED_KEYS: dict[str, str] = {
     "motion.degrees": "write inDegrees=yes or inDegrees=no into the header of the motion file",
     "motion.max_substeps": "delete the key: a motion may take 100000 sub-steps",
     "activation.from": "use a list of numbers, spread over the motion: [from, to]",
+    "activation.file": "read the file in Python and give the numbers as a list, spread over the motion",
     "activation.to": "use a list of numbers, spread over the motion: [from, to]",
     "shortening": "delete the key: a fully active fibre has no tension at half its slack length",
     "optimal_fibre_length": "use fibre_stretch_at_rest: the mean length of the fibres in the scan over it",

@@ -93,7 +93,7 @@ def _apply(scene, key, value):
     if head == "model":
         _set_model(muscles, rest, value, key)
     elif head in KEYS:
-        _set_contraction(muscles, scene, head, rest, value)
+        _set_contraction(muscles, head, rest, value)
     elif head not in TABLES:
         raise SceneError(f"{key}: unknown setting, {did_you_mean(head, HEADS)}")
     elif not rest:
@@ -173,15 +173,14 @@ def _set_model(muscles, rest, value, key):
         set_dotted(muscle.options, rest, value, place=key)
 
 
-def _set_contraction(muscles, scene, key, rest, value):
+def _set_contraction(muscles, key, rest, value):
     for muscle in muscles:
         table = muscle.contraction
         given = {} if table is None else table.model_dump(by_alias=True, exclude_unset=True)
         if rest and not isinstance(given.get(key), dict):
             given[key] = {}
         set_dotted(given, f"{key}.{rest}" if rest else key, value, place=key)
-        folder = scene.path.parent if scene.path else None
-        muscle.contraction = contraction_keys(given, muscle=muscle.name, folder=folder)
+        muscle.contraction = contraction_keys(given, muscle=muscle.name)
 
 
 def _set_motion(scene, rest, value, key):

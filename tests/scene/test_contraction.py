@@ -9,8 +9,6 @@ from rbfmuscle.scene.activation.curve import SETTLING, STEP, Activations, activa
 from rbfmuscle.scene.activation.resolve import resolve_contraction
 from rbfmuscle.validation import SceneError
 
-STO = "controls\nversion=1\nendheader\ntime\t{column}\tother\n0.0\t0.0\t1\n0.5\t0.8\t1\n1.0\t0.4\t1\n"
-
 
 def scene(**keys):
     return spindle_scene(frames=4, spacing=6.0, **keys)
@@ -42,19 +40,6 @@ def test_activation_along_the_motion_and_in_chosen_frames(given, values):
     assert activation_curve(chosen.muscle(MUSCLE), chosen.motion) == pytest.approx(values[2:5:2])
 
 
-@pytest.mark.parametrize("column", [MUSCLE, f"/forceset/{MUSCLE}/activation", f"{MUSCLE}.excitation"])
-def test_activation_from_a_file_of_controls_follows_the_time_of_a_motion_file(tmp_path, column):
-    path = tmp_path / "controls.sto"
-    path.write_text(STO.format(column=column))
-    made = scene(activation={"file": str(path)})
-    for times, values in (
-        ([], [0.0, 0.4, 0.8, 0.6, 0.4]),
-        ([0.0, 0.25, 0.5, 2.0, 3.0], [0.0, 0.4, 0.8, 0.4, 0.4]),
-    ):
-        made.motion.times = times or made.motion.times
-        assert activation_curve(made.muscle(MUSCLE), made.motion) == pytest.approx(values)
-
-
 def test_sub_steps_follow_activation_and_settle_where_bones_stand_still():
     made = scene(activation=[0.0, 0.55])
     activations = Activations(made)
@@ -82,35 +67,23 @@ def test_tendon_by_share_and_length_agree():
     assert np.array_equal(one, tendon & (x < 0))
 
 
-CONTROLS = STO.format(column=MUSCLE)
-
-
 @pytest.mark.parametrize(
     ("keys", "words"),
     [
         ({"activation": 1.2}, "from 0 to 1"),
         ({"activation": float("nan")}, "from 0 to 1"),
         ({"activation": "full"}, "got 'full'"),
-        ({"activation": {"file": "no.sto"}}, "cannot read"),
+        ({"activation": {"at": 1}}, "from 0 to 1"),
         ({"tendon": {"length": 400.0}}, "covers all"),
         ({"tendon": {"length": 0.01}}, "make it longer"),
         ({"tendon": {"length": 5.0, "at": "insertoin"}}, "did you mean 'insertion'"),
         ({"fibre_strech_at_rest": 0.5}, "did you mean 'fibre_stretch_at_rest'"),
-        (STO.format(column="tibia"), "has no column 'muscle', known: tibia"),
-        (CONTROLS.replace("0.8", "1.8"), "row 2"),
-        (CONTROLS.replace("0.8", "nan"), "row 2"),
-        (CONTROLS.replace("0.5\t", ""), "row 2 has 2 values, the header names 3"),
-        (CONTROLS.replace("0.5\t", "0.0\t"), "increases"),
     ],
 )
-def test_wrong_keys_and_controls_are_one_line(tmp_path, keys, words):
-    if isinstance(keys, str):
-        (tmp_path / "controls.sto").write_text(keys)
-        keys = {"activation": {"file": str(tmp_path / "controls.sto")}}
+def test_wrong_keys_are_one_line(keys, words):
     with pytest.raises(SceneError, match=words) as caught:
         scene(**keys).validate()
-    message = str(caught.value)
-    assert "\n" not in message and (MUSCLE in message or "controls.sto" in message)
+    assert "\n" not in str(caught.value) and MUSCLE in str(caught.value)
 
 
 def test_fibres_that_leave_the_muscle_are_refused():

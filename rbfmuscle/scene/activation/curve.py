@@ -8,11 +8,8 @@ import math
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.scene.activation.keys import CurveTable
 from rbfmuscle.scene.motion import interpolate
-from rbfmuscle.scene.motion_file import read_storage
 from rbfmuscle.scene.objects import Motion, Muscle, SceneData
-from rbfmuscle.validation import SceneError, did_you_mean
 
 # No activation changes by more in one sub-step; smaller steps change the shapes that are reached by less than
 # 0.1 mm (tests/contract/test_contraction.py).
@@ -22,49 +19,9 @@ SETTLING = 4
 
 
 def activation_curve(muscle: Muscle, motion: Motion) -> Floats:
-    """Activation (n,) of one muscle in each frame, 0 to 1.
-
-    The motion's times say which rows of a file of controls count; without times these are spread over the motion.
-
-    Raises
-    ------
-    SceneError
-        If its file cannot be used.
-    """
-    progress = np.asarray(motion.progress, dtype=float)
-    given = 0.0 if muscle.contraction is None else muscle.contraction.activation
-    if isinstance(given, CurveTable):
-        times, values = _read_controls(given.file, given.column or muscle.name, muscle.name)
-        when = times[0] + progress * (times[-1] - times[0]) if motion.times is None else motion.times
-        return np.interp(when, times, values)
-    values = np.atleast_1d(given)
-    return np.interp(progress, np.linspace(0.0, 1.0, len(values)), values)
-
-
-def _read_controls(path, column, muscle):
-    """Times [s] and activations, (n,) each, of one column of an OpenSim storage file (.sto)."""
-    place = f"muscle {muscle!r} activation"
-    _, labels, rows = read_storage(path, place=place)
-    index = _column(labels, column, f"{place}: {path}")
-    times, values = rows[:, 0], rows[:, index]
-    bad = np.flatnonzero(~((values >= 0.0) & (values <= 1.0)))
-    if len(bad):
-        raise SceneError(
-            f"{place}: {path} row {bad[0] + 1}: {labels[index]} is {values[bad[0]]:g}, activation lies from 0 to 1"
-        )
-    if not np.all(np.diff(times) > 0.0):
-        raise SceneError(f"{place}: {path}: the first column must be a time that increases")
-    return times, values
-
-
-def _column(labels, wanted, place):
-    for number, label in enumerate(labels[1:], start=1):
-        parts = label.replace(".", "/").strip("/").split("/")
-        if label == wanted or (parts[-1] in ("activation", "excitation") and parts[-2:-1] == [wanted]):
-            return number
-    raise SceneError(
-        f"{place} has no column {wanted!r}, {did_you_mean(wanted, labels[1:])}; give activation.column"
-    )
+    """Activation (n,) of one muscle in each frame, 0 to 1."""
+    values = np.atleast_1d(0.0 if muscle.contraction is None else muscle.contraction.activation)
+    return np.interp(motion.progress, np.linspace(0.0, 1.0, len(values)), values)
 
 
 class Activations:
@@ -115,20 +72,18 @@ class Activations:
         """
         if not self.curves:
             return stops, []
-        goal, start = self.at(frame), dict(self.here)
+        goal, start = self.at(frame), self.here
         most = max(abs(goal[name] - start[name]) for name in goal)
         wanted, steps = math.ceil(most / STEP - 1e-9), len(stops) - 1
         if steps == 0 and wanted == 0:
             return stops, []
-        each = max(1, math.ceil(wanted / steps)) if steps else wanted
+        each = max(1, math.ceil(wanted / max(1, steps)))
         fine = [stops[0]]
         for before, after in list(itertools.pairwise(stops)) or [(stops[0], stops[0])]:
             fine += [interpolate(before, after, k / each) for k in range(1, each)] + [after]
-        self.here, count = goal, len(fine) - 1
-        values = [
-            {name: start[name] + (goal[name] - start[name]) * (k / count) for name in goal}
-            for k in range(1, count + 1)
-        ]
+        count = len(fine) - 1
+        values = [interpolate(start, goal, k / count) for k in range(1, count + 1)]
+        self.here = goal
         if steps == 0:
             # Bones that stand still leave the muscles nothing else to settle in.
             fine, values = fine + [stops[0]] * SETTLING, values + [goal] * SETTLING

@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
 from rbfmuscle.geometry.arrays import Booleans
-from rbfmuscle.scene.options import FileName, Positive, Table
+from rbfmuscle.scene.options import Positive, Table
 
 KEYS = ("activation", "fibre_stretch_at_rest", "tendon")
 TENDON_STRAIN = 0.033
-
-
-class CurveTable(Table):
-    """``activation`` as a table: a ``column`` of a ``file``, by default the one named as the muscle."""
-
-    file: FileName
-    column: str | None = None
 
 
 class TendonTable(Table):
@@ -36,27 +28,15 @@ class TendonTable(Table):
 
 def _check_activation(value: Any) -> Any:
     """One message in place of one for each of the forms that it may take."""
-    numbers = value if isinstance(value, list) and value else [value]
-    for number in numbers:
+    for number in value if isinstance(value, list) and value else [value]:
         if isinstance(number, bool) or not isinstance(number, (int, float)) or not 0.0 <= number <= 1.0:
-            raise ValueError(
-                "must be a number from 0 to 1, a list of them over the motion, or a table with 'file'"
-            )
+            raise ValueError("must be a number from 0 to 1, or a list of them over the motion")
     return value
 
 
-def _form(value: Any) -> str:
-    return "table" if isinstance(value, (dict, Table)) else "number"
-
-
-Curve = Annotated[
-    Annotated[float | list[float], BeforeValidator(_check_activation), Tag("number")]
-    | Annotated[CurveTable, Tag("table")],
-    Discriminator(_form),
-]
 Tendon = Annotated[
     Annotated[float, Field(gt=0, lt=1), Tag("number")] | Annotated[TendonTable, Tag("table")],
-    Discriminator(_form),
+    Discriminator(lambda value: "table" if isinstance(value, (dict, Table)) else "number"),
 ]
 
 
@@ -65,34 +45,22 @@ class ContractionTable(Table):
 
     Attributes
     ----------
-    activation : number, list of numbers, or table
+    activation : number or list of numbers
         0 to 1; waypoints are spread evenly over the motion.
     fibre_stretch_at_rest : float, optional
         Stretch of the fibres in the scan pose against their slack length.
     tendon : number (a share of the length at every attachment) or table, optional
     """
 
-    activation: Curve = 0.0
+    activation: Annotated[float | list[float], BeforeValidator(_check_activation)] = 0.0
     fibre_stretch_at_rest: Annotated[float, Field(gt=0.2, lt=5)] | None = None
     tendon: Tendon | None = None
 
 
-def contraction_keys(
-    given: Mapping[str, Any], *, muscle: str, folder: Path | None = None
-) -> ContractionTable | None:
-    """The checked keys of one muscle, or None where it has none.
-
-    Parameters
-    ----------
-    given : mapping
-        None counts as not given.
-    muscle : str
-        For messages.
-    folder : path, optional
-        What relative files are relative to.
-    """
+def contraction_keys(given: Mapping[str, Any], *, muscle: str) -> ContractionTable | None:
+    """The checked keys of one muscle, or None where it has none; a value None counts as not given."""
     found = {key: value for key, value in given.items() if value is not None}
-    return ContractionTable.build(found, place=f"muscle {muscle!r} ", folder=folder) if found else None
+    return ContractionTable.build(found, place=f"muscle {muscle!r} ") if found else None
 
 
 class Contraction(NamedTuple):
