@@ -242,22 +242,21 @@ class DetectOptions(Table):
     tunnelling: TunnellingOptions | None = None
 
 
-def _refuse_other_formats(value: object) -> object:
-    if value != "pvd":
-        raise ValueError("runs are written as 'pvd'; rbfmuscle export writes other formats")
+def _accept_format(value: object) -> object:
+    """Scene files may say ``{ format = "pvd" }`` in place of true."""
+    if isinstance(value, dict):
+        if value != {"format": "pvd"}:
+            raise ValueError(
+                'must be true, false or { format = "pvd" }; rbfmuscle export writes other formats'
+            )
+        return True
     return value
-
-
-class SurfaceOptions(Table):
-    """``output.surfaces``: the surfaces written for every frame; `export` writes other formats."""
-
-    format: Annotated[Literal["pvd"], BeforeValidator(_refuse_other_formats)] = "pvd"
 
 
 class OutputOptions(Table):
     """``[output]``: which files a run writes."""
 
-    surfaces: SurfaceOptions | Literal[False] = SurfaceOptions()
+    surfaces: Annotated[bool, BeforeValidator(_accept_format)] = True
     tendons: bool = True
     report: bool = True
 

@@ -12,7 +12,14 @@ from rbfmuscle.scene.activation.keys import KEYS, contraction_keys
 from rbfmuscle.scene.build import split_model
 from rbfmuscle.scene.motion import make_motion, slice_motion
 from rbfmuscle.scene.objects import Muscle, SceneData
-from rbfmuscle.scene.options import DetectOptions, SlidingOptions, check_plain, check_removed, set_dotted
+from rbfmuscle.scene.options import (
+    DetectOptions,
+    MotionOptions,
+    SlidingOptions,
+    check_plain,
+    check_removed,
+    set_dotted,
+)
 from rbfmuscle.validation import SceneError, UsageError, did_you_mean
 
 S = TypeVar("S", bound=SceneData)
@@ -67,20 +74,10 @@ def chooses_model(key: str) -> bool:
     return key == "model" or (key.startswith("muscle.") and key.endswith(".model"))
 
 
-def _set_models(muscles: Sequence[Muscle], model: str | dict[str, Any]) -> None:
-    """Give muscles another model; options of a different model are dropped."""
-    name, options = split_model(model, place="model")
-    for muscle in muscles:
-        if muscle.model != name:
-            muscle.options = {}
-        muscle.model = name
-        muscle.options.update(options)
-
-
 def _apply(scene, key, value):
     check_removed({key: value}, place="")
     head, _, rest = key.partition(".")
-    muscles = scene.muscles
+    muscles, folder = scene.muscles, scene.path.parent if scene.path else None
     if head == "muscle":
         name, _, inner = rest.partition(".")
         check_removed({inner: value}, place=f"{key}: ")
@@ -90,19 +87,59 @@ def _apply(scene, key, value):
             raise SceneError(
                 f"{key}: of a muscle its model (muscle.{name}.model.KEY) and {', '.join(KEYS)} can be set"
             )
-    if head == "model":
-        _set_model(muscles, rest, value, key)
+    if head == "model" and not rest:
+        _set_models(muscles, value)
+    elif head == "model":
+        for muscle in muscles:
+            set_dotted(muscle.options, rest, value, place=key)
     elif head in KEYS:
-        _set_contraction(muscles, head, rest, value)
+        for muscle in muscles:
+            _set_contraction(muscle, head, rest, value)
     elif head not in TABLES:
         raise SceneError(f"{key}: unknown setting, {did_you_mean(head, HEADS)}")
     elif not rest:
         raise SceneError(f"{key}: name a key of the table, for instance {head}.KEY=VALUE")
     elif head == "motion":
-        _set_motion(scene, rest, value, key)
+        options = MotionOptions.build(
+            _changed_motion(scene.motion.options, rest, value, key), place=f"{key}: motion ", folder=folder
+        )
+        scene.motion = make_motion(scene, options)
     else:
         table = getattr(scene, head) or {"sliding": SlidingOptions, "detect": DetectOptions}[head]()
         setattr(scene, head, table.changed(rest, value, place=key))
+
+
+def _set_models(muscles: Sequence[Muscle], model: str | dict[str, Any]) -> None:
+    """Give muscles another model; options of a different model are dropped."""
+    name, options = split_model(model, place="model")
+    for muscle in muscles:
+        kept = muscle.options if muscle.model == name else {}
+        muscle.model, muscle.options = name, kept | options
+
+
+def _set_contraction(muscle, key, rest, value):
+    given = {} if muscle.contraction is None else muscle.contraction.model_dump(exclude_unset=True)
+    if rest and not isinstance(given.get(key), dict):
+        given[key] = {}
+    set_dotted(given, f"{key}.{rest}" if rest else key, value, place=key)
+    muscle.contraction = contraction_keys(given, muscle=muscle.name)
+
+
+def _changed_motion(options, rest, value, key):
+    """Values of a motion's table with one key changed; names of coordinates hold full stops."""
+    values = options.model_dump(by_alias=True, exclude_unset=True)
+    if rest == "step" and options.ramp is not None:
+        for ramp in values["ramp"].values():
+            ramp["step"] = value
+    elif rest.startswith("ramp.") and rest.count(".") >= 2:
+        name, _, last = rest.removeprefix("ramp.").rpartition(".")
+        ramps = values.setdefault("ramp", {})
+        if name not in ramps:
+            raise SceneError(f"{key}: the motion has no ramp {name!r}, {did_you_mean(name, ramps)}")
+        ramps[name][last] = value
+    else:
+        values[rest] = value
+    return values
 
 
 def parse_settings(texts: Sequence[str] | None) -> dict[str, Any]:
@@ -162,40 +199,3 @@ def parse_slice(text: str) -> slice:
     if len(numbers) == 1 and first is not None:
         return slice(first, first + 1 or None)
     return slice(*numbers)
-
-
-def _set_model(muscles, rest, value, key):
-    if not rest:
-        _set_models(muscles, value)
-        return
-    for muscle in muscles:
-        muscle.options = dict(muscle.options)
-        set_dotted(muscle.options, rest, value, place=key)
-
-
-def _set_contraction(muscles, key, rest, value):
-    for muscle in muscles:
-        table = muscle.contraction
-        given = {} if table is None else table.model_dump(by_alias=True, exclude_unset=True)
-        if rest and not isinstance(given.get(key), dict):
-            given[key] = {}
-        set_dotted(given, f"{key}.{rest}" if rest else key, value, place=key)
-        muscle.contraction = contraction_keys(given, muscle=muscle.name)
-
-
-def _set_motion(scene, rest, value, key):
-    options = scene.motion.options
-    values = options.model_dump(by_alias=True, exclude_unset=True)
-    if rest == "step" and options.ramp is not None:
-        for ramp in values["ramp"].values():
-            ramp["step"] = value
-    elif rest.startswith("ramp.") and rest.count(".") >= 2:
-        name, _, last = rest.removeprefix("ramp.").rpartition(".")
-        ramps = values.setdefault("ramp", {})
-        if name not in ramps:
-            raise SceneError(f"{key}: the motion has no ramp {name!r}, {did_you_mean(name, ramps)}")
-        ramps[name][last] = value
-    else:
-        values[rest] = value
-    folder = scene.path.parent if scene.path else None
-    scene.motion = make_motion(scene, type(options).build(values, place=f"{key}: motion ", folder=folder))

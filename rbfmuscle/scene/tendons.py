@@ -19,6 +19,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.scene.activation.keys import TENDON_STRAIN
 from rbfmuscle.scene.bone import Bone
+from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.taut_line import line_length, points_along, taut_line
 
 # Strain of a passive belly at which it bears the force that strains its tendon by `TENDON_STRAIN` (Zajac 1989), and
@@ -251,7 +252,7 @@ class TendonEnd:
         twist = last @ first.T
         skew = np.array([twist[2, 1] - twist[1, 2], twist[0, 2] - twist[2, 0], twist[1, 0] - twist[0, 1]])
         angle = self._share * np.arctan2(skew @ now, np.trace(twist) - 1.0)
-        return _about(now, angle) @ first
+        return rotation_about(now, float(angle), np.zeros(3))[:3, :3] @ first
 
 
 def _with_nodes(line: Floats) -> Floats:
@@ -293,10 +294,3 @@ def _least_turn(now: Floats, before: Floats) -> Floats:
     axis, cosine = np.cross(before, now), float(before @ now)
     skew = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
     return np.eye(3) + skew + skew @ skew / max(1.0 + cosine, 1e-9)
-
-
-def _about(axis: Floats, angle: float) -> Floats:
-    """Rotation (3, 3) by an angle [radian] about a unit axis (3,)."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_rotvec(angle * axis).as_matrix()

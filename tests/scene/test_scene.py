@@ -215,7 +215,7 @@ class TestOptions:
             ("muscle.bicep.model", "did you mean 'biceps'"),
             ("motion.ramp.x.y.step", "no ramp 'x.y'"),
             ("contact", "name a key"),
-            ("output.surfaces.format", "surfaces.format: .*rbfmuscle export writes other formats"),
+            ("output.surfaces.format", "surfaces: .*rbfmuscle export writes other formats"),
         ],
     )
     def test_unknown_settings(self, key, message):
@@ -295,7 +295,7 @@ WRONG = [
     ('[motion]\nramp = { "a.b" = { to = 1, step = 1, x = 1 } }\n', "[motion] ramp a.b: unknown key"),
     ('[motion]\nramp = { "a.b" = 3 }\n', "[motion] ramp a.b: input should be a table, got 3"),
     ("[detect]\ntunnelling = { x = 1 }\n", "[detect] tunnelling: unknown key"),
-    ("[output]\nsurfaces = 3\n", "[output] surfaces: input should be a table, got 3"),
+    ("[output]\nsurfaces = 3\n", "[output] surfaces: input should be a valid boolean, got 3"),
 ]
 
 
