@@ -24,7 +24,7 @@ from rbfmuscle.scene.objects import (
     ViaTable,
     find_named,
 )
-from rbfmuscle.scene.options import NotNegative, Positive, Table, Vector
+from rbfmuscle.scene.options import FileName, NotNegative, Positive, Table, Vector
 from rbfmuscle.scene.tendons import BonePoint, TendonEnd
 from rbfmuscle.validation import SceneError, is_file, shown, shown_path
 
@@ -47,7 +47,7 @@ class AttachTable(Table):
     """A bone, and one of: a file or list of vertex numbers, a distance to the bone, a ball; maybe a tendon."""
 
     bone: str
-    vertices: str | list[int] | None = None
+    vertices: FileName | list[int] | None = None
     near: NotNegative | None = None
     sphere: SphereTable | None = None
     tendon: LineTable | None = None
@@ -201,15 +201,15 @@ class ExactMeshes:
         return distance if inside is None else np.where(inside(points), -1.0, 1.0) * np.abs(distance)
 
 
-def _listed(listed: str | list[int], count: int, place: str) -> Integers:
+def _listed(listed: Path | list[int], count: int, place: str) -> Integers:
     """Vertex numbers of a list or of a text file, below ``count``; ``place`` begins each message."""
     numbers = listed if isinstance(listed, list) else []
-    if isinstance(listed, str):
+    if isinstance(listed, Path):
         place = f"{place}{shown_path(listed)}: "
         if not is_file(listed):
             raise SceneError(f"{place}cannot read it: no such file")
         try:
-            words = Path(listed).read_text(encoding="utf-8", errors="replace").split()
+            words = listed.read_text(encoding="utf-8", errors="replace").split()
         except OSError as error:
             raise SceneError(f"{place}cannot read it: {error.strerror}") from None
         for word in words:

@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from pydantic import Field, ValidationError, field_validator
 
-from rbfmuscle.scene.activation.keys import KEYS, ContractionTable
+from rbfmuscle.scene.activation.keys import ContractionTable
 from rbfmuscle.scene.attachments import AttachTable
 from rbfmuscle.scene.build import add_bone, add_link, add_muscle, place_coupling, place_joint, validate
 from rbfmuscle.scene.check import check_centre, check_place, check_size
@@ -25,7 +25,7 @@ from rbfmuscle.scene.joints.tables import (
 )
 from rbfmuscle.scene.meshes.read import read_mesh
 from rbfmuscle.scene.motion import make_motion, unit_sign
-from rbfmuscle.scene.objects import Attachment, Bone, Muscle, SceneData
+from rbfmuscle.scene.objects import Bone, Muscle, SceneData
 from rbfmuscle.scene.options import (
     ContactOptions,
     DetectOptions,
@@ -175,8 +175,8 @@ def load_scene(cls: type[S], path: str | Path, *, skeleton: bool = False) -> S:
 
 
 def _fill(scene: SceneData, tables: SceneFile) -> None:
-    scene.left_out = tables.scene.left_out
-    scene.superior, scene.anterior = tables.scene.superior, tables.scene.anterior
+    for name in ("left_out", "superior", "anterior"):
+        setattr(scene, name, getattr(tables.scene, name))
     for bone in tables.bone:
         if bone.mesh is None:
             add_link(scene, bone.name)
@@ -192,30 +192,18 @@ def _fill(scene: SceneData, tables: SceneFile) -> None:
     for muscle in tables.muscle:
         _add_muscle(scene, muscle, tables.defaults)
     scene.motion = make_motion(scene, tables.motion)
-    scene.contact = tables.contact
-    scene.sliding = tables.sliding
-    scene.detect = tables.detect
-    scene.output = tables.output
+    for name in ("contact", "sliding", "detect", "output"):
+        setattr(scene, name, getattr(tables, name))
 
 
 def _add_muscle(scene, muscle, defaults):
-    given = {key: getattr(muscle, key) for key in muscle.model_fields_set}
-    for key in defaults.model_fields_set:
-        given.setdefault(key, getattr(defaults, key))
+    given = {key: getattr(table, key) for table in (defaults, muscle) for key in table.model_fields_set}
     scale = given.get("scale", 1.0)
     read = read_mesh(muscle.mesh, name=muscle.name, scale=scale)
     check_size(scene, "muscle", muscle.name, read)
     check_place(scene, muscle.name, read)
-    add_muscle(
-        scene,
-        muscle.name,
-        read,
-        attach=[_from_folder(entry, scene.path.parent) for entry in given.get("attach", [])],
-        model=_merge_model(given.get("model", "rbf"), defaults.model),
-        fibres=given.get("fibres"),
-        scale=scale,
-        **{key: given[key] for key in KEYS if key in given},
-    )
+    given |= {"mesh": read, "model": _merge_model(given.get("model", "rbf"), defaults.model)}
+    add_muscle(scene, **given)
 
 
 def _merge_model(model, default):
@@ -223,12 +211,6 @@ def _merge_model(model, default):
     if isinstance(model, dict) and "name" not in model:
         return {**({"name": default} if isinstance(default, str) else default), **model}
     return model
-
-
-def _from_folder(entry, folder):
-    if isinstance(entry.vertices, str):
-        return entry.model_copy(update={"vertices": str(folder / entry.vertices)})
-    return entry
 
 
 def _place(location, data):
@@ -282,16 +264,15 @@ def _describe_muscle(muscle: Muscle) -> dict[str, Any]:
     return {
         "name": muscle.name,
         "model": {"name": muscle.model, **muscle.options},
-        "attach": [_describe_attachment(attachment) for attachment in muscle.attachments],
+        "attach": [
+            {"bone": held.bone, "vertices": len(held.vertices)}
+            | ({} if held.tendon is None else {"tendon": held.tendon.model_dump()})
+            for held in muscle.attachments
+        ],
         "fibres": len(muscle.fibres) if muscle.fibres else 0,
-        **({} if keys is None else keys.model_dump(mode="json", by_alias=True, exclude_none=True)),
+        **({} if keys is None else keys.model_dump(exclude_none=True)),
         **_describe_mesh(muscle),
     }
-
-
-def _describe_attachment(attachment: Attachment) -> dict[str, Any]:
-    tendon = {} if attachment.tendon is None else {"tendon": attachment.tendon.model_dump()}
-    return {"bone": attachment.bone, "vertices": len(attachment.vertices), **tendon}
 
 
 def _describe_mesh(item: Bone | Muscle) -> dict[str, Any]:
