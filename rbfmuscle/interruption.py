@@ -21,7 +21,7 @@ class _State:
     """State of this process."""
 
     asked = False
-    has_kept: Callable[[], bool] | None = None
+    kept: Callable[[], str] | None = None
     as_json = False
 
 
@@ -35,7 +35,7 @@ def install(*, as_json: bool = False, watch: bool = False) -> None:
     watch : bool
         Also listen in a thread: Python's own handlers wait until compiled code of the main thread returns.
     """
-    _State.asked, _State.has_kept, _State.as_json = False, None, as_json
+    _State.asked, _State.kept, _State.as_json = False, None, as_json
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _handle)
     if watch:
@@ -48,19 +48,23 @@ def install(*, as_json: bool = False, watch: bool = False) -> None:
 
 
 @contextlib.contextmanager
-def keeping(has_kept: Callable[[], bool]) -> Iterator[None]:
-    """While inside, and once ``has_kept()``, an interrupt raises KeyboardInterrupt, so that output can be finished.
+def keeping(kept: Callable[[], str]) -> Iterator[None]:
+    """While inside, and once ``kept()`` says what is kept, an interrupt raises KeyboardInterrupt with these words.
+
+    So output can be finished.
 
     A second interrupt ends the process at once. Compiled code and callbacks may lose the exception: :func:`check`
     raises it again, and so does leaving.
     """
-    before = _State.has_kept
-    _State.has_kept = has_kept
+    before = _State.kept
+    _State.kept = kept
     try:
         yield
         check()
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"interrupted; {kept()}") from None
     finally:
-        _State.has_kept = before
+        _State.kept = before
 
 
 def check() -> None:
@@ -76,7 +80,7 @@ def _ignore():
 
 
 def _must_finish():
-    return _State.has_kept is not None and _State.has_kept()
+    return _State.kept is not None and bool(_State.kept())
 
 
 def _handle(number, frame):

@@ -50,21 +50,23 @@ def run_command(arguments: list[str]) -> int:
     """Run one command and return the exit code; errors are one line."""
     sys.excepthook = _report_bug
     warnings.showwarning = _show_warning
-    logging.lastResort = _LogLines(logging.WARNING)
-    as_json = "--json" in arguments
+    logging.lastResort = logging.StreamHandler()
+    logging.lastResort.setFormatter(logging.Formatter("rbfmuscle: warning: %(message)s"))
+    logging.lastResort.setLevel(logging.WARNING)
     if sys.stdout is None:
-        return _fail(
-            "standard output is closed; send it to a file, or to /dev/null", UsageError.exit_code, False
-        )
+        return _fail("standard output is closed; send it to a file, or to /dev/null", UsageError.exit_code)
     try:
-        code = _run(arguments, as_json)
+        code = _run(arguments, "--json" in arguments)
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output went away, as `| head` does
         _drop_output()
         return 0
     except OSError as error:
         _drop_output()
-        return _fail(_describe_os_error(error), UsageError.exit_code, False)
+        what = error.filename or "standard output or a file of the command"
+        reason = error.strerror or one_line(error)
+        message = f"cannot read or write {what}: {reason}; free or choose another place"
+        return _fail(message, UsageError.exit_code)
     return code
 
 
@@ -75,7 +77,8 @@ def _run(arguments, as_json):
     try:
         action, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False)
     except CycloptsError as error:
-        return _fail(one_line(error), 2, as_json, hint=f"try 'rbfmuscle {_command_of(arguments)}--help'")
+        command = f"{arguments[0]} " if arguments[0] in app else ""
+        return _fail(one_line(error), 2, as_json, hint=f"; try 'rbfmuscle {command}--help'")
     try:
         code = action(*bound.args, **bound.kwargs)
     except KeyboardInterrupt as error:
@@ -89,20 +92,14 @@ def _run(arguments, as_json):
     return code if isinstance(code, int) else 0
 
 
-def _describe_os_error(error):
-    """Describe an error of the operating system; a stream without a name is standard output."""
-    what = f"{error.filename}" if error.filename else "standard output or a file of the command"
-    return f"cannot read or write {what}: {error.strerror or one_line(error)}; free or choose another place"
-
-
 def _drop_output():
     """Discard buffered output, so that exiting raises no second error."""
     with contextlib.suppress(OSError):  # of a caller in Python, whose stream has no file
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _fail(message, code, as_json, *, hint=""):
-    print(f"rbfmuscle: {message}{'; ' + hint if hint else ''}", file=sys.stderr)
+def _fail(message, code, as_json=False, *, hint=""):
+    print(f"rbfmuscle: {message}{hint}", file=sys.stderr)
     if as_json:
         print(json.dumps({"error": message, "exit_code": code}))
     return code
@@ -114,19 +111,8 @@ def one_line(error: object) -> str:
     return text if len(text) <= LONGEST_LINE else f"{text[: LONGEST_LINE - 60]} ... {text[-50:]}"
 
 
-def _command_of(arguments):
-    return f"{arguments[0]} " if arguments[0] in app else ""
-
-
 def _show_warning(message, category, filename, lineno, file=None, line=None):
     print(f"rbfmuscle: warning: {one_line(message)}", file=sys.stderr)
-
-
-class _LogLines(logging.Handler):
-    """Prints log records as warnings where logging is not configured."""
-
-    def emit(self, record):
-        print(f"rbfmuscle: warning: {one_line(record.getMessage())}", file=sys.stderr)
 
 
 def _report_bug(kind, error, trace):

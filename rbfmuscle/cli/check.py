@@ -23,26 +23,23 @@ def check(scene: SceneName, *, picture: Flag = False, fields: Flag = False, as_j
     """
     with Progress(f"check {scene.name}"):
         loaded, findings = _findings(scene)
-        errors_of = _measure_fields(loaded) if fields else {}
-    drawn = _draw(loaded, scene.with_suffix(".png")) if picture else {}
+        errors = _measure_fields(loaded) if fields else {}
+        drawn = {}
+        if picture:
+            from rbfmuscle.report.scene_picture import draw_scene
+
+            drawn = {"picture": str(scene.with_suffix(".png"))}
+            with stage("drawing the picture"):
+                draw_scene(loaded, scene.with_suffix(".png"))
+    usable = not any(finding.level == "error" for finding in findings)
     if as_json:
         facts = {"scene": loaded.resolved(), "findings": [vars(finding) for finding in findings]}
-        print(json.dumps(facts | drawn | ({"fields": errors_of} if errors_of else {}), indent=1))
+        print(json.dumps(facts | drawn | ({"fields": errors} if errors else {}), indent=1))
     else:
-        of_fields = [_describe_field(name, found, loaded.units) for name, found in errors_of.items()]
+        of_fields = [_describe_field(name, found, loaded.units) for name, found in errors.items()]
         print("\n".join([*_scene_lines(loaded), *of_fields, *map(str, findings), *drawn.values()]))
-    usable = not any(finding.level == "error" for finding in findings)
-    if not as_json:
         print("usable" if usable else "not usable", file=sys.stderr)
     return 0 if usable else SceneError.exit_code
-
-
-def _draw(scene, file):
-    from rbfmuscle.report.scene_picture import draw_scene
-
-    with Progress(f"picture of {scene.name}"):
-        draw_scene(scene, file)
-    return {"picture": str(file)}
 
 
 def _findings(path):

@@ -40,7 +40,8 @@ def compare(
 
     names = [name.strip() for name in (models or "").split(",") if name.strip()] or list(COMPARED)
     changes = parse_settings(settings)
-    with Progress("compare") as progress, interruption.keeping(lambda: output.exists()):
+    kept = f"finished runs are kept in {output}"
+    with Progress("compare") as progress, interruption.keeping(lambda: kept if output.exists() else ""):
 
         def advance(model, done, total):
             if done == 0:
@@ -49,10 +50,7 @@ def compare(
             interruption.check()
 
         options: dict[str, Any] = {"frames": frames, "settings": changes, "pictures": pictures}
-        try:
-            table = compare_models(open_scene(scene), output, names, progress=advance, **options)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"interrupted; finished runs are kept in {output}") from None
+        table = compare_models(open_scene(scene), output, names, progress=advance, **options)
     if as_json:
         print(json_text({"directory": str(output), **table}))
     else:

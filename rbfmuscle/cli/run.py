@@ -42,25 +42,27 @@ def run(
     from rbfmuscle import interruption
 
     start, done = time.perf_counter(), 0
-    with Progress(scene.stem) as progress, interruption.keeping(lambda: done > 0):
+
+    def kept():
+        return f"{done} frames are kept in {output}" if done else ""
+
+    def advance(count, total):
+        nonlocal done
+        done = count
+        progress(count, total)
+        interruption.check()
+
+    with Progress(scene.stem) as progress, interruption.keeping(kept):
         from rbfmuscle.run import stream_run
         from rbfmuscle.scene.phantom import open_scene
         from rbfmuscle.scene.settings import parse_settings
 
-        def advance(count, total):
-            nonlocal done
-            done = count
-            progress(count, total)
-            interruption.check()
-
+        changes = parse_settings(settings)
+        options: dict[str, Any] = {"model": model, "frames": frames, "fail_on": fail_on}
         try:
-            changes = parse_settings(settings)
-            options: dict[str, Any] = {"model": model, "frames": frames, "fail_on": fail_on}
             info = stream_run(open_scene(scene), output, settings=changes, progress=advance, **options)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"interrupted, {done} frames are kept in {output}") from None
         except SolveError as error:
-            raise SolveError(f"{error}; {done} frames are kept in {output}" if done else str(error)) from None
+            raise SolveError("; ".join(filter(None, [str(error), kept()]))) from None
     if as_json:
         from rbfmuscle.output.writer import json_text
 

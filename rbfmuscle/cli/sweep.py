@@ -70,12 +70,12 @@ def sweep(
     for point in points:  # a mistyped key is reported now, not after the first point
         configure_scene(loaded[point.scene], point.settings)
     options: dict[str, Any] = {"frames": frames, "jobs": jobs, "cluster": cluster}
-    with Progress(f"sweep of {len(points)} points", what="point") as progress:
-        try:
-            with interruption.keeping(lambda: True):
-                run_sweep(run_point, loaded, points, output, progress=progress, **options)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"interrupted; finished points are kept in {output}") from None
+    progress, kept = (
+        Progress(f"sweep of {len(points)} points", what="point"),
+        f"finished points are kept in {output}",
+    )
+    with progress, interruption.keeping(lambda: kept):
+        run_sweep(run_point, loaded, points, output, progress=progress, **options)
     _finish(points, output, {name: scene.units for name, scene in loaded.items()}, error, as_json)
 
 
