@@ -60,16 +60,7 @@ def resolve_attachments(
     *,
     muscle: str,
 ) -> list[Attachment]:
-    """Return the attachments of a muscle.
-
-    Parameters
-    ----------
-    attach : list of Attachment, AttachTable or dict
-    read : ReadMesh
-        The muscle's mesh with the map from the file's vertex numbers.
-    bones : list of Bone
-    muscle : str
-        For messages.
+    """Return the attachments of the muscle of that name and mesh.
 
     Raises
     ------
@@ -102,14 +93,7 @@ def resolve_attachments(
 
 
 def tendon_ends(muscle: Muscle, scene: SceneData) -> list[TendonEnd]:
-    """The ends of a muscle's belly that tendons hold, in the order of its attachments.
-
-    Parameters
-    ----------
-    muscle : Muscle
-    scene : SceneData
-        With its bones and joints.
-    """
+    """The ends of a muscle's belly that tendons hold, in the order of its attachments; the scene has its joints."""
     vertices = np.asarray(muscle.mesh.vertices, dtype=float)
     areas = vertex_areas(vertices, np.asarray(muscle.mesh.faces))
     ends = []

@@ -44,11 +44,7 @@ class Finding:
 def check_scene(scene: SceneData, exact: ExactMeshes | None = None) -> list[Finding]:
     """Return all findings about a scene, the worst first; nothing is solved or changed.
 
-    Parameters
-    ----------
-    scene : SceneData
-    exact : ExactMeshes, optional
-        Takes the distances to the bones' meshes, for further questions.
+    ``exact`` takes the distances to the bones' meshes, for further questions.
     """
     exact = exact or ExactMeshes()
     items: list[Bone | Muscle] = [*scene.bones, *scene.muscles]
@@ -185,15 +181,8 @@ def bone_collisions(
 ) -> list[tuple[int, str, str, float]]:
     """Return where a motion drives bones into each other, as (frame, bone, other, depth [scene unit]).
 
-    The depth is that of the deepest vertex of either bone in the other; pairs that do not move are left out.
-
-    Parameters
-    ----------
-    scene : SceneData
-    frames : iterable of int, optional
-        Which frames to look at, about ten of the motion by default.
-    exact : ExactMeshes, optional
-        Distances to the bones' meshes.
+    The depth is that of the deepest vertex of either bone in the other; pairs that do not move are left out. ``frames``
+    are about ten of the motion by default, ``exact`` takes the distances to the bones' meshes.
     """
     exact, found = exact or ExactMeshes(), []
     for frame in sampled_frames(scene) if frames is None else frames:

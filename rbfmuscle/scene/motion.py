@@ -28,11 +28,6 @@ RANGE_TOLERANCE = 1e-6
 def make_motion(scene: SceneData, options: MotionOptions) -> Motion:
     """Return the motion that ``[motion]`` asks of a scene's joints.
 
-    Parameters
-    ----------
-    scene : SceneData
-    options : MotionOptions
-
     Raises
     ------
     SceneError
@@ -76,15 +71,7 @@ def completed(scene: SceneData, coordinates: Mapping[str, float]) -> dict[str, f
 
 
 def interpolate(before: dict[str, float], after: dict[str, float], t: float) -> dict[str, float]:
-    """Return the coordinates between two frames, linear in each.
-
-    Parameters
-    ----------
-    before, after : dict of str -> float
-        Coordinates [radian]; an absent one is 0.
-    t : float
-        0 gives ``before``, 1 gives ``after``.
-    """
+    """Return the values between two tables by name, linear in each; t = 0 gives ``before``, an absent one is 0."""
     names = [*before, *(name for name in after if name not in before)]
     return {name: (1 - t) * before.get(name, 0.0) + t * after.get(name, 0.0) for name in names}
 

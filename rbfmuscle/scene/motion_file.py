@@ -35,11 +35,6 @@ def read_motion_file(
     -------
     frames, times, notes
         Times [s] where the file has a column ``time``, else None.
-
-    Raises
-    ------
-    SceneError
-        Naming the file and what is wrong in it.
     """
     header, labels, values = _read_storage(path)
     if len(values) > MAX_FRAMES:

@@ -145,12 +145,7 @@ def phantom_scene(*, model: str = "rbf", end: float = 90.0, step: float = 2.0, s
 def open_scene(scene: Scene | str | Path, *, skeleton: bool = False) -> Scene:
     """Return the scene of a file; the embedded hip for "phantom" where there is no file of that name.
 
-    Parameters
-    ----------
-    scene : path, "phantom" or Scene
-        A Scene is returned as it is.
-    skeleton : bool
-        As for `Scene.load`.
+    A Scene is returned as it is; ``skeleton`` is that of `Scene.load`.
     """
     if isinstance(scene, Scene):
         return scene

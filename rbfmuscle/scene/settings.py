@@ -143,13 +143,7 @@ def _changed_motion(options, rest, value, key):
 
 
 def parse_settings(texts: Sequence[str] | None) -> dict[str, Any]:
-    """Return the settings of several "KEY=VALUE", of which the last of a key counts; values are as in TOML, or text.
-
-    Raises
-    ------
-    UsageError
-        If there is no "=", or a value is a number or a nesting that nothing takes.
-    """
+    """Return the settings of several "KEY=VALUE", of which the last of a key counts; values are as in TOML, or text."""
     found = {}
     for text in texts or ():
         key, equals, value = (part.strip() for part in text.partition("="))
@@ -162,10 +156,7 @@ def parse_settings(texts: Sequence[str] | None) -> dict[str, Any]:
 def parse_value(text: str, *, place: str) -> dict[str, Any] | int | str:
     """Return the value of a TOML literal (number, true, list, table), or the text itself.
 
-    Raises
-    ------
-    UsageError
-        For NaN, infinity, numbers beyond 2^53 and deep nesting; ``place`` begins the message.
+    NaN, infinity, numbers beyond 2^53 and deep nesting raise a UsageError that begins with ``place``.
     """
     try:
         value = tomllib.loads(f"value = {text}")["value"]
@@ -179,13 +170,7 @@ def parse_value(text: str, *, place: str) -> dict[str, Any] | int | str:
 
 
 def parse_slice(text: str) -> slice:
-    """Return the slice of "A:B:S" (each part may be empty), or of a single frame "A".
-
-    Raises
-    ------
-    UsageError
-        If a part is no whole number or S is zero.
-    """
+    """Return the slice of "A:B:S" (each part may be empty), or of a single frame "A"."""
     parts = text.split(":")
     try:
         numbers = [int(part) if part.strip() else None for part in parts]

@@ -126,10 +126,7 @@ class Joint:
     def motion(self, values: dict[str, float], rest: dict[str, float]) -> np.ndarray:
         """Return the (4, 4) motion of the child against the parent, scene coordinates, the identity at rest.
 
-        Parameters
-        ----------
-        values, rest : dict of str to float
-            Every coordinate of the joint by its bare name, now and in the rest pose.
+        ``values`` and ``rest`` hold every coordinate of the joint by its bare name, now and in the rest pose.
         """
         if values == rest:
             return np.eye(4)
@@ -139,13 +136,7 @@ class Joint:
         return np.linalg.inv(transform) if self.backward else transform
 
     def displacement(self, values: dict[str, float]) -> np.ndarray:
-        """Return the (4, 4) motion from where every function is zero, in scene coordinates.
-
-        Parameters
-        ----------
-        values : dict of str to float
-            Every coordinate of the joint by its bare name.
-        """
+        """Return the (4, 4) motion in scene coordinates from where every function is zero."""
         transform = np.eye(4)
         for axis in self.translations:
             transform[:3, 3] += axis.amount(values) * self._turned(axis.direction)

@@ -18,12 +18,8 @@ def resolve(
 ) -> dict[str, float]:
     """Return the value that every coordinate takes when some are asked for.
 
-    Locked ones stay, clamped ones are cut to their range, those that follow others follow.
-
-    Parameters
-    ----------
-    coordinates : dict of str to float
-        Full names, radian or scene unit; absent ones are at rest.
+    Locked ones stay, clamped ones are cut to their range, those that follow others follow; absent ones are at rest. All
+    have full names [radian or scene unit].
     """
     values = {}
     for name, facts in all_coordinates(joints).items():
@@ -34,13 +30,7 @@ def resolve(
 
 
 def ordered(couplings: list[Coupling]) -> list[Coupling]:
-    """Return the couplings in an order in which each follows what is known by then.
-
-    Raises
-    ------
-    SceneError
-        If a coordinate follows itself, or is given twice.
-    """
+    """Return the couplings in an order in which each follows what is known by then, or raise SceneError."""
     by_name: dict[str, Coupling] = {}
     for coupling in couplings:
         if by_name.setdefault(coupling.coordinate, coupling) is not coupling:

@@ -20,11 +20,6 @@ def read_fibres(fibres: Any, *, scale: float = 1.0, muscle: str = "") -> list[Fl
         A JSON file holds ``{"polylines": [[[x, y, z], ...], ...]}`` or that list alone.
     scale : float
         Factor from the file's unit to the scene's.
-
-    Raises
-    ------
-    SceneError
-        If the file cannot be read or a polyline has fewer than two points.
     """
     place = f"muscle {muscle!r} fibres"
     if isinstance(fibres, (str, Path)):

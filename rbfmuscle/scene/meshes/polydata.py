@@ -32,13 +32,7 @@ class PolyData(NamedTuple):
 
 
 def read_polydata(path: str | Path) -> PolyData:
-    """Return what a ``.vtk`` or ``.vtp`` file of PolyData holds; polygons and strips as triangles.
-
-    Raises
-    ------
-    MeshError
-        If the file is damaged or of another kind.
-    """
+    """Return what a ``.vtk`` or ``.vtp`` file of PolyData holds; polygons and strips as triangles."""
     with _LOCK:
         child = _child(os.getpid())
         assert child.stdout is not None  # start_child asks for a pipe

@@ -70,12 +70,7 @@ def repair(vertices: Floats, faces: Integers, *, place: str, may_be_open: bool =
     place : str
         Begins each message: the file or the object.
     may_be_open : bool
-        Keep holes and several parts (bones) instead of refusing them.
-
-    Raises
-    ------
-    MeshError
-        If holes, non-manifold edges or several parts remain that cannot be mended safely.
+        Keep holes and several parts (bones) instead of refusing them by a MeshError.
     """
     bad = _repeated(faces)
     state = ReadMesh(vertices, faces[~bad], np.arange(len(vertices)))
