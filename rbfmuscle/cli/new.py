@@ -52,7 +52,7 @@ def new(
     guess = guess_scene(folder, "mm" if volume else units, output.parent, header=HEADER if volume else None)
     scene = write_scene(guess, output)
     print(f"{output} written; every guess in it is marked, look them over")
-    for note in guess.notes:
+    for note in guess.parts.notes:
         print(f"note: {note}")
     for doubt in guess.doubts():
         print(f"doubtful: {doubt}")

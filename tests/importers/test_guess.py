@@ -20,6 +20,7 @@ from rbfmuscle.importers.guess.names import name_facts
 from rbfmuscle.importers.guess.orientation import HEADER, find_orientation
 from rbfmuscle.importers.guess.parts import Part
 from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.scene.joints.tables import JointTable
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import UsageError
@@ -58,7 +59,7 @@ def test_ball_is_found_from_a_cap():
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     fit = fit_ball(Face(normals * 23.0 + [1, 2, 3], normals, np.ones(len(normals))))
     assert fit.centre == pytest.approx([1, 2, 3], abs=1e-9)
-    assert fit.radius == pytest.approx(23.0, abs=1e-9) and fit.misfit < 1e-9 and fit.cover > 0
+    assert fit.radii == pytest.approx([23.0], abs=1e-9) and fit.misfit < 1e-9 and fit.cover > 0
 
 
 def test_hinge_is_found_from_a_dome():
@@ -70,7 +71,7 @@ def test_hinge_is_found_from_a_dome():
     points = 20.0 * normals + rng.uniform(-15, 15, 400)[:, None] * axis + [5, -4, 2]
     fit = fit_hinge(Face(points, normals, np.ones(400)))
     assert abs(fit.axis @ axis) == pytest.approx(1.0, abs=1e-6)
-    assert fit.radius == pytest.approx(20.0, abs=1e-3) and fit.misfit < 1e-3
+    assert fit.radii == pytest.approx([20.0], abs=1e-3) and fit.misfit < 1e-3
     away = fit.centre - [5, -4, 2]
     assert np.linalg.norm(away - away @ axis * axis) < 1e-3
 
@@ -191,11 +192,13 @@ def test_patella_follows_the_table_that_was_computed_for_the_leg(leg):
     bones, true = _leg_bones(leg, np.eye(4))
     joint = next(j for j in guess_joints(bones, 1.0, find_orientation(bones))[1] if j.name == "patella")
     table, points = true["patella"]["table"], joint.child.points
-    assert joint.kind == "custom" and joint.follows == ("knee.flexion",)
+    assert joint.kind == "custom" and joint.follows == "knee.flexion"
+    made = JointTable(**joint.row()).joint()
     for row in table["rows"]:
         turn = Rotation.from_rotvec(np.radians(row[1:4])).as_matrix()
         moved = (points - table["point_mm"]) @ turn.T + table["point_mm"] + row[4:7]
-        pose = joint.pose(row[0])
+        angles = [{"flexion": np.radians(angle)} for angle in (joint.rest + row[0], joint.rest)]
+        pose = made.motion(*angles)
         error = np.linalg.norm(points @ pose[:3, :3].T + pose[:3, 3] - moved, axis=1)
         assert np.sqrt(np.mean(error**2)) < 6.0  # the table itself starts 4.6 mm off the scan
 
@@ -262,8 +265,8 @@ def test_what_cannot_be_used_is_left_out_with_its_reason_and_the_rest_loads(tmp_
     (tmp_path / "sacrum.stl").write_bytes(b"nothing")
     open_mesh.export(tmp_path / "femoral_cartilage.ply")
     guess = guess_scene(tmp_path, None, tmp_path)
-    assert {"gracilis.ply", "sacrum.stl"} == {Path(file).name for file in guess.unusable}
-    assert any("femoral_cartilage.ply" in note for note in guess.notes)
+    assert {"gracilis.ply", "sacrum.stl"} == {Path(file).name for file in guess.parts.unusable}
+    assert any("femoral_cartilage.ply" in note for note in guess.parts.notes)
     scene = write_scene(guess, tmp_path / "scene.toml")
     text = (tmp_path / "scene.toml").read_text(encoding="utf-8")
     assert "# NOT USED: gracilis.ply: " in text and len(scene.muscles) == 4

@@ -1,4 +1,4 @@
-"""Parents of bones, the joints between them and their ranges; and a joint as guessed."""
+"""Parents of bones; hip, knee and ankle with methods, names, signs and ranges of anatomy; a joint as guessed."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rbfmuscle.importers.guess.landmarks import Fit, across, fit_condyles, fit_dome, sole_direction, unit
+from rbfmuscle.importers.guess.orientation import Orientation, shank_up
 from rbfmuscle.importers.guess.parts import Part
-from rbfmuscle.scene.joints.tables import JointTable
 
 # Class of bone: its possible parents, the likeliest first, and the kind of joint between.
 PARENTS = {
@@ -50,6 +51,8 @@ COORDINATES = {
     "knee": {"flexion": (-10.0, 135.0)},
     "ankle": {"dorsiflexion": (-50.0, 20.0)},
 }
+# Greatest misfit of a condyle or a dome against its radius.
+MISFIT = 0.05
 
 
 @dataclass
@@ -58,21 +61,17 @@ class JointGuess:
 
     Attributes
     ----------
-    parent, child : Part
     kind : str
         ``"ball"``, ``"hinge"``, ``"custom"`` (the patella) or ``"fixed"``.
-    centre : (3,) ndarray [scene unit]
-    axes : dict of str to (3,) ndarray
-        Axis of each coordinate.
+    centre, axes : (3,) ndarray [scene unit], dict of str to (3,) ndarray
+        The axes by coordinate.
     confidence : float
         0 to 1: one minus half the misfit over the greatest allowed, where something was fitted.
-    reason, name : str
-        Why; of the joint in the scene.
     ranges, rest : dict of str to (float, float), float
         Of coordinates; the value of the first one in the pose of the meshes [degree].
     tables : dict
         ``rotations`` and ``translations`` of a custom joint, as the scene file has them.
-    follows : tuple of str
+    follows : str
         Full name of the coordinate that the first one follows.
     ligament : (2, 3) ndarray or None
         Ends of a patella's ligament at rest, on it and on the tibia [scene unit].
@@ -89,7 +88,7 @@ class JointGuess:
     ranges: dict[str, tuple] = field(default_factory=dict)
     rest: float = 0.0
     tables: dict[str, list] = field(default_factory=dict)
-    follows: tuple[str, ...] = ()
+    follows: str = ""
     ligament: np.ndarray | None = None
 
     @property
@@ -106,25 +105,89 @@ class JointGuess:
         """The joint's table in the scene file [degree, scene unit]."""
         row: dict[str, Any] = {"name": self.name, "parent": self.parent.name, "child": self.child.name}
         row["type"] = self.kind
-        if self.kind != "fixed":
-            row["centre"] = rounded(self.centre, 6)
-        if self.axes and not self.tables:
+        if self.kind == "fixed":
+            return row
+        row["centre"] = rounded(self.centre, 6)
+        if not self.tables:
             row["axes"] = {name: rounded(axis, 6) for name, axis in self.axes.items()}
-        row |= self.tables
         facts: dict[str, dict] = {name: {"range": rounded(ends, 1)} for name, ends in self.ranges.items()}
-        if self.rest:
-            facts.setdefault(next(iter(self.axes)), {})["rest"] = self.rest
-        if self.tables:
-            facts.setdefault(next(iter(self.axes)), {})["motion"] = "rotation"
-        return row | ({"coordinates": facts} if facts else {})
-
-    def pose(self, angle: float) -> np.ndarray:
-        """Motion (4, 4) of the child when the first coordinate is turned by an angle [degree] from rest."""
-        (name,) = self.axes
-        values = [{name: float(np.radians(value))} for value in (self.rest + angle, self.rest)]
-        return JointTable(**self.row()).joint().motion(*values)
+        first = facts.setdefault(next(iter(self.axes)), {})
+        first |= ({"rest": self.rest} if self.rest else {}) | ({"motion": "rotation"} if self.tables else {})
+        return row | self.tables | ({"coordinates": facts} if first else {})
 
 
 def rounded(values: ArrayLike, digits: int) -> list[float]:
     """Numbers rounded for the scene file."""
     return np.round(np.asarray(values, dtype=float), digits).tolist()
+
+
+def make_anatomical(
+    joint: JointGuess,
+    bones: list[Part],
+    joints: list[JointGuess],
+    orientation: Orientation,
+    millimetre: float,
+) -> None:
+    """Give a joint the method and the coordinates that anatomy has for it; ``joints`` are those before it."""
+    pair, right = (joint.parent.kind, joint.child.kind), orientation.right
+    if pair[1] == "femur" and joint.kind == "ball":
+        lowest = joint.child.points[np.argmin(joint.child.points @ orientation.superior)]
+        up = unit(across(joint.centre - lowest, right))
+        inward = 1.0 if joint.child.frame.side == "r" else -1.0
+        axes = (right, inward * np.cross(up, right), inward * up)
+        joint.axes, joint.ranges = dict(zip(COORDINATES["hip"], axes)), COORDINATES["hip"]
+    elif pair == ("femur", "tibia"):
+        fit = fit_condyles(joint.parent, joint.parent.frame, millimetre)
+        _take(joint, fit, "posterior condyles", "knee", -right)
+    elif pair == ("tibia", "talus"):
+        knee = next((j for j in joints if j.child is joint.parent and j.kind == "hinge"), None)
+        start = right if knee is None else -knee.axis
+        fit = fit_dome(joint.child, joint.parent, shank_up(joint.parent, bones), start, millimetre)
+        _take(joint, fit, "talar dome and tibial plafond", "ankle", right)
+    elif joint.kind == "hinge":
+        joint.axes = {"angle": joint.axis * (-1.0 if joint.axis @ right < 0.0 else 1.0)}
+
+
+def _take(joint: JointGuess, fit: Fit | None, method: str, name: str, direction: np.ndarray) -> None:
+    """Take a fitted axis, in about a direction (3,), for a hinge."""
+    joint.kind, joint.ranges = "hinge", COORDINATES[name]
+    coordinate = next(iter(joint.ranges))
+    if fit is None:
+        joint.reason, joint.confidence = f"{method} not found: the axis is across the body", 0.1
+        joint.axes = {coordinate: direction}
+        return
+    radii = " and ".join(f"{radius:.4g}" for radius in fit.radii)
+    joint.reason = f"{method}, radii {radii}, misfit {fit.misfit:.2g}"
+    joint.centre, joint.axes = fit.centre, {coordinate: fit.axis * np.sign(fit.axis @ direction)}
+    joint.confidence = max(1.0 - 0.5 * fit.misfit / (MISFIT * min(fit.radii)), 0.1)
+    joint.confidence -= 0.2 * (len(fit.radii) < 2)  # one surface alone shows the direction less well
+    if fit.wrong:
+        joint.reason, joint.confidence = f"{joint.reason}; {fit.wrong}: refused, correct it", 0.1
+
+
+def set_rest(joints: list[JointGuess], bones: list[Part]) -> None:
+    """Set the knee flexion and ankle dorsiflexion of the meshes: by axes of the bones and the sole of the foot."""
+    for joint in joints:
+        if joint.child.kind == "tibia" and "flexion" in joint.axes:
+            thigh, shank = joint.parent.frame.superior, shank_up(joint.child, bones)
+            for other in joints:  # from centre to centre where both ends have one
+                if other.child is joint.parent and other.kind == "ball":
+                    thigh = other.centre - joint.centre
+                if other.parent is joint.child and "dorsiflexion" in other.axes:
+                    shank = joint.centre - other.centre
+            joint.rest = _angle_about(joint.axis, thigh, shank)
+        elif "dorsiflexion" in joint.axes:
+            feet = [b.points for b in bones if b.kind in ("foot", "calcaneus") and b.side == joint.child.side]
+            up = shank_up(joint.parent, bones)
+            if feet:
+                sole = sole_direction(np.vstack(feet), joint.axis, up)
+                joint.rest = _angle_about(joint.axis, np.cross(up, joint.axis), sole)
+        joint.ranges = {
+            name: (min(low, joint.rest), max(high, joint.rest)) for name, (low, high) in joint.ranges.items()
+        }
+
+
+def _angle_about(axis, start, end):
+    """Angle [degree] about an axis from one direction to another, both seen along it."""
+    start, end = across(start, axis), across(end, axis)
+    return float(round(np.degrees(np.arctan2(np.cross(start, end) @ axis, start @ end)), 1))

@@ -1,19 +1,21 @@
 """Where a muscle holds: at its ends, and where it lies on a bone that anatomy names.
 
 A muscle's length is measured along its surface. Where an end lies on a bone, the patch is what touches it; where
-the belly stops short of its bone, the patch is the cap of the end that points there, and the tendon is missing.
+the belly stops short of its bone, the patch is the cap of the end that points there, and a tendon goes straight to the
+nearest place of the bone; from a patella that follows its knee on along the patellar ligament to the tibia.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from rbfmuscle.importers.guess.anatomy import JointGuess
 from rbfmuscle.importers.guess.landmarks import unit
 from rbfmuscle.importers.guess.parts import Part
 from rbfmuscle.scene.attachments import ExactMeshes
@@ -33,22 +35,27 @@ FEWEST, LARGEST = 8, 0.6
 REACH = 0.75
 # How much farther a bone counts that an end does not point to.
 ASIDE = 60.0
-# Beyond this [mm] an end is said to be far from its bone.
+# An end farther than this [mm] from its bone gets a tendon.
 FAR = 25.0
+
+
+class TendonGuess(NamedTuple):
+    """Bone and place (3,) of a tendon's insertion; (bone, place) of its via points from the muscle on [scene unit]."""
+
+    bone: Part
+    to: np.ndarray
+    via: tuple[tuple[Part, np.ndarray], ...] = ()
 
 
 @dataclass
 class AttachmentGuess:
-    """Vertices of a muscle's mended mesh that a bone holds, their least distance to it [mm], and why.
-
-    ``tendon`` is that of an end far from its bone.
-    """
+    """Vertices of a muscle's mended mesh that a bone holds, their least distance to it [mm], and why."""
 
     bone: Part
     vertices: np.ndarray
     gap: float
     reason: str
-    tendon: Any = None
+    tendon: TendonGuess | None = None
 
 
 @dataclass
@@ -75,6 +82,7 @@ class Skeleton(NamedTuple):
 
     bones: list[Part]
     bodies: dict[Part, Part]
+    joints: list[JointGuess]
     exact: ExactMeshes
     millimetre: float
 
@@ -121,6 +129,9 @@ def guess_attachments(muscle: Part, skeleton: Skeleton, *, named: bool = True) -
         _compare(guess, skeleton.bodies, distances)
         guess.confidence = 0.5 if guess.reasons else guess.confidence
     _doubt(guess, skeleton.bodies)
+    for hold in guess.holds:
+        if hold.gap > FAR and not guess.wrong:
+            hold.tendon = _tendon(hold, muscle, skeleton.joints)
     return guess
 
 
@@ -209,6 +220,17 @@ def _hold(bone, distance, ends, end, millimetre):
     return AttachmentGuess(bone, chosen, gap, f"the end that points there, {gap:.3g} mm short of it")
 
 
+def _tendon(hold, muscle, joints):
+    end = muscle.points[hold.vertices].mean(axis=0)
+    place = hold.bone.points[np.argmin(((hold.bone.points - end) ** 2).sum(axis=1))]
+    patella = next((j for j in joints if j.child is hold.bone and j.ligament is not None), None)
+    if patella is None:
+        return TendonGuess(hold.bone, place)
+    tibia = next(j.child for j in joints if j.child.kind == "tibia" and j.parent is patella.parent)
+    apex, tuberosity = patella.ligament
+    return TendonGuess(tibia, tuberosity, ((hold.bone, place), (hold.bone, apex)))
+
+
 def _disjoint(holds, distances):
     """Each vertex is held by one bone: the one that it lies nearer to, as its patch sees it."""
     for second, first in combinations(holds, 2):
@@ -225,7 +247,7 @@ def _doubt(guess, bodies):
         if hold.gap > FAR:
             away = f"{hold.gap:.0f} mm from the {hold.bone.name}"
             guess.doubt(0.5, f"its end is {away}: a tendon is missing")
-    if not guess.muscle.sure:
+    if guess.muscle.doubt:
         guess.confidence = min(guess.confidence, 0.3)
     share = sum(len(hold.vertices) for hold in guess.holds) / len(guess.muscle.points)
     if share > LARGEST:

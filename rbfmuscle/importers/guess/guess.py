@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,8 +11,7 @@ from rbfmuscle.importers.guess.anatomy import JointGuess
 from rbfmuscle.importers.guess.attachments import MuscleGuess, Skeleton, guess_attachments
 from rbfmuscle.importers.guess.joints import guess_joints
 from rbfmuscle.importers.guess.orientation import Orientation, find_orientation
-from rbfmuscle.importers.guess.parts import MILLIMETRE, Part, guess_units, read_parts
-from rbfmuscle.importers.guess.tendons import guess_tendons
+from rbfmuscle.importers.guess.parts import MILLIMETRE, Part, Parts, guess_units, read_parts
 from rbfmuscle.importers.guess.text import hold_file, scene_text
 from rbfmuscle.scene.attachments import ExactMeshes
 from rbfmuscle.scene.scene import Scene
@@ -25,29 +23,20 @@ DOUBTFUL = 0.6
 
 @dataclass
 class SceneGuess:
-    """What was guessed of a folder.
+    """What was guessed of the meshes of a folder; ``root`` is the bone that stands still."""
 
-    ``title`` is what the comment at the top of the file calls the source, ``root`` the bone that stands still,
-    ``unusable`` says why a bone or a muscle is not in the scene, by file, ``left_out`` names the bones of them;
-    ``notes`` what was left out, taken for something or made coarser, and the unit where it was guessed.
-    """
-
-    title: str
-    name: str
+    folder: Path
     units: str
-    bones: list[Part]
+    parts: Parts
     root: Part
     joints: list[JointGuess]
-    orientation: Orientation | None = None
-    unusable: dict[str, str] = field(default_factory=dict)
-    left_out: list[str] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
+    orientation: Orientation | None
     muscles: list[MuscleGuess] = field(default_factory=list)
 
     def doubts(self) -> list[str]:
         """One line for each guess that wants a look, the least sure first."""
-        rows = [(0.3, f"bone {bone.name}: {bone.reason}") for bone in self.bones if not bone.sure]
-        rows += [(0.0, f"{file} cannot be used: {reason}") for file, reason in self.unusable.items()]
+        rows = [(0.3, f"bone {bone.name}: {bone.doubt}") for bone in self.parts.bones if bone.doubt]
+        rows += [(0.0, f"{file} cannot be used: {reason}") for file, reason in self.parts.unusable.items()]
         rows += [(0.1, doubt) for doubt in (self.orientation.doubts if self.orientation else ())]
         rows += [(joint.confidence, f"joint of {joint.child.name}: {joint.reason}") for joint in self.joints]
         for muscle in self.muscles:
@@ -77,29 +66,24 @@ def guess_scene(
     UsageError
         If the folder is missing, holds no bone or no muscle, or is of no known unit.
     """
-    found = read_parts(folder, base)
-    bones, notes = found.bones, found.notes
+    parts = read_parts(folder, base)
+    bones = parts.bones
     if units is None:
         units, reason = guess_units(bones)
-        notes.append(f"units are {units}: {reason}")
+        parts.notes.append(f"units are {units}: {reason}")
     millimetre = MILLIMETRE[units]
     orientation = find_orientation(bones, header)
     root, joints = guess_joints(bones, millimetre, orientation)
-    name = re.sub(r"[^A-Za-z0-9_-]+", "_", folder.resolve().name) or "scene"
-    title = f"the meshes in {folder.name or folder}"
-    guess = SceneGuess(
-        title, name, units, bones, root, joints, orientation, found.unusable, found.left_out, notes
-    )
+    guess = SceneGuess(folder, units, parts, root, joints, orientation)
     bodies = {bone: bone for bone in bones}
     for joint in joints:  # parents come before their children
         if joint.kind == "fixed":
             bodies[joint.child] = bodies[joint.parent]
-    skeleton = Skeleton(bones, bodies, ExactMeshes(), millimetre)
-    guess.muscles = [guess_attachments(muscle, skeleton) for muscle in found.muscles]
+    skeleton = Skeleton(bones, bodies, joints, ExactMeshes(), millimetre)
+    guess.muscles = [guess_attachments(muscle, skeleton) for muscle in parts.muscles]
     # Where the bones that names ask for are not here, what is there is taken.
     if all(muscle.wrong for muscle in guess.muscles):
-        guess.muscles = [guess_attachments(muscle, skeleton, named=False) for muscle in found.muscles]
-    guess_tendons(guess)
+        guess.muscles = [guess_attachments(muscle, skeleton, named=False) for muscle in parts.muscles]
     order = [root, *(joint.child for joint in joints)]
     for muscle in guess.muscles:  # from the bone that stands still outwards
         muscle.holds.sort(key=lambda hold: order.index(hold.bone) if hold.bone in order else 0)
@@ -107,18 +91,9 @@ def guess_scene(
 
 
 def write_scene(guess: SceneGuess, path: Path) -> Scene:
-    """Write the scene file and its attachments; what cannot be loaded is commented out, with the reason.
+    """Write the scene file and, beside it, ``attachments/``; what cannot be loaded is commented out, with the reason.
 
-    Parameters
-    ----------
-    guess : SceneGuess
-    path : Path
-        Of the scene file; attachments go to ``attachments/`` beside it.
-
-    Returns
-    -------
-    Scene
-        As loaded from the file.
+    Returns the scene as loaded from the file.
 
     Raises
     ------
@@ -147,7 +122,7 @@ def write_scene(guess: SceneGuess, path: Path) -> Scene:
 
 def _write_coarse(guess, folder):
     """Meshes that were made coarser, beside the scene."""
-    for part in [*guess.bones, *(m.muscle for m in guess.muscles)]:
+    for part in (*guess.parts.bones, *guess.parts.muscles):
         if part.coarse:
             (folder / "coarse").mkdir(parents=True, exist_ok=True)
             part.file = f"coarse/{part.name}.ply"

@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.importers.guess.anatomical import make_anatomical, place_patellae, set_rest
-from rbfmuscle.importers.guess.anatomy import JOINTS, PARENTS, ROOTS, JointGuess
-from rbfmuscle.importers.guess.landmarks import HEAD, fit_coaxial, fit_sphere
+from rbfmuscle.importers.guess.anatomy import JOINTS, PARENTS, ROOTS, JointGuess, make_anatomical, set_rest
+from rbfmuscle.importers.guess.landmarks import HEAD, Fit, fit_coaxial, fit_sphere
 from rbfmuscle.importers.guess.orientation import Orientation
 from rbfmuscle.importers.guess.parts import Part
+from rbfmuscle.importers.guess.patella import place_patellae
 
 # Width [mm] beyond the least gap within which faces face each other.
 BAND = 8.0
@@ -42,16 +42,6 @@ class Face(NamedTuple):
     normals: np.ndarray
     areas: np.ndarray
     gap: float = np.inf
-
-
-class Fit(NamedTuple):
-    """A ball or a cylinder: centre, axis (of a cylinder), radius, misfit (RMS), share of a hemisphere (of a ball)."""
-
-    centre: np.ndarray
-    radius: float
-    misfit: float
-    axis: np.ndarray | None = None
-    cover: float = 0.0
 
 
 def find_face(first: Part, second: Part, millimetre: float, band: float = BAND) -> Face | None:
@@ -138,27 +128,29 @@ def _fit(parent, child, millimetre, area):
     named = dict(PARENTS.get(child.kind, ())).get(parent.kind, "")
     pairs = ((parent, child), (child, parent))
     faces = [find_face(*pair, millimetre) for pair in pairs]
-    gap = faces[0].gap
-    ball = min((fit_ball(face) for face in faces), key=lambda fit: fit.misfit / max(fit.radius, 1e-300))
+    ball = min((fit_ball(face) for face in faces), key=lambda fit: fit.misfit / max(fit.radii[0], 1e-300))
     low, high = HEAD if child.kind == "femur" else (0.0, np.inf)
-    allowed = low <= ball.radius / millimetre <= high
-    fits_ball = ball.misfit < BALL_MISFIT * ball.radius and ball.cover > BALL_COVER and allowed
+    allowed = low <= ball.radii[0] / millimetre <= high
+    fits_ball = ball.misfit < BALL_MISFIT * ball.radii[0] and ball.cover > BALL_COVER and allowed
     band = max(BAND, 0.5 * np.sqrt(area))
     hinges = [fit for pair in pairs if (fit := fit_hinge(find_face(*pair, millimetre, band))) is not None]
     # What rolls has the smaller radius, not its socket.
-    hinge = min(hinges, key=lambda fit: (fit.misfit > HINGE_MISFIT * fit.radius, fit.radius), default=None)
-    fits_hinge = hinge is not None and hinge.misfit < HINGE_MISFIT * hinge.radius
+    hinge = min(
+        hinges, key=lambda fit: (fit.misfit > HINGE_MISFIT * fit.radii[0], fit.radii[0]), default=None
+    )
+    fits_hinge = hinge is not None and hinge.misfit < HINGE_MISFIT * hinge.radii[0]
+    gap = faces[0].gap
     kind = named or ("ball" if fits_ball else "hinge" if fits_hinge and gap >= BOUND else "fixed")
     if kind == "ball":
-        sure = 1.0 - 0.5 * ball.misfit / (BALL_MISFIT * ball.radius) if fits_ball else 0.1
+        sure = 1.0 - 0.5 * ball.misfit / (BALL_MISFIT * ball.radii[0]) if fits_ball else 0.1
         share = 100 * min(ball.cover, 1.0)
-        why = f"ball of radius {ball.radius:.4g}, misfit {ball.misfit:.2g}, of a hemisphere {share:.0f} %"
+        why = f"ball of radius {ball.radii[0]:.4g}, misfit {ball.misfit:.2g}, of a hemisphere {share:.0f} %"
         why += "" if allowed else f"; anatomy has {low:g} to {high:g} mm"
         axes = {f"rotation_{word}": axis for word, axis in zip("xyz", np.eye(3))}
         return JointGuess(parent, child, "ball", ball.centre, axes, sure, why)
     if kind == "hinge" and hinge is not None:
-        sure = 0.6 * max(1.0 - 0.5 * hinge.misfit / (HINGE_MISFIT * hinge.radius), 0.0)
-        why = f"cylinder of radius {hinge.radius:.4g}, misfit {hinge.misfit:.2g}, about the dome where they face"
+        sure = 0.6 * max(1.0 - 0.5 * hinge.misfit / (HINGE_MISFIT * hinge.radii[0]), 0.0)
+        why = f"cylinder of radius {hinge.radii[0]:.4g}, misfit {hinge.misfit:.2g}, about the dome where they face"
         return JointGuess(parent, child, "hinge", hinge.centre, {"angle": hinge.axis}, sure, why)
     middle = faces[1].points.mean(axis=0) if len(faces[1].points) else child.points.mean(axis=0)
     why = f"they are {gap:.2g} mm apart, " + (
@@ -170,11 +162,12 @@ def _fit(parent, child, millimetre, area):
 def fit_ball(face: Face) -> Fit:
     """The sphere that fits a face."""
     if len(face.points) < 12:
-        return Fit(np.zeros(3), 0.0, np.inf)
+        return Fit(np.zeros(3), np.zeros(1), np.inf)
     centre, radius = fit_sphere(face.points, face.areas)
     away = np.linalg.norm(face.points - centre, axis=1) - radius
     misfit = float(np.sqrt(np.average(away**2, weights=face.areas)))
-    return Fit(centre, radius, misfit, cover=float(face.areas.sum() / (2.0 * np.pi * radius**2)))
+    cover = float(face.areas.sum() / (2.0 * np.pi * radius**2))
+    return Fit(centre, np.array([radius]), misfit, cover=cover)
 
 
 def fit_hinge(face: Face) -> Fit | None:
@@ -189,5 +182,6 @@ def fit_hinge(face: Face) -> Fit | None:
     middle = np.average(points, axis=0, weights=areas)
     size = float(np.sqrt(np.average(((points - middle) ** 2).sum(axis=1), weights=areas)))
     start = flat @ np.array(plane) + middle @ axis * axis
-    centre, axis, radii, misfit = fit_coaxial([(points, areas)], start, axis, np.array([radius]), 0.02 * size)
-    return Fit(centre + (points.mean(axis=0) - centre) @ axis * axis, float(radii[0]), misfit, axis)
+    fit = fit_coaxial([(points, areas)], start, axis, np.array([radius]), 0.02 * size)
+    fit.centre = fit.centre + (points.mean(axis=0) - fit.centre) @ fit.axis * fit.axis
+    return fit

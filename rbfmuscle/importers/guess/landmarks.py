@@ -40,16 +40,17 @@ class Frame:
 
 
 @dataclass
-class AxisFit:
-    """An axis: point on it, unit direction to the body's right, radii and misfit (RMS) [scene unit].
+class Fit:
+    """A sphere, or spheres or cylinders on an axis: centre (3,), radii, misfit (RMS) [scene unit], unit axis (3,).
 
-    ``wrong`` says why it is refused; empty where it is not.
+    ``cover`` is the share of a hemisphere that was fitted; ``wrong`` says why a fit is refused, empty where it is not.
     """
 
     centre: np.ndarray
-    axis: np.ndarray
     radii: np.ndarray
     misfit: float
+    axis: np.ndarray | None = None
+    cover: float = 0.0
     wrong: str = ""
 
 
@@ -118,7 +119,7 @@ def fit_sphere(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, flo
     return middle + x, float(np.sqrt(max(last + np.dot(x, x), 0.0)))
 
 
-def fit_condyles(femur: Part, frame: Frame, millimetre: float) -> AxisFit | None:
+def fit_condyles(femur: Part, frame: Frame, millimetre: float) -> Fit | None:
     """The knee's axis; None where a condyle has too few triangles."""
     points, right = femur.faces[0], frame.right
     along = points @ frame.superior
@@ -141,7 +142,7 @@ def fit_condyles(femur: Part, frame: Frame, millimetre: float) -> AxisFit | None
             break
     centres, radii, misfits = (np.array(values) for values in zip(*fits))
     misfit, wrong = float(np.sqrt(np.mean(misfits**2))), _refused("condyle", radii, CONDYLE, millimetre)
-    return AxisFit(centres.mean(axis=0), right, radii, misfit, wrong)
+    return Fit(centres.mean(axis=0), radii, misfit, right, wrong=wrong)
 
 
 def _fit_condyle(points, normals, areas, millimetre):
@@ -162,9 +163,7 @@ def _refused(what, radii, allowed, millimetre):
     return f"a {what} of radius {bad[0]:.3g} mm, anatomy has {low:g} to {high:g}" if bad else ""
 
 
-def fit_dome(
-    talus: Part, tibia: Part, up: np.ndarray, right: np.ndarray, millimetre: float
-) -> AxisFit | None:
+def fit_dome(talus: Part, tibia: Part, up: np.ndarray, right: np.ndarray, millimetre: float) -> Fit | None:
     """The ankle's axis; None where talus and tibia show no dome.
 
     ``up`` (3,) is the direction along the tibia, ``right`` (3,) about that of the axis.
@@ -191,9 +190,11 @@ def fit_dome(
         if np.array_equal(before, before := np.concatenate(chosen)):
             break
         used = [(patch[0][c], patch[2][c]) for patch, c in zip(patches, chosen)]
-        centre, right, radii, misfit = fit_coaxial(used, centre, right, radii, 0.5 * millimetre)
-    centre = centre + ((used[0][0] - centre) @ right).mean() * right
-    return AxisFit(centre, right, radii, misfit, _refused("talar dome", radii[:1], DOME, millimetre))
+        fit = fit_coaxial(used, centre, right, radii, 0.5 * millimetre)
+        centre, right, radii = fit.centre, fit.axis, fit.radii
+    fit.centre = centre + ((used[0][0] - centre) @ right).mean() * right
+    fit.wrong = _refused("talar dome", radii[:1], DOME, millimetre)
+    return fit
 
 
 def _on_cylinder(points, normals, centre, right, up, radius):
@@ -212,8 +213,8 @@ def fit_coaxial(
     axis: np.ndarray,
     radii: np.ndarray,
     soft: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Centre, axis, radii and misfit (RMS) of cylinders with one axis, from a start on.
+) -> Fit:
+    """Cylinders with one axis, from a start on.
 
     ``patches`` holds points and weights of each cylinder; from the distance ``soft`` on a point loses its weight.
     """
@@ -232,4 +233,4 @@ def fit_coaxial(
     x = least_squares(residual, start, loss="soft_l1", f_scale=soft / size, max_nfev=200).x
     parts = np.split(residual(x) * size, np.cumsum([len(root) for root in roots])[:-1])
     misfit = float(np.sqrt(sum(np.mean(part**2) for part in parts)))
-    return line(x)[1], line(x)[0], x[4:] * size, misfit
+    return Fit(line(x)[1], x[4:] * size, misfit, line(x)[0])

@@ -41,8 +41,8 @@ class Part:
         Class of bone, empty where the name says none.
     side : str
         ``"l"``, ``"r"`` or empty.
-    reason : str
-        Why it is a bone or a muscle, where that is not ``sure``.
+    doubt : str
+        What speaks for a bone or a muscle where its name does not; empty where it does.
     facts : MuscleFacts or None
     coarse : bool
         The mesh was made coarser than its file.
@@ -55,8 +55,7 @@ class Part:
     read: Any
     kind: str = ""
     side: str = ""
-    reason: str = ""
-    sure: bool = True
+    doubt: str = ""
     facts: MuscleFacts | None = None
     coarse: bool = False
     frame: Any = None
@@ -122,8 +121,7 @@ def read_parts(folder: Path, base: Path) -> Parts:
     # Of names that are not known: the largest are bones until there are two, the others muscles.
     for part in sorted(unknown, key=lambda part: -np.linalg.norm(part.mesh.extents)):
         is_bone = len(found.bones) < 2 or not part.mesh.is_watertight
-        part.sure = False
-        part.reason = f"{'a bone' if is_bone else 'a muscle'} by its size, as its name is not known"
+        part.doubt = f"{'a bone' if is_bone else 'a muscle'} by its size, as its name is not known"
         (found.bones if is_bone else found.muscles).append(part)
     if left_out:
         found.notes.append(f"left out, neither bone nor muscle: {', '.join(left_out)}")

@@ -8,13 +8,10 @@ Points of the plane are complex numbers about the knee's axis: forwards, and i t
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from rbfmuscle.importers.guess.anatomy import JointGuess, rounded
 from rbfmuscle.importers.guess.landmarks import across, unit
-from rbfmuscle.importers.guess.parts import Part
 
 # Knee flexion from the rest pose [degree] at which the path is taken.
 FLEXIONS = tuple(range(0, 131, 10))
@@ -27,22 +24,24 @@ LIGAMENT = (25.0, 80.0)
 OUTLINE, STEP, ORDER = (-50.0, 125.0), 5.0, 6
 
 
-class PatellaPath(NamedTuple):
-    """Place (3,) and the ligament's ends (2, 3), at rest, and the custom joint's rotations and translations."""
+def place_patellae(joints: list[JointGuess], millimetre: float) -> None:
+    """Patellae glide in their grooves as the knee bends; about its axis where no groove is found."""
+    for joint in joints:
+        knee = next((j for j in joints if j.child.kind == "tibia" and j.parent is joint.parent), None)
+        if joint.child.kind != "patella" or knee is None or knee.kind != "hinge":
+            continue
+        joint.axes, joint.rest = {"flexion": knee.axis}, knee.rest
+        if not _put_in_groove(joint, knee, millimetre):
+            joint.kind, joint.centre, joint.confidence = "hinge", knee.centre, 0.2
+            joint.reason = "no groove or no ligament was found: it turns about the knee's axis"
 
-    centre: np.ndarray
-    ligament: np.ndarray
-    tables: dict[str, list]
 
-
-def patella_path(
-    femur: Part, tibia: Part, patella: Part, knee: JointGuess, millimetre: float
-) -> PatellaPath | None:
-    """The path of a patella, None where its groove or its ligament is not found; ``knee`` has its axis and rest."""
-    axis = knee.axis
+def _put_in_groove(joint, knee, millimetre):
+    """Make a patella's joint the custom one of its path; False where its groove or its ligament is not found."""
+    femur, axis = joint.parent, knee.axis
     down = unit(across(-femur.frame.superior, axis))
     front = np.cross(down, axis)
-    side = float((patella.points.mean(axis=0) - knee.centre) @ axis)
+    side = float((joint.child.points.mean(axis=0) - knee.centre) @ axis)
 
     def flat(points, half):
         away = points - knee.centre
@@ -50,13 +49,13 @@ def patella_path(
         return away @ front + 1j * (away @ down)
 
     groove = _Groove(flat(np.vstack([femur.points, femur.faces[0]]), GROOVE))
-    outline = flat(patella.points, np.inf)
-    shin, apex = flat(tibia.points, TUBEROSITY), outline[np.argmax(outline.imag)]
+    outline = flat(joint.child.points, np.inf)
+    shin, apex = flat(knee.child.points, TUBEROSITY), outline[np.argmax(outline.imag)]
     gaps = np.abs(shin - apex) / millimetre
     shin = shin[(gaps > LIGAMENT[0]) & (gaps < LIGAMENT[1]) & (shin.imag > apex.imag)]
     middle = outline.mean()
     if len(shin) == 0 or not groove.low < np.angle(middle, deg=True) < groove.high:
-        return None
+        return False
     tuberosity = shin[np.argmax(shin.real)]
     shifts = _follow(groove, outline, middle, apex, tuberosity)
     flexions = np.array(FLEXIONS, dtype=float)
@@ -65,15 +64,16 @@ def patella_path(
         spline = {"x": rounded(knee.rest + flexions, 3), "y": rounded(values, 6)}
         return {"axis": rounded(direction, 6), "coordinates": ["flexion"], "spline": spline}
 
-    tables = {
-        "rotations": [table(axis, TURN * flexions)],
-        "translations": [table(front, shifts.real), table(down, shifts.imag)],
-    }
-
     def place(point):
         return knee.centre + side * axis + point.real * front + point.imag * down
 
-    return PatellaPath(place(middle), np.stack([place(apex), place(tuberosity)]), tables)
+    joint.tables["rotations"] = [table(axis, TURN * flexions)]
+    joint.tables["translations"] = [table(front, shifts.real), table(down, shifts.imag)]
+    joint.kind, joint.centre, joint.confidence = "custom", place(middle), 0.6
+    joint.follows, joint.ligament = knee.coordinate, np.stack([place(apex), place(tuberosity)])
+    length = abs(apex - tuberosity) / millimetre
+    joint.reason = f"in its groove, on a ligament of {length:.3g} mm, to {FLEXIONS[-1]} degrees"
+    return True
 
 
 class _Groove:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from rbfmuscle.importers.guess.anatomy import JointGuess, rounded
@@ -18,27 +19,33 @@ tunnelling = { angle = 135, action = "substep" }   # points that pass through a 
 
 def scene_text(guess: Any) -> str:
     """Text of the scene file of a `SceneGuess`."""
-    parts = [_head(guess)]
-    for bone in guess.bones:
-        row = {"name": bone.name, "mesh": bone.file}
-        parts.append(table_text("[[bone]]", row, {} if bone.sure else {"name": f"GUESS: {bone.reason}"}))
-    parts += [_joint(joint) for joint in guess.joints]
+    bones = [
+        table_text("[[bone]]", {"name": bone.name, "mesh": bone.file}, _doubt(bone))
+        for bone in guess.parts.bones
+    ]
     movable = [joint for joint in guess.joints if joint.axes and not joint.follows]
-    if movable:
-        parts.append(_motion(movable[0]))
-    return "\n".join([*parts, *(_muscle(muscle) for muscle in guess.muscles), _TAIL])
+    motion = [_motion(movable[0])] if movable else []
+    muscles = map(_muscle, guess.muscles)
+    return "\n".join([_head(guess), *bones, *map(_joint, guess.joints), *motion, *muscles, _TAIL])
+
+
+def _doubt(part):
+    return {"name": f"GUESS: {part.doubt}"} if part.doubt else {}
 
 
 def _head(guess):
+    folder, parts = guess.folder, guess.parts
     lines = [
-        f"# Scene guessed from {guess.title}. Lines marked GUESS want a look; the number is how sure it is, of 1.",
+        f"# Scene guessed from the meshes in {folder.name or folder}. "
+        "Lines marked GUESS want a look; the number is how sure it is, of 1.",
         "# All keys: docs/scene_file.md. Then: rbfmuscle check --picture, rbfmuscle run.",
-        *(f"# NOT USED: {file}: {reason}" for file, reason in guess.unusable.items()),
+        *(f"# NOT USED: {file}: {reason}" for file, reason in parts.unusable.items()),
     ]
-    row = {"format": 1, "name": guess.name, "units": guess.units}
+    name = re.sub(r"[^A-Za-z0-9_-]+", "_", folder.resolve().name) or "scene"
+    row = {"format": 1, "name": name, "units": guess.units}
     comments = {"units": "of every length here; a mesh in another unit takes scale = ..."}
-    if guess.left_out:
-        row["left_out"] = guess.left_out
+    if parts.left_out:
+        row["left_out"] = parts.left_out
         comments["left_out"] = "bones whose meshes cannot be used; every run counts them as beyond its limits"
     for word in ("superior", "anterior") if guess.orientation is not None else ():
         row[word] = rounded(getattr(guess.orientation, word), 5)
@@ -54,7 +61,7 @@ def _joint(joint: JointGuess) -> str:
         comments["axes"] += "; GUESS: rename and turn them where angles should have the other sign"
     text = table_text(f"[[joint]]   # GUESS {joint.confidence:.1f}: {joint.reason}", joint.row(), comments)
     if joint.follows:
-        row = {"coordinate": joint.coordinate, "of": list(joint.follows), "linear": [1, 0]}
+        row = {"coordinate": joint.coordinate, "of": [joint.follows], "linear": [1, 0]}
         text += "\n" + table_text("[[coupling]]", row)
     return text
 
@@ -72,25 +79,23 @@ def hold_file(muscle: MuscleGuess, hold: AttachmentGuess) -> str:
     return f"attachments/{muscle.muscle.name}_{hold.bone.name}.txt"
 
 
-def _attachment(hold: AttachmentGuess, file: str) -> dict[str, Any]:
+def _attachment(hold, file):
     """A row of ``attach``, with its tendon."""
-    tendon = hold.tendon
-    if tendon is None:
+    if hold.tendon is None:
         return {"bone": hold.bone.name, "vertices": file}
-    line: dict[str, Any] = {"to": rounded(tendon.to, 6)}
-    if tendon.via:
-        line["via"] = [{"bone": bone.name, "point": rounded(point, 6)} for bone, point in tendon.via]
-    return {"bone": tendon.bone.name, "vertices": file, "tendon": line}
+    line = {"to": rounded(hold.tendon.to, 6)}
+    if hold.tendon.via:
+        line["via"] = [{"bone": bone.name, "point": rounded(at, 6)} for bone, at in hold.tendon.via]
+    return {"bone": hold.tendon.bone.name, "vertices": file, "tendon": line}
 
 
 def _muscle(guess: MuscleGuess) -> str:
-    part, said = guess.muscle, []
-    row: dict[str, Any] = {"name": part.name, "mesh": part.file, "attach": []}
-    for hold in guess.holds:
-        row["attach"].append(_attachment(hold, hold_file(guess, hold)))
-        said.append(f"GUESS {guess.confidence:.1f}: {len(hold.vertices)} vertices, {hold.reason}")
-    comments = {"attach": said} | ({} if part.sure else {"name": f"GUESS: {part.reason}"})
-    text = table_text("\n".join(["[[muscle]]", *(f"# {reason}" for reason in guess.reasons)]), row, comments)
+    part, sure = guess.muscle, f"GUESS {guess.confidence:.1f}"
+    attach = [_attachment(hold, hold_file(guess, hold)) for hold in guess.holds]
+    said = [f"{sure}: {len(hold.vertices)} vertices, {hold.reason}" for hold in guess.holds]
+    row = {"name": part.name, "mesh": part.file, "attach": attach}
+    head = "\n".join(["[[muscle]]", *(f"# {reason}" for reason in guess.reasons)])
+    text = table_text(head, row, {"attach": said, **_doubt(part)})
     if guess.wrong:
         text = "".join(f"# {line}\n" for line in [f"NOT RUN: {guess.wrong}", *text.splitlines()])
     return text
