@@ -272,6 +272,14 @@ def test_what_cannot_be_used_is_left_out_with_its_reason_and_the_rest_loads(tmp_
     assert "# NOT USED: gracilis.ply: " in text and len(scene.muscles) == 4
 
 
+def test_a_mesh_without_a_name_that_cannot_be_a_muscle_is_a_bone(tmp_path):
+    _phantom_meshes(tmp_path, plain_names=True)
+    two = [trimesh.creation.icosphere(radius=6.0).apply_translation([x, 80.0, 0.0]) for x in (0.0, 20.0)]
+    trimesh.util.concatenate(two).export(tmp_path / "Segment_99.ply")
+    guess = guess_scene(tmp_path, "mm", tmp_path)
+    assert "segment_99" in [bone.name for bone in write_scene(guess, tmp_path / "scene.toml").bones]
+
+
 def test_a_bone_that_cannot_be_used_is_in_the_verdict_wherever_it_is_said(tmp_path, capsys):
     _phantom_meshes(tmp_path)
     (tmp_path / "sacrum.stl").write_bytes(b"nothing")

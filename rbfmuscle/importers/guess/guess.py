@@ -131,9 +131,10 @@ def _write_coarse(guess, folder):
 
 
 def _comment_out(guess, error):
-    """Mark the muscle that an error names as wrong; an error that names none is raised."""
+    """Mark the muscle that an error names, or whose file it names, as wrong; an error that names none is raised."""
     for muscle in guess.muscles:
-        if not muscle.wrong and f"{muscle.muscle.name!r}" in str(error):
+        part = muscle.muscle
+        if not muscle.wrong and (repr(part.name) in str(error) or part.file in str(error)):
             muscle.wrong, muscle.confidence = str(error), 0.0
             return
     raise error

@@ -7,7 +7,7 @@ tibial plafond above it, each with its own radius (Singh et al. 1992; Siegler et
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -49,7 +49,7 @@ class Fit:
     centre: np.ndarray
     radii: np.ndarray
     misfit: float
-    axis: np.ndarray | None = None
+    axis: np.ndarray = field(default_factory=lambda: np.zeros(3))
     cover: float = 0.0
     wrong: str = ""
 

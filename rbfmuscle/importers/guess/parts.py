@@ -118,9 +118,9 @@ def read_parts(folder: Path, base: Path) -> Parts:
         if facts.spelling:
             found.notes.append(f"{path.name}: {facts.spelling}")
         {"bone": found.bones, "muscle": found.muscles, "": unknown}[tissue].append(part)
-    # Of names that are not known: the largest are bones until there are two, the others muscles.
+    # Of names that are not known: the largest are bones until there are two, the others muscles if they can be.
     for part in sorted(unknown, key=lambda part: -np.linalg.norm(part.mesh.extents)):
-        is_bone = len(found.bones) < 2 or not part.mesh.is_watertight
+        is_bone = len(found.bones) < 2 or not _is_one_closed_surface(part)
         part.doubt = f"{'a bone' if is_bone else 'a muscle'} by its size, as its name is not known"
         (found.bones if is_bone else found.muscles).append(part)
     if left_out:
@@ -133,6 +133,14 @@ def read_parts(folder: Path, base: Path) -> Parts:
             f"name files ({' '.join(MESH_SUFFIXES)}) after what they are, or sort them into folders bones and muscles"
         )
     return found
+
+
+def _is_one_closed_surface(part):
+    try:
+        prepare_mesh(part.mesh.vertices, part.mesh.faces, place=part.file, name=part.name)
+    except MeshError:
+        return False
+    return True
 
 
 def _find_meshes(folder):
