@@ -17,7 +17,6 @@ def import_(
     output: Output,
     units: Literal["m", "cm", "mm"] = "m",
     geometry: Annotated[list[Path] | None, Parameter(negative="")] = None,
-    bodies: Annotated[list[str] | None, Parameter(negative="")] = None,
     motion: Path | None = None,
     muscles: Annotated[bool, Parameter(negative="--no-muscles")] = True,
     force: Flag = False,
@@ -32,8 +31,6 @@ def import_(
         Unit of the scene's lengths.
     geometry
         Folder with meshes, besides the model's own and its Geometry; repeatable.
-    bodies
-        Take this body and what lies between it and the ground; repeatable, all by default.
     motion
         A .mot or .sto file for the scene's motion.
     muscles
@@ -50,7 +47,7 @@ def import_(
     for folder in geometry or []:
         if not folder.is_dir():
             raise UsageError(f"--geometry {folder}: no such folder")
-    found = import_osim(model, units=units, geometry=geometry, bodies=bodies, muscles=muscles)
+    found = import_osim(model, units=units, geometry=geometry, muscles=muscles)
     written = write_scene(found, output, motion=motion)
     for note in found.notes:
         print(f"note: {note}")

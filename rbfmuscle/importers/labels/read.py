@@ -59,21 +59,10 @@ def is_volume(path: Path) -> bool:
 
 
 def read_labels(path: Path, *, names: Path | None = None) -> LabelVolume:
-    """Read a volume of labels, or a folder with one mask a file.
+    """Read a volume of labels, or a folder with one mask a file, named after what it masks.
 
-    Parameters
-    ----------
-    path : Path
-        ``.nii``, ``.nii.gz`` or ``.nrrd``, or a folder of such files, named after what they mask.
-    names : Path, optional
-        Table of names: JSON (number to name), or lines of number and name as CSV, TSV or ITK-SNAP's descriptions.
-
-    Raises
-    ------
-    MeshError
-        If the volume cannot be read, has not three axes, no label, too many, or no usable voxel size.
-    MissingPartError
-        If the package that reads the format is not installed.
+    ``names`` is a table of names, as `read_names` takes it. MeshError if the volume cannot be read, has not three axes,
+    no label, too many, or no usable voxel size; MissingPartError if the package that reads the format is not there.
     """
     volume = _read_folder(path) if path.is_dir() else _read_file(path)
     if names is not None:
@@ -207,7 +196,7 @@ def _check_affine(affine, path):
 
 
 def read_names(path: Path) -> dict[int, str]:
-    """Names of labels from a file, or from a known table by its name."""
+    """Names of labels from JSON, from lines as CSV, TSV or ITK-SNAP write them, or from a known table by its name."""
     tables = tomllib.loads((Path(__file__).parent / "tables.toml").read_text(encoding="utf-8"))
     if not path.exists() and path.name in tables:
         return dict(enumerate(tables[path.name].split(), start=1))

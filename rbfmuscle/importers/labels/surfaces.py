@@ -8,11 +8,11 @@ shifted to the label's volume, a few hundredths of a voxel.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import find_objects, gaussian_filter, map_coordinates
+from scipy.ndimage import binary_fill_holes, find_objects, gaussian_filter, map_coordinates
 from scipy.ndimage import label as connected
 
 from rbfmuscle.geometry.crossing import crossing_faces
@@ -39,7 +39,7 @@ class LabelSurface:
     name: str
     mesh: Any
     volume: float
-    notes: list[str] = field(default_factory=list)
+    notes: list[str]
 
 
 def label_surface(volume: LabelVolume, label: int, *, pieces: bool = False) -> LabelSurface:
@@ -50,13 +50,13 @@ def label_surface(volume: LabelVolume, label: int, *, pieces: bool = False) -> L
     import igl
     import trimesh
 
-    found, notes = LabelSurface(volume.name(label), None, 0.0), []
+    name, notes = volume.name(label), []
     box = find_objects((volume.labels == label).astype(np.int8))[0]
     mask = np.pad(volume.labels[box] == label, MARGIN)
     mask = _without_islands(mask, notes, PIECE if pieces else 1.0)
     count = int(mask.sum())
     if count < 27:
-        raise MeshError(f"{volume.source}: label {found.name!r} has {count} voxels, too few for a surface")
+        raise MeshError(f"{volume.source}: label {name!r} has {count} voxels, too few for a surface")
     smooth = smooth_mask(mask)
     vertices, faces, level = _contour(smooth, count)
     # Fewer triangles by quadric edge collapse (Garland and Heckbert 1997), of about the edge that is wanted.
@@ -67,11 +67,10 @@ def label_surface(volume: LabelVolume, label: int, *, pieces: bool = False) -> L
     vertices = _to_volume(_untangled(vertices, faces, smooth - level), faces, count)
     corner = np.array([part.start for part in box]) - MARGIN
     world = (vertices + corner) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
-    found.mesh = trimesh.Trimesh(world, faces, process=False)
-    if found.mesh.volume < 0:
-        found.mesh.invert()
-    found.volume, found.notes = count * float(np.prod(volume.spacing)), notes
-    return found
+    mesh = trimesh.Trimesh(world, faces, process=False)
+    if mesh.volume < 0:
+        mesh.invert()
+    return LabelSurface(name, mesh, count * float(np.prod(volume.spacing)), notes)
 
 
 def smooth_mask(mask: np.ndarray) -> np.ndarray:
@@ -97,12 +96,11 @@ def _without_islands(mask, notes, least):
             share = 100 * rest / sizes.sum()
             notes.append(f"{int((~kept).sum()) - 1} islands of {rest} voxels left out ({share:.2g} %)")
         mask = kept[pieces]
-    outside, count = connected(~mask)
-    if count > 1:
-        hollow = (outside != outside[0, 0, 0]) & ~mask
-        notes.append(f"{count - 1} holes of {int(hollow.sum())} voxels filled")
-        mask = mask | hollow
-    return mask
+    filled = binary_fill_holes(mask)
+    hollow = int((filled & ~mask).sum())
+    if hollow:
+        notes.append(f"holes of {hollow} voxels filled")
+    return filled
 
 
 def _contour(smooth, wanted):

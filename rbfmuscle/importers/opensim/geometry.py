@@ -31,17 +31,10 @@ def find_mesh(name: str, folders: list[Path]) -> Path | None:
 def body_meshes(
     model: OsimModel, places: dict[str, np.ndarray], metre: float, geometry: list[Path]
 ) -> tuple[dict[str, ReadMesh], list[str]]:
-    """Return one mesh for each body that shows any, in the scene's coordinates, and what could not be taken.
+    """One mesh for each body that shows any, in the scene's coordinates, and what could not be taken.
 
-    Parameters
-    ----------
-    model : OsimModel
-    places : dict of str to (4, 4) ndarray
-        From every body to the ground in the rest pose [metre].
-    metre : float
-        Scene units in a metre.
-    geometry : list of path
-        Folders with meshes, after the model's own and its ``Geometry``.
+    ``places`` are (4, 4) from every body to the ground in the rest pose [metre]; a metre is ``metre`` scene units;
+    ``geometry`` are folders with meshes, after the model's own and its ``Geometry``.
     """
     folders = [model.path.parent, model.path.parent / "Geometry", *geometry]
     parts, meshes, notes = {}, {}, []

@@ -119,13 +119,7 @@ def clean_name(name: str) -> str:
 
 
 def finish(model: OsimModel) -> OsimModel:
-    """Check what was read, note what is not connected, and return the model.
-
-    Raises
-    ------
-    SceneError
-        If two bodies or two coordinates share a name, or a joint or a coupling names what is not there.
-    """
+    """The model, what is not connected noted; SceneError if names are shared, or if one names what is not there."""
     coordinates = [name for joint in model.joints for name in joint.coordinates]
     joints = [joint.name for joint in model.joints]
     for what, names in (("bodies", model.bodies), ("joints", joints), ("coordinates", coordinates)):

@@ -30,23 +30,7 @@ JOINT_KINDS = {
 
 
 def read_osim(path: Path | str) -> OsimModel:
-    """Read an OpenSim model.
-
-    Parameters
-    ----------
-    path : path
-        An ``.osim`` file of version 2 to 4.
-
-    Returns
-    -------
-    OsimModel
-        In metres and radians.
-
-    Raises
-    ------
-    SceneError
-        Naming the file, the object and the remedy, where something cannot be taken.
-    """
+    """An OpenSim model of version 2 to 4; a SceneError names the object that cannot be taken, and the remedy."""
     path = Path(path)
     root = read_xml(path)
     try:

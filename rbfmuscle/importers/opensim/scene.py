@@ -9,14 +9,14 @@ import numpy as np
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.importers.opensim.geometry import body_meshes
-from rbfmuscle.importers.opensim.model import GROUND, OsimModel, clean_name
+from rbfmuscle.importers.opensim.model import OsimModel, clean_name
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.tubes import make_tube, scaled
 from rbfmuscle.scene.joints.functions import Function
 from rbfmuscle.scene.joints.joint import Coupling, Joint
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.validation import MeshError, SceneError, did_you_mean
+from rbfmuscle.validation import MeshError, SceneError
 
 
 @dataclass
@@ -46,7 +46,6 @@ def import_osim(
     *,
     units: str = "m",
     geometry: list[Path] | None = None,
-    bodies: list[str] | None = None,
     muscles: bool = True,
 ) -> Imported:
     """Make a scene of an OpenSim model.
@@ -62,14 +61,8 @@ def import_osim(
         Unit of the scene's lengths.
     geometry : list of path, optional
         Folders with meshes, after the model's own and its ``Geometry``.
-    bodies : list of str, optional
-        Take these and what lies between them and the ground; all where not given.
     muscles : bool
         Make a tube of each of the model's muscles.
-
-    Returns
-    -------
-    Imported
 
     Raises
     ------
@@ -77,8 +70,6 @@ def import_osim(
         If the model cannot be read, or has a joint that the table of joints lacks.
     """
     model = read_osim(path)
-    if bodies:
-        _keep(model, bodies)
     scene = Scene(clean_name(model.name or Path(path).stem), units=units)
     metre = 1000.0 / MM_PER_UNIT[units]
     ground = model.transforms()
@@ -117,23 +108,6 @@ def _add_muscles(found, metre):
             scene.add_muscle(name, (tube.vertices, tube.faces), attach=attach)
         except (SceneError, MeshError) as error:
             found.notes.append(f"muscle {name!r} is not taken: {error}")
-
-
-def _keep(model, bodies):
-    """Leave out every body that is neither named nor on the way from one of those to the ground."""
-    for body in bodies:
-        if body not in model.bodies:
-            raise SceneError(f"{model.path}: there is no body {body!r}, {did_you_mean(body, model.bodies)}")
-    kept = {GROUND, *bodies}
-    for joint, backward in reversed(list(model.tree())):  # from the farthest to the ground
-        outer, inner = (joint.parent, joint.child) if backward else (joint.child, joint.parent)
-        kept |= {inner} if outer in kept else set()
-    model.bodies = [body for body in model.bodies if body in kept]
-    model.joints = [joint for joint in model.joints if {joint.parent, joint.child} <= kept]
-    model.meshes = [mesh for mesh in model.meshes if mesh.body in kept]
-    model.muscles = [m for m in model.muscles if all(body in kept for body, _ in m.points)]
-    known = model.coordinates()
-    model.couplings = [c for c in model.couplings if all(n in known for n in (c.coordinate, *c.of))]
 
 
 def _add_joints(found, metre):

@@ -36,15 +36,8 @@ def make_tube(
 ) -> Tube:
     """The tube of a muscle in the scene, or SceneError where no two bodies with a mesh hold it.
 
-    Parameters
-    ----------
-    muscle : ModelMuscle
-    places : dict of str to (4, 4) ndarray
-        From every body of the model to the scene [scene unit].
-    bones : dict of str to ExactDistance
-        Of the bodies that have a mesh in the scene.
-    metre : float
-        Scene units in a metre.
+    ``places`` are (4, 4) from every body of the model to the scene [scene unit], ``bones`` the meshes of those that
+    have one; a metre is ``metre`` scene units.
     """
     bodies = [body for body, _ in muscle.points]
     if len(set(bodies[:1] + bodies[-1:])) < 2 or muscle.volume <= 0.0:

@@ -14,13 +14,7 @@ from rbfmuscle.validation import UsageError
 def write_scene(found: Imported, directory: Path, *, motion: Path | None = None) -> Path:
     """Write ``scene.toml``, meshes and attachments to a folder, and return the scene file.
 
-    Parameters
-    ----------
-    found : Imported
-    directory : path
-        Made where it is missing.
-    motion : path, optional
-        A motion file that the scene shall follow; checked against its coordinates.
+    ``motion`` is a file that the scene shall follow, checked against its coordinates.
     """
     directory, scene = Path(directory), found.scene
     target = directory / "scene.toml"

@@ -128,12 +128,9 @@ def _as_utf8(data):
 
 
 def read_xml(path: Path) -> Node:
-    """Return the root element of an XML file; two colons in a name, which XML forbids, become two underscores.
+    """The root element of an XML file; two colons in a name, which XML forbids, become two underscores.
 
-    Raises
-    ------
-    SceneError
-        If the file is missing, unreadable, no XML, or beyond the limits of this module.
+    SceneError if the file is missing, unreadable, no XML, or beyond the limits of this module.
     """
     try:
         with path.open("rb") as file:
