@@ -134,7 +134,7 @@ def test_bones_of_the_leg_hang_on_the_right_ones(leg_guess):
     guess, facts, _ = leg_guess
     found = {joint.child.name: joint.parent.name for joint in guess.joints}
     true = {joint["child"]: joint["parent"] for joint in facts["joints"].values()}
-    assert guess.root.name == "pelvis" and found == {**true, "sacrum": "pelvis"} and guess.units == "mm"
+    assert guess.root.name == "pelvis" and found == {**true, "sacrum": "pelvis"} and guess.parts.units == "mm"
 
 
 def _leg_bones(leg, transform):
@@ -278,6 +278,23 @@ def test_a_mesh_without_a_name_that_cannot_be_a_muscle_is_a_bone(tmp_path):
     trimesh.util.concatenate(two).export(tmp_path / "Segment_99.ply")
     guess = guess_scene(tmp_path, "mm", tmp_path)
     assert "segment_99" in [bone.name for bone in write_scene(guess, tmp_path / "scene.toml").bones]
+
+
+def test_nothing_is_left_behind_that_does_not_load(tmp_path):
+    _phantom_meshes(tmp_path)
+    dot = trimesh.creation.icosphere(radius=0.5)
+    dot.export(tmp_path / "sacrum.ply")
+    dot.export(tmp_path / "gracilis.ply")
+    guess = guess_scene(tmp_path, None, tmp_path)
+    assert guess.parts.left_out == ["sacrum"] and "1.732 mm across" in guess.parts.unusable["sacrum.ply"]
+    assert "gracilis" not in [muscle.name for muscle in write_scene(guess, tmp_path / "scene.toml").muscles]
+    for path in tmp_path.glob("*.ply"):
+        if path.stem not in ("gracilis", "femur"):
+            path.unlink()
+    file = tmp_path / "second.toml"
+    with pytest.raises(UsageError, match="no muscle can be held"):
+        write_scene(guess_scene(tmp_path, "mm", tmp_path), file)
+    assert not file.exists()
 
 
 def test_a_bone_that_cannot_be_used_is_in_the_verdict_wherever_it_is_said(tmp_path, capsys):

@@ -11,7 +11,7 @@ from rbfmuscle.importers.guess.anatomy import JointGuess
 from rbfmuscle.importers.guess.attachments import MuscleGuess, Skeleton, guess_attachments
 from rbfmuscle.importers.guess.joints import guess_joints
 from rbfmuscle.importers.guess.orientation import Orientation, find_orientation
-from rbfmuscle.importers.guess.parts import MILLIMETRE, Part, Parts, guess_units, read_parts
+from rbfmuscle.importers.guess.parts import Part, Parts, read_parts
 from rbfmuscle.importers.guess.text import hold_file, scene_text
 from rbfmuscle.scene.attachments import ExactMeshes
 from rbfmuscle.scene.scene import Scene
@@ -26,7 +26,6 @@ class SceneGuess:
     """What was guessed of the meshes of a folder; ``root`` is the bone that stands still."""
 
     folder: Path
-    units: str
     parts: Parts
     root: Part
     joints: list[JointGuess]
@@ -66,15 +65,11 @@ def guess_scene(
     UsageError
         If the folder is missing, holds no bone or no muscle, or is of no known unit.
     """
-    parts = read_parts(folder, base)
-    bones = parts.bones
-    if units is None:
-        units, reason = guess_units(bones)
-        parts.notes.append(f"units are {units}: {reason}")
-    millimetre = MILLIMETRE[units]
+    parts = read_parts(folder, units, base)
+    bones, millimetre = parts.bones, parts.millimetre
     orientation = find_orientation(bones, header)
     root, joints = guess_joints(bones, millimetre, orientation)
-    guess = SceneGuess(folder, units, parts, root, joints, orientation)
+    guess = SceneGuess(folder, parts, root, joints, orientation)
     bodies = {bone: bone for bone in bones}
     for joint in joints:  # parents come before their children
         if joint.kind == "fixed":
@@ -101,6 +96,7 @@ def write_scene(guess: SceneGuess, path: Path) -> Scene:
         If nothing can be written there, or no muscle can be held.
     """
     try:
+        _check_runs(guess, path)
         _write_coarse(guess, path.parent)
         for muscle in guess.muscles:
             for hold in muscle.holds:
@@ -110,12 +106,12 @@ def write_scene(guess: SceneGuess, path: Path) -> Scene:
                 np.savetxt(file, np.flatnonzero(in_file), fmt="%d")
         while True:
             path.write_text(scene_text(guess), encoding="utf-8")
-            if all(muscle.wrong for muscle in guess.muscles):
-                raise UsageError(f"{path}: no muscle can be held by two bones ({guess.muscles[0].wrong})")
             try:
                 return Scene.load(path)
             except (SceneError, MeshError) as error:
-                _comment_out(guess, error)
+                path.unlink()
+                _leave_out(guess, error)
+                _check_runs(guess, path)
     except OSError as error:
         raise UsageError(f"cannot write {path}: {error.strerror}; choose another --output") from None
 
@@ -130,11 +126,17 @@ def _write_coarse(guess, folder):
             part.read.vertex_map = np.arange(len(part.points))
 
 
-def _comment_out(guess, error):
+def _check_runs(guess, path):
+    if all(muscle.wrong for muscle in guess.muscles):
+        raise UsageError(f"{path}: no muscle can be held by two bones ({guess.muscles[0].wrong})")
+
+
+def _leave_out(guess, error):
     """Mark the muscle that an error names, or whose file it names, as wrong; an error that names none is raised."""
+    text = str(error)
     for muscle in guess.muscles:
         part = muscle.muscle
-        if not muscle.wrong and (repr(part.name) in str(error) or part.file in str(error)):
-            muscle.wrong, muscle.confidence = str(error), 0.0
+        if not muscle.wrong and (repr(part.name) in text or part.file in text):
+            muscle.wrong, muscle.confidence = text, 0.0
             return
     raise error

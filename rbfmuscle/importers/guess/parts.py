@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.importers.guess.names import MuscleFacts, name_facts
+from rbfmuscle.scene.check import LARGEST_MM, SMALLEST_MM
 from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, prepare_mesh, read_arrays
 from rbfmuscle.validation import MeshError, UsageError
 
@@ -65,6 +66,11 @@ class Part:
         """The mended mesh, trimesh.Trimesh [scene unit]."""
         return self.read.mesh
 
+    @property
+    def size(self) -> float:
+        """Diagonal of its box [scene unit]."""
+        return float(np.linalg.norm(self.mesh.extents))
+
     @cached_property
     def points(self) -> np.ndarray:
         """Vertices (n, 3)."""
@@ -86,21 +92,30 @@ class Part:
 
 @dataclass
 class Parts:
-    """What is in a folder.
+    """What is in a folder, and the unit of its lengths.
 
     ``unusable`` gives reasons by file, ``left_out`` names those that are no muscles;
-    ``notes`` name what was left out, misspelt or made coarser.
+    ``notes`` name what was left out, misspelt or made coarser, and the unit where it was guessed.
     """
 
+    units: str = ""
     bones: list[Part] = field(default_factory=list)
     muscles: list[Part] = field(default_factory=list)
     unusable: dict[str, str] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
+    @property
+    def millimetre(self) -> float:
+        """Its length in scene units."""
+        return MILLIMETRE[self.units]
 
-def read_parts(folder: Path, base: Path) -> Parts:
-    """Bones and muscles of a folder, and of its folders ``bones`` and ``muscles``; files relative to ``base``."""
+
+def read_parts(folder: Path, units: str | None, base: Path) -> Parts:
+    """Bones and muscles of a folder, and of its folders ``bones`` and ``muscles``; files relative to ``base``.
+
+    Where no unit is given it is the one in which the bones have the size that they have in people.
+    """
     found, unknown, names, left_out = Parts(), [], set(), []
     for path in _find_meshes(folder):
         facts = name_facts(path.stem)
@@ -119,12 +134,15 @@ def read_parts(folder: Path, base: Path) -> Parts:
             found.notes.append(f"{path.name}: {facts.spelling}")
         {"bone": found.bones, "muscle": found.muscles, "": unknown}[tissue].append(part)
     # Of names that are not known: the largest are bones until there are two, the others muscles if they can be.
-    for part in sorted(unknown, key=lambda part: -np.linalg.norm(part.mesh.extents)):
+    for part in sorted(unknown, key=lambda part: -part.size):
         is_bone = len(found.bones) < 2 or not _is_one_closed_surface(part)
         part.doubt = f"{'a bone' if is_bone else 'a muscle'} by its size, as its name is not known"
         (found.bones if is_bone else found.muscles).append(part)
     if left_out:
         found.notes.append(f"left out, neither bone nor muscle: {', '.join(left_out)}")
+    if found.bones:
+        found.units = units or _guess_units(found)
+        _leave_out_wrong_sizes(found)
     if not found.bones or not found.muscles:
         kind, other = ("bone", "muscles") if not found.bones else ("muscle", "bones")
         listed = ", ".join([part.file for part in found.bones or found.muscles] + list(found.unusable))
@@ -167,13 +185,23 @@ def _read_part(path, base, names, facts, notes, *, closed):
     return Part(name, file, read, facts.bone, facts.side, facts=facts.muscle, coarse=coarse)
 
 
-def guess_units(bones: list[Part]) -> tuple[str, str]:
-    """The unit in which bones have the size that they have in people, and the reason; a UsageError where none fits."""
-    known = [bone for bone in bones if bone.kind in LENGTHS]
-    bone = max(known or bones, key=lambda bone: float(np.linalg.norm(bone.mesh.extents)))
+def _guess_units(found):
+    """The unit in which a bone has the size that it has in people, a note why; a UsageError where none fits."""
+    known = [bone for bone in found.bones if bone.kind in LENGTHS]
+    bone = max(known or found.bones, key=lambda bone: bone.size)
     low, high = LENGTHS.get(bone.kind, LARGEST_BONE)
-    size = float(np.linalg.norm(bone.mesh.extents))
+    size = bone.size
     for units, millimetre in MILLIMETRE.items():
         if low <= size / millimetre <= high:
-            return units, f"{bone.name} is {size:.4g} {units} long"
+            found.notes.append(f"units are {units}: {bone.name} is {size:.4g} {units} long")
+            return units
     raise UsageError(f"{bone.file} is {size:.4g} across, which is no bone in mm, cm or m; give --units")
+
+
+def _leave_out_wrong_sizes(found):
+    """Bones that a scene would refuse for their size cannot be used."""
+    for bone in list(found.bones):
+        if not SMALLEST_MM <= bone.size / found.millimetre <= LARGEST_MM:
+            found.bones.remove(bone)
+            found.left_out.append(bone.name)
+            found.unusable[Path(bone.file).name] = f"it is {bone.size:.4g} {found.units} across"

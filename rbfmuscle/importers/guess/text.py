@@ -42,7 +42,7 @@ def _head(guess):
         *(f"# NOT USED: {file}: {reason}" for file, reason in parts.unusable.items()),
     ]
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", folder.resolve().name) or "scene"
-    row = {"format": 1, "name": name, "units": guess.units}
+    row = {"format": 1, "name": name, "units": parts.units}
     comments = {"units": "of every length here; a mesh in another unit takes scale = ..."}
     if parts.left_out:
         row["left_out"] = parts.left_out
