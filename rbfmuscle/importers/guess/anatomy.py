@@ -53,8 +53,6 @@ COORDINATES = {
 }
 # Greatest misfit of a condyle or a dome against its radius.
 MISFIT = 0.05
-# Mean edge of a talus against its dome's radius, from which on it has about ten vertices on its dome.
-COARSE = 0.3
 
 
 @dataclass
@@ -146,10 +144,6 @@ def make_anatomical(
         start = right if knee is None else -knee.axis
         fit = fit_dome(joint.child, joint.parent, shank_up(joint.parent, bones), start, millimetre)
         _take(joint, fit, "talar dome and tibial plafond", "ankle", right)
-        edge = float(joint.child.mesh.edges_unique_length.mean())
-        if fit is not None and edge > COARSE * fit.radii[0]:
-            joint.confidence = min(joint.confidence, 0.4)
-            joint.reason += f"; edges of {edge:.3g} are too long to show a dome"
     elif joint.kind == "hinge":
         joint.axes = {"angle": joint.axis * (-1.0 if joint.axis @ right < 0.0 else 1.0)}
 

@@ -23,6 +23,8 @@ END, CONDYLES = 0.12, 0.16
 POSTERIOR, SIDEWAYS = (-30.0, 60.0), 0.5
 # Of the dome: half its arc [degree], band beyond the least gap [mm], least cosine of a normal and its radius.
 ARC, BAND, RADIAL = 45.0, 8.0, 0.95
+# Greatest space between dome and plafond [mm]: 4.3 on the leg of the Visible Human Female, cartilage included.
+SPACE = 6.0
 
 
 @dataclass
@@ -194,6 +196,9 @@ def fit_dome(talus: Part, tibia: Part, up: np.ndarray, right: np.ndarray, millim
         centre, right, radii = fit.centre, fit.axis, fit.radii
     fit.centre = centre + ((used[0][0] - centre) @ right).mean() * right
     fit.wrong = _refused("talar dome", radii[:1], DOME, millimetre)
+    space = np.ptp(radii) / millimetre
+    if space > SPACE:
+        fit.wrong = f"dome and plafond are {space:.2g} mm apart, at most {SPACE:g} are believed"
     return fit
 
 
