@@ -7,7 +7,7 @@ from typing import Any
 
 
 def value_text(value: Any) -> str:
-    """Return a value as TOML on one line; numbers to 13 digits."""
+    """A value as TOML on one line; numbers to 13 digits."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, float):
@@ -30,15 +30,9 @@ def _key(key):
 def table_text(
     head: str, row: Mapping[str, Any], comments: Mapping[str, str | list[str]] | None = None
 ) -> str:
-    """Return a table as TOML, lists of tables with one a line.
+    """A table as TOML, lists of tables with one a line, after its first line ``head``, as ``[[bone]]``.
 
-    Parameters
-    ----------
-    head : str
-        The first line, as ``[[bone]]``.
-    row : dict
-    comments : dict of str to str or list of str
-        After the line of a key, or after each table of its list.
+    ``comments`` stand after the line of a key, or after each table of its list.
     """
     lines = [head]
     for key, value in row.items():

@@ -71,6 +71,15 @@ class Part:
         """Diagonal of its box [scene unit]."""
         return float(np.linalg.norm(self.mesh.extents))
 
+    @property
+    def is_one_closed_surface(self) -> bool:
+        """Whether it can be a muscle."""
+        try:
+            prepare_mesh(self.mesh.vertices, self.mesh.faces, place=self.file, name=self.name)
+        except MeshError:
+            return False
+        return True
+
     @cached_property
     def points(self) -> np.ndarray:
         """Vertices (n, 3)."""
@@ -116,14 +125,13 @@ def read_parts(folder: Path, units: str | None, base: Path) -> Parts:
 
     Where no unit is given it is the one in which the bones have the size that they have in people.
     """
-    found, unknown, names, left_out = Parts(), [], set(), []
+    found, unknown, names, other = Parts(), [], set(), []
     for path in _find_meshes(folder):
         facts = name_facts(path.stem)
         if facts.tissue == "other":
-            left_out.append(path.name)
+            other.append(path.name)
             continue
-        sorted_in = path.parent != folder
-        tissue = FOLDERS[path.parent.name.lower()] if sorted_in else facts.tissue
+        tissue = facts.tissue if path.parent == folder else FOLDERS[path.parent.name.lower()]
         try:
             part = _read_part(path, base, names, facts, found.notes, closed=tissue == "muscle")
         except MeshError as error:
@@ -133,32 +141,27 @@ def read_parts(folder: Path, units: str | None, base: Path) -> Parts:
         if facts.spelling:
             found.notes.append(f"{path.name}: {facts.spelling}")
         {"bone": found.bones, "muscle": found.muscles, "": unknown}[tissue].append(part)
-    # Of names that are not known: the largest are bones until there are two, the others muscles if they can be.
-    for part in sorted(unknown, key=lambda part: -part.size):
-        is_bone = len(found.bones) < 2 or not _is_one_closed_surface(part)
-        part.doubt = f"{'a bone' if is_bone else 'a muscle'} by its size, as its name is not known"
-        (found.bones if is_bone else found.muscles).append(part)
-    if left_out:
-        found.notes.append(f"left out, neither bone nor muscle: {', '.join(left_out)}")
-    if found.bones:
-        found.units = units or _guess_units(found)
-        _leave_out_wrong_sizes(found)
+    if other:
+        found.notes.append(f"left out, neither bone nor muscle: {', '.join(other)}")
+    _sort_unknown(found, unknown)
     if not found.bones or not found.muscles:
-        kind, other = ("bone", "muscles") if not found.bones else ("muscle", "bones")
+        kind, rest = ("bone", "muscles") if not found.bones else ("muscle", "bones")
         listed = ", ".join([part.file for part in found.bones or found.muscles] + list(found.unusable))
         raise UsageError(
-            f"{folder} holds no {kind} (by names or sizes all are {other}, or cannot be used: {listed or 'no files'}); "
+            f"{folder} holds no {kind} (by names or sizes all are {rest}, or cannot be used: {listed or 'no files'}); "
             f"name files ({' '.join(MESH_SUFFIXES)}) after what they are, or sort them into folders bones and muscles"
         )
+    found.units = units or _guess_units(found)
+    _leave_out_wrong_sizes(found)
     return found
 
 
-def _is_one_closed_surface(part):
-    try:
-        prepare_mesh(part.mesh.vertices, part.mesh.faces, place=part.file, name=part.name)
-    except MeshError:
-        return False
-    return True
+def _sort_unknown(found, unknown):
+    """Of names that are not known: the largest are bones until there are two, the others muscles if they can be."""
+    for part in sorted(unknown, key=lambda part: -part.size):
+        is_bone = len(found.bones) < 2 or not part.is_one_closed_surface
+        part.doubt = f"{'a bone' if is_bone else 'a muscle'} by its size, as its name is not known"
+        (found.bones if is_bone else found.muscles).append(part)
 
 
 def _find_meshes(folder):
@@ -190,18 +193,20 @@ def _guess_units(found):
     known = [bone for bone in found.bones if bone.kind in LENGTHS]
     bone = max(known or found.bones, key=lambda bone: bone.size)
     low, high = LENGTHS.get(bone.kind, LARGEST_BONE)
-    size = bone.size
     for units, millimetre in MILLIMETRE.items():
-        if low <= size / millimetre <= high:
-            found.notes.append(f"units are {units}: {bone.name} is {size:.4g} {units} long")
+        if low <= bone.size / millimetre <= high:
+            found.notes.append(f"units are {units}: {bone.name} is {bone.size:.4g} {units} long")
             return units
-    raise UsageError(f"{bone.file} is {size:.4g} across, which is no bone in mm, cm or m; give --units")
+    raise UsageError(f"{bone.file} is {bone.size:.4g} across, which is no bone in mm, cm or m; give --units")
 
 
 def _leave_out_wrong_sizes(found):
-    """Bones that a scene would refuse for their size cannot be used."""
+    """Bones that a scene would refuse for their size cannot be used; a UsageError where that is all of them."""
     for bone in list(found.bones):
         if not SMALLEST_MM <= bone.size / found.millimetre <= LARGEST_MM:
+            words = f"it is {bone.size:.4g} {found.units} across"
             found.bones.remove(bone)
             found.left_out.append(bone.name)
-            found.unusable[Path(bone.file).name] = f"it is {bone.size:.4g} {found.units} across"
+            found.unusable[Path(bone.file).name] = words
+    if not found.bones:
+        raise UsageError(f"{bone.file} cannot be a bone: {words}; correct --units")

@@ -64,20 +64,10 @@ def fit_path(
     *,
     most: int = 7,
 ) -> FittedPath:
-    """Fit a polynomial to lengths and, by its derivatives, to moment arms.
+    """Fit a polynomial to lengths (n,) and, by its derivatives, to moment arms (n, d).
 
-    The order is the one whose fit without a fifth of the poses, each in turn, errs least there.
-
-    Parameters
-    ----------
-    muscle : str
-    coordinates : tuple of str
-    values : (n, d) ndarray
-        Coordinates [radian or scene unit].
-    lengths : (n,) ndarray
-    arms : (n, d) ndarray
-    most : int
-        Highest order tried; there are always more equations than terms.
+    ``values`` (n, d) are the coordinates [radian or scene unit]. The order, at most ``most``, is the one whose fit without
+    a fifth of the poses, each in turn, errs least there; there are always more equations than terms.
     """
     count, dimension = values.shape
     weights = np.r_[1.0, np.full(dimension, ARM_WEIGHT)][:, None]
@@ -109,28 +99,21 @@ def write_paths(file: Path, fitted: list[FittedPath], metre: float, turning: dic
 
     ``metre`` is its length in scene units; ``turning`` says which coordinates are no shifts, which are in metres there.
     """
+    add = ElementTree.SubElement
     root = ElementTree.Element("OpenSimDocument", Version="40600")
-    paths = ElementTree.SubElement(root, "Set_FunctionBasedPath_")
-    objects = ElementTree.SubElement(paths, "objects")
-    ElementTree.SubElement(paths, "groups")
+    paths = add(root, "Set_FunctionBasedPath_")
+    objects = add(paths, "objects")
+    add(paths, "groups")
     for path in fitted:
         units = np.array([1.0 if turning[name] else metre for name in path.coordinates])
         powers = exponents(len(path.coordinates), path.order)
         numbers = path.coefficients * np.prod(units**powers, axis=1) / metre
-        item = ElementTree.SubElement(objects, "FunctionBasedPath", name=f"/forceset/{path.muscle}")
-        function = ElementTree.SubElement(
-            ElementTree.SubElement(item, "length_function"), "MultivariatePolynomialFunction"
-        )
-        for owner, tag, words in (
-            (
-                item,
-                "coordinate_paths",
-                ["/jointset/" + name.replace(".", "/", 1) for name in path.coordinates],
-            ),
-            (function, "coefficients", [repr(float(value)) for value in numbers]),
-            (function, "dimension", [str(len(path.coordinates))]),
-            (function, "order", [str(path.order)]),
-        ):
-            ElementTree.SubElement(owner, tag).text = " ".join(words)
+        item = add(objects, "FunctionBasedPath", name=f"/forceset/{path.muscle}")
+        function = add(add(item, "length_function"), "MultivariatePolynomialFunction")
+        names = ["/jointset/" + name.replace(".", "/", 1) for name in path.coordinates]
+        add(item, "coordinate_paths").text = " ".join(names)
+        add(function, "coefficients").text = " ".join(repr(float(value)) for value in numbers)
+        add(function, "dimension").text = str(len(path.coordinates))
+        add(function, "order").text = str(path.order)
     ElementTree.indent(root)
     ElementTree.ElementTree(root).write(file, encoding="UTF-8", xml_declaration=True)
