@@ -260,16 +260,25 @@ def _listed(names):
 def _describe_excess(row, table, left_out):
     muscle, quantity, worst, limit, frame = row
     unit = table[muscle][quantity]["unit"]
-    value = f"{shown_number(worst)}{'' if unit == '1' else f' {unit}'}"
+    value = shown_number(worst, unit)
     place = "the bones" if muscle == ALL else muscle
     title = LIMITS[quantity].title if quantity in LIMITS else quantity
     title += f" ({_listed(left_out)})" if quantity == "bones_left_out" else ""
     return f"{place}, {title} {value} at frame {frame} (limit {limit:.3g})"
 
 
-def shown_number(value: float) -> str:
-    """A number as people read it: three digits, and what is rounding only as less than 1e-12."""
-    return "< 1e-12" if 0.0 < abs(value) < 1e-12 else f"{value:.3g}"
+def shown_number(value: float | None, unit: str = "") -> str:
+    """A value with three digits and its unit: less than 1e-12 and 0.01 mm as such, seconds as milliseconds."""
+    if value is None or math.isnan(value):
+        return "–"
+    if unit == "s" and abs(value) < 1.0:
+        value, unit = 1e3 * value, "ms"
+    least = {"mm": 0.01}.get(unit, 1e-12)
+    if 0.0 < abs(value) < least:
+        text = f"< {least:g}"
+    else:
+        text = f"{value:.0f}" if 1e3 <= abs(value) < 1e5 else f"{value:.3g}"
+    return text if unit in ("", "1") else f"{text} {unit}"
 
 
 def require_limits(table: Table, limits: Mapping[str, float]) -> None:

@@ -55,6 +55,7 @@ class SavedRun:
 
     def __init__(self, directory: str | Path) -> None:
         self.directory = Path(directory)
+        self._bones: dict[str, tuple[Floats, Integers]] = {}
         path = self.directory / "run.json"
         try:
             self.info = json.loads(path.read_text(encoding="utf-8"))
@@ -115,8 +116,10 @@ class SavedRun:
 
     def bone(self, name: str) -> tuple[Floats, Integers]:
         """Vertices and faces of a bone at rest."""
-        self._check_surfaces()
-        return read_vtp(self.directory / "bones" / f"{name}.vtp")
+        if name not in self._bones:
+            self._check_surfaces()
+            self._bones[name] = read_vtp(self.directory / "bones" / f"{name}.vtp")
+        return self._bones[name]
 
     def series(self, muscle: str, quantity: str, coordinate: str | None = None) -> tuple[Integers, Floats]:
         """Frames and values of a quantity of a muscle, of moment arms those of a coordinate, as two arrays."""

@@ -13,6 +13,7 @@ import numpy as np
 from rbfmuscle.experiments.comparison import AGAINST, MEASURES, best_models
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.quantities import ALL
+from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.appearance import MUSCLE_COLOURS
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report.page import (
@@ -23,23 +24,22 @@ from rbfmuscle.report.page import (
     Light,
     Page,
     Section,
-    definitions,
+    Table,
     embedded_image,
     limit_state,
-    number,
-    table,
 )
 from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.render import draw_preview
 from rbfmuscle.report.report import COUNTS, packed_scene
 
 LIGHTS = ("volume_error", "penetration_max", "bone_penetration_max", "return_rms", "time_frame")
+Series = tuple[Integers, Floats]
 # Pixels of a picture of one model, and of all together.
 _AREA, _WHOLE = 90_000, 400_000
-_READING = """<p>All models ran through the same frames and sub-steps, one after another in one process with the
-same bone fields and number of threads, each after a warm-up. <b>The time per frame</b> is the wall time of prediction,
-solution, contacts and surface of all muscles; <b>solution</b> and <b>surface</b> are sums over muscles, which run side
-by side, and may exceed it. The <b>distance to the first model</b> is no error: it says how far models differ.</p>"""
+_READING = """All models ran through the same frames and sub-steps, one after another in one process with the same
+bone fields and number of threads, each after a warm-up. The time per frame is the wall time of prediction, solution,
+contacts and surface of all muscles; solution and surface are sums over muscles, which run side by side, and may exceed
+it. The distance to the first model is no error: it says how far models differ."""
 
 
 def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) -> None:
@@ -65,7 +65,7 @@ def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) ->
         labelled = {found["labels"][name]: run for name, run in runs.items()}
         draw_preview(labelled, moving, area=min(_AREA, _WHOLE / len(runs)))
         page.scene = packed_scene(labelled)
-        page.picture = embedded_image(moving.read_bytes(), "webp", "the motion, models beside each other")
+        page.picture = embedded_image(moving.read_bytes(), "webp")
     else:
         page.missing = "No pictures: they were switched off."
     page.write(folder / "report.html")
@@ -74,7 +74,6 @@ def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) ->
 def _page(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> Page:
     machine = found["machine"]
     failed = [f"{name} did not finish: {reason}" for name, reason in found["failed"].items()]
-    terms = ((measure.title, measure.meaning) for measure in MEASURES.values())
     return Page(
         f"{found['scene']}: models compared",
         [
@@ -87,14 +86,18 @@ def _page(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> Page:
         lights=[light for quantity in LIGHTS if (light := _light(found, runs, quantity))],
         heads=[found["labels"][name] for name in found["models"]],
         sections=[
-            Section("Every measure", _measures(found), "worst over muscles and frames; the best in green"),
-            Section("Over the motion", _plots(found, runs)),
+            Section(
+                "Every measure", "worst over muscles and frames; the best in green", table=_measures(found)
+            ),
+            Section("Over the motion", plots=_plots(found, runs)),
             Section(
                 "Between the models",
-                _matrix(found),
                 f"RMS over all muscles in the last pose, {found['units']}",
+                table=_distances(found),
             ),
-            Section("How to read this", _READING + definitions(terms)),
+            Section(
+                "How to read this", text=_READING, terms=[(m.title, m.meaning) for m in MEASURES.values()]
+            ),
         ],
         footer=", ".join(f"{name} {value}" for name, value in found["versions"].items()),
         layout="below",
@@ -118,20 +121,15 @@ def _light(found: dict[str, Any], runs: Mapping[str, SavedRun], quantity: str) -
 def shown(found: dict[str, Any], quantity: str, value: float | None) -> str:
     """A value of a measure with its unit; lengths that do not count as zero."""
     measure, unit = MEASURES[quantity], found["measures"][quantity]["unit"]
-    if (
-        value is not None
-        and measure.kind == "length"
-        and found["units"] == "mm"
-        and abs(value) < 0.5 * measure.floor
-    ):
+    if value is not None and unit == "mm" and abs(value) < 0.5 * measure.floor:
         value = 0.0
     if quantity == "strain_rms" and value is not None:
         return f"{100 * value:.2g} %"
-    return number(value, unit)
+    return shown_number(value, unit)
 
 
-def _measures(found: dict[str, Any]) -> str:
-    rows: list[list[Cell | str]] = []
+def _measures(found: dict[str, Any]) -> Table:
+    rows = []
     for quantity, measure in MEASURES.items():
         values = [found["results"][name][ALL].get(quantity) for name in found["models"]]
         if all(value is None for value in values):
@@ -142,43 +140,36 @@ def _measures(found: dict[str, Any]) -> str:
             Cell(shown(found, quantity, value), value, GOOD if name in good else PLAIN)
             for name, value in zip(found["models"], values)
         ]
-        rows.append([measure.title, Cell(AGAINST[measure.against]), *cells])
-    return table(["", "against", *(found["labels"][name] for name in found["models"])], rows)
+        rows.append([Cell(measure.title), Cell(AGAINST[measure.against]), *cells])
+    return Table(["", "against", *(found["labels"][name] for name in found["models"])], rows)
 
 
-def _matrix(found: dict[str, Any]) -> str:
+def _distances(found: dict[str, Any]) -> Table:
     labels = [found["labels"][name] for name in found["models"]]
-    rows: list[list[Cell | str]] = []
-    for label, line in zip(labels, found["distances"]):
-        rows.append([label, *(Cell(number(value), value) for value in line)])
-    return table(["", *labels], rows)
+    rows = [
+        [Cell(label), *(Cell(shown_number(value), value) for value in line)]
+        for label, line in zip(labels, found["distances"])
+    ]
+    return Table(["", *labels], rows)
 
 
-def _plots(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> str:
+def _plots(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> list[str]:
     """Moment arms and lengths of each muscle, then the worst over muscles and the time, a line for each model."""
-    first, pictures = next(iter(runs.values())), []
-
-    def draw(title: str, unit: str, series: Callable[[SavedRun], tuple[Integers, Floats]]) -> None:
-        pictures.append(
-            _model_plot(found, runs, title, unit, {name: series(run) for name, run in runs.items()})
-        )
-
+    first = next(iter(runs.values()))
+    panels: list[tuple[str, str, Callable[[SavedRun], Series]]] = []
     for muscle in first.muscles:
         for about in first.moment_arm_coordinates(muscle):
-            title = f"Moment arm: {muscle}, {about}"
-            draw(
-                title,
-                arm_unit(first, about),
-                partial(SavedRun.series, muscle=muscle, quantity="moment_arm", coordinate=about),
-            )
+            arms = partial(SavedRun.series, muscle=muscle, quantity="moment_arm", coordinate=about)
+            panels.append((f"Moment arm: {muscle}, {about}", arm_unit(first, about), arms))
     for muscle in first.muscles:
-        draw(f"Length: {muscle}", first.units, partial(SavedRun.series, muscle=muscle, quantity="length"))
+        lengths = partial(SavedRun.series, muscle=muscle, quantity="length")
+        panels.append((f"Length: {muscle}", first.units, lengths))
     for quantity in LIGHTS[1:3]:
-        draw(
-            f"{MEASURES[quantity].title}, worst muscle", first.units, partial(worst_series, quantity=quantity)
-        )
-    draw("Time per frame after the first", "s", _times)
-    return f'<div class="plots">{"".join(pictures)}</div>'
+        worst = partial(worst_series, quantity=quantity)
+        panels.append((f"{MEASURES[quantity].title}, worst muscle", first.units, worst))
+    panels.append(("Time per frame after the first", "s", _times))
+    pictures = [_model_plot(found, runs, *panel) for panel in panels]
+    return [picture for picture in pictures if picture]
 
 
 def _model_plot(
@@ -186,24 +177,26 @@ def _model_plot(
     runs: Mapping[str, SavedRun],
     title: str,
     unit: str,
-    series: Mapping[str, tuple[Integers, Floats]],
+    series: Callable[[SavedRun], Series],
 ) -> str:
+    """A line for each model, nothing where all are constant."""
     axis, label = motion_axis(next(iter(runs.values())))
-    tracks = [
-        Track(found["labels"][name], colour, np.array([axis[frame] for frame in frames]), values)
-        for (name, (frames, values)), colour in zip(series.items(), cycle(MUSCLE_COLOURS))
-        if np.isfinite(values).any()
-    ]
-    flat = all(np.ptp(track.y) == 0 for track in tracks)
-    return "" if flat else line_plot(title, tracks, (label, unit), legend=True)
+    tracks = []
+    for (name, run), colour in zip(runs.items(), cycle(MUSCLE_COLOURS)):
+        frames, values = series(run)
+        if np.isfinite(values).any():
+            places = np.array([axis[frame] for frame in frames])
+            tracks.append(Track(found["labels"][name], colour, places, values))
+    constant = all(np.ptp(track.y) == 0 for track in tracks)
+    return "" if constant else line_plot(title, tracks, (label, unit), legend=True)
 
 
-def _times(run: SavedRun) -> tuple[Integers, Floats]:
+def _times(run: SavedRun) -> Series:
     frames, values = run.series(ALL, "time_frame")
     return frames[1:], values[1:]
 
 
-def worst_series(run: SavedRun, quantity: str) -> tuple[Integers, Floats]:
+def worst_series(run: SavedRun, quantity: str) -> Series:
     """Frames, and of each frame the value of greatest magnitude among the muscles."""
     found = [series for muscle in run.muscles if len((series := run.series(muscle, quantity))[0])]
     if not found:

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from rbfmuscle.experiments.kernel_study import ALIKE, cost, describe, row_name, row_toml
 from rbfmuscle.metrics.mesh_distance import MeshDistance
+from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.appearance import MUSCLE_COLOURS
 from rbfmuscle.output.vtp import write_vtp
 from rbfmuscle.output.writer import json_text
-from rbfmuscle.report.page import BAD, GOOD, PLAIN, Cell, Light, Page, Section, number, table
+from rbfmuscle.report.page import BAD, GOOD, PLAIN, Cell, Light, Page, Section, Table
 from rbfmuscle.report.plots import Point, front_plot
 
 if TYPE_CHECKING:
@@ -29,11 +30,11 @@ COLUMNS = {
     "fit_time": ("fit [ms]", 1e3), "evaluation_time": ("20,000 values [ms]", 1e3), "note": ("note", 1.0),
 }  # fmt: skip
 _MOST_LIGHTS = 5
-_READING = """<p>Each kernel has the same number of centres; its shape parameter is chosen by the error at other points
+_READING = """Each kernel has the same number of centres; its shape parameter is chosen by the error at other points
 of the mesh. Distances are measured both ways between the mesh and the extracted surface, root mean square and greatest.
 The volume error is that of the level zero; a muscle's level is moved until its volume is right. Recommended is the
 quickest row (a fit and 20,000 values, processor time of one thread) that errs at most 5 % more than the best; of those
-alike in time one without a parameter, then the best-conditioned one.</p>"""
+alike in time one without a parameter, then the best-conditioned one."""
 
 
 def write_studies(
@@ -92,16 +93,7 @@ def _page(studies: Mapping[str, KernelStudy]) -> Page:
     surfaces = f"all {len(studies)} muscles" if several else next(iter(studies)).replace("_", " ")
     kernels = len({row["kernel"] for row in rows})
     counts = ", ".join(map(str, sorted({row["centres"] for row in rows})))
-    sections = [
-        Section(
-            f"Every row{f' of {name}' if several else ''}",
-            _rows(study),
-            f"distances in {units or 'mesh units'}",
-        )
-        for name, study in studies.items()
-    ]
-    toml = "\n\n".join(f"# {name}\n{row_toml(s.recommended)}" for name, s in studies.items() if s.recommended)
-    found = any(study.recommended for study in studies.values())
+    found = {name: study.recommended for name, study in studies.items() if study.recommended}
     return Page(
         f"Kernels for {surfaces}",
         [
@@ -111,29 +103,34 @@ def _page(studies: Mapping[str, KernelStudy]) -> Page:
         ],
         answer(studies),
         GOOD if found else BAD,
-        picture=_plot(studies, units),
+        plot=_plot(studies, units),
         lights=_lights(studies, units),
         heads=["RMS error", "fit and values"],
         sections=[
-            *sections,
-            Section("To paste at the end of a [[muscle]]", f"<pre>{toml}</pre>" if toml else ""),
-            Section("How to read this", _READING),
+            *(
+                Section(
+                    f"Every row{f' of {name}' if several else ''}",
+                    f"distances in {units or 'mesh units'}",
+                    table=_rows(study),
+                )
+                for name, study in studies.items()
+            ),
+            Section(
+                "To paste at the end of a [[muscle]]",
+                code="\n\n".join(f"# {name}\n{row_toml(row)}" for name, row in found.items()),
+            ),
+            Section("How to read this", text=_READING),
         ],
     )
 
 
 def _lights(studies: Mapping[str, KernelStudy], units: str) -> list[Light]:
     """Of one surface its best rows, each with whether it ties; of several what is recommended for each."""
-    lights = []
     if len(studies) > 1:
-        return [
-            _light(study.recommended, name, units, GOOD)
-            for name, study in studies.items()
-            if study.recommended
-        ]
+        return [_light(s.recommended, name, units, GOOD) for name, s in studies.items() if s.recommended]
     (study,) = studies.values()
-    good = [row for row in study.rows if not row["unfit"]]
-    best = study.recommended
+    good, best = [row for row in study.rows if not row["unfit"]], study.recommended
+    lights = []
     for row in [best, *(row for row in good if row is not best)][:_MOST_LIGHTS] if best else []:
         state = GOOD if row["rms"] <= ALIKE * good[0]["rms"] else PLAIN
         lights.append(_light(row, "recommended" if row is best else "", units, state))
@@ -141,7 +138,10 @@ def _lights(studies: Mapping[str, KernelStudy], units: str) -> list[Light]:
 
 
 def _light(row: dict[str, Any], note: str, units: str, state: str) -> Light:
-    cells = [Cell(number(row["rms"], units), row["rms"], state), Cell(number(cost(row), "s"), cost(row))]
+    cells = [
+        Cell(shown_number(row["rms"], units), row["rms"], state),
+        Cell(shown_number(cost(row), "s"), cost(row)),
+    ]
     return Light(row_name(row), cells, note=note)
 
 
@@ -160,23 +160,18 @@ def _plot(studies: Mapping[str, KernelStudy], units: str) -> str:
     return front_plot(points, labels, groups=colours)
 
 
-def _rows(study: KernelStudy) -> str:
-    lines = []
+def _rows(study: KernelStudy) -> Table:
+    rows = []
     for row in study.rows:
-        cells = [shown(name, row[name]) for name in COLUMNS]
         state = GOOD if row is study.recommended else BAD if row["unfit"] else PLAIN
-        lines.append(
-            [
-                row["kernel"],
-                *cells,
-                Cell(row["unfit"] or ("on the front" if row["front"] else ""), None, state),
-            ]
+        verdict = row["unfit"] or ("on the front" if row["front"] else "")
+        rows.append(
+            [Cell(row["kernel"]), *(_cell(name, row[name]) for name in COLUMNS), Cell(verdict, None, state)]
         )
-    return table(["kernel", *(head for head, _ in COLUMNS.values()), "verdict"], lines)
+    return Table(["kernel", *(head for head, _ in COLUMNS.values()), "verdict"], rows)
 
 
-def shown(name: str, value: Any) -> Cell:
-    """A cell of a row's quantity."""
+def _cell(name: str, value: float | str | None) -> Cell:
     if isinstance(value, float):
-        return Cell(number(COLUMNS[name][1] * value), value)
+        return Cell(shown_number(COLUMNS[name][1] * value), value)
     return Cell("" if value is None else str(value), value if isinstance(value, int) else None)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.jit import compiled
-from rbfmuscle.output.appearance import BACKGROUND
+from rbfmuscle.output.appearance import BACKGROUND, rgb
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -24,11 +24,11 @@ _LINE, _CHIP = 22, 17
 
 
 class Solid(NamedTuple):
-    """What is drawn: vertices (n, 3), faces (m, 3), colour (3,) or (n, 3) from 0 to 1, and opacity from 0 to 1."""
+    """What is drawn: vertices (n, 3), faces (m, 3), colour "#rrggbb", and opacity from 0 to 1."""
 
     vertices: Floats
     faces: Integers
-    colour: Floats
+    colour: str
     opacity: float = 1.0
 
 
@@ -64,46 +64,30 @@ def fitted_size(axes: Floats, points: Floats, area: float) -> tuple[int, int]:
     return 2 * round(0.5 * (area / shape) ** 0.5), 2 * round(0.5 * (area * shape) ** 0.5)
 
 
-class Layer(NamedTuple):
-    """What is nearest in each fine pixel: depth (h, w), and colour with opacity (h, w, 4)."""
-
-    depth: NDArray[np.float32]
-    image: NDArray[np.float32]
-
-
-def draw_solids(
-    solids: Sequence[Solid], camera: Camera, background: Floats, *, behind: Layer | None = None
-) -> Integers:
-    """Picture (h, w, 3) of uint8; of solids that are not opaque the nearest one is seen, over all that are.
-
-    ``behind`` is drawn already: opaque solids from `draw_layer`.
-    """
-    depth, image = draw_layer([one for one in solids if one.opacity >= 1.0], camera, background, on=behind)
-    veils = [solid for solid in solids if solid.opacity < 1.0]
-    if veils:
-        over, veil = draw_layer(veils, camera, background)
-        share = np.where(over > depth, veil[..., 3], 0.0)[..., None]
-        image = (1.0 - share) * image + share * veil
-    corners = [image[i::_FINER, j::_FINER, :3] for i in range(_FINER) for j in range(_FINER)]
-    return np.round(255.0 * np.clip(sum(corners) / len(corners), 0.0, 1.0)).astype(np.uint8)
-
-
-def draw_layer(
-    solids: Sequence[Solid], camera: Camera, background: Floats, *, on: Layer | None = None
-) -> Layer:
-    """The nearest of some solids, and of a layer that they are drawn on."""
+def draw_solids(solids: Sequence[Solid], camera: Camera) -> Integers:
+    """Picture (h, w, 3) of uint8; of solids that are not opaque the nearest one is seen, over all that are."""
     width, height = camera.size
     fine = camera._replace(scale=camera.scale * _FINER, size=(_FINER * width, _FINER * height))
-    if on is None:
-        depth = np.full(fine.size[::-1], -np.inf, dtype=np.float32)
-        image = np.tile(np.array([*background, 1.0], dtype=np.float32), (*depth.shape, 1))
-    else:
-        depth, image = on.depth.copy(), on.image.copy()
+    depth, image = _nearest([solid for solid in solids if solid.opacity >= 1.0], fine)
+    veils = [solid for solid in solids if solid.opacity < 1.0]
+    if veils:
+        over, veil = _nearest(veils, fine)
+        share = np.where(over > depth, veil[..., 3], 0.0)[..., None]
+        image = (1.0 - share) * image + share * veil
+    mean = image[..., :3].reshape(height, _FINER, width, _FINER, 3).mean(axis=(1, 3))
+    return np.round(255.0 * np.clip(mean, 0.0, 1.0)).astype(np.uint8)
+
+
+def _nearest(solids: Sequence[Solid], camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Depth (h, w) of what is nearest in each pixel, and its colour with opacity (h, w, 4)."""
+    depth = np.full(camera.size[::-1], -np.inf, dtype=np.float32)
+    image = np.tile(np.array([*rgb(BACKGROUND), 1.0], dtype=np.float32), (*depth.shape, 1))
     for solid in solids:
         shades = np.empty((len(solid.vertices), 4))
-        shades[:, :3], shades[:, 3] = _shaded(solid, fine.axes), solid.opacity
-        _raster_loop(fine.project(solid.vertices), shades, solid.faces.astype(np.int64), depth, image)
-    return Layer(depth, image)
+        shades[:, :3], shades[:, 3] = _shaded(solid, camera.axes), solid.opacity
+        points = camera.project(np.asarray(solid.vertices, dtype=float))
+        _raster_loop(points, shades, np.asarray(solid.faces, dtype=np.int64), depth, image)
+    return depth, image
 
 
 def _shaded(solid: Solid, axes: Floats) -> Floats:
@@ -114,7 +98,7 @@ def _shaded(solid: Solid, axes: Floats) -> Floats:
     half = lamp + axes[2]
     facing = np.clip(normals @ lamp, 0.0, 1.0)[:, None]
     gloss = np.clip(normals @ (half / np.linalg.norm(half)), 0.0, 1.0)[:, None] ** 24
-    return solid.colour * (0.42 + 0.62 * facing) + 0.1 * gloss
+    return rgb(solid.colour) * (0.42 + 0.62 * facing) + 0.1 * gloss
 
 
 def labelled(image: Integers, text: str, titles: Sequence[str], chips: Mapping[str, str]) -> Image:
@@ -131,25 +115,23 @@ def labelled(image: Integers, text: str, titles: Sequence[str], chips: Mapping[s
 
     font = ImageFont.load_default(13)
     height, width = image.shape[:2]
-    pen = ImageDraw.Draw(Image.new("RGB", (1, 1)))
+    parts = text.split(", ") if font.getlength(text) > width - 16 else [text]
     x, y, places = 8, height + _LINE + 5, []
-    parts = [text] if pen.textlength(text, font=font) <= width - 16 else text.split(", ")
-    for name in [*parts, *chips]:
-        wide = int(pen.textlength(name, font=font)) + (_CHIP if len(places) >= len(parts) else 0)
+    for name, colour in [*((part, "") for part in parts), *chips.items()]:
+        wide = int(font.getlength(name)) + (_CHIP if colour else 0)
         if places and x + wide > width:
             x, y = 8, y + _LINE
-        places.append((x, y))
+        places.append((x, y, name, colour))
         x += wide + 20
     sheet = Image.new("RGB", (width, y + _LINE + 3), BACKGROUND)
     sheet.paste(Image.fromarray(image), (0, _LINE))
     pen = ImageDraw.Draw(sheet)
     for k, title in enumerate(titles):
         pen.text((k * width // len(titles) + 8, 4), title, fill="#5f646b", font=font)
-    for place, part in zip(places, parts):
-        pen.text(place, part, fill="#26282b", font=font)
-    for (x, y), (name, colour) in zip(places[len(parts) :], chips.items()):
-        pen.rectangle((x, y + 2, x + 12, y + 14), fill=colour)
-        pen.text((x + _CHIP, y), name, fill="#26282b", font=font)
+    for x, y, name, colour in places:
+        if colour:
+            pen.rectangle((x, y + 2, x + 12, y + 14), fill=colour)
+        pen.text((x + (_CHIP if colour else 0), y), name, fill="#26282b", font=font)
     return sheet
 
 
@@ -174,8 +156,5 @@ def _raster_loop(points, shades, faces, depth, image):
                 if z > depth[y, x]:
                     depth[y, x] = z
                     for k in range(4):
-                        image[y, x, k] = (
-                            u * shades[faces[f, 0], k]
-                            + v * shades[faces[f, 1], k]
-                            + w * shades[faces[f, 2], k]
-                        )
+                        a_k, b_k, c_k = shades[faces[f, 0], k], shades[faces[f, 1], k], shades[faces[f, 2], k]
+                        image[y, x, k] = u * a_k + v * b_k + w * c_k

@@ -22,12 +22,11 @@ from rbfmuscle.output.appearance import (
     motion_direction,
     muscle_colours,
     muscle_groups,
-    rgb,
     view_axes,
 )
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report.page import embedded_image
-from rbfmuscle.report.raster import Solid, aim, draw_layer, draw_solids, fitted_size, labelled
+from rbfmuscle.report.raster import Camera, Solid, aim, draw_solids, fitted_size, labelled
 from rbfmuscle.validation import SolveError, UsageError
 
 if TYPE_CHECKING:
@@ -41,77 +40,16 @@ _FIGURE, _DIRECTION = (300, 340), (1.4, -1.6, 0.5)
 _AREA, _PREVIEW_AREA, _PREVIEW_FRAMES, _PREVIEW_SECONDS = 220_000, 110_000, 12, 4.0
 
 
-class Panel:
-    """A run seen from one direction, as large in all frames.
-
-    Parameters
-    ----------
-    saved : SavedRun
-    axes : (3, 3) ndarray
-        Right, up and towards the camera.
-    size : (width, height)
-        Pixels.
-    seen : (n, 3) ndarray
-        What is to be seen.
-    """
-
-    def __init__(self, saved: SavedRun, axes: Floats, size: tuple[int, int], seen: Floats) -> None:
-        self.saved = saved
-        self.colours = muscle_colours(saved.muscles, muscle_groups(saved.info))
-        self.camera = aim(axes, seen, size)
-        bones, first = {name: saved.bone(name) for name in saved.bones}, saved.poses[saved.frames[0]]
-        moving = {
-            name
-            for name in bones
-            if any(not np.array_equal(saved.poses[k][name], first[name]) for k in saved.frames)
-        }
-        self.moving = {name: bones[name] for name in moving}
-        still = [_posed(*bones[name], first[name]) for name in bones if name not in moving]
-        self._behind = draw_layer(still, self.camera, rgb(BACKGROUND))
-
-    def draw(self, frame: int) -> Integers:
-        """Picture (h, w, 3) of a frame."""
-        solids = [_posed(*mesh, self.saved.poses[frame][name]) for name, mesh in self.moving.items()]
-        for name, colour in self.colours.items():
-            solids.append(Solid(*self.saved.surface(name, frame), rgb(colour)))
-        tendons = (self.saved.surface(name, frame) for name in self.saved.tendons)
-        solids += [Solid(vertices, faces, rgb(TENDON_COLOUR)) for vertices, faces in tendons]
-        return draw_solids(solids, self.camera, rgb(BACKGROUND), behind=self._behind)
-
-
-def _posed(vertices: Floats, faces: Integers, pose: Floats) -> Solid:
-    return Solid(vertices @ pose[:3, :3].T + pose[:3, 3], faces, rgb(BONE_COLOUR))
-
-
-def muscle_points(runs: Sequence[SavedRun], frames: Sequence[int]) -> Floats:
-    """Points (n, 3) of all muscles and tendons in the first, middle and last of some frames."""
-    some = sorted({frames[0], frames[len(frames) // 2], frames[-1]})
-    names = [(run, name) for run in runs for name in (*run.muscles, *run.tendons)]
-    return np.concatenate([run.surface(name, k)[0][::3] for run, name in names for k in some])
-
-
-def draw_panels(
-    panels: Sequence[Panel], frames: Sequence[int], titles: Sequence[str], chips: Mapping[str, str]
-) -> list[Image]:
-    """Panels beside each other, a picture for each frame, with titles above and caption and colours below."""
-    images = each(lambda frame: np.concatenate([panel.draw(frame) for panel in panels], axis=1), frames)
-    saved = panels[0].saved
-    return [labelled(image, saved.caption(k), titles, chips) for image, k in zip(images, frames)]
-
-
 def draw_preview(runs: Mapping[str, SavedRun], path: Path, *, area: float = _PREVIEW_AREA) -> None:
     """Write the whole motion of runs beside each other, seen in its plane; one run is seen from the front as well."""
     first = next(iter(runs.values()))
     frames = chosen_frames(first.frames, _PREVIEW_FRAMES)
-    seen = muscle_points(list(runs.values()), frames)
     side = view_axes(motion_direction([first.poses[frame] for frame in frames], first.body), first.body)
-    size = fitted_size(side, seen, area)
-    panels, titles = [Panel(run, side, size, seen) for run in runs.values()], list(runs)
+    panels, chips = [(title, run, side) for title, run in runs.items()], {}
     if len(runs) == 1:
-        panels.append(Panel(first, view_axes(VIEWS["front"], first.body), size, seen))
-        titles = ["plane of the motion", "front"]
-    chips = _chips(first) if len(runs) == 1 else {}
-    save_images(draw_panels(panels, frames, titles, chips), path, _PREVIEW_SECONDS)
+        front = view_axes(VIEWS["front"], first.body)
+        panels, chips = [("plane of the motion", first, side), ("front", first, front)], _chips(first)
+    save_images(_draw_panels(panels, frames, chips, frames, area), path, _PREVIEW_SECONDS)
 
 
 def render_run(
@@ -146,8 +84,7 @@ def render_run(
         If the folder holds nothing to draw, or the suffix, frame or view is unknown.
     """
     saved, output = SavedRun(directory), Path(output)
-    views = list(views or USUAL_VIEWS)
-    for view in views:
+    for view in views or ():
         if view not in VIEWS:
             raise UsageError(f"unknown view {view!r}; known: {', '.join(VIEWS)}")
     if output.suffix not in (".png", *ANIMATIONS):
@@ -159,13 +96,52 @@ def render_run(
         raise UsageError(
             f"frame {frame} was not written; the run has {saved.frames[0]} to {saved.frames[-1]}"
         )
-    seen = muscle_points([saved], saved.frames)
-    axes = [view_axes(VIEWS[view], saved.body) for view in views]
-    size = fitted_size(axes[0], seen, area)
-    panels = [Panel(saved, one, size, seen) for one in axes]
+    panels = [(view, saved, view_axes(VIEWS[view], saved.body)) for view in views or USUAL_VIEWS]
     frames = [frame] if output.suffix == ".png" else saved.frames
-    images = draw_panels(panels, frames, views, _chips(saved))
-    save_images(images, output, seconds)
+    save_images(_draw_panels(panels, frames, _chips(saved), saved.frames, area), output, seconds)
+
+
+def _draw_panels(
+    panels: Sequence[tuple[str, SavedRun, Floats]],
+    frames: Sequence[int],
+    chips: Mapping[str, str],
+    seen_in: Sequence[int],
+    area: float,
+) -> list[Image]:
+    """A picture of each frame: runs beside each other, with titles above, and caption and colours below.
+
+    Parameters
+    ----------
+    panels : sequence of (title, run, axes)
+    frames : sequence of int
+    chips : dict of str to colour
+    seen_in : sequence of int
+        Frames in the first, middle and last of which every muscle is in the picture.
+    area : float
+        Pixels of a panel.
+    """
+    first, some = panels[0], sorted({seen_in[0], seen_in[len(seen_in) // 2], seen_in[-1]})
+    runs = {run.directory: run for _, run, _ in panels}.values()
+    names = [(run, name) for run in runs for name in (*run.muscles, *run.tendons)]
+    seen = np.concatenate([run.surface(name, k)[0][::3] for run, name in names for k in some])
+    size = fitted_size(first[2], seen, area)
+    cameras = [(run, aim(axes, seen, size)) for _, run, axes in panels]
+
+    def draw(frame: int) -> Image:
+        image = np.concatenate([_draw_frame(run, camera, frame) for run, camera in cameras], axis=1)
+        return labelled(image, first[1].caption(frame), [title for title, *_ in panels], chips)
+
+    return each(draw, frames)
+
+
+def _draw_frame(run: SavedRun, camera: Camera, frame: int) -> Integers:
+    """Picture (h, w, 3) of a frame of a run."""
+    colours = muscle_colours(run.muscles, muscle_groups(run.info)) | dict.fromkeys(run.tendons, TENDON_COLOUR)
+    solids = [Solid(*run.surface(name, frame), colour) for name, colour in colours.items()]
+    for name, pose in run.poses[frame].items():
+        vertices, faces = run.bone(name)
+        solids.append(Solid(vertices @ pose[:3, :3].T + pose[:3, 3], faces, BONE_COLOUR))
+    return draw_solids(solids, camera)
 
 
 def _chips(saved: SavedRun) -> dict[str, str]:
@@ -187,15 +163,13 @@ def save_images(images: Sequence[Image], path: Path, seconds: float) -> None:
     """Save one picture, or several of one width as an animation of so many seconds; raises SolveError if it fails."""
     from PIL import Image
 
-    width, height = (max(image.size[k] for image in images) for k in range(2))
-    sheets = []
+    height, sheets = max(image.height for image in images), []
     for image in images:
-        sheets.append(Image.new("RGB", (width, height), BACKGROUND))
+        sheets.append(Image.new("RGB", (image.width, height), BACKGROUND))
         sheets[-1].paste(image, (0, 0))
     kind: dict[str, Any] = {}
     if len(sheets) > 1:
-        pause = max(20, int(1000 * seconds / len(sheets)))
-        pauses = [pause] * (len(sheets) - 1) + [900]
+        pauses = [max(20, int(1000 * seconds / len(sheets)))] * (len(sheets) - 1) + [900]
         kind = {"save_all": True, "append_images": sheets[1:], "duration": pauses, "loop": 0}
         kind |= {"quality": 82, "method": 2} if path.suffix == ".webp" else {}
     try:
@@ -217,13 +191,12 @@ def figure_html(bones: Meshes, muscles: Meshes, caption: str, body: Floats) -> s
     """
     from PIL import Image
 
-    colours = muscle_colours(list(muscles))
-    solids = [Solid(np.asarray(v), np.asarray(f), rgb(BONE_COLOUR)) for v, f in bones.values()]
-    solids += [Solid(np.asarray(v), np.asarray(f), rgb(colours[name])) for name, (v, f) in muscles.items()]
+    solids = [Solid(*mesh, BONE_COLOUR) for mesh in bones.values()]
+    solids += [Solid(*muscles[name], colour) for name, colour in muscle_colours(list(muscles)).items()]
     picture = ""
     if solids:
         camera = aim(view_axes(_DIRECTION, body), np.concatenate([s.vertices for s in solids]), _FIGURE)
         file = io.BytesIO()
-        Image.fromarray(draw_solids(solids, camera, rgb(BACKGROUND))).save(file, format="PNG")
-        picture = embedded_image(file.getvalue(), "png", caption)
+        Image.fromarray(draw_solids(solids, camera)).save(file, format="PNG")
+        picture = f'<img alt="{escape(caption)}" src="{embedded_image(file.getvalue(), "png")}">'
     return f"<figure>{picture}<figcaption>{escape(caption)}</figcaption></figure>"

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES
-from rbfmuscle.metrics.summary import LEAST, exceeded, excess, muscle_limit, within
+from rbfmuscle.metrics.summary import LEAST, exceeded, excess, muscle_limit, shown_number, within
 from rbfmuscle.output.animation.moving import read_moving
 from rbfmuscle.output.animation.page import pack_runs
 from rbfmuscle.output.appearance import motion_direction, muscle_colours, muscle_groups
@@ -24,12 +24,10 @@ from rbfmuscle.report.page import (
     Light,
     Page,
     Section,
-    definitions,
+    Table,
     embedded_image,
     limit_state,
-    number,
     sentence,
-    table,
 )
 from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.render import chosen_frames, draw_preview
@@ -53,17 +51,17 @@ PANELS = (
     ("Edge strain of the carried mesh (RMS)", "edge_strain_rms", 100.0, "%", False),
     ("Time per frame after the first", "time_frame", 1000.0, "ms", False),
 )
-_MECHANICS = ("length", "activation")
-# Below this share of its limit a quantity is flat, and named in place of a plot.
-_FLAT = 0.01
+_MECHANICS = ("length", "activation", "moment_arm")
+# Below this share of its limit a quantity is constant, and named in place of a plot.
+_CONSTANT = 0.01
 # Points of all muscles in all frames that a page holds.
 _MOST_POINTS = 2_600_000
 # Tables or plots of their own.
 _ELSEWHERE = ("volume", "moment_arm", "time_solve", "time_fit", "time_extract")
-_READING = """<p>Each muscle is one closed surface in each frame. Depths in bones are exact distances to the bone
+_READING = """Each muscle is one closed surface in each frame. Depths in bones are exact distances to the bone
 meshes; where the model cuts the bone out of the surface, the depth before the cut is given too. A row is amber from
 four fifths of its limit. Times are medians, as the first frame may load and compile. Drag to turn the picture, scroll
-or pinch to zoom, drag with shift to move it; names below it switch muscles and their lines on and off.</p>"""
+or pinch to zoom, drag with shift to move it; names below it switch muscles and their lines on and off."""
 
 
 def write_report(directory: str | Path, *, pictures: bool = True) -> None:
@@ -84,7 +82,7 @@ def write_report(directory: str | Path, *, pictures: bool = True) -> None:
         if len(saved.frames) > 1:
             moving = saved.directory / "preview.webp"
             draw_preview({"": saved}, moving)
-            page.picture = embedded_image(moving.read_bytes(), "webp", "the motion")
+            page.picture = embedded_image(moving.read_bytes(), "webp")
     page.write(saved.directory / "report.html")
 
 
@@ -109,14 +107,6 @@ def _page(saved: SavedRun) -> Page:
     answer, _, detail = info["verdict"].partition(". ")
     if not complete:
         answer, detail = f"the run ended early ({info['status']}): {info['message'] or ''}", ""
-    reading = _READING + definitions((n, meaning) for n, (_, meaning) in QUANTITIES.items())
-    sections = [
-        *_plots(saved),
-        Section("Every quantity of every muscle", _summary(saved), "worst over the frames"),
-        Section("Neighbours", _neighbours(saved)),
-        Section("Events", _events(saved.events), "each with its frame in events.csv"),
-        Section("How to read this", reading),
-    ]
     return Page(
         info["scene"]["name"],
         _facts(saved),
@@ -124,7 +114,15 @@ def _page(saved: SavedRun) -> Page:
         BAD if info["beyond"] or not complete else GOOD,
         detail=sentence(detail) if detail else "",
         lights=_lights(saved),
-        sections=sections,
+        sections=[
+            *_plots(saved),
+            Section("Every quantity of every muscle", "worst over the frames", table=_summary(saved)),
+            Section("Neighbours", table=_neighbours(saved)),
+            Section("Events", "each with its frame in events.csv", table=_events(saved.events)),
+            Section(
+                "How to read this", text=_READING, terms=[(n, text) for n, (_, text) in QUANTITIES.items()]
+            ),
+        ],
         footer=", ".join(f"{name} {value}" for name, value in info["versions"].items()),
     )
 
@@ -132,84 +130,80 @@ def _page(saved: SavedRun) -> Page:
 def _facts(saved: SavedRun) -> list[str]:
     info = saved.info
     models = sorted({muscle["model"]["name"] for muscle in info["scene"]["muscles"]})
-    frame = info.get("frame_time") or {}
-    time = f"{number(frame['median'], 's')} per frame" if frame.get("median") else ""
-    facts = [
+    median = (info.get("frame_time") or {}).get("median")
+    return [
         f"model {', '.join(models)}",
         f"{len(saved.muscles)} muscles",
         f"{len(saved.frames)} frame{'s'[: len(saved.frames) != 1]}",
-        time,
+        *([f"{shown_number(median, 's')} per frame"] if median else []),
         f"{info['times']['wall']:.1f} s in all",
     ]
-    return [fact for fact in facts if fact]
 
 
 def _lights(saved: SavedRun) -> list[Light]:
     """A row for each of `LIGHTS`, then one for whatever else is beyond a limit."""
-    muscles, limits = saved.info["muscles"], saved.info["limits"]
-    rows = [_light(saved, title, quantities) for title, quantities in LIGHTS.items()]
     known = {quantity for quantities in LIGHTS.values() for quantity in quantities}
-    other = {name.partition(":")[0] for _, name, *_ in exceeded(muscles, limits)} - known
-    return [row for row in rows if row] + [row for q in sorted(other) if (row := _light(saved, q, (q,)))]
+    beyond = exceeded(saved.info["muscles"], saved.info["limits"])
+    other = sorted({name.partition(":")[0] for _, name, *_ in beyond} - known)
+    rows = [_light(saved, *row) for row in (*LIGHTS.items(), *((name, (name,)) for name in other))]
+    return [row for row in rows if row]
 
 
 def _light(saved: SavedRun, title: str, quantities: Sequence[str]) -> Light | None:
     """The worst of some quantities against their limits, over muscles and frames."""
     limits, found = saved.info["limits"], []
-    for muscle, table_ in saved.info["muscles"].items():
+    for muscle, table in saved.info["muscles"].items():
         for name in quantities:
-            facts = table_.get(name)
+            facts = table.get(name)
             if facts and limits.get(name) is not None and muscle != ALL:
                 worst = math.nan if facts.get("worst") is None else facts["worst"]
-                limit = muscle_limit(name, limits[name], table_)
+                limit = muscle_limit(name, limits[name], table)
                 near = 0.0 if name in COUNTS and within(name, worst, limit) else excess(name, worst, limit)
                 found.append((near, muscle, name, worst, facts, limit))
     if not found:
         return None
     _, muscle, name, worst, facts, limit = max(found, key=lambda entry: entry[0])
-    unit = facts["unit"]
-    sign = "≥" if name in LEAST else "≤"
+    unit, title_of = facts["unit"], name.replace("_", " ")
     state = limit_state(worst, limit, least=name in LEAST, count=name in COUNTS)
-    note = f"{name}: {muscle}, frame {facts.get('worst_frame', '–')}".replace("_", " ")
-    shown = f"{sign} {limit:.3g}{'' if unit == '1' else ' ' + unit}"
+    place = f": {muscle.replace('_', ' ')}, frame {facts.get('worst_frame', '–')}"
     return Light(
-        title, [Cell(number(worst, unit), worst, state)], shown, note if worst else name.replace("_", " ")
+        title,
+        [Cell(shown_number(worst, unit), worst, state)],
+        f"{'≥' if name in LEAST else '≤'} {limit:.3g}{'' if unit == '1' else ' ' + unit}",
+        title_of + (place if worst else ""),
     )
 
 
 def _plots(saved: SavedRun) -> list[Section]:
     """Moment arms and lengths, then what else changes along the motion."""
-    axis = motion_axis(saved)
-    arms = [
-        (f"Moment arm: {name}", "moment_arm", 1.0, arm_unit(saved, name), False, name)
+    axis, label = motion_axis(saved)
+    panels = [
+        (f"Moment arm: {name}", "moment_arm", 1.0, arm_unit(saved, name), True, name)
         for name in saved.moment_arm_coordinates()
-    ]
-    mechanics, errors, flat = [], [], []
-    for title, quantity, factor, unit, both, coordinate in [*arms, *((*panel, None) for panel in PANELS)]:
-        tracks = _tracks(saved, quantity, factor, axis[0], coordinate)
+    ] + [(*panel, None) for panel in PANELS]
+    mechanics, errors, constant = [], [], []
+    for title, quantity, factor, unit, both, coordinate in panels:
+        tracks = _tracks(saved, quantity, factor, axis, coordinate)
         if not tracks:
             continue
-        limit, greatest = (
-            saved.info["limits"].get(quantity),
-            max(np.nanmax(np.abs(t.y), initial=0.0) for t in tracks),
+        unit, limit = (
+            saved.units if unit is None else unit,
+            factor * (saved.info["limits"].get(quantity) or 0.0),
         )
-        if quantity not in _MECHANICS and not coordinate and greatest <= _FLAT * factor * (limit or 0.0):
-            flat.append(f"{title.lower()} at most {greatest:.2g} {saved.units if unit is None else unit}")
+        greatest = max(np.nanmax(np.abs(track.y), initial=0.0) for track in tracks)
+        if quantity not in _MECHANICS and greatest <= _CONSTANT * limit:
+            value = shown_number(greatest, unit)
+            constant.append(f"{title.lower()} {value if value[0] == '<' else f'≤ {value}'}")
             continue
-        limits = [] if limit is None else [factor * limit, -factor * limit] if both else [factor * limit]
-        labels = axis[1], saved.units if unit is None else unit
-        zero = quantity not in ("length", "moment_arm") and not both
-        picture = line_plot(title, tracks, labels, limits=limits, zero=zero)
-        (mechanics if coordinate or quantity in _MECHANICS else errors).append(picture)
-    flat_note = f'<p class="note">Flat over the motion: {"; ".join(flat)}.</p>' if flat else ""
+        limits = [limit, -limit][: 1 + both] if limit else []
+        zero = quantity != "length" and not both
+        picture = line_plot(title, tracks, (label, unit), limits=limits, zero=zero)
+        (mechanics if quantity in _MECHANICS else errors).append(picture)
+    text = f"Constant over the motion: {'; '.join(constant)}." if constant else ""
     return [
-        Section("Moment arms and lengths", _grid(mechanics)),
-        Section("Errors and times over the motion", _grid(errors) + flat_note),
+        Section("Moment arms and lengths", plots=mechanics),
+        Section("Errors and times over the motion", plots=errors, text=text),
     ]
-
-
-def _grid(pictures: Sequence[str]) -> str:
-    return f'<div class="plots">{"".join(pictures)}</div>' if pictures else ""
 
 
 def _tracks(
@@ -229,7 +223,7 @@ def _tracks(
     return tracks
 
 
-def _summary(saved: SavedRun) -> str:
+def _summary(saved: SavedRun) -> Table:
     """A row for each muscle, those beyond most limits first."""
     muscles, limits = saved.info["muscles"], saved.info["limits"]
     used = [q for q in QUANTITIES if q not in _ELSEWHERE and any(q in found for found in muscles.values())]
@@ -238,48 +232,51 @@ def _summary(saved: SavedRun) -> str:
         unit = next(found[name]["unit"] for found in muscles.values() if name in found)
         limit = "" if name not in limits else f" ({'≥' if name in LEAST else '≤'} {limits[name]:g})"
         head.append(f"{name.replace('_', ' ')}{'' if unit == '1' else f' [{unit}]'}{limit}")
-    rows: list[tuple[int, list[Cell | str]]] = []
-    for muscle, found in muscles.items():
-        own = {
-            name: muscle_limit(name, limits[name], found) for name in used if name in limits and name in found
-        }
-        cells = [_cell(name, found.get(name), own.get(name)) for name in used]
-        rows.append((-sum(cell.state == BAD for cell in cells), [muscle, *cells]))
-    return table(head, [row for _, row in sorted(rows, key=lambda row: row[0])])
+    rows = [
+        [Cell(muscle), *(_cell(name, found, limits) for name in used)] for muscle, found in muscles.items()
+    ]
+    return Table(head, sorted(rows, key=lambda row: -sum(cell.state == BAD for cell in row)))
 
 
-def _cell(name: str, facts: Mapping[str, Any] | None, limit: float | None) -> Cell:
+def _cell(name: str, found: Mapping[str, Mapping[str, Any]], limits: Mapping[str, float]) -> Cell:
+    facts = found.get(name)
     if not facts or facts.get("worst") is None:
         return Cell("–")
     if name in ("length", "edge_strain_rms"):
         return Cell(f"{facts['min']:.4g} … {facts['max']:.4g}", facts["max"])
     if name == "time_frame":
-        return Cell(number(facts["median"], "s"), facts["median"])
-    state = limit_state(facts["worst"], limit, least=name in LEAST, count=name in COUNTS)
-    return Cell(number(facts["worst"]), facts["worst"], BAD if state == BAD else PLAIN)
+        return Cell(shown_number(facts["median"], "s"), facts["median"])
+    limit = muscle_limit(name, limits[name], found) if name in limits else None
+    state = limit_state(facts["worst"], limit, least=name in LEAST)
+    return Cell(shown_number(facts["worst"]), facts["worst"], BAD if state == BAD else PLAIN)
 
 
-def _neighbours(saved: SavedRun) -> str:
+def _neighbours(saved: SavedRun) -> Table:
     """Pairs of muscles that slide on each other, the deepest overlap first."""
-    rows: list[list[Cell | str]] = [
+    rows = [
         [
-            " and ".join(pair["muscles"]),
-            Cell(f"{number(pair['overlap_max'])}, frame {pair['overlap_frame']}", pair["overlap_max"]),
-            Cell(f"{number(pair['gap_rms'])}, frame {pair['gap_frame']}", pair["gap_rms"]),
+            Cell(" and ".join(pair["muscles"])),
+            *(
+                Cell(f"{shown_number(pair[name])}, frame {pair[frame]}", pair[name])
+                for name, frame in (("overlap_max", "overlap_frame"), ("gap_rms", "gap_frame"))
+            ),
         ]
         for pair in saved.info.get("neighbours") or []
     ]
-    head = ["pair", f"overlap [{saved.units}]", f"gap opened, RMS [{saved.units}]"]
-    return table(head, rows) if rows else ""
+    return Table(["pair", f"overlap [{saved.units}]", f"gap opened, RMS [{saved.units}]"], rows)
 
 
-def _events(events: Iterable[Sequence[Any]]) -> str:
+def _events(events: Sequence[Sequence[Any]]) -> Table:
     """How many events of each kind, the commonest first, and the muscles that have most of them."""
     kinds: dict[str, Counter[str]] = {}
     for event in events:
         kinds.setdefault(event[4], Counter()).update([event[1] or event[2]])
-    rows: list[list[Cell | str]] = [
-        [kind, Cell(str(n := found.total()), n), ", ".join(f"{name} {k}" for name, k in found.most_common(6))]
+    rows = [
+        [
+            Cell(kind),
+            Cell(str(n := found.total()), n),
+            Cell(", ".join(f"{m} {k}" for m, k in found.most_common(6))),
+        ]
         for kind, found in sorted(kinds.items(), key=lambda row: -row[1].total())
     ]
-    return table(["event", "how often", "most often"], rows) if rows else ""
+    return Table(["event", "how often", "most often"], rows)

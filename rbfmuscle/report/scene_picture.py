@@ -7,16 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.output.appearance import (
-    BACKGROUND,
-    MUSCLE_COLOURS,
-    TENDON_COLOUR,
-    VIEWS,
-    mixed_colour,
-    rgb,
-    view_axes,
-)
+from rbfmuscle.output.appearance import MUSCLE_COLOURS, TENDON_COLOUR, VIEWS, mixed_colour, view_axes
 from rbfmuscle.output.tubes import tendon_mesh
 from rbfmuscle.report.raster import Camera, Solid, aim, draw_solids, labelled
 from rbfmuscle.scene.tendons import AT_REST
@@ -24,7 +15,7 @@ from rbfmuscle.scene.tendons import AT_REST
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
 
-    from rbfmuscle.scene.objects import Bone, Muscle
+    from rbfmuscle.scene.objects import Muscle
     from rbfmuscle.scene.scene import Scene
 
 SIZE, SIDES = (480, 860), ("front", "right", "back", "left")
@@ -39,45 +30,36 @@ def draw_scene(scene: Scene, path: str | Path) -> None:
     scene : Scene
     path : path
     """
+    from PIL import Image, ImageDraw
+
     colours = {bone.name: _bone_colour(k) for k, bone in enumerate(scene.bones)}
-    solids = [Solid(*_mesh(bone), rgb(mixed_colour(colours[bone.name], _PALE))) for bone in scene.bones]
+    solids = [
+        Solid(np.asarray(bone.mesh.vertices), bone.mesh.faces, mixed_colour(colours[bone.name], _PALE))
+        for bone in scene.bones
+    ]
     solids += [solid for muscle in scene.muscles for solid in _muscle_solids(muscle, colours)]
     points, images = np.concatenate([solid.vertices for solid in solids]), []
     for side in SIDES:
         camera = aim(view_axes(VIEWS[side], scene.body), points, SIZE)
-        images.append(_with_joints(draw_solids(solids, camera, rgb(BACKGROUND)), camera, scene))
+        images.append(Image.fromarray(draw_solids(solids, camera)))
+        _draw_joints(ImageDraw.Draw(images[-1]), camera, scene)
     text = f"{scene.name}: held patches in the colour of their bone"
     chips = {**colours, "joint centres and axes": _AXIS}
     labelled(np.concatenate(images, axis=1), text, SIDES, chips).save(path)
 
 
-def _mesh(item: Bone | Muscle) -> tuple[Floats, Integers]:
-    return np.asarray(item.mesh.vertices, dtype=float), np.asarray(item.mesh.faces)
-
-
 def _muscle_solids(muscle: Muscle, colours: dict[str, str]) -> list[Solid]:
     """A muscle as a veil, its held patches in the colours of their bones, and its tendons."""
-    vertices, faces = _mesh(muscle)
-    held = np.zeros(len(vertices), dtype=bool)
-    solids = []
+    vertices, faces = np.asarray(muscle.mesh.vertices), np.asarray(muscle.mesh.faces)
+    free, solids = np.ones(len(faces), dtype=bool), []
     for attachment in muscle.attachments:
-        mine = np.zeros(len(vertices), dtype=bool)
-        mine[attachment.vertices] = True
-        solids.append(Solid(vertices, faces[mine[faces].all(axis=1)], rgb(colours[attachment.bone])))
-        held |= mine
-    veil = Solid(vertices, faces[~held[faces].all(axis=1)], rgb(_MUSCLE), _OPACITY)
+        held = np.isin(faces, attachment.vertices).all(axis=1)
+        solids.append(Solid(vertices, faces[held], colours[attachment.bone]))
+        free &= ~held
     tendons = tendon_mesh(muscle, {end.name: end.place(AT_REST)[0] for end in muscle.tendons})
     if tendons is not None:
-        solids.append(Solid(*tendons, rgb(TENDON_COLOUR)))
-    return [veil, *(solid for solid in solids if len(solid.faces))]
-
-
-def _with_joints(image: Integers, camera: Camera, scene: Scene) -> Integers:
-    from PIL import Image, ImageDraw
-
-    sheet = Image.fromarray(image)
-    _draw_joints(ImageDraw.Draw(sheet), camera, scene)
-    return np.asarray(sheet)
+        solids.append(Solid(*tendons, TENDON_COLOUR))
+    return [Solid(vertices, faces[free], _MUSCLE, _OPACITY), *solids]
 
 
 def _draw_joints(pen: ImageDraw, camera: Camera, scene: Scene) -> None:

@@ -7,16 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from rbfmuscle.experiments.sweep_table import LENGTHS
+from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.appearance import MUSCLE_COLOURS
-from rbfmuscle.report.page import GOOD, NEAR, PLAIN, Cell, Light, Page, Section, number, table
+from rbfmuscle.report.page import GOOD, NEAR, PLAIN, Cell, Light, Page, Section, Table
 from rbfmuscle.report.plots import Point, front_plot
 
 SHOWN = ("error_rms", "error_max", "volume_error", "penetration_max", "bone_penetration_max", "time_frame")
-_READING = """<p><b>error_rms</b> is the distance between a point's surfaces and those of the <b>reference</b> at the
-same poses, both ways, root mean square over frames and muscles: how far a setting is from the reference, not how far
-the model is from a real muscle. A point is on the <b>front</b> if no other is as accurate in less time.</p>"""
-_INSIDE = """<p>The reference is itself a point of the grid, so points near it err little by definition. Give a finer
-one (<code>--reference</code>) to judge the default.</p>"""
+_READING = """error_rms is the distance between a point's surfaces and those of the reference at the same poses, both
+ways, root mean square over frames and muscles: how far a setting is from the reference, not how far the model is from a
+real muscle. A point is on the front if no other is as accurate in less time."""
+_INSIDE = """ The reference is itself a point of the grid, so points near it err little by definition. Give a finer one
+(--reference) to judge the default."""
 
 
 def write_page(found: dict[str, Any], directory: str | Path) -> None:
@@ -31,13 +32,13 @@ def write_page(found: dict[str, Any], directory: str | Path) -> None:
         [f"{found[status]} points {status}" for status in ("done", "failed", "missing") if found[status]],
         " ".join(v["text"] for v in verdicts) or f"{found['done']} points are done; none is judged.",
         judged,
-        picture=picture,
+        plot=picture,
         missing="" if picture else "No front: no point has both an error and a time.",
         lights=_lights(rows, verdicts, quantity),
         heads=[quantity.replace("_", " "), "per frame"],
         sections=[
-            Section("Every point", _points(rows)),
-            Section("How to read this", _READING + (_INSIDE if inside else "")),
+            Section("Every point", table=_points(rows)),
+            Section("How to read this", text=_READING + (_INSIDE if inside else "")),
         ],
     ).write(Path(directory) / "sweep.html")
 
@@ -101,21 +102,22 @@ def _lights(rows: list[dict[str, Any]], verdicts: list[dict[str, Any]], quantity
 def _light(row: dict[str, Any], title: str, quantity: str, state: str) -> Light:
     unit = row["units"] if quantity in LENGTHS else ""
     cells = [
-        Cell(number(row[quantity], unit), row[quantity], state),
-        Cell(number(row["time_frame"], "s"), row["time_frame"]),
+        Cell(shown_number(row[quantity], unit), row[quantity], state),
+        Cell(shown_number(row["time_frame"], "s"), row["time_frame"]),
     ]
     return Light(title, cells, note="" if row["role"] == "default" else _short(row))
 
 
-def _points(rows: list[dict[str, Any]]) -> str:
+def _points(rows: list[dict[str, Any]]) -> Table:
     settings = list(dict.fromkeys(key for row in rows for key in row["settings"]))
     lines = []
     for row in rows:
         cells = [Cell(str(row["settings"].get(key, ""))) for key in settings]
         cells += [Cell(row["role"]), Cell("yes" if row["front"] else "")]
         cells += [
-            Cell(number(row[name], "s" if name.startswith("time_") else ""), row[name]) for name in SHOWN
+            Cell(shown_number(row[name], "s" if name.startswith("time_") else ""), row[name])
+            for name in SHOWN
         ]
-        lines.append([row["scene"], *cells, Cell(row["error"] or row["status"])])
+        lines.append([Cell(row["scene"]), *cells, Cell(row["error"] or row["status"])])
     head = ["scene", *settings, "role", "front", *(name.replace("_", " ") for name in SHOWN), "status"]
-    return table(head, lines)
+    return Table(head, lines)
