@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.output.animation.moving import MovingBone, MovingMuscle, MovingRun, read_moving
+from rbfmuscle.output.animation.moving import MovingRun, read_moving
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.vtp import Collection, write_vtp
 from rbfmuscle.scene.objects import MM_PER_UNIT
@@ -123,8 +122,7 @@ def _export_frame(saved: SavedRun, folder: Path, frame: int) -> Path:
 
 def _export_meshes(run: MovingRun, folder: Path, name: str, frames: list[int]) -> list[Path]:
     written = []
-    groups: dict[str, Sequence[MovingMuscle | MovingBone]] = {"surfaces": run.muscles, "bones": run.bones}
-    for group, parts in groups.items():
+    for group, parts in (("surfaces", run.muscles), ("bones", run.bones)):
         collection = Collection(folder / f"{group}.pvd") if name == "pvd" else None
         for k, frame in enumerate(frames):
             files = [

@@ -122,9 +122,9 @@ def front_plot(points: Sequence[Point], labels: tuple[str, str], *, groups: Mapp
             front = sorted(point for point in shown if point.front and point.colour == colour)
             axes.plot([point.x for point in front], [point.y for point in front], color=colour, linewidth=1.0)
         for point in shown:
-            look = {"marker": "*", "markersize": 13} if point.star else {"marker": "o", "markersize": 6}
-            faint = 1.0 if point.star or point.front else 0.4
-            axes.plot(point.x, point.y, color=point.colour, alpha=faint, markeredgewidth=0.0, **look)
+            marker, size = ("*", 13.0) if point.star else ("o", 6.0)
+            shade = point.colour + ("" if point.star or point.front else "66")
+            axes.plot(point.x, point.y, marker, color=shade, markersize=size, markeredgewidth=0.0)
         _set_ticks(axes.xaxis, axes.get_xlim())
         _set_ticks(axes.yaxis, axes.get_ylim())
         _label_beside(axes, named, groups, _ROW / (tall - 0.55))

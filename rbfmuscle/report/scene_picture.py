@@ -45,7 +45,7 @@ def draw_scene(scene: Scene, path: str | Path) -> None:
         _draw_joints(ImageDraw.Draw(images[-1]), camera, scene)
     text = f"{scene.name}: held patches in the colour of their bone"
     chips = {**colours, "joint centres and axes": _AXIS}
-    labelled(np.concatenate(images, axis=1), text, SIDES, chips).save(path)
+    labelled(np.concatenate([np.asarray(image) for image in images], axis=1), text, SIDES, chips).save(path)
 
 
 def _muscle_solids(muscle: Muscle, colours: dict[str, str]) -> list[Solid]:

@@ -12,7 +12,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.output.animation import page
-from rbfmuscle.output.animation.moving import MovingBone, MovingMuscle, MovingRun
+from rbfmuscle.output.animation.moving import MovingPart, MovingRun
 
 CAPTIONS = ["frame 0: knee 0°", "frame 1: knee 10°", "frame 2: knee 20°", "frame 5: knee 30°"]
 
@@ -30,14 +30,15 @@ def moving():
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, :3, :3] = Rotation.from_rotvec(np.radians([[10.0 * k, 0, 0] for k in range(4)])).as_matrix()
     poses[:, :3, 3] = [[0.0, 10.0 * k, 0.0] for k in range(4)]
-    red, white = np.array([0.7, 0.2, 0.2]), np.array([0.9, 0.9, 0.8])
     bones = [
-        MovingBone("shin", white, np.array(box.vertices), np.array(box.faces), poses),
-        MovingBone("thigh", white, np.array(box.vertices) + 300, np.array(box.faces), poses[:1].repeat(4, 0)),
+        MovingPart("shin", "#e9e0cd", [np.array(box.vertices)], [np.array(box.faces)], poses),
+        MovingPart(
+            "thigh", "#e9e0cd", [np.array(box.vertices) + 300], [np.array(box.faces)], poses[:1].repeat(4, 0)
+        ),
     ]
     muscles = [
-        MovingMuscle("calf </script><b>", red, shapes, [faces] * 4),
-        MovingMuscle("knee", red, other, kinds),
+        MovingPart("calf </script><b>", "#cc6677", shapes, [faces] * 4),
+        MovingPart("knee", "#cc6677", other, kinds),
     ]
     return MovingRun("knee & calf", "mm", np.array([2, 3, 4, 7]) / 24.0, False, muscles, bones, np.eye(3))
 
@@ -80,7 +81,9 @@ def test_every_vertex_and_triangle_of_every_frame_is_unpacked(written, moving):
     assert [len(parts[m.name]["pieces"]) for m in moving.muscles] == [1, 2]
     for bone in moving.bones:
         part = parts[bone.name]
-        np.testing.assert_allclose(np.reshape(part["pieces"][0]["places"], (-1, 3)), bone.vertices, atol=0.02)
+        np.testing.assert_allclose(
+            np.reshape(part["pieces"][0]["places"], (-1, 3)), bone.vertices[0], atol=0.02
+        )
         poses = np.reshape(part["poses"], (-1, 3, 4))
         np.testing.assert_allclose(poses, bone.poses[: len(poses), :3], atol=1e-6)
-        assert len(poses) == (4 if bone.moves else 1)
+        assert len(poses) == (4 if bone.turns else 1)

@@ -15,8 +15,8 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
-from rbfmuscle.output.animation.moving import MovingBone, MovingMuscle, MovingRun
-from rbfmuscle.output.appearance import linear_rgb
+from rbfmuscle.output.animation.moving import MovingPart, MovingRun
+from rbfmuscle.output.appearance import linear_rgb, rgb
 from rbfmuscle.validation import UsageError
 
 _FLOAT, _INT = 5126, 5125
@@ -40,42 +40,32 @@ def animated_glb(run: MovingRun, name: str = "animated-glb") -> bytes:
     file = _File()
     if len(run.times) > 1:
         file.times = file.add(run.times[:, None] - run.times[0], "SCALAR", bounds=True)
-    children = [_add_bone(file, bone) for bone in run.bones] + [_add_muscle(file, m) for m in run.muscles]
+    children = [_add_part(file, part) for part in (*run.bones, *run.muscles)]
     root: dict[str, Any] = {"name": run.name, "children": children}
     left, posterior, superior = run.body  # glTF looks at what faces +z, with y up
     root["rotation"] = _quaternions(np.stack([left, superior, -posterior])[None])[0].tolist()
     return file.content({"name": run.name, "nodes": [file.append("nodes", root)]})
 
 
-def _add_bone(file: _File, bone: MovingBone) -> int:
-    turns, shifts = _quaternions(bone.poses[:, :3, :3]), bone.poses[:, :3, 3]
-    node = file.append(
-        "nodes",
-        {
-            "name": bone.name,
-            "mesh": file.mesh(bone.name, bone.colour, bone.vertices, bone.faces),
-            "rotation": turns[0].tolist(),
-            "translation": shifts[0].tolist(),
-        },
-    )
-    if bone.moves:
-        file.animate(node, "rotation", file.add(turns, "VEC4"))
-        file.animate(node, "translation", file.add(shifts, "VEC3"))
-    return node
-
-
-def _add_muscle(file: _File, muscle: MovingMuscle) -> int:
-    base, faces = muscle.mesh(0)
+def _add_part(file: _File, part: MovingPart) -> int:
+    """Number of a new node: a muscle has a morph target for each frame but the first, a bone turns."""
+    base, faces = part.vertices[0], part.faces[0]
     normals, targets = vertex_normals(base, faces), []
-    for vertices in muscle.vertices[1:]:
+    for vertices in part.vertices[1:]:
         moved, turned = vertices - base, vertex_normals(vertices, faces) - normals
         position = file.add(moved, "VEC3", target=_VERTICES, bounds=True)
         targets.append({"POSITION": position, "NORMAL": file.add(turned, "VEC3", target=_VERTICES)})
-    mesh = file.mesh(muscle.name, muscle.colour, base, faces, targets=targets)
-    node = file.append("nodes", {"name": muscle.name, "mesh": mesh})
+    entry: dict[str, Any] = {"name": part.name, "mesh": file.mesh(part, normals, targets)}
+    node = file.append("nodes", entry)
     if targets:
-        weights = np.eye(len(muscle.vertices))[:, 1:]
+        weights = np.eye(len(part.vertices))[:, 1:]
         file.animate(node, "weights", file.add(weights.reshape(-1, 1), "SCALAR"))
+    if part.poses is not None:
+        turns, shifts = _quaternions(part.poses[:, :3, :3]), part.poses[:, :3, 3]
+        entry |= {"rotation": turns[0].tolist(), "translation": shifts[0].tolist()}
+        if part.turns:
+            file.animate(node, "rotation", file.add(turns, "VEC4"))
+            file.animate(node, "translation", file.add(shifts, "VEC3"))
     return node
 
 
@@ -127,24 +117,22 @@ class _File:
             entry |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
         return self.append("accessors", entry)
 
-    def mesh(
-        self, name: str, colour: Floats, vertices: Floats, faces: Integers, *, targets: Sequence[Any] = ()
-    ) -> int:
-        """Number of a new mesh with a material of its own."""
+    def mesh(self, part: MovingPart, normals: Floats, targets: Sequence[Any]) -> int:
+        """Number of a new mesh, that of the first frame, with a material of its own."""
         look = {
-            "baseColorFactor": [*linear_rgb(colour).tolist(), 1.0],
+            "baseColorFactor": [*linear_rgb(rgb(part.colour)).tolist(), 1.0],
             "metallicFactor": 0.0,
             "roughnessFactor": 0.6,
         }
         primitive = {
             "attributes": {
-                "POSITION": self.add(vertices, "VEC3", target=_VERTICES, bounds=True),
-                "NORMAL": self.add(vertex_normals(vertices, faces), "VEC3", target=_VERTICES),
+                "POSITION": self.add(part.vertices[0], "VEC3", target=_VERTICES, bounds=True),
+                "NORMAL": self.add(normals, "VEC3", target=_VERTICES),
             },
-            "indices": self.add(faces.reshape(-1, 1), "SCALAR", target=_INDICES),
-            "material": self.append("materials", {"name": name, "pbrMetallicRoughness": look}),
+            "indices": self.add(part.faces[0].reshape(-1, 1), "SCALAR", target=_INDICES),
+            "material": self.append("materials", {"name": part.name, "pbrMetallicRoughness": look}),
         }
-        entry: dict[str, Any] = {"name": name, "primitives": [primitive]}
+        entry: dict[str, Any] = {"name": part.name, "primitives": [primitive]}
         if targets:
             primitive["targets"] = list(targets)
             entry["weights"] = [0.0] * len(targets)

@@ -10,15 +10,16 @@ import base64
 import html
 import json
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from importlib import resources
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.output.animation.moving import FRAMES_A_SECOND, MovingMuscle, MovingRun
+from rbfmuscle.output.animation.moving import FRAMES_A_SECOND, MovingPart, MovingRun
 from rbfmuscle.output.appearance import VIEWS
 
 # Whole numbers of which the longest side of all that moves has so many: 0.03 mm of 900.
@@ -86,21 +87,12 @@ def pack_runs(
     parts: list[dict[str, Any]] = []
     for panel, run in enumerate(runs.values()):
         for muscle in run.muscles:
-            part = {"name": muscle.name, "panel": panel, "pieces": list(_pieces(packer, muscle))}
-            part["colour"] = (colours or {}).get(muscle.name) or _hex(muscle.colour)
-            parts.append(part | {"group": (groups or {}).get(muscle.name, "")})
+            colour, group = ((table or {}).get(muscle.name) for table in (colours, groups))
+            parts.append(packer.part(muscle, panel) | {"group": group or ""})
+            parts[-1]["colour"] = colour or muscle.colour
     for bone in first.bones:
-        piece = packer.piece([bone.vertices], bone.faces)
-        poses = bone.poses[:, :3].round(6) if bone.moves else bone.poses[:1, :3].round(6)
-        parts.append(
-            {
-                "name": bone.name,
-                "panel": -1,
-                "pieces": [piece],
-                "colour": _hex(bone.colour),
-                "poses": poses.reshape(len(poses), 12).tolist(),
-            }
-        )
+        poses = bone.poses[: None if bone.turns else 1, :3].round(6)
+        parts.append(packer.part(bone, -1) | {"poses": poses.reshape(len(poses), 12).tolist()})
     facts = {
         "panels": list(runs), "captions": captions, "parts": parts, "step": packer.step,
         "views": VIEWS, "body": first.body.tolist(),
@@ -111,31 +103,27 @@ def pack_runs(
     return json.dumps(facts, separators=(",", ":")).replace("<", "\\u003c")
 
 
-def _pieces(packer: _Packer, muscle: MovingMuscle) -> Iterator[dict[str, int]]:
-    """Runs of frames of a muscle that have the same triangles."""
-    start = 0
-    for k in range(1, len(muscle.vertices) + 1):
-        if k == len(muscle.vertices) or muscle.faces[k] is not muscle.faces[start]:
-            yield packer.piece(muscle.vertices[start:k], muscle.faces[start])
-            start = k
-
-
-def _hex(colour: Floats) -> str:
-    return "#" + "".join(f"{round(255 * float(part)):02x}" for part in colour)
-
-
 class _Packer:
     """Arrays on their way into one stream."""
 
     def __init__(self, runs: Mapping[str, MovingRun]) -> None:
-        sets = [part.vertices for run in runs.values() for part in run.bones]
-        sets += [points for run in runs.values() for part in run.muscles for points in part.vertices]
+        sets = [
+            points for run in runs.values() for part in (*run.bones, *run.muscles) for points in part.vertices
+        ]
         low = np.min([points.min(axis=0) for points in sets], axis=0)
         high = np.max([points.max(axis=0) for points in sets], axis=0)
         self.origin, self.step = low, float((high - low).max()) / _STEPS or 1.0
         self.parts: list[bytes] = []
 
-    def piece(self, frames: list[Floats], faces: Integers) -> dict[str, int]:
+    def part(self, part: MovingPart, panel: int) -> dict[str, Any]:
+        """Take in a muscle or bone, in pieces: frames that follow each other and have the same triangles."""
+        pieces: list[dict[str, int]] = []
+        for _, group in groupby(range(len(part.faces)), key=lambda k: id(part.faces[k])):
+            frames = list(group)
+            pieces.append(self._piece([part.vertices[k] for k in frames], part.faces[frames[0]]))
+        return {"name": part.name, "panel": panel, "pieces": pieces, "colour": part.colour}
+
+    def _piece(self, frames: list[Floats], faces: Integers) -> dict[str, int]:
         """Take in the points of some frames and their triangles; how many there are of each."""
         whole = np.rint((np.asarray(frames) - self.origin) / self.step).astype(np.int32)
         for axis, times in ((0, 2), (1, 1)):

@@ -9,8 +9,8 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
-from rbfmuscle.output.animation.moving import FRAMES_A_SECOND, MovingBone, MovingMuscle, MovingRun
-from rbfmuscle.output.appearance import linear_rgb
+from rbfmuscle.output.animation.moving import FRAMES_A_SECOND, MovingPart, MovingRun
+from rbfmuscle.output.appearance import linear_rgb, rgb
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import MissingPartError
 
@@ -57,41 +57,33 @@ def write_usd(path: Path, run: MovingRun) -> None:
     upright[:3, :3] = run.body
     root.AddTransformOp().Set(Gf.Matrix4d(upright.T))
     used: set[str] = set()
-    parts: list[MovingBone | MovingMuscle] = [*run.bones, *run.muscles]
-    for part in parts:
+    for part in (*run.bones, *run.muscles):
         mesh = UsdGeom.Mesh.Define(stage, f"{place}/{identifier(part.name, used)}")
         mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
         mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
-        if isinstance(part, MovingBone):
-            _fill_bone(mesh, part, codes)
-        else:
-            _fill_muscle(mesh, part, codes)
-        mesh.CreateDisplayColorAttr([Gf.Vec3f(*linear_rgb(part.colour).tolist())])
+        _fill(mesh, part, codes)
+        mesh.CreateDisplayColorAttr([Gf.Vec3f(*linear_rgb(rgb(part.colour)).tolist())])
         mesh.GetPrim().SetDisplayName(part.name)
     stage.GetRootLayer().Export(str(path))
 
 
-def _fill_bone(mesh: Any, bone: MovingBone, codes: list[float]) -> None:
+def _fill(mesh: Any, part: MovingPart, codes: list[float]) -> None:
+    """Set a muscle's points at every time, its topology too where it changes; of a bone one of each, and its pose."""
     from pxr import Gf, UsdGeom, Vt
 
-    _set_faces(mesh, bone.faces, ())
-    _set_points(mesh, bone.vertices, ())
-    # Without normals a surface that is no subdivision surface is drawn facet by facet.
-    normals = np.ascontiguousarray(vertex_normals(bone.vertices, bone.faces), dtype=np.float32)
-    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals))
-    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-    place = mesh.AddTransformOp()
-    for code, pose in zip(codes, bone.poses):
-        place.Set(Gf.Matrix4d(pose.T), *((code,) if bone.moves else ()))
-
-
-def _fill_muscle(mesh: Any, muscle: MovingMuscle, codes: list[float]) -> None:
-    if muscle.keeps_vertices:
-        _set_faces(mesh, muscle.faces[0], ())
-    for k, code in enumerate(codes):
-        if not muscle.keeps_vertices:
-            _set_faces(mesh, muscle.faces[k], (code,))
-        _set_points(mesh, muscle.vertices[k], (code,))
+    for k, (vertices, faces) in enumerate(zip(part.vertices, part.faces)):
+        at = (codes[k],) if part.poses is None else ()
+        if k == 0 or not part.keeps_vertices:
+            _set_faces(mesh, faces, () if part.keeps_vertices else at)
+        _set_points(mesh, vertices, at)
+    if part.poses is not None:
+        # Without normals a surface that is no subdivision surface is drawn facet by facet.
+        normals = np.ascontiguousarray(vertex_normals(part.vertices[0], part.faces[0]), dtype=np.float32)
+        mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals))
+        mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+        place = mesh.AddTransformOp()
+        for code, pose in zip(codes, part.poses):
+            place.Set(Gf.Matrix4d(pose.T), *((code,) if part.turns else ()))
 
 
 def _set_faces(mesh: Any, faces: Integers, at: tuple[float, ...]) -> None:
