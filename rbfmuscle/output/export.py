@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.output.animation.gltf import animated_glb
 from rbfmuscle.output.animation.moving import MovingRun, read_moving
+from rbfmuscle.output.animation.page import write_animated_page
+from rbfmuscle.output.animation.usd import check_usd, write_usd
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.vtp import Collection, write_vtp
 from rbfmuscle.scene.objects import MM_PER_UNIT
@@ -69,18 +73,28 @@ def export_run(
             folder = base / name
             folder.mkdir(parents=True, exist_ok=True)
             unit = units or ("m" if name in IN_METRES else saved.units)
+            if name == "glb":
+                for frame in chosen:
+                    written.append(folder / f"frame_{frame:04d}.glb")
+                    written[-1].write_bytes(animated_glb(read_moving(saved, [frame], unit=unit)))
+                continue
+            run = read_moving(saved, chosen, unit=unit)
             if name in MESHES:
-                written += _export_meshes(read_moving(saved, chosen, unit=unit), folder, name, chosen)
-            elif name == "glb":
-                written += [_export_frame(saved, folder, frame) for frame in chosen]
+                written += _export_meshes(run, folder, name, chosen)
+                continue
+            written.append(folder / f"{run.name}{SUFFIX_OF[name]}")
+            if name == "html":
+                write_animated_page(written[-1], run, [saved.caption(frame) for frame in chosen])
+            elif name == "usd":
+                write_usd(written[-1], run)
             else:
-                written.append(_export_animation(saved, folder, name, chosen, unit))
+                written[-1].write_bytes(animated_glb(run))
     except OSError as error:
         raise SolveError(f"cannot write to {base}: {error.strerror}") from None
     return written
 
 
-def _check_words(formats, units):
+def _check_words(formats: Sequence[str], units: str | None) -> None:
     for name in formats:
         if name not in FORMATS:
             raise UsageError(f"unknown format {name!r}; known: {', '.join(FORMATS)}")
@@ -89,50 +103,20 @@ def _check_words(formats, units):
     if units is not None and units not in MM_PER_UNIT:
         raise UsageError(f"units must be m, cm or mm, got {units!r}")
     if "usd" in formats:
-        from rbfmuscle.output.animation.usd import check_usd
-
         check_usd()
 
 
-def _export_animation(saved: SavedRun, folder: Path, name: str, frames: list[int], unit: str) -> Path:
-    run = read_moving(saved, frames, unit=unit)
-    path = folder / f"{run.name}{SUFFIX_OF[name]}"
-    if name == "html":
-        from rbfmuscle.output.animation.page import write_animated_page
-
-        write_animated_page(path, run, [saved.caption(frame) for frame in frames])
-    elif name == "usd":
-        from rbfmuscle.output.animation.usd import write_usd
-
-        write_usd(path, run)
-    else:
-        from rbfmuscle.output.animation.gltf import animated_glb
-
-        path.write_bytes(animated_glb(run))
-    return path
-
-
-def _export_frame(saved: SavedRun, folder: Path, frame: int) -> Path:
-    from rbfmuscle.output.animation.gltf import animated_glb
-
-    path = folder / f"frame_{frame:04d}.glb"
-    path.write_bytes(animated_glb(read_moving(saved, [frame], unit="m")))
-    return path
-
-
 def _export_meshes(run: MovingRun, folder: Path, name: str, frames: list[int]) -> list[Path]:
-    written = []
+    written, suffix = [], "vtp" if name == "pvd" else name
     for group, parts in (("surfaces", run.muscles), ("bones", run.bones)):
         collection = Collection(folder / f"{group}.pvd") if name == "pvd" else None
         for k, frame in enumerate(frames):
-            files = [
-                (part.name, f"{part.name}_{frame:04d}.{'vtp' if name == 'pvd' else name}") for part in parts
-            ]
-            for part, (_, file) in zip(parts, files):
-                write_mesh(folder / file, *part.mesh(k))
-                written.append(folder / file)
+            files = {part.name: f"{part.name}_{frame:04d}.{suffix}" for part in parts}
+            for part in parts:
+                write_mesh(folder / files[part.name], *part.mesh(k))
+            written += [folder / file for file in files.values()]
             if collection is not None:
-                collection.add(run.times[k] if run.timed else frame, files)
+                collection.add(run.times[k] if run.timed else frame, list(files.items()))
         if collection is not None:
             collection.close()
             written.append(folder / f"{group}.pvd")

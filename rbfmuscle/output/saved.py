@@ -112,7 +112,8 @@ class SavedRun:
 
     def surface(self, muscle: str, frame: int) -> tuple[Floats, Integers]:
         """Vertices and faces of a muscle in a frame."""
-        return read_vtp(self._file("surfaces", muscle, frame))
+        self._check_surfaces()
+        return read_vtp(self._surface_file(muscle, frame))
 
     def bone(self, name: str) -> tuple[Floats, Integers]:
         """Vertices and faces of a bone at rest."""
@@ -140,39 +141,36 @@ class SavedRun:
         return list(dict.fromkeys(r.coordinate for r in rows))
 
     def caption(self, frame: int) -> str:
-        """Frame number, time and joint coordinates of a frame, as text."""
-        entry = next(entry for entry in self.info["frames"] if entry["frame"] == frame)
+        """Frame number, time and coordinates of a frame, as text; of many coordinates those that move most."""
+        rows, units = self.info["frames"], self.info["scene"].get("coordinate_units", {})
+        entry = next(row for row in rows if row["frame"] == frame)
+        values = entry["coordinates"]
+        if len(values) > MOST_SHOWN:
+            spans = {name: np.ptp([row["coordinates"].get(name, 0.0) for row in rows]) for name in values}
+            values = {name: values[name] for name in sorted(values, key=lambda n: -spans[n])[:MOST_SHOWN]}
+        texts = [f"{name} {value:.4g}{units.get(name, '°')}" for name, value in values.items()]
         clock = [f"{entry['time']:.4g} s"] if "time" in entry else []
-        return ", ".join([f"frame {frame}", *clock, *coordinate_texts(self.info, entry)])
+        return ", ".join([f"frame {frame}", *clock, *texts])
 
     def has_surfaces(self) -> bool:
         """Whether there is something to draw."""
         return self._meshes and bool(self.frames)
 
     def _whole_frames(self):
-        """Entries of ``run.json`` for the frames of which every file is there.
-
-        A frame's surfaces are on the disk before its poses.
-        """
-        planned = self.info.get("planned", [])
+        """Entries of ``run.json`` for the frames of which every file is there."""
+        planned, meshes = self.info.get("planned", []), [*self.muscles, *self.tendons] if self._meshes else []
         return [
             {"frame": frame, "coordinates": planned[frame] if frame < len(planned) else {}, "wall": None}
             for frame, poses in self.poses.items()
-            if set(poses) >= set(self.bones) and self._has_files(frame)
+            if set(poses) >= set(self.bones) and all(self._surface_file(m, frame).is_file() for m in meshes)
         ]
 
-    def _has_files(self, frame):
-        return not self._meshes or all(
-            self._file("surfaces", m, frame).is_file() for m in [*self.muscles, *self.tendons]
-        )
+    def _surface_file(self, muscle, frame):
+        return self.directory / "surfaces" / f"{muscle}_{frame:04d}.vtp"
 
     def _check_surfaces(self):
         if not self._meshes:
             raise UsageError(f"{self.directory} has no surfaces: the run's scene had output.surfaces = false")
-
-    def _file(self, folder, name, frame):
-        self._check_surfaces()
-        return self.directory / folder / f"{name}_{frame:04d}.vtp"
 
     def _table(self, name):
         path = self.directory / name
@@ -209,22 +207,3 @@ def saved_frames(saved: SavedRun) -> list[Frame]:
         surfaces = _SavedSurfaces(saved, index)
         found.append(Frame(index, angles, saved.poses[index], surfaces, {}, events, {}, entry["wall"]))
     return found
-
-
-def coordinate_texts(info: Mapping[str, Any], entry: Mapping[str, Any]) -> list[str]:
-    """A frame's coordinates as text, each with its unit; of many, those that the motion moves most.
-
-    Parameters
-    ----------
-    info : dict
-        What ``run.json`` holds.
-    entry : dict
-        Of its ``frames``.
-    """
-    values = entry["coordinates"]
-    if len(values) > MOST_SHOWN:
-        tracks = {n: [row["coordinates"].get(n, 0.0) for row in info["frames"]] for n in values}
-        spans = {n: max(track) - min(track) for n, track in tracks.items()}
-        values = {n: values[n] for n in sorted(values, key=lambda n: -spans[n])[:MOST_SHOWN]}
-    units = info["scene"].get("coordinate_units", {})
-    return [f"{name} {value:.4g}{units.get(name, '°')}" for name, value in values.items()]

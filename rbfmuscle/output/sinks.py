@@ -36,13 +36,11 @@ class MemorySink:
     def __init__(self) -> None:
         self.frames: list[Frame] = []
         self.rows: list[Row] = []
-        self._complete: list[int] = []
 
     def write(self, frame: Frame, rows: Sequence[Row] = ()) -> None:
         """Keep a frame, and the rows of metrics that are complete by now."""
         self.frames.append(frame)
         self.rows.extend(rows)
-        self._complete.append(len(self.rows))
 
     def close(self, rows: Sequence[Row] = ()) -> None:
         """Keep the last rows."""
@@ -52,9 +50,7 @@ class MemorySink:
         """Nothing: the facts are the run's own."""
 
     def replay(self, sink: Sink) -> None:
-        """Give another sink what came here, in the same portions."""
-        start = 0
-        for frame, end in zip(self.frames, self._complete):
-            sink.write(frame, self.rows[start:end])
-            start = end
-        sink.close(self.rows[start:])
+        """Give another sink what came here."""
+        for frame in self.frames:
+            sink.write(frame)
+        sink.close(self.rows)

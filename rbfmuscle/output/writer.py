@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 import os
 import tempfile
@@ -76,8 +75,8 @@ class RunWriter:
         self.scene = scene
         self.meshes = bool(scene.output.surfaces)
         self.count, self._failed = 0, False
-        # Pose of the file that shows a bone now, and its meshes for a series.
-        self._bone_files: dict[str, tuple[Floats, str]] = {}
+        # Pose and file that show a bone now, and its mesh for a series.
+        self._bones: dict[str, tuple[Floats, str]] = {}
         self._light: dict[str, tuple[Floats, Integers]] = {}
         try:
             self._clear()
@@ -119,7 +118,7 @@ class RunWriter:
         if self._failed:
             return
         try:
-            self._add_rows(rows)
+            self._add_rows("metrics.csv", rows)
             for file in self._open_files():
                 file.close()
         except OSError as error:
@@ -146,19 +145,20 @@ class RunWriter:
             surfaces = self._write_surfaces(frame)
             self._collections["bones"].add(step, self._write_bones(frame))
             self._collections["surfaces"].add(step, surfaces)
-        (poses, poses_file), (events, events_file) = self._tables["poses.csv"], self._tables["events.csv"]
-        poses.writerows(
-            [frame.index, bone.name, *(repr(float(x)) for x in frame.poses[bone.name].ravel())]
-            for bone in self.scene.bones
+        # A frame's surfaces are on the disk before its poses: readers of a run that was killed rely on it.
+        self._add_rows(
+            "poses.csv",
+            [
+                (frame.index, bone.name, *map(float, frame.poses[bone.name].ravel()))
+                for bone in self.scene.bones
+            ],
         )
-        events.writerows([e.frame, e.muscle, e.bone, e.count, e.action] for e in frame.events)
-        poses_file.flush()
-        events_file.flush()
-        self._add_rows(rows)
+        self._add_rows("events.csv", [(e.frame, e.muscle, e.bone, e.count, e.action) for e in frame.events])
+        self._add_rows("metrics.csv", rows)
 
-    def _add_rows(self, rows):
-        metrics, file = self._tables["metrics.csv"]
-        metrics.writerows(rows)
+    def _add_rows(self, name, rows):
+        writer, file = self._tables[name]
+        writer.writerows(rows)
         file.flush()
 
     def _write_surfaces(self, frame):
@@ -176,27 +176,20 @@ class RunWriter:
 
         Whoever wants more takes the mesh at rest and the pose.
         """
-        entries = []
-        for bone in self.scene.bones:
-            pose = frame.poses[bone.name]
-            if bone.name not in self._bone_files:
-                file = f"bones/{bone.name}.vtp"
-                write_vtp(self.directory / file, bone.mesh.vertices, bone.mesh.faces)
-                self._bone_files[bone.name] = (np.eye(4), file)
-            stood, file = self._bone_files[bone.name]
-            if not np.array_equal(stood, pose):
-                vertices, faces = self._light_bone(bone)
+        for name, pose in frame.poses.items():
+            if name not in self._bones:
+                mesh = self.scene.bone(name).mesh
+                self._bones[name] = np.eye(4), f"bones/{name}.vtp"
+                write_vtp(self.directory / self._bones[name][1], mesh.vertices, mesh.faces)
+            if not np.array_equal(self._bones[name][0], pose):
+                if name not in self._light:
+                    mesh = self.scene.bone(name).mesh
+                    self._light[name] = clustered(mesh.vertices, mesh.faces, LIGHT)
+                vertices, faces = self._light[name]
                 moved = vertices @ pose[:3, :3].T + pose[:3, 3]
-                file = f"bones/{bone.name}_{frame.index:04d}.vtp"
-                write_vtp(self.directory / file, moved.astype(np.float32), faces)
-                self._bone_files[bone.name] = (pose.copy(), file)
-            entries.append((bone.name, file))
-        return entries
-
-    def _light_bone(self, bone):
-        if bone.name not in self._light:
-            self._light[bone.name] = clustered(bone.mesh.vertices, bone.mesh.faces, LIGHT)
-        return self._light[bone.name]
+                self._bones[name] = pose.copy(), f"bones/{name}_{frame.index:04d}.vtp"
+                write_vtp(self.directory / self._bones[name][1], moved.astype(np.float32), faces)
+        return [(bone.name, self._bones[bone.name][1]) for bone in self.scene.bones]
 
     def _remove(self, last):
         """Take the meshes of all frames after ``last`` away."""
@@ -237,20 +230,10 @@ def write_json(path: Path, data: dict[str, Any]) -> None:
 
 
 def json_text(data: Any) -> str:
-    """JSON that every reader takes: NaN and infinity become null."""
-    return json.dumps(plain(data), indent=1, allow_nan=False)
+    """JSON that every reader takes: NaN and infinity become null, what has no form in JSON its text."""
+    from pydantic_core import to_json
 
+    def plain(value: Any) -> Any:
+        return value.tolist() if isinstance(value, (np.generic, np.ndarray)) else str(value)
 
-def plain(value: Any) -> Any:
-    """A tree as JSON can hold it: NaN and infinity become null, what is no plain value its text."""
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    elif isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value if isinstance(value, (str, int, float, bool, type(None))) else str(value)
+    return to_json(data, indent=1, inf_nan_mode="null", fallback=plain).decode()
