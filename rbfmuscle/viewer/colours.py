@@ -35,14 +35,14 @@ COLOURINGS = {
 
 
 def vertex_values(
-    colouring: str, name: str, picture: Picture, probes: list[BoneProbe], other: Picture | None
+    colouring: str, name: str, picture: Picture, rest: Picture, probes: list[BoneProbe], other: Picture | None
 ) -> Floats:
     """One number for each vertex of a muscle, NaN where it is not known; ``other`` is the model beside it."""
-    vertices = picture.surfaces[name][0]
+    vertices, faces = picture.surfaces[name]
     if colouring == "activation":
         return np.full(len(vertices), picture.activation.get(name, np.nan))
-    if colouring == "stretch" and name in picture.material:
-        return _stretch(vertices, *picture.material[name])
+    if colouring == "stretch" and np.array_equal(faces, rest.surfaces[name][1]):
+        return _stretch(vertices, *rest.surfaces[name])
     if colouring == "penetration":
         return surface_depth(vertices, probes, picture.poses)
     if colouring == "distance" and other is not None:
@@ -50,15 +50,12 @@ def vertex_values(
     return np.full(len(vertices), np.nan)
 
 
-def _stretch(vertices: Floats, now: Floats, rest: Floats, faces: Integers) -> Floats:
+def _stretch(now: Floats, rest: Floats, faces: Integers) -> Floats:
     """Mean change of length of the edges about each vertex, relative to rest."""
-    from scipy.spatial import cKDTree
-
     edges = unique_edges(faces)
     change = edge_lengths(now, edges) / edge_lengths(rest, edges) - 1.0
     total, count = (np.bincount(edges.T.ravel(), x, len(now)) for x in (np.tile(change, 2), None))
-    mean = total / np.maximum(count, 1)
-    return mean if len(now) == len(vertices) else mean[cKDTree(now).query(vertices)[1]]
+    return total / np.maximum(count, 1)
 
 
 def shades(colouring: Colouring, values: Floats, millimetre: float) -> Floats:

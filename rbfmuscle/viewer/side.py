@@ -27,8 +27,8 @@ class Side:
         Which of the source's models or runs; "none" for none.
     figure : LiveFigure, SavedFigure or None
         The one chosen.
-    picture : Picture or None
-        What is shown of it.
+    picture, rest : Picture or None
+        What is shown of it, and what it began with.
     numbers : dict of str to dict of str to float
         Volume error [%], depth in bones and mean of the coloured quantity of each muscle, NaN where not known.
     """
@@ -37,6 +37,7 @@ class Side:
         self.server, self.root, self.source, self.choice = server, root, source, "none"
         self.figure: Any = None
         self.picture: Any = None
+        self.rest: Any = None
         self.numbers: dict[str, dict[str, float]] = {}
         self.frame = server.scene.add_frame(root, show_axes=False, visible=False)
         self._bones = {
@@ -52,7 +53,8 @@ class Side:
             return False
         figure = None if choice == "none" else self.source.figure(choice)
         self.close()
-        self.choice, self.figure, self.picture = choice, figure, None
+        self.choice, self.figure = choice, figure
+        self.rest = self.picture = None if figure is None else figure.advance()
         self.frame.visible = figure is not None
         return True
 
@@ -85,7 +87,7 @@ class Side:
             node.wxyz = SO3.from_matrix(pose[:3, :3]).wxyz
         painted, colouring = [], COLOURINGS[colour]
         for name, mesh in self.picture.surfaces.items():
-            values = vertex_values(colour, name, self.picture, probes, other)
+            values = vertex_values(colour, name, self.picture, self.rest, probes, other)
             error = 100.0 * (mesh_volume(*mesh) / self._volumes[name] - 1.0)
             depth = self.picture.depth.get(name, math.nan)
             self.numbers[name] = {"volume": error, "depth": depth, "mean": float(values.mean())}

@@ -34,16 +34,14 @@ class Control(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """One picture's content, by bone or muscle; tendons of the muscles that have some.
+    """One picture's content, by bone or muscle.
 
-    ``material`` is a mesh of constant topology where one is known: vertices, vertices at rest, faces. ``depth`` in
-    the bones [scene unit] and ``activation`` are there for the muscles that have them.
+    Tendons, ``activation`` and ``depth`` in the bones [scene unit] are those of the muscles that have them.
     """
 
     poses: dict[str, Floats]
     surfaces: dict[str, Mesh]
     tendons: dict[str, Mesh]
-    material: dict[str, tuple[Floats, Floats, Integers]]
     activation: dict[str, float]
     depth: dict[str, float]
     text: str
@@ -107,7 +105,6 @@ class LiveFigure:
         self.session, self._unfinished = session, True
         self.stride = math.radians(session.scene.contact.substep_angle)
         session.use(models)
-        self._rest = {model.name: model.material_mesh() for model in models}
 
     def set(self, name: str, value: float) -> None:
         """Give a control a new target."""
@@ -130,14 +127,12 @@ class LiveFigure:
         """Go one sub-step further; coarse shows the material where it is and leaves fit and cut for later."""
         frame = self.session.advance(self.stride, surfaces=not coarse)
         self._unfinished = coarse
-        drawn = frame.surfaces.items()
-        surfaces = {n: (s.vertices, s.faces) for n, s in drawn} or frame.carried
-        material = {n: (frame.carried[n][0], *mesh) for n, mesh in self._rest.items()}
-        key = "solver_penetration_max"
-        depth = {n: s.quantities[key] for n, s in drawn if key in s.quantities}
+        surfaces = {n: (s.vertices, s.faces) for n, s in frame.surfaces.items()} or frame.carried
+        depths = {n: s.quantities.get("solver_penetration_max") for n, s in frame.surfaces.items()}
         meshes = {m.name: tendon_mesh(m, frame.tendons) for m in self.session.scene.muscles}
         tendons = {name: mesh for name, mesh in meshes.items() if mesh is not None}
-        return Picture(frame.poses, surfaces, tendons, material, frame.activations, depth, "")
+        known = {name: depth for name, depth in depths.items() if depth is not None}
+        return Picture(frame.poses, surfaces, tendons, frame.activations, known, "")
 
     def close(self) -> None:
         """End the session's threads."""
@@ -176,7 +171,6 @@ class SavedFigure:
 
     def __init__(self, saved: SavedRun) -> None:
         self.saved, self.frame, self.pending = saved, saved.frames[0], True
-        self._rest = {name: saved.surface(name, self.frame) for name in saved.muscles}
 
     def set(self, name: str, value: float) -> None:
         """Go to the frame nearest to a number."""
@@ -190,14 +184,10 @@ class SavedFigure:
         """Read the frame."""
         saved, frame, self.pending = self.saved, self.frame, False
         surfaces = {name: saved.surface(name, frame) for name in saved.muscles}
-        rest = {n: mesh for n, mesh in self._rest.items() if np.array_equal(mesh[1], surfaces[n][1])}
-        material = {n: (surfaces[n][0], *mesh) for n, mesh in rest.items()}
-        activation, depth = (self._known(quantity) for quantity in ("activation", "penetration_max"))
         named = {name: tendon_name(name) for name in saved.muscles}
         tendons = {n: saved.surface(mesh, frame) for n, mesh in named.items() if mesh in saved.tendons}
-        return Picture(
-            saved.poses[frame], surfaces, tendons, material, activation, depth, saved.caption(frame)
-        )
+        activation, depth = (self._known(quantity) for quantity in ("activation", "penetration_max"))
+        return Picture(saved.poses[frame], surfaces, tendons, activation, depth, saved.caption(frame))
 
     def _known(self, quantity: str) -> dict[str, float]:
         series = {name: self.saved.series(name, quantity) for name in self.saved.muscles}
