@@ -27,6 +27,7 @@ from rbfmuscle.report.page import (
     Table,
     embedded_image,
     limit_state,
+    number_cell,
 )
 from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.render import draw_preview
@@ -146,10 +147,8 @@ def _measures(found: dict[str, Any]) -> Table:
 
 def _distances(found: dict[str, Any]) -> Table:
     labels = [found["labels"][name] for name in found["models"]]
-    rows = [
-        [Cell(label), *(Cell(shown_number(value), value) for value in line)]
-        for label, line in zip(labels, found["distances"])
-    ]
+    lines = zip(labels, found["distances"])
+    rows = [[Cell(label), *(number_cell(value) for value in line)] for label, line in lines]
     return Table(["", *labels], rows)
 
 

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any
 from rbfmuscle.experiments.kernel_study import ALIKE, cost, describe, row_name, row_toml
 from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.metrics.summary import shown_number
-from rbfmuscle.output.appearance import MUSCLE_COLOURS
 from rbfmuscle.output.vtp import write_vtp
 from rbfmuscle.output.writer import json_text
-from rbfmuscle.report.page import BAD, GOOD, PLAIN, Cell, Light, Page, Section, Table
+from rbfmuscle.report.page import BAD, GOOD, PLAIN, Cell, Light, Page, Section, Table, number_cell
 from rbfmuscle.report.plots import Point, front_plot
 
 if TYPE_CHECKING:
@@ -138,26 +137,27 @@ def _lights(studies: Mapping[str, KernelStudy], units: str) -> list[Light]:
 
 
 def _light(row: dict[str, Any], note: str, units: str, state: str) -> Light:
-    cells = [
-        Cell(shown_number(row["rms"], units), row["rms"], state),
-        Cell(shown_number(cost(row), "s"), cost(row)),
-    ]
+    cells = [number_cell(row["rms"], units, state), number_cell(cost(row), "s")]
     return Light(row_name(row), cells, note=note)
 
 
 def _plot(studies: Mapping[str, KernelStudy], units: str) -> str:
     """Error against the time of a fit and 20,000 values: a colour a surface, or of one a number of centres."""
-    rows = [(name, study, row) for name, study in studies.items() for row in study.rows if not row["unfit"]]
-    keys = [name if len(studies) > 1 else f"{row['centres']} centres" for name, _, row in rows]
-    colours = {key: MUSCLE_COLOURS[k % len(MUSCLE_COLOURS)] for k, key in enumerate(sorted(set(keys)))}
     points = [
         Point(
-            1e3 * cost(row), row["rms"], row["kernel"], colours[key], row is study.recommended, row["front"]
+            1e3 * cost(row),
+            row["rms"],
+            row["kernel"],
+            name if len(studies) > 1 else f"{row['centres']} centres",
+            row is study.recommended,
+            row["front"],
         )
-        for key, (_, study, row) in zip(keys, rows)
+        for name, study in studies.items()
+        for row in study.rows
+        if not row["unfit"]
     ]
     labels = ("a fit and 20,000 values [ms of one thread]", f"RMS error [{units or 'mesh units'}]")
-    return front_plot(points, labels, groups=colours)
+    return front_plot(points, labels)
 
 
 def _rows(study: KernelStudy) -> Table:

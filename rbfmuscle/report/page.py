@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.validation import SolveError
 
 GOOD, NEAR, BAD, PLAIN = "good", "near", "bad", "plain"
@@ -21,6 +22,11 @@ class Cell(NamedTuple):
     text: str
     value: float | None = None
     state: str = PLAIN
+
+
+def number_cell(value: float | None, unit: str = "", state: str = PLAIN) -> Cell:
+    """A cell that shows a number."""
+    return Cell(shown_number(value, unit), value, state)
 
 
 class Table(NamedTuple):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from itertools import cycle
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.output.appearance import MUSCLE_COLOURS
 
 if TYPE_CHECKING:
     from matplotlib.axis import Axis
@@ -38,12 +40,12 @@ class Track(NamedTuple):
 
 
 class Point(NamedTuple):
-    """A point of error against time: a star where it is the default; its label is drawn where it has one."""
+    """A point of error against time: a star where it is the default; its label is drawn there and on the front."""
 
     x: float
     y: float
     label: str
-    colour: str
+    group: str
     star: bool = False
     front: bool = False
 
@@ -94,16 +96,15 @@ def line_plot(
         return _svg(figure, title)
 
 
-def front_plot(points: Sequence[Point], labels: tuple[str, str], *, groups: Mapping[str, str] = {}) -> str:
+def front_plot(points: Sequence[Point], labels: tuple[str, str]) -> str:
     """Markup of error against time on logarithmic axes: the front joined, its points and the default labelled.
 
     Parameters
     ----------
     points : sequence of Point
+        Each group has a colour, named where there are several, and its own front.
     labels : (str, str)
         Of the axes.
-    groups : dict of str to str
-        What the colours stand for.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -111,19 +112,21 @@ def front_plot(points: Sequence[Point], labels: tuple[str, str], *, groups: Mapp
     shown = [point for point in points if point.x > 0 and point.y > 0]
     if not shown:
         return ""
-    named = [point for point in shown if point.label and (point.star or point.front)]
+    colours = dict(zip(sorted({point.group for point in shown}), cycle(MUSCLE_COLOURS)))
+    groups = colours if len(colours) > 1 else {}
+    named = [point for point in shown if point.star or point.front]
     letters = max((len(text) for text in (*groups, *(point.label for point in named))), default=0)
     wide, tall = 5.4 + _LETTER * letters, max(3.8, 0.6 + _ROW * (len(named) + len(groups)))
     with rc_context(_STYLE):
         figure = Figure((wide, tall))
         place = (0.6 / wide, 0.45 / tall, 4.6 / wide, 1.0 - 0.55 / tall)
         axes = figure.add_axes(place, xscale="log", yscale="log", xlabel=labels[0], ylabel=labels[1])
-        for colour in dict.fromkeys(point.colour for point in shown):
-            front = sorted(point for point in shown if point.front and point.colour == colour)
+        for group, colour in colours.items():
+            front = sorted(point for point in shown if point.front and point.group == group)
             axes.plot([point.x for point in front], [point.y for point in front], color=colour, linewidth=1.0)
         for point in shown:
             marker, size = ("*", 13.0) if point.star else ("o", 6.0)
-            shade = point.colour + ("" if point.star or point.front else "66")
+            shade = colours[point.group] + ("" if point.star or point.front else "66")
             axes.plot(point.x, point.y, marker, color=shade, markersize=size, markeredgewidth=0.0)
         _set_ticks(axes.xaxis, axes.get_xlim())
         _set_ticks(axes.yaxis, axes.get_ylim())

@@ -27,6 +27,7 @@ from rbfmuscle.report.page import (
     Table,
     embedded_image,
     limit_state,
+    number_cell,
     sentence,
 )
 from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
@@ -168,7 +169,7 @@ def _light(saved: SavedRun, title: str, quantities: Sequence[str]) -> Light | No
     place = f": {muscle.replace('_', ' ')}, frame {facts.get('worst_frame', '–')}"
     return Light(
         title,
-        [Cell(shown_number(worst, unit), worst, state)],
+        [number_cell(worst, unit, state)],
         f"{'≥' if name in LEAST else '≤'} {limit:.3g}{'' if unit == '1' else ' ' + unit}",
         title_of + (place if worst else ""),
     )
@@ -245,10 +246,10 @@ def _cell(name: str, found: Mapping[str, Mapping[str, Any]], limits: Mapping[str
     if name in ("length", "edge_strain_rms"):
         return Cell(f"{facts['min']:.4g} … {facts['max']:.4g}", facts["max"])
     if name == "time_frame":
-        return Cell(shown_number(facts["median"], "s"), facts["median"])
+        return number_cell(facts["median"], "s")
     limit = muscle_limit(name, limits[name], found) if name in limits else None
     state = limit_state(facts["worst"], limit, least=name in LEAST)
-    return Cell(shown_number(facts["worst"]), facts["worst"], BAD if state == BAD else PLAIN)
+    return number_cell(facts["worst"], state=BAD if state == BAD else PLAIN)
 
 
 def _neighbours(saved: SavedRun) -> Table:

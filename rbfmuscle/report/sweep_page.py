@@ -7,9 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rbfmuscle.experiments.sweep_table import LENGTHS
-from rbfmuscle.metrics.summary import shown_number
-from rbfmuscle.output.appearance import MUSCLE_COLOURS
-from rbfmuscle.report.page import GOOD, NEAR, PLAIN, Cell, Light, Page, Section, Table
+from rbfmuscle.report.page import GOOD, NEAR, PLAIN, Cell, Light, Page, Section, Table, number_cell
 from rbfmuscle.report.plots import Point, front_plot
 
 SHOWN = ("error_rms", "error_max", "volume_error", "penetration_max", "bone_penetration_max", "time_frame")
@@ -57,19 +55,19 @@ def inside_grid(rows: Iterable[dict[str, Any]]) -> bool:
 
 def front_picture(rows: Iterable[dict[str, Any]], quantity: str) -> str:
     """SVG of the error against time per frame: a colour for each scene and model, fronts joined and labelled."""
-    rows = [row for row in rows if row["role"] != "reference" and row["status"] == "done"]
-    groups = list(dict.fromkeys(_group(row) for row in rows))
-    colours = {group: MUSCLE_COLOURS[k % len(MUSCLE_COLOURS)] for k, group in enumerate(groups)}
-    points = []
-    for row in rows:
-        place, star = (1e3 * row["time_frame"], row[quantity]), row["role"] == "default"
-        points.append(Point(*place, _short(row), colours[_group(row)], star, row["front"]))
-    labels = ("time per frame [ms]", quantity.replace("_", " "))
-    return front_plot(points, labels, groups=colours if len(groups) > 1 else {})
-
-
-def _group(row: dict[str, Any]) -> str:
-    return f"{row['scene']} {row['model']}".strip()
+    points = [
+        Point(
+            1e3 * row["time_frame"],
+            row[quantity],
+            _short(row),
+            f"{row['scene']} {row['model']}".strip(),
+            row["role"] == "default",
+            row["front"],
+        )
+        for row in rows
+        if row["role"] != "reference" and row["status"] == "done"
+    ]
+    return front_plot(points, ("time per frame [ms]", quantity.replace("_", " ")))
 
 
 def _short(row: dict[str, Any]) -> str:
@@ -101,23 +99,24 @@ def _lights(rows: list[dict[str, Any]], verdicts: list[dict[str, Any]], quantity
 
 def _light(row: dict[str, Any], title: str, quantity: str, state: str) -> Light:
     unit = row["units"] if quantity in LENGTHS else ""
-    cells = [
-        Cell(shown_number(row[quantity], unit), row[quantity], state),
-        Cell(shown_number(row["time_frame"], "s"), row["time_frame"]),
-    ]
+    cells = [number_cell(row[quantity], unit, state), number_cell(row["time_frame"], "s")]
     return Light(title, cells, note="" if row["role"] == "default" else _short(row))
 
 
 def _points(rows: list[dict[str, Any]]) -> Table:
     settings = list(dict.fromkeys(key for row in rows for key in row["settings"]))
-    lines = []
-    for row in rows:
-        cells = [Cell(str(row["settings"].get(key, ""))) for key in settings]
-        cells += [Cell(row["role"]), Cell("yes" if row["front"] else "")]
-        cells += [
-            Cell(shown_number(row[name], "s" if name.startswith("time_") else ""), row[name])
-            for name in SHOWN
-        ]
-        lines.append([Cell(row["scene"]), *cells, Cell(row["error"] or row["status"])])
     head = ["scene", *settings, "role", "front", *(name.replace("_", " ") for name in SHOWN), "status"]
+    lines = [
+        [
+            *(
+                Cell(str(text))
+                for text in (row["scene"], *(row["settings"].get(key, "") for key in settings))
+            ),
+            Cell(row["role"]),
+            Cell("yes" if row["front"] else ""),
+            *(number_cell(row[name], "s" if name.startswith("time_") else "") for name in SHOWN),
+            Cell(row["error"] or row["status"]),
+        ]
+        for row in rows
+    ]
     return Table(head, lines)

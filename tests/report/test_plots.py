@@ -43,7 +43,7 @@ def test_lines_lie_where_the_numbers_at_the_axes_say():
 def test_front_labels_the_front_and_the_default_and_no_label_covers_another():
     rng = np.random.default_rng(1)
     places = np.exp(rng.normal(size=(40, 2)))
-    points = [Point(x, y, f"point {k}", "#cc6677", k == 0, k % 2 == 0) for k, (x, y) in enumerate(places)]
+    points = [Point(x, y, f"point {k}", "one", k == 0, k % 2 == 0) for k, (x, y) in enumerate(places)]
     svg = front_plot(points, ("ms", "mm"))
     labels = re.findall(r"x=\"[\d.]+\" y=\"([\d.]+)\"[^>]*>point (\d+)</text>", svg)
     heights, numbers = zip(*((float(y), int(number)) for y, number in labels))
@@ -51,7 +51,7 @@ def test_front_labels_the_front_and_the_default_and_no_label_covers_another():
     assert np.diff(sorted(heights)).min() > 11.0  # a row is 0.16 inches of 72 pixels high
     # The higher the point, the higher its label.
     assert list(np.argsort(heights)) == list(np.argsort([-points[number].y for number in numbers]))
-    assert front_plot([Point(1.0, 0.0, "exact", "#000000")], ("ms", "mm")) == ""
+    assert front_plot([Point(1.0, 0.0, "exact", "one")], ("ms", "mm")) == ""
 
 
 def test_tracks_are_the_series_of_the_run_and_times_leave_out_the_first_frame(arm_run):
