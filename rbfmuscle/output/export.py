@@ -84,7 +84,7 @@ def export_run(
                 continue
             written.append(folder / f"{run.name}{SUFFIX_OF[name]}")
             if name == "html":
-                write_animated_page(written[-1], run, [saved.caption(frame) for frame in chosen])
+                write_animated_page(written[-1], run)
             elif name == "usd":
                 write_usd(written[-1], run)
             else:

@@ -7,6 +7,7 @@ import importlib.metadata
 import os
 import platform
 from collections import Counter, defaultdict
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -87,12 +88,10 @@ class Stages:
         for name, work in frame.work.items():
             self._work[name].update({work.state: 1, "substeps": work.substeps})
         for name, times in frame.times.items():
-            surface = frame.surfaces.get(name)
-            inner = surface.quantities if surface is not None else {}
-            for source in (times, inner):
-                for key, value in source.items():
-                    if key.startswith("time_"):
-                        self._values[name][key].append(float(value))
+            inner = frame.surfaces[name].quantities if name in frame.surfaces else {}
+            for key, value in (*times.items(), *inner.items()):
+                if key.startswith("time_"):
+                    self._values[name][key].append(float(value))
 
     def neighbours(self) -> list[dict[str, Any]]:
         """Pairs of neighbours, the deepest overlap first [scene unit]."""
@@ -125,10 +124,9 @@ def versions() -> dict[str, str]:
     """Versions of Python, this library and what it computes with."""
     found = {"python": platform.python_version(), "rbfmuscle": rbfmuscle.__version__}
     for name in _PACKAGES:
-        try:
+        # Some distributions of VTK bring no metadata.
+        with suppress(importlib.metadata.PackageNotFoundError):
             found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
     return found
 
 
@@ -150,9 +148,5 @@ def input_hashes(scene: Scene) -> dict[str, Any]:
     if motion is not None:
         motion = (Path(scene.path).parent if scene.path else Path()) / motion
     sources = [scene.path, motion, *(b.source for b in scene.bones), *(m.source for m in scene.muscles)]
-    found = {}
-    for source in dict.fromkeys(str(s) for s in sources if s):
-        path = Path(source)
-        if path.is_file():
-            found[source] = hashlib.sha256(path.read_bytes()).hexdigest()
-    return found
+    paths = [Path(source) for source in dict.fromkeys(str(source) for source in sources if source)]
+    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths if path.is_file()}

@@ -14,7 +14,7 @@ from rbfmuscle.metrics.quantities import ALL, QUANTITIES
 from rbfmuscle.metrics.summary import LEAST, exceeded, excess, muscle_limit, shown_number, within
 from rbfmuscle.output.animation.moving import read_moving
 from rbfmuscle.output.animation.page import pack_runs
-from rbfmuscle.output.appearance import motion_direction, muscle_colours, muscle_groups
+from rbfmuscle.output.appearance import muscle_colours, muscle_groups
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report.page import (
     BAD,
@@ -92,14 +92,7 @@ def packed_scene(runs: Mapping[str, SavedRun]) -> str:
     first = next(iter(runs.values()))
     points = sum(len(run.surface(name, run.frames[0])[0]) for run in runs.values() for name in run.muscles)
     frames = chosen_frames(first.frames, max(2, _MOST_POINTS // max(points, 1)))
-    groups = muscle_groups(first.info)
-    return pack_runs(
-        {title: read_moving(run, frames, unit=run.units) for title, run in runs.items()},
-        [first.caption(frame) for frame in frames],
-        direction=motion_direction([first.poses[frame] for frame in frames], first.body),
-        groups=groups | dict.fromkeys(first.tendons, "tendons") if len(first.muscles) > 1 else {},
-        colours=muscle_colours(first.muscles, groups),
-    )
+    return pack_runs({title: read_moving(run, frames, unit=run.units) for title, run in runs.items()})
 
 
 def _page(saved: SavedRun) -> Page:

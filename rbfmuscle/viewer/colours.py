@@ -34,6 +34,18 @@ COLOURINGS = {
 }
 
 
+class Look(NamedTuple):
+    """What of a picture is shown, and how: colouring, hidden muscles and bones, axis and place [scene unit] of a cut.
+
+    Nothing is shown beyond the cut; ``others`` are choices that ask for a new picture too.
+    """
+
+    colour: str
+    hidden: frozenset[str]
+    cut: tuple[int, float] | None
+    others: tuple[str, ...]
+
+
 def vertex_values(
     colouring: str, name: str, picture: Picture, rest: Picture, probes: list[BoneProbe], other: Picture | None
 ) -> Floats:

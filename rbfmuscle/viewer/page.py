@@ -16,6 +16,7 @@ from rbfmuscle.output.appearance import VIEWS, view_axes
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import RBFMuscleError, SolveError
+from rbfmuscle.viewer.colours import Look
 from rbfmuscle.viewer.panel import Panel
 from rbfmuscle.viewer.server import open_server
 from rbfmuscle.viewer.side import Side
@@ -81,7 +82,8 @@ class Page:
         self.source, (self.server, self.address) = source, open_server(port)
         self._probes = [BoneProbe(n, trimesh.Trimesh(*m, process=False)) for n, m in source.bones.items()]
         self._wake, self._closed, self._resting = threading.Event(), False, False
-        self._moved, self._cost, self._message, self._shown, self._place = 0.0, 0.0, "", [], 0
+        self._moved, self._cost, self._message, self._place = 0.0, 0.0, "", 0
+        self._shown: Look | None = None
         # Software drawing takes long for shadows.
         self.server.scene.configure_default_lights(cast_shadow=False)
         self.sides = [Side(self.server, f"/{name}", source) for name in ("first", "second")]
@@ -173,9 +175,10 @@ class Page:
             side.picture = side.figure.advance(coarse=coarse)
         if waiting and not coarse:
             self._cost = time.perf_counter() - start
-        if waiting or panel.look() != self._shown:
-            self._shown = panel.look()
-            self._draw(sides)
+        look = panel.look()
+        if waiting or look != self._shown:
+            self._shown = look
+            self._draw(sides, look)
         return panel.play.value or any(side.figure.pending for side in sides)
 
     def _follow_motion(self, arrived: bool) -> None:
@@ -196,19 +199,12 @@ class Page:
                 side.figure.rest()
         return False
 
-    def _draw(self, sides: list[Side]) -> None:
-        panel, cut = self.panel, None
-        if panel.cut.value != "none":
-            axis = "xyz".index(panel.cut.value)
-            points = np.concatenate([vertices[:, axis] for vertices, _ in self.source.muscles.values()])
-            cut = axis, float(points.min() + panel.place.value * np.ptp(points))
-        hidden = {name for name, eye in panel.eyes.items() if not eye.value}
+    def _draw(self, sides: list[Side], look: Look) -> None:
         with self.server.atomic():
             for side, other in zip(sides, sides[::-1] if len(sides) > 1 else [None]):
-                beside = None if other is None else other.picture
-                side.draw(panel.colour.value, self._probes, beside, hidden, cut)
+                side.draw(look, self._probes, None if other is None else other.picture)
             self._write()
-            panel.plot_on(sides)
+            self.panel.plot_on(sides)
 
     def _write(self) -> None:
         sides = [side for side in self.sides if side.picture is not None]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.output.appearance import VIEWS
-from rbfmuscle.viewer.colours import COLOURINGS, legend
+from rbfmuscle.viewer.colours import COLOURINGS, Look, legend
 from rbfmuscle.viewer.side import Side
 from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
@@ -91,10 +91,16 @@ class Panel:
             with gui.add_folder(title, expand_by_default=False):
                 self.eyes |= {name: self._watch(gui.add_checkbox(name, True)) for name in names}
 
-    def look(self) -> list[Any]:
+    def look(self) -> Look:
         """All that decides how a picture is shown."""
-        elements = (*self.eyes.values(), *self.models, self.colour, self.cut, self.place, self.quantity)
-        return [element.value for element in elements]
+        cut = None
+        if self.cut.value != "none":
+            axis = "xyz".index(self.cut.value)
+            points = np.concatenate([vertices[:, axis] for vertices, _ in self.source.muscles.values()])
+            cut = axis, float(points.min() + self.place.value * np.ptp(points))
+        hidden = frozenset(name for name, eye in self.eyes.items() if not eye.value)
+        others = *(model.value for model in self.models), self.quantity.value
+        return Look(self.colour.value, hidden, cut, others)
 
     def move_to(self, values: dict[str, float]) -> None:
         """Set controls."""

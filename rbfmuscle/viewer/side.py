@@ -12,7 +12,7 @@ from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.metrics.penetration import BoneProbe
 from rbfmuscle.output.appearance import BONE_COLOUR, TENDON_COLOUR, linear_rgb
 from rbfmuscle.output.tubes import tendon_name
-from rbfmuscle.viewer.colours import COLOURINGS, shades, vertex_values
+from rbfmuscle.viewer.colours import COLOURINGS, Look, shades, vertex_values
 from rbfmuscle.viewer.sources import LiveSource, Mesh, Picture, SavedSource
 
 BONE_TRIANGLES = 6000  # Software drawing pays for each of them in every picture.
@@ -58,46 +58,30 @@ class Side:
         self.frame.visible = figure is not None
         return True
 
-    def draw(
-        self, colour: str, probes: list[BoneProbe], other: Picture | None, hidden: set[str],
-        cut: tuple[int, float] | None,
-    ) -> None:  # fmt: skip
-        """Show the picture.
-
-        Parameters
-        ----------
-        colour : str
-            Of `COLOURINGS`.
-        probes : list of BoneProbe
-        other : Picture or None
-            Of the model beside this one.
-        hidden : set of str
-            Muscles and bones that are not shown.
-        cut : (int, float) or None
-            Axis and place [scene unit] beyond which nothing is shown.
-        """
+    def draw(self, look: Look, probes: list[BoneProbe], other: Picture | None) -> None:
+        """Show the picture; ``other`` is that of the model beside this one."""
         from viser.transforms import SO3
 
         for name, (vertices, faces) in self._bones.items():
             pose = self.picture.poses[name]
-            _, kept = self._part((vertices @ pose[:3, :3].T + pose[:3, 3], faces), cut)
-            self._show(name, self._part((vertices, kept), None), BONE_COLOUR, visible=name not in hidden)
+            _, kept = self._part((vertices @ pose[:3, :3].T + pose[:3, 3], faces), look.cut)
+            self._show(name, self._part((vertices, kept), None), BONE_COLOUR, visible=name not in look.hidden)
             node = self._nodes[name]
             node.position = pose[:3, 3] * (0.001 / self.source.millimetre)
             node.wxyz = SO3.from_matrix(pose[:3, :3]).wxyz
-        painted, colouring = [], COLOURINGS[colour]
+        painted, colouring = [], COLOURINGS[look.colour]
         for name, mesh in self.picture.surfaces.items():
-            values = vertex_values(colour, name, self.picture, self.rest, probes, other)
+            values = vertex_values(look.colour, name, self.picture, self.rest, probes, other)
             error = 100.0 * (mesh_volume(*mesh) / self._volumes[name] - 1.0)
             depth = self.picture.depth.get(name, math.nan)
             self.numbers[name] = {"volume": error, "depth": depth, "mean": float(values.mean())}
-            part, shown = self._part(mesh, cut), name not in hidden
+            part, shown = self._part(mesh, look.cut), name not in look.hidden
             self._show(name, part, self.source.colours[name], visible=shown and colouring is None)
             if shown and colouring is not None:
                 painted.append((*part, linear_rgb(shades(colouring, values, self.source.millimetre))))
         for name, mesh in self.picture.tendons.items():
-            part = self._part(mesh, cut)
-            self._show(tendon_name(name), part, TENDON_COLOUR, visible=name not in hidden)
+            part = self._part(mesh, look.cut)
+            self._show(tendon_name(name), part, TENDON_COLOUR, visible=name not in look.hidden)
         self._paint(painted)
 
     def _part(self, mesh: Mesh, cut: tuple[int, float] | None) -> Mesh:

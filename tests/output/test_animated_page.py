@@ -40,13 +40,15 @@ def moving():
         MovingPart("calf </script><b>", "#cc6677", shapes, [faces] * 4),
         MovingPart("knee", "#cc6677", other, kinds),
     ]
-    return MovingRun("knee & calf", "mm", np.array([2, 3, 4, 7]) / 24.0, False, muscles, bones, np.eye(3))
+    times = np.array([2, 3, 4, 7]) / 24.0
+    right = np.array([-1.0, 0.0, 0.0])
+    return MovingRun("knee & calf", "mm", times, False, CAPTIONS, muscles, bones, np.eye(3), right)
 
 
 @pytest.fixture(scope="module")
 def written(moving, tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "knee.html"
-    page.write_animated_page(path, moving, CAPTIONS)
+    page.write_animated_page(path, moving)
     return path
 
 

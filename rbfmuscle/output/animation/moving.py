@@ -7,7 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.output.appearance import BONE_COLOUR, TENDON_COLOUR, muscle_colours
+from rbfmuscle.output.appearance import (
+    BONE_COLOUR,
+    TENDON_COLOUR,
+    motion_direction,
+    muscle_colours,
+    muscle_groups,
+)
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.objects import MM_PER_UNIT
 
@@ -20,7 +26,8 @@ class MovingPart:
     """The surface of a muscle or of its tendons in each frame, or a rigid bone.
 
     Vertices (n, 3) and faces (m, 3) are those of each frame, with the same array of faces where it stays; of a bone
-    there is one of each, at rest, and poses (T, 4, 4) from there to the world. ``colour`` is "#rrggbb".
+    there is one of each, at rest, and poses (T, 4, 4) from there to the world. ``colour`` is "#rrggbb"; muscles of one
+    ``group`` cross the same joints.
     """
 
     name: str
@@ -28,6 +35,7 @@ class MovingPart:
     vertices: list[Floats]
     faces: list[Integers]
     poses: Floats | None = None
+    group: str = ""
 
     @property
     def keeps_vertices(self) -> bool:
@@ -60,25 +68,33 @@ class MovingRun:
         Of the frames [s].
     timed : bool
         Whether these are the motion's own.
+    captions : list of str
+        Of each frame.
     muscles, bones : list of MovingPart
     body : (3, 3) ndarray
         Left, posterior and superior.
+    direction : (3,) ndarray
+        From which the motion is seen in its plane, along the body's axes.
     """
 
     name: str
     unit: str
     times: Floats
     timed: bool
+    captions: list[str]
     muscles: list[MovingPart]
     bones: list[MovingPart]
     body: Floats
+    direction: Floats
 
 
 def read_moving(saved: SavedRun, frames: list[int], *, unit: str) -> MovingRun:
     """Some frames of a saved run at once, lengths in ``unit``."""
     factor = MM_PER_UNIT[saved.units] / MM_PER_UNIT[unit]
-    colours = {**muscle_colours(saved.muscles), **dict.fromkeys(saved.tendons, TENDON_COLOUR)}
-    muscles, bones = [MovingPart(name, colour, [], []) for name, colour in colours.items()], []
+    groups = muscle_groups(saved.info) | dict.fromkeys(saved.tendons, "tendons")
+    colours = muscle_colours(saved.muscles, groups) | dict.fromkeys(saved.tendons, TENDON_COLOUR)
+    muscles = [MovingPart(name, colour, [], [], group=groups[name]) for name, colour in colours.items()]
+    bones = []
     for muscle in muscles:
         for frame in frames:
             points, faces = saved.surface(muscle.name, frame)
@@ -93,4 +109,6 @@ def read_moving(saved: SavedRun, frames: list[int], *, unit: str) -> MovingRun:
     times = saved.times or {frame: frame / FRAMES_A_SECOND for frame in frames}
     name = str(saved.info["scene"].get("name") or saved.directory.name)
     at = np.array([times[frame] for frame in frames], dtype=float)
-    return MovingRun(name, unit, at, bool(saved.times), muscles, bones, saved.body)
+    captions = [saved.caption(frame) for frame in frames]
+    direction = motion_direction([saved.poses[frame] for frame in frames], saved.body)
+    return MovingRun(name, unit, at, bool(saved.times), captions, muscles, bones, saved.body, direction)

@@ -35,23 +35,13 @@ html,body{{margin:0;height:100%;font:15px/1.4 system-ui,"Segoe UI",Helvetica,Ari
 """
 
 
-def write_animated_page(
-    path: Path, run: MovingRun, captions: list[str], direction: Floats | None = None
-) -> None:
-    """Write a run as one ``.html`` file that needs nothing else.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-    run : MovingRun
-    captions : list of str
-        Of each frame.
-    direction : (3,) ndarray, optional
-        From which it is first seen, along the body's axes.
-    """
-    data = pack_runs({"": run}, captions, direction=direction)
+def write_animated_page(path: Path, run: MovingRun) -> None:
+    """Write a run as one ``.html`` file that needs nothing else."""
     page = _PAGE.format(
-        title=html.escape(run.name), data=data, script=scene_file("scene.js"), style=scene_file("scene.css")
+        title=html.escape(run.name),
+        data=pack_runs({"": run}),
+        script=scene_file("scene.js"),
+        style=scene_file("scene.css"),
     )
     path.write_text(page, encoding="utf-8")
 
@@ -61,42 +51,22 @@ def scene_file(name: str) -> str:
     return (resources.files("rbfmuscle.output.animation") / name).read_text(encoding="utf-8")
 
 
-def pack_runs(
-    runs: Mapping[str, MovingRun],
-    captions: list[str],
-    *,
-    direction: Floats | None = None,
-    groups: Mapping[str, str] | None = None,
-    colours: Mapping[str, str] | None = None,
-) -> str:
+def pack_runs(runs: Mapping[str, MovingRun]) -> str:
     """JSON of one or several runs of the same frames and bones, which ``scene.js`` shows beside each other.
 
     Parameters
     ----------
     runs : dict of str to MovingRun
-        By what stands above each.
-    captions : list of str
-        Of each frame.
-    direction : (3,) ndarray, optional
-        From which they are first seen, along the body's axes.
-    groups, colours : dict of str to str, optional
-        Of each muscle; the colours of the runs where not given.
+        By what stands above each. They are first seen in the plane of the motion.
     """
     first = next(iter(runs.values()))
     packer = _Packer(runs)
-    parts: list[dict[str, Any]] = []
-    for panel, run in enumerate(runs.values()):
-        for muscle in run.muscles:
-            colour, group = ((table or {}).get(muscle.name) for table in (colours, groups))
-            parts.append(packer.part(muscle, panel) | {"group": group or ""})
-            parts[-1]["colour"] = colour or muscle.colour
-    for bone in first.bones:
-        poses = bone.poses[: None if bone.turns else 1, :3].round(6)
-        parts.append(packer.part(bone, -1) | {"poses": poses.reshape(len(poses), 12).tolist()})
+    parts = [packer.part(muscle, k) for k, run in enumerate(runs.values()) for muscle in run.muscles]
+    parts += [packer.part(bone, -1) for bone in first.bones]
     facts = {
-        "panels": list(runs), "captions": captions, "parts": parts, "step": packer.step,
+        "panels": list(runs), "captions": first.captions, "parts": parts, "step": packer.step,
         "views": VIEWS, "body": first.body.tolist(),
-        "direction": [float(x) for x in (VIEWS["right"] if direction is None else direction)],
+        "direction": first.direction.tolist(),
         "origin": packer.origin.tolist(), "rate": FRAMES_A_SECOND / 2.0, "bytes": packer.text(),
     }  # fmt: skip
     # No name may end the script that holds it.
@@ -121,7 +91,12 @@ class _Packer:
         for _, group in groupby(range(len(part.faces)), key=lambda k: id(part.faces[k])):
             frames = list(group)
             pieces.append(self._piece([part.vertices[k] for k in frames], part.faces[frames[0]]))
-        return {"name": part.name, "panel": panel, "pieces": pieces, "colour": part.colour}
+        entry: dict[str, Any] = {"name": part.name, "panel": panel, "pieces": pieces}
+        entry |= {"colour": part.colour, "group": part.group}
+        if part.poses is not None:
+            poses = part.poses[: None if part.turns else 1, :3].round(6)
+            entry["poses"] = poses.reshape(len(poses), 12).tolist()
+        return entry
 
     def _piece(self, frames: list[Floats], faces: Integers) -> dict[str, int]:
         """Take in the points of some frames and their triangles; how many there are of each."""

@@ -26,12 +26,7 @@ def check_usd() -> None:
 
 
 def write_usd(path: Path, run: MovingRun) -> None:
-    """Write a run as one ``.usdc`` file.
-
-    Raises
-    ------
-    MissingPartError
-        Where usd-core is absent.
+    """Write a run as one ``.usdc`` file; usd-core must be there (`check_usd`).
 
     Notes
     -----
@@ -39,7 +34,6 @@ def write_usd(path: Path, run: MovingRun) -> None:
     time; another one has both at every time. Lengths stay in the run's unit, named by ``metersPerUnit``;
     the root brings superior to z.
     """
-    check_usd()
     from pxr import Gf, Usd, UsdGeom
 
     codes = (run.times * FRAMES_A_SECOND).tolist()
