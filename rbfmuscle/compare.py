@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rbfmuscle.experiments.comparison import (
-    ModelProbe,
     add_distances,
     chosen_poses,
     measure_run,
     write_tables,
 )
-from rbfmuscle.models import COMPARED, build_models, check_model_name, configure_scene
+from rbfmuscle.models import COMPARED, build_models, check_model_name, configure_scene, model_title
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.writer import check_writable
 from rbfmuscle.progress import stage
@@ -32,9 +31,6 @@ if TYPE_CHECKING:
 
 # The motion is repeated with steps this many times as long.
 COARSER = 5
-_CONVERGED = "-converged"
-NAMES = {"rbf": "RBF", "pbd": "PBD", "pbd-paper": "PBD of the paper", "xpbd": "XPBD"}
-_PAPER_SWEEPS = 3
 
 
 def compare_models(
@@ -99,7 +95,7 @@ def compare_models(
         raise SolveError("; ".join(f"{name}: {reason}" for name, reason in failed.items()))
     with stage("distances between models"):
         matrix = add_distances(results, folder, poses)
-    labels = {name: _label(name, variant) for name, variant in variants.items()}
+    labels = {name: model_title(variant.muscles[0]) for name, variant in variants.items()}
     first = next(iter(variants.values()))
     table = write_tables(folder, first, results, failed, labels=labels, matrix=matrix, poses=poses)
 
@@ -108,17 +104,6 @@ def compare_models(
     with stage("drawing pictures" if pictures else "writing the report"):
         write_page(folder, table, pictures=pictures)
     return table
-
-
-def _label(name: str, scene: Scene) -> str:
-    """What a model is called, from the settings that it ran with."""
-    base = name.removesuffix(_CONVERGED)
-    title, sweeps = NAMES.get(base, base), scene.muscles[0].options.get("iterations", 0)
-    if name != base:
-        return f"{title}, converged"
-    if base == "pbd" and sweeps in (0, _PAPER_SWEEPS):
-        return f"{title}, {_PAPER_SWEEPS} sweeps as in the paper"
-    return f"{title}, {sweeps} sweeps" if sweeps and base != "rbf" else title
 
 
 def _variants(scene, models, settings):
@@ -144,15 +129,14 @@ def _variants(scene, models, settings):
 
 
 def _measure(name, scene, folder, progress):
-    """One model: warm up, run and watch, then there and back by coarser steps."""
+    """One model: warm up, run, then there and back by coarser steps."""
     _surfaces(scene, scene.motion.frames[:2])
-    probe = ModelProbe(scene)
     report = None if progress is None else (lambda done, total: progress(name, done, total))
-    stream_run(scene, folder, pictures=False, progress=report, watch=probe)
+    stream_run(scene, folder, pictures=False, progress=report)
     with stage(f"{name}: there and back by coarser steps"):
         again = _there_and_back(scene)
     with stage(f"{name}: measuring"):
-        return measure_run(SavedRun(folder), probe, again)
+        return measure_run(SavedRun(folder), again)
 
 
 def _there_and_back(scene):

@@ -24,7 +24,7 @@ class _Home(NamedTuple):
 _RBF = "rbfmuscle.muscle", "RBFMuscle", "RBFOptions"
 _PBD = "pbd_baseline", "PBDMuscle", "PBDOptions"
 # Sweeps of the converged mesh models go on until none moves a vertex by more than this share of the muscle's size.
-CONVERGED = 5e-6
+CONVERGED, _SUFFIX = 5e-6, "-converged"
 _HOME = {
     "rbf": _Home(*_RBF, {}),
     **{
@@ -32,7 +32,7 @@ _HOME = {
         for name in ("pbd", "pbd-paper", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
     },
     **{
-        f"{name}-converged": _Home(*_PBD, {"method": name, "tolerance": CONVERGED})
+        f"{name}{_SUFFIX}": _Home(*_PBD, {"method": name, "tolerance": CONVERGED})
         for name in ("pbd", "xpbd", "arap-pbd", "arap-volume")
     },
 }
@@ -40,6 +40,20 @@ _HOME = {
 MODEL_NAMES = tuple(_HOME)
 # The default of `compare`: all but the historical model, and PBD converged.
 COMPARED = ("rbf", "pbd", "pbd-converged", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
+# What models are called where it is not their name.
+_TITLES = {"rbf": "RBF", "pbd": "PBD", "pbd-paper": "PBD of the paper", "xpbd": "XPBD"}
+_PAPER_SWEEPS = 3
+
+
+def model_title(muscle: Muscle) -> str:
+    """What the model of a muscle is called in tables and pictures, with its sweeps where they are its own."""
+    base = muscle.model.removesuffix(_SUFFIX)
+    title, sweeps = _TITLES.get(base, base), muscle.options.get("iterations", 0)
+    if base != muscle.model:
+        return f"{title}, converged"
+    if base == "pbd" and sweeps in (0, _PAPER_SWEEPS):
+        return f"{title}, {_PAPER_SWEEPS} sweeps as in the paper"
+    return f"{title}, {sweeps} sweeps" if sweeps and base != "rbf" else title
 
 
 def build_model(muscle: Muscle, scene: Scene, name: str | None = None) -> MuscleModel:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, suppress
 from datetime import UTC, datetime
 
@@ -13,6 +13,7 @@ import numba
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.importers.guess.orientation import orient_scene
 from rbfmuscle.metrics.joint_gaps import joint_gaps
+from rbfmuscle.metrics.metrics import Values
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.rows import frame_rows, moment_arm_rows
 from rbfmuscle.metrics.summary import LIMITS, Summary, default_limit, describe_verdict, exceeded
@@ -38,8 +39,6 @@ class Recording:
         As it shall be run.
     options : dict, optional
         What the caller asked for, for ``run.json``.
-    models_here : bool
-        Build the models in this process, for who wants to watch them, however many they are.
     fields : mapping of str to BoneField, optional
         Of the bones, by name, in place of `BoneSDF`; all muscles are then in this process.
     """
@@ -49,7 +48,6 @@ class Recording:
         scene: Scene,
         *,
         options: dict | None = None,
-        models_here: bool = True,
         fields: Mapping[str, BoneField] | None = None,
     ) -> None:
         self.started, self._start = datetime.now(UTC), time.perf_counter()
@@ -62,8 +60,7 @@ class Recording:
         self._path: dict[int, dict[str, float]] = {}
         self._place = {muscle.name: k for k, muscle in enumerate(scene.muscles)}
         with self.timed("build"), stage("building"):
-            alone = models_here or fields is not None
-            helpers = 0 if alone else helpers_for(scene, numba.get_num_threads())
+            helpers = 0 if fields is not None else helpers_for(scene, numba.get_num_threads())
             self.share, self._skeleton = self._build(helpers, fields)
 
     def _build(self, helpers, fields):
@@ -89,25 +86,17 @@ class Recording:
         """Context whose time is added to one entry of ``times`` [s]."""
         return timed(self.times, part)
 
-    def feed(
-        self,
-        sink: Sink,
-        *,
-        progress: Callable[[int, int], None] | None = None,
-        watch: Callable[[list, Frame | None], None] | None = None,
-    ) -> None:
+    def feed(self, sink: Sink, *, progress: Callable[[int, int], None] | None = None) -> None:
         """Run the whole motion into a sink, which is closed whatever ends it."""
         self.status, self.message = "interrupted", "interrupted"
         try:
             sink.write_info(self.info("running"))
-            if watch is not None:
-                watch(self.share.models, None)
-            for frame, rows in self.frames():
-                if watch is not None:
-                    watch(self.share.models, frame)
+            for frame, measured in self.share.frames():
+                rows = self._take(frame, measured)
                 with self.timed("write"):
                     sink.write(frame, rows)
-                    self.written.append(frame_facts(self.scene, frame))
+                self._path[frame.index] = dict(frame.coordinates)
+                self.written.append(frame_facts(self.scene, frame))
                 if progress is not None:
                     progress(len(self.written), len(self.scene.motion))
             self.status, self.message = "complete", ""
@@ -116,7 +105,7 @@ class Recording:
             raise
         finally:
             self.close()
-            rows = self._moment_arms()
+            rows = moment_arm_rows(self.scene, self._path, self.summary.series("length"))
             self.summary.add(rows)
             # What ended the run says more than a disk that then refuses the rest.
             with suppress(*((SolveError,) if self.status == "failed" else ())):
@@ -127,25 +116,17 @@ class Recording:
         """End what helps; nothing more can be solved."""
         self.share.close()
 
-    def frames(self) -> Iterator[tuple[Frame, list[Row]]]:
-        """The frames as they are solved, each with the rows of metrics that became complete with it."""
-        for frame, measured in self.share.frames():
-            # By muscle, whoever solved it.
-            frame.events.sort(key=lambda event: self._place[event.muscle])
-            events, together = self._skeleton.get(frame.index, ([], {}))
-            frame.events.extend(events)
-            self.stages.add(frame)
-            before = next(reversed(self._path.values()), None)
-            rows = frame_rows(self.scene, frame, before, {**measured, ALL: together})
-            self.summary.add(rows)
-            self._path[frame.index] = dict(frame.coordinates)
-            yield frame, rows
-
-    def _moment_arms(self) -> list[Row]:
-        """Rows of the frames that were written."""
-        kept = {entry["frame"] for entry in self.written}
-        path = {index: coordinates for index, coordinates in self._path.items() if index in kept}
-        return moment_arm_rows(self.scene, path, self.summary.series("length"))
+    def _take(self, frame: Frame, measured: Mapping[str, Values]) -> list[Row]:
+        """Complete the events of a frame; the rows of metrics that became complete with it."""
+        # By muscle, whoever solved it.
+        frame.events.sort(key=lambda event: self._place[event.muscle])
+        events, together = self._skeleton.get(frame.index, ([], {}))
+        frame.events.extend(events)
+        self.stages.add(frame)
+        before = next(reversed(self._path.values()), None)
+        rows = frame_rows(self.scene, frame, before, {**measured, ALL: together})
+        self.summary.add(rows)
+        return rows
 
     def _spent(self):
         """Wall time of all parts so far [s]."""

@@ -29,7 +29,7 @@ from rbfmuscle.progress import Progress, stage
 from rbfmuscle.recording import Recording
 from rbfmuscle.scene.phantom import open_scene
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.simulation.frame import Event, Frame, MuscleModel
+from rbfmuscle.simulation.frame import Event, Frame
 from rbfmuscle.validation import MissingPartError, SolveError, UsageError, did_you_mean
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def simulate(
         bones = ", ".join(bone.name for bone in scene.bones)
         raise UsageError(f"fields must name each bone ({bones}), got {', '.join(fields) or 'none'}")
     options = _options(model, settings, frames)
-    recording, memory = Recording(scene, options=options, models_here=False, fields=fields), MemorySink()
+    recording, memory = Recording(scene, options=options, fields=fields), MemorySink()
     run = Run(memory.frames, memory.rows, recording=recording, memory=memory)
     try:
         recording.feed(memory, progress=progress or None)
@@ -116,7 +116,6 @@ def stream_run(
     fail_on: str | Sequence[str] | dict[str, float] | None = None,
     pictures: bool = True,
     progress: Callable[[int, int], None] | None = None,
-    watch: Callable[[list[MuscleModel], Frame | None], None] | None = None,
 ) -> dict[str, Any]:
     """Run a scene and write it to a folder frame by frame; memory does not grow with the frames.
 
@@ -131,8 +130,6 @@ def stream_run(
         Limits, see `rbfmuscle.metrics.summary.parse_limits`.
     pictures : bool
         Draw pictures for the report and the preview.
-    watch : callable, optional
-        Called as ``watch(models, None)`` before the motion and ``watch(models, frame)`` with every frame.
 
     Returns
     -------
@@ -151,10 +148,10 @@ def stream_run(
     scene = configure_scene(scene, settings, model=model, frames=frames)
     limits = parse_limits(fail_on, scene)
     check_writable(directory)
-    recording = Recording(scene, options=_options(model, settings, frames), models_here=watch is not None)
+    recording = Recording(scene, options=_options(model, settings, frames))
     with closing(recording):
         writer = RunWriter(directory, scene)
-        recording.feed(writer, progress=progress, watch=watch)
+        recording.feed(writer, progress=progress)
     return _finish(recording, writer, limits, pictures)
 
 

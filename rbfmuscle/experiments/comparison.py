@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from rbfmuscle.metrics.comparison_measures import MaterialProbe
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.metrics.quantities import ALL, unit_text
 from rbfmuscle.output.runinfo import machine, versions
@@ -19,18 +18,10 @@ from rbfmuscle.scene.objects import MM_PER_UNIT
 
 if TYPE_CHECKING:
     from rbfmuscle.scene.scene import Scene
-    from rbfmuscle.simulation.frame import Frame, MuscleModel
 
 
-FORMAT = 2
-LAW, MESH, OWN, FIRST, COST = "law", "input mesh", "own run", "first model", "cost"
-AGAINST = {
-    LAW: "a law",
-    MESH: "the input mesh",
-    OWN: "the run itself",
-    FIRST: "the first model",
-    COST: "what it costs",
-}
+FORMAT = 3
+LAW, MESH, FIRST, COST = "law", "input mesh", "first model", "cost"
 # A model keeps out of bones that is no deeper in one [mm].
 KEPT_OUT = 0.3
 
@@ -70,7 +61,6 @@ MEASURES = {
     "step_max": Measure("step dependence (greatest)", "length", LAW, 0.1, "the same, greatest distance"),
     "rest_error_rms": Measure("rest error (RMS)", "length", MESH, 0.02, "surface to input mesh at rest"),
     "rest_error_max": Measure("rest error (greatest)", "length", MESH, 0.1, "the same, greatest distance"),
-    "strain_rms": Measure("strain", "1", OWN, 0.002, "edges between the same 1200 points of the material"),
     "distance_rms": Measure(
         "distance (RMS)", "length", FIRST, 0.0, "to the first model's surface, worst pose"
     ),
@@ -88,49 +78,18 @@ _SUMMED = ("time_solve", "time_surface")
 _TIE = 1.05
 
 
-class ModelProbe:
-    """Measures one model during its run, beside the metrics; given to `stream_run` as ``watch``.
-
-    Parameters
-    ----------
-    scene : Scene
-    """
-
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
-        self.found = {muscle.name: {} for muscle in scene.muscles}
-        self._material = {}
-
-    def __call__(self, models: list[MuscleModel], frame: Frame | None) -> None:
-        """Take what is kept of a frame; the rest states where ``frame`` is None."""
-        if frame is None:
-            for model in models:
-                vertices, faces = model.material_mesh()
-                probe = MaterialProbe(self.scene.muscle(model.name).mesh, vertices, faces)
-                self._material[model.name] = probe, probe.points(vertices)
-            return
-        for name, (probe, start) in self._material.items():
-            self._worst(name, "strain_rms", probe.strain(probe.points(frame.carried[name][0]), start))
-
-    def _worst(self, muscle, quantity, value):
-        known = self.found[muscle]
-        known[quantity] = max(known.get(quantity, 0.0), value)
-
-
 def chosen_poses(scene: Scene) -> list[int]:
     """First, middle and last frame of the motion, each once."""
     last = len(scene.motion) - 1
     return sorted({0, last // 2, last})
 
 
-def measure_run(saved: SavedRun, probe: ModelProbe, extra: dict[str, Any]) -> dict[str, Any]:
+def measure_run(saved: SavedRun, extra: dict[str, Any]) -> dict[str, Any]:
     """Values of every measure but the distances for one model.
 
     Parameters
     ----------
     saved : SavedRun
-    probe : ModelProbe
-        Which has watched the run.
     extra : dict
         ``build`` [s], and where the motion has more than one frame ``turn`` and ``end``: surfaces by muscle
         (vertices, faces) at the last pose and back at the first, by coarser steps.
@@ -144,7 +103,6 @@ def measure_run(saved: SavedRun, probe: ModelProbe, extra: dict[str, Any]) -> di
     for muscle in saved.muscles:
         facts = saved.info["muscles"].get(muscle, {})
         values = {q: facts[q]["worst"] for q in _FROM_METRICS if q in facts}
-        values.update(probe.found[muscle])
         values.update(_times(saved, muscle))
         for name, frame, part in (("return", 0, "end"), ("step", -1, "turn")):
             if part in extra:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rbfmuscle.experiments.comparison import AGAINST, MEASURES, best_models
+from rbfmuscle.experiments.comparison import MEASURES, best_models
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.quantities import ALL
 from rbfmuscle.metrics.summary import shown_number
@@ -37,10 +37,10 @@ LIGHTS = ("volume_error", "penetration_max", "bone_penetration_max", "return_rms
 Series = tuple[Integers, Floats]
 # Pixels of a picture of one model, and of all together.
 _AREA, _WHOLE = 90_000, 400_000
-_READING = """All models ran through the same frames and sub-steps, one after another in one process with the same
-bone fields and number of threads, each after a warm-up. The time per frame is the wall time of prediction, solution,
-contacts and surface of all muscles; solution and surface are sums over muscles, which run side by side, and may exceed
-it. The distance to the first model is no error: it says how far models differ."""
+_READING = """All models ran through the same frames and sub-steps, one after another with the same bone fields and
+number of threads, each after a warm-up. The time per frame is the wall time of prediction, solution, contacts and
+surface of all muscles; solution and surface are sums over muscles, which run side by side, and may exceed it. The
+distance to the first model is no error: it says how far models differ."""
 
 
 def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) -> None:
@@ -124,8 +124,6 @@ def shown(found: dict[str, Any], quantity: str, value: float | None) -> str:
     measure, unit = MEASURES[quantity], found["measures"][quantity]["unit"]
     if value is not None and unit == "mm" and abs(value) < 0.5 * measure.floor:
         value = 0.0
-    if quantity == "strain_rms" and value is not None:
-        return f"{100 * value:.2g} %"
     return shown_number(value, unit)
 
 
@@ -141,7 +139,7 @@ def _measures(found: dict[str, Any]) -> Table:
             Cell(shown(found, quantity, value), value, GOOD if name in good else PLAIN)
             for name, value in zip(found["models"], values)
         ]
-        rows.append([Cell(measure.title), Cell(AGAINST[measure.against]), *cells])
+        rows.append([Cell(measure.title), Cell(measure.against), *cells])
     return Table(["", "against", *(found["labels"][name] for name in found["models"])], rows)
 
 
