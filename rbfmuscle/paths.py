@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.importers.opensim.fitted import MOST_COORDINATES, fit_path, write_paths
-from rbfmuscle.metrics.centreline import Centreline, MuscleAtRest
+from rbfmuscle.metrics.centreline import Centreline
 from rbfmuscle.models import build_models
 from rbfmuscle.scene.joints.skeleton import all_coordinates
 from rbfmuscle.scene.joints.tables import full_name
@@ -112,10 +112,7 @@ def _measured(scene, poses):
     scene.motion = Motion(poses[:40])  # what bones a muscle may meet is sought along it
     models = build_models(scene)
     rest = [model.snapshot() for model in models]
-    lines = {
-        m.name: Centreline(MuscleAtRest(scene.muscle(m.name), scene.joints, *m.material_mesh()))
-        for m in models
-    }
+    lines = {m.name: Centreline(scene.muscle(m.name), scene.joints, *m.material_mesh()) for m in models}
     fields = build_fields(scene, find_contact_pairs(scene))
     for pose in poses:
         for model, state in zip(models, rest):

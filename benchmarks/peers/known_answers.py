@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.metrics.centreline import Centreline, MuscleAtRest
+from rbfmuscle.metrics.centreline import Centreline
 
 # Points of a centreline: their chords fall short of an arc of 90 degrees by 0.01 %.
 SLICES = 64
@@ -66,7 +66,7 @@ def centreline(muscle, scene, rest, carried, poses):
         A model's material surface at rest and now.
     poses : dict of str to (4, 4) ndarray
     """
-    return Centreline(MuscleAtRest(muscle, scene.joints, *rest), slices=SLICES).points(carried[0], poses)
+    return Centreline(muscle, scene.joints, *rest, slices=SLICES).points(carried[0], poses)
 
 
 def path_length(points):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sparse
@@ -16,29 +16,15 @@ from rbfmuscle.scene.joints.skeleton import all_coordinates
 from rbfmuscle.scene.taut_line import line_length
 from rbfmuscle.scene.tendons import TendonLine
 
-_FINE, _SLICES = 120, 16
+if TYPE_CHECKING:
+    from rbfmuscle.scene.joints.joint import Joint
+    from rbfmuscle.scene.objects import Attachment, Muscle
+    from rbfmuscle.scene.scene import Scene
 
+_LEVELS = 120  # by which the line is measured at rest
 
-class MuscleAtRest(NamedTuple):
-    """What measures that follow a muscle are bound to.
-
-    Attributes
-    ----------
-    muscle : Muscle
-        Input mesh and attachments.
-    joints : list of Joint
-        Bones that no joint separates count as one.
-    vertices, faces : (n, 3) and (m, 3) ndarray
-        The model's carried mesh at rest [scene unit].
-    moving : collection of str, optional
-        Names of the joints that move; all where not given.
-    """
-
-    muscle: Any
-    joints: list[Any]
-    vertices: Floats
-    faces: Integers
-    moving: Collection[str] | None = None
+# Of origin or insertion each attachment: its bone or tendon, attached vertices (k, 3) at rest, the areas (k,) of these.
+End = list[tuple[str, Floats, Floats]]
 
 
 class Centreline:
@@ -51,17 +37,32 @@ class Centreline:
 
     Parameters
     ----------
-    rest : MuscleAtRest
+    muscle : Muscle
+        Input mesh and attachments.
+    joints : list of Joint
+        Bones that no joint separates count as one.
+    vertices, faces : (n, 3) and (m, 3) ndarray
+        The model's carried mesh at rest [scene unit].
+    moving : collection of str, optional
+        Names of the joints that move; all where not given.
     slices : int
         Points of the line between its ends.
     """
 
-    def __init__(self, rest: MuscleAtRest, *, slices: int = _SLICES) -> None:
-        vertices, faces = rest.vertices, rest.faces
-        self.ends = end_groups(rest.muscle, rest.joints, rest.moving)
-        sides = _sides(rest.muscle, self.ends, vertices)
+    def __init__(
+        self,
+        muscle: Muscle,
+        joints: Sequence[Joint],
+        vertices: Floats,
+        faces: Integers,
+        *,
+        moving: Collection[str] | None = None,
+        slices: int = 16,
+    ) -> None:
+        self.ends = end_groups(muscle, joints, moving)
+        sides = _sides(muscle, self.ends, vertices)
         field = harmonic_weights(vertices, faces, sides)[:, 1]
-        levels = np.linspace(0.0, 1.0, _FINE + 2)[1:-1]
+        levels = np.linspace(0.0, 1.0, _LEVELS + 2)[1:-1]
         fine = slice_operator(vertices, faces, field, levels)
         along = distance_along(fine @ vertices)
         even = np.interp(np.linspace(0.0, along[-1], slices), along, levels)
@@ -109,9 +110,7 @@ def resampled(line: Floats, segments: int) -> Floats:
     return np.stack([np.interp(even, along, column) for column in line.T], axis=1)
 
 
-def end_groups(
-    muscle: Any, joints: list[Any], moving: Collection[str] | None = None
-) -> list[list[tuple[Any, ...]]]:
+def end_groups(muscle: Muscle, joints: Sequence[Joint], moving: Collection[str] | None = None) -> list[End]:
     """Split the attachments into origin and insertion.
 
     The origin is every attachment on the same rigid body as the first one; the rest is the insertion. Bones whose
@@ -131,7 +130,9 @@ def end_groups(
     ]
 
 
-def split_ends(muscle: Any, joints: list[Any], moving: Collection[str] | None = None) -> list[Any]:
+def split_ends(
+    muscle: Muscle, joints: Sequence[Joint], moving: Collection[str] | None = None
+) -> list[list[Attachment]]:
     """The attachments of the origin and those of the insertion, as `end_groups` has them."""
     joint_of = {joint.child: joint for joint in joints}
 
@@ -150,7 +151,7 @@ def split_ends(muscle: Any, joints: list[Any], moving: Collection[str] | None = 
     return [muscle.attachments[:1], muscle.attachments[1:]]
 
 
-def moving_joints(scene: Any) -> set[str]:
+def moving_joints(scene: Scene) -> set[str]:
     """Names of the joints that a scene's motion moves, those that follow others among them."""
     facts = all_coordinates(scene.joints)
     names = {
@@ -162,7 +163,7 @@ def moving_joints(scene: Any) -> set[str]:
     return {name.rpartition(".")[0] for name in names}
 
 
-def slice_operator(vertices: Floats, faces: Integers, field: Floats, levels: Floats) -> Any:
+def slice_operator(vertices: Floats, faces: Integers, field: Floats, levels: Floats) -> sparse.csr_matrix:
     """Sparse matrix that maps vertices to the centroids of the field's isolines.
 
     Parameters
@@ -210,25 +211,15 @@ def isolines(
 def _crossed_edges(faces, field, levels):
     """Of each face that an isoline crosses: the corner alone on its side, the others, shares of both edges, level."""
     at_corner = field[faces]
-    face, row = _crossings(at_corner, levels)
+    # Levels not below a face's least value and below its greatest.
+    low, high = at_corner.min(axis=1)[:, None], at_corner.max(axis=1)[:, None]
+    face, row = np.nonzero((low <= levels) & (levels < high))
     level = levels[row]
     crossed, above = faces[face], at_corner[face] > level[:, None]
     lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
     each = np.arange(len(crossed))
     a, b, c = (crossed[each, (lone + k) % 3] for k in range(3))
     return (a, b, c), [(level - field[a]) / (field[k] - field[a]) for k in (b, c)], row
-
-
-def _crossings(at_corner, levels):
-    """Face and level of every isoline in every face: levels not below a face's least value and below its greatest."""
-    order = np.argsort(levels, kind="stable")
-    first, last = (
-        np.searchsorted(levels[order], end) for end in (at_corner.min(axis=1), at_corner.max(axis=1))
-    )
-    count = last - first
-    face = np.repeat(np.arange(len(at_corner)), count)
-    place = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count) + first[face]
-    return face, order[place]
 
 
 def _sides(muscle, ends, vertices):
@@ -245,7 +236,7 @@ def _sides(muscle, ends, vertices):
     return [np.setdiff1d(sides[0], sides[1]), sides[1]]
 
 
-def carried_middle(end: list[tuple[Any, ...]], poses: Mapping[str, Floats]) -> Any:
+def carried_middle(end: End, poses: Mapping[str, Floats]) -> Floats:
     """Middle (3,) of an end's patches where its bones (their poses (4, 4)) carry them."""
     total = sum(areas.sum() for _, _, areas in end)
     moved = [

@@ -10,16 +10,14 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.jit import compiled
+from rbfmuscle.metrics.belly import belly_measures
 from rbfmuscle.metrics.centreline import (
     Centreline,
-    MuscleAtRest,
     carried_middle,
     distance_along,
     moving_joints,
     resampled,
 )
-from rbfmuscle.metrics.contraction import ContractionStudy, belly_measures
 from rbfmuscle.metrics.geodesic import NODES, shortest_path
 from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.metrics.penetration import BoneProbe, bone_depth, surface_depth
@@ -81,11 +79,14 @@ class _Tracker:
     def __init__(self, muscle: Any, scene: Any, vertices: Floats, faces: Integers) -> None:
         self.name, self.mesh, self.attachments = muscle.name, muscle.mesh, muscle.attachments
         self.rest_volume = float(muscle.mesh.volume)
-        self.edges = unique_edges(faces)
-        self.rest_lengths = edge_lengths(vertices, self.edges)
-        rest = MuscleAtRest(muscle, scene.joints, vertices, faces, moving_joints(scene))
-        self.line = Centreline(rest) if len(muscle.attachments) > 1 else None
-        self.contraction = ContractionStudy(rest) if muscle.contraction is not None else None
+        edges = unique_edges(faces)
+        lengths = edge_lengths(vertices, edges)
+        self.edges, self.rest_lengths = edges[lengths > 0.0], lengths[lengths > 0.0]
+        self.contracts = muscle.contraction is not None
+        moving = moving_joints(scene)
+        self.line = None
+        if len(muscle.attachments) > 1:
+            self.line = Centreline(muscle, scene.joints, vertices, faces, moving=moving)
         self.form = SurfaceForm()
         self.rest_measured = False
         # Of the last surface.
@@ -119,11 +120,12 @@ class _Tracker:
                 self.rest_measured = True
         mine = [event for event in frame.events if event.muscle == self.name]
         found["tunnelled"] = sum(event.count for event in mine if event.action in _THROUGH)
-        found["edge_strain_rms"] = edge_strain(carried, self.edges, self.rest_lengths)
+        found["edge_strain_rms"] = self._edge_strain(carried)
         found.update(self._of_line(carried, probes, frame))
-        if self.contraction is not None:
+        if self.contracts:
             found["activation"] = frame.activations[self.name]
-            found.update(self.contraction.measure(carried, frame.poses, surface))
+            if surface is not None and self.line is not None:
+                found.update(self._section(surface.vertices, surface.faces, frame.poses))
         times = frame.times.get(self.name, {})
         if times:
             found["time_solve"] = times.get("time_predict", 0.0) + times.get("time_solve", 0.0)
@@ -157,6 +159,12 @@ class _Tracker:
         before, self.offset = self.offset, self.distance.signed(carried, near=self.near)
         return {"flicker": np.abs(self.offset - before).max() if before is not None else 0.0}
 
+    def _edge_strain(self, carried):
+        """Root mean square of the relative change of edge lengths."""
+        apart = carried[self.edges[:, 0]] - carried[self.edges[:, 1]]
+        stretch = np.sqrt(np.einsum("ij,ij->i", apart, apart)) / self.rest_lengths
+        return math.sqrt(np.mean((stretch - 1.0) ** 2))
+
     def _at_rest(self, surface, probes, poses):
         """What is measured once, in the first frame in which all bones are at rest."""
         mesh = self.mesh.vertices, self.mesh.faces
@@ -166,29 +174,13 @@ class _Tracker:
         gaps = [bones[a.bone].unsigned(mesh[0][a.vertices]).min() for a in held]
         found = {"rest_error_rms": rms, "rest_error_max": worst, "end_gap": max(gaps, default=0.0)}
         if self.line is not None:
-            first, last = (carried_middle(end, poses) for end in self.line.ends)
-            found["thickness"] = belly_measures(*map(np.asarray, mesh), first, last)["belly_thickness"]
+            found["thickness"] = self._section(*mesh, poses)["belly_thickness"]
         return found
 
-
-def edge_strain(vertices: Floats, edges: Integers, rest_lengths: Floats) -> float:
-    """Root mean square of the relative change of edge lengths."""
-    return math.sqrt(_strain_loop(vertices, edges, rest_lengths))
-
-
-@compiled
-def _strain_loop(vertices, edges, rest_lengths):
-    """Mean square over the edges that have a length at rest."""
-    total, count = 0.0, 0
-    for e in range(len(edges)):
-        a, b = edges[e, 0], edges[e, 1]
-        x = vertices[a, 0] - vertices[b, 0]
-        y = vertices[a, 1] - vertices[b, 1]
-        z = vertices[a, 2] - vertices[b, 2]
-        if rest_lengths[e] > 0.0:
-            total += (np.sqrt(x * x + y * y + z * z) / rest_lengths[e] - 1.0) ** 2
-            count += 1
-    return total / max(count, 1)
+    def _section(self, vertices, faces, poses):
+        """The greatest section of a surface across the line between the middles of origin and insertion."""
+        first, last = (carried_middle(end, poses) for end in self.line.ends)
+        return belly_measures(np.asarray(vertices), np.asarray(faces), first, last)
 
 
 def surface_distance(

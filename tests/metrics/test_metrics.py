@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from rbfmuscle.geometry.crossing import crossing_faces
-from rbfmuscle.metrics.centreline import Centreline, MuscleAtRest, split_ends
+from rbfmuscle.metrics.centreline import Centreline, split_ends
 from rbfmuscle.metrics.columns import Columns
 from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.metrics.metrics import MuscleMeasures
@@ -185,7 +185,7 @@ JOINTS = [SimpleNamespace(name="joint", parent="trunk", child="limb", coordinate
 class TestLength:
     def test_bent_cylinder_has_its_arc(self):
         mesh, radius = rod(), 60.0
-        line = Centreline(MuscleAtRest(rod_muscle(mesh), JOINTS, *arrays(mesh)))
+        line = Centreline(rod_muscle(mesh), JOINTS, *arrays(mesh))
         v = np.array(mesh.vertices)
         angle = v[:, 0] / radius
         bent = np.stack([(radius + v[:, 1]) * np.sin(angle), (radius + v[:, 1]) * np.cos(angle), v[:, 2]], 1)
