@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager, ExitStack, suppress
 from datetime import UTC, datetime
 
 import numba
@@ -65,22 +65,18 @@ class Recording:
 
     def _build(self, helpers, fields):
         """All muscles, in this process or in several, and what is found of the bones."""
-        if helpers < 2:
-            self._check()
-            return MuscleGroup(self.scene, fields=fields), _check_skeleton(self.scene)
-        crew = WorkerPool(self.scene, helpers)
-        try:
-            self._check()
+        with ExitStack() as undo:
+            pool = WorkerPool(self.scene, helpers) if helpers > 1 else None
+            if pool is not None:
+                undo.callback(pool.close)
+            check_substeps(self.scene)
+            check_initial(self.scene)
             skeleton = _check_skeleton(self.scene)
-            crew.built()
-        except BaseException:
-            crew.close()
-            raise
-        return crew, skeleton
-
-    def _check(self):
-        check_substeps(self.scene)
-        check_initial(self.scene)
+            if pool is None:
+                return MuscleGroup(self.scene, fields=fields), skeleton
+            pool.wait_until_built()
+            undo.pop_all()
+            return pool, skeleton
 
     def timed(self, part: str) -> AbstractContextManager[None]:
         """Context whose time is added to one entry of ``times`` [s]."""

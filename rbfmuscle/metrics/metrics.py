@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy.sparse as sparse
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
@@ -79,9 +80,7 @@ class _Tracker:
     def __init__(self, muscle: Any, scene: Any, vertices: Floats, faces: Integers) -> None:
         self.name, self.mesh, self.attachments = muscle.name, muscle.mesh, muscle.attachments
         self.rest_volume = float(muscle.mesh.volume)
-        edges = unique_edges(faces)
-        lengths = edge_lengths(vertices, edges)
-        self.edges, self.rest_lengths = edges[lengths > 0.0], lengths[lengths > 0.0]
+        self.edges = _edge_operator(vertices, faces)
         self.contracts = muscle.contraction is not None
         moving = moving_joints(scene)
         self.line = None
@@ -120,7 +119,9 @@ class _Tracker:
                 self.rest_measured = True
         mine = [event for event in frame.events if event.muscle == self.name]
         found["tunnelled"] = sum(event.count for event in mine if event.action in _THROUGH)
-        found["edge_strain_rms"] = self._edge_strain(carried)
+        edges = self.edges @ carried
+        stretch = np.sqrt(np.einsum("ij,ij->i", edges, edges))
+        found["edge_strain_rms"] = math.sqrt(np.mean((stretch - 1.0) ** 2))
         found.update(self._of_line(carried, probes, frame))
         if self.contracts:
             found["activation"] = frame.activations[self.name]
@@ -159,12 +160,6 @@ class _Tracker:
         before, self.offset = self.offset, self.distance.signed(carried, near=self.near)
         return {"flicker": np.abs(self.offset - before).max() if before is not None else 0.0}
 
-    def _edge_strain(self, carried):
-        """Root mean square of the relative change of edge lengths."""
-        apart = carried[self.edges[:, 0]] - carried[self.edges[:, 1]]
-        stretch = np.sqrt(np.einsum("ij,ij->i", apart, apart)) / self.rest_lengths
-        return math.sqrt(np.mean((stretch - 1.0) ** 2))
-
     def _at_rest(self, surface, probes, poses):
         """What is measured once, in the first frame in which all bones are at rest."""
         mesh = self.mesh.vertices, self.mesh.faces
@@ -181,6 +176,16 @@ class _Tracker:
         """The greatest section of a surface across the line between the middles of origin and insertion."""
         first, last = (carried_middle(end, poses) for end in self.line.ends)
         return belly_measures(np.asarray(vertices), np.asarray(faces), first, last)
+
+
+def _edge_operator(vertices: Floats, faces: Integers) -> sparse.csr_matrix:
+    """Sparse matrix (e, n) that maps vertices to edge vectors in units of their lengths at rest."""
+    edges = unique_edges(faces)
+    lengths = edge_lengths(vertices, edges)
+    edges, lengths = edges[lengths > 0.0], lengths[lengths > 0.0]
+    rows, inverse = np.arange(len(edges)), 1.0 / lengths
+    places = np.tile(rows, 2), edges.T.ravel()
+    return sparse.csr_matrix((np.concatenate([inverse, -inverse]), places), (len(edges), len(vertices)))
 
 
 def surface_distance(

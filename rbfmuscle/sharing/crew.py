@@ -9,12 +9,11 @@ from __future__ import annotations
 import contextlib
 import logging
 import pickle
-import queue
+import subprocess
 import threading
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numba
 
@@ -23,12 +22,12 @@ from rbfmuscle.progress import stage
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.sharing.share import Solved
 
-# Frames that a helper may be ahead of what is written: memory is bounded, and nobody waits for the disk.
-AHEAD = 1
-
 
 class WorkerPool:
     """Several `MuscleGroup` in processes, with the frames of one of all muscles, to the last digit.
+
+    A process continues while its last frame is taken, and waits with the next one until it is asked for: memory is
+    bounded by the pipes.
 
     Parameters
     ----------
@@ -44,116 +43,70 @@ class WorkerPool:
 
     def __init__(self, scene: Scene, helpers: int) -> None:
         self.scene = scene
+        self.times: dict[str, float] = {}
+        self._repeated: set[str] = set()
+        self._processes: list[subprocess.Popen[bytes]] = []
         threads = max(1, numba.get_num_threads() // helpers)
-        self._told: set[str] = set()
-        self._helpers: list[_Worker] = []
-        try:
-            for names in _dealt([muscle.name for muscle in scene.muscles], helpers):
-                self._helpers.append(_Worker((scene, names), threads))
-        except BaseException:
-            self.close()
-            raise
+        names = [muscle.name for muscle in scene.muscles]
+        for k in range(helpers):
+            process = start_child("rbfmuscle.sharing.helper", threads)
+            self._processes.append(process)
+            # In turn: neighbours in a scene's list are often alike in size.
+            job = scene, names[k::helpers]
+            threading.Thread(target=_deliver, args=(process, job), daemon=True).start()
 
-    @property
-    def times(self) -> dict[str, float]:
-        """See the class."""
-        every = [helper.clock.get("times", {}) for helper in self._helpers]
-        return {part: max(times.get(part, 0.0) for times in every) for part in {p for t in every for p in t}}
-
-    def built(self) -> None:
+    def wait_until_built(self) -> None:
         """Wait until all muscles are built, or raise what went wrong."""
-        for helper in self._helpers:
-            self._next(helper)
+        for process in self._processes:
+            self._next(process)
 
     def frames(self) -> Iterator[Solved]:
         """See `MuscleGroup.frames`."""
-        for helper in self._helpers:
-            helper.begin()
+        names = [muscle.name for muscle in self.scene.muscles]
         with stage("solving the first frame"):
-            parts = [self._next(helper) for helper in self._helpers]
+            parts = [self._next(process) for process in self._processes]
         while not any(part is None for part in parts):
-            yield _joined(parts, [muscle.name for muscle in self.scene.muscles])
+            yield _joined(parts, names)
             parts.clear()  # a frame that is written need not be here any more
-            parts = [self._next(helper) for helper in self._helpers]
+            parts = [self._next(process) for process in self._processes]
 
     def close(self) -> None:
-        """End the workers."""
-        for helper in self._helpers:
-            helper.close()
+        """End the processes."""
+        for process in self._processes:
+            process.kill()
+            process.wait()
+            for pipe in (process.stdin, process.stdout):
+                with contextlib.suppress(OSError):
+                    if pipe is not None:
+                        pipe.close()
 
-    def _next(self, helper):
-        """The next frame of a worker; its warnings and log records are repeated here."""
+    def _next(self, process: subprocess.Popen[bytes]) -> Solved | None:
+        """The next frame of a process; its warnings and log records are repeated here."""
+        assert process.stdout is not None  # start_child asks for a pipe
         while True:
-            kind, what = helper.take()
-            if kind == "done":
-                return what
+            try:
+                kind, what = pickle.load(process.stdout)
+            except (OSError, EOFError, pickle.UnpicklingError):
+                raise gone(how_it_ended(process)) from None
             if kind == "failed":
                 raise what
-            if kind == "gone":
-                raise gone(what)
-            if str(what) in self._told:
+            if kind == "done":
+                solved, times = what
+                self.times |= {part: max(spent, self.times.get(part, 0.0)) for part, spent in times.items()}
+                return solved
+            if str(what) in self._repeated:
                 continue
-            self._told.add(str(what))
+            self._repeated.add(str(what))
             if kind == "warned":
                 warnings.warn(what, stacklevel=3)
             else:
                 logging.getLogger(what[0]).log(*what[1:])
 
 
-class _Worker:
-    """One process; a thread reads its messages."""
-
-    def __init__(self, job: Any, threads: int) -> None:
-        self.process = start_child("rbfmuscle.sharing.helper", threads)
-        self._inbox: queue.Queue[tuple[str, Any]] = queue.Queue()
-        # Taken before a message is read, so that no more of them than this wait here, each as large as a frame.
-        self._room = threading.Semaphore(AHEAD)
-        self.clock: dict[str, Any] = {}
-        self._closed = False
-        self._thread = threading.Thread(target=self._listen, args=(job,), daemon=True)
-        self._thread.start()
-
-    def begin(self) -> None:
-        """Start the motion."""
-        with contextlib.suppress(OSError):  # it is gone: the inbox says so
-            send(self.process.stdin, "begin")
-
-    def take(self) -> tuple[str, Any]:
-        """Its next message: a kind, and what it is about."""
-        found = self._inbox.get()
-        self._room.release()
-        return found
-
-    def close(self) -> None:
-        """End it."""
-        self._closed = True
-        self._room.release()
-        self.process.kill()
-        self.process.wait()
-        self._thread.join()
-        for pipe in (self.process.stdin, self.process.stdout):
-            with contextlib.suppress(OSError):
-                if pipe is not None:
-                    pipe.close()
-
-    def _listen(self, job):
-        try:
-            send(self.process.stdin, job)
-            while self._room.acquire():
-                if self._closed:
-                    return
-                kind, what, self.clock = pickle.load(self.process.stdout)
-                self._inbox.put((kind, what))
-                del what
-        except (OSError, EOFError, pickle.UnpicklingError):
-            self._inbox.put(("gone", how_it_ended(self.process)))
-        except MemoryError as error:  # of a frame that does not fit here: nobody else would tell
-            self._inbox.put(("failed", error))
-
-
-def _dealt(names, hands):
-    """Distribute muscles in turn: neighbours in a scene's list are often alike in size."""
-    return [names[k::hands] for k in range(hands)]
+def _deliver(process, job):
+    """Send a process its job, which it reads when it has started."""
+    with contextlib.suppress(OSError, ValueError):  # it has ended: so does what it answers
+        send(process.stdin, job)
 
 
 def _joined(parts, order):

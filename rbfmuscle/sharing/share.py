@@ -76,16 +76,14 @@ class MuscleGroup:
             If a muscle cannot be solved, naming muscle, frame and coordinates.
         """
         frames = simulate_frames(self.scene, self.models, fields=self._fields)
-        first = True
-        while True:
-            with timed(self.times, "simulate"):
-                frame = _first(frames) if first else next(frames, None)
-            first = False
-            if frame is None:
-                return
+        with stage("solving the first frame"), timed(self.times, "simulate"):
+            frame = next(frames, None)
+        while frame is not None:
             with timed(self.times, "metrics"):
                 measured = self._measures.measure(frame)
             yield Solved(frame, measured)
+            with timed(self.times, "simulate"):
+                frame = next(frames, None)
 
     def close(self) -> None:
         """Nothing is held."""
@@ -99,8 +97,3 @@ def timed(times: dict[str, float], part: str) -> Iterator[None]:
         yield
     finally:
         times[part] = times.get(part, 0.0) + time.perf_counter() - start
-
-
-def _first(frames):
-    with stage("solving the first frame"):
-        return next(frames, None)

@@ -1,5 +1,6 @@
 """Muscles dealt out to processes: what comes together is what one process finds, whatever ends the run."""
 
+import io
 import logging
 import os
 import pickle
@@ -20,7 +21,6 @@ from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.run import simulate, stream_run
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.phantom import phantom_scene
-from rbfmuscle.sharing import crew as sharing
 from rbfmuscle.sharing.crew import WorkerPool
 from rbfmuscle.sharing.share import MuscleGroup
 from rbfmuscle.simulation.plan.processes import helpers_for
@@ -64,7 +64,7 @@ def assert_same_folders(one, other):
 
 
 def ended(crew):
-    return all(helper.process.poll() is not None for helper in crew._helpers)
+    return all(process.poll() is not None for process in crew._processes)
 
 
 def test_folder_is_that_of_one_process_to_the_last_byte(tmp_path, two_helpers, crews, monkeypatch):
@@ -93,7 +93,7 @@ def test_frames_in_memory_have_all_muscles_in_the_scenes_order(two_helpers, crew
         np.testing.assert_array_equal(surface.vertices, frame.surfaces[names[1]].vertices)
 
 
-def test_what_cannot_be_built_is_told_as_by_one_process(two_helpers, crews):
+def test_a_muscle_that_cannot_be_built_raises_the_error_of_one_process(two_helpers, crews):
     scene = small_scene()
     muscle = scene.muscles[0]
     muscle.mesh = trimesh.Trimesh(muscle.mesh.vertices, muscle.mesh.faces[1:], process=False)
@@ -105,8 +105,8 @@ def test_what_cannot_be_built_is_told_as_by_one_process(two_helpers, crews):
 def test_helper_that_is_killed_ends_the_run_with_the_frames_so_far(tmp_path, two_helpers, crews):
     def kill(done, total):
         if done == 1:
-            os.kill(crews[0]._helpers[1].process.pid, signal.SIGKILL)
-            crews[0]._helpers[1].process.wait()
+            os.kill(crews[0]._processes[1].pid, signal.SIGKILL)
+            crews[0]._processes[1].wait()
 
     with pytest.raises(
         SolveError, match=r"helper process was ended by signal 9; memory.*NUMBA_NUM_THREADS=1"
@@ -133,7 +133,7 @@ def test_helper_ends_with_the_process_that_started_it():
 
 
 @pytest.mark.parametrize(
-    ("raised", "told"),
+    ("raised", "expected"),
     [
         ("MemoryError('asked for 7 GB')", MemoryError("asked for 7 GB")),
         ("OSError(28, 'No space left', 'cache')", OSError(28, "No space left", "cache")),
@@ -141,7 +141,7 @@ def test_helper_ends_with_the_process_that_started_it():
         ("ZeroDivisionError('a bug')", RuntimeError),
     ],
 )
-def test_what_goes_wrong_in_a_helper_is_told_as_what_it_is(raised, told):
+def test_errors_of_a_helper_are_reported_as_they_are(raised, expected):
     code = (
         "from rbfmuscle.sharing import helper\n"
         "from rbfmuscle.validation import SolveError\n"
@@ -156,12 +156,12 @@ def test_what_goes_wrong_in_a_helper_is_told_as_what_it_is(raised, told):
     ) as process:
         process.stdin.write(job)
         process.stdin.flush()
-        kind, what, _ = pickle.load(process.stdout)
+        kind, what = pickle.load(process.stdout)
     assert kind == "failed"
-    if isinstance(told, Exception):
-        assert type(what) is type(told) and what.args == told.args and str(what) == str(told)
+    if isinstance(expected, Exception):
+        assert type(what) is type(expected) and what.args == expected.args and str(what) == str(expected)
     else:
-        assert type(what) is told and "ZeroDivisionError: a bug" in str(what)
+        assert type(what) is expected and "ZeroDivisionError: a bug" in str(what)
 
 
 class TestHelpersFor:
@@ -185,14 +185,6 @@ class TestHelpersFor:
         assert helpers_for(self.scene(38, 37, sliding=object()), 4) < 2
 
 
-def test_muscles_are_dealt_whole():
-    names = [f"muscle_{k}" for k in range(11)]
-    for hands in (2, 3, 4):
-        dealt = sharing._dealt(names, hands)
-        assert sorted(name for share in dealt for name in share) == sorted(names)
-        assert max(map(len, dealt)) - min(map(len, dealt)) <= 1
-
-
 def test_a_message_that_is_cut_is_the_last_one():
     """What follows it would be read as its rest: the process ends, and its end tells."""
     said = """
@@ -208,18 +200,17 @@ box.put(("failed", "next"))
     assert done.returncode == 1 and b"pickle" in done.stderr and b"next" not in done.stdout
 
 
-def test_what_helpers_say_is_said_once(caplog):
+def test_warnings_and_log_records_of_several_helpers_are_repeated_once(caplog):
     def helper(*messages):
-        found = iter(messages)
-        return SimpleNamespace(take=lambda: next(found))
+        return SimpleNamespace(stdout=io.BytesIO(b"".join(pickle.dumps(message) for message in messages)))
 
     crew = WorkerPool.__new__(WorkerPool)
-    crew._told = set()
+    crew.times, crew._repeated = {}, set()
     warning, line = SceneWarning("bones meet"), ("rbfmuscle.bones", logging.WARNING, "bone: is open")
-    one = helper(("warned", warning), ("logged", line), ("done", 1))
-    other = helper(("logged", line), ("warned", SceneWarning("bones meet")), ("done", 2))
+    one = helper(("warned", warning), ("logged", line), ("done", (1, {"simulate": 2.0})))
+    other = helper(("logged", line), ("warned", SceneWarning("bones meet")), ("done", (2, {"simulate": 1.0})))
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
-        assert [crew._next(one), crew._next(other)] == [1, 2]
+        assert [crew._next(one), crew._next(other)] == [1, 2] and crew.times == {"simulate": 2.0}
     assert [str(w.message) for w in heard] == ["bones meet"]
     assert [record.getMessage() for record in caplog.records] == ["bone: is open"]
