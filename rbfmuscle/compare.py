@@ -94,10 +94,10 @@ def compare_models(
     if not results:
         raise SolveError("; ".join(f"{name}: {reason}" for name, reason in failed.items()))
     with stage("distances between models"):
-        matrix = add_distances(results, folder, poses)
+        add_distances(results, folder, poses)
     labels = {name: model_title(variant.muscles[0]) for name, variant in variants.items()}
     first = next(iter(variants.values()))
-    table = write_tables(folder, first, results, failed, labels=labels, matrix=matrix, poses=poses)
+    table = write_tables(folder, first, results, failed, labels=labels, poses=poses)
 
     from rbfmuscle.report.comparison_page import write_page
 

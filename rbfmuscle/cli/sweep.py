@@ -68,7 +68,7 @@ def sweep(
     }
     points = plan_sweep(loaded, axes, frames=frames, reference=parse_settings(reference))
     for point in points:  # a mistyped key is reported now, not after the first point
-        configure_scene(loaded[point.scene], point.settings)
+        configure_scene(loaded[point.scene], point.settings, frames=frames)
     options: dict[str, Any] = {"frames": frames, "jobs": jobs, "cluster": cluster}
     progress, kept = (
         Progress(f"sweep of {len(points)} points", what="point"),

@@ -142,44 +142,24 @@ def _over_muscles(quantity, muscles):
     )
 
 
-def add_distances(results: dict[str, Any], folder: Path, poses: list[int]) -> list[list[float]]:
-    """Distances between the models' surfaces.
+def add_distances(results: dict[str, Any], folder: Path, poses: list[int]) -> None:
+    """Add the distances of each model's surfaces to those of the first, the worst of some poses.
 
     Parameters
     ----------
     results : dict of str to dict
-        Model -> what `measure_run` found; takes ``distance_rms`` and ``distance_max`` to the first model.
+        Model -> what `measure_run` found; takes ``distance_rms`` and ``distance_max``.
     folder : pathlib.Path
         With a run of each model.
     poses : list of int
-
-    Returns
-    -------
-    list of list of float
-        Root mean square distance of each pair of models in the last pose, over all muscles.
     """
-    runs = {name: SavedRun(folder / name) for name in results}
-    first = next(iter(runs))
-    matrix = np.zeros((len(runs), len(runs)))
-    for i, (a, mine) in enumerate(runs.items()):
-        for j, (b, other) in enumerate(runs.items()):
-            if j <= i:
-                continue
-            for pose in poses if a == first else poses[-1:]:
-                pairs = {
-                    m: surface_distance(*mine.surface(m, pose), *other.surface(m, pose)) for m in mine.muscles
-                }
-                if a == first:
-                    _take_worst(results[b], pairs)
-            matrix[i, j] = matrix[j, i] = math.sqrt(np.mean([rms**2 for rms, _ in pairs.values()]))
-    return matrix.tolist()
-
-
-def _take_worst(found, pairs):
-    pairs = {**pairs, ALL: tuple(np.max(list(pairs.values()), axis=0).tolist())}
-    for muscle, pair in pairs.items():
-        for name, value in zip(("distance_rms", "distance_max"), pair):
-            found[muscle][name] = max(found[muscle].get(name, 0.0), value)
+    first, *others = (SavedRun(folder / name) for name in results)
+    for found, run in zip(list(results.values())[1:], others):
+        for muscle in first.muscles:
+            pairs = [surface_distance(*first.surface(muscle, k), *run.surface(muscle, k)) for k in poses]
+            for name, values in zip(("distance_rms", "distance_max"), zip(*pairs)):
+                found[muscle][name] = max(values)
+                found[ALL][name] = max(found[ALL].get(name, 0.0), max(values))
 
 
 def write_tables(
@@ -189,7 +169,6 @@ def write_tables(
     failed: dict[str, str],
     *,
     labels: dict[str, str],
-    matrix: list[list[float]],
     poses: list[int],
 ) -> dict[str, Any]:
     """Write ``comparison.json`` and ``comparison.csv``.
@@ -204,7 +183,6 @@ def write_tables(
         Models that did not finish, and why.
     labels : dict of str to str
         Model -> what it is called.
-    matrix : list of list of float
     poses : list of int
 
     Returns
@@ -228,7 +206,6 @@ def write_tables(
             for name, m in MEASURES.items()
         },
         "results": results,
-        "distances": matrix,
         "machine": machine(),
         "versions": versions(),
     }

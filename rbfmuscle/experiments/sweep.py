@@ -117,18 +117,8 @@ def plan_sweep(
     -------
     list of SweepPoint
         Scene by scene: references, the scene's own settings, the grid.
-
-    Raises
-    ------
-    UsageError
-        If a key or value of the grid is not one that a scene takes.
     """
-    points = [
-        point for n, s in scenes.items() for point in _points(n, s, grid, frames, dict(reference or {}))
-    ]
-    for point in points:
-        scenes[point.scene].with_options(point.settings, frames=frames)
-    return points
+    return [point for n, s in scenes.items() for point in _points(n, s, grid, frames, dict(reference or {}))]
 
 
 def _points(name, scene, grid, frames, reference):

@@ -8,17 +8,14 @@ import os
 import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rbfmuscle.experiments.sweep import SweepPoint
-from rbfmuscle.experiments.workers import available_cores, connect_cluster, threads_limited
+from rbfmuscle.experiments.workers import connect_cluster, threads_limited
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.metrics.quantities import ALL
 from rbfmuscle.output.writer import write_json
@@ -74,11 +71,6 @@ class SweepFolder:
     def write(self, result: dict[str, Any]) -> None:
         """Keep a point's result: whole or not at all."""
         write_json(self.points / f"{result['key']}.json", result)
-        self.marker(result["key"]).unlink(missing_ok=True)
-
-    def marker(self, key: str) -> Path:
-        """A file that is there while a point is run."""
-        return self.points / f"{key}.running"
 
     def surfaces(self, key: str) -> Path:
         """Surfaces of a reference."""
@@ -112,15 +104,14 @@ def run_sweep(
     progress : callable, optional
         ``progress(done, total)``.
     """
-    from joblib import parallel_config
+    from joblib import cpu_count, parallel_config
 
     folder = SweepFolder(directory)
     left = [point for point in points if not _is_done(folder, point)]
     for point in left:
         (folder.points / f"{point.key}.json").unlink(missing_ok=True)
-    jobs = jobs or available_cores()
-    threads = 1 if cluster else max(1, available_cores() // jobs)
-    calls = [(runner, scenes[p.scene], p, folder, frames, threads) for p in left]
+    jobs = jobs or cpu_count()
+    threads = 1 if cluster else max(1, cpu_count() // jobs)
 
     def advance():
         if progress is not None:
@@ -133,8 +124,9 @@ def run_sweep(
         elif jobs > 1:
             stack.enter_context(parallel_config(backend="loky", inner_max_num_threads=threads))
         for first in (True, False):
-            stage = [call for call in calls if (call[2].role == "reference") == first]
-            _side_by_side(stage, folder, -1 if cluster else jobs, advance)
+            stage = [point for point in left if (point.role == "reference") == first]
+            calls = [(runner, scenes[p.scene], p, folder, frames, threads) for p in stage]
+            _side_by_side(calls, folder, -1 if cluster else jobs, advance)
     return len(left)
 
 
@@ -144,35 +136,25 @@ def _is_done(folder, point):
 
 
 def _side_by_side(calls, folder, jobs, advance):
-    """Run calls; a process that dies takes only its own point along."""
+    """Run calls; after a process has died, those that are left one by one, each in a process of its own."""
     from joblib import Parallel, delayed
-    from joblib.externals.loky.process_executor import TerminatedWorkerError
+    from joblib.externals.loky import BrokenProcessPool, ProcessPoolExecutor
 
-    calls = [call for call in calls if not folder.read(call[2].key)]
-    if not calls:
-        return
     try:
         tasks = (delayed(measure_point)(*call) for call in calls)
         for _ in Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1)(tasks):
             advance()
-    except TerminatedWorkerError:
-        left = [call for call in calls if not folder.read(call[2].key)]
-        for call in [call for call in left if folder.marker(call[2].key).exists()] or left:
-            _alone(call, folder)
+    except BrokenProcessPool:
+        for call in [call for call in calls if not folder.read(call[2].key)]:
+            with ProcessPoolExecutor(1) as pool:
+                try:
+                    pool.submit(measure_point, *call).result()
+                except BrokenProcessPool:
+                    error = "the process ended without a word (out of memory, or a crash)"
+                    folder.write({"key": call[2].key, "status": "failed", "error": error})
             advance()
-        _side_by_side(left, folder, jobs, advance)
     except RuntimeError as error:  # of Dask, where worker after worker dies of a point
         raise SolveError(f"a point ended its workers ({error}); finished points are kept") from None
-
-
-def _alone(call, folder):
-    """A point that was under way when a process died: in a process of its own, so that it shows which."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        try:
-            pool.submit(measure_point, *call).result()
-        except BrokenProcessPool:
-            error = "the process ended without a word (out of memory, or a crash)"
-            folder.write({"key": call[2].key, "status": "failed", "error": error})
 
 
 def measure_point(
@@ -181,17 +163,23 @@ def measure_point(
     """Run one point, measure it and keep the result; an error becomes the result of a failed point."""
     start = time.perf_counter()
     result: dict[str, Any] = {"key": point.key, "settings": point.settings, "status": "done", "error": ""}
-    folder.marker(point.key).touch()
     try:
         with threads_limited(threads):
             run = runner(scene, point.settings, frames)
             values = _values(run)
-            shown = {_pose(f): {n: (s.vertices, s.faces) for n, s in f.surfaces.items()} for f in run.frames}
+            shown = {
+                f"{_pose(frame)}|{name}": (surface.vertices, surface.faces)
+                for frame in run.frames
+                for name, surface in frame.surfaces.items()
+            }
             if point.role == "reference":
-                _keep_surfaces(shown, folder.surfaces(point.key))
+                arrays = {f"{place}|{k}": mesh[k] for place, mesh in shown.items() for k in (0, 1)}
+                fresh = folder.references / f".{os.getpid()}.npz"
+                np.savez_compressed(fresh, **arrays)
+                os.replace(fresh, folder.surfaces(point.key))
             elif point.reference:
                 values |= _errors(shown, folder.surfaces(point.reference))
-            result |= {"values": values, "muscles": run.summary}
+            result["values"] = values
     except POINT_ERRORS as error:
         result |= {"status": "failed", "error": f"{type(error).__name__}: {' '.join(str(error).split())}"}
     result |= {"threads": threads, "machine": platform.node(), "process": os.getpid()}
@@ -217,32 +205,18 @@ def _pose(frame):
     return " ".join(f"{name}={angle:.9f}" for name, angle in sorted(frame.coordinates.items())) or "rest"
 
 
-def _keep_surfaces(shown, path):
-    """Surfaces of every pose in one file, written in one move."""
-    arrays = {}
-    for pose, surfaces in shown.items():
-        for name, (vertices, faces) in surfaces.items():
-            arrays[f"{pose}|{name}|v"] = np.asarray(vertices)
-            arrays[f"{pose}|{name}|f"] = np.asarray(faces, dtype=np.int32)
-    fresh = path.with_name(f".{os.getpid()}.{path.name}")
-    np.savez_compressed(fresh, **arrays)
-    os.replace(fresh, path)
-
-
 def _errors(shown, path):
     """Surface distance to the reference, root mean square over frames and muscles, and greatest."""
     if not path.exists():
         raise UsageError("its reference is missing: that point failed, or the folder is not shared")
-    squares, worst = [], 0.0
     with np.load(path) as kept:
-        for pose, surfaces in shown.items():
-            for name, (vertices, faces) in surfaces.items():
-                if f"{pose}|{name}|v" not in kept:
-                    continue
-                other = kept[f"{pose}|{name}|v"], kept[f"{pose}|{name}|f"].astype(np.int64)
-                rms, most = surface_distance(vertices, faces, *other)
-                squares.append(rms**2)
-                worst = max(worst, most)
-    if not squares:
+        found = np.array(
+            [
+                surface_distance(*mesh, kept[f"{place}|0"], kept[f"{place}|1"])
+                for place, mesh in shown.items()
+                if f"{place}|0" in kept
+            ]
+        )
+    if not len(found):
         raise UsageError("no frame of this point is at a pose of the reference")
-    return {"error_rms": math.sqrt(float(np.mean(squares))), "error_max": worst}
+    return {"error_rms": math.sqrt(np.mean(found[:, 0] ** 2)), "error_max": float(found[:, 1].max())}

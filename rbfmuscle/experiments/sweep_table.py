@@ -10,20 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from rbfmuscle.experiments.sweep import SweepPoint
-from rbfmuscle.experiments.sweep_run import VALUES, SweepFolder
+from rbfmuscle.experiments.sweep_run import VALUES, WORST, SweepFolder
+from rbfmuscle.metrics.quantities import QUANTITIES
 from rbfmuscle.output.writer import write_json
 
 # The default may be this much worse than the front, in error and in time at once.
 NEAR = 1.1
 # In the scene's unit.
-LENGTHS = (
-    "error_rms",
-    "error_max",
-    "penetration_max",
-    "bone_penetration_max",
-    "solver_penetration_max",
-    "rest_error_rms",
-)
+LENGTHS = ("error_rms", "error_max", *(name for name in WORST if QUANTITIES[name][0] == "length"))
 
 
 def sweep_rows(

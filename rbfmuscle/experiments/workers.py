@@ -1,8 +1,9 @@
-"""What runs of an experiment are spread over: threads, cores, the workers of a cluster."""
+"""What runs of an experiment are distributed to: threads, the workers of a cluster."""
 
 from __future__ import annotations
 
-import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from rbfmuscle.validation import MissingPartError, UsageError
@@ -13,30 +14,19 @@ if TYPE_CHECKING:
 CONNECT_WITHIN = 20  # seconds for a scheduler and its first two workers
 
 
-def available_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-class threads_limited:
+@contextmanager
+def threads_limited(count: int) -> Iterator[None]:
     """Context in which loops and BLAS use so many threads."""
+    import numba
+    from threadpoolctl import threadpool_limits
 
-    def __init__(self, count: int) -> None:
-        self.count = count
-
-    def __enter__(self) -> None:
-        import numba
-        from threadpoolctl import threadpool_limits
-
-        self.before = numba.get_num_threads()
-        numba.set_num_threads(max(1, min(self.count, numba.config.NUMBA_NUM_THREADS)))
-        self.limits = threadpool_limits(self.count)
-
-    def __exit__(self, *error: object) -> None:
-        import numba
-
-        self.limits.restore_original_limits()
-        numba.set_num_threads(self.before)
+    before = numba.get_num_threads()
+    numba.set_num_threads(max(1, min(count, numba.config.NUMBA_NUM_THREADS)))
+    try:
+        with threadpool_limits(count):
+            yield
+    finally:
+        numba.set_num_threads(before)
 
 
 def connect_cluster(address: str) -> Client:

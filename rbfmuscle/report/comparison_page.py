@@ -92,11 +92,6 @@ def _page(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> Page:
             ),
             Section("Over the motion", plots=_plots(found, runs)),
             Section(
-                "Between the models",
-                f"RMS over all muscles in the last pose, {found['units']}",
-                table=_distances(found),
-            ),
-            Section(
                 "How to read this", text=_READING, terms=[(m.title, m.meaning) for m in MEASURES.values()]
             ),
         ],
@@ -141,13 +136,6 @@ def _measures(found: dict[str, Any]) -> Table:
         ]
         rows.append([Cell(measure.title), Cell(measure.against), *cells])
     return Table(["", "against", *(found["labels"][name] for name in found["models"])], rows)
-
-
-def _distances(found: dict[str, Any]) -> Table:
-    labels = [found["labels"][name] for name in found["models"]]
-    lines = zip(labels, found["distances"])
-    rows = [[Cell(label), *(number_cell(value) for value in line)] for label, line in lines]
-    return Table(["", *labels], rows)
 
 
 def _plots(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> list[str]:
