@@ -95,8 +95,8 @@ def simulate(
     if fields is not None and set(fields) != {bone.name for bone in scene.bones}:
         bones = ", ".join(bone.name for bone in scene.bones)
         raise UsageError(f"fields must name each bone ({bones}), got {', '.join(fields) or 'none'}")
-    options = _options(model, settings, frames)
-    recording, memory = Recording(scene, options=options, fields=fields), MemorySink()
+    recording = Recording(scene, options=_options(model, settings, frames), fields=fields)
+    memory = MemorySink()
     run = Run(memory.frames, memory.rows, recording=recording, memory=memory)
     try:
         recording.feed(memory, progress=progress or None)
@@ -236,7 +236,7 @@ class Run:
         self._write(folder)
         return SavedRun(folder)
 
-    @property
+    @cached_property
     def info(self) -> dict[str, Any]:
         """What ``run.json`` holds."""
         return self.saved.info if self._recording is None else self._recording.info()
@@ -372,28 +372,25 @@ class Run:
         writer.write_info(self._recording.info())
         return writer
 
-    def _bones(self):
-        """Bones in the last frame."""
-        poses = self.frames[-1].poses
-        if self.scene is None:
-            meshes = {name: self.saved.bone(name) for name in self.saved.bones}
-        else:
-            meshes = {bone.name: (bone.mesh.vertices, bone.mesh.faces) for bone in self.scene.bones}
-        for name, (vertices, faces) in meshes.items():
-            yield name, (vertices @ poses[name][:3, :3].T + poses[name][:3, 3], faces)
-
     def __repr__(self) -> str:
         return f"<Run of {self.info['scene']['name']!r}: {len(self)} frames, {', '.join(self.muscles)}>"
 
     def _repr_html_(self) -> str:
         from rbfmuscle.report.render import figure_html
 
-        body = self.saved.body if self.scene is None else self.scene.body
         if not self.frames:
             return figure_html({}, {}, repr(self), np.eye(3))
-        surfaces = self.frames[-1].surfaces
-        muscles = {name: (surfaces[name].vertices, surfaces[name].faces) for name in surfaces}
-        return figure_html(dict(self._bones()), muscles, f"{self!r} {self.verdict}", body)
+        last, scene = self.frames[-1], self.scene
+        if scene is None:
+            bones, body = {name: self.saved.bone(name) for name in self.saved.bones}, self.saved.body
+        else:
+            bones, body = {b.name: (b.mesh.vertices, b.mesh.faces) for b in scene.bones}, scene.body
+        moved = {
+            name: (vertices @ last.poses[name][:3, :3].T + last.poses[name][:3, 3], faces)
+            for name, (vertices, faces) in bones.items()
+        }
+        muscles = {name: (surface.vertices, surface.faces) for name, surface in last.surfaces.items()}
+        return figure_html(moved, muscles, f"{self!r} {self.verdict}", body)
 
 
 class MuscleRun:
