@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack, suppress
 from datetime import UTC, datetime
+from typing import Any
 
 import numba
 
@@ -16,9 +17,18 @@ from rbfmuscle.metrics.joint_gaps import joint_gaps
 from rbfmuscle.metrics.metrics import Values
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.rows import frame_rows, moment_arm_rows
-from rbfmuscle.metrics.summary import LIMITS, Summary, default_limit, describe_verdict, exceeded
+from rbfmuscle.metrics.summary import (
+    LIMITS,
+    Summary,
+    default_limit,
+    describe_verdict,
+    exceeded,
+    require_limits,
+)
+from rbfmuscle.models import configure_scene
 from rbfmuscle.output.runinfo import Stages, build_info, frame_facts
 from rbfmuscle.output.sinks import Sink
+from rbfmuscle.output.writer import RunWriter
 from rbfmuscle.progress import stage
 from rbfmuscle.scene.check import bone_collisions, bone_findings, check_initial, sampled_frames
 from rbfmuscle.scene.scene import Scene
@@ -27,7 +37,7 @@ from rbfmuscle.sharing.share import MuscleGroup, timed
 from rbfmuscle.simulation.frame import Event, Frame
 from rbfmuscle.simulation.plan.processes import helpers_for
 from rbfmuscle.simulation.substeps import check_substeps
-from rbfmuscle.validation import RBFMuscleError, SceneWarning, SolveError
+from rbfmuscle.validation import RBFMuscleError, SceneWarning, SolveError, UsageError
 
 
 class Recording:
@@ -36,9 +46,8 @@ class Recording:
     Parameters
     ----------
     scene : Scene
-        As it shall be run.
-    options : dict, optional
-        What the caller asked for, for ``run.json``.
+    model, settings, frames
+        As for `configure_scene`.
     fields : mapping of str to BoneField, optional
         Of the bones, by name, in place of `BoneSDF`; all muscles are then in this process.
     """
@@ -47,12 +56,18 @@ class Recording:
         self,
         scene: Scene,
         *,
-        options: dict | None = None,
+        model: str | dict[str, Any] | None = None,
+        settings: Mapping[str, Any] | None = None,
+        frames: slice | str | None = None,
         fields: Mapping[str, BoneField] | None = None,
     ) -> None:
         self.started, self._start = datetime.now(UTC), time.perf_counter()
+        scene = configure_scene(scene, settings, model=model, frames=frames)
         self.scene = orient_scene(scene.validate())
-        self.options = options or {}
+        if fields is not None and set(fields) != {bone.name for bone in scene.bones}:
+            bones = ", ".join(bone.name for bone in scene.bones)
+            raise UsageError(f"fields must name each bone ({bones}), got {', '.join(fields) or 'none'}")
+        self.options = {"model": model, "frames": str(frames or ""), "settings": dict(settings or {})}
         self.times: dict[str, float] = {}
         self.status, self.message = "running", ""
         self.summary, self.stages = Summary(), Stages()
@@ -107,6 +122,20 @@ class Recording:
             with suppress(*((SolveError,) if self.status == "failed" else ())):
                 sink.close(rows)
                 sink.write_info(self.info())
+
+    def finish(
+        self, writer: RunWriter, limits: Mapping[str, float], *, pictures: bool = True
+    ) -> dict[str, Any]:
+        """Write report and pictures of a run that is in a folder, then hold it to limits; what ``run.json`` holds."""
+        with self.timed("report"), stage("drawing pictures"):
+            if self.scene.output.report:
+                from rbfmuscle.report.report import write_report
+
+                write_report(writer.directory, pictures=pictures)
+        info = self.info()
+        writer.write_info(info)
+        require_limits(self.summary.table(), limits)
+        return info
 
     def close(self) -> None:
         """End what helps; nothing more can be solved."""

@@ -19,13 +19,12 @@ from numpy.typing import NDArray
 
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.metrics.quantities import Row
-from rbfmuscle.metrics.summary import parse_limits, require_limits
-from rbfmuscle.models import configure_scene
+from rbfmuscle.metrics.summary import parse_limits
 from rbfmuscle.output.export import export_run
 from rbfmuscle.output.saved import SavedRun, saved_frames
 from rbfmuscle.output.sinks import MemorySink
 from rbfmuscle.output.writer import RunWriter, check_writable
-from rbfmuscle.progress import Progress, stage
+from rbfmuscle.progress import Progress
 from rbfmuscle.recording import Recording
 from rbfmuscle.scene.phantom import open_scene
 from rbfmuscle.scene.scene import Scene
@@ -91,11 +90,7 @@ def simulate(
     if progress is True:
         with Progress(scene.name) as shown:
             return simulate(scene, model, settings=settings, frames=frames, progress=shown, fields=fields)
-    scene = configure_scene(scene, settings, model=model, frames=frames)
-    if fields is not None and set(fields) != {bone.name for bone in scene.bones}:
-        bones = ", ".join(bone.name for bone in scene.bones)
-        raise UsageError(f"fields must name each bone ({bones}), got {', '.join(fields) or 'none'}")
-    recording = Recording(scene, options=_options(model, settings, frames), fields=fields)
+    recording = Recording(scene, model=model, settings=settings, frames=frames, fields=fields)
     memory = MemorySink()
     run = Run(memory.frames, memory.rows, recording=recording, memory=memory)
     try:
@@ -145,32 +140,13 @@ def stream_run(
     LimitExceededError
         If a limit of ``fail_on`` is exceeded; everything is written.
     """
-    scene = configure_scene(scene, settings, model=model, frames=frames)
     limits = parse_limits(fail_on, scene)
     check_writable(directory)
-    recording = Recording(scene, options=_options(model, settings, frames))
+    recording = Recording(scene, model=model, settings=settings, frames=frames)
     with closing(recording):
-        writer = RunWriter(directory, scene)
+        writer = RunWriter(directory, recording.scene)
         recording.feed(writer, progress=progress)
-    return _finish(recording, writer, limits, pictures)
-
-
-def _options(model, settings, frames):
-    """The caller's options, for ``run.json``."""
-    return {"model": model, "frames": str(frames or ""), "settings": dict(settings or {})}
-
-
-def _finish(recording, writer, limits, pictures):
-    """Report and pictures, then the limits."""
-    with recording.timed("report"), stage("drawing pictures"):
-        if recording.scene.output.report:
-            from rbfmuscle.report.report import write_report
-
-            write_report(writer.directory, pictures=pictures)
-    info = recording.info()
-    writer.write_info(info)
-    require_limits(recording.summary.table(), limits)
-    return info
+    return recording.finish(writer, limits, pictures=pictures)
 
 
 class Run:
@@ -341,7 +317,7 @@ class Run:
         if self._recording is None:
             shutil.copytree(self.saved.directory, directory, dirs_exist_ok=True)
         else:
-            _finish(self._recording, self._write(directory), {}, pictures)
+            self._recording.finish(self._write(directory), {}, pictures=pictures)
 
     def export(
         self, directory: str | Path, formats: str | Sequence[str], *, units: str | None = None
@@ -397,8 +373,7 @@ class MuscleRun:
     """One muscle of a run."""
 
     def __init__(self, run: Run, name: str) -> None:
-        self.run = run
-        self.name = name
+        self.run, self.name = run, name
 
     def surface(self, frame: int = -1) -> trimesh.Trimesh:
         """Surface in a frame of the run.
@@ -424,6 +399,3 @@ class MuscleRun:
     def values(self, quantity: str) -> NDArray[np.float64]:
         """Values of a quantity over the frames, (n,) ndarray."""
         return self.run.values(self.name, quantity)
-
-    def __repr__(self) -> str:
-        return f"<{self.name!r} in {self.run!r}>"

@@ -38,8 +38,8 @@ ALLOWED = {
     "rbfmuscle.report": ABOVE,
     "rbfmuscle.viewer": (*ABOVE, "rbfmuscle.importers", "rbfmuscle.models", "rbfmuscle.viewer"),
     "rbfmuscle.sharing": (*ABOVE, "rbfmuscle.models", "rbfmuscle.sharing"),
-    "rbfmuscle.recording": (*ABOVE, "rbfmuscle.importers", "rbfmuscle.sharing"),
-    "rbfmuscle.run": (*ABOVE, "rbfmuscle.models", "rbfmuscle.recording"),
+    "rbfmuscle.recording": (*ABOVE, "rbfmuscle.importers", "rbfmuscle.models", "rbfmuscle.sharing"),
+    "rbfmuscle.run": (*ABOVE, "rbfmuscle.recording"),
     "rbfmuscle.compare": (*ABOVE, "rbfmuscle.models", "rbfmuscle.run"),
     "rbfmuscle.paths": (*ABOVE, "rbfmuscle.importers", "rbfmuscle.models"),
     "rbfmuscle.cli": (
