@@ -58,8 +58,8 @@ class Faults:
             away = float(np.sqrt(np.mean(rest.unsigned(vertices) ** 2)))
         self.rows.append((
             depth[held].max(initial=0.0), depth[~held].max(initial=0.0),
-            bone_depth(vertices, faces, probes, frame.poses), form["self_crossings"], form["self_crossings"] > 0,
-            abs(volume / self.muscle.mesh.volume - 1.0), away, form["euler"] != 2,
+            bone_depth(MeshDistance(vertices, faces), probes, frame.poses), form["self_crossings"],
+            form["self_crossings"] > 0, abs(volume / self.muscle.mesh.volume - 1.0), away, form["euler"] != 2,
         ))  # fmt: skip
 
     def worst(self):

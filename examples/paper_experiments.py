@@ -20,6 +20,7 @@ import numpy as np
 
 from pbd_baseline.muscle import PBDMuscle
 from pbd_baseline.options import PBDOptions
+from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.metrics.penetration import BoneProbe, bone_depth, surface_depth
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.options import TunnellingOptions
@@ -142,7 +143,9 @@ class Record:
         # the muscle starts with an overlap; the first frame resolves it
         if self.frames > 1:
             self.depth = max(self.depth, depth)
-        self.bone_depth = max(self.bone_depth, bone_depth(*self.model.material_mesh(), self.probes, poses))
+        self.bone_depth = max(
+            self.bone_depth, bone_depth(MeshDistance(*self.model.material_mesh()), self.probes, poses)
+        )
         self.volume = max(self.volume, abs(self.model.volume() / self.model.rest.volume.rest - 1.0))
         low, high = np.quantile(self.edge_lengths(points) / self.lengths, [0.01, 0.99])
         self.ratio = [min(self.ratio[0], low), max(self.ratio[1], high)]

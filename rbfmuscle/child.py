@@ -38,14 +38,10 @@ def send(pipe: BinaryIO | Any, what: Any) -> None:
     pipe.flush()
 
 
-def how_it_ended(process: subprocess.Popen[bytes]) -> str:
-    """Describe how a process ended."""
+def unexpected_end(process: subprocess.Popen[bytes]) -> SolveError:
+    """Return the error for a process that ended unexpectedly, or ends now."""
     code = process.wait()
-    return f" by signal {-code}" if code < 0 else f" (exit code {code})"
-
-
-def gone(how: str) -> SolveError:
-    """Return the error for a process that ended unexpectedly."""
+    how = f" by signal {-code}" if code < 0 else f" (exit code {code})"
     return SolveError(
         f"a helper process was ended{how}; memory may have run out: with NUMBA_NUM_THREADS=1 set, one process does "
         "it all"
@@ -67,7 +63,7 @@ class Outbox:
                 send(self.file, what)
         except BrokenPipeError:
             os._exit(0)
-        except Exception:  # noqa: BLE001 - whatever it is, the message is cut, and none can follow it: the end tells
+        except Exception:  # noqa: BLE001 - whatever it is, the message is cut, and none can follow it
             traceback.print_exc()
             os._exit(1)
 
@@ -85,6 +81,6 @@ def _listen(words: queue.Queue[Any]) -> None:
             words.put(pickle.load(sys.stdin.buffer))
     except (EOFError, pickle.UnpicklingError):
         os._exit(0)
-    except BaseException:  # noqa: BLE001 - what was told needs what is not there: nobody would answer
+    except BaseException:  # noqa: BLE001 - the message cannot be read: nobody would answer
         traceback.print_exc()
         os._exit(1)

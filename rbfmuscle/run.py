@@ -1,7 +1,4 @@
-"""Running a scene: in memory with `simulate`, or straight to a folder with `stream_run`.
-
-Both are one run, a generator of frames, and differ in the sink that takes them.
-"""
+"""Running a scene: in memory with `simulate`, or straight to a folder with `stream_run`."""
 
 from __future__ import annotations
 
@@ -108,7 +105,7 @@ def stream_run(
     model: str | dict[str, Any] | None = None,
     settings: Mapping[str, Any] | None = None,
     frames: slice | str | None = None,
-    fail_on: str | Sequence[str] | dict[str, float] | None = None,
+    fail_on: str | Sequence[str] | None = None,
     pictures: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
@@ -121,7 +118,7 @@ def stream_run(
     directory : path
     model, settings, frames, progress
         As for `simulate`.
-    fail_on : str, list of str or dict, optional
+    fail_on : str or list of str, optional
         Limits, see `rbfmuscle.metrics.summary.parse_limits`.
     pictures : bool
         Draw pictures for the report and the preview.

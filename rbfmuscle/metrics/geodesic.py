@@ -12,7 +12,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.jit import compiled
 from rbfmuscle.metrics.centreline import distance_along, resampled
-from rbfmuscle.metrics.penetration import BoneProbe, bone_coordinates, bones_about, inverse_pose
+from rbfmuscle.metrics.penetration import BoneProbe, bones_about, inverse_pose
 
 NODES = 33
 ROUNDS = 40  # in which planes are taken, at most
@@ -73,7 +73,7 @@ def _planes(
     gap, normal = np.full(len(points), np.inf), np.zeros((len(points), 3))
     for probe in probes:
         pose = poses[probe.name]
-        local = bone_coordinates(points, pose)
+        local = (points - pose[:3, 3]) @ pose[:3, :3]
         distance, closest, outward = probe.nearest(local)
         far = np.abs(distance) > least
         outward[far] = (local[far] - closest[far]) / distance[far, None]

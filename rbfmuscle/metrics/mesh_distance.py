@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.exact_distance import STACK, ExactDistance, Layout, nearest_triangle, record_square
 from rbfmuscle.geometry.threads import in_chunks
+from rbfmuscle.geometry.winding import inside_test
 from rbfmuscle.jit import compiled
 from rbfmuscle.metrics.columns import Columns
 from rbfmuscle.validation import check_mesh, check_points
@@ -50,6 +52,10 @@ class MeshDistance:
         return ExactDistance(self.vertices, self.faces, layout=self._known_layout)
 
     @cached_property
+    def _wound(self) -> Callable[[Floats], Booleans]:
+        return inside_test(self.vertices, self.faces)
+
+    @cached_property
     def _columns(self) -> Columns:
         return Columns(self.vertices, self.faces)
 
@@ -70,10 +76,7 @@ class MeshDistance:
         points = check_points(points)
         if self.closed:
             return self._columns.inside(points, pose)
-        import igl
-
-        points = points @ pose[:3, :3].T + pose[:3, 3]
-        return np.asarray(igl.fast_winding_number(self.vertices, self.faces, points) > 0.5)
+        return self._wound(points @ pose[:3, :3].T + pose[:3, 3])
 
     def unsigned(self, points: ArrayLike, *, near: Integers | None = None) -> Floats:
         """Distance to the surface, (n,) ndarray [scene unit].

@@ -146,7 +146,7 @@ class _Tracker:
             "volume_error": volume / self.rest_volume - 1.0,
             "penetration_max": depth.max(),
             "penetration_fraction": np.mean(depth > 0.0),
-            "bone_penetration_max": bone_depth(vertices, faces, probes, poses, distance=self.distance),
+            "bone_penetration_max": bone_depth(self.distance, probes, poses),
             **self.form.measure(surface, same_faces=same),
             **self._flicker(carried, vertices, same),
         }

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.metrics.mesh_distance import MeshDistance
 
 if TYPE_CHECKING:
@@ -27,11 +27,6 @@ class BoneProbe(MeshDistance):
         super().__init__(mesh.vertices, mesh.faces, closed=bool(mesh.is_watertight))
         self.name = name
         self.bounds = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
-
-
-def bone_coordinates(points: Floats, pose: Floats) -> Floats:
-    """World points in the rest coordinates of a bone with this (4, 4) pose."""
-    return (points - pose[:3, 3]) @ pose[:3, :3]
 
 
 def surface_depth(vertices: Floats, probes: list[BoneProbe], poses: dict[str, Floats]) -> Floats:
@@ -77,31 +72,21 @@ def bones_about(vertices: Floats, probes: list[BoneProbe], poses: dict[str, Floa
     return [probe for probe, near in zip(probes, met) if near]
 
 
-def bone_depth(
-    vertices: Floats,
-    faces: Integers,
-    probes: list[BoneProbe],
-    poses: dict[str, Floats],
-    *,
-    distance: MeshDistance | None = None,
-) -> float:
-    """Greatest depth of any bone vertex inside a muscle's closed surface.
+def bone_depth(surface: MeshDistance, probes: list[BoneProbe], poses: dict[str, Floats]) -> float:
+    """Greatest depth of any bone vertex inside a muscle's closed, outward surface.
 
     Parameters
     ----------
-    vertices, faces : (n, 3) and (m, 3) ndarray
-        Closed, outward surface in world coordinates.
+    surface : MeshDistance
+        In world coordinates.
     probes : list of BoneProbe
     poses : dict of str to (4, 4) ndarray
-    distance : MeshDistance, optional
-        Of the surface, where it is at hand.
 
     Returns
     -------
     float
         [scene unit]; 0 where no bone vertex is inside.
     """
-    distance = MeshDistance(vertices, faces) if distance is None else distance
-    near = bones_about(vertices, probes, poses)
-    depths = [distance.depth(probe.vertices, pose=poses[probe.name]).max(initial=0.0) for probe in near]
+    near = bones_about(surface.vertices, probes, poses)
+    depths = [surface.depth(probe.vertices, pose=poses[probe.name]).max(initial=0.0) for probe in near]
     return float(max(depths, default=0.0))

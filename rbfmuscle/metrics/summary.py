@@ -113,12 +113,12 @@ class Summary:
         return facts
 
 
-def parse_limits(limits: str | Sequence[str] | Mapping[str, float] | None, scene: Scene) -> dict[str, float]:
+def parse_limits(limits: str | Sequence[str] | None, scene: Scene) -> dict[str, float]:
     """Limits as a dict of quantity to greatest allowed magnitude.
 
     Parameters
     ----------
-    limits : str, list of str, dict or None
+    limits : str, list of str or None
         ``"penetration_max=0.5,volume_error"``: a quantity with a value in the unit of ``metrics.csv``, or
         alone with the limit of `LIMITS`; ``"all"`` for every one of `LIMITS`.
     scene : Scene
@@ -128,15 +128,9 @@ def parse_limits(limits: str | Sequence[str] | Mapping[str, float] | None, scene
     UsageError
         On an unknown quantity or a value that is no number.
     """
-    if not limits:
-        return {}
-    if isinstance(limits, Mapping):
-        parts = [f"{name}={value}" for name, value in limits.items()]
-    else:
-        listed = [limits] if isinstance(limits, str) else limits
-        parts = [part.strip() for text in listed for part in text.split(",") if part.strip()]
+    listed = [limits] if isinstance(limits, str) else limits or []
     found = {}
-    for part in parts:
+    for part in (part.strip() for text in listed for part in text.split(",") if part.strip()):
         if part == "all":
             found |= {name: default_limit(name, scene) for name in LIMITS}
             continue

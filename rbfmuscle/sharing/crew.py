@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numba
 
-from rbfmuscle.child import gone, how_it_ended, send, start_child
+from rbfmuscle.child import send, start_child, unexpected_end
 from rbfmuscle.progress import stage
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.sharing.share import Solved
@@ -87,7 +87,7 @@ class WorkerPool:
             try:
                 kind, what = pickle.load(process.stdout)
             except (OSError, EOFError, pickle.UnpicklingError):
-                raise gone(how_it_ended(process)) from None
+                raise unexpected_end(process) from None
             if kind == "failed":
                 raise what
             if kind == "done":

@@ -32,7 +32,7 @@ ALLOWED = {
     "rbfmuscle.importers": (*LEAVES, "rbfmuscle.scene", "rbfmuscle.importers"),
     "rbfmuscle.muscle": (*CORE, "rbfmuscle.implicit", "rbfmuscle.muscle"),
     "pbd_baseline": (*CORE, "pbd_baseline"),
-    "rbfmuscle.metrics": (*CORE, "rbfmuscle.implicit", "rbfmuscle.metrics"),
+    "rbfmuscle.metrics": (*CORE, "rbfmuscle.metrics"),
     "rbfmuscle.output": (*CORE, "rbfmuscle.metrics", "rbfmuscle.output"),
     "rbfmuscle.experiments": MEASURED,
     "rbfmuscle.report": ABOVE,
