@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from rbfmuscle.cli.options import Frames, Json, Output, SceneName, Settings
+from rbfmuscle.cli.options import Frames, Output, SceneName, Settings
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import SolveError
 
@@ -17,7 +17,6 @@ def compare(
     settings: Settings = None,
     frames: Frames = None,
     pictures: bool = True,
-    as_json: Json = False,
 ) -> None:
     """Run models on one scene: the same motion, contacts and measures; tables, report, pictures.
 
@@ -34,7 +33,6 @@ def compare(
     from rbfmuscle import interruption
     from rbfmuscle.compare import compare_models
     from rbfmuscle.models import COMPARED
-    from rbfmuscle.output.writer import json_text
     from rbfmuscle.scene.phantom import open_scene
     from rbfmuscle.scene.settings import parse_settings
 
@@ -51,10 +49,7 @@ def compare(
 
         options: dict[str, Any] = {"frames": frames, "settings": changes, "pictures": pictures}
         table = compare_models(open_scene(scene), output, names, progress=advance, **options)
-    if as_json:
-        print(json_text({"directory": str(output), **table}))
-    else:
-        _print_table(table, output)
+    _print_table(table, output)
     if table["failed"]:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in table["failed"].items())
         raise SolveError(f"{reasons}; the other models are in {output}")

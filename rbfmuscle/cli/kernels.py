@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from rbfmuscle.cli.options import Json, Output, Texts
+from rbfmuscle.cli.options import Output, Texts
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import UsageError
 
@@ -24,7 +24,6 @@ def kernels(
     resolution: int = 0,
     units: str = "",
     error: float | None = None,
-    as_json: Json = False,
 ) -> None:
     """Rank kernels, shape parameters and numbers of centres on a surface, or on each muscle of a scene.
 
@@ -58,9 +57,9 @@ def kernels(
     try:
         if error is None:
             options |= {"centres": [int(c) for c in counts], "units": units, "resolution": resolution}
-            _study(meshes, output, options, as_json)
+            _study(meshes, output, options)
         else:
-            _find_wanted(meshes, output, error, options, units, as_json)
+            _find_wanted(meshes, output, error, options, units)
     except OSError as failed:
         raise UsageError(f"cannot write to {output}: {failed.strerror}; choose another --output") from None
 
@@ -82,9 +81,8 @@ def _meshes(source, muscle, units):
     return {each.name: each.mesh for each in chosen}, scene.units
 
 
-def _study(meshes, output, options, as_json):
+def _study(meshes, output, options):
     from rbfmuscle.experiments.kernel_study import describe, row_toml, study_kernels
-    from rbfmuscle.output.writer import json_text
     from rbfmuscle.report.kernel_page import answer, write_studies
 
     studies = {}
@@ -92,10 +90,6 @@ def _study(meshes, output, options, as_json):
         with Progress(f"kernels of {name}", what="fit") as bar:
             studies[name] = study_kernels(mesh, **options, progress=bar)
     write_studies(studies, output, meshes)
-    if as_json:
-        rows = [{"surface": name, **row} for name, study in studies.items() for row in study.rows]
-        print(json_text({"rows": rows}))
-        return
     for name, study in studies.items():
         if study.recommended is not None:
             print(f"{name}: {describe(study.rows)}")
@@ -103,7 +97,7 @@ def _study(meshes, output, options, as_json):
     print(f"{answer(studies)}\npage in {output / 'kernels.html'}")
 
 
-def _find_wanted(meshes, output, error, options, units, as_json):
+def _find_wanted(meshes, output, error, options, units):
     """Find, print and write what reaches an error; where it is not reached, that is said."""
     from rbfmuscle.experiments.kernel_study import row_toml
     from rbfmuscle.experiments.wanted_error import reach_error
@@ -119,9 +113,6 @@ def _find_wanted(meshes, output, error, options, units, as_json):
         }  # fmt: skip
     output.mkdir(parents=True, exist_ok=True)
     (output / "error.json").write_text(json_text(facts), encoding="utf-8")
-    if as_json:
-        print(json_text(facts))
-        return
     print("\n".join(found["said"] for found in facts.values()))
     print(f"all that was tried in {output / 'error.json'}")
     for name, found in facts.items():

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rbfmuscle.cli.options import Frames, Json, Model, Output, Settings, Texts
+from rbfmuscle.cli.options import Frames, Model, Output, Settings, Texts
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import SolveError, UsageError, did_you_mean
 
@@ -26,7 +26,6 @@ def sweep(
     jobs: int | None = None,
     cluster: str | None = None,
     error: str = "error_rms",
-    as_json: Json = False,
 ) -> None:
     """Run scenes under a grid of settings: errors, time per frame, Pareto front.
 
@@ -76,7 +75,7 @@ def sweep(
     )
     with progress, interruption.keeping(lambda: kept):
         run_sweep(run_point, loaded, points, output, progress=progress, **options)
-    _finish(points, output, {name: scene.units for name, scene in loaded.items()}, error, as_json)
+    _finish(points, output, {name: scene.units for name, scene in loaded.items()}, error)
 
 
 def _names(scenes):
@@ -97,19 +96,15 @@ def run_point(scene: Scene, settings: dict[str, Any], frames: str | None) -> Run
     return simulate(scene, settings=settings, frames=frames)
 
 
-def _finish(points, output, units, error, as_json):
+def _finish(points, output, units, error):
     from rbfmuscle.experiments.sweep_table import write_table
-    from rbfmuscle.output.writer import json_text
     from rbfmuscle.report.sweep_page import write_page
 
     table = write_table(points, output, units, quantity=error)
     write_page(table, output)
-    if as_json:
-        print(json_text({"directory": str(output), **table}))
-    else:
-        for verdict in table["verdicts"]:
-            print(verdict["text"])
-        print(f"{table['done']} points done, {table['failed']} failed, in {output}, open {output}/sweep.html")
+    for verdict in table["verdicts"]:
+        print(verdict["text"])
+    print(f"{table['done']} points done, {table['failed']} failed, in {output}, open {output}/sweep.html")
     bad = [row for row in table["rows"] if row["status"] != "done"]
     for row in bad[:5]:
         print(f"rbfmuscle: {row['scene']} {row['label']}: {row['error'] or row['status']}", file=sys.stderr)

@@ -231,9 +231,9 @@ class TestCommand:
         use_blend_model(monkeypatch)
         other = scene_file.with_name("other.toml")
         other.write_text(scene_file.read_text(encoding="utf-8"))
-        words = ["sweep", str(scene_file), str(other), "-o", str(tmp_path / "out"), "--jobs", "1", "--json"]
+        words = ["sweep", str(scene_file), str(other), "-o", str(tmp_path / "out"), "--jobs", "1"]
         assert command([*words, "--grid", "contact.substep_angle=1,2"]) == 0
-        table = json.loads(capsys.readouterr().out)
+        table = json.loads((tmp_path / "out" / "sweep.json").read_text(encoding="utf-8"))
         assert {r["scene"] for r in table["rows"]} == {scene_file.stem, "other"}
         assert table["done"] == len(table["rows"])
 
