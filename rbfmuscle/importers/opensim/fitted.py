@@ -66,8 +66,8 @@ def fit_path(
 ) -> FittedPath:
     """Fit a polynomial to lengths (n,) and, by its derivatives, to moment arms (n, d).
 
-    ``values`` (n, d) are the coordinates [radian or scene unit]. The order, at most ``most``, is the one whose fit without
-    a fifth of the poses, each in turn, errs least there; there are always more equations than terms.
+    ``values`` (n, d) are the coordinates [radian or scene unit]. The order, at most ``most``, is the one whose fit
+    without a fifth of the poses, each in turn, errs least there; there are always more equations than terms.
     """
     count, dimension = values.shape
     weights = np.r_[1.0, np.full(dimension, ARM_WEIGHT)][:, None]

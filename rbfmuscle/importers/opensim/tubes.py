@@ -13,11 +13,12 @@ import numpy as np
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.surfaces import mesh_volume
+from rbfmuscle.geometry.tubes import SIDES, tube_mesh
 from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
 from rbfmuscle.validation import SceneError
 
-# Sections along a tube and corners of each; radius at the ends against the middle; share of the length held at an end.
-SECTIONS, CORNERS, END_RADIUS, HELD = 28, 12, 0.3, 0.06
+# Sections along a tube; radius at the ends against the middle; share of the length held at an end.
+SECTIONS, END_RADIUS, HELD = 28, 0.3, 0.06
 # Rounds in which the middle line is drawn straight and put out of what is in its way.
 ROUNDS = 60
 
@@ -53,8 +54,8 @@ def make_tube(
     radius = share * np.sqrt(volume / (np.pi * length * np.mean(share**2)))
     wraps = [(wrap, places[wrap.body] @ scaled(wrap.frame, metre)) for wrap in muscle.wraps]
     line = _clear_line(line, fixed, radius, wraps, metre, list(bones.values()))
-    found = mesh_volume(*_skin(line, radius))  # as its square, but for where sections run into each other
-    vertices, faces = _skin(line, radius * np.sqrt(volume / found))
+    found = mesh_volume(*tube_mesh(line, radius))  # as its square, but for where sections run into each other
+    vertices, faces = tube_mesh(line, radius * np.sqrt(volume / found))
     return Tube(vertices, faces, _held(bodies, fixed, bones))
 
 
@@ -123,36 +124,6 @@ def _out_of_bone(bone, points, reach):
     return out
 
 
-def _skin(line, radius):
-    """Vertices and triangles of a tube about a line, closed at both ends; sections turn as little as they can."""
-    tangent = np.gradient(line, axis=0)
-    tangent /= np.maximum(np.linalg.norm(tangent, axis=1), 1e-12)[:, None]
-    side = np.cross(tangent[0], np.eye(3)[np.argmin(np.abs(tangent[0]))])
-    angle = np.linspace(0.0, 2.0 * np.pi, CORNERS, endpoint=False)
-    rings = []
-    for point, along, r in zip(line, tangent, radius):
-        side = side - side @ along * along
-        side = side / np.linalg.norm(side)
-        circle = np.outer(np.cos(angle), side) + np.outer(np.sin(angle), np.cross(along, side))
-        rings.append(point + r * circle)
-    k = np.arange(CORNERS)
-    following, count = np.roll(k, -1), len(line) * CORNERS
-    a = CORNERS * np.arange(len(line) - 1)[:, None]
-    this, beside = a + k, a + following
-    pairs = [
-        np.stack([this, beside, this + CORNERS], 2),
-        np.stack([beside, beside + CORNERS, this + CORNERS], 2),
-    ]
-    sides = np.stack(pairs, axis=1)
-    last = count - CORNERS
-    caps = [
-        (following, k, np.full(CORNERS, count)),
-        (last + k, last + following, np.full(CORNERS, count + 1)),
-    ]
-    faces = np.vstack([np.column_stack(caps[0]), sides.reshape(-1, 3), np.column_stack(caps[1])])
-    return np.vstack([*rings, line[:1], line[-1:]]), faces
-
-
 def _held(bodies, fixed, bones):
     """Vertices by bone: both ends with the points that follow on their body, a section at each point on another."""
     few = max(1, round(HELD * SECTIONS))
@@ -166,7 +137,7 @@ def _held(bodies, fixed, bones):
             sections.setdefault(place, body)
     held = {body: [] for body in sections.values()}
     for k, body in sections.items():
-        held[body].append(np.arange(k * CORNERS, (k + 1) * CORNERS))
+        held[body].append(np.arange(k * SIDES, (k + 1) * SIDES))
     for k in (0, -1):
-        held[bodies[k]].append(np.array([SECTIONS * CORNERS - k]))
+        held[bodies[k]].append(np.array([SECTIONS * SIDES - k]))
     return {body: np.sort(np.concatenate(rows)) for body, rows in held.items()}

@@ -1,0 +1,47 @@
+"""Closed tubes of varying radius about a line."""
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats, Integers
+
+# Vertices around a tube.
+SIDES = 12
+
+
+def tube_mesh(line: Floats, radii: Floats) -> tuple[Floats, Integers]:
+    """Rings about the points (n, 3) of a line, closed by a vertex at either end; and outward faces (m, 3).
+
+    Vertices are ring by ring, then both ends; neighbouring rings are turned as little as they can be.
+    """
+    first, second = _frames(line)
+    angles = np.linspace(0.0, 2.0 * np.pi, SIDES, endpoint=False)
+    spokes = np.cos(angles)[:, None] * first[:, None] + np.sin(angles)[:, None] * second[:, None]
+    rings = line[:, None] + radii[:, None, None] * spokes
+    return np.concatenate([rings.reshape(-1, 3), line[[0, -1]]]), _tube_faces(len(line))
+
+
+def _frames(line: Floats) -> tuple[Floats, Floats]:
+    """Unit vectors (n, 3) across a line that turn with it as little as they can, and those across both."""
+    ahead = np.gradient(line, axis=0)
+    ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-300)
+    across = np.empty_like(line)
+    before = np.eye(3)[np.argmin(np.abs(ahead[0]))]
+    for k, direction in enumerate(ahead):
+        before = before - (before @ direction) * direction
+        before = across[k] = before / max(float(np.linalg.norm(before)), 1e-300)
+    return across, np.cross(ahead, across)
+
+
+def _tube_faces(rings: int) -> Integers:
+    """Outward faces of so many rings, then of the fans at both ends."""
+    side = np.arange(SIDES)
+    after = np.roll(side, -1)
+    base = SIDES * np.arange(rings - 1)[:, None]
+    a, b, c, d = (base + k for k in (side, after, SIDES + side, SIDES + after))
+    wall = np.concatenate([np.stack([a, b, d], axis=-1), np.stack([a, d, c], axis=-1)]).reshape(-1, 3)
+    last, tips = SIDES * (rings - 1), SIDES * rings
+    fans = [
+        np.stack([np.full(SIDES, tips), after, side], axis=-1),
+        np.stack([np.full(SIDES, tips + 1), last + side, last + after], axis=-1),
+    ]
+    return np.concatenate([wall, *fans])
