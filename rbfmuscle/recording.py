@@ -26,7 +26,7 @@ from rbfmuscle.metrics.summary import (
     require_limits,
 )
 from rbfmuscle.models import configure_scene
-from rbfmuscle.output.runinfo import Stages, build_info, frame_facts
+from rbfmuscle.output.runinfo import Neighbours, build_info, frame_facts
 from rbfmuscle.output.sinks import Sink
 from rbfmuscle.output.writer import RunWriter
 from rbfmuscle.progress import stage
@@ -70,7 +70,7 @@ class Recording:
         self.options = {"model": model, "frames": str(frames or ""), "settings": dict(settings or {})}
         self.times: dict[str, float] = {}
         self.status, self.message = "running", ""
-        self.summary, self.stages = Summary(), Stages()
+        self.summary, self.neighbours = Summary(), Neighbours()
         self.written: list[dict] = []
         self._path: dict[int, dict[str, float]] = {}
         self._place = {muscle.name: k for k, muscle in enumerate(scene.muscles)}
@@ -147,7 +147,7 @@ class Recording:
         frame.events.sort(key=lambda event: self._place[event.muscle])
         events, together = self._skeleton.get(frame.index, ([], {}))
         frame.events.extend(events)
-        self.stages.add(frame)
+        self.neighbours.add(frame)
         before = next(reversed(self._path.values()), None)
         rows = frame_rows(self.scene, frame, before, {**measured, ALL: together})
         self.summary.add(rows)
@@ -168,7 +168,7 @@ class Recording:
         return build_info(
             self.scene,
             self.started,
-            self.stages,
+            self.neighbours,
             table,
             status=status or self.status,
             message=self.message,

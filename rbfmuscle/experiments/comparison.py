@@ -67,14 +67,9 @@ MEASURES = {
     "distance_max": Measure("distance (greatest)", "length", FIRST, 0.0, "the same, greatest distance"),
     "time_frame": Measure("time per frame", "s", COST, 0.0, "median of all muscles together, with surfaces"),
     "time_frame_p95": Measure("time per frame (95 %)", "s", COST, 0.0, "exceeded by one frame in 20"),
-    "time_solve": Measure(
-        "solution", "s", COST, 0.0, "with prediction and contacts; median, sum over muscles"
-    ),
-    "time_surface": Measure("surface", "s", COST, 0.0, "fit and extraction; median, sum over muscles"),
     "time_build": Measure("build", "s", COST, 0.0, "models of all muscles, once, with filled caches"),
 }
 _FROM_METRICS = [name for name, m in MEASURES.items() if m.against in (LAW, MESH)]
-_SUMMED = ("time_solve", "time_surface")
 _TIE = 1.05
 
 
@@ -97,19 +92,21 @@ def measure_run(saved: SavedRun, extra: dict[str, Any]) -> dict[str, Any]:
     Returns
     -------
     dict
-        muscle -> quantity -> value, and under ``"all"`` the worst over muscles, the sum, or the wall time.
+        muscle -> quantity -> value, and under ``"all"`` the worst over muscles, or the wall time.
     """
     found = {}
     for muscle in saved.muscles:
         facts = saved.info["muscles"].get(muscle, {})
         values = {q: facts[q]["worst"] for q in _FROM_METRICS if q in facts}
-        values.update(_times(saved, muscle))
+        times = saved.series(muscle, "time_frame")[1][1:]  # the first loads and compiles
+        if len(times):
+            values["time_frame"] = float(np.median(times))
         for name, frame, part in (("return", 0, "end"), ("step", -1, "turn")):
             if part in extra:
                 pair = surface_distance(*saved.surface(muscle, saved.frames[frame]), *extra[part][muscle])
                 values[f"{name}_rms"], values[f"{name}_max"] = pair
         found[muscle] = values
-    together = {name: _over_muscles(name, found.values()) for name in MEASURES}
+    together = {name: _worst(name, found.values()) for name in MEASURES}
     wall = saved.series(ALL, "time_frame")[1][1:]
     if len(wall):
         together.update(time_frame=float(np.median(wall)), time_frame_p95=float(np.percentile(wall, 95)))
@@ -118,28 +115,9 @@ def measure_run(saved: SavedRun, extra: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _times(saved, muscle):
-    """Median times of a muscle after its first frame, which loads and compiles."""
-    found = {}
-    for name in ("time_frame", "time_solve"):
-        values = saved.series(muscle, name)[1][1:]
-        if len(values):
-            found[name] = float(np.median(values))
-    stages = saved.info["stages"].get(muscle, {})
-    if "time_surface" in stages:
-        found["time_surface"] = stages["time_surface"]["median"]
-    return found
-
-
-def _over_muscles(quantity, muscles):
+def _worst(quantity, muscles):
     values = [values[quantity] for values in muscles if values.get(quantity) is not None]
-    if not values:
-        return None
-    return (
-        float(sum(values))
-        if quantity in _SUMMED
-        else float(max(values, key=lambda v: abs(v - MEASURES[quantity].ideal)))
-    )
+    return max(values, key=lambda v: abs(v - MEASURES[quantity].ideal), default=None)
 
 
 def add_distances(results: dict[str, Any], folder: Path, poses: list[int]) -> None:

@@ -6,13 +6,10 @@ import hashlib
 import importlib.metadata
 import os
 import platform
-from collections import Counter, defaultdict
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 import rbfmuscle
 from rbfmuscle.metrics.quantities import ALL
@@ -25,7 +22,7 @@ _PACKAGES = ("numpy", "scipy", "numba", "scikit-image", "trimesh", "pyvista", "v
 
 
 def build_info(
-    scene: Scene, started: datetime, stages: Stages, summary: dict[str, Any], **facts: Any
+    scene: Scene, started: datetime, neighbours: Neighbours, summary: dict[str, Any], **facts: Any
 ) -> dict[str, Any]:
     """Assemble ``run.json``.
 
@@ -33,7 +30,7 @@ def build_info(
     ----------
     scene : Scene
     started : datetime
-    stages : Stages
+    neighbours : Neighbours
     summary : dict
         From `Summary.table`.
     **facts
@@ -49,9 +46,7 @@ def build_info(
         "versions": versions(),
         "machine": machine(),
         "inputs": input_hashes(scene),
-        "stages": stages.table(),
-        "work": stages.work(),
-        **({"neighbours": stages.neighbours()} if stages.pairs else {}),
+        **({"neighbours": neighbours.table()} if neighbours.pairs else {}),
         "muscles": {name: found for name, found in summary.items() if name != ALL},
         "frame_time": summary.get(ALL, {}).get("time_frame"),
         **facts,
@@ -69,55 +64,25 @@ def frame_facts(scene: Scene, frame: Frame) -> dict:
     }
 
 
-class Stages:
-    """Time of each stage of each muscle over the frames, and what each frame took of it."""
+class Neighbours:
+    """Pairs of muscles that slide: worst overlap and its frame, worst gap and its frame."""
 
     def __init__(self) -> None:
-        self._values = defaultdict(lambda: defaultdict(list))
-        self._work = defaultdict(Counter)
-        #: Pairs of neighbours: worst overlap and its frame, worst gap and its frame.
         self.pairs: dict[tuple[str, str], tuple[float, int, float, int]] = {}
 
     def add(self, frame: Frame) -> None:
-        """Take in a frame's times and those that its surfaces report."""
+        """Take in what a frame holds of them."""
         for pair, (overlap, gap) in frame.neighbours.items():
             deepest, at, widest, there = self.pairs.get(pair, (-1.0, 0, -1.0, 0))
             deepest, at = max((deepest, at), (overlap, frame.index), key=lambda found: found[0])
             widest, there = max((widest, there), (gap, frame.index), key=lambda found: found[0])
             self.pairs[pair] = deepest, at, widest, there
-        for name, work in frame.work.items():
-            self._work[name].update({work.state: 1, "substeps": work.substeps})
-        for name, times in frame.times.items():
-            inner = frame.surfaces[name].quantities if name in frame.surfaces else {}
-            for key, value in (*times.items(), *inner.items()):
-                if key.startswith("time_"):
-                    self._values[name][key].append(float(value))
 
-    def neighbours(self) -> list[dict[str, Any]]:
+    def table(self) -> list[dict[str, Any]]:
         """Pairs of neighbours, the deepest overlap first [scene unit]."""
         names = ("overlap_max", "overlap_frame", "gap_rms", "gap_frame")
         found = [{"muscles": list(pair), **dict(zip(names, worst))} for pair, worst in self.pairs.items()]
         return sorted(found, key=lambda row: -row["overlap_max"])
-
-    def work(self) -> dict[str, dict[str, int]]:
-        """Nested dict: muscle -> frames ``solved``, ``carried``, ``skipped``, and ``substeps``."""
-        keys = ("solved", "carried", "skipped", "substeps")
-        return {name: {key: count[key] for key in keys} for name, count in self._work.items()}
-
-    def table(self) -> dict[str, Any]:
-        """Nested dict: muscle -> stage -> total, median, 95th percentile and first [s]."""
-        return {
-            name: {
-                key: {
-                    "total": float(np.sum(values)),
-                    "median": float(np.median(values)),
-                    "p95": float(np.percentile(values, 95)),
-                    "first": values[0],
-                }
-                for key, values in stages.items()
-            }
-            for name, stages in self._values.items()
-        }
 
 
 def versions() -> dict[str, str]:

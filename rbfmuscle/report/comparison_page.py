@@ -39,8 +39,7 @@ Series = tuple[Integers, Floats]
 _AREA, _WHOLE = 90_000, 400_000
 _READING = """All models ran through the same frames and sub-steps, one after another with the same bone fields and
 number of threads, each after a warm-up. The time per frame is the wall time of prediction, solution, contacts and
-surface of all muscles; solution and surface are sums over muscles, which run side by side, and may exceed it. The
-distance to the first model is no error: it says how far models differ."""
+surface of all muscles. The distance to the first model is no error: it says how far models differ."""
 
 
 def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) -> None:

@@ -7,12 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rbfmuscle.output.runinfo import Stages
+from rbfmuscle.output.runinfo import Neighbours
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report.comparison_page import worst_series
 from rbfmuscle.report.plots import Point, Track, front_plot, line_plot, motion_axis
 from rbfmuscle.report.report import _tracks
-from rbfmuscle.simulation.rigid_transport import MuscleStatus
 
 
 def numbers_at(svg, anchor):
@@ -66,36 +65,16 @@ def test_tracks_are_the_series_of_the_run_and_times_leave_out_the_first_frame(ar
     np.testing.assert_allclose(track.y, 1000.0 * saved.series("biceps", "time_frame")[1][1:], rtol=1e-12)
 
 
-def frame(index, times, *, state="solved", substeps=1, reason="bones turn", pairs=None, inner=None):
-    return SimpleNamespace(
-        index=index,
-        times={"a": times},
-        surfaces={} if inner is None else {"a": SimpleNamespace(quantities=inner)},
-        work={"a": MuscleStatus(state, substeps, reason)},
-        neighbours=pairs or {},
-    )
-
-
-FRAMES = [
-    frame(0, {"time_solve": 4.0, "n": 9}, inner={"time_fit": 0.5, "volume": 3.0}, pairs={("a", "b"): (0.1, 0.0)}),
-    frame(2, {"time_solve": 1.0}, substeps=3, pairs={("a", "b"): (0.4, 0.2), ("a", "c"): (0.5, 0.0)}),
-    frame(4, {"time_solve": 2.0}, state="carried", substeps=0, reason="moves with b", pairs={("a", "b"): (0.3, 0.7)}),
-    frame(6, {"time_solve": 3.0}, substeps=2, reason="touches", pairs={("a", "b"): (0.0, 0.1)}),
-    frame(8, {"time_solve": 5.0}, substeps=2, reason="touches"),
-]  # fmt: skip
-
-
-def test_stages_sum_times_and_work_and_keep_the_worst_of_neighbours():
-    stages = Stages()
-    for each in FRAMES:
-        stages.add(each)
-    table = stages.table()
-    assert set(table["a"]) == {"time_solve", "time_fit"}
-    assert table["a"]["time_solve"] == pytest.approx({"total": 15.0, "median": 3.0, "p95": 4.8, "first": 4.0})
-    assert table["a"]["time_fit"]["total"] == 0.5
-    work = stages.work()["a"]
-    assert [work[key] for key in ("solved", "carried", "skipped", "substeps")] == [4, 1, 0, 8]
-    found = [[*row.pop("muscles"), *row.values()] for row in stages.neighbours()]
+def test_the_worst_of_neighbours_over_the_frames_is_kept():
+    neighbours = Neighbours()
+    for index, pairs in (
+        (0, {("a", "b"): (0.1, 0.0)}),
+        (2, {("a", "b"): (0.4, 0.2), ("a", "c"): (0.5, 0.0)}),
+        (4, {("a", "b"): (0.3, 0.7)}),
+        (6, {}),
+    ):
+        neighbours.add(SimpleNamespace(index=index, neighbours=pairs))
+    found = [[*row.pop("muscles"), *row.values()] for row in neighbours.table()]
     assert found == [["a", "c", 0.5, 2, 0.0, 2], ["a", "b", 0.4, 2, 0.7, 4]]
 
 
