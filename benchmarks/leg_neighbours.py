@@ -24,8 +24,8 @@ from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.models import build_models
 from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame_loop import FrameLoop
-from rbfmuscle.simulation.plan.contact_pairs import build_fields, find_contact_pairs
 
 THRESHOLD = 2.0  # mm: nearer at rest is touching, as `[sliding]` has it
 FACING = 0.5  # cosine between a vertex's normal and the way to its neighbour, from which on it faces that
@@ -51,7 +51,7 @@ class Bench:
         self.fields = build_fields(self.scenes[True], find_contact_pairs(self.scenes[True]))
 
     def loop(self, *, sliding=True):
-        """A loop at rest, to be closed."""
+        """A loop at rest."""
         for model, state in zip(self.models, self.rest):
             model.restore(state)
         return FrameLoop(self.scenes[sliding], self.models, fields=self.fields)
@@ -162,23 +162,23 @@ def _surfaces(frame):
 def pairs(bench, arguments):
     wanted = {0, *chosen(arguments.frames, len(bench.path))}
     worst, touching = {}, None
-    with bench.loop(sliding=not arguments.without) as loop:
-        for k, coordinates in enumerate(bench.path[: max(wanted) + 1]):
-            if k not in wanted:
-                loop.skip(coordinates)
-                continue
-            frame = loop.advance(coordinates)
-            surfaces = _surfaces(frame)
-            touching = touching or Touching(surfaces, holders(bench.scenes[True], bench.models, surfaces))
-            opened = touching.opened(surfaces)
-            # Overlap, gap; the same of what is held on both sides; the gap of what is faced.
-            found = [one for pair in zip(touching.overlaps(surfaces), opened) for one in pair]
-            found += opened[2:]
-            for place, values in enumerate(found):
-                for pair, value in values.items():
-                    row = worst.setdefault(pair, [(0.0, 0)] * 5)
-                    row[place] = max(row[place], (value, k))
-            _tell_frame(k, frame, found[:2])
+    loop = bench.loop(sliding=not arguments.without)
+    for k, coordinates in enumerate(bench.path[: max(wanted) + 1]):
+        if k not in wanted:
+            loop.skip(coordinates)
+            continue
+        frame = loop.advance(coordinates)
+        surfaces = _surfaces(frame)
+        touching = touching or Touching(surfaces, holders(bench.scenes[True], bench.models, surfaces))
+        opened = touching.opened(surfaces)
+        # Overlap, gap; the same of what is held on both sides; the gap of what is faced.
+        found = [one for pair in zip(touching.overlaps(surfaces), opened) for one in pair]
+        found += opened[2:]
+        for place, values in enumerate(found):
+            for pair, value in values.items():
+                row = worst.setdefault(pair, [(0.0, 0)] * 5)
+                row[place] = max(row[place], (value, k))
+        _tell_frame(k, frame, found[:2])
     print(f"{len(touching.found) // 2} pairs touch at rest, {len(worst)} pairs meet")
     for name, places in (("muscle against muscle", (0, 1)), ("held by bones on both sides", (2, 3))):
         _tell_pairs(name, {pair: [row[k] for k in places] for pair, row in worst.items()})

@@ -26,7 +26,7 @@ from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.run import simulate
 from rbfmuscle.scene.motion import bone_poses, interpolate
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.simulation.plan.contact_pairs import build_fields, find_contact_pairs
+from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.validation import MissingPartError, SolveError
 
 ROOT = Path(__file__).resolve().parents[1]

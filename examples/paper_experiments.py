@@ -27,7 +27,7 @@ from rbfmuscle.scene.options import TunnellingOptions
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
-from rbfmuscle.simulation.plan.contact_pairs import build_fields, find_contact_pairs
+from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.substeps import SubSteps
 from rbfmuscle.simulation.tunnelling import find_crossings
 

@@ -16,7 +16,9 @@ POWER = 4.0
 ROUNDS = 8
 # Faces whose gradient is below this share of the largest count as having this much.
 LEAST_GRADIENT = 1e-3
-LEAST_COTANGENT = 1e-3
+COTANGENTS = 1e-3, 1e3
+# Height of a triangle over its longest side below which its gradient is that of this height.
+FLATTEST = 1e-6
 
 
 def even_weights(vertices: Floats, faces: Integers, groups: list[Integers]) -> Floats:
@@ -55,12 +57,14 @@ def _face_operators(vertices, faces):
     """Half cotangents (m, 3) opposite to each corner's edge, and three (m, n) gradient matrices."""
     corners = [vertices[faces[:, k]] for k in range(3)]
     normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-    square = np.maximum(np.einsum("ij,ij->i", normal, normal), 1e-300)
+    sides = [corners[k - 1] - corners[k] for k in range(3)]
+    longest = np.max([np.einsum("ij,ij->i", side, side) for side in sides], axis=0)
+    square = np.maximum(np.einsum("ij,ij->i", normal, normal), (FLATTEST * longest) ** 2 + 1e-300)
     cotangents, slopes = np.empty((len(faces), 3)), []
     for k in range(3):
         one, two = corners[(k + 1) % 3], corners[(k + 2) % 3]
         dot = np.einsum("ij,ij->i", one - corners[k], two - corners[k])
-        cotangents[:, k] = np.maximum(0.5 * dot / np.sqrt(square), LEAST_COTANGENT)
+        cotangents[:, k] = np.clip(0.5 * dot / np.sqrt(square), *COTANGENTS)
         slopes.append(np.cross(normal, two - one) / square[:, None])
     rows = np.tile(np.arange(len(faces)), 3)
     shape = (len(faces), len(vertices))

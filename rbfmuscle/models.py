@@ -4,6 +4,7 @@ import importlib
 from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
+from rbfmuscle.geometry.threads import each
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.options import Table
 from rbfmuscle.scene.scene import Scene
@@ -96,15 +97,11 @@ def solved_points(muscle: Muscle, scene: Scene) -> str:
 
 def build_models(scene: Scene, names: Collection[str] | None = None) -> list[MuscleModel]:
     """Return the models of a scene's muscles, all or those named, in the scene's order, built side by side."""
-    from rbfmuscle.simulation.workers import Workers
+    from threadpoolctl import threadpool_limits
 
     muscles = [muscle for muscle in scene.muscles if names is None or muscle.name in names]
-    workers = Workers(len(muscles))
-    try:
-        with workers.one_thread_each():
-            return workers.each(lambda muscle: build_model(muscle, scene), muscles)
-    finally:
-        workers.close()
+    with threadpool_limits(limits=1, user_api="blas"):
+        return each(lambda muscle: build_model(muscle, scene), muscles)
 
 
 def configure_scene(

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rbfmuscle.geometry.threads import each
 from rbfmuscle.importers.opensim.fitted import MOST_COORDINATES, fit_path, write_paths
 from rbfmuscle.metrics.centreline import Centreline
 from rbfmuscle.models import build_models
@@ -16,8 +17,8 @@ from rbfmuscle.scene.joints.tables import full_name
 from rbfmuscle.scene.motion import bone_poses, inner_value
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame_loop import FrameLoop
-from rbfmuscle.simulation.plan.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.validation import SceneError, SolveError, UsageError
 
 # Every fifth sample is held out of the fit.
@@ -118,8 +119,7 @@ def _measured(scene, poses):
         for model, state in zip(models, rest):
             model.restore(state)
         try:
-            with FrameLoop(scene, models, fields=fields, surfaces=False) as loop:
-                yield _row(loop, lines, pose)
+            yield _row(FrameLoop(scene, models, fields=fields, surfaces=False), lines, pose)
         except SolveError:
             yield np.full((len(models), 1 + len(pose)), np.nan)
 
@@ -140,8 +140,8 @@ def _row(loop, lines, pose):
 def _settled(loop, lines, pose):
     """Lengths (n,) of the muscles when they have come to rest at a pose, or have had `MOST_SOLVES`."""
     loop.skip(pose)
-    with loop.workers.one_thread_each():
-        loop.workers.each(lambda stepper: _settle(stepper, loop.here), loop.steppers)
+    with loop.working():
+        each(lambda stepper: _settle(stepper, loop.here), loop.steppers)
     poses, found = bone_poses(loop.scene, loop.here), []
     for stepper in loop.steppers:
         line = lines[stepper.name]

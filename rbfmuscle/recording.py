@@ -33,9 +33,9 @@ from rbfmuscle.progress import stage
 from rbfmuscle.scene.check import bone_collisions, bone_findings, check_initial, sampled_frames
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.sharing.crew import WorkerPool
+from rbfmuscle.sharing.processes import helpers_for
 from rbfmuscle.sharing.share import MuscleGroup, timed
 from rbfmuscle.simulation.frame import Event, Frame
-from rbfmuscle.simulation.plan.processes import helpers_for
 from rbfmuscle.simulation.substeps import check_substeps
 from rbfmuscle.validation import RBFMuscleError, SceneWarning, SolveError, UsageError
 

@@ -48,7 +48,7 @@ def _findings(path):
     from rbfmuscle.scene.attachments import ExactMeshes
     from rbfmuscle.scene.check import Finding, check_scene, sort_findings
     from rbfmuscle.scene.phantom import open_scene
-    from rbfmuscle.simulation.plan.motion_check import motion_findings
+    from rbfmuscle.simulation.motion_check import motion_findings
     from rbfmuscle.simulation.substeps import check_substeps
 
     loaded = open_scene(path, skeleton=True)

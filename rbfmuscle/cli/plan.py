@@ -23,7 +23,7 @@ def plan(scene: SceneName, *, time: Flag = False, as_json: Json = False) -> None
     """
     from rbfmuscle.models import check_models, solved_points
     from rbfmuscle.scene.phantom import open_scene
-    from rbfmuscle.simulation.plan.plan import plan_scene
+    from rbfmuscle.simulation.plan import plan_scene
 
     with Progress(f"plan {scene.name}"):
         loaded = open_scene(scene)
@@ -55,10 +55,9 @@ def measure_time(scene: Scene) -> dict[str, float]:
 def _lines(made):
     yield f"{made['frames']} frames in {made['substeps']} sub-steps"
     for muscle in made["muscles"]:
-        work = ", ".join(f"{s} in {muscle[s]}" for s in ("solved", "carried", "skipped") if muscle[s])
         yield (
             f"muscle {muscle['name']}: {muscle['model']}, {muscle['points']}, can meet "
-            f"{', '.join(muscle['bones']) or 'no bone'}; {work or 'solved in 0'} frames ({muscle['reason']})"
+            f"{', '.join(muscle['bones']) or 'no bone'}; solved in {muscle['substeps']} sub-steps"
         )
     for field in made["fields"]:
         yield f"field of {field['bone']}: {field['share']:.0%} of its box, {field['triangles']} triangles"

@@ -259,7 +259,9 @@ class RBFDrawing:
 
     def __init__(self, drawer: SurfaceBuilder, now: Configuration, contacts: BoneContacts) -> None:
         self._drawer, self._now = drawer, now
-        self._depth, self._contacts = contacts.depth(now.points), contacts.frozen()
+        depths = contacts.depths(now.points).values()
+        self._depth = max((float(depth.max()) for depth in depths), default=0.0)
+        self._contacts = contacts.frozen()
         self._fitted: RBFField | None = None
         self._time_fit = 0.0
 
@@ -297,7 +299,7 @@ class _BoneCut:
         self.steepest = np.inf if contacts.cuts and neighbours else 1.0
 
     def __call__(self, points: Floats) -> Floats:
-        return self.contacts.nearest(points, self.reach, neighbours=self.neighbours)
+        return self.contacts.nearest(points, self.reach, neighbours=self.neighbours)[0]
 
     def value_and_gradient_below(self, points: Floats, limit: Floats) -> tuple[Floats, Floats]:
-        return self.contacts.nearest_with_gradient(points, limit, neighbours=self.neighbours)
+        return self.contacts.nearest(points, limit, neighbours=self.neighbours)

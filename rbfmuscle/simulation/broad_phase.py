@@ -93,7 +93,7 @@ def _lower_bound(points, i, pose, bounds, anchor, bound):
 
 
 @compiled(error_model="numpy")
-def box_loop(points, chosen, box):
+def _box_loop(points, chosen, box):
     """Fill ``box`` (2, 3) with the least and greatest coordinates of the chosen points."""
     box[0], box[1] = np.inf, -np.inf
     for i in range(len(points)):
@@ -121,27 +121,45 @@ def boxes_apart(box, pose, bounds):
 def apart_loop(points, poses, boxes, apart):
     """Lower bound of the distance between each bone's box and the box of the points."""
     box = np.empty((2, 3))
-    box_loop(points, np.ones(len(points), np.bool_), box)
+    _box_loop(points, np.ones(len(points), np.bool_), box)
     for b in range(len(poses)):
         apart[b] = boxes_apart(box, poses[b], boxes[b])
 
 
 @compiled(error_model="numpy")
-def near_loop(points, free, reach, rows, bones, known, found, counts):
-    """Fill ``found`` (b, n) with the free points that may be nearer than ``reach`` to each bone, and ``counts``."""
+def near_loop(points, free, reach, bones, known, found, counts):
+    """Fill ``found`` (b, n) with the free points that may be nearer than ``reach`` to each bone, and ``counts``.
+
+    ``reach`` (b, n) or (1, n) holds the reach of each point, for each bone or for all.
+    """
     poses, boxes = bones
     anchor, bound = known
-    box, farthest = np.empty((2, 3)), -np.inf
-    box_loop(points, free, box)
-    for i in range(len(points)):
-        if free[i]:
-            farthest = max(farthest, reach[i])
-    for n in range(len(rows)):
-        b, count = rows[n], 0
+    box = np.empty((2, 3))
+    _box_loop(points, free, box)
+    for b in range(len(poses)):
+        count, farthest, limit = 0, -np.inf, reach[b % len(reach)]
+        for i in range(len(points)):
+            if free[i]:
+                farthest = max(farthest, limit[i])
         if boxes_apart(box, poses[b], boxes[b]) > farthest:
             continue
         for i in range(len(points)):
-            if free[i] and _lower_bound(points, i, poses[b], boxes[b], anchor[b], bound[b]) <= reach[i]:
-                found[n, count] = i
+            if free[i] and _lower_bound(points, i, poses[b], boxes[b], anchor[b], bound[b]) <= limit[i]:
+                found[b, count] = i
                 count += 1
-        counts[n] = count
+        counts[b] = count
+
+
+@compiled(error_model="numpy")
+def path_loop(start, end, before, after, length):
+    """Fill ``length`` (b, n) with the lengths of straight paths as seen from each of some bones that move too."""
+    for b in range(len(before)):
+        for i in range(len(start)):
+            square = 0.0
+            for k in range(3):
+                way = 0.0
+                for j in range(3):
+                    way += after[b, j, k] * (end[i, j] - after[b, j, 3])
+                    way -= before[b, j, k] * (start[i, j] - before[b, j, 3])
+                square += way * way
+            length[b, i] = np.sqrt(square)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbfmuscle.geometry.arrays import Booleans, Floats
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.scene.tendons import AtRest
 from rbfmuscle.simulation.broad_phase import (
     answer_loop,
@@ -21,6 +21,7 @@ from rbfmuscle.simulation.broad_phase import (
     closer_loop,
     direction_loop,
     near_loop,
+    path_loop,
     take_contacts_loop,
 )
 from rbfmuscle.validation import check_points
@@ -42,18 +43,35 @@ class HalfSpaces:
         Unit direction of growing distance, world axes.
     source : (c,) ndarray of int
         Index of the bone, or ``-1 - k`` for virtual edges of family k.
-    give : (c,) ndarray or None
-        Contact compliance, relative to the contact's diagonal response; None where all are rigid.
     """
 
     index: np.ndarray
     gap: np.ndarray
     normal: np.ndarray
     source: np.ndarray
-    give: np.ndarray | None = None
 
-    def __len__(self) -> int:
-        return len(self.index)
+
+class Planes:
+    """Half-spaces of one kind against one obstacle, fixed through a sub-step.
+
+    Attributes
+    ----------
+    index, gap, normal
+        As in :class:`HalfSpaces`, at the points ``anchor`` (c, 3).
+    """
+
+    def __init__(self) -> None:
+        self.set(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+
+    def set(self, index: Integers, gap: Floats, normal: Floats, anchor: Floats) -> None:
+        """Replace the planes."""
+        self.index, self.gap, self.normal, self.anchor = index, gap, normal, anchor
+
+    def contacts(self, points: Floats, reach: float) -> tuple[Integers, Floats, Floats]:
+        """``(index, gap, normal)`` of the planes nearer than ``reach`` to the model's contact points now."""
+        gap = self.gap + np.einsum("ij,ij->i", self.normal, points[self.index] - self.anchor)
+        near = gap < reach
+        return self.index[near], gap[near], self.normal[near]
 
 
 class BoneContacts:
@@ -63,19 +81,22 @@ class BoneContacts:
     ----------
     names : sequence of str
         Names of all bones of the scene.
-    fields : sequence of BoneSDF or None
+    fields : sequence of BoneField or None
         One for each name; None where the muscle cannot reach the bone. Fields may be shared between muscles.
     contact_bone : (n,) array_like of int, optional
         Bone that contact point i is attached to, -1 where free. Attached points take no contact.
+
+    Attributes
+    ----------
+    reached : list of int
+        Indices of the bones with a field.
+    neighbours : list of Planes
+        Of sliding neighbours, and those that hold points on their side of a bone.
+    cuts : list of SlidingPair
+        What clips the muscle's surface beside the bones.
     """
 
-    def __init__(
-        self,
-        names: list[str],
-        fields: list[Any],
-        *,
-        contact_bone: ArrayLike | None = None,
-    ) -> None:
+    def __init__(self, names: list[str], fields: list[Any], *, contact_bone: ArrayLike | None = None) -> None:
         if len(names) != len(fields):
             raise ValueError(f"one field per bone is needed, got {len(fields)} for {len(names)} bones")
         self.names = list(names)
@@ -85,9 +106,10 @@ class BoneContacts:
         boxes = [self.fields[b].bounds for b in self.reached]
         self.boxes = np.array(boxes, dtype=np.float64).reshape(-1, 2, 3)
         self.contact_bone = None if contact_bone is None else np.asarray(contact_bone, dtype=np.int64)
-        self._take(AtRest((name, np.eye(4)) for name in self.names))
-        self.allowed = {}
-        self.neighbours, self.cuts = [], []
+        self.move(AtRest((name, np.eye(4)) for name in self.names))
+        self.allowed: dict[int, Floats] = {}
+        self.neighbours: list[Any] = []
+        self.cuts: list[Any] = []
         self._known: tuple[Floats, ...] = (
             np.zeros((len(self.reached), 0, 3)),
             np.zeros((len(self.reached), 0)),
@@ -98,14 +120,7 @@ class BoneContacts:
         missing = [self.names[b] for b in self.reached if self.names[b] not in poses]
         if missing:
             raise ValueError(f"poses lack the bone {missing[0]!r}")
-        self._take(poses)
-
-    def stacked(self, poses: dict[str, Floats]) -> Floats:
-        """Poses (r, 4, 4) of the bones that the muscle can reach, in their order."""
-        return np.array([poses[self.names[b]] for b in self.reached]).reshape(-1, 4, 4)
-
-    def _take(self, poses: dict[str, Floats]) -> None:
-        self.poses, self._placed = poses, self.stacked(poses)
+        self.poses, self._placed = poses, self._stacked(poses)
 
     def frozen(self) -> BoneContacts:
         """A copy in the present poses, for queries from another thread while the bones move."""
@@ -113,7 +128,7 @@ class BoneContacts:
         other.cuts, other._known = list(self.cuts), tuple(part[:, :0] for part in self._known)
         return other
 
-    def only(self, index: Any) -> BoneContacts:
+    def only(self, index: Integers) -> BoneContacts:
         """A copy for a subset ``index`` of the contact points."""
         other = self.frozen()
         if self.contact_bone is not None:
@@ -121,83 +136,73 @@ class BoneContacts:
         other.allowed = {bone: depth[index] for bone, depth in self.allowed.items()}
         return other
 
-    def allow(self, bone_index: Any, depth: Any) -> None:
+    def allow(self, bone_index: int, depth: Floats) -> None:
         """Let each contact point be up to ``depth`` (n,) inside a bone, [scene unit]; zeros take it back."""
         if np.any(depth > 0.0):
             self.allowed[bone_index] = np.array(depth, dtype=np.float64)
         else:
             self.allowed.pop(bone_index, None)
 
-    def distance_and_direction(self, points: Floats, bone_index: int) -> tuple[Floats, Floats]:
-        """Signed distance (n,) to one bone and the unit direction (n, 3) in which it grows, world axes."""
-        points = check_points(points)
-        return self._query(points, bone_index)
+    def distance_and_direction(
+        self, points: Floats, bone_index: int, reach: Floats | float = np.inf
+    ) -> tuple[Floats, Floats]:
+        """Signed distance (n,) to one bone and the unit direction (n, 3) in which it grows, world axes.
 
-    def nearest(self, points: ArrayLike, reach: float = np.inf, *, neighbours: bool = True) -> Floats:
-        """Smallest distance over all bones and neighbours at any points, by which an extracted surface is clipped.
+        Where the bone is farther than ``reach``, a number or (n,), a lower bound beyond it suffices [scene unit].
+        """
+        pose, points = self.poses[self.names[bone_index]], check_points(points)
+        field = self.fields[bone_index]
+        distance, gradient = field.distance_and_gradient(points, pose=pose, reach=reach)
+        # On the medial surface the field has no direction: away from the middle of the bone is used.
+        direction_loop(points, gradient, pose, self.boxes[self._row[bone_index]])
+        return distance, gradient
+
+    def nearest(
+        self, points: ArrayLike, limit: Floats | float = np.inf, *, neighbours: bool = True
+    ) -> tuple[Floats, Floats]:
+        """Smallest distance over all bones and neighbours, by which an extracted surface is clipped.
 
         Parameters
         ----------
         points : (n, 3) array_like
-        reach : float
-            Where a bone is farther than this, a lower bound beyond ``reach`` suffices [scene unit].
+        limit : float or (n,) ndarray
+            Where the smallest distance exceeds it, the value is only a lower bound above the limit, without a gradient
+            [scene unit].
         neighbours : bool
             Count sliding neighbours.
 
         Returns
         -------
-        (n,) ndarray
+        distance : (n,) ndarray
             [scene unit], negative inside a bone; infinity where no bone is in reach. Against a sliding
             neighbour it is half the difference of the two muscles' distances, so that both are cut alike.
+        gradient : (n, 3) ndarray
+            World axes.
         """
         points = check_points(points)
-        near, beyond = self._within(points, reach)
-        smallest = np.full(len(points), beyond)
-        for b in near:
-            pose = self.poses[self.names[b]]
-            distance = self.fields[b].distance(points, pose=pose, reach=np.minimum(smallest, reach))
-            np.minimum(smallest, distance, out=smallest)
-        for neighbour in self.cuts if neighbours else ():
-            np.minimum(smallest, neighbour.cut(points), out=smallest)
-        return smallest
-
-    def nearest_with_gradient(
-        self, points: Floats, limit: Floats | float = np.inf, *, neighbours: bool = True
-    ) -> tuple[Floats, Floats]:
-        """Smallest distance (n,) over bones and, where wanted, neighbours, exact, and its gradient (n, 3), world axes.
-
-        Where the smallest distance exceeds ``limit``, a number or (n,), the value is only a lower bound above the
-        limit, without a gradient.
-        """
-        points = check_points(points)
-        near, beyond = self._within(points, limit)
-        smallest, gradient = np.full(len(points), beyond), np.zeros((len(points), 3))
-        for b in near:
+        apart = np.empty(len(self.reached))
+        apart_loop(points, self._placed, self.boxes, apart)
+        far = apart > np.max(limit, initial=0.0)
+        smallest, gradient = np.full(len(points), apart[far].min(initial=np.inf)), np.zeros((len(points), 3))
+        for b in np.array(self.reached, dtype=int)[~far].tolist():
             # No farther than what was found: elsewhere a lower bound will do.
-            closer_loop(*self._query(points, b, np.minimum(smallest, limit)), smallest, gradient)
+            found = self.distance_and_direction(points, b, np.minimum(smallest, limit))
+            closer_loop(*found, smallest, gradient)
         for neighbour in self.cuts if neighbours else ():
-            closer_loop(*neighbour.cut_with_gradient(points), smallest, gradient)
+            closer_loop(*neighbour.cut(points), smallest, gradient)
         return smallest, gradient
 
     def neighbour_points(self) -> Floats:
         """Points (k, 3) of sliding neighbours where these meet the muscle [scene unit]."""
         return np.concatenate([np.zeros((0, 3)), *(neighbour.points() for neighbour in self.cuts)])
 
-    def depth(self, points: Floats) -> float:
-        """Greatest depth of a free contact point in a bone [scene unit]; 0 if all are outside."""
-        return max([0.0, *(-float(distance.min()) for _, _, distance in self._inside(points))])
-
     def depths(self, points: Floats) -> dict[int, Floats]:
         """Depth (n,) of each free contact point in each bone, by the bone's index [scene unit]; 0 outside."""
+        points = check_points(points)
         found = {b: np.zeros(len(points)) for b in self.reached}
-        for b, near, distance in self._inside(points):
-            found[b][near] = np.maximum(-distance, 0.0)
+        for b, near in self.near(points, np.zeros((1, len(points)))):
+            found[b][near] = np.maximum(-self._ask(points, near, b, 0.0)[0], 0.0)
         return found
-
-    def comes_near(self, points: Floats, bone_index: int, reach: float) -> bool:
-        """Whether a bone is nearer than ``reach`` to any free contact point."""
-        asked = self._near(points, np.full(len(points), reach), [bone_index])
-        return any(self._ask(points, near, b, reach)[0].min() < reach for b, near in asked)
 
     def half_spaces(self, points: ArrayLike, reach: ArrayLike) -> HalfSpaces:
         """All pairs of contact point and obstacle nearer than ``reach``, as :class:`HalfSpaces`.
@@ -211,10 +216,10 @@ class BoneContacts:
         """
         points = check_points(points)
         reach = np.full(len(points), reach) if np.ndim(reach) == 0 else np.asarray(reach, dtype=np.float64)
-        near = self._near(points, reach, self.reached)
-        room = sum(len(some) for _, some in near)
-        index, source = np.empty(room, np.int64), np.empty(room, np.int64)
-        gap, normal, count = np.empty(room), np.empty((room, 3)), 0
+        near = self.near(points, reach[None])
+        most = sum(len(some) for _, some in near)
+        index, source = np.empty(most, np.int64), np.empty(most, np.int64)
+        gap, normal, count = np.empty(most), np.empty((most, 3)), 0
         for b, some in near:
             distance, direction = self._ask(points, some, b, reach[some])
             allowed = self.allowed.get(b, NONE_ALLOWED)
@@ -223,30 +228,34 @@ class BoneContacts:
             end = count + take_contacts_loop(some, distance, direction, limits, found)
             source[count:end] = b
             count = end
-        spaces = HalfSpaces(index[:count], gap[:count], normal[:count], source[:count])
-        return (
-            self._with_neighbours(spaces, points, float(reach.max(initial=0.0)))
-            if self.neighbours
-            else spaces
-        )
-
-    def _with_neighbours(self, bones: HalfSpaces, points: Floats, reach: float) -> HalfSpaces:
-        """The half-spaces of the bones, then those of the neighbours."""
-        parts = [(bones.index, bones.gap, bones.normal, bones.source, np.zeros(len(bones)))]
+        parts = [(index[:count], gap[:count], normal[:count], source[:count])]
         for k, neighbour in enumerate(self.neighbours):
-            index, gap, normal = neighbour.contacts(points, reach)
-            count = len(index)
-            parts.append((index, gap, normal, np.full(count, -1 - k), np.full(count, neighbour.give)))
-        return HalfSpaces(*(np.concatenate(part) for part in zip(*parts)))
+            found = neighbour.contacts(points, float(reach.max(initial=0.0)))
+            parts.append((*found, np.full(len(found[0]), -1 - k)))
+        return HalfSpaces(*(parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts))))
 
-    def known(self, count: int) -> tuple[Floats, ...]:
-        """Positions (r, count, 3) of the last queries, in the coordinates of each bone in reach, and bounds of the
-        distances there, (r, count); -infinity where nothing is known.
+    def near(self, points: Floats, reach: Floats) -> list[tuple[int, Integers]]:
+        """Bones in reach, each with the free contact points that may be nearer to it than their reach.
+
+        Parameters
+        ----------
+        points : (n, 3) ndarray
+        reach : (1, n) or (r, n) ndarray
+            For all bones, or for each of the bones ``reached``.
         """
-        if self._known[1].shape[1] != count:
-            rows = len(self.reached)
-            self._known = np.zeros((rows, count, 3)), np.full((rows, count), -np.inf)
-        return self._known
+        found = np.empty((len(self.reached), len(points)), dtype=np.int64)
+        counts = np.zeros(len(self.reached), dtype=np.int64)
+        bones = self._placed, self.boxes
+        near_loop(points, self.free(len(points)), reach, bones, self._bounds(len(points)), found, counts)
+        return [(b, near[:count]) for b, near, count in zip(self.reached, found, counts.tolist()) if count]
+
+    def path_lengths(
+        self, start: Floats, end: Floats, before: dict[str, Floats], after: dict[str, Floats]
+    ) -> Floats:
+        """Lengths (r, n) of straight paths as each of the bones ``reached`` sees them, moving from pose to pose."""
+        length = np.empty((len(self.reached), len(start)))
+        path_loop(start, end, self._stacked(before), self._stacked(after), length)
+        return length
 
     def free(self, count: int) -> Booleans:
         """Mask (n,) of the contact points that are attached to no bone."""
@@ -256,41 +265,23 @@ class BoneContacts:
             raise ValueError(f"half-spaces need all {len(self.contact_bone)} contact points, got {count}")
         return self.contact_bone < 0
 
-    def _query(self, points, b, reach=np.inf):
-        pose = self.poses[self.names[b]]
-        distance, gradient = self.fields[b].distance_and_gradient(points, pose=pose, reach=reach)
-        # On the medial surface the field has no direction: away from the middle of the bone is used.
-        direction_loop(points, gradient, pose, self.boxes[self._row[b]])
-        return distance, gradient
+    def _stacked(self, poses):
+        """Poses (r, 4, 4) of the bones that the muscle can reach, in their order."""
+        return np.array([poses[self.names[b]] for b in self.reached]).reshape(-1, 4, 4)
 
-    def _within(self, points, limit):
-        """Bones whose box is within the greatest limit of the points' box, and a bound of the others' distance."""
-        apart = np.empty(len(self.reached))
-        apart_loop(points, self._placed, self.boxes, apart)
-        far = apart > np.max(limit, initial=0.0)
-        return [b for b, left in zip(self.reached, far) if not left], apart[far].min(initial=np.inf)
-
-    def _near(self, points, reach, bones):
-        """Bones, each with the free contact points that may be nearer to it than their ``reach``."""
-        rows = np.array([self._row[b] for b in bones], dtype=np.int64)
-        found, counts = (
-            np.empty((len(rows), len(points)), dtype=np.int64),
-            np.zeros(len(rows), dtype=np.int64),
-        )
-        free, known = self.free(len(points)), self.known(len(points))
-        near_loop(points, free, reach, rows, (self._placed, self.boxes), known, found, counts)
-        return [(b, near[:count]) for b, near, count in zip(bones, found, counts.tolist()) if count]
-
-    def _inside(self, points):
-        """Bones, each with the free contact points that may be inside it and their distances."""
-        points = check_points(points)
-        for b, near in self._near(points, np.zeros(len(points)), self.reached):
-            yield b, near, self._ask(points, near, b, 0.0)[0]
+    def _bounds(self, count):
+        """Positions (r, n, 3) of the last queries, in the coordinates of each bone in reach, and bounds (r, n) of the
+        distances there; -infinity where nothing is known.
+        """
+        if self._known[1].shape[1] != count:
+            rows = len(self.reached)
+            self._known = np.zeros((rows, count, 3)), np.full((rows, count), -np.inf)
+        return self._known
 
     def _ask(self, points, near, b, reach):
         """Distances and directions of some of the contact points to bone b; stored as bounds for later queries."""
         pose, row = self.poses[self.names[b]], self._row[b]
         distance, gradient = self.fields[b].distance_and_gradient(points[near], pose=pose, reach=reach)
-        anchor, bound = self.known(len(points))
+        anchor, bound = self._bounds(len(points))
         answer_loop(points, pose, self.boxes[row], near, distance, gradient, anchor[row], bound[row])
         return distance, gradient

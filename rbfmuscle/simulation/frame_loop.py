@@ -1,46 +1,39 @@
 """The frame loop: any muscle model against any bones."""
 
+from __future__ import annotations
+
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
+from threadpoolctl import ThreadpoolController
+
 from rbfmuscle.geometry.fields import BoneField
+from rbfmuscle.geometry.threads import each
 from rbfmuscle.scene.activation.curve import Activations
 from rbfmuscle.scene.motion import completed, rest_coordinates
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
-from rbfmuscle.simulation.coupled_stepper import CoupledStepper
-from rbfmuscle.simulation.frame import Event, FinishedDrawing, Frame, ModelSurface, MuscleModel
+from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
+from rbfmuscle.simulation.frame import Event, Frame, ModelSurface, MuscleModel
 from rbfmuscle.simulation.overlap import resolve_initial_overlap
-from rbfmuscle.simulation.plan.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.rigid_transport import RigidTransport
 from rbfmuscle.simulation.stepper import MuscleStepper, TimedDrawing
 from rbfmuscle.simulation.substeps import PoseCache, SubSteps
-from rbfmuscle.simulation.workers import Workers
 
-__all__ = [
-    "Event",
-    "FinishedDrawing",
-    "Frame",
-    "FrameLoop",
-    "ModelSurface",
-    "MuscleModel",
-    "simulate_frames",
-]
+Path = tuple[list[dict[str, float]], list[dict[str, float]]]
 
 
 class FrameLoop:
     """Moves muscles with the bones, one frame at a time, from the rest pose on.
 
-    Call `advance` for each frame. Close the loop, or use it in a ``with`` block: it holds threads.
-
     Parameters
     ----------
     scene : Scene
         Its motion only determines which bones and neighbours a muscle can meet.
-    models : sequence of MuscleModel, or mapping of str to MuscleModel
+    models : iterable of MuscleModel
         In their rest state.
-    fields : mapping of str to BoneSDF, optional
+    fields : mapping of str to BoneField, optional
         Distance fields of the bones; built for the bones in reach where not given.
     surfaces : bool
         Whether surfaces are extracted.
@@ -51,6 +44,7 @@ class FrameLoop:
         Present coordinates [radian]; empty before the first frame.
     activations : Activations
         Of the muscles that contract.
+    steppers : list of MuscleStepper
 
     Raises
     ------
@@ -63,35 +57,29 @@ class FrameLoop:
     def __init__(
         self,
         scene: Scene,
-        models: Sequence[MuscleModel] | Mapping[str, MuscleModel],
+        models: Iterable[MuscleModel],
         *,
         fields: Mapping[str, BoneField] | None = None,
         surfaces: bool = True,
     ) -> None:
-        models = list(models.values()) if isinstance(models, Mapping) else list(models)
+        models = list(models)
         self.scene, self.surfaces, self._poses = scene, surfaces, PoseCache(scene)
         self.steppers = [
             MuscleStepper(model, contacts, scene, poses=self._poses)
             for model, contacts in zip(models, _obstacles(scene, models, fields))
         ]
         self.here: dict[str, float] = {}
-        self.activations = Activations(scene)
-        self._sub_steps, self._own_sub_steps = SubSteps(scene, poses=self._poses), {}
+        self.activations, self._sub_steps = Activations(scene), SubSteps(scene, poses=self._poses)
         for stepper in self.steppers:
-            carrier = stepper.carrier = RigidTransport(stepper, scene)
-            if not carrier.never:
-                self._own_sub_steps[stepper.name] = self._cut_for(carrier)
-        self._next_index, self._wall = 0, 0.0
-        self._pairs: dict[tuple[str, str], tuple[float, float]] = {}
-        self.workers = Workers(len(self.steppers))
-        try:
-            with self.clocked(), self.workers.one_thread_each():
-                self.workers.each(resolve_initial_overlap, self.steppers)
-                self._sliding = _sliding(scene, self.steppers)
-                self._together = self._side_by_side()
-        except BaseException:
-            self.close()
-            raise
+            muscle, contacts = scene.muscle(stepper.name), stepper.contacts
+            if muscle.contraction is None:
+                met = [contacts.names[b] for b in contacts.reached]
+                stepper.cut = SubSteps(scene, muscle, bones=met, poses=self._poses)
+                stepper.carrier = RigidTransport(muscle, scene) if scene.sliding is None else None
+        self._next_index, self._wall, self._blas = 0, 0.0, ThreadpoolController()
+        with self.working():
+            each(resolve_initial_overlap, self.steppers)
+            self._sliding = _sliding(scene, self.steppers)
 
     def advance(self, coordinates: Mapping[str, float]) -> Frame:
         """Advance to the given coordinates and return the frame.
@@ -110,128 +98,88 @@ class FrameLoop:
         SolveError
             If a muscle cannot be solved, naming muscle, frame and coordinates.
         """
-        with self.clocked(), self.workers.one_thread_each():
+        with self.working():
             paths = self._path_to(coordinates)
-            if self.surfaces and self._sliding is None and self.workers.parallel:
+            if self.surfaces and self._sliding is None:
                 # No muscle waits for another: each thread takes one through all its sub-steps.
-                drawn = self.workers.each(
-                    lambda stepper: stepper.go(*paths[stepper.name]).draw(), self.steppers
-                )
+                drawn = each(lambda stepper: stepper.go(*paths[stepper.name]).drawing().draw(), self.steppers)
             else:
                 self._solve(paths)
-                drawings = self._drawings() if self.surfaces else []
-                drawn = self.workers.each(TimedDrawing.draw, drawings)
-            frame = self.collect()
-        return self.finish(frame, drawn)
+                drawings = self._sliding.drawings() if self.surfaces and self._sliding is not None else []
+                drawn = each(TimedDrawing.draw, drawings)
+            frame = self._frame(drawn)
+        frame.wall, self._wall = self._wall, 0.0
+        return frame
 
     def skip(self, coordinates: Mapping[str, float]) -> None:
         """Advance without surfaces; times and events are counted to the next frame that is returned."""
-        with self.clocked(), self.workers.one_thread_each():
+        with self.working():
             self._solve(self._path_to(coordinates))
 
-    def collect(self) -> Frame:
-        """The present frame, without surfaces."""
-        carried = {stepper.name: stepper.model.material_mesh() for stepper in self.steppers}
-        times, events = {}, []
-        for stepper in self.steppers:
-            times[stepper.name], happened = stepper.collect()
-            events.extend(happened)
-        poses = self._poses(self.here)
-        solved = [muscle for muscle in self.scene.muscles if muscle.name in carried]
-        for end in (end for muscle in solved for end in muscle.tendons):
-            poses[end.name]  # the pose of an end is computed, and kept, when it is first asked for
-        frame = Frame(self._next_index - 1, dict(self.here), dict(poses), {}, carried, events, times, 0.0)
-        frame.tendons.update(poses.tendons)
-        frame.activations.update(self.activations.here)
-        frame.neighbours.update(self._pairs)
-        frame.work.update({stepper.name: stepper.work for stepper in self.steppers})
-        return frame
-
-    def finish(self, frame: Frame, drawn: Iterable[tuple[ModelSurface, float]]) -> Frame:
-        """Add surfaces and the time since the last frame."""
-        surfaces = {}
-        for name, (surface, seconds) in zip(frame.carried, drawn):
-            surfaces[name] = surface
-            frame.events.extend(Event(frame.index, name, *note) for note in surface.notes)
-            for key in ("time_surface", "time_frame"):
-                frame.times[name][key] = frame.times[name].get(key, 0.0) + seconds
-        frame.surfaces, frame.wall, self._wall = surfaces, self._wall, 0.0
-        return frame
-
     @contextmanager
-    def clocked(self) -> Iterator[None]:
-        """Count the time spent inside to the next frame."""
+    def working(self) -> Iterator[None]:
+        """Count the time spent inside to the next frame; BLAS uses one thread there.
+
+        More would spin and take the cores from the loops, and results would depend on their number.
+        """
         start = time.perf_counter()
         try:
-            yield
+            with self._blas.limit(limits=1, user_api="blas"):
+                yield
         finally:
             self._wall += time.perf_counter() - start
 
-    def close(self) -> None:
-        """End the threads."""
-        self.workers.close()
-
-    def __enter__(self) -> "FrameLoop":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
-    def _cut_for(self, carrier: RigidTransport) -> SubSteps:
-        """Sub-steps of one muscle, by the relative motion of the bones that hold it or that it can meet."""
-        contacts = carrier.stepper.contacts
-        met = [contacts.names[b] for b in contacts.reached]
-        return SubSteps(self.scene, carrier.muscle, bones=met, poses=self._poses)
-
-    def _side_by_side(self) -> CoupledStepper | None:
-        """The stepper of muscles that slide, None without sliding; muscles that contract take every sub-step."""
-        if self._sliding is None:
-            return None
-        contract = {muscle.name for muscle in self.scene.muscles if muscle.contraction is not None}
-        carriers = [stepper.carrier for stepper in self.steppers if stepper.name not in contract]
-        cuts = {carrier.stepper.name: self._cut_for(carrier) for carrier in carriers if carrier is not None}
-        return CoupledStepper(self.steppers, self._sliding, cuts)
-
-    def _path_to(self, coordinates: Mapping[str, float]) -> dict[str, tuple[list[dict], list[dict]]]:
+    def _path_to(self, coordinates: Mapping[str, float]) -> dict[str, Path]:
         """For each muscle the coordinates and the activations of its sub-steps to the next frame."""
         # Coordinates start at rest, which is zero for most.
         here = self.here or dict.fromkeys(coordinates, 0.0) | rest_coordinates(self.scene)
         self.here = completed(self.scene, coordinates)
+        paths: dict[str, Path] = {}
         for stepper in self.steppers:
             stepper.frame = self._next_index
-        self._next_index += 1
-        found = {name: ([here, *cut.split(here, self.here)], []) for name, cut in self._own_sub_steps.items()}
-        if len(found) < len(self.steppers):
-            # Muscles that slide share the sub-steps of the muscle that has the most.
+            if stepper.carrier is not None and stepper.cut is not None:
+                paths[stepper.name] = [here, *stepper.cut.split(here, self.here)], []
+        if len(paths) < len(self.steppers):
+            # The others share the sub-steps of the muscle that has the most.
             stops = [here, *self._sub_steps.split(here, self.here)]
-            shared = self.activations.refine(self._next_index - 1, stops)
-            found.update({s.name: shared for s in self.steppers if s.name not in found})
-        return found
+            shared = self.activations.refine(self._next_index, stops)
+            paths = {stepper.name: paths.get(stepper.name, shared) for stepper in self.steppers}
+        self._next_index += 1
+        return paths
 
-    def _solve(self, paths: dict[str, tuple[list[dict], list[dict]]]) -> None:
+    def _solve(self, paths: dict[str, Path]) -> None:
         """Advance all muscles through their sub-steps."""
-        if self._together is None:
-            self.workers.each(lambda stepper: stepper.advance(*paths[stepper.name]), self.steppers)
-            return
-        stops, activations = paths[self.steppers[0].name]
-        self._together.go(stops, activations, self.workers)
+        if self._sliding is None:
+            each(lambda stepper: stepper.go(*paths[stepper.name]), self.steppers)
+        elif self.steppers:
+            self._sliding.go(*paths[self.steppers[0].name])
 
-    def _drawings(self) -> list[TimedDrawing]:
-        """Drawings of all muscles in their present state."""
-        if self._sliding is not None:
-            self.workers.each(self._sliding.refresh, self.steppers)
-            for stepper, found in zip(self.steppers, self.workers.each(self._sliding.measure, self.steppers)):
-                stepper.measured = found
-            self._pairs = self._sliding.pairs()
-        drawings = [stepper.drawing() for stepper in self.steppers]
-        if self._sliding is not None:
-            self.workers.each(self._sliding.show, drawings)
-        return drawings
+    def _frame(self, drawn: list[tuple[ModelSurface, float]]) -> Frame:
+        """The present frame, with surfaces and the seconds that each took."""
+        carried = {stepper.name: stepper.model.material_mesh() for stepper in self.steppers}
+        found = [stepper.collect() for stepper in self.steppers]
+        times = dict(zip(carried, (times for times, _, _ in found)))
+        poses = self._poses(self.here)
+        for end in (end for name in carried for end in self.scene.muscle(name).tendons):
+            poses[end.name]  # the pose of an end is computed, and kept, when it is first asked for
+        index, surfaces = self._next_index - 1, dict(zip(carried, (surface for surface, _ in drawn)))
+        events = [event for _, events, _ in found for event in events]
+        events += [Event(index, name, *note) for name, shown in surfaces.items() for note in shown.notes]
+        for name, (_, seconds) in zip(carried, drawn):
+            for key in ("time_surface", "time_frame"):
+                times[name][key] = times[name].get(key, 0.0) + seconds
+        return Frame(
+            index, dict(self.here), dict(poses), surfaces, carried, events, times, 0.0,
+            activations=dict(self.activations.here),
+            work=dict(zip(carried, (status for _, _, status in found))),
+            neighbours={} if self._sliding is None else dict(self._sliding.pairs),
+            tendons=dict(poses.tendons),
+        )  # fmt: skip
 
 
 def simulate_frames(
     scene: Scene,
-    models: Sequence[MuscleModel] | Mapping[str, MuscleModel],
+    models: Iterable[MuscleModel],
     *,
     surfaces: bool = True,
     written: Collection[int] | None = None,
@@ -256,17 +204,17 @@ def simulate_frames(
     SceneError
         If muscles overlap bones at rest and the scene's ``initial`` is ``"error"``.
     """
-    with FrameLoop(scene, models, fields=fields, surfaces=surfaces) as loop:
-        for index, coordinates in enumerate(scene.motion.frames):
-            if written is None or index in written:
-                yield loop.advance(coordinates)
-            else:
-                loop.skip(coordinates)
+    loop = FrameLoop(scene, models, fields=fields, surfaces=surfaces)
+    for index, coordinates in enumerate(scene.motion.frames):
+        if written is None or index in written:
+            yield loop.advance(coordinates)
+        else:
+            loop.skip(coordinates)
 
 
 def solve_pose(
     scene: Scene,
-    models: Sequence[MuscleModel],
+    models: Collection[MuscleModel],
     coordinates: Mapping[str, float],
     *,
     fields: Mapping[str, BoneField] | None = None,
@@ -276,7 +224,7 @@ def solve_pose(
     Parameters
     ----------
     scene : Scene
-    models : sequence of MuscleModel
+    models : collection of MuscleModel
         In their rest state, to which they return.
     coordinates : mapping of str to float
         Target coordinates [radian]; absent ones are at rest.
@@ -290,8 +238,7 @@ def solve_pose(
     """
     rest = [model.snapshot() for model in models]
     try:
-        with FrameLoop(scene, models, fields=fields) as loop:
-            return loop.advance(coordinates)
+        return FrameLoop(scene, models, fields=fields).advance(coordinates)
     finally:
         for model, state in zip(models, rest):
             model.restore(state)

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.scene.activation.curve import STEP
 from rbfmuscle.scene.joints.skeleton import all_coordinates
 from rbfmuscle.scene.objects import Motion
+from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame_loop import FrameLoop
-from rbfmuscle.simulation.plan.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.validation import UsageError
 
 if TYPE_CHECKING:
     from rbfmuscle.scene.scene import Scene
-    from rbfmuscle.simulation.frame import Frame
+    from rbfmuscle.simulation.frame import Frame, MuscleModel
 
 
 # Range of a coordinate around rest where the scene's motion does not exceed it [degree, mm].
@@ -31,67 +32,47 @@ class LiveSession:
     Parameters
     ----------
     scene : Scene
-    fields : dict of str to BoneSDF, optional
+    fields : mapping of str to BoneField, optional
         Distance fields of the bones, as `live_fields` builds them.
 
     Attributes
     ----------
     limits : dict of str to (float, float)
         Range of each coordinate [radian].
-    here : dict of str to float
-        Present coordinates [radian].
-    target : dict of str to float
-        Target coordinates [radian].
+    rest, here, target : dict of str to float
+        Coordinates at rest, at present and to be reached [radian].
     activation : dict of str to float
         Target activation of the muscles that contract, 0 to 1.
     """
 
-    def __init__(self, scene: Scene, *, fields: dict[str, Any] | None = None) -> None:
-        self.scene = scene
-        self.limits = coordinate_limits(scene)
+    def __init__(self, scene: Scene, *, fields: Mapping[str, BoneField] | None = None) -> None:
+        self.scene, self.limits = scene, coordinate_limits(scene)
         self.fields = live_fields(scene) if fields is None else fields
-        self.rest = _rest(scene, self.limits)
+        facts = all_coordinates(scene.joints)
+        self.rest = {name: facts[name].rest for name in self.limits}
         self.here, self.target = dict(self.rest), dict(self.rest)
         self.activation = {m.name: 0.0 for m in scene.muscles if m.contraction is not None}
-        self.models, self._rest = [], []
-        self._loop: Any = None
+        self._loop: FrameLoop | None = None
 
-    def use(
-        self, models: list[Any], rest: list[tuple[Floats, Floats]] | None = None
-    ) -> list[tuple[Floats, Floats]]:
-        """Start these models from the rest pose; the target stays.
-
-        Parameters
-        ----------
-        models : list of MuscleModel
-        rest : list, optional
-            Their snapshots at rest; taken now where not given, so the models must be new.
-
-        Returns
-        -------
-        list
-            Snapshots at rest.
-        """
-        self.models = list(models)
-        self._rest = [model.snapshot() for model in self.models] if rest is None else list(rest)
+    def use(self, models: list[MuscleModel]) -> None:
+        """Start these models, in their rest state, from the rest pose; the target stays."""
+        self.models, self._rest = models, [model.snapshot() for model in models]
         self.reset()
-        return self._rest
 
     def reset(self) -> None:
         """Return models and bones to rest; the target stays."""
-        self.close()
         for model, state in zip(self.models, self._rest):
             model.restore(state)
             if model.name in self.activation:
                 model.activate(0.0)
-        self.here = dict(self.rest)
+        self.here, self._loop = dict(self.rest), None
 
     def set(self, name: str, angle: float) -> None:
         """Give a coordinate a new target [radian], kept within its limits."""
         low, high = self.limits[name]
         self.target[name] = min(max(float(angle), low), high)
 
-    def activate(self, muscle: Any, activation: Any) -> None:
+    def activate(self, muscle: str, activation: float) -> None:
         """Give a muscle that contracts a new activation, kept from 0 to 1."""
         if muscle not in self.activation:
             raise UsageError(f"muscle {muscle!r} does not contract: give it activation = 0 in the scene")
@@ -101,9 +82,8 @@ class LiveSession:
     def arrived(self) -> bool:
         """Whether coordinates and activations have reached their targets."""
         active = self._loop.activations.here if self._loop else dict.fromkeys(self.activation, 0.0)
-        return all(abs(self.target[name] - self.here[name]) < 1e-9 for name in self.target) and all(
-            abs(value - active[name]) < 1e-9 for name, value in self.activation.items()
-        )
+        wanted = {**self.target, **self.activation}
+        return all(abs(value - {**self.here, **active}[name]) < 1e-9 for name, value in wanted.items())
 
     def advance(self, stride: float = math.inf, *, surfaces: bool = True) -> Frame:
         """Move towards the target and return the frame reached.
@@ -124,9 +104,6 @@ class LiveSession:
         SolveError
             If a muscle cannot be solved; `reset` goes back to rest.
         """
-        farthest = max((abs(self.target[k] - self.here[k]) for k in self.target), default=0.0)
-        share = 1.0 if farthest <= stride else stride / farthest
-        step = {k: self.here[k] + share * (self.target[k] - self.here[k]) for k in self.target}
         if self._loop is None:
             self._loop = FrameLoop(_wide_scene(self.scene), self.models, fields=self.fields)
         self._loop.surfaces = surfaces
@@ -135,15 +112,12 @@ class LiveSession:
         for name, wanted in self.activation.items():
             now = active.here[name]
             active.target[name] = now + min(max(wanted - now, -reach), reach)
+        farthest = max((abs(self.target[k] - self.here[k]) for k in self.target), default=0.0)
+        share = stride / farthest if farthest > stride else 1.0
+        step = {k: self.here[k] + share * (self.target[k] - self.here[k]) for k in self.target}
         frame = self._loop.advance(dict(self.target) if share == 1.0 else step)
         self.here = dict(frame.coordinates)
         return frame
-
-    def close(self) -> None:
-        """End the loop and its threads."""
-        if self._loop is not None:
-            self._loop.close()
-            self._loop = None
 
 
 def coordinate_limits(scene: Scene) -> dict[str, tuple[float, float]]:
@@ -169,18 +143,13 @@ def coordinate_limits(scene: Scene) -> dict[str, tuple[float, float]]:
         values = [frame.get(name, facts.rest) for frame in scene.motion.frames]
         low, high = min([facts.rest - free, *values]), max([facts.rest + free, *values])
         if facts.range is not None and facts.range[0] < facts.range[1]:
-            least, most = (min(facts.range[0], facts.rest), max(facts.range[1], facts.rest))
-            low, high = max(low, least), min(high, most)
+            low = max(low, min(facts.range[0], facts.rest))
+            high = min(high, max(facts.range[1], facts.rest))
         limits[name] = (low, high)
     return limits
 
 
-def _rest(scene, names):
-    facts = all_coordinates(scene.joints)
-    return {name: facts[name].rest for name in names}
-
-
-def live_fields(scene: Scene) -> Any:
+def live_fields(scene: Scene) -> Mapping[str, BoneField]:
     """Distance fields of the bones in reach of a muscle within the coordinates' ranges.
 
     Parameters
@@ -194,10 +163,10 @@ def live_fields(scene: Scene) -> Any:
     return build_fields(scene, find_contact_pairs(_wide_scene(scene)))
 
 
-def _wide_scene(scene):
+def _wide_scene(scene: Scene) -> Scene:
     """The scene with a motion that takes each coordinate to its limits."""
-    limits = coordinate_limits(scene)
-    rest, stops = _rest(scene, limits), [{}]
+    facts, limits = all_coordinates(scene.joints), coordinate_limits(scene)
+    rest, stops = {name: facts[name].rest for name in limits}, [{}]
     for name, ends in limits.items():
         stops += [{name: value} for end in ends for value in np.linspace(rest[name], end, 4)[1:]]
     wide = copy.copy(scene)

@@ -3,40 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Booleans, Floats
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.surfaces import touching_balls, vertex_normals
 from rbfmuscle.geometry.triangles import nearest_weights, triangle_normal
 from rbfmuscle.geometry.winding import wound_around
 from rbfmuscle.jit import compiled
-from rbfmuscle.simulation.neighbours.extrapolation import MotionExtrapolator
 
 if TYPE_CHECKING:
+    from rbfmuscle.geometry.fields import Field
     from rbfmuscle.simulation.frame import MuscleModel
 
-
+# Index, distance, outward normal and nearest vertex of the points that are near a surface.
+Found = tuple[Integers, Floats, Floats, Integers]
 # Greatest thickness of a muscle, relative to rest.
 DEEPER = 1.5
 # Least cosine between the surface normal and the direction to a point for which the normal is used.
 RIM = 0.7
 # Depth, in mean edges, beyond which a point is inside only where its winding number says so.
 FOLDED = 0.3
-
-
-class Cells(NamedTuple):
-    """Vertices sorted by the cells of a grid: its box, edge and shape; those of cell c are
-    members[first[c] : first[c + 1]].
-    """
-
-    box: np.ndarray
-    edge: float
-    shape: np.ndarray
-    first: np.ndarray
-    members: np.ndarray
 
 
 class Skin(NamedTuple):
@@ -52,8 +41,8 @@ class Skin(NamedTuple):
 class NeighbourSurface:
     """Signed distance to a model's material mesh, for points near it.
 
-    The nearest vertex is found through a uniform grid of cells as wide as the reach; the nearest point of the
-    surface lies in one of the triangles around it, up to the square of an edge over the radius of curvature.
+    The nearest point of the surface lies in one of the triangles around the nearest vertex, up to the square of an edge
+    over the radius of curvature.
     Directions are interpolated vertex normals, or, around a rim, the direction to the point. The sign is that of the
     triangles that meet at the nearest point.
 
@@ -82,7 +71,8 @@ class NeighbourSurface:
     """
 
     def __init__(self, model: MuscleModel, reach: float) -> None:
-        self.model, self.field = model, None
+        self.model = model
+        self.field: Field | None = None
         vertices, faces = model.material_mesh()
         self.faces = np.ascontiguousarray(faces, dtype=np.int64)
         corner = self.faces.ravel()
@@ -91,37 +81,47 @@ class NeighbourSurface:
         self.start = np.searchsorted(corner[order], np.arange(len(vertices) + 1))
         sides = vertices[self.faces] - vertices[np.roll(self.faces, 1, axis=1)]
         self.edge = float(np.linalg.norm(sides, axis=2).mean())
-        self.cell = float(reach) + self.edge
+        self.reach = float(reach)
         rest, balls = np.ascontiguousarray(vertices, dtype=np.float64), np.empty((2, len(vertices)))
         touching_balls(rest, vertex_normals(rest, self.faces), balls, np.empty(len(rest)))
-        self.deepest = DEEPER * np.minimum(balls[1], float(reach)) + self.edge
+        self.deepest = DEEPER * np.minimum(balls[1], self.reach) + self.edge
         self.contact = cKDTree(model.contact_points()).query(vertices)[1]
         self.fixed = np.asarray(model.contact_bone)[self.contact] >= 0
-        #: Extrapolates the model's prediction.
-        self.extrapolator = MotionExtrapolator()
+        #: Change of the coordinates in the last sub-step, and how far the solve moved points and vertices in it.
+        self._change: dict[str, float] = {}
+        self._correction: list[Floats] = []
         self.refresh()
 
-    def refresh(self, way: Mapping[str, float] | None = None) -> None:
-        """Update from the model's present state, extrapolated by the change ``way`` of the coordinates where given."""
-        self._predicted = [np.array(self.model.contact_points()), np.array(self.model.material_mesh()[0])]
-        self.points, self.vertices = (
-            self._predicted if way is None else self.extrapolator.ahead(self._predicted, way)
-        )
-        self.vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
+    def refresh(self, *path: Mapping[str, float]) -> None:
+        """Update from the model's present state.
+
+        For a path from coordinates to others the prediction is extrapolated: neighbours that react to plain
+        predictions, which lie a millimetre or two from the equilibrium, accumulate these errors.
+        """
+        self._predicted = self._present()
+        share = self._share(_change(*path)) if path and self._correction else 0.0
+        ahead = [here + share * moved for here, moved in zip(self._predicted, self._correction)]
+        self.points, self.vertices = map(np.ascontiguousarray, ahead if share else self._predicted)
         self.normals = vertex_normals(self.vertices, self.faces)
         self.box = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
         #: Box of the contact points.
         self.reach_box = np.array([self.points.min(axis=0), self.points.max(axis=0)])
-        shape = (np.ceil((self.box[1] - self.box[0]) / self.cell).astype(np.int64) + 1).clip(1)
-        first = np.zeros(int(np.prod(shape)) + 1, dtype=np.int64)
-        self.cells = Cells(self.box, self.cell, shape, first, np.empty(len(self.vertices), dtype=np.int64))
-        _fill_loop(self.vertices, self.cells)
+        self._tree = cKDTree(self.vertices, balanced_tree=False, compact_nodes=False)
 
-    def settled(self, way: Mapping[str, float]) -> None:
-        """Record how far the solve moved the model from its prediction, for a change ``way`` of the coordinates."""
-        self.extrapolator.learn(
-            way, self._predicted, [self.model.contact_points(), self.model.material_mesh()[0]]
-        )
+    def learn(self, *path: Mapping[str, float]) -> None:
+        """Record how far the solve moved the model from its prediction, for a path from coordinates to others."""
+        self._change = _change(*path)
+        self._correction = [solved - predicted for solved, predicted in zip(self._present(), self._predicted)]
+
+    def _present(self) -> list[Floats]:
+        """Contact points and vertices now."""
+        return [np.array(self.model.contact_points()), np.array(self.model.material_mesh()[0])]
+
+    def _share(self, change: dict[str, float]) -> float:
+        """Fraction of the last correction to apply: 1 for the same change of coordinates, 0 across or back."""
+        square = sum(value**2 for value in self._change.values())
+        along = sum(value * self._change.get(name, 0.0) for name, value in change.items())
+        return min(max(along / square, 0.0), 1.0) if square else 0.0
 
     def apart(self, other: NeighbourSurface, reach: float) -> bool:
         """Whether no point of the other muscle can be nearer than ``reach`` to this surface, by their boxes."""
@@ -130,7 +130,7 @@ class NeighbourSurface:
             or np.any(other.reach_box[1] < self.box[0] - reach)
         )
 
-    def query(self, points: Floats, which: Booleans, reach: float) -> Any:
+    def query(self, points: Floats, which: Booleans, reach: float) -> Found:
         """Distances of those points that are nearer than ``reach``.
 
         Parameters
@@ -151,10 +151,12 @@ class NeighbourSurface:
         nearest : (c,) ndarray of int
             Nearest vertex.
         """
-        index, nearest = np.empty(len(points), dtype=np.int64), np.empty(len(points), dtype=np.int64)
-        bound = min(reach + self.edge, self.cell)
-        count = _nearest_loop(points, which, self.vertices, self.cells, bound, index, nearest)
-        index, nearest = index[:count], nearest[:count]
+        bound = min(reach, self.reach) + self.edge
+        inside = which & ((points >= self.box[0] - bound) & (points <= self.box[1] + bound)).all(axis=1)
+        index = np.flatnonzero(inside)
+        away, nearest = self._tree.query(points[index], distance_upper_bound=bound)
+        index, nearest = index[away < bound], nearest[away < bound]
+        count = len(index)
         distance, normal = np.empty(count), np.empty((count, 3))
         skin = Skin(self.vertices, self.normals, self.faces, self.start, self.ring)
         _distance_loop(points, index, nearest, skin, distance, normal)
@@ -169,56 +171,9 @@ class NeighbourSurface:
         return index[near], distance[near], normal[near], nearest[near]
 
 
-@compiled
-def _fill_loop(vertices, cells):
-    """Sort the vertices by cell."""
-    box, cell, shape, first, members = cells
-    where = np.empty(len(vertices), dtype=np.int64)
-    for v in range(len(vertices)):
-        c = 0
-        for k in range(3):
-            c = c * shape[k] + int((vertices[v, k] - box[0, k]) / cell)
-        where[v] = c
-        first[c + 1] += 1
-    for c in range(len(first) - 1):
-        first[c + 1] += first[c]
-    filled = first[:-1].copy()
-    for v in range(len(vertices)):
-        members[filled[where[v]]] = v
-        filled[where[v]] += 1
-
-
-@compiled
-def _nearest_loop(points, which, vertices, cells, bound, index, nearest):
-    """Nearest vertex within ``bound``, at most a cell, of each selected point; return how many have one."""
-    box, cell, shape, first, members = cells
-    count = 0
-    low, high = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)
-    for p in range(len(points)):
-        if not which[p]:
-            continue
-        outside = False
-        for k in range(3):
-            outside = outside or points[p, k] < box[0, k] - bound or points[p, k] > box[1, k] + bound
-            c = int(np.floor((points[p, k] - box[0, k]) / cell))
-            low[k], high[k] = max(c - 1, 0), min(c + 2, shape[k])
-        if outside:
-            continue
-        least, best = bound * bound, -1
-        for a in range(low[0], high[0]):
-            for b in range(low[1], high[1]):
-                row = (a * shape[1] + b) * shape[2]
-                for m in range(first[row + low[2]], first[row + max(high[2], low[2])]):
-                    v = members[m]
-                    squared = 0.0
-                    for k in range(3):
-                        squared += (points[p, k] - vertices[v, k]) ** 2
-                    if squared < least:
-                        least, best = squared, v
-        if best >= 0:
-            index[count], nearest[count] = p, best
-            count += 1
-    return count
+def _change(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str, float]:
+    """Change of each coordinate."""
+    return {name: value - before.get(name, 0.0) for name, value in after.items()}
 
 
 @compiled

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.validation import SceneError
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ def resolve_initial_overlap(stepper: MuscleStepper) -> None:
     """Deal with overlap at rest as the scene's ``[contact] initial`` says; for a muscle in its rest pose.
 
     ``"resolve"`` lets the bones grow from the muscle's surface to their true size while the model holds its
-    shape and volume; the muscle gives way by the least that its own elasticity knows. ``"keep"`` measures
+    shape and volume; then the model brings out of bones what no contact point represents. ``"keep"`` measures
     every gap from the depth at rest.
 
     Raises
@@ -34,35 +35,26 @@ def resolve_initial_overlap(stepper: MuscleStepper) -> None:
         With ``"error"``, naming muscle, bone and depth.
     """
     contacts, scene = stepper.contacts, stepper.scene
-    least = scene.length(DEPTH)
+    least, initial = scene.length(DEPTH), scene.contact.initial
     overlap = contacts.depths(stepper.model.contact_points())
     overlap = {b: depth for b, depth in overlap.items() if depth.max(initial=0.0) > least}
-    if not overlap:
-        _settle_rest_of(stepper)
-        return
-    if scene.contact.initial == "error":
-        b = max(overlap, key=lambda key: overlap[key].max())
-        count, depth = int((overlap[b] > least).sum()), overlap[b].max()
-        raise SceneError(
-            f"muscle {stepper.name!r} overlaps bone {contacts.names[b]!r} at rest: {count} points, "
-            f"{depth:.3g} {scene.units} deep; set [contact] initial to 'resolve' or 'keep'"
-        )
-    for b, depth in overlap.items():
+    for b, depth in sorted(overlap.items(), key=lambda found: -found[1].max()):
+        count, bone = int((depth > least).sum()), contacts.names[b]
+        if initial == "error":
+            raise SceneError(
+                f"muscle {stepper.name!r} overlaps bone {bone!r} at rest: {count} points, {depth.max():.3g} "
+                f"{scene.units} deep; set [contact] initial to 'resolve' or 'keep'"
+            )
         contacts.allow(b, depth)
-        action = "overlap_kept" if scene.contact.initial == "keep" else "overlap_resolved"
-        stepper.report(contacts.names[b], int((depth > least).sum()), action)
-    if scene.contact.initial == "resolve":
-        _resolve(stepper, overlap)
-    _settle_rest_of(stepper)
+        stepper.report(bone, count, "overlap_kept" if initial == "keep" else "overlap_resolved")
+    if initial == "resolve":
+        if overlap:
+            _resolve(stepper, overlap)
+        stepper.model.settle(contacts)
 
 
-def _settle_rest_of(stepper):
-    """Let the model bring out of bones what no contact point stands for, where that is to be resolved."""
-    if stepper.scene.contact.initial == "resolve":
-        stepper.model.settle(stepper.contacts)
-
-
-def _resolve(stepper, overlap):
+def _resolve(stepper: MuscleStepper, overlap: dict[int, Floats]) -> None:
+    """Solve while the depth (n,) that is allowed in each bone shrinks to zero, until no contact point moves."""
     contacts, model = stepper.contacts, stepper.model
     model.predict(contacts.poses, contacts.poses)
     deepest = max(float(depth.max()) for depth in overlap.values())

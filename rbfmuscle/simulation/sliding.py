@@ -11,23 +11,27 @@ on the order of the muscles or on the number of threads.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rbfmuscle.geometry.threads import each
+from rbfmuscle.simulation.contact_pairs import sampled_poses, swept_boxes
 from rbfmuscle.simulation.neighbour_surface import NeighbourSurface
-from rbfmuscle.simulation.neighbours.pairs import BoneLink, Met, SlidingLimits, SlidingPair
-from rbfmuscle.simulation.plan.contact_pairs import sampled_poses, swept_region
+from rbfmuscle.simulation.sliding_pair import BoneLink, SlidingLimits, SlidingPair
+from rbfmuscle.simulation.stepper import MuscleStepper, TimedDrawing
 from rbfmuscle.validation import SceneError
 
 if TYPE_CHECKING:
     from rbfmuscle.scene.scene import Scene
 
+Coordinates = dict[str, float]
+
 
 class Sliding:
-    """All sliding pairs of a scene.
+    """Muscles that exchange their surfaces, in all sliding pairs of a scene.
 
     Parameters
     ----------
@@ -36,17 +40,23 @@ class Sliding:
     steppers : list of MuscleStepper
         In their rest state.
 
+    Attributes
+    ----------
+    pairs : dict of (str, str) to (float, float)
+        For each pair that met by the last drawings: overlap, and RMS gap opened where they touched at rest.
+
     Raises
     ------
     SceneError
         If ``pairs`` names an unknown muscle.
     """
 
-    def __init__(self, scene: Scene, steppers: list[Any]) -> None:
-        options: Any = scene.sliding
-        limits = SlidingLimits(options, scene)
-        self.links = {stepper.name: [] for stepper in steppers}
-        self.bone_links = {stepper.name: [] for stepper in steppers}
+    def __init__(self, scene: Scene, steppers: list[MuscleStepper]) -> None:
+        assert scene.sliding is not None
+        limits = SlidingLimits(scene.sliding, scene)
+        self.steppers, self.pairs = steppers, {}
+        self.links: dict[str, list[SlidingPair]] = {stepper.name: [] for stepper in steppers}
+        self.bone_links: dict[str, list[BoneLink]] = {stepper.name: [] for stepper in steppers}
         pairs = sliding_pairs(scene, [stepper.name for stepper in steppers], limits.reach)
         reach = max(limits.reach, limits.cut_depth)
         self.surfaces = {
@@ -57,69 +67,110 @@ class Sliding:
         for stepper in steppers:
             for other in steppers:
                 if frozenset((stepper.name, other.name)) in pairs:
-                    link = SlidingPair(
-                        stepper, self.surfaces[stepper.name], self.surfaces[other.name], limits
-                    )
-                    self.links[stepper.name].append(link)
-                    stepper.contacts.neighbours += [link.push, link.pull]
-                    stepper.contacts.cuts.append(link)
-                    link.back = next((b for b in self.links[other.name] if b.other is link.own), None)
-                    if link.back is not None:
-                        link.back.back = link
-            if options.bones:
+                    self._link(stepper, other, limits)
+            if scene.sliding.bones:
                 held = [BoneLink(stepper, b, limits) for b in stepper.contacts.reached]
                 self.bone_links[stepper.name] = held
                 stepper.contacts.neighbours += [link.pull for link in held]
 
-    def pairs(self) -> dict[tuple[str, str], tuple[float, float]]:
-        """Overlap, and RMS gap opened where they touched at rest, of each pair, when measured last.
+    def _link(self, stepper: MuscleStepper, other: MuscleStepper, limits: SlidingLimits) -> None:
+        """Link a muscle to a neighbour."""
+        link = SlidingPair(stepper, self.surfaces[stepper.name], self.surfaces[other.name], limits)
+        self.links[stepper.name].append(link)
+        stepper.contacts.neighbours += [link.push, link.pull]
+        stepper.contacts.cuts.append(link)
+        link.back = next((back for back in self.links[other.name] if back.other is link.own), None)
+        if link.back is not None:
+            link.back.back = link
 
-        The greater overlap of the two muscles counts; a pair that never met is left out.
+    def go(self, stops: Sequence[Coordinates], activations: Sequence[Mapping[str, float]]) -> None:
+        """Solve all muscles at the coordinates of the sub-steps; the first of them are the present ones.
+
+        The muscle with the most sub-steps divides the frame. Another muscle takes several of these at a time, as many
+        as its own bones allow; in between its neighbours see its prediction.
         """
-        met: dict[tuple[str, str], list[Met]] = {}
-        for name, links in self.links.items():
-            for link in links:
-                one, other = sorted((name, link.other.model.name))
-                met.setdefault((one, other), []).append(link.found)
-        return {
-            pair: (
-                max(m.overlap for m in found),
-                _rms(sum(m.opened for m in found), sum(m.touching for m in found)),
-            )
-            for pair, found in met.items()
-            if any(m.touching or m.overlap for m in found)
+        strides = {stepper.name: _stride(stepper, stops) for stepper in self.steppers}
+        last, here = len(stops) - 1, dict.fromkeys(strides, 0)
+        for stop in range(1, last + 1):
+            due = [s for s in self.steppers if stop == last or stop % strides[s.name] == 0]
+            for stepper in due if len(activations) else ():
+                stepper.set_activation(activations[stop - 1])
+            if due:
+                self._step(due, {name: (stops[k], stops[stop]) for name, k in here.items()})
+            here.update((stepper.name, stop) for stepper in due)
+
+    def _step(self, due: list[MuscleStepper], paths: Mapping[str, tuple[Coordinates, Coordinates]]) -> None:
+        """One sub-step of some muscles, each from its own last coordinates."""
+
+        def predict(stepper: MuscleStepper) -> None:
+            stepper.predict(*paths[stepper.name])
+            self.refresh(stepper, *paths[stepper.name])
+
+        def wait(stepper: MuscleStepper) -> None:
+            state, (before, after) = stepper.model.snapshot(), paths[stepper.name]
+            with stepper.timed("predict"):
+                stepper.model.predict(stepper.poses(before), stepper.poses(after))
+            self.refresh(stepper, before, after)
+            stepper.model.restore(state)
+
+        def find_planes(stepper: MuscleStepper) -> None:
+            with stepper.timed("sliding"):
+                for link in self.links[stepper.name]:
+                    link.update()
+                for bone_link in self.bone_links[stepper.name]:
+                    bone_link.update()
+
+        def learn(stepper: MuscleStepper) -> None:
+            if stepper.name in self.surfaces:
+                with stepper.timed("sliding"):
+                    self.surfaces[stepper.name].learn(*paths[stepper.name])
+
+        each(predict, due)
+        each(wait, [stepper for stepper in self.steppers if stepper not in due])
+        for act in (find_planes, MuscleStepper.correct, learn):
+            each(act, due)
+
+    def refresh(self, stepper: MuscleStepper, *path: Coordinates) -> None:
+        """Update a muscle's surface from its present state, extrapolated for a path from coordinates to others."""
+        if stepper.name in self.surfaces:
+            with stepper.timed("sliding"):
+                self.surfaces[stepper.name].refresh(*path)
+
+    def drawings(self) -> list[TimedDrawing]:
+        """Drawings of all muscles in their present state; updates ``pairs``."""
+        each(self.refresh, self.steppers)
+        met: dict[tuple[str, str], list[tuple[float, int, float]]] = {}
+        for stepper, found in zip(self.steppers, each(self._measure, self.steppers)):
+            for link, one in zip(self.links[stepper.name], found):
+                names = stepper.name, link.other.model.name
+                met.setdefault((min(names), max(names)), []).append(one)
+        self.pairs = {
+            pair: (max(overlap), math.sqrt(sum(opened) / max(sum(touching), 1)))
+            for pair, (overlap, touching, opened) in ((pair, zip(*found)) for pair, found in met.items())
+            if any(touching) or any(overlap)
         }
+        drawings = [stepper.drawing() for stepper in self.steppers]
+        each(self._show, drawings)
+        return drawings
 
-    def refresh(self, stepper: Any, way: Mapping[str, float] | None = None) -> None:
-        """Update a muscle's surface from its present state, extrapolated by the change ``way`` of the coordinates."""
-        if stepper.name in self.surfaces:
-            with stepper.timed("sliding"):
-                self.surfaces[stepper.name].refresh(way)
+    def _measure(self, stepper):
+        with stepper.timed("sliding"):
+            return [link.measure() for link in self.links[stepper.name]]
 
-    def settled(self, stepper: Any, way: Mapping[str, float]) -> None:
-        """Record a muscle's correction for extrapolation."""
-        if stepper.name in self.surfaces:
-            with stepper.timed("sliding"):
-                self.surfaces[stepper.name].settled(way)
-
-    def show(self, drawing: Any) -> None:
+    def _show(self, drawing):
         """Use the field that a muscle will be shown by, before its surface is drawn."""
         stepper = drawing.stepper
         if self.links[stepper.name]:
             with stepper.timed("surface"):
                 self.surfaces[stepper.name].field = drawing.drawing.field()
 
-    def update(self, stepper: Any) -> None:
-        """Recompute the planes of one muscle; its neighbours' surfaces must be up to date."""
-        with stepper.timed("sliding"):
-            for link in [*self.links[stepper.name], *self.bone_links[stepper.name]]:
-                link.update()
 
-    def measure(self, stepper: Any) -> Any:
-        """Greatest value of each quantity over a muscle's pairs; empty without neighbours."""
-        with stepper.timed("sliding"):
-            found = [link.measure() for link in self.links[stepper.name]]
-        return {key: max(one[key] for one in found) for key in found[0]} if found else {}
+def _stride(stepper, stops):
+    """Number of sub-steps that a muscle takes at a time; one that contracts takes every one."""
+    count = len(stops) - 1
+    if stepper.cut is None or count < 2:
+        return 1
+    return max(1, count // max(1, len(stepper.cut.split(stops[0], stops[-1]))))
 
 
 def sliding_pairs(scene: Scene, names: list[str], reach: float) -> set[frozenset[str]]:
@@ -134,7 +185,7 @@ def sliding_pairs(scene: Scene, names: list[str], reach: float) -> set[frozenset
 
     @cache
     def box(k, bone):
-        return swept_region(muscles[k], bone, poses)
+        return swept_boxes(muscles[k], [bone], poses)[0]
 
     def meet(i, k):
         """Whether the swept boxes meet in the coordinates of every bone that holds one of the two."""
@@ -146,7 +197,3 @@ def sliding_pairs(scene: Scene, names: list[str], reach: float) -> set[frozenset
         (i, k, frozenset((muscles[i].name, muscles[k].name))) for i in range(len(muscles)) for k in range(i)
     ]
     return {pair for i, k, pair in pairs if (not wanted or pair in wanted) and meet(i, k)}
-
-
-def _rms(squares, count):
-    return math.sqrt(squares / count) if count else 0.0

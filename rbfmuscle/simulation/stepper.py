@@ -5,16 +5,20 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.scene.motion import bone_poses, interpolate, shown_value, step_angle, unit_sign
+from rbfmuscle.geometry.fields import Field
+from rbfmuscle.scene.motion import interpolate, shown_value, step_angle, unit_sign
+from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.simulation.frame import Drawing, Event, ModelSurface
-from rbfmuscle.simulation.rigid_transport import SOLVED, MuscleStatus, RigidTransport
+from rbfmuscle.simulation.rigid_transport import MuscleStatus, RigidTransport
+from rbfmuscle.simulation.substeps import PoseCache, SubSteps
 from rbfmuscle.simulation.tunnelling import find_crossings, one_sided_planes, only_grazed, rotate_with_bone
 from rbfmuscle.validation import NotFiniteError, SolveError
 
@@ -33,24 +37,22 @@ SMALLEST_STEP = math.radians(0.1)
 
 
 class TimedDrawing:
-    """A muscle's drawing with the quantities of its sub-steps.
+    """A muscle's drawing, whose surface is computed once.
 
     Parameters
     ----------
     stepper : MuscleStepper
     drawing : Drawing
-    measured : dict of str to float
     """
 
-    def __init__(self, stepper: MuscleStepper, drawing: Drawing, measured: dict) -> None:
-        self.stepper, self.drawing, self.measured = stepper, drawing, measured
+    def __init__(self, stepper: MuscleStepper, drawing: Drawing) -> None:
+        self.stepper, self.drawing = stepper, drawing
         self._finished: ModelSurface | None = None
 
     def surface(self) -> ModelSurface:
-        """The surface with all quantities; computed once."""
+        """The surface."""
         if self._finished is None:
             self._finished = self.drawing.surface()
-            self._finished.quantities.update(self.measured)
         return self._finished
 
     def draw(self) -> tuple[ModelSurface, float]:
@@ -59,28 +61,22 @@ class TimedDrawing:
         return self.surface(), time.perf_counter() - start
 
 
-class CarriedDrawing(TimedDrawing):
-    """A drawing moved rigidly.
+@dataclass(frozen=True)
+class CarriedDrawing:
+    """An earlier drawing, and the rigid motion (4, 4) since."""
 
-    Parameters
-    ----------
-    before : TimedDrawing
-    motion : (4, 4) ndarray
-        Since ``before``.
-    """
+    before: TimedDrawing
+    motion: Floats
 
-    def __init__(self, before: TimedDrawing, motion: Floats) -> None:
-        super().__init__(before.stepper, before.drawing, before.measured)
-        self._before, self._motion = before, motion
+    def field(self) -> Field | None:
+        """None: muscles that move rigidly do not slide."""
 
     def surface(self) -> ModelSurface:
         """The earlier surface, moved."""
-        if self._finished is None:
-            then, motion = self._before.surface(), self._motion
-            vertices = then.vertices @ motion[:3, :3].T + motion[:3, 3]
-            taken = {name: 0.0 if name.startswith("time_") else v for name, v in then.quantities.items()}
-            self._finished = ModelSurface(vertices, then.faces, taken, list(then.notes), (then, motion))
-        return self._finished
+        then, motion = self.before.surface(), self.motion
+        vertices = then.vertices @ motion[:3, :3].T + motion[:3, 3]
+        quantities = {name: 0.0 if name.startswith("time_") else v for name, v in then.quantities.items()}
+        return ModelSurface(vertices, then.faces, quantities, list(then.notes), (then, motion))
 
 
 class MuscleStepper:
@@ -97,29 +93,32 @@ class MuscleStepper:
 
     Attributes
     ----------
+    cut : SubSteps or None
+        Sub-steps by the relative motion of the muscle's own bones; None for one that contracts.
     carrier : RigidTransport or None
-        Moves the muscle rigidly where it need not be solved; set by the frame loop.
-    work : MuscleStatus
-        How the muscle came to the last frame.
+        Moves the muscle rigidly where it need not be solved; None where it is always solved.
     """
 
     def __init__(
-        self, model: MuscleModel, contacts: BoneContacts, scene: Scene, *, poses: Any = None
+        self,
+        model: MuscleModel,
+        contacts: BoneContacts,
+        scene: Scene,
+        *,
+        poses: Callable[[Mapping[str, float]], Poses] | None = None,
     ) -> None:
-        self.model, self.contacts, self.scene = model, contacts, scene
-        self.name = model.name
+        self.model, self.contacts, self.scene, self.name = model, contacts, scene, model.name
+        self.poses = poses or PoseCache(scene)
         self.detect = scene.detect.tunnelling if scene.detect is not None else None
         self.tolerance = scene.length(TOUCH)
-        self.times, self.events = {}, {}
-        self.frame = 0
-        self.path: Any = None
-        self.saved: Any = None
-        self.measured = {}
-        self.poses = poses or (lambda coordinates: bone_poses(scene, coordinates))
+        self.times: dict[str, float] = {}
+        self.events: dict[tuple[int, str, str], int] = {}
+        self.frame, self.solves = 0, 0
+        self.cut: SubSteps | None = None
         self.carrier: RigidTransport | None = None
-        self.solves, self.work = 0, MuscleStatus(SOLVED, 0, "")
+        self._path: Any = None
+        self._saved: Any = None
         self._shown: TimedDrawing | None = None
-        self._since = np.eye(4)
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[Any]:
@@ -131,104 +130,96 @@ class MuscleStepper:
             key = f"time_{stage}"
             self.times[key] = self.times.get(key, 0.0) + time.perf_counter() - start
 
-    def advance(self, stops: list[dict[str, float]], activations: Any = ()) -> None:
+    def go(
+        self, stops: list[dict[str, float]], activations: Sequence[Mapping[str, float]] = ()
+    ) -> MuscleStepper:
         """Advance through a list of coordinates; the first are the present ones.
 
         ``activations`` holds, for muscles that contract, the activation by muscle at the end of each.
         """
         for before, after, activation in itertools.zip_longest(stops[:-1], stops[1:], activations):
-            self.set_activation(activation)
-            if not self._carries(before, after):
+            self.set_activation(activation or {})
+            poses = self.poses(before), self.poses(after)
+            if self.carrier is None or not self.carrier.try_carry(self.model, self.contacts, *poses):
                 self.step(before, after)
+        return self
 
-    def _carries(self, before: Mapping[str, float], after: Mapping[str, float]) -> bool:
-        """Move the muscle rigidly if it need not be solved; return whether it was."""
-        return self.carrier is not None and self.carrier.try_carry(self.poses(before), self.poses(after))
-
-    def carried(self, motion: Floats) -> None:
-        """Record a rigid motion (4, 4) of the muscle."""
-        self._since = motion @ self._since
-
-    def set_activation(self, activation: Any) -> None:
-        """Set the model's activation from a dict by muscle; None changes nothing."""
-        if activation is not None and self.name in activation:
+    def set_activation(self, activation: Mapping[str, float]) -> None:
+        """Set the model's activation from a dict by muscle, where it is in there."""
+        if self.name in activation:
             self.model.activate(activation[self.name])
 
-    def step(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
+    def step(self, before: dict[str, float], after: dict[str, float]) -> None:
         """One sub-step, with the tunnelling test where the scene has one."""
-        self.begin(before, after)
-        self.finish()
+        self.predict(before, after)
+        self.correct()
 
-    def begin(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
+    def predict(self, before: dict[str, float], after: dict[str, float]) -> None:
         """First half of a sub-step: the bones move and the model predicts."""
-        self.path, poses = (before, after), (self.poses(before), self.poses(after))
-        self.saved, self._shown = None, None
+        self._path, poses = (before, after), (self.poses(before), self.poses(after))
+        self._saved = self._shown = None
         if self.detect is not None:
-            self.saved = self.model.snapshot(), self.model.contact_points().copy(), poses
+            self._saved = self.model.snapshot(), self.model.contact_points().copy(), poses
         self._predict(poses)
 
-    def finish(self) -> None:
+    def correct(self) -> None:
         """Second half: the model solves, and points that passed through a bone are corrected."""
-        before, after = self.path
+        before, after = self._path
         self.solve(after)
         self.solves += 1
-        if self.saved is not None:
-            state, start, poses = self.saved
+        if self._saved is not None:
+            state, start, poses = self._saved
             crossings = self._crossings(start, poses)
             if crossings:
                 self._correct(state, start, poses, before, after, crossings)
         if self.carrier is not None:
             self.carrier.solved = self.poses(after)
 
-    def solve(self, coordinates: dict[str, float]) -> None:
+    def solve(self, coordinates: Mapping[str, float]) -> None:
         """Solve, and refuse what is not finite.
 
         Raises
         ------
         SolveError
-            Naming muscle, frame and coordinates.
+            Naming muscle, mesh, frame and coordinates.
         """
-        with self.timed("solve"):
-            try:
+        try:
+            with self.timed("solve"):
                 self.model.solve(self.contacts)
-            except (np.linalg.LinAlgError, FloatingPointError, NotFiniteError) as error:
-                raise SolveError(f"{self._place(coordinates)}: {error}") from error
-        bad = ~np.isfinite(self.model.contact_points()).all(axis=1)
-        if bad.any():
+            bad = ~np.isfinite(self.model.contact_points()).all(axis=1)
+            if bad.any():
+                raise NotFiniteError(f"{int(bad.sum())} of {len(bad)} positions are not finite")
+        except (np.linalg.LinAlgError, FloatingPointError, NotFiniteError) as error:
+            source = self.scene.muscle(self.name).source
             raise SolveError(
-                f"{self._place(coordinates)}: {int(bad.sum())} of {len(bad)} positions are not finite; "
-                "try a smaller substep_angle in [contact]"
-            )
-
-    def go(self, stops: list[dict], activations: Sequence[dict] = ()) -> TimedDrawing:
-        """Advance through sub-steps; return the drawing there."""
-        self.advance(stops, activations)
-        return self.drawing()
+                f"{self._place(coordinates)}: {error}; look for spikes and thin triangles in its mesh"
+                f"{f' ({source})' if source else ''} and remesh it, or try a smaller substep_angle in [contact]"
+            ) from error
 
     def drawing(self) -> TimedDrawing:
         """The drawing of the present state."""
-        if self._shown is not None:
-            return CarriedDrawing(self._shown, self._since)
+        carrier = self.carrier
+        if self._shown is not None and carrier is not None:
+            return TimedDrawing(self, CarriedDrawing(self._shown, carrier.since))
         with self.timed("surface"):
-            shown = TimedDrawing(self, self.model.drawing(self.contacts), self.measured)
-        if self.carrier is not None and not self.carrier.never:
-            self._shown, self._since = shown, np.eye(4)
+            shown = TimedDrawing(self, self.model.drawing(self.contacts))
+        if carrier is not None:
+            self._shown, carrier.since = shown, np.eye(4)
         return shown
 
-    def report(self, bone: Any, count: int, action: Any) -> None:
+    def report(self, bone: str, count: int, action: str) -> None:
         """Record an event of the present frame; of one kind the greatest number of points is kept."""
         key = (self.frame, bone, action)
-        self.events[key] = max(int(count), self.events.get(key, 0))
+        self.events[key] = max(count, self.events.get(key, 0))
 
-    def collect(self) -> tuple[Any, ...]:
-        """Times and events since the last call."""
-        times = self.times
-        events = [Event(k, self.name, bone, n, action) for (k, bone, action), n in self.events.items()]
+    def collect(self) -> tuple[dict[str, float], list[Event], MuscleStatus]:
+        """Times, events and status since the last call."""
+        times, solves = self.times, self.solves
         times["time_frame"] = sum(times.values())
-        if self.carrier is not None:
-            self.work = self.carrier.collect(self.solves)
+        events = [Event(k, self.name, bone, n, action) for (k, bone, action), n in self.events.items()]
+        moved = self.carrier is not None and self.carrier.collect()
         self.times, self.events, self.solves = {}, {}, 0
-        return times, events
+        return times, events, MuscleStatus("solved" if solves else "carried" if moved else "skipped", solves)
 
     def _predict(self, poses):
         self.contacts.move(poses[1])

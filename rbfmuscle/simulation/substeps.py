@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import RestFrame, diameter
 from rbfmuscle.scene.joints.skeleton import all_coordinates
 from rbfmuscle.scene.motion import (
@@ -22,20 +23,19 @@ from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.validation import SceneError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
+    from rbfmuscle.scene.objects import Muscle
     from rbfmuscle.scene.scene import Scene
 
 
+Coordinates: TypeAlias = dict[str, float]
 # No attached point moves farther against a bone in one sub-step than this share of its muscle's diameter.
 TRAVEL = 1.0 / 27.0
 # Sub-steps that one coordinate may take in a motion.
 MOST_SUBSTEPS = 100_000
 # Pieces in which a path is followed to see how far it turns the bones.
 PIECES = 8
-
-
-__all__ = ["PoseCache", "SubSteps", "path_angle", "turned_angle"]
 
 
 class SubSteps:
@@ -57,13 +57,17 @@ class SubSteps:
     """
 
     def __init__(
-        self, scene: Scene, muscle: Any = None, *, bones: Sequence[str] = (), poses: Any = None
+        self,
+        scene: Scene,
+        muscle: Muscle | None = None,
+        *,
+        bones: Sequence[str] = (),
+        poses: Callable[[Coordinates], Poses] | None = None,
     ) -> None:
-        self.scene = scene
-        self._poses = poses or (lambda coordinates: bone_poses(scene, coordinates))
+        self.scene, self._poses = scene, poses or PoseCache(scene)
         muscles = scene.muscles if muscle is None else [muscle]
-        own = [attachment.holder for part in muscles for attachment in part.attachments]
-        guides = [name for part in muscles for attachment in part.attachments for name in attachment.bones]
+        attachments = [(part, attachment) for part in muscles for attachment in part.attachments]
+        own = [attachment.holder for _, attachment in attachments]
         self._facts = all_coordinates(scene.joints)
         #: The bones that count, and the coordinates that move them against each other. A muscle's are seen from the
         #: first that holds it, a whole scene's from the world.
@@ -72,22 +76,17 @@ class SubSteps:
             self.relevant = set(self._facts)
         else:
             self._root, self.bones = own[0], [*dict.fromkeys([*own, *bones])]
+            guides = [name for _, attachment in attachments for name in attachment.bones]
             self.relevant = _moving_apart(scene, [*guides, *bones])
         self.limit = math.radians(scene.contact.substep_angle)
-        names = self.bones
-        owner, corners, size = [], [], []
-        for part in muscles:
-            vertices = np.asarray(part.mesh.vertices)
-            frame = RestFrame(vertices)
-            for attachment in part.attachments:
-                owner.append(names.index(attachment.holder))
-                corners.append(frame.corners(attachment.vertices))
-                size.append(diameter(vertices))
         # Of each attachment: its bone, a box about it, and how far that may move in one sub-step.
-        self._owner, self._travel = np.array(owner, dtype=int), TRAVEL * np.array(size)
-        self._corners = np.array(corners).reshape(-1, 8, 3)
+        frames = {part.name: RestFrame(np.asarray(part.mesh.vertices)) for part in muscles}
+        corners = [frames[part.name].corners(attachment.vertices) for part, attachment in attachments]
+        sizes = [diameter(np.asarray(part.mesh.vertices)) for part, _ in attachments]
+        self._owner = np.array([self.bones.index(name) for name in own], dtype=int)
+        self._travel, self._corners = TRAVEL * np.array(sizes), np.array(corners).reshape(-1, 8, 3)
 
-    def split(self, before: dict[str, Any], after: dict[str, float]) -> list[Any]:
+    def split(self, before: Coordinates, after: Coordinates) -> list[Coordinates]:
         """Coordinates of the sub-steps from one frame to the next, ``before`` left out and ``after`` last.
 
         Returns
@@ -124,16 +123,18 @@ class SubSteps:
                 return stops[1:]
             count = max(count + 1, math.ceil(count * min(excess, 4.0)))
 
-    def rate_of(self, name: str) -> float:
-        """About how many sub-steps a change of one coordinate takes, a radian or a scene unit of it."""
+    def estimate(self, name: str, changes: Floats) -> float:
+        """About how many sub-steps some changes of one coordinate take, from a small probe at rest; may be infinite."""
         turns = self._facts[name].motion == "rotation"
         probe = self.limit if turns else self.scene.length(1.0)
         rest = rest_coordinates(self.scene)
         moved = {**rest, name: rest.get(name, 0.0) + probe}
-        excess = self._excess(self._matrices(rest), self._matrices(moved))
-        if not math.isfinite(excess):
-            return math.inf
-        return max(1.0 if turns else 0.0, excess) / probe
+        with np.errstate(all="ignore"):
+            excess = self._excess(self._matrices(rest), self._matrices(moved))
+            rate = max(1.0 if turns else 0.0, excess) / probe if math.isfinite(excess) else math.inf
+            total = float(np.ceil(np.abs(changes[changes != 0.0]) * rate - 1e-9).sum())
+        # Not a number, where numbers overflow, is more than any limit.
+        return total if math.isfinite(total) else math.inf
 
     def _stops_on_grid(self, before, after, name):
         """Stops strictly between two values of the coordinate ``name``, in order."""
@@ -186,16 +187,16 @@ class PoseCache:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        self._known: dict[Any, Poses] = {}
+        self._known: dict[tuple[tuple[str, float], ...], Poses] = {}
 
-    def __call__(self, coordinates: dict[str, float]) -> Poses:
+    def __call__(self, coordinates: Mapping[str, float]) -> Poses:
         """Poses (4, 4) by bone, as `bone_poses` gives them; shared, so not to be changed."""
         key = tuple(sorted(coordinates.items()))
         found = self._known.get(key)
         if found is None:
             if len(self._known) >= self.MOST:
                 self._known = {}
-            found = self._known[key] = bone_poses(self.scene, coordinates)
+            found = self._known[key] = bone_poses(self.scene, dict(coordinates))
         return found
 
 
@@ -218,7 +219,7 @@ def _moving_apart(scene: Scene, bones: Sequence[str]) -> set[str]:
     return found
 
 
-def check_substeps(scene: Any) -> None:
+def check_substeps(scene: Scene) -> None:
     """Refuse a motion of more sub-steps than `MOST_SUBSTEPS`, before anything grows with their number.
 
     Raises
@@ -226,36 +227,19 @@ def check_substeps(scene: Any) -> None:
     SceneError
         With the number, and the coordinate that takes most of it.
     """
-    by_name = estimate_substeps(scene)
-    name = max(by_name, key=lambda name: by_name[name], default="")
-    if by_name and not by_name[name] <= MOST_SUBSTEPS:
-        raise SceneError(
-            f"[motion]: {name!r} takes about {by_name[name]:.3g} sub-steps, more than {MOST_SUBSTEPS} (its path is "
-            f"long, contact.substep_angle = {scene.contact.substep_angle:g} is small, or muscles lie far from the "
-            "joint's centre); correct these"
-        )
-
-
-def estimate_substeps(scene: Any) -> dict[str, float]:
-    """Return about how many sub-steps each coordinate of a motion takes by itself, from rest on.
-
-    Found from one probe a coordinate: how far a small change of it, from rest, moves what is attached.
-    """
     cut, frames, rest = SubSteps(scene), scene.motion.frames, rest_coordinates(scene)
-    found = {}
     for name in sorted({name for frame in frames for name in frame}):
         start = rest.get(name, 0.0)
-        path = np.array([start, *(frame.get(name, start) for frame in frames)])
-        with np.errstate(all="ignore"):
-            change = np.abs(np.diff(path))
-            steps = np.ceil(change * cut.rate_of(name) - 1e-9)
-            total = float(steps[change > 0].sum())
-        # Not a number, where numbers overflow, is more than any limit.
-        found[name] = total if math.isfinite(total) else math.inf
-    return found
+        count = cut.estimate(name, np.diff([start, *(frame.get(name, start) for frame in frames)]))
+        if count > MOST_SUBSTEPS:
+            raise SceneError(
+                f"[motion]: {name!r} takes about {count:.3g} sub-steps, more than {MOST_SUBSTEPS} (its path is "
+                f"long, contact.substep_angle = {scene.contact.substep_angle:g} is small, or muscles lie far from "
+                "the joint's centre); correct these"
+            )
 
 
-def path_angle(scene: Scene, before: Any, after: Any) -> Any:
+def path_angle(scene: Scene, before: Coordinates, after: Coordinates) -> float:
     """How far the bones turn from one set of coordinates to another [radian].
 
     Angles count as they are given; where other coordinates move too, the path is followed in a few pieces.

@@ -17,14 +17,12 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.rotations import rigid_fit
-from rbfmuscle.jit import compiled
-from rbfmuscle.simulation.broad_phase import box_loop, boxes_apart
-from rbfmuscle.simulation.neighbours.pairs import Planes
+from rbfmuscle.simulation.contact import BoneContacts, Planes
 
 if TYPE_CHECKING:
     from rbfmuscle.bones.sdf import BoneSDF
     from rbfmuscle.scene.options import TunnellingOptions
-    from rbfmuscle.simulation.contact import BoneContacts
+    from rbfmuscle.simulation.frame import MuscleModel
 
 
 # 135 degrees, the bound of the angle test.
@@ -65,11 +63,10 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Crossing:
-    """Points that passed through one bone in a step, and how deep they were by its field."""
+    """Points that passed through one bone in a step, and how many the angle test flags."""
 
     bone: int
     index: np.ndarray
-    depth: float
     flagged: int
 
 
@@ -126,7 +123,7 @@ def find_crossings(
     options: TunnellingOptions,
     *,
     tolerance: float,
-) -> list[Any]:
+) -> list[Crossing]:
     """Points that passed through bones while the bones went from one set of poses to another.
 
     Parameters
@@ -147,7 +144,9 @@ def find_crossings(
         One for each bone that was crossed or flagged.
     """
     crossings = []
-    for b, index in _candidates(contacts, start, end, before, after):
+    # A path that is shorter than the distance of its end touches nothing.
+    lengths = contacts.path_lengths(start, end, before, after)
+    for b, index in contacts.near(end, lengths):
         name = contacts.names[b]
         first, second = _local(start[index], before[name]), _local(end[index], after[name])
         sweep = sweep_paths(
@@ -155,12 +154,18 @@ def find_crossings(
         )
         crossed = sweep.through if options.swept else sweep.flagged
         if crossed.any() or sweep.flagged.any():
-            depth = float(max(0.0, -sweep.lowest[crossed].min())) if crossed.any() else 0.0
-            crossings.append(Crossing(b, index[sweep.index[crossed]], depth, int(sweep.flagged.sum())))
+            crossings.append(Crossing(b, index[sweep.index[crossed]], int(sweep.flagged.sum())))
     return crossings
 
 
-def rotate_with_bone(model: Any, crossings: Any, start: Any, before: Any, after: Any, names: Any) -> None:
+def rotate_with_bone(
+    model: MuscleModel,
+    crossings: list[Crossing],
+    start: Floats,
+    before: dict[str, Floats],
+    after: dict[str, Floats],
+    names: list[str],
+) -> None:
     """Move points that crossed back to where they were relative to the bone: rotated with it about its joint.
 
     The bone's motion from ``before`` to ``after`` is the rotation about the joint centre by the step's angle. The model
@@ -174,15 +179,20 @@ def rotate_with_bone(model: Any, crossings: Any, start: Any, before: Any, after:
         model.turn(which, rigid_fit(model.contact_points()[crossing.index], wanted))
 
 
-def one_sided_planes(contacts: Any, crossing: Crossing, start: Any, before: Any, after: Any) -> Planes:
+def one_sided_planes(
+    contacts: BoneContacts,
+    crossing: Crossing,
+    start: Floats,
+    before: dict[str, Floats],
+    after: dict[str, Floats],
+) -> Planes:
     """Planes that hold points which crossed on their side of the bone, a half-space for each.
 
     The plane lies between the point and the bone, normal to the distance's gradient, and moves with the bone.
     """
     name = contacts.names[crossing.bone]
-    back, motion = np.linalg.inv(before[name]), after[name] @ np.linalg.inv(before[name])
-    points = start[crossing.index]
-    local = points @ back[:3, :3].T + back[:3, 3]
+    motion, points = after[name] @ np.linalg.inv(before[name]), start[crossing.index]
+    local = _local(points, before[name])
     distance = contacts.fields[crossing.bone].distance(local)
     way = _directions(contacts.fields[crossing.bone], local) @ after[name][:3, :3].T
     planes = Planes()
@@ -297,84 +307,3 @@ def _directions(field, points):
 def _local(points, pose):
     """Points in the coordinates of a bone in a rigid pose."""
     return (points - pose[:3, 3]) @ pose[:3, :3]
-
-
-def _candidates(contacts, start, end, before, after):
-    """Bones, each with the free points whose paths may touch it."""
-    poses = contacts.stacked(before), contacts.stacked(after)
-    found = np.empty((len(contacts.reached), len(start)), dtype=np.int64)
-    counts = np.zeros(len(found), dtype=np.int64)
-    free, known = contacts.free(len(end)), contacts.known(len(end))
-    _candidates_loop((start, end), free, poses, contacts.boxes, known, found, counts)
-    return [(b, index[:count]) for b, index, count in zip(contacts.reached, found, counts.tolist()) if count]
-
-
-@compiled(error_model="numpy")
-def _candidates_loop(paths, free, poses, boxes, known, found, counts):
-    """Leave out paths that are shorter than a lower bound of their end's distance to the bone.
-
-    The bound is the distance to the bone's box, or an earlier bound less the motion since; (x + y)^2 <= 2 x^2 + 2 y^2.
-    """
-    start, end = paths
-    before, after = poses
-    anchor, answer = known
-    ends, starts, longest = np.empty((2, 3)), np.empty((2, 3)), 0.0
-    box_loop(start, free, starts)
-    box_loop(end, free, ends)
-    for i in range(len(start)):
-        if free[i]:
-            way = 0.0
-            for k in range(3):
-                way += (end[i, k] - start[i, k]) ** 2
-            longest = max(longest, way)
-    longest = np.sqrt(longest)
-    for b in range(len(boxes)):
-        count = 0
-        if boxes_apart(ends, after[b], boxes[b]) > longest + _carried_way(starts, before[b], after[b]):
-            continue
-        for i in range(len(start)):
-            if free[i] and _may_touch(
-                start[i], end[i], before[b], after[b], boxes[b], anchor[b, i], answer[b, i]
-            ):
-                found[b, count] = i
-                count += 1
-        counts[b] = count
-
-
-@compiled(error_model="numpy")
-def _may_touch(start, end, before, after, bounds, anchor, known):
-    """Whether a path is long enough to reach a bone from where it ends."""
-    way, moved, outside = 0.0, 0.0, 0.0
-    for k in range(3):
-        a, b = 0.0, 0.0
-        for j in range(3):
-            a += before[j, k] * (start[j] - before[j, 3])
-            b += after[j, k] * (end[j] - after[j, 3])
-        way += (b - a) ** 2
-        moved += (b - anchor[k]) ** 2
-        beyond = max(bounds[0, k] - b, b - bounds[1, k], 0.0)
-        outside += beyond * beyond
-    if way < outside:
-        return False
-    if known <= 0.0:
-        return True
-    square = known * known
-    return not (2.0 * (way + moved) < square or np.sqrt(way) + np.sqrt(moved) < known)
-
-
-@compiled(error_model="numpy")
-def _carried_way(box, before, after):
-    """Greatest displacement of a point of a box between two poses: that of a corner, as it is convex."""
-    farthest = 0.0
-    for corner in range(8):
-        square = 0.0
-        for k in range(3):
-            there = after[k, 3]
-            for j in range(3):
-                local = 0.0
-                for m in range(3):
-                    local += before[m, j] * (box[corner >> m & 1, m] - before[m, 3])
-                there += after[k, j] * local
-            square += (there - box[corner >> k & 1, k]) ** 2
-        farthest = max(farthest, square)
-    return np.sqrt(farthest)

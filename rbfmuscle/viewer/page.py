@@ -103,8 +103,6 @@ class Page:
         self._closed = True
         self._wake.set()
         self._thread.join()
-        for side in self.sides:
-            side.close()
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 

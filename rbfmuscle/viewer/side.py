@@ -52,7 +52,6 @@ class Side:
         if choice == self.choice:
             return False
         figure = None if choice == "none" else self.source.figure(choice)
-        self.close()
         self.choice, self.figure = choice, figure
         self.rest = self.picture = None if figure is None else figure.advance()
         self.frame.visible = figure is not None
@@ -126,8 +125,3 @@ class Side:
         poses = [(vertices, self.picture.poses[name]) for name, (vertices, _) in self._bones.items()]
         bones = [vertices @ pose[:3, :3].T + pose[:3, 3] for vertices, pose in poses]
         return bones + [vertices for vertices, _ in self.picture.surfaces.values()]
-
-    def close(self) -> None:
-        """End the figure's threads."""
-        if self.figure is not None:
-            self.figure.close()

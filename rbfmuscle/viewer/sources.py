@@ -134,10 +134,6 @@ class LiveFigure:
         known = {name: depth for name, depth in depths.items() if depth is not None}
         return Picture(frame.poses, surfaces, tendons, frame.activations, known, "")
 
-    def close(self) -> None:
-        """End the session's threads."""
-        self.session.close()
-
 
 class SavedSource:
     """Saved runs of one scene by name, scrubbed by frame; attributes as of `LiveSource`.
@@ -192,6 +188,3 @@ class SavedFigure:
     def _known(self, quantity: str) -> dict[str, float]:
         series = {name: self.saved.series(name, quantity) for name in self.saved.muscles}
         return {n: float(x[k == self.frame][0]) for n, (k, x) in series.items() if (k == self.frame).any()}
-
-    def close(self) -> None:
-        """Nothing is held open."""

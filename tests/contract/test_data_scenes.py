@@ -6,7 +6,7 @@ from rbfmuscle.models import check_models
 from rbfmuscle.run import simulate
 from rbfmuscle.scene.check import check_initial
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.simulation.plan.plan import plan_scene
+from rbfmuscle.simulation.plan import plan_scene
 
 # Muscles and bones of each scene.
 SCENES = {

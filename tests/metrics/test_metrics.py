@@ -20,7 +20,7 @@ from rbfmuscle.metrics.topology import SurfaceForm, euler_characteristic
 from rbfmuscle.run import simulate
 from rbfmuscle.scene.joints.joint import Coordinate
 from rbfmuscle.scene.objects import Attachment, Motion
-from rbfmuscle.simulation.frame_loop import Event, Frame, ModelSurface
+from rbfmuscle.simulation.frame import Event, Frame, ModelSurface
 
 EYE = np.eye(4)
 

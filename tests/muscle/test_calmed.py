@@ -38,7 +38,7 @@ def test_a_tangle_of_the_material_is_shown_as_a_sound_surface(drawn):
     surface = model.drawer.draw(no_fit, now, contacts)
     assert not crossing_faces(surface.vertices, np.asarray(surface.faces)).any()
     assert mesh_volume(surface.vertices, np.asarray(surface.faces)) == pytest.approx(volume, rel=1e-10)
-    assert contacts.nearest(surface.vertices).min() > -0.05
+    assert contacts.nearest(surface.vertices)[0].min() > -0.05
     assert surface.quantities["unfitted_fraction"] == 1.0
     # Far from the tangle it is where the material is.
     far = shown.rest[:, 2] > 15.0

@@ -15,7 +15,7 @@ from rbfmuscle.scene.joints.tables import JointTable, joint_row
 from rbfmuscle.scene.motion import bone_poses, step_angle, turned_angle
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.simulation.plan.contact_pairs import find_contact_pairs
+from rbfmuscle.simulation.contact_pairs import find_contact_pairs
 from rbfmuscle.simulation.substeps import SubSteps
 from rbfmuscle.validation import SceneError
 

@@ -8,10 +8,10 @@ import trimesh
 
 from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.options import SlidingOptions
+from rbfmuscle.simulation import sliding_pair as links
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.simulation.neighbour_surface import NeighbourSurface
-from rbfmuscle.simulation.neighbours import pairs as links
 from rbfmuscle.simulation.sliding import Sliding, sliding_pairs
 from rbfmuscle.simulation.stepper import MuscleStepper
 from rbfmuscle.validation import SceneError
@@ -96,7 +96,7 @@ def test_side_and_distance_around_a_sharp_rim_are_those_of_the_mesh():
 def _run(angles, sliding, **options):
     made, fields = toy.neighbour_scene(angles, sliding=sliding, **options)
     parts = toy.neighbour_parts(made)
-    return list(simulate_frames(made, parts, fields=fields)), parts
+    return list(simulate_frames(made, parts.values(), fields=fields)), parts
 
 
 def _overlap(parts):
@@ -157,12 +157,9 @@ def test_linked_points_keep_near_their_neighbour(monkeypatch):
     lift = [{"lift": a} for a in (0, 2, 4, 6)]
     frames, _ = _run(lift, SlidingOptions())
     apart, _ = _run(lift, SlidingOptions(threshold=1e-3))
-    # Linked are points nearer than 2 mm and half an edge of 2.4.
-    assert 2.0 < frames[0].surfaces["upper"].quantities["sliding_gap_max"] < 3.2
     # Free to 0.5 mm beyond the gap at rest; curved surfaces and one linearisation a sub-step leave some tenths.
-    assert frames[-1].surfaces["upper"].quantities["sliding_gap_max"] < 4.2
     assert frames[-1].neighbours["lower", "upper"][1] < 1.0
-    assert apart[-1].surfaces["upper"].quantities["sliding_gap_max"] == 0.0
+    assert ("lower", "upper") not in apart[-1].neighbours
     held, loose = (f[-1].surfaces["upper"].vertices[:, 2].mean() for f in (frames, apart))
     assert held < loose - 0.05
 
@@ -171,29 +168,30 @@ def test_what_is_pulled_away_hard_is_let_go(monkeypatch):
     lift = [{"lift": a} for a in (0, 10, 20)]
     monkeypatch.setattr(links, "STRIP", 0.1)
     monkeypatch.setattr(links, "RELEASE", 0.01)
-    frames, parts = _run(lift, SlidingOptions())
+    _, parts = _run(lift, SlidingOptions())
     _, alone = _run(lift, None)
     monkeypatch.setattr(links, "RELEASE", 50.0)
     _, held = _run(lift, SlidingOptions())
-    # Linked points were nearer than 3.31 where they were expected; settling moves them by some tenths.
-    assert frames[-1].surfaces["upper"].quantities["sliding_gap_max"] < 3.6
     away = [np.sqrt(np.square(one["upper"].x - alone["upper"].x).sum(axis=1).mean()) for one in (parts, held)]
     # Those near the hinge, which move little, stay linked.
     assert away[0] < 0.7 * away[1]
 
 
-def test_neighbours_may_join():
-    meet = [{"press": a} for a in (0, 6)]
-    joined, _ = _run(meet, SlidingOptions(), gap=4.0)
-    assert joined[0].surfaces["upper"].quantities["sliding_gap_max"] == 0.0
-    assert joined[-1].surfaces["upper"].quantities["sliding_gap_max"] > 0.0
+@pytest.mark.parametrize("met", [True, False])
+def test_neighbours_may_join(monkeypatch, met):
+    """Apart at rest, and linked from when they met: then the one that is lifted is held."""
+    monkeypatch.setattr(links, "RELEASE", 50.0)
+    path = [{"press": 0}, *([{"press": 6}] if met else []), {"lift": 6}]
+    _, joined = _run(path, SlidingOptions(), gap=4.0)
+    _, alone = _run(path, None, gap=4.0)
+    moved = np.linalg.norm(joined["upper"].x - alone["upper"].x, axis=1).max()
+    assert moved > 0.05 if met else moved < 1e-9
 
 
 def test_sliding_along_the_neighbour_is_free():
     roll = [{"roll": a} for a in (0, 10, 20)]
-    frames, parts = _run(roll, SlidingOptions())
+    _, parts = _run(roll, SlidingOptions())
     _, alone = _run(roll, None)
-    assert frames[-1].surfaces["upper"].quantities["sliding_speed"] > 0.1
     moved = np.linalg.norm(parts["upper"].x - alone["upper"].x, axis=1)
     assert np.sqrt((moved**2).mean()) < 1.0
 
@@ -205,16 +203,17 @@ def test_cut_is_midway_between_overlapping_muscles():
         contacts = BoneContacts(list(fields), list(fields.values()), contact_bone=part.contact_bone)
         steppers.append(MuscleStepper(part, contacts, made))
     sliding = Sliding(made, steppers)
-    for stepper in steppers:
-        sliding.measure(stepper)
+    sliding.drawings()
+    for surface in sliding.surfaces.values():
+        surface.field = None
     points = np.array([[0, 0, 2.5], [0, 0, 3.0], [0, 0, 3.5], [1, 1, 3.0], [0, 0, -4.5], [0, 30, 0]])
-    lower, upper = (stepper.contacts.nearest(points) for stepper in steppers)
+    lower, upper = (stepper.contacts.nearest(points)[0] for stepper in steppers)
     assert np.allclose(lower[:3], [0.5, 0.0, -0.5], atol=0.1)
     assert np.allclose(lower[:4], -upper[:4], atol=1e-12)
     assert lower[4] > 4.0
     step = 1e-5
-    value, gradient = steppers[0].contacts.cuts[0].cut_with_gradient(points[:4])
-    ahead = steppers[0].contacts.cuts[0].cut(points[:4] + [0, 0, step])
+    value, gradient = steppers[0].contacts.cuts[0].cut(points[:4])
+    ahead = steppers[0].contacts.cuts[0].cut(points[:4] + [0, 0, step])[0]
     # Normals are interpolated, distances are to flat triangles.
     assert np.allclose((ahead - value) / step, gradient[:, 2], atol=0.1)
     # What a coarse surface has to leave outside: all of the neighbour that lies in it, and nothing far from there.
@@ -280,7 +279,7 @@ def _spike_into_a_belly(sliding):
         sliding=sliding,
     )
     parts = toy.neighbour_parts(made)
-    list(simulate_frames(made, parts, fields=fields))
+    list(simulate_frames(made, parts.values(), fields=fields))
     return -igl.signed_distance(parts["spike"].x, parts["belly"].x, parts["belly"].faces)[0].min()
 
 

@@ -132,7 +132,6 @@ def test_paths_are_relative_to_the_bone(angle, count):
     options = TunnellingOptions()
     (crossing,) = find_crossings(contacts, points, points, *poses, options, tolerance=TOLERANCE)
     assert (crossing.bone, crossing.index.tolist(), crossing.flagged) == (0, [0], 1)
-    assert crossing.depth == pytest.approx(0.2, rel=0.5)
     carried = points + (turn @ [0, 0, 4.0, 0])[:3]
     assert find_crossings(contacts, points, carried, *poses, options, tolerance=TOLERANCE) == []
 
@@ -169,7 +168,7 @@ def test_fast_muscle_tunnels_through_a_plate_when_only_reported_or_not_looked_fo
     assert [(event.bone, event.count) for event in reported] == [("plate", crossed)]
     stepper, crossed = _swing(None)
     assert crossed > 0
-    times, events = stepper.collect()
+    times, events, _ = stepper.collect()
     assert events == [] and "time_tunnelling" not in times
 
 
@@ -196,7 +195,7 @@ def test_only_a_path_that_the_triangles_call_shallow_has_grazed(thickness, touch
     mesh = trimesh.creation.box((9.0, 9.0, thickness))
     turn = rotation_about([1, 2, 0], 0.7, np.zeros(3))
     start, end = np.array([[9.0, 9.0, 9.0], [0.3, 0.1, 2.0]]), np.array([[9.0, 9.0, 9.0], [0.3, 0.1, -2.0]])
-    crossing = Crossing(0, np.array([1]), 5.0, 0)
+    crossing = Crossing(0, np.array([1]), 0)
     paths = start, end @ turn[:3, :3].T
     assert only_grazed(crossing, mesh, paths, np.eye(4), turn, 0.1) is touched
     mesh.update_faces(np.arange(len(mesh.faces)) > 0)

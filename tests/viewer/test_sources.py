@@ -17,11 +17,9 @@ from rbfmuscle.viewer.sources import LiveFigure, LiveSource, Picture, SavedSourc
 @pytest.fixture
 def figure():
     scene, fields = toy_scene.hinged_scene([0, 20, 40])
-    made = LiveFigure(
+    return LiveFigure(
         LiveSession(scene, fields=fields), [toy_scene.ToyMuscle(m, scene) for m in scene.muscles]
     )
-    yield made
-    made.close()
 
 
 def go(figure, *, coarse=False):
@@ -156,4 +154,3 @@ def test_activation_of_a_muscle_is_set_and_coloured():
     picture, _ = go(figure)
     values = vertex_values("activation", "extensor", picture, picture, [], None)
     np.testing.assert_allclose(values, 0.35)
-    figure.close()

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.simulation.contact import Planes
+from rbfmuscle.simulation.neighbour_surface import Found, NeighbourSurface
 
 if TYPE_CHECKING:
+    from rbfmuscle.scene.options import SlidingOptions
     from rbfmuscle.scene.scene import Scene
+    from rbfmuscle.simulation.stepper import MuscleStepper
 
 
 # Distances [mm]. Points nearer than THRESHOLD (the default) at rest are linked. A linked point is free to STRIP beyond
@@ -21,62 +25,12 @@ BETWEEN = 0.5
 SEARCH = 3.0
 # Distance [mm] between the surfaces as solved below which they are cut, and how deep an overlap may be.
 CUT_FROM, CUT_DEPTH = 3.0, 6.0
-# Neighbours on all sides, and bones, may leave no admissible position: rigid planes would push without end.
-# So planes yield: their compliance, relative to the point's own response; larger for planes that pull.
-PUSH_GIVES, PULL_GIVES = 0.1, 1.0
 # How far a plane pushes out of a neighbour at most in one sub-step [mm].
 MOST = 0.5
 
 
 # The result for muscles far from each other.
-_FAR = (np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, dtype=np.int64))
-
-
-class Met(NamedTuple):
-    """Overlap and gap of a muscle with a neighbour.
-
-    Attributes
-    ----------
-    overlap : float
-        Its deepest point in the neighbour, 0 where none is.
-    touching : int
-        Points that touch the neighbour at rest.
-    opened : float
-        Sum of the squares of how much their gaps have grown.
-    """
-
-    overlap: float
-    touching: int
-    opened: float
-
-
-_NOTHING = Met(0.0, 0, 0.0)
-
-
-class Planes:
-    """Half-spaces of one kind against one obstacle, fixed through a sub-step.
-
-    Attributes
-    ----------
-    index, gap, normal
-        As in :class:`~rbfmuscle.simulation.contact.HalfSpaces`, at the points ``anchor`` (c, 3).
-    give : float
-        The same of all of them.
-    """
-
-    def __init__(self, give: float = 0.0) -> None:
-        self.give = give
-        self.set(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
-
-    def set(self, index: Any, gap: Any, normal: Any, anchor: Any) -> None:
-        """Replace the planes."""
-        self.index, self.gap, self.normal, self.anchor = index, gap, normal, anchor
-
-    def contacts(self, points: Floats, reach: Any) -> Any:
-        """``(index, gap, normal)`` of the planes nearer than ``reach`` to the model's contact points now."""
-        gap = self.gap + np.einsum("ij,ij->i", self.normal, points[self.index] - self.anchor)
-        near = gap < reach
-        return self.index[near], gap[near], self.normal[near]
+_FAR: Found = (np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, dtype=np.int64))
 
 
 class SlidingPair:
@@ -91,17 +45,22 @@ class SlidingPair:
     limits : SlidingLimits
     """
 
-    def __init__(self, stepper: Any, own: Any, other: Any, limits: Any) -> None:
-        self.stepper, self.own, self.other, self.limits = stepper, own, other, limits
-        self.push, self.pull = Planes(PUSH_GIVES), Planes(PULL_GIVES)
+    def __init__(
+        self,
+        stepper: MuscleStepper,
+        own: NeighbourSurface,
+        other: NeighbourSurface,
+        limits: SlidingLimits,
+    ) -> None:
+        self.own, self.other, self.limits = own, other, limits
+        self.push, self.pull = Planes(), Planes()
         self.free = stepper.contacts.free(len(stepper.model.contact_points()))
         #: Which points are linked, and how far each may be from the neighbour.
         self.linked = self.free.copy()
-        self.touching = np.zeros(0, dtype=np.int64)
+        self.touching: Integers = np.zeros(0, dtype=np.int64)
         self.hold = np.full(len(self.free), limits.hold)
-        self.before: Any = None
         #: Box in which points of this muscle are near the neighbour, and the pair seen from the neighbour.
-        self.zone: Any = None
+        self.zone: Floats | None = None
         self.back: SlidingPair | None = None
         index, distance, _, _ = self._near()
         self.linked[:] = False
@@ -111,7 +70,6 @@ class SlidingPair:
         near = distance < limits.threshold
         #: Points that touch the neighbour at rest, and how far they are from it there.
         self.touching, self.gap = index[near], distance[near]
-        self.found = _NOTHING
 
     def update(self) -> None:
         """Recompute the planes from the extrapolated surfaces."""
@@ -123,20 +81,15 @@ class SlidingPair:
         self.linked &= ~far
         self.linked[index[distance < limits.threshold]] = True
         share = np.where(self.other.fixed[nearest], 1.0, 0.5)
-        self._push_out((index, np.maximum(share * distance, -limits.most), normal))
+        own = index, np.maximum(share * distance, -limits.most), normal
+        # Planes that keep the muscle out: at its own points, and at attached points of the neighbour.
+        at, gap, out = (np.concatenate(parts) for parts in zip(own, self._pushed()))
+        self.push.set(at, gap, out, points[at])
         held = self.linked[index]
         slack = share[held] * (self.hold[index[held]] - distance[held])
         self.pull.set(index[held], slack, -normal[held], points[index[held]])
 
-    def _push_out(self, met: tuple[Any, Any, Any]) -> None:
-        """Planes that keep the muscle out: at its own points, and at attached points of the neighbour."""
-        at, gap, normal = self._given_way()
-        index = np.concatenate([met[0], at])
-        self.push.set(
-            index, np.concatenate([met[1], gap]), np.concatenate([met[2], normal]), self.own.points[index]
-        )
-
-    def _given_way(self) -> Any:
+    def _pushed(self) -> tuple[Integers, Floats, Floats]:
         """Planes (index, gap, normal) by which the muscle yields to attached points of the neighbour inside it.
 
         Attached points take no contact, and the muscle's own points may be too sparse to meet a thin end.
@@ -153,64 +106,60 @@ class SlidingPair:
         deep = deep[np.unique(at[deep], return_index=True)[1]]
         return at[deep], np.maximum(distance[deep], -self.limits.most), -normal[deep]
 
-    def measure(self) -> Any:
-        """Overlap, widest gap of linked points, and their slip over the neighbour since the last call."""
-        points = self.stepper.model.contact_points()
-        index, distance, normal, nearest = self._near()
-        held = self.linked[index]
-        self.found = self._met(index, distance)
-        close = distance < self.limits.cut_from
-        self.zone = _box(points[index[close]], self.limits.cut_depth) if close.any() else None
-        found = {
-            "sliding_overlap_max": max(0.0, -float(distance.min(initial=0.0))),
-            "sliding_gap_max": float(distance[held].max(initial=0.0)),
-            "sliding_speed": self._slip(points, index[held], normal[held], nearest[held]),
-        }
-        self.before = points.copy(), self.other.vertices.copy()
-        return found
+    def measure(self) -> tuple[float, int, float]:
+        """Overlap with the neighbour as solved, and where the two meet.
 
-    def _met(self, index: Any, distance: Any) -> Met:
-        """Overlap with the neighbour, and the gaps opened where they touched at rest."""
-        apart = np.full(len(self.free), self.limits.reach)
+        Returns
+        -------
+        overlap : float
+            Deepest point of this muscle in the neighbour, 0 where none is.
+        touching : int
+            Points that touch the neighbour at rest.
+        opened : float
+            Sum of the squares of how much their gaps have grown.
+        """
+        limits, index, distance = self.limits, *self._near()[:2]
+        close = self.own.points[index[distance < limits.cut_from]]
+        self.zone = None
+        if len(close):
+            self.zone = np.array([close.min(axis=0) - limits.cut_depth, close.max(axis=0) + limits.cut_depth])
+        apart = np.full(len(self.free), limits.reach)
         apart[index] = distance
         opened = np.maximum(apart[self.touching] - np.maximum(self.gap, 0.0), 0.0)
-        return Met(max(0.0, -float(distance.min(initial=0.0))), len(opened), float((opened**2).sum()))
+        return max(0.0, -float(distance.min(initial=0.0))), len(opened), float((opened**2).sum())
 
-    def meeting(self) -> Any:
-        """Box in which the two meet, as seen from either; None where they do not."""
-        zones = [
-            zone for zone in (self.zone, None if self.back is None else self.back.zone) if zone is not None
-        ]
+    def meeting(self) -> Floats | None:
+        """Box (2, 3) in which the two meet, as seen from either; None where they do not."""
+        zones = [pair.zone for pair in (self, self.back) if pair is not None and pair.zone is not None]
         if not zones:
             return None
-        return np.min([low for low, _ in zones], axis=0), np.max([high for _, high in zones], axis=0)
+        return np.array(
+            [np.min([zone[0] for zone in zones], axis=0), np.max([zone[1] for zone in zones], axis=0)]
+        )
 
-    def cut(self, points: Floats) -> Any:
-        """Half the difference of both muscles' distances near where they meet, infinity elsewhere."""
-        return self.cut_with_gradient(points)[0]
+    def cut(self, points: Floats) -> tuple[Floats, Floats]:
+        """The surface midway between two overlapping muscles.
 
-    def cut_with_gradient(self, points: Floats) -> Any:
-        """Cut (n,) and its gradient (n, 3): the surface midway between two overlapping muscles."""
+        Half the difference (n,) of both muscles' distances near where they meet, infinity elsewhere; its gradient
+        (n, 3). Where both have a field, both surfaces are clipped where their fields are equal.
+        """
         value, gradient = np.full(len(points), np.inf), np.zeros((len(points), 3))
-        zone, depth = self.meeting(), self.limits.cut_depth
+        zone = self.meeting()
         if zone is None:
             return value, gradient
         inside = np.all((points > zone[0]) & (points < zone[1]), axis=1)
         if self.own.field is not None and self.other.field is not None:
-            # Both surfaces are clipped where their fields are equal.
-            (ours, own), (theirs, normal) = (
-                self.own.field.value_and_gradient(points[inside]),
-                self.other.field.value_and_gradient(points[inside]),
-            )
-            value[inside], gradient[inside] = 0.5 * (theirs - ours), 0.5 * (normal - own)
-            return value, gradient
-        near, theirs, normal, _ = self.other.query(points, inside, depth)
-        inside[:] = False
-        inside[near] = True
-        both, ours, own, _ = self.own.query(points, inside, depth)
-        match = np.searchsorted(near, both)
-        value[both] = 0.5 * (theirs[match] - ours)
-        gradient[both] = 0.5 * (normal[match] - own)
+            both = np.flatnonzero(inside)
+            ours, own = self.own.field.value_and_gradient(points[both])
+            theirs, normal = self.other.field.value_and_gradient(points[both])
+        else:
+            near, theirs, normal, _ = self.other.query(points, inside, self.limits.cut_depth)
+            inside[:] = False
+            inside[near] = True
+            both, ours, own, _ = self.own.query(points, inside, self.limits.cut_depth)
+            match = np.searchsorted(near, both)
+            theirs, normal = theirs[match], normal[match]
+        value[both], gradient[both] = 0.5 * (theirs - ours), 0.5 * (normal - own)
         return value, gradient
 
     def points(self) -> Floats:
@@ -221,7 +170,7 @@ class SlidingPair:
         found, (low, high) = self.other.vertices, zone
         return found[np.all((found > low) & (found < high), axis=1)]
 
-    def _near(self):
+    def _near(self) -> Found:
         """Points near the neighbour: linked ones up to their release distance, others within the search distance."""
         limits = self.limits
         if self.other.apart(self.own, limits.reach):
@@ -232,21 +181,14 @@ class SlidingPair:
             self.other.query(self.own.points, self.free & which, reach)
             for which, reach in ((far, limits.reach), (~far, limits.search))
         ]
-        return tuple(np.concatenate(parts) for parts in zip(*found))
-
-    def _slip(self, points, index, normal, nearest):
-        if self.before is None or len(index) == 0:
-            return 0.0
-        own = points[index] - self.before[0][index]
-        way = own - (self.other.vertices[nearest] - self.before[1][nearest])
-        way -= np.einsum("ij,ij->i", way, normal)[:, None] * normal
-        return float(np.linalg.norm(way, axis=1).mean())
+        index, distance, normal, nearest = (np.concatenate(parts) for parts in zip(*found))
+        return index, distance, normal, nearest
 
 
 class BoneLink:
     """Points near a bone at rest, linked to it; the bone's own contact keeps them out."""
 
-    def __init__(self, stepper: Any, bone_index: Any, limits: Any) -> None:
+    def __init__(self, stepper: MuscleStepper, bone_index: int, limits: SlidingLimits) -> None:
         self.stepper, self.bone, self.limits = stepper, bone_index, limits
         points = stepper.model.contact_points()
         distance, _ = stepper.contacts.distance_and_direction(points, bone_index)
@@ -267,7 +209,7 @@ class BoneLink:
 class SlidingLimits:
     """The distances of sliding in the scene's unit."""
 
-    def __init__(self, options: Any, scene: Scene) -> None:
+    def __init__(self, options: SlidingOptions, scene: Scene) -> None:
         self.threshold = scene.length(THRESHOLD) if options.threshold is None else float(options.threshold)
         self.strip = scene.length(STRIP)
         self.hold = self.threshold + self.strip
@@ -276,7 +218,3 @@ class SlidingLimits:
         self.reach = max(self.search, self.hold + self.release)
         self.cut_from, self.cut_depth = scene.length(CUT_FROM), scene.length(CUT_DEPTH)
         self.most = scene.length(MOST)
-
-
-def _box(points, pad):
-    return points.min(axis=0) - pad, points.max(axis=0) + pad

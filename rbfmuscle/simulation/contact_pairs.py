@@ -5,15 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numba
 import numpy as np
 
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import moved_box
+from rbfmuscle.geometry.threads import each
 from rbfmuscle.scene.motion import bone_poses, completed, interpolate, rest_coordinates
 from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.simulation.substeps import check_substeps, path_angle
@@ -28,26 +27,24 @@ SAMPLED_POSES = 48
 # Padding of a swept box, relative to the muscle's diagonal: a muscle bulges beyond its bones' motions.
 PADDING = 0.1
 
+# By muscle and bone: box (2, 3) in the bone's coordinates.
+Regions = dict[tuple[str, str], Floats]
 
-def swept_region(muscle: Muscle, bone_name: str, poses: Sequence[Mapping[str, Floats]]) -> Floats:
-    """Box (2, 3) in a bone's coordinates that holds a muscle through a motion.
+
+def swept_boxes(muscle: Muscle, bones: Sequence[str], poses: Sequence[Mapping[str, Floats]]) -> Floats:
+    """Boxes (b, 2, 3) in the coordinates of some bones that hold a muscle through a motion.
 
     Parameters
     ----------
     muscle : Muscle
-    bone_name : str
+    bones : sequence of str
     poses : list of dict
         Poses of all bones, the rest pose among them.
     """
-    back = np.linalg.inv(np.array([pose[bone_name] for pose in poses]))
+    there = np.linalg.inv(np.array([[pose[name] for pose in poses] for name in bones]))
     held = np.array([[pose[name] for pose in poses] for name in {a.holder for a in muscle.attachments}])
-    return _swept(muscle, back[None], held)[0]
-
-
-def _swept(muscle, back, held):
-    """Boxes (b, 2, 3) for the inverse poses (b, p, 4, 4) of bones, and the poses (h, p, 4, 4) of those that hold it."""
     bounds = np.asarray(muscle.mesh.bounds, dtype=np.float64)
-    boxes = moved_box(bounds, back[:, None] @ held)
+    boxes = moved_box(bounds, there[:, None] @ held)
     pad = PADDING * float(np.linalg.norm(bounds[1] - bounds[0]))
     low, high = boxes[..., 0, :].min(axis=(1, 2)) - pad, boxes[..., 1, :].max(axis=(1, 2)) + pad
     return np.stack([low, high], axis=1)
@@ -65,36 +62,32 @@ def sampled_poses(scene: Scene) -> list[Poses]:
     return poses
 
 
-def find_contact_pairs(scene: Scene) -> dict[tuple[Any, ...], Floats]:
+def find_contact_pairs(scene: Scene) -> Regions:
     """Region of each bone that each muscle can reach: dict of (muscle name, bone name) to (2, 3) box."""
     check_substeps(scene)
-    poses = sampled_poses(scene)
-    there = {bone.name: np.array([pose[bone.name] for pose in poses]) for bone in scene.bones}
-    back = np.linalg.inv(np.array(list(there.values())))
+    poses, names = sampled_poses(scene), [bone.name for bone in scene.bones]
     boxes = np.array([bone.mesh.bounds for bone in scene.bones])
     regions = {}
     for muscle in scene.muscles:
-        held = np.array([[pose[name] for pose in poses] for name in {a.holder for a in muscle.attachments}])
-        swept = _swept(muscle, back, held)
+        swept = swept_boxes(muscle, names, poses)
         met = np.all((swept[:, 0] <= boxes[:, 1]) & (swept[:, 1] >= boxes[:, 0]), axis=1)
-        regions.update({(muscle.name, scene.bones[b].name): swept[b] for b in np.flatnonzero(met)})
+        regions.update({(muscle.name, names[b]): swept[b] for b in np.flatnonzero(met)})
     return regions
 
 
-def build_fields(scene: Scene, regions: dict[tuple[Any, ...], Floats]) -> dict[str, BoneSDF]:
-    """Distance fields of the parts of bones that some muscle can reach, in parallel: dict of bone name to field."""
-
-    def build(bone):
-        boxes = [box for (_, name), box in regions.items() if name == bone.name]
-        return BoneSDF.from_mesh(bone.mesh, region=union_of(boxes))
-
-    bones = [bone for bone in scene.bones if any(name == bone.name for _, name in regions)]
-    if len(bones) < 2:
-        return {bone.name: build(bone) for bone in bones}
-    with ThreadPoolExecutor(max_workers=numba.get_num_threads()) as pool:
-        return dict(zip([bone.name for bone in bones], pool.map(build, bones)))
+def build_fields(scene: Scene, regions: Regions) -> dict[str, BoneSDF]:
+    """Distance fields of the parts of bones that some muscle can reach: dict of bone name to field."""
+    parts = bone_regions(regions)
+    bones = [bone for bone in scene.bones if bone.name in parts]
+    fields = each(lambda bone: BoneSDF.from_mesh(bone.mesh, region=parts[bone.name]), bones)
+    return {bone.name: field for bone, field in zip(bones, fields)}
 
 
-def union_of(boxes: list[Floats]) -> Floats:
-    """Least box (2, 3) that holds all boxes."""
-    return np.array([np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)])
+def bone_regions(regions: Regions) -> dict[str, Floats]:
+    """Least box (2, 3) of each bone that holds what all muscles can reach of it."""
+    boxes: dict[str, list[Floats]] = {}
+    for (_, bone), box in regions.items():
+        boxes.setdefault(bone, []).append(box)
+    return {
+        bone: np.array([np.min(found, axis=0)[0], np.max(found, axis=0)[1]]) for bone, found in boxes.items()
+    }

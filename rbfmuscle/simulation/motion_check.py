@@ -1,0 +1,149 @@
+"""Checks a motion before the run: attachments that it moves into another bone, too far apart or too close together."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.rest_frame import moved_box
+from rbfmuscle.scene.attachments import ExactMeshes
+from rbfmuscle.scene.check import Finding
+from rbfmuscle.scene.motion import bone_poses
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from rbfmuscle.scene.objects import Muscle
+    from rbfmuscle.scene.scene import Scene
+
+# Greatest numbers of frames and of vertices of an attachment that are checked.
+MOST_FRAMES, MOST_VERTICES = 25, 60
+# Depth beyond that at rest from which an attachment counts as inside a bone [mm].
+DEEPER = 1.0
+# Bounds of the distance between attachments, relative to rest.
+LONGEST, SHORTEST = 1.5, 0.5
+# Attachments closer than this fraction of the muscle's extent lie side by side, not at its ends.
+APART = 0.3
+
+
+class Fault(NamedTuple):
+    """An attachment that the motion moves into another bone, or two that it moves too far apart or together.
+
+    Attributes
+    ----------
+    muscle : str
+    bones : (str, str)
+        The bone that holds the attachment and the one that it enters, or those that hold the two.
+    rest : float
+        Distance between the two at rest [scene unit]; 0 for one that enters a bone.
+    value : float
+        Greatest depth beyond that at rest, or the distance farthest from that at rest [scene unit].
+    frame, first : int
+        Where it is so, and the first frame of too great a value.
+    """
+
+    muscle: str
+    bones: tuple[str, str]
+    rest: float
+    value: float
+    frame: int
+    first: int
+
+
+def check_motion(scene: Scene, exact: ExactMeshes | None = None) -> list[Fault]:
+    """Follow the attachments of every muscle along the motion.
+
+    Parameters
+    ----------
+    scene : Scene
+    exact : ExactMeshes, optional
+        Distances to the bones' meshes that are known already.
+    """
+    exact, count = exact or ExactMeshes(), len(scene.motion)
+    frames = sorted({round(k) for k in np.linspace(0, count - 1, min(count, MOST_FRAMES))})
+    poses = [bone_poses(scene, {}), *(bone_poses(scene, scene.motion.frames[k]) for k in frames)]
+    faults = []
+    for muscle in scene.muscles:
+        extent = float(np.linalg.norm(np.ptp(np.asarray(muscle.mesh.vertices), axis=0)))
+        for bones, values, bad in _followed(scene, muscle, extent, poses, exact):
+            if bad.any():
+                worst, first = int(np.abs(values[1:] - values[0]).argmax()), int(np.flatnonzero(bad)[0])
+                faults.append(
+                    Fault(muscle.name, bones, values[0], values[1 + worst], frames[worst], frames[first])
+                )
+    return faults
+
+
+def _followed(
+    scene: Scene, muscle: Muscle, extent: float, poses: list[Any], exact: ExactMeshes
+) -> Iterator[tuple[tuple[str, str], Floats, np.ndarray]]:
+    """For an attachment and a bone, or two attachments: a value (1 + p,) along the motion, and where it is bad."""
+    patches = _patches(muscle)
+    for bone, points in patches.items():
+        bounds = np.array([points.min(axis=0), points.max(axis=0)])
+        for other in scene.bones:
+            places = [np.linalg.inv(pose[other.name]) @ pose[bone] for pose in poses]
+            if not all(np.allclose(place, places[0], atol=1e-9) for place in places[1:]):
+                depths = np.array([_depth(points, bounds, place, other.mesh, exact) for place in places])
+                deeper = np.maximum(depths - depths[0], 0.0)
+                yield (bone, other.name), deeper, deeper[1:] > scene.length(DEEPER)
+    for pair in itertools.combinations(patches, 2):
+        one, other = (np.append(patches[bone].mean(axis=0), 1.0) for bone in pair)
+        away = np.array([np.linalg.norm((pose[pair[0]] @ one - pose[pair[1]] @ other)[:3]) for pose in poses])
+        if away[0] >= APART * extent:
+            for bad, limit in (
+                (away > LONGEST * away[0], np.maximum),
+                (away < SHORTEST * away[0], np.minimum),
+            ):
+                yield pair, np.append(away[0], limit(away[1:], away[0])), bad[1:]
+
+
+def _patches(muscle: Muscle) -> dict[str, Floats]:
+    """Attached vertices by bone, thinned."""
+    found: dict[str, list[np.ndarray]] = {}
+    for attachment in muscle.attachments:
+        found.setdefault(attachment.holder, []).append(attachment.vertices)
+    thinned = {}
+    for bone, parts in found.items():
+        index = np.unique(np.concatenate(parts))
+        step = max(1, math.ceil(len(index) / MOST_VERTICES))
+        thinned[bone] = np.asarray(muscle.mesh.vertices, dtype=float)[index[::step]]
+    return thinned
+
+
+def _depth(points: Floats, bounds: Floats, place: Floats, mesh: trimesh.Trimesh, exact: ExactMeshes) -> float:
+    """Depth of the deepest point inside a mesh, of points moved into its coordinates."""
+    low, high = moved_box(bounds, place)
+    if np.any(low > mesh.bounds[1]) or np.any(high < mesh.bounds[0]):
+        return 0.0
+    return max(0.0, -float(exact.distances(points @ place[:3, :3].T + place[:3, 3], mesh).min()))
+
+
+def motion_findings(scene: Scene, exact: ExactMeshes | None = None) -> list[Finding]:
+    """The faults of `check_motion` as warnings with remedies, the worst of each kind first."""
+    faults, units = check_motion(scene, exact), scene.units
+    inside = sorted((one for one in faults if not one.rest), key=lambda one: -one.value)
+    apart = [one for one in faults if one.rest]
+    said = []
+    for one in [*inside, *sorted(apart, key=lambda one: -abs(math.log(max(one.value / one.rest, 1e-12))))]:
+        bone, other = one.bones
+        if not one.rest:
+            text = (
+                f"the motion drives the end held by {bone!r} into bone {other!r}, from about frame {one.first}, by up "
+                f"to {one.value:.3g} {units} at frame {one.frame}; give it a tendon, or its tendon via points, or end "
+                "the motion sooner"
+            )
+        else:
+            how, ratio = "take apart" if one.value > one.rest else "bring together", one.value / one.rest
+            text = (
+                f"{bone!r} and {other!r} {how} its ends to {ratio:.2f} times their distance at rest ({one.rest:.4g} to "
+                f"{one.value:.4g} {units} at frame {one.frame}, too far from about frame {one.first}); a tendon may be "
+                "missing between mesh and bone: give one to the attachment, or correct the attachments"
+            )
+        said.append(Finding("warning", one.muscle, text))
+    return said

@@ -1,1 +1,0 @@
-"""Sliding of neighbouring muscles."""

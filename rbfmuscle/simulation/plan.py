@@ -1,0 +1,63 @@
+"""What a run of a scene would build and solve, without building it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rbfmuscle.scene.motion import completed, rest_coordinates
+from rbfmuscle.simulation.contact_pairs import bone_regions, find_contact_pairs
+from rbfmuscle.simulation.rigid_transport import RigidTransport
+from rbfmuscle.simulation.substeps import PoseCache, SubSteps
+
+if TYPE_CHECKING:
+    from rbfmuscle.scene.objects import Muscle
+    from rbfmuscle.scene.scene import Scene
+
+
+def plan_scene(scene: Scene) -> dict[str, Any]:
+    """Return what a run of the scene would build.
+
+    Returns
+    -------
+    dict
+        ``frames`` of the motion; ``substeps`` of the muscle that takes most; ``fields``: of each bone that a muscle can
+        reach the triangles and the share of its box; ``muscles``: name, model, vertices, ``bones`` within reach, and
+        the ``substeps`` in which it is solved.
+
+    Notes
+    -----
+    A listed bone need not be touched. A bone that comes near a muscle is not foreseen: the muscle may then
+    be solved in more sub-steps.
+    """
+    regions, poses = find_contact_pairs(scene), PoseCache(scene)
+    muscles: list[dict[str, Any]] = []
+    fields = []
+    for muscle in scene.muscles:
+        bones = [bone for name, bone in regions if name == muscle.name]
+        facts = {"name": muscle.name, "model": muscle.model, "vertices": len(muscle.mesh.vertices)}
+        muscles.append({**facts, "bones": bones, "substeps": _count_substeps(muscle, scene, bones, poses)})
+    for name, box in bone_regions(regions).items():
+        mesh = scene.bone(name).mesh
+        own = np.asarray(mesh.bounds, dtype=float)
+        reached = np.clip(box, own[0], own[1])
+        share = float(np.prod(reached[1] - reached[0]) / np.prod(own[1] - own[0]))
+        fields.append({"bone": name, "triangles": len(mesh.faces), "share": share})
+    most = max((muscle["substeps"] for muscle in muscles), default=0)
+    return {"frames": len(scene.motion), "substeps": most, "muscles": muscles, "fields": fields}
+
+
+def _count_substeps(muscle: Muscle, scene: Scene, bones: list[str], poses: PoseCache) -> int:
+    """Sub-steps in which the motion requires a muscle to be solved."""
+    always = scene.sliding is not None or muscle.contraction is not None
+    cut = SubSteps(scene, poses=poses) if always else SubSteps(scene, muscle, bones=bones, poses=poses)
+    carrier, count, here = RigidTransport(muscle, scene), 0, rest_coordinates(scene)
+    carrier.solved = poses(here)
+    for frame in scene.motion.frames:
+        there = completed(scene, frame)
+        for stop in cut.split(here, there):
+            if always or not carrier.keeps_shape(poses(stop)):
+                count, carrier.solved = count + 1, poses(stop)
+        here = there
+    return count
