@@ -10,12 +10,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.sparse as sparse
 
 from pbd_baseline.topology import colour
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.harmonic import cotangent_laplacian
-from rbfmuscle.geometry.rotations import quaternion_matrix, rotate, turn_quaternion
+from rbfmuscle.geometry.harmonic import cotangent_laplacian, graph_laplacian
+from rbfmuscle.geometry.rotations import quaternion_matrix, rotate
 from rbfmuscle.jit import compiled
 
 if TYPE_CHECKING:
@@ -54,30 +53,21 @@ class ARAP:
         self.weights = -np.asarray(self.laplacian[i, j]).ravel()
         if np.any(stiffer != 1.0):
             self.weights = self.weights * stiffer
-            self.laplacian = _laplacian(topology, self.weights)
+            self.laplacian = graph_laplacian(i, j, self.weights, topology.vertex_count)
         self.rest = np.ascontiguousarray(vertices[i] - vertices[j])
         self.quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (topology.vertex_count, 1))
 
-    def fit_rotations(self, points: Floats, *, steps: int = ROTATION_STEPS) -> None:
+    def fit_rotations(self, points: Floats) -> None:
         """The local step: the best rotation of every one-ring, from the present ones on."""
         t = self.topology
         rings = t.ring_start, t.ring, t.ring_edge, t.edges
-        _rotation_loop(points, rings, self.rest, self.weights, self.quaternions, steps)
+        _rotation_loop(points, rings, self.rest, self.weights, self.quaternions)
 
     def targets(self) -> Floats:
         """Right side (n, 3) of the global step: sum_j w_ij (R_i + R_j) E_ij / 2."""
         out = np.zeros((len(self.quaternions), 3))
         _target_loop(self.topology.edges, self.rest, self.weights, self.quaternions, out)
         return out
-
-
-def _laplacian(topology, weights):
-    """Laplacian of the mesh with one weight an edge."""
-    i, j = topology.edges.T
-    count = topology.vertex_count
-    half = sparse.coo_matrix((weights, (i, j)), shape=(count, count))
-    links = (half + half.T).tocsc()
-    return (sparse.diags(np.asarray(links.sum(axis=1)).ravel()) - links).tocsc()
 
 
 class ARAPConstraint:
@@ -121,7 +111,7 @@ class ARAPConstraint:
 
 
 @compiled
-def _rotation_loop(points, rings, rest, weights, quaternions, steps):
+def _rotation_loop(points, rings, rest, weights, quaternions):
     start, ring, ring_edge, edges = rings
     moment = np.empty((3, 3))
     for i in range(len(quaternions)):
@@ -133,7 +123,7 @@ def _rotation_loop(points, rings, rest, weights, quaternions, steps):
                 pull = sign * (points[i, a] - points[j, a])
                 for b in range(3):
                     moment[a, b] += pull * rest[c, b]
-        for _ in range(steps):
+        for _ in range(ROTATION_STEPS):
             if _turn_towards(moment, quaternions[i]) < ROTATION_ERROR:
                 break
 
@@ -169,8 +159,21 @@ def _turn_towards(moment, q):
     square = ox * ox + oy * oy + oz * oz
     if square > 1.0:
         ox, oy, oz = ox / np.sqrt(square), oy / np.sqrt(square), oz / np.sqrt(square)
-    turn_quaternion(q, 0.5 * ox, 0.5 * oy, 0.5 * oz)
+    _turn_quaternion(q, 0.5 * ox, 0.5 * oy, 0.5 * oz)
     return square
+
+
+@compiled
+def _turn_quaternion(q, x, y, z):
+    """q <- q (1, x, y, z), normalised: right to third order, and the fixed point is unchanged."""
+    a, b, c, d = q[0], q[1], q[2], q[3]
+    q[0] = a - b * x - c * y - d * z
+    q[1] = b + a * x + c * z - d * y
+    q[2] = c + a * y + d * x - b * z
+    q[3] = d + a * z + b * y - c * x
+    size = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    for k in range(4):
+        q[k] /= size
 
 
 @compiled

@@ -1,17 +1,15 @@
-"""Collision response of a mesh: half-spaces from the contacts, and held vertices that enter a bone."""
+"""Collision response of a mesh to the half-spaces of its contacts."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.jit import compiled
 from rbfmuscle.simulation.contact import BoneContacts
 
 # A half-space counts as violated below this share of the search reach.
 TOUCHING = 1e-9
-# Rounds in which held vertices are taken out of bones, and the depth, as a share of the search reach, that ends them.
-ROUNDS, OUTSIDE = 8, 1e-4
 
 
 class ContactConstraint:
@@ -19,8 +17,6 @@ class ContactConstraint:
 
     Parameters
     ----------
-    held : (h,) ndarray of int
-        Vertices that a bone holds.
     reach : float
         Distance within which contacts are looked for [scene unit].
     nearest_only : bool
@@ -28,11 +24,10 @@ class ContactConstraint:
         their sum.
     """
 
-    def __init__(self, held: Integers, *, reach: float, nearest_only: bool = False) -> None:
-        self.held, self.reach, self.nearest_only = held, float(reach), nearest_only
+    def __init__(self, *, reach: float, nearest_only: bool = False) -> None:
+        self.reach, self.nearest_only = float(reach), nearest_only
         self.index, self.gap = np.zeros(0, dtype=np.int64), np.zeros(0)
         self.normal = self.anchor = np.zeros((0, 3))
-        self._of_held: tuple[BoneContacts, BoneContacts] | None = None
 
     def find(self, contacts: BoneContacts, points: Floats, *, reach: float | None = None) -> float:
         """Ask the contacts where the vertices (n, 3) are now; return the greatest depth."""
@@ -61,24 +56,6 @@ class ContactConstraint:
         if len(self.index) == 0 or step == 0.0:
             return False
         return _clear_loop(points, self.index, self.gap, self.normal, self.anchor, direction, step)
-
-    def free_held(self, contacts: BoneContacts, points: Floats) -> float:
-        """Take held vertices out of bones, their own and others, in place; return how deep they were."""
-        if self._of_held is None or self._of_held[0] is not contacts:
-            mine = contacts.only(self.held)
-            mine.contact_bone, mine.neighbours = None, []
-            self._of_held = contacts, mine
-        mine = self._of_held[1]
-        mine.move(contacts.poses)
-        first = 0.0
-        for turn in range(ROUNDS):
-            found = mine.half_spaces(points[self.held], 0.0)
-            depth = max(0.0, -float(found.gap.min(initial=0.0)))
-            first = depth if turn == 0 else first
-            if depth < OUTSIDE * self.reach:
-                break
-            np.add.at(points, self.held[found.index], -found.gap[:, None] * found.normal)
-        return first
 
     def _depths(self, points):
         way = np.einsum("cd,cd->c", points[self.index] - self.anchor, self.normal)

@@ -10,7 +10,6 @@ from pbd_baseline.contact import ContactConstraint
 from pbd_baseline.contraction import TENDON_WEIGHT, MeshFibres
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.rest import RestState
-from pbd_baseline.self_collision import SelfCollision
 from pbd_baseline.shapes import METHODS
 from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.geometry.rest_frame import diameter
@@ -72,9 +71,7 @@ class PBDMuscle:
             self.most_sweeps = self.options.iterations or MOST_SWEEPS
         self.still = self.options.tolerance * diameter(self.rest.vertices)
         self.contact_bone = _bone_numbers(self.rest, scene.holders(muscle))
-        held = np.flatnonzero(self.contact_bone >= 0)
-        self.contact = ContactConstraint(held, reach=scene.length(REACH), nearest_only=self.as_printed)
-        self.self_collision = SelfCollision(self.rest) if self.options.self_collision else None
+        self.contact = ContactConstraint(reach=scene.length(REACH), nearest_only=self.as_printed)
         self.finishing_reach, self.depth = scene.length(FINISHING_REACH), scene.length(DEPTH)
         self.points = self.rest.vertices.copy()
         self.before = self.points.copy()
@@ -101,8 +98,6 @@ class PBDMuscle:
 
     def solve(self, contacts: BoneContacts) -> None:
         """Sweep the shape, contacts inside the iteration and last, the volume on what is not in contact."""
-        if self.self_collision is not None:
-            self.contact.free_held(contacts, self.points)
         for k in range(self.most_sweeps):
             fresh = k % FRESH == 0
             if fresh:
@@ -113,20 +108,11 @@ class PBDMuscle:
             if self._sweep() < self.still:
                 break
         self._finish(contacts)
-        if self.self_collision is not None:
-            self.self_collision.untangle(self.points, lambda: self._finish(contacts, rounds=2))
 
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next `solve` settles under."""
         if self.fibres is not None:
             self.fibres.activate(activation)
-
-    def settle(self, contacts: BoneContacts) -> None:
-        """Take held vertices out of the bones at rest, and what they pull along, with ``self_collision``."""
-        if self.self_collision is None:
-            return
-        if self.contact.free_held(contacts, self.points.copy()) > self.depth:
-            self.solve(contacts)
 
     def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
         """Move the vertices marked in a bool mask (n,) by a (4, 4) transform; held ones stay."""
@@ -177,12 +163,12 @@ class PBDMuscle:
             self.shape.restore_volume(self.points, self.contact)
         return np.sqrt(((self.points - before) ** 2).sum(axis=1).max()) if self.still > 0.0 else np.inf
 
-    def _finish(self, contacts, rounds=FINISHING_ROUNDS):
+    def _finish(self, contacts):
         """Contact and volume in turn until both hold where the bones are now known to be.
 
         The half-spaces are found again where the last round still left something to do.
         """
-        for _ in range(rounds):
+        for _ in range(FINISHING_ROUNDS):
             self.penetration = self.contact.find(contacts, self.points, reach=self.finishing_reach)
             self.contact.project(self.points)
             self.shape.restore_volume(self.points, self.contact)

@@ -15,8 +15,7 @@ class PBDOptions(Table):
     ``bending`` is the stiffness of dihedral angles in PBD, 0 to 1; ``edge_compliance`` and ``bending_compliance`` are
     those of XPBD, over a time that passes by one for each two degrees of motion. ``fibre_exponent`` is a of
     k = (1 - |cos|)^a. Fibres shorten without resistance from their length in the scan to 1 / ``slack`` of it (1: no
-    slack; `pbd-paper` has none). With ``self_collision`` held vertices leave bones, and triangles that cross
-    others are smoothed apart after each solve, at two to three times the time.
+    slack; `pbd-paper` has none).
     """
 
     method: Literal["pbd", "pbd-paper", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved"] = "pbd"
@@ -27,4 +26,3 @@ class PBDOptions(Table):
     edge_compliance: NotNegative = 0.2
     bending_compliance: NotNegative = 0.2
     slack: Annotated[float, Field(ge=1.0, le=5.0)] = 1.6
-    self_collision: bool = False

@@ -17,10 +17,10 @@ from rbfmuscle.geometry.harmonic import surface_gradient
 from rbfmuscle.geometry.surfaces import edge_lengths, vertex_normals
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.validation import SceneError
+from rbfmuscle.validation import MeshError, NotFiniteError, SceneError, check_finite
 
 # Raise it when weights or room are computed in another way: entries of the cache are then not found.
-VERSION = 3
+VERSION = 4
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class RestState:
         Raises
         ------
         MeshError
-            If its mesh is not closed.
+            If its mesh is not closed, or no smooth weights can be found on it.
         SceneError
             If nothing holds it.
         """
@@ -82,7 +82,13 @@ class RestState:
         topology = Topology.from_mesh(vertices, faces)
         volume = VolumeConstraint(vertices, faces)
         inverse_mass = np.where(attached_bone < 0, 1.0, 0.0)
-        weights, room = _weights_and_room(vertices, faces, attached_bone, len(bones))
+        try:
+            weights, room = _weights_and_room(vertices, faces, attached_bone, len(bones))
+        except (RuntimeError, np.linalg.LinAlgError, NotFiniteError) as error:
+            raise MeshError(
+                f"muscle {muscle.name!r}{f' ({muscle.source})' if muscle.source else ''}: the motions of its bones "
+                f"cannot be spread over its mesh ({error}); remesh it, and attach each part of it to a bone"
+            ) from error
         along = surface_gradient(vertices, faces, weights[:, -1])
         fibres = fibre_directions(vertices, along, muscle.fibres)
         return cls(
@@ -121,6 +127,8 @@ def _weights_and_room(vertices, faces, attached_bone, bones):
             "weights": even_weights(vertices, faces, groups),
             "room": swelling_room(vertices, faces, vertex_normals(vertices, faces), attached_bone >= 0),
         }
+        for name, values in known.items():
+            check_finite(values, name=name)
         store_arrays(key, known)
     return known["weights"], known["room"]
 

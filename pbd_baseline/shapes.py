@@ -6,13 +6,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sparse
+from scipy.sparse.linalg import splu
 
 from pbd_baseline.arap import ARAP, ARAPConstraint
 from pbd_baseline.bending import BendingConstraint
 from pbd_baseline.constraints import EdgeConstraint
 from pbd_baseline.contact import ContactConstraint
 from pbd_baseline.contraction import TENDON_WEIGHT, MeshFibres
-from pbd_baseline.factor import SymmetricFactor
 from pbd_baseline.fibres import edge_stiffness
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.rest import RestState
@@ -206,7 +206,9 @@ class GlobalARAPShape(RotatingShape):
         reach = STEP_REACH * float(np.linalg.norm(np.ptp(rest.vertices, axis=0)))
         self.mass = vertex_areas(rest.vertices, rest.topology.faces)[self.free, None] / reach**2
         rows = self.arap.laplacian[self.free]
-        self.factor = SymmetricFactor(rows[:, self.free] + sparse.diags(self.mass[:, 0]))
+        matrix = (rows[:, self.free] + sparse.diags(self.mass[:, 0])).tocsc()
+        symmetric = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+        self.factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", **symmetric)
         self.coupling = rows[:, self.held].tocsr()
 
     def contract(self, fibres: MeshFibres, points: np.ndarray) -> None:
@@ -224,7 +226,7 @@ class GlobalARAPShape(RotatingShape):
         """L^-1 of the volume's gradient: its smooth (Sobolev) direction, 0 at held vertices."""
         gradient = self.volume.gradient(points)
         direction = np.zeros_like(gradient)
-        direction[self.free] = self.factor.solve(np.ascontiguousarray(gradient[self.free]))
+        direction[self.free] = self.factor.solve(gradient[self.free])
         return direction
 
 

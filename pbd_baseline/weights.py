@@ -10,7 +10,7 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.harmonic import harmonic_weights
+from rbfmuscle.geometry.harmonic import graph_laplacian, harmonic_weights
 
 POWER = 4.0
 ROUNDS = 8
@@ -42,10 +42,13 @@ def even_weights(vertices: Floats, faces: Integers, groups: list[Integers]) -> F
     if len(free) == 0 or len(groups) < 2:
         return weights
     cotangents, gradients = _face_operators(vertices, faces)
+    first, second = (np.roll(faces, -shift, axis=1).T.ravel() for shift in (1, 2))
     for _ in range(ROUNDS):
         size = np.sqrt(sum(((gradient @ weights) ** 2).sum(axis=1) for gradient in gradients))
         conductance = np.maximum(size / size.max(), LEAST_GRADIENT) ** (POWER - 2.0)
-        laplacian = _laplacian(faces, cotangents * conductance[:, None], len(vertices))[free]
+        laplacian = graph_laplacian(
+            first, second, (cotangents * conductance[:, None]).T.ravel(), len(vertices)
+        )[free]
         solved = splu(laplacian[:, free].tocsc()).solve(-(laplacian[:, fixed] @ weights[fixed]))
         # a full step oscillates for p > 3; this one is Newton's where the direction of the gradient stays
         weights[free] += (solved - weights[free]) / (POWER - 1.0)
@@ -74,11 +77,3 @@ def _face_operators(vertices, faces):
         for d in range(3)
     ]
     return cotangents, matrices
-
-
-def _laplacian(faces, cotangents, count):
-    rows = np.concatenate([faces[:, (k + 1) % 3] for k in range(3)])
-    columns = np.concatenate([faces[:, (k + 2) % 3] for k in range(3)])
-    half = sparse.csr_matrix((cotangents.T.ravel(), (rows, columns)), shape=(count, count))
-    full = half + half.T
-    return (sparse.diags(np.asarray(full.sum(axis=1)).ravel()) - full).tocsr()

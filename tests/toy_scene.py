@@ -154,9 +154,6 @@ class ToyMuscle:
     def restore(self, state):
         self.x, self.target = state[0].copy(), state[1].copy()
 
-    def settle(self, contacts):
-        pass
-
     def material_mesh(self):
         return self.x.copy(), self.faces
 

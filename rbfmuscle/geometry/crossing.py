@@ -9,13 +9,6 @@ from rbfmuscle.jit import compiled
 
 # Triangles in a leaf of the tree, and bits of their places along each axis by which they are sorted.
 LEAF, BITS = 4, 10
-# Pairs of the triangles of two leaves are bits of a number: all, and those of a leaf with itself. Powers of two leave
-# different remainders when divided by 19, which gives the place of a bit.
-ONE, ALL_PAIRS = np.uint64(1), np.uint64((1 << LEAF * LEAF) - 1)
-ABOVE_DIAGONAL = np.uint64(sum(1 << LEAF * m + n for m in range(LEAF) for n in range(m + 1, LEAF)))
-REMAINDERS = np.uint64(19)
-PLACES = np.zeros(19, dtype=np.uint64)
-PLACES[[pow(2, bit, 19) for bit in range(LEAF * LEAF)]] = np.arange(LEAF * LEAF)
 # Pairs of nodes that wait at a time: less than four for each level of the tree.
 WAITING = 512
 
@@ -218,33 +211,21 @@ def _cross_loop(vertices, faces, leaves, asked, found):
     among, plain = asked
     for k in range(len(pairs)):
         i, j = pairs[k, 0], pairs[k, 1]
-        touching = _touching(box, i, j) & (ABOVE_DIAGONAL if i == j else ALL_PAIRS)
-        while touching:
-            lowest = touching & (~touching + ONE)
-            touching ^= lowest
-            place = PLACES[lowest % REMAINDERS]
-            f, g = LEAF * i + np.int64(place // LEAF), LEAF * j + np.int64(place % LEAF)
-            if not _meet(faces, f, g, plain) or (found[f] and found[g]) or not (among[f] or among[g]):
-                continue
-            if _cross(vertices, faces, f, g):
-                found[f], found[g] = True, True
-
-
-@compiled
-def _touching(box, i, j):
-    """Which triangles of two leaves touch by their boxes: a bit for each pair."""
-    found = np.uint64(0)
-    for m in range(LEAF):
-        row = 0
-        for n in range(LEAF):
-            near = (
-                (box[i, 0, m] <= box[j, 3, n]) & (box[j, 0, n] <= box[i, 3, m])
-                & (box[i, 1, m] <= box[j, 4, n]) & (box[j, 1, n] <= box[i, 4, m])
-                & (box[i, 2, m] <= box[j, 5, n]) & (box[j, 2, n] <= box[i, 5, m])
-            )  # fmt: skip
-            row |= np.int64(near) << n
-        found |= np.uint64(row) << np.uint64(LEAF * m)
-    return found
+        for m in range(LEAF):
+            for n in range(m + 1 if i == j else 0, LEAF):
+                # All six are compared: which of them tells cannot be foreseen, and a wrong guess costs more.
+                near = (
+                    (box[i, 0, m] <= box[j, 3, n]) & (box[j, 0, n] <= box[i, 3, m])
+                    & (box[i, 1, m] <= box[j, 4, n]) & (box[j, 1, n] <= box[i, 4, m])
+                    & (box[i, 2, m] <= box[j, 5, n]) & (box[j, 2, n] <= box[i, 5, m])
+                )  # fmt: skip
+                if not near:
+                    continue
+                f, g = LEAF * i + m, LEAF * j + n
+                if not _meet(faces, f, g, plain) or (found[f] and found[g]) or not (among[f] or among[g]):
+                    continue
+                if _cross(vertices, faces, f, g):
+                    found[f], found[g] = True, True
 
 
 @compiled

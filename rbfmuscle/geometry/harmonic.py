@@ -42,10 +42,16 @@ def cotangent_laplacian(vertices: Floats, faces: Integers) -> sparse.csc_matrix:
     rows, cols, values = map(np.concatenate, (rows, cols, values))
     count = len(vertices)
     half = sparse.coo_matrix((values, (rows, cols)), shape=(count, count)).tocsr()
-    weights = (half + half.T).tocoo()
-    positive = np.clip(weights.data, 1e-3 * np.median(np.abs(weights.data)), 1e3)
-    weights = sparse.csr_matrix((positive, (weights.row, weights.col)), shape=(count, count))
-    return (sparse.diags(np.asarray(weights.sum(axis=1)).ravel()) - weights).tocsc()
+    edges = sparse.triu(half + half.T, format="coo")
+    weights = np.clip(edges.data, 1e-3 * np.median(np.abs(edges.data)), 1e3)
+    return graph_laplacian(edges.row, edges.col, weights, count)
+
+
+def graph_laplacian(first: Integers, second: Integers, weights: Floats, count: int) -> sparse.csc_matrix:
+    """Laplacian (count, count) of edges between vertices; the weights of an edge that is given twice are added."""
+    half = sparse.csr_matrix((weights, (first, second)), shape=(count, count))
+    links = half + half.T
+    return (sparse.diags(np.asarray(links.sum(axis=1)).ravel()) - links).tocsc()
 
 
 def harmonic_weights(vertices: Floats, faces: Integers, groups: Sequence[Integers]) -> Floats:
@@ -62,6 +68,11 @@ def harmonic_weights(vertices: Floats, faces: Integers, groups: Sequence[Integer
     -------
     (n, len(groups)) ndarray
         Weights in [0, 1] that sum to one in each row.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If a part of the surface has no fixed vertex.
     """
     count = len(vertices)
     weights = np.zeros((count, len(groups)))
@@ -75,7 +86,10 @@ def harmonic_weights(vertices: Floats, faces: Integers, groups: Sequence[Integer
         right = -(laplacian[free][:, fixed] @ weights[fixed])
         weights[free] = splu(laplacian[free][:, free].tocsc()).solve(right)
     weights = np.clip(weights, 0.0, 1.0)
-    return weights / weights.sum(axis=1, keepdims=True)
+    total = weights.sum(axis=1, keepdims=True)
+    if not (total > 0.0).all():
+        raise np.linalg.LinAlgError("a part of the surface has no fixed vertex, or no area")
+    return weights / total
 
 
 def surface_gradient(vertices: Floats, faces: Array, values: Floats) -> Floats:

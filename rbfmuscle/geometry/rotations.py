@@ -70,19 +70,6 @@ def rotate(q, v):
     )
 
 
-@compiled
-def turn_quaternion(q, x, y, z):
-    """q <- q (1, x, y, z), normalised: right to third order, and the fixed point is unchanged."""
-    a, b, c, d = q[0], q[1], q[2], q[3]
-    q[0] = a - b * x - c * y - d * z
-    q[1] = b + a * x + c * z - d * y
-    q[2] = c + a * y + d * x - b * z
-    q[3] = d + a * z + b * y - c * x
-    size = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
-    for k in range(4):
-        q[k] /= size
-
-
 @compiled(error_model="numpy", fastmath={"contract"})
 def rotation_loop(m, q):
     """Turn the unit quaternion q in place to the rotational part of the 3x3 matrix m, by Newton's method.

@@ -87,7 +87,8 @@ class SurfaceBuilder:
     """
 
     def __init__(self, muscle: Muscle, scene: Scene, rest: RestState, options: RBFOptions) -> None:
-        self.name, self.rest, self.options = muscle.name, rest, options
+        self.name = f"muscle {muscle.name!r}" + (f" ({muscle.source})" if muscle.source else "")
+        self.rest, self.options = rest, options
         self._bones = [PointGrid(np.asarray(bone.mesh.vertices, dtype=float)) for bone in scene.bones]
         self.level = 0.0
         self.shown = DisplayMesh(muscle, rest, options) if options.surface == "material" else None
@@ -187,8 +188,8 @@ class SurfaceBuilder:
         if found:
             return min(found, key=lambda pair: pair[0])[1]
         raise SolveError(
-            f"muscle {self.name!r}: no surface outside the bones holds its volume of {volume:.6g} ({reason}); "
-            "check where its attachments lie and what the motion drives into it"
+            f"{self.name}: no surface outside the bones holds its volume of {volume:.6g} ({reason}); look for spikes "
+            "in its mesh, and check where its attachments lie and what the motion drives into it"
         ) from reason
 
     def _march(
@@ -205,7 +206,7 @@ class SurfaceBuilder:
             )  # fmt: skip
         except (ValueError, np.linalg.LinAlgError) as error:
             raise SolveError(
-                f"muscle {self.name!r}: no closed surface by marching cubes with kernel "
+                f"{self.name}: no closed surface by marching cubes with kernel "
                 f"{self.options.kernel!r} and {len(now.centres)} centres: {error}; surface = 'material' shows one"
             ) from error
         self.level = result.level

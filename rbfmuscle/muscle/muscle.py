@@ -101,9 +101,6 @@ class RBFMuscle:
         if self.law is not None:
             self.law.activate(activation)
 
-    def settle(self, contacts: BoneContacts) -> None:
-        """Nothing: the surface is cut along the bones."""
-
     def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
         """Move the centres that carry contact points marked in a bool mask by a (4, 4) transform; held ones stay."""
         self.solid.turn(which, transform)

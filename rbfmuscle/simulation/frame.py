@@ -147,9 +147,6 @@ class MuscleModel(Protocol):
     def solve(self, contacts: BoneContacts) -> None:
         """Solve for equilibrium under the model's constraints and these contacts."""
 
-    def settle(self, contacts: BoneContacts) -> None:
-        """Move out of the bones, at rest, what no contact point represents."""
-
     def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
         """Move the contact points marked in a bool mask (n,) by a (4, 4) transform."""
 

@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.surfaces import touching_balls, vertex_normals
 from rbfmuscle.geometry.triangles import nearest_weights, triangle_normal
-from rbfmuscle.geometry.winding import wound_around
 from rbfmuscle.jit import compiled
 
 if TYPE_CHECKING:
@@ -165,9 +164,9 @@ class NeighbourSurface:
         # A folded triangle at a rim may give a point far outside a large depth.
         deep = np.flatnonzero(near & (distance < -FOLDED * self.edge))
         if len(deep):
-            inside = np.empty(len(deep), dtype=np.bool_)
-            wound_around(points[index[deep]], self.vertices, self.faces, inside)
-            near[deep] = inside
+            import igl
+
+            near[deep] = igl.winding_number(self.vertices, self.faces, points[index[deep]]) > 0.5
         return index[near], distance[near], normal[near], nearest[near]
 
 

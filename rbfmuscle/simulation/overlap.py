@@ -26,8 +26,7 @@ def resolve_initial_overlap(stepper: MuscleStepper) -> None:
     """Deal with overlap at rest as the scene's ``[contact] initial`` says; for a muscle in its rest pose.
 
     ``"resolve"`` lets the bones grow from the muscle's surface to their true size while the model holds its
-    shape and volume; then the model brings out of bones what no contact point represents. ``"keep"`` measures
-    every gap from the depth at rest.
+    shape and volume. ``"keep"`` measures every gap from the depth at rest.
 
     Raises
     ------
@@ -47,10 +46,8 @@ def resolve_initial_overlap(stepper: MuscleStepper) -> None:
             )
         contacts.allow(b, depth)
         stepper.report(bone, count, "overlap_kept" if initial == "keep" else "overlap_resolved")
-    if initial == "resolve":
-        if overlap:
-            _resolve(stepper, overlap)
-        stepper.model.settle(contacts)
+    if initial == "resolve" and overlap:
+        _resolve(stepper, overlap)
 
 
 def _resolve(stepper: MuscleStepper, overlap: dict[int, Floats]) -> None:

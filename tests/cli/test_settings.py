@@ -39,7 +39,7 @@ MODELS = {
         PBDOptions,
         {
             "iterations": 2, "fibre_exponent": 1.0, "bending": 0.8, "edge_compliance": 0.1,
-            "bending_compliance": 0.1, "slack": 1.2, "self_collision": True,
+            "bending_compliance": 0.1, "slack": 1.2,
         },
     ),
 }  # fmt: skip

@@ -10,7 +10,6 @@ from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.fields import LevelField
 from rbfmuscle.geometry.rest_frame import BoneFrame
 from rbfmuscle.geometry.triangles import nearest_weights
-from rbfmuscle.geometry.winding import wound_around
 
 
 def solid():
@@ -45,15 +44,6 @@ def test_local_units_are_the_same_wherever_a_bone_is_and_however_large(scale):
     # Along its principal axes the slab fills its own box.
     sides = np.sort(np.ptp(frame.local, axis=0)) * frame.size
     np.testing.assert_allclose(sides, scale * np.array([1.0, 2.0, 5.0]), rtol=1e-5)
-
-
-def test_a_mesh_winds_around_what_is_inside_it_and_once_only():
-    vertices, faces = solid()
-    points = np.array([[5.2, 0.1, 1.1], [8.0, 0.3, 1.0]])
-    for triangles, expected in ((faces, [True, False]), (faces[:, ::-1], [False, False])):
-        found = np.empty(2, dtype=bool)
-        wound_around(points, vertices, np.ascontiguousarray(triangles), found)
-        np.testing.assert_array_equal(found, expected)
 
 
 def test_nearest_point_of_a_triangle_is_a_mean_of_its_corners_in_every_region():
