@@ -27,7 +27,6 @@ from rbfmuscle.report.page import (
     Table,
     embedded_image,
     limit_state,
-    number_cell,
 )
 from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.render import draw_preview
