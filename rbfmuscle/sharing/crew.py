@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numba
 
-from rbfmuscle.child import send, start_child, unexpected_end
+from rbfmuscle.child import start_child, unexpected_end
 from rbfmuscle.progress import stage
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.sharing.share import Solved
@@ -51,8 +51,9 @@ class WorkerPool:
         for k in range(helpers):
             process = start_child("rbfmuscle.sharing.helper", threads)
             self._processes.append(process)
-            # In turn: neighbours in a scene's list are often alike in size.
-            job = scene, names[k::helpers]
+            # In turn: neighbours in a scene's list are often alike in size. Pickled here, not in the thread: what a
+            # scene computes on demand would change it while another thread pickles it.
+            job = pickle.dumps((scene, names[k::helpers]), protocol=pickle.HIGHEST_PROTOCOL)
             threading.Thread(target=_deliver, args=(process, job), daemon=True).start()
 
     def wait_until_built(self) -> None:
@@ -104,9 +105,10 @@ class WorkerPool:
 
 
 def _deliver(process, job):
-    """Send a process its job, which it reads when it has started."""
+    """Send a process its pickled job, which it reads when it has started."""
     with contextlib.suppress(OSError, ValueError):  # it has ended: so does what it answers
-        send(process.stdin, job)
+        process.stdin.write(job)
+        process.stdin.flush()
 
 
 def _joined(parts, order):
