@@ -15,7 +15,7 @@ def timeless(path):
 
 def without_times(value):
     """A JSON value whose clock readings are None: their keys stay."""
-    clocks = ("started", "written", "wall", "times", "stages", "frame_time")
+    clocks = ("started", "written", "wall", "times", "frame_time")
     if isinstance(value, dict):
         return {
             key: (sorted(item) if isinstance(item, dict) else None)
