@@ -70,7 +70,7 @@ class Experiment:
 
     def __init__(self, scene, coordinate, end, step):
         self.scene = scene.copy()
-        known = {f"{joint.name}.{axis}" for joint in scene.joints for axis in joint.axes}
+        known = {f"{joint.name}.{axis}" for joint in scene.joints for axis in joint.coordinates}
         self.possible = coordinate in known
         if not self.possible:
             return
