@@ -121,8 +121,7 @@ for initial, title in (("keep", "overlapping"), ("resolve", "resolved")):
     scene = rm.Scene(name="overlap", units="mm")
     for bone in source.bones:
         scene.add_bone(bone.name, bone.mesh)
-    for joint in source.joints:
-        scene.add_joint(joint.name, joint.parent, joint.child, joint.centre, joint.axes)
+    scene.joints.extend(source.joints)
     attach = [{"bone": a.bone, "vertices": np.asarray(a.vertices)} for a in old.attachments]
     scene.add_muscle("extensor", thick, attach=attach, model="pbd")
     scene.contact = ContactOptions(initial=initial)
