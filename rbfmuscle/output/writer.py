@@ -176,14 +176,13 @@ class RunWriter:
 
         Whoever wants more takes the mesh at rest and the pose.
         """
-        for name, pose in frame.poses.items():
+        for bone in self.scene.bones:
+            name, mesh, pose = bone.name, bone.mesh, frame.poses[bone.name]
             if name not in self._bones:
-                mesh = self.scene.bone(name).mesh
                 self._bones[name] = np.eye(4), f"bones/{name}.vtp"
                 write_vtp(self.directory / self._bones[name][1], mesh.vertices, mesh.faces)
             if not np.array_equal(self._bones[name][0], pose):
                 if name not in self._light:
-                    mesh = self.scene.bone(name).mesh
                     self._light[name] = clustered(mesh.vertices, mesh.faces, LIGHT)
                 vertices, faces = self._light[name]
                 moved = vertices @ pose[:3, :3].T + pose[:3, 3]
