@@ -50,9 +50,7 @@ def run_command(arguments: list[str]) -> int:
     """Run one command and return the exit code; errors are one line."""
     sys.excepthook = _report_bug
     warnings.showwarning = _show_warning
-    logging.lastResort = logging.StreamHandler()
-    logging.lastResort.setFormatter(logging.Formatter("rbfmuscle: warning: %(message)s"))
-    logging.lastResort.setLevel(logging.WARNING)
+    logging.lastResort = _LogLines(logging.WARNING)
     if sys.stdout is None:
         return _fail("standard output is closed; send it to a file, or to /dev/null", UsageError.exit_code)
     try:
@@ -113,6 +111,13 @@ def one_line(error: object) -> str:
 
 def _show_warning(message, category, filename, lineno, file=None, line=None):
     print(f"rbfmuscle: warning: {one_line(message)}", file=sys.stderr)
+
+
+class _LogLines(logging.Handler):
+    """Prints log records as warnings in one line, without tracebacks, where logging is not configured."""
+
+    def emit(self, record):
+        print(f"rbfmuscle: warning: {one_line(record.getMessage())}", file=sys.stderr)
 
 
 def _report_bug(kind, error, trace):
