@@ -100,6 +100,8 @@ def main():
     leg, models = data_folder("leg"), arguments.models.split(",")
     facts = json.loads((leg / "scene.json").read_text(encoding="utf-8"))
     reference = leg.parent.parent / "reference" / "anatomy" / "gait2392_moment_arms.json"
+    if not reference.is_file():
+        raise SystemExit(f"{reference} is not here: it lies beside the folder of the data")
     theirs = json.loads(reference.read_text(encoding="utf-8"))
     heads = [
         *models,

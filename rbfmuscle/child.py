@@ -5,6 +5,7 @@ They are started by command and not by `multiprocessing`, so that a script needs
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
 import queue
@@ -36,6 +37,16 @@ def send(pipe: BinaryIO | Any, what: Any) -> None:
     """Pickle an object into a pipe."""
     pickle.dump(what, pipe, protocol=pickle.HIGHEST_PROTOCOL)
     pipe.flush()
+
+
+def end_child(process: subprocess.Popen[bytes]) -> None:
+    """End a process and close its pipes."""
+    process.kill()
+    process.wait()
+    for pipe in (process.stdin, process.stdout):
+        with contextlib.suppress(OSError):  # what it did not read is lost
+            if pipe is not None:
+                pipe.close()
 
 
 def unexpected_end(process: subprocess.Popen[bytes]) -> SolveError:

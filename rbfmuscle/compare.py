@@ -129,7 +129,7 @@ def _variants(scene, models, settings):
 
 
 def _measure(name, scene, folder, progress):
-    """One model: warm up, run, then there and back by coarser steps."""
+    """One model: compile its loops, run, then there and back by coarser steps."""
     _surfaces(scene, scene.motion.frames[:2])
     report = None if progress is None else (lambda done, total: progress(name, done, total))
     stream_run(scene, folder, pictures=False, progress=report)

@@ -49,12 +49,10 @@ def install(*, as_json: bool = False, watch: bool = False) -> None:
 
 @contextlib.contextmanager
 def keeping(kept: Callable[[], str]) -> Iterator[None]:
-    """While inside, and once ``kept()`` says what is kept, an interrupt raises KeyboardInterrupt with these words.
+    """While inside, and where ``kept()`` returns text, an interrupt raises KeyboardInterrupt with it.
 
-    So output can be finished.
-
-    A second interrupt ends the process at once. Compiled code and callbacks may lose the exception: :func:`check`
-    raises it again, and so does leaving.
+    Output can then be finished; where it returns none, the process ends at once, as at a second interrupt. Compiled
+    code and callbacks may lose the exception: :func:`check` raises it again, and so does leaving.
     """
     before = _State.kept
     _State.kept = kept
@@ -62,7 +60,7 @@ def keeping(kept: Callable[[], str]) -> Iterator[None]:
         yield
         check()
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"interrupted; {kept()}") from None
+        raise KeyboardInterrupt("; ".join(filter(None, ("interrupted", kept())))) from None
     finally:
         _State.kept = before
 

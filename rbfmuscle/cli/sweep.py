@@ -69,11 +69,8 @@ def sweep(
     for point in points:  # a mistyped key is reported now, not after the first point
         configure_scene(loaded[point.scene], point.settings, frames=frames)
     options: dict[str, Any] = {"frames": frames, "jobs": jobs, "cluster": cluster}
-    progress, kept = (
-        Progress(f"sweep of {len(points)} points", what="point"),
-        f"finished points are kept in {output}",
-    )
-    with progress, interruption.keeping(lambda: kept):
+    progress = Progress(f"sweep of {len(points)} points", what="point")
+    with progress, interruption.keeping(lambda: f"finished points are kept in {output}"):
         run_sweep(run_point, loaded, points, output, progress=progress, **options)
     _finish(points, output, {name: scene.units for name, scene in loaded.items()}, error)
 

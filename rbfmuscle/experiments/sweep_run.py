@@ -136,7 +136,7 @@ def _is_done(folder, point):
 
 
 def _side_by_side(calls, folder, jobs, advance):
-    """Run calls; after a process has died, those that are left one by one, each in a process of its own."""
+    """Run calls; after a process has died, those that were running each in a process of its own, then the others."""
     from joblib import Parallel, delayed
     from joblib.externals.loky import BrokenProcessPool, ProcessPoolExecutor
 
@@ -145,14 +145,16 @@ def _side_by_side(calls, folder, jobs, advance):
         for _ in Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1)(tasks):
             advance()
     except BrokenProcessPool:
-        for call in [call for call in calls if not folder.read(call[2].key)]:
+        left = [call for call in calls if not folder.read(call[2].key)]
+        for call in left[:jobs]:
             with ProcessPoolExecutor(1) as pool:
                 try:
                     pool.submit(measure_point, *call).result()
                 except BrokenProcessPool:
-                    error = "the process ended without a word (out of memory, or a crash)"
+                    error = "the process ended without a message (out of memory, or a crash)"
                     folder.write({"key": call[2].key, "status": "failed", "error": error})
             advance()
+        _side_by_side(left[jobs:], folder, jobs, advance)
     except RuntimeError as error:  # of Dask, where worker after worker dies of a point
         raise SolveError(f"a point ended its workers ({error}); finished points are kept") from None
 
@@ -174,7 +176,7 @@ def measure_point(
             }
             if point.role == "reference":
                 arrays = {f"{place}|{k}": mesh[k] for place, mesh in shown.items() for k in (0, 1)}
-                fresh = folder.references / f".{os.getpid()}.npz"
+                fresh = folder.references / f".{point.key}.{os.getpid()}.npz"
                 np.savez_compressed(fresh, **arrays)
                 os.replace(fresh, folder.surfaces(point.key))
             elif point.reference:

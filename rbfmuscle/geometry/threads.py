@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import lru_cache
 from itertools import pairwise
 from typing import TypeVar
@@ -25,11 +25,20 @@ def _pool(workers: int) -> ThreadPoolExecutor:
 
 
 def each(act: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """``[act(item) for item in items]``, on at most ``numba.get_num_threads()`` threads."""
+    """``[act(item) for item in items]``, on at most ``numba.get_num_threads()`` threads.
+
+    An error is raised once no item is being worked on any more.
+    """
     workers = min(numba.get_num_threads(), len(items))
     if workers < 2:
         return [act(item) for item in items]
-    return list(_pool(workers).map(act, items))
+    futures = [_pool(workers).submit(act, item) for item in items]
+    try:
+        return [future.result() for future in futures]
+    finally:
+        for future in futures:
+            future.cancel()
+        wait(futures)
 
 
 def in_chunks(count: int, work: Callable[[int, int], object], *, least: int = LEAST_SHARE) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 # A slope is fitted over the frames within so many degrees, or millimetres of a shift, and over the frames next to it.
-# In motions by one degree moment arms then ripple about smooth curves by at most 0.3 mm RMS (docs/moment_arms.md).
+# In motions by one degree moment arms then ripple about smooth curves by at most 0.3 mm RMS (docs/validation.md).
 REACH = 8.0
 # Coordinates that change by less [radian or scene unit] rest.
 _STILL = 1e-9

@@ -126,8 +126,10 @@ def parse_limits(limits: str | Sequence[str] | None, scene: Scene) -> dict[str, 
     Raises
     ------
     UsageError
-        On an unknown quantity or a value that is no number.
+        On an unknown quantity, a value that is no number, or limits that are no text.
     """
+    if isinstance(limits, Mapping):
+        raise UsageError("limits are text, for instance 'penetration_max=0.5,volume_error'")
     listed = [limits] if isinstance(limits, str) else limits or []
     found = {}
     for part in (part.strip() for text in listed for part in text.split(",") if part.strip()):
@@ -271,7 +273,7 @@ def shown_number(value: float | None, unit: str = "") -> str:
     if 0.0 < abs(value) < least:
         text = f"< {least:g}"
     else:
-        text = f"{value:.0f}" if 1e3 <= abs(value) < 1e5 else f"{value:.3g}"
+        text = f"{value:.0f}" if 100.0 <= abs(value) < 1e5 else f"{value:.3g}"
     return text if unit in ("", "1") else f"{text} {unit}"
 
 

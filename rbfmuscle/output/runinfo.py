@@ -17,7 +17,7 @@ from rbfmuscle.scene.motion import shown_value
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Frame
 
-FORMAT = 1
+FORMAT = 2
 _PACKAGES = ("numpy", "scipy", "numba", "scikit-image", "trimesh", "pyvista", "vtk", "libigl")
 
 

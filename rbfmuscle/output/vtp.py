@@ -8,8 +8,8 @@ import re
 import zlib
 from collections.abc import Mapping
 from functools import lru_cache
+from html import escape
 from pathlib import Path
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -142,7 +142,7 @@ class Collection:
     def add(self, time: float, entries: list[tuple[str, str]]) -> None:
         """Add one time step; ``entries`` are pairs of name and file."""
         lines = [
-            f'<DataSet timestep="{time}" group="" part="{part}" name={quoteattr(name)} file={quoteattr(file)}/>\n'
+            f'<DataSet timestep="{time}" group="" part="{part}" name="{escape(name)}" file="{escape(file)}"/>\n'
             for part, (name, file) in enumerate(entries)
         ]
         self._write("".join(lines))

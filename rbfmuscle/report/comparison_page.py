@@ -37,8 +37,9 @@ Series = tuple[Integers, Floats]
 # Pixels of a picture of one model, and of all together.
 _AREA, _WHOLE = 90_000, 400_000
 _READING = """All models ran through the same frames and sub-steps, one after another with the same bone fields and
-number of threads, each after a warm-up. The time per frame is the wall time of prediction, solution, contacts and
-surface of all muscles. The distance to the first model is no error: it says how far models differ."""
+number of threads. The time per frame is the wall time of prediction, solution, contacts and surface of all muscles,
+without the first frame, which loads and compiles. The distance to the first model is no error: it says how far models
+differ."""
 
 
 def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) -> None:

@@ -24,7 +24,7 @@ _STYLE = {
     "svg.fonttype": "none", "svg.hashsalt": "rbfmuscle", "font.size": 8.5, "axes.titlesize": 9,
     "axes.titleweight": "bold", "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": "#b9b5ab",
     "axes.labelcolor": _SOFT, "xtick.color": _SOFT, "ytick.color": _SOFT, "axes.grid": True, "grid.color": "#e8e6e0",
-    "axes.axisbelow": True, "lines.linewidth": 1.4, "legend.frameon": False,
+    "axes.axisbelow": True, "lines.linewidth": 1.4, "legend.frameon": False, "text.parse_math": False,
 }  # fmt: skip
 # Height of a row of labels, and width of a letter [inch].
 _ROW, _LETTER = 0.16, 0.075
@@ -75,11 +75,11 @@ def line_plot(
     legend : bool
         Whether the lines' names stand below.
     """
-    from matplotlib import rc_context
+    from matplotlib import style
     from matplotlib.figure import Figure
 
     below = _ROW * len(tracks) if legend else 0.0
-    with rc_context(_STYLE):
+    with style.context(["default", _STYLE]):
         figure = Figure((4.2, 2.3 + below))
         tall = 2.3 + below
         axes = figure.add_axes((0.12, (0.4 + below) / tall, 0.86, 1.65 / tall), xlabel=labels[0])
@@ -106,7 +106,7 @@ def front_plot(points: Sequence[Point], labels: tuple[str, str]) -> str:
     labels : (str, str)
         Of the axes.
     """
-    from matplotlib import rc_context
+    from matplotlib import style
     from matplotlib.figure import Figure
 
     shown = [point for point in points if point.x > 0 and point.y > 0]
@@ -117,7 +117,7 @@ def front_plot(points: Sequence[Point], labels: tuple[str, str]) -> str:
     named = [point for point in shown if point.star or point.front]
     letters = max((len(text) for text in (*groups, *(point.label for point in named))), default=0)
     wide, tall = 5.4 + _LETTER * letters, max(3.8, 0.6 + _ROW * (len(named) + len(groups)))
-    with rc_context(_STYLE):
+    with style.context(["default", _STYLE]):
         figure = Figure((wide, tall))
         place = (0.6 / wide, 0.45 / tall, 4.6 / wide, 1.0 - 0.55 / tall)
         axes = figure.add_axes(place, xscale="log", yscale="log", xlabel=labels[0], ylabel=labels[1])

@@ -53,8 +53,8 @@ PANELS = (
     ("Time per frame after the first", "time_frame", 1000.0, "ms", False),
 )
 _MECHANICS = ("length", "activation", "moment_arm")
-# Below this share of its limit a quantity is constant, and named in place of a plot.
-_CONSTANT = 0.01
+# Below this share of its limit a quantity is named in place of a plot.
+_NEGLIGIBLE = 0.01
 # Points of all muscles in all frames that a page holds.
 _MOST_POINTS = 2_600_000
 # Tables or plots of their own.
@@ -175,7 +175,7 @@ def _plots(saved: SavedRun) -> list[Section]:
         (f"Moment arm: {name}", "moment_arm", 1.0, arm_unit(saved, name), True, name)
         for name in saved.moment_arm_coordinates()
     ] + [(*panel, None) for panel in PANELS]
-    mechanics, errors, constant = [], [], []
+    mechanics, errors, negligible = [], [], []
     for title, quantity, factor, unit, both, coordinate in panels:
         tracks = _tracks(saved, quantity, factor, axis, coordinate)
         if not tracks:
@@ -185,15 +185,15 @@ def _plots(saved: SavedRun) -> list[Section]:
             factor * (saved.info["limits"].get(quantity) or 0.0),
         )
         greatest = max(np.nanmax(np.abs(track.y), initial=0.0) for track in tracks)
-        if quantity not in _MECHANICS and greatest <= _CONSTANT * limit:
+        if quantity not in _MECHANICS and greatest <= _NEGLIGIBLE * limit:
             value = shown_number(greatest, unit)
-            constant.append(f"{title.lower()} {value if value[0] == '<' else f'≤ {value}'}")
+            negligible.append(f"{title.lower()} {value if value[0] == '<' else f'≤ {value}'}")
             continue
         limits = [limit, -limit][: 1 + both] if limit else []
         zero = quantity != "length" and not both
         picture = line_plot(title, tracks, (label, unit), limits=limits, zero=zero)
         (mechanics if quantity in _MECHANICS else errors).append(picture)
-    text = f"Constant over the motion: {'; '.join(constant)}." if constant else ""
+    text = f"Not plotted, as below 1 % of the limit: {'; '.join(negligible)}." if negligible else ""
     return [
         Section("Moment arms and lengths", plots=mechanics),
         Section("Errors and times over the motion", plots=errors, text=text),

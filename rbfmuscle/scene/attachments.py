@@ -5,9 +5,10 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+from pydantic import BeforeValidator, ValidationInfo
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
@@ -24,7 +25,7 @@ from rbfmuscle.scene.objects import (
     ViaTable,
     find_named,
 )
-from rbfmuscle.scene.options import FileName, NotNegative, Positive, Table, Vector
+from rbfmuscle.scene.options import NotNegative, Positive, Table, Vector, in_folder
 from rbfmuscle.scene.tendons import BonePoint, TendonEnd
 from rbfmuscle.validation import SceneError, is_file, shown, shown_path
 
@@ -43,11 +44,19 @@ class SphereTable(Table):
     radius: Positive
 
 
+def _check_vertices(value: object, info: ValidationInfo) -> object:
+    if isinstance(value, (list, tuple)) and all(type(number) is int for number in value):
+        return list(value)
+    if value is None or isinstance(value, (str, Path)):
+        return value if value is None else in_folder(value, info)
+    raise ValueError("must be a file or a list of vertex numbers")
+
+
 class AttachTable(Table):
     """A bone, and one of: a file or list of vertex numbers, a distance to the bone, a ball; maybe a tendon."""
 
     bone: str
-    vertices: FileName | list[int] | None = None
+    vertices: Annotated[Path | list[int] | None, BeforeValidator(_check_vertices)] = None
     near: NotNegative | None = None
     sphere: SphereTable | None = None
     tendon: LineTable | None = None

@@ -44,7 +44,7 @@ class Finding:
 def check_scene(scene: SceneData, exact: ExactMeshes | None = None) -> list[Finding]:
     """Return all findings about a scene, the worst first; nothing is solved or changed.
 
-    ``exact`` takes the distances to the bones' meshes, for further questions.
+    ``exact`` keeps what was prepared for distances to the bones' meshes, for later calls.
     """
     exact = exact or ExactMeshes()
     items: list[Bone | Muscle] = [*scene.bones, *scene.muscles]
@@ -182,7 +182,7 @@ def bone_collisions(
     """Return where a motion drives bones into each other, as (frame, bone, other, depth [scene unit]).
 
     The depth is that of the deepest vertex of either bone in the other; pairs that do not move are left out. ``frames``
-    are about ten of the motion by default, ``exact`` takes the distances to the bones' meshes.
+    are about ten of the motion by default; ``exact`` is as in `check_scene`.
     """
     exact, found = exact or ExactMeshes(), []
     for frame in sampled_frames(scene) if frames is None else frames:

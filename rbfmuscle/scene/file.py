@@ -175,8 +175,8 @@ def load_scene(cls: type[S], path: str | Path, *, skeleton: bool = False) -> S:
 
 
 def _fill(scene: SceneData, tables: SceneFile) -> None:
-    for name in ("left_out", "superior", "anterior"):
-        setattr(scene, name, getattr(tables.scene, name))
+    about = tables.scene
+    scene.left_out, scene.superior, scene.anterior = about.left_out, about.superior, about.anterior
     for bone in tables.bone:
         if bone.mesh is None:
             add_link(scene, bone.name)
@@ -192,8 +192,8 @@ def _fill(scene: SceneData, tables: SceneFile) -> None:
     for muscle in tables.muscle:
         _add_muscle(scene, muscle, tables.defaults)
     scene.motion = make_motion(scene, tables.motion)
-    for name in ("contact", "sliding", "detect", "output"):
-        setattr(scene, name, getattr(tables, name))
+    scene.contact, scene.sliding = tables.contact, tables.sliding
+    scene.detect, scene.output = tables.detect, tables.output
 
 
 def _add_muscle(scene, muscle, defaults):

@@ -57,7 +57,7 @@ REMOVED_KEYS: dict[str, str] = {
     "coupling.scale": "multiply the numbers of the function by it",
     "joint.rotations.natural_spline": "use spline",
     "joint.translations.natural_spline": "use spline",
-    "joint.coordinates.default": "delete the key: a coordinate that a motion does not mention is at rest",
+    "joint.coordinates.*.default": "delete the key: a coordinate that a motion does not mention is at rest",
     "tendon.vertices": "use tendon.length, measured from the attachments",
     "coupling.natural_spline": "use spline",
     "model.seed": "delete the key: samples and centres are always the same",
@@ -79,8 +79,8 @@ REMOVED_KEYS: dict[str, str] = {
     "model.arap_reach": "delete the key: a global step carries 3 % of the muscle's diagonal",
     "model.swelling_reach": "delete the key: the freedom to swell ends within 4 % of the muscle's diagonal",
     "model.contact": "delete the key: bones are met by the vertices of a mesh muscle",
-    "model.sound": "delete the key: the mesh models may cross themselves and hold attached vertices in a bone",
-    "model.self_collision": "delete the key: the mesh models may cross themselves and hold attached vertices in a bone",
+    "model.sound": "delete the key: surfaces of mesh models are not kept from crossing themselves",
+    "model.self_collision": "delete the key: surfaces of mesh models are not kept from crossing themselves",
     "model.response": 'use model = "pbd-paper", or delete the key: ways out of several bones are added up',
     "model.derivatives": "delete the key: up to 200 centres, and fitted ones, meet all derivatives",
     "output.preview": "use output.report = false, which leaves out report.html and preview.webp",
@@ -97,7 +97,8 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 
 
-def _in_folder(name: object, info: ValidationInfo) -> Path:
+def in_folder(name: object, info: ValidationInfo) -> Path:
+    """A file's path; names are relative to the folder of the scene file."""
     if isinstance(name, Path):
         return name
     if not isinstance(name, str):
@@ -106,7 +107,7 @@ def _in_folder(name: object, info: ValidationInfo) -> Path:
 
 
 # A file: relative to the scene file, where there is one.
-FileName = Annotated[Path, BeforeValidator(_in_folder)]
+FileName = Annotated[Path, BeforeValidator(in_folder)]
 
 
 def _check_length(vector):
@@ -143,7 +144,9 @@ def check_removed(values: object, *, place: str, prefix: str = "") -> None:
             name = f"{prefix}{key}".removeprefix("muscle.").removeprefix("defaults.")
             if name in REMOVED_KEYS:
                 raise SceneError(f"{place}{name} was removed: {REMOVED_KEYS[name]}")
-            check_removed(value, place=place, prefix=f"{name}.")
+            # Coordinates have names of their own.
+            inner = "joint.coordinates.*" if prefix == "joint.coordinates." else name
+            check_removed(value, place=place, prefix=f"{inner}.")
 
 
 class Table(BaseModel):

@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numba
 
-from rbfmuscle.child import start_child, unexpected_end
+from rbfmuscle.child import end_child, start_child, unexpected_end
 from rbfmuscle.progress import stage
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.sharing.share import Solved
@@ -49,11 +49,11 @@ class WorkerPool:
         threads = max(1, numba.get_num_threads() // helpers)
         names = [muscle.name for muscle in scene.muscles]
         for k in range(helpers):
-            process = start_child("rbfmuscle.sharing.helper", threads)
-            self._processes.append(process)
             # In turn: neighbours in a scene's list are often alike in size. Pickled here, not in the thread: what a
             # scene computes on demand would change it while another thread pickles it.
             job = pickle.dumps((scene, names[k::helpers]), protocol=pickle.HIGHEST_PROTOCOL)
+            process = start_child("rbfmuscle.sharing.helper", threads)
+            self._processes.append(process)
             threading.Thread(target=_deliver, args=(process, job), daemon=True).start()
 
     def wait_until_built(self) -> None:
@@ -74,12 +74,7 @@ class WorkerPool:
     def close(self) -> None:
         """End the processes."""
         for process in self._processes:
-            process.kill()
-            process.wait()
-            for pipe in (process.stdin, process.stdout):
-                with contextlib.suppress(OSError):
-                    if pipe is not None:
-                        pipe.close()
+            end_child(process)
 
     def _next(self, process: subprocess.Popen[bytes]) -> Solved | None:
         """The next frame of a process; its warnings and log records are repeated here."""

@@ -52,8 +52,9 @@ class Side:
         if choice == self.choice:
             return False
         figure = None if choice == "none" else self.source.figure(choice)
+        picture = None if figure is None else figure.advance()
         self.choice, self.figure = choice, figure
-        self.rest = self.picture = None if figure is None else figure.advance()
+        self.rest = self.picture = picture
         self.frame.visible = figure is not None
         return True
 

@@ -13,9 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from rbfmuscle.cli.app import run_command
 from rbfmuscle.geometry.coarse import clustered
-from rbfmuscle.importers.guess.attachments import _best_of
-from rbfmuscle.importers.guess.guess import guess_scene, write_scene
+from rbfmuscle.importers.guess.attachments import AttachmentGuess, Ends, _best_of, _tendon
+from rbfmuscle.importers.guess.guess import _leave_out, guess_scene, write_scene
 from rbfmuscle.importers.guess.joints import Face, fit_ball, fit_hinge, guess_joints
+from rbfmuscle.importers.guess.landmarks import CONDYLE, fit_condyles
 from rbfmuscle.importers.guess.names import name_facts
 from rbfmuscle.importers.guess.orientation import HEADER, find_orientation
 from rbfmuscle.importers.guess.parts import Part
@@ -23,7 +24,7 @@ from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.joints.tables import JointTable
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.validation import UsageError
+from rbfmuscle.validation import MeshError, UsageError
 
 
 @pytest.mark.parametrize(
@@ -50,6 +51,12 @@ def test_names_as_they_are_published(name, tissue, known, side):
     facts = name_facts(name)
     found = facts.bone or (facts.muscle.name if facts.muscle else "")
     assert (facts.tissue, found, facts.side) == (tissue, known, side)
+
+
+def test_misspelt_names_are_named_and_known_words_are_never_taken_for_others():
+    assert "'illiacus' read as 'iliacus'" in name_facts("Illiacus").spelling
+    assert not name_facts("obturator_externus").spelling
+    assert name_facts("abductor_hallucis").muscle.name == "abductor hallucis"
 
 
 def test_ball_is_found_from_a_cap():
@@ -105,6 +112,48 @@ def test_what_is_written_loads_and_has_the_phantoms_joint(tmp_path, units, optio
         held = [set(a.vertices) for a in muscle.attachments]
         assert len(held) >= 2 and not set.intersection(*held)
     assert Scene.load(tmp_path / "scene.toml").units == units
+
+
+def test_ends_of_a_bent_tube_are_its_tips():
+    mesh = trimesh.creation.capsule(height=100.0, radius=8.0)
+    mesh.vertices[:, 0] += 0.01 * (mesh.vertices[:, 2] - 50.0) ** 2
+    ends = Ends(mesh)
+    z = np.sort(mesh.vertices[list(ends.tips), 2])
+    assert z[0] < mesh.bounds[0][2] + 5 and z[1] > mesh.bounds[1][2] - 5
+    assert ends.along(0)[ends.tips[0]] == 0.0 and ends.along(0)[ends.tips[1]] == 1.0
+
+
+def test_a_tendon_goes_straight_to_the_nearest_place_of_its_bone():
+    bone = trimesh.creation.cylinder(radius=8, height=100, sections=48).apply_translation([0, 0, -55])
+    belly = trimesh.creation.capsule(height=30, radius=4).apply_translation([40, 0, 45])
+    lower = Part("lower", "lower.ply", SimpleNamespace(mesh=bone))
+    held = np.flatnonzero(belly.vertices[:, 2] < belly.vertices[:, 2].min() + 3)
+    found = _tendon(
+        AttachmentGuess(lower, held, 60.0, ""), Part("belly", "belly.ply", SimpleNamespace(mesh=belly)), []
+    )
+    away = ((bone.vertices - belly.vertices[held].mean(axis=0)) ** 2).sum(axis=1)
+    assert found.bone is lower and not found.via
+    np.testing.assert_array_equal(found.to, bone.vertices[np.argmin(away)])
+
+
+def test_muscles_without_the_bones_of_their_names_still_make_a_scene(tmp_path):
+    """Where anatomy finds none of its bones, the nearest are taken and every muscle is doubtful."""
+    for item in phantom_scene().bones:
+        item.mesh.export(tmp_path / f"{'radius' if item.name == 'pelvis' else 'ulna'}.ply")
+    for item, name in zip(phantom_scene().muscles, ("soleus", "plantaris", "popliteus", "sartorius")):
+        item.mesh.export(tmp_path / f"{name}.ply")
+    guess = guess_scene(tmp_path, "mm", tmp_path)
+    assert len(write_scene(guess, tmp_path / "scene.toml").muscles) == 4
+    assert all(muscle.confidence <= 0.2 and "are not here" in muscle.reasons[0] for muscle in guess.muscles)
+
+
+def test_an_error_is_of_the_muscle_that_it_names_and_of_no_other_with_a_similar_file(tmp_path):
+    _phantom_meshes(tmp_path)
+    guess = guess_scene(tmp_path, "mm", tmp_path)
+    good, bad = guess.muscles[:2]
+    good.muscle.file, bad.muscle.file = "psoas.ply", "right_psoas.ply"
+    _leave_out(guess, MeshError(f"{tmp_path}/right_psoas.ply: not closed"))
+    assert bad.wrong and not good.wrong
 
 
 def test_a_folder_without_muscles_is_refused(tmp_path):
@@ -186,6 +235,13 @@ def test_joints_of_the_leg_however_it_lies(leg, how):
     # Against the estimates of data/leg, which have other methods [degree].
     assert joints["knee"].rest == pytest.approx(-0.5, abs=2.0)
     assert joints["ankle"].rest == pytest.approx(-32.0, abs=3.0)
+
+
+def test_a_condyle_larger_than_anatomy_has_is_refused_and_named(leg):
+    bones, _ = _leg_bones(leg, np.diag([2.5, 2.5, 2.5, 1.0]))
+    find_orientation(bones)
+    fit = fit_condyles(bones[1], bones[1].frame, 1.0)
+    assert fit.wrong and f"anatomy has {CONDYLE[0]:g} to {CONDYLE[1]:g}" in fit.wrong
 
 
 def test_patella_follows_the_table_that_was_computed_for_the_leg(leg):

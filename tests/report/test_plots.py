@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from rbfmuscle.output.appearance import MUSCLE_COLOURS
 from rbfmuscle.output.runinfo import Neighbours
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report.comparison_page import worst_series
@@ -14,29 +15,29 @@ from rbfmuscle.report.plots import Point, Track, front_plot, line_plot, motion_a
 from rbfmuscle.report.report import _tracks
 
 
-def numbers_at(svg, anchor):
-    """Numbers at the axis whose labels have this anchor, with their places."""
-    pattern = rf'text-anchor: {anchor}[^>]*" x="([\d.]+)" y="([\d.]+)"[^>]*>([−\d.]+)</text>'
+def ticks(svg, anchor):
+    """Places of the ticks whose numbers have this anchor, and the numbers."""
+    pattern = (
+        rf'<use [^>]*x="([\d.]+)" y="([\d.]+)"[^<]*(?:<(?!use)[^<]*)*?text-anchor: {anchor}[^>]*>([−\d.]+)<'
+    )
     return np.array([[float(x.replace("−", "-")) for x in found] for found in re.findall(pattern, svg)])
 
 
-def drawn(svg, name):
-    """Values of the line of a muscle, read back by the numbers at the axes."""
-    x, y = numbers_at(svg, "middle"), numbers_at(svg, "end")
+def drawn(svg, line):
+    """Values of a line that a pattern finds, read back by the ticks of the axes."""
+    x, y = ticks(svg, "middle"), ticks(svg, "end")
     across, up = np.polyfit(x[:, 0], x[:, 2], 1), np.polyfit(y[:, 1], y[:, 2], 1)
-    line = re.search(rf'<g data-muscle="{name}">.*?<path d="([^"]*)"', svg, re.S)[1]
-    points = np.array(re.findall(r"[ML] ([-\d.]+) ([-\d.]+)", line), dtype=float)
+    points = np.array(re.findall(r"[ML] ([-\d.]+) ([-\d.]+)", re.search(line, svg, re.S)[1]), dtype=float)
     return np.polyval(across, points[:, 0]), np.polyval(up, points[:, 1])
 
 
 def test_lines_lie_where_the_numbers_at_the_axes_say():
     x, y = np.arange(0.0, 90.0, 10.0), np.sin(np.arange(9)) * 30.0 + 7.0
     svg = line_plot("a <title>", [Track("strap", "#cc6677", x, y)], ("angle", "mm"), limits=[50.0])
-    found = drawn(svg, "strap")
-    np.testing.assert_allclose(found[0], x, atol=1e-4)
-    # The numbers stand lower than their lines by some part of a letter, the same for all.
-    np.testing.assert_allclose(found[1] - found[1].mean(), y - y.mean(), atol=1e-4)
-    assert "a &lt;title&gt;" in svg and "http" not in svg and "stroke-dasharray" in svg
+    np.testing.assert_allclose(drawn(svg, r'<g data-muscle="strap">.*?<path d="([^"]*)"'), [x, y], atol=1e-4)
+    limit = drawn(svg, r'<path d="([^"]*)"[^>]*stroke-dasharray')[1]
+    np.testing.assert_allclose(limit, 50.0, atol=1e-4)
+    assert "a &lt;title&gt;" in svg and "http" not in svg
 
 
 def test_front_labels_the_front_and_the_default_and_no_label_covers_another():
@@ -50,7 +51,23 @@ def test_front_labels_the_front_and_the_default_and_no_label_covers_another():
     assert np.diff(sorted(heights)).min() > 11.0  # a row is 0.16 inches of 72 pixels high
     # The higher the point, the higher its label.
     assert list(np.argsort(heights)) == list(np.argsort([-points[number].y for number in numbers]))
+    colour = MUSCLE_COLOURS[0]
+    assert len(re.findall(rf"<use [^>]*fill: {colour}", svg)) == 40
+    front = re.search(rf'<path d="([^"]*)"[^>]*stroke: {colour}', svg)[1]
+    x = np.array(re.findall(r"[ML] ([-\d.]+)", front), dtype=float)
+    wanted = np.sort([np.log(point.x) for point in points if point.front])
+    np.testing.assert_allclose((x - x[0]) / np.ptp(x), (wanted - wanted[0]) / np.ptp(wanted), atol=1e-6)
     assert front_plot([Point(1.0, 0.0, "exact", "one")], ("ms", "mm")) == ""
+
+
+def test_plots_do_not_depend_on_the_users_settings_and_take_any_name():
+    import matplotlib
+
+    tracks = [Track("strap", "#cc6677", np.arange(3.0), np.arange(3.0))]
+    plain = line_plot(r"$\frac$", tracks, ("angle", "mm"))
+    with matplotlib.rc_context({"axes.facecolor": "black", "text.color": "white", "font.size": 30}):
+        assert line_plot(r"$\frac$", tracks, ("angle", "mm")) == plain
+    assert r">$\frac$</text>" in plain
 
 
 def test_tracks_are_the_series_of_the_run_and_times_leave_out_the_first_frame(arm_run):

@@ -125,6 +125,16 @@ class TestMending:
         read = read_mesh(write(tmp_path / "a.ply", both.vertices, both.faces), may_be_open=True)
         assert read.mesh.volume == pytest.approx(ball().volume - inner.volume, rel=1e-6)
 
+    def test_few_triangles_at_edges_of_more_than_two_are_dropped_from_a_bone(self, tmp_path):
+        mesh = ball()
+        edges = mesh.edges_unique[[10, 300]]
+        extra = np.column_stack([edges, (edges[:, 0] + 90) % len(mesh.vertices)])
+        file = write(tmp_path / "bone.ply", mesh.vertices, np.vstack([mesh.faces, extra]))
+        read = read_mesh(file, may_be_open=True)
+        assert read.mesh.volume == pytest.approx(mesh.volume, rel=0.01) and len(read.mesh.faces) <= len(
+            mesh.faces
+        )
+
     def test_non_manifold_edge_that_cannot_be_mended(self, tmp_path):
         box = trimesh.creation.box((10, 10, 10))
         other = trimesh.creation.box((10, 10, 10)).apply_translation([10, 10, 0])

@@ -2,8 +2,9 @@
 
 import math
 import re
+import threading
+import time
 from contextlib import nullcontext
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from rbfmuscle.scene.check import (
 from rbfmuscle.scene.motion import turned_angle
 from rbfmuscle.scene.objects import Bone
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.validation import MeshError, SceneError
+from rbfmuscle.validation import MeshError, SceneError, SolveError
 
 UNITS = {"mm": 1.0, "cm": 0.1, "m": 1e-3}
 SIDES = [(axis, sign) for axis in range(3) for sign in (1.0, -1.0)]
@@ -99,7 +100,28 @@ def test_angle_of_a_turn_is_its_angle_about_any_axis_and_way_round(axis, angle):
 
 @pytest.mark.parametrize("threads", [1, 2, 4])
 def test_what_runs_in_parallel_comes_back_in_order(monkeypatch, threads):
-    there = SimpleNamespace(get_num_threads=lambda: threads, set_num_threads=lambda count: None)
-    monkeypatch.setattr("rbfmuscle.geometry.threads.numba", there)
-    for items in ([], [7], [3, 1, 2, 9]):
-        assert each(lambda value: value * value, items) == [value * value for value in items]
+    monkeypatch.setattr("numba.get_num_threads", lambda: threads)
+    # As many calls as threads go on at a time: none of them returns before the others have begun.
+    begun = threading.Barrier(threads, timeout=10)
+
+    def square(value):
+        begun.wait()
+        return value * value
+
+    for items in ([], [3, 1, 2, 9]):
+        assert each(square, items) == [value * value for value in items]
+
+
+def test_an_error_in_parallel_is_raised_once_nothing_goes_on_any_more(monkeypatch):
+    monkeypatch.setattr("numba.get_num_threads", lambda: 2)
+    ended = threading.Event()
+
+    def act(value):
+        if value:
+            raise SolveError("no equilibrium")
+        time.sleep(0.2)
+        ended.set()
+
+    with pytest.raises(SolveError):
+        each(act, [0, 1])
+    assert ended.is_set()

@@ -2,7 +2,8 @@
 
 A muscle's length is measured along its surface. Where an end lies on a bone, the patch is what touches it; where
 the belly stops short of its bone, the patch is the cap of the end that points there, and a tendon goes straight to the
-nearest place of the bone; from a patella that follows its knee on along the patellar ligament to the tibia.
+nearest place of the bone. At a patella that follows its knee, the tendon goes on along the patellar ligament to the
+tibia.
 """
 
 from __future__ import annotations
@@ -246,7 +247,7 @@ def _doubt(guess, bodies):
     for hold in guess.holds:
         if hold.gap > FAR:
             away = f"{hold.gap:.0f} mm from the {hold.bone.name}"
-            guess.doubt(0.5, f"its end is {away}: a tendon is missing")
+            guess.doubt(0.5, f"the mesh ends {away}: a straight tendon was added, check its path")
     if guess.muscle.doubt:
         guess.confidence = min(guess.confidence, 0.3)
     share = sum(len(hold.vertices) for hold in guess.holds) / len(guess.muscle.points)

@@ -133,10 +133,10 @@ def _check_runs(guess, path):
 
 def _leave_out(guess, error):
     """Mark the muscle that an error names, or whose file it names, as wrong; an error that names none is raised."""
-    text = str(error)
-    for muscle in guess.muscles:
-        part = muscle.muscle
-        if not muscle.wrong and (repr(part.name) in text or part.file in text):
-            muscle.wrong, muscle.confidence = text, 0.0
-            return
-    raise error
+    text, usable = str(error), [muscle for muscle in guess.muscles if not muscle.wrong]
+    found = [muscle for muscle in usable if repr(muscle.muscle.name) in text]
+    # A file's name may be the end of another's.
+    found += sorted((m for m in usable if m.muscle.file in text), key=lambda m: -len(m.muscle.file))
+    if not found:
+        raise error
+    found[0].wrong, found[0].confidence = text, 0.0

@@ -71,15 +71,6 @@ class Part:
         """Diagonal of its box [scene unit]."""
         return float(np.linalg.norm(self.mesh.extents))
 
-    @property
-    def is_one_closed_surface(self) -> bool:
-        """Whether it can be a muscle."""
-        try:
-            prepare_mesh(self.mesh.vertices, self.mesh.faces, place=self.file, name=self.name)
-        except MeshError:
-            return False
-        return True
-
     @cached_property
     def points(self) -> np.ndarray:
         """Vertices (n, 3)."""
@@ -159,9 +150,20 @@ def read_parts(folder: Path, units: str | None, base: Path) -> Parts:
 def _sort_unknown(found, unknown):
     """Of names that are not known: the largest are bones until there are two, the others muscles if they can be."""
     for part in sorted(unknown, key=lambda part: -part.size):
-        is_bone = len(found.bones) < 2 or not part.is_one_closed_surface
+        is_bone = len(found.bones) < 2 or not _can_be_muscle(part)
         part.doubt = f"{'a bone' if is_bone else 'a muscle'} by its size, as its name is not known"
         (found.bones if is_bone else found.muscles).append(part)
+
+
+def _can_be_muscle(part):
+    """Whether a mesh is one closed surface."""
+    if not part.mesh.is_watertight:
+        return False
+    try:
+        prepare_mesh(part.mesh.vertices, part.mesh.faces, place=part.file, name=part.name)
+    except MeshError:
+        return False
+    return True
 
 
 def _find_meshes(folder):

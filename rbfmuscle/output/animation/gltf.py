@@ -48,7 +48,7 @@ def animated_glb(run: MovingRun, name: str = "animated-glb") -> bytes:
 
 
 def _add_part(file: _File, part: MovingPart) -> int:
-    """Number of a new node: a muscle has a morph target for each frame but the first, a bone turns."""
+    """Number of a new node: a muscle has a morph target for each frame but the first, a bone a pose for each."""
     base, faces = part.vertices[0], part.faces[0]
     normals, targets = vertex_normals(base, faces), []
     for vertices in part.vertices[1:]:
@@ -63,7 +63,7 @@ def _add_part(file: _File, part: MovingPart) -> int:
     if part.poses is not None:
         turns, shifts = _quaternions(part.poses[:, :3, :3]), part.poses[:, :3, 3]
         entry |= {"rotation": turns[0].tolist(), "translation": shifts[0].tolist()}
-        if part.turns:
+        if part.moves:
             file.animate(node, "rotation", file.add(turns, "VEC4"))
             file.animate(node, "translation", file.add(shifts, "VEC3"))
     return node

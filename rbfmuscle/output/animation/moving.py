@@ -43,7 +43,7 @@ class MovingPart:
         return all(faces is self.faces[0] for faces in self.faces)
 
     @property
-    def turns(self) -> bool:
+    def moves(self) -> bool:
         """Whether it is a bone that is ever anywhere else than in the first frame."""
         return self.poses is not None and bool(np.ptp(self.poses, axis=0).max() > 0.0)
 

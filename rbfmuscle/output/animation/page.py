@@ -94,7 +94,7 @@ class _Packer:
         entry: dict[str, Any] = {"name": part.name, "panel": panel, "pieces": pieces}
         entry |= {"colour": part.colour, "group": part.group}
         if part.poses is not None:
-            poses = part.poses[: None if part.turns else 1, :3].round(6)
+            poses = part.poses[: None if part.moves else 1, :3].round(6)
             entry["poses"] = poses.reshape(len(poses), 12).tolist()
         return entry
 

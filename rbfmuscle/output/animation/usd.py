@@ -62,7 +62,7 @@ def write_usd(path: Path, run: MovingRun) -> None:
 
 
 def _fill(mesh: Any, part: MovingPart, codes: list[float]) -> None:
-    """Set a muscle's points at every time, its topology too where it changes; of a bone one of each, and its pose."""
+    """A muscle gets its points at each time, and its faces where they change; a bone its points once and its poses."""
     from pxr import Gf, UsdGeom, Vt
 
     for k, (vertices, faces) in enumerate(zip(part.vertices, part.faces)):
@@ -77,7 +77,7 @@ def _fill(mesh: Any, part: MovingPart, codes: list[float]) -> None:
         mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
         place = mesh.AddTransformOp()
         for code, pose in zip(codes, part.poses):
-            place.Set(Gf.Matrix4d(pose.T), *((code,) if part.turns else ()))
+            place.Set(Gf.Matrix4d(pose.T), *((code,) if part.moves else ()))
 
 
 def _set_faces(mesh: Any, faces: Integers, at: tuple[float, ...]) -> None:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.child import Outbox, listen, send, start_child
+from rbfmuscle.child import Outbox, end_child, listen, send, start_child
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.validation import MeshError
 
@@ -42,7 +42,7 @@ def read_polydata(path: str | Path) -> PolyData:
                 raise EOFError
             found = pickle.load(child.stdout)
         except (OSError, EOFError, pickle.UnpicklingError):
-            child.kill()
+            end_child(child)
             _child.cache_clear()
             found = "VTK ends, or does not end, at it"
     if isinstance(found, str):
@@ -54,7 +54,7 @@ def read_polydata(path: str | Path) -> PolyData:
 def _child(process: int) -> subprocess.Popen[bytes]:
     """The process that reads for the process of this number: none is shared after a fork."""
     child = start_child(__name__, 1)
-    atexit.register(child.kill)
+    atexit.register(end_child, child)
     return child
 
 
