@@ -72,7 +72,7 @@ class _LoopCache(FunctionCache):
             if self._enabled and head == _digest(content).encode():  # whole
                 _note_use(path.parent)
                 return CompileResult._rebuild(target_context, *pickle.loads(content))
-        _say("compiling loops for this processor, once; a first run takes half a minute longer")
+        _say("compiling loops for this processor, once; a first run takes a minute or two longer")
         return None
 
     def _save_overload(self, sig, data):

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Grid = list[tuple[str, str, list[Any]]]
 
 # Of these keys the reference takes the greatest value of the grid, or the least; of all others the scene's own.
-FINER_UP = ("model.centres", "model.samples", "model.iterations", "model.resolution", "model.substeps")
+FINER_UP = ("model.centres", "model.samples", "model.nodes", "model.iterations", "model.resolution")
 FINER_DOWN = ("contact.substep_angle", "motion.step")
 
 
@@ -110,8 +110,8 @@ def plan_sweep(
         Frames of the motion, "A:B:S".
     reference : dict, optional
         Settings of the reference, over those that follow from the grid: the greatest number of centres, samples,
-        iterations and cells in it and the least angle and step. With a ``model``, one reference serves all models;
-        else each model of the grid has its own.
+        nodes, iterations and cells in it and the least angle and step. With a ``model``, one reference serves all
+        models; else each model of the grid has its own.
 
     Returns
     -------

@@ -12,6 +12,7 @@ from typing import Any
 from rbfmuscle.experiments.sweep import SweepPoint
 from rbfmuscle.experiments.sweep_run import VALUES, WORST, SweepFolder
 from rbfmuscle.metrics.quantities import QUANTITIES
+from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.writer import write_json
 
 # The default may be this much worse than the front, in error and in time at once.
@@ -112,10 +113,8 @@ def _ratio(mine: float, other: float) -> float:
 
 
 def _figures(row: dict[str, Any], quantity: str) -> str:
-    time = row["time_frame"]
-    spent = f"{time:.2g} s" if time >= 1.0 else f"{1e3 * time:.2g} ms"
-    unit = f" {row['units']}" if quantity in LENGTHS else ""
-    return f"{row[quantity]:.2g}{unit} at {spent} per frame"
+    unit = row["units"] if quantity in LENGTHS else ""
+    return f"{shown_number(row[quantity], unit)} at {shown_number(row['time_frame'], 's')} per frame"
 
 
 def write_table(

@@ -10,6 +10,7 @@ from rbfmuscle.experiments.sweep_table import LENGTHS
 from rbfmuscle.report.page import GOOD, NEAR, PLAIN, Cell, Light, Page, Section, Table, number_cell
 from rbfmuscle.report.plots import Point, front_plot
 
+ROUNDING = 1e-9  # errors below it are none
 SHOWN = ("error_rms", "error_max", "volume_error", "penetration_max", "bone_penetration_max", "time_frame")
 _READING = """error_rms is the distance between a point's surfaces and those of the reference at the same poses, both
 ways, root mean square over frames and muscles: how far a setting is from the reference, not how far the model is from a
@@ -54,7 +55,10 @@ def inside_grid(rows: Iterable[dict[str, Any]]) -> bool:
 
 
 def front_picture(rows: Iterable[dict[str, Any]], quantity: str) -> str:
-    """SVG of the error against time per frame: a colour for each scene and model, fronts joined and labelled."""
+    """SVG of the error against time per frame: a colour for each scene and model, fronts joined and labelled.
+
+    Points that are their own reference, but for rounding, are left out.
+    """
     points = [
         Point(
             1e3 * row["time_frame"],
@@ -65,7 +69,7 @@ def front_picture(rows: Iterable[dict[str, Any]], quantity: str) -> str:
             row["front"],
         )
         for row in rows
-        if row["role"] != "reference" and row["status"] == "done"
+        if row["role"] != "reference" and row["status"] == "done" and row[quantity] > ROUNDING
     ]
     return front_plot(points, ("time per frame [ms]", quantity.replace("_", " ")))
 

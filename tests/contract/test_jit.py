@@ -43,7 +43,7 @@ MAIN = """
 from loops import fields, inner, outer
 print(outer.outer(1.0), inner.difference(fields.Pair(a=3.0, b=2.0)))
 """
-SAID = "rbfmuscle: compiling loops for this processor, once; a first run takes half a minute longer\n"
+SAID = "rbfmuscle: compiling loops for this processor, once; a first run takes a minute or two longer\n"
 
 
 @pytest.fixture
