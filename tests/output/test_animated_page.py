@@ -88,4 +88,4 @@ def test_every_vertex_and_triangle_of_every_frame_is_unpacked(written, moving):
         )
         poses = np.reshape(part["poses"], (-1, 3, 4))
         np.testing.assert_allclose(poses, bone.poses[: len(poses), :3], atol=1e-6)
-        assert len(poses) == (4 if bone.turns else 1)
+        assert len(poses) == (4 if bone.moves else 1)
