@@ -3,14 +3,15 @@
 With y the nodes of a `Lattice` and F = Σ y_k ∇N_k the deformation gradient at its quadrature points q, the nodes
 minimise
 
-    E(y) = μ Σ_q w_q min over R, t of (|F_q - R D(t)|² + c (|F_q a| - t)²) - μ b V (1 - t̄)²,
-    D(t) = t aaᵀ + t^(-1/2) (I - aaᵀ),    1 / slack <= t <= 1,    t̄ = Σ_q w_q t_q / V,
+    E(y) = μ Σ_q w_q min over R, t of (|F_q - R D(t)|² + c (|F_q a| - t)² - 2 τ (1 - t)),
+    D(t) = t aaᵀ + t^(-1/2) (I - aaᵀ),    1 / slack <= t <= 1,    τ = min(TONE (1 - d / d₀), MOST_TONE) >= 0,
 
 subject to the volumes of the regions r of the lattice, V_r(y) = Σ_{q in r} w_q det F_q, and to the contacts. R is a
-rotation, a the fibre direction and V the volume. Between 1 / slack and 1 a fibre shortens without resistance while
-the section thickens, and bears a small tension, 2 μ b (1 - t̄), which keeps a slack muscle straight. It is the same in
-all of a muscle: one that grew with the fibre's own shortening would draw all shortening into one place;
-c = 3/2 (fibre_ratio - 1) stiffens fibres that are longer or shorter than that.
+rotation, a the fibre direction. Between 1 / slack and 1 a fibre shortens without resistance while the section
+thickens, and bears a small tension, 2 μ τ, which keeps a slack muscle straight. It grows as the muscle's ends
+approach, from their distance d₀ at rest to d, and depends on the bones alone: a tension that grew with the fibres'
+shortening would be a negative stiffness. c = 3/2 (fibre_ratio - 1) stiffens fibres that are longer or shorter than
+that.
 For small stretches beyond the slack band and more and more nodes this is the incompressible solid of shear modulus μ,
 Young's modulus 3 μ across and 3 μ · fibre_ratio along the fibres.
 
@@ -22,6 +23,7 @@ pressures are kept from iteration to iteration, so that the fixed point of the i
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -41,9 +43,9 @@ from rbfmuscle.simulation.contact import BoneContacts
 MEMORY = 5  # steps that Anderson acceleration combines
 HOLD = 25.0  # stiffness of the spring at a held point, relative to that of a cell
 GHOST = 1e-3  # stiffness of second differences, relative to a cell: for nodes that hold hardly any material
-# b: where all fibres have a slack of 1.6 they bear 0.375 μ; at full activation they bear 30 μ. With 1 the gluteus
-# maximus leaps straight at the start of external rotation.
-TONE = 0.5
+# Tension of slack fibres over 2 μ: for a muscle whose ends are at 0.82 of their distance at rest, and for shorter ones,
+# it is 0.03 of that at full activation.
+TONE, MOST_TONE = 2.5, 0.45
 # Bulk modulus and greatest pressure of a region, over 2 μ: a muscle that bones squeeze yields in volume. The surface
 # is drawn at the volume at rest in any case.
 BULK, MOST_PRESSURE = 50.0, 3.0
@@ -144,7 +146,9 @@ class EmbeddedSolid:
         self.y, self.pressure = self.rest.copy(), np.zeros(len(self.rest_volumes))
         self.right, self.squeezed = np.empty_like(self.y), 0.0
         self.shown, self.forces = self.y, np.zeros((len(points), 1))
-        self.anchor, self.history, self.still = points[held], [0.0], False
+        self._ends, self._end_distance = self._farthest_ends()
+        self._take_anchor(points[held])
+        self.history, self.still = [0.0], False
         self.trend: tuple[Floats, Floats, Floats] | None = None
         self.begun: tuple[Floats, Floats, Floats] | None = None
         self._followed: tuple[Floats, Integers, Floats] | None = None
@@ -211,6 +215,24 @@ class EmbeddedSolid:
             self.matrix = self.without_fibres + (along * (stiff * self.weights)[:, None]).T @ along
         self._invert()
 
+    def _farthest_ends(self) -> tuple[tuple[Integers, Integers] | None, float]:
+        """Held points of the two bones that hold the muscle farthest apart, and their distance at rest."""
+        held, own = self.points[self.held], self.owner[self.held]
+        ends, most = None, 0.0
+        for first, second in combinations([np.flatnonzero(own == bone) for bone in self.bones], 2):
+            away = float(np.linalg.norm(held[first].mean(axis=0) - held[second].mean(axis=0)))
+            if away > most:
+                ends, most = (first, second), away
+        return ends, most
+
+    def _take_anchor(self, anchor: Floats) -> None:
+        """Take positions (h, 3) of the held points, and the tension of slack fibres that goes with them."""
+        self.anchor, self.tension = anchor, 0.0
+        if self._ends is not None:
+            first, second = (anchor[end].mean(axis=0) for end in self._ends)
+            approach = 1.0 - float(np.linalg.norm(first - second)) / self._end_distance
+            self.tension = min(max(0.0, TONE * approach), MOST_TONE)
+
     def mobility(self) -> Floats:
         """Motion (n,) of each contact point for a unit force at it."""
         out = np.empty(len(self.points))
@@ -270,7 +292,8 @@ class EmbeddedSolid:
             anchor[here] = self.points[self.held[here]] @ pose[:3, :3].T + pose[:3, 3]
         step = (anchor - self.anchor).ravel()
         self.still = bool(np.abs(step).max() <= SETTLED_STILL * self.scale)
-        self.anchor, self.begun = anchor, (step, self.y, self.pressure.copy())
+        self._take_anchor(anchor)
+        self.begun = step, self.y, self.pressure.copy()
         if self.trend is not None:
             last, correction, pressed = self.trend
             share = float(step @ last) / max(float(last @ last), 1e-30)
@@ -308,9 +331,10 @@ class EmbeddedSolid:
 
     def restore(self, state: SolidState) -> None:
         """Return to an earlier ``snapshot``."""
-        self.y, self.shown, self.quaternion, self.stretch, self.pressure, self.forces, self.anchor = (
-            part.copy() for part in state[:7]
+        self.y, self.shown, self.quaternion, self.stretch, self.pressure, self.forces = (
+            part.copy() for part in state[:6]
         )
+        self._take_anchor(state.anchor.copy())
         self.trend, self.begun = state.trend, None
 
     # --- equilibrium ------------------------------------------------------------------------------------------
@@ -384,12 +408,8 @@ class EmbeddedSolid:
         along = np.linalg.norm(np.einsum("qab,qb->qa", self.f, given.direction), axis=1)
         beyond = along - np.clip(along, given.lower, given.upper)
         springs = given.passive * beyond**2 + given.active * (along - given.content) ** 2
-        tone = TONE * float(self.weights.sum()) * self._shortened() ** 2
-        return 0.5 * (float(self.weights @ ((gap**2).sum(axis=(1, 2)) + springs)) - tone) + self.squeezed
-
-    def _shortened(self) -> float:
-        """Mean shortening of the fibres against rest, 1 - t̄."""
-        return 1.0 - float(self.weights @ self.stretch) / float(self.weights.sum())
+        tone = 2.0 * self.tension * (1.0 - self.stretch)
+        return 0.5 * float(self.weights @ ((gap**2).sum(axis=(1, 2)) + springs - tone)) + self.squeezed
 
     def localise(self) -> bool:
         """Find deformation gradients, targets, volumes and forces for the present nodes.
@@ -400,9 +420,9 @@ class EmbeddedSolid:
             Whether points are squeezed that the matrix does not know of yet.
         """
         cells = self.quad_columns, self.slopes, self.weights, self.region, self.slot
-        state, tension = (self.quaternion, self.stretch), TONE * self._shortened()
+        state = self.quaternion, self.stretch
         joined, self.squeezed = local_loop(
-            self.y, cells, self.fibres, tension, self.stiffened, state, self.f, self.target, self.right,
+            self.y, cells, self.fibres, self.tension, self.stiffened, state, self.f, self.target, self.right,
             self.gradient, self.volumes,
         )  # fmt: skip
         return bool(joined)

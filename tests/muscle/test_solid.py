@@ -46,9 +46,11 @@ def with_fibres(solid, along, ratio=1.0, slack=1.0):
     return solid
 
 
-def settle(solid, motion):
+def settle(solid, motion, tension=True):
     """The second bone moves by a 4x4 transform."""
     solid.move(np.array([np.eye(4), motion]), {0: np.eye(4), 1: motion})
+    if not tension:
+        solid.tension = 0.0
     solid.settle(BoneContacts([], [], contact_bone=solid.owner))
 
 
@@ -185,10 +187,10 @@ def test_extensor_lies_near_finite_elements_of_the_same_passive_law(file, asked,
 
 
 def moved(x, along, ratio=1.0, slack=1.0, steps=3):
-    """A bar with fibres, one end moved by x in steps."""
+    """A bar with fibres that bear no tension while they are slack, one end moved by x in steps."""
     solid = with_fibres(bar(), along, ratio, slack)
     for part in range(steps):
-        settle(solid, shift(x * (part + 1) / steps))
+        settle(solid, shift(x * (part + 1) / steps), tension=False)
     return solid
 
 
@@ -219,6 +221,16 @@ def test_slack_band_ends_where_it_should():
     # Pulled, slack fibres are those of the plain solid.
     tight, slack = (moved(3.0, ALONG, slack=slack, steps=1).y for slack in (1.0, 1.6))
     assert np.abs(tight - slack).max() < 0.1  # mm; near the held ends some fibres shorten
+
+
+def test_tension_of_slack_fibres_follows_the_ends():
+    solid = with_fibres(bar(), ALONG, slack=1.6)
+    found = []
+    for x in (0.0, 2.0, -4.0, -6.0, -12.0):
+        settle(solid, shift(x))
+        found.append(solid.tension)
+    # 2.5 times the approach of ends that are 40 apart, and no more than 0.45.
+    assert found == pytest.approx([0.0, 0.0, 0.25, 0.375, 0.45], abs=1e-12)
 
 
 @pytest.mark.parametrize("name", ["extensor", "adductor_posterior"])
