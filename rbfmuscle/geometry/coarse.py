@@ -1,15 +1,31 @@
-"""Meshes with fewer triangles, for looks and for guesses: they may have holes and touch themselves."""
+"""Meshes with fewer triangles, for looks and for guesses."""
 
+import igl
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 
 
-def clustered(vertices: Floats, faces: Integers, count: int) -> tuple[Floats, Integers]:
-    """A mesh of about as many triangles as wanted; one that has no more as it is.
+def simplified(vertices: Floats, faces: Integers, count: int) -> tuple[Floats, Integers]:
+    """A closed mesh of about as many triangles as wanted, near the given one; one that has no more as it is.
 
-    The vertices of each cell of a grid become their mean (Rossignac and Borrel 1993, "Multi-resolution 3D
-    approximations for rendering complex scenes").
+    Edges collapse in the order of their quadric error (Garland and Heckbert 1997, "Surface simplification using
+    quadric error metrics"). A mesh that is not manifold is `clustered`.
+    """
+    vertices, faces = np.array(vertices, dtype=float), np.array(faces, dtype=np.int64)
+    if len(faces) <= count:
+        return vertices, faces
+    if not igl.is_edge_manifold(faces)[0]:
+        return clustered(vertices, faces, count)
+    vertices, faces, _, _ = igl.qslim(vertices, faces, count)
+    return np.ascontiguousarray(vertices), np.ascontiguousarray(faces)
+
+
+def clustered(vertices: Floats, faces: Integers, count: int) -> tuple[Floats, Integers]:
+    """A mesh of about as many triangles as wanted, with holes and doubled edges; one that has no more as it is.
+
+    Takes any mesh of any size. The vertices of each cell of a grid become their mean (Rossignac and Borrel 1993,
+    "Multi-resolution 3D approximations for rendering complex scenes").
     """
     vertices, faces = np.asarray(vertices, dtype=float), np.asarray(faces)
     if len(faces) <= count:

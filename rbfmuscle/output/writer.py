@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.coarse import clustered
+from rbfmuscle.geometry.coarse import simplified
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.output.tubes import tendon_mesh, tendon_name
@@ -183,7 +183,7 @@ class RunWriter:
                 write_vtp(self.directory / self._bones[name][1], mesh.vertices, mesh.faces)
             if not np.array_equal(self._bones[name][0], pose):
                 if name not in self._light:
-                    self._light[name] = clustered(mesh.vertices, mesh.faces, LIGHT)
+                    self._light[name] = simplified(mesh.vertices, mesh.faces, LIGHT)
                 vertices, faces = self._light[name]
                 moved = vertices @ pose[:3, :3].T + pose[:3, 3]
                 self._bones[name] = pose.copy(), f"bones/{name}_{frame.index:04d}.vtp"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.geometry.coarse import clustered
+from rbfmuscle.geometry.coarse import simplified
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.output.export import MESHES, export_run, write_mesh
 from rbfmuscle.output.saved import SavedRun
@@ -87,14 +87,15 @@ class TestSaved:
 
     def test_a_bone_that_moves_is_light_in_the_series(self, tmp_path):
         ball = trimesh.creation.icosphere(subdivisions=6, radius=20.0)
-        vertices, faces = clustered(ball.vertices, ball.faces, 1600)
-        assert len(faces) < 2500  # a grid of cells gives about as many as asked for
-        away = np.linalg.norm(vertices, axis=1) - 20.0
-        assert away.min() > -1.0 and away.max() < 1e-9  # the mean of a cell of 3 mm lies inside the sphere
+        vertices, faces = simplified(ball.vertices, ball.faces, 1600)
         light = trimesh.Trimesh(vertices, faces, process=False)
-        assert light.volume == pytest.approx(ball.volume, rel=0.1)
+        assert len(faces) == 1600 and light.is_watertight
+        assert np.abs(np.linalg.norm(vertices, axis=1) - 20.0).max() < 0.1
+        assert light.volume == pytest.approx(ball.volume, rel=0.01)
         box = trimesh.creation.box((1, 2, 3))
-        np.testing.assert_array_equal(clustered(box.vertices, box.faces, 1600)[0], box.vertices)
+        np.testing.assert_array_equal(simplified(box.vertices, box.faces, 1600)[0], box.vertices)
+        doubled = np.vstack([ball.faces, ball.faces[:5, ::-1]])  # edges of four faces
+        assert 1000 < len(simplified(ball.vertices, doubled, 1600)[1]) < 2500
 
     def test_no_run_is_said(self, tmp_path):
         with pytest.raises(UsageError, match="holds no run"):
