@@ -83,6 +83,20 @@ TENDONS = {
         "to": [-653.0, -417.0, 880.0],
         "via": [{"bone": "pelvis", "point": [-619.0, -394.0, 869.0]}],
     },
+    # The iliotibial tract, over the vastus lateralis to Gerdy's tubercle.
+    "tensor_fasciae_latae femur": {
+        "bone": "tibia",
+        "to": [-648.2, -438.1, 460.7],
+        "via": [
+            {"bone": "femur", "point": point}
+            for point in (
+                [-704.0, -452.0, 760.0],
+                [-693.0, -445.0, 680.0],
+                [-678.0, -441.0, 600.0],
+                [-664.0, -433.0, 530.0],
+            )
+        ],
+    },
     "popliteus femur": {"to": [-651.0, -415.0, 495.0]},
 }
 
