@@ -4,15 +4,14 @@ With y the nodes of a `Lattice` and F = Σ y_k ∇N_k the deformation gradient a
 minimise
 
     E(y) = μ Σ_q w_q min over R, t of (|F_q - R D(t)|² + c (|F_q a| - t)² - 2 τ (1 - t)),
-    D(t) = t aaᵀ + t^(-1/2) (I - aaᵀ),    1 / slack <= t <= 1,    τ = max(0, 1 - d / d₀),
+    D(t) = t aaᵀ + t^(-1/2) (I - aaᵀ),    1 / slack <= t <= 1,    τ = min(TONE (1 - d / d₀), MOST_TONE) >= 0,
 
 subject to the volumes of the regions r of the lattice, V_r(y) = Σ_{q in r} w_q det F_q, and to the contacts. R is a
 rotation, a the fibre direction. Between 1 / slack and 1 a fibre shortens without resistance while the section
 thickens, and bears a small tension, 2 μ τ, which keeps a slack muscle straight. It grows as the muscle's ends
 approach, from their distance d₀ at rest to d, and depends on the bones alone: a tension that grew with the fibres'
-shortening would be a negative stiffness, and one 1.5 times as great pushes sliding neighbours through each other. At
-the end of the slack band it is 0.025 of that at full activation. c = 3/2 (fibre_ratio - 1) stiffens fibres that are
-longer or shorter than the band.
+shortening would be a negative stiffness. c = 3/2 (fibre_ratio - 1) stiffens fibres that are longer or shorter than the
+band.
 For small stretches beyond the slack band and more and more nodes this is the incompressible solid of shear modulus μ,
 Young's modulus 3 μ across and 3 μ · fibre_ratio along the fibres.
 
@@ -42,6 +41,9 @@ from rbfmuscle.muscle.solid_step import Anderson, global_loop, local_loop, press
 from rbfmuscle.simulation.contact import BoneContacts
 
 MEMORY = 5  # steps that Anderson acceleration combines
+# Tension of slack fibres over 2 μ: for a muscle whose ends are at 0.82 of their distance at rest, and for shorter ones,
+# it is 0.03 of that at full activation.
+TONE, MOST_TONE = 2.5, 0.45
 HOLD = 25.0  # stiffness of the spring at a held point, relative to that of a cell
 GHOST = 1e-3  # stiffness of second differences, relative to a cell: for nodes that hold hardly any material
 # Bulk modulus and greatest pressure of a region, over 2 μ: a muscle that bones squeeze yields in volume. The surface
@@ -229,7 +231,7 @@ class EmbeddedSolid:
         if self._ends is not None:
             first, second = (anchor[end].mean(axis=0) for end in self._ends)
             approach = 1.0 - float(np.linalg.norm(first - second)) / self._end_distance
-            self.tension = max(0.0, approach)
+            self.tension = min(max(0.0, TONE * approach), MOST_TONE)
 
     def mobility(self) -> Floats:
         """Motion (n,) of each contact point for a unit force at it."""

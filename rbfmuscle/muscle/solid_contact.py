@@ -73,6 +73,8 @@ class NearPoints(NamedTuple):
         Distance within which points were chosen [scene unit].
     most : (m,) ndarray
         Greatest force on each, over 2 μ.
+    softness : (sources,) ndarray
+        Of each obstacle, relative to that of a bone.
     """
 
     which: Integers
@@ -84,6 +86,7 @@ class NearPoints(NamedTuple):
     y: Floats
     reach: float
     most: Floats
+    softness: Floats
 
     def carry(self, y: Floats) -> Floats:
         """Positions (m, 3) for nodes (N, 3)."""
@@ -134,6 +137,9 @@ class SolidContact:
         sources = max(1, len(contacts.names) + len(contacts.neighbours))
         if solid.forces.shape[1] != sources:
             solid.forces = np.zeros((len(solid.points), sources))
+        softness = np.ones(sources)
+        for k, planes in enumerate(contacts.neighbours):
+            softness[-1 - k] = planes.softness
         index = np.arange(len(solid.points))
         if not contacts.neighbours:
             here = np.empty_like(solid.points)
@@ -142,7 +148,7 @@ class SolidContact:
             contacts = contacts.only(index)
         return NearPoints(
             index, solid.columns[index], solid.shares[index], solid.forces[index], self._rounded(contacts),
-            contacts, solid.y.copy(), self.reach, self.most[index],
+            contacts, solid.y.copy(), self.reach, self.most[index], softness,
         )  # fmt: skip
 
     def _rounded(self, contacts: BoneContacts) -> BoneContacts:
@@ -206,11 +212,11 @@ class SolidContact:
         yielding: float,
         most: Floats,
     ) -> tuple[Floats, Floats]:
-        solid = self.solid
+        solid, source = self.solid, spaces.source % forces.shape[1]
         push, taken = np.empty_like(solid.y), np.empty(len(solid.pressure))
         contact_loop(
-            spaces.index, spaces.gap, spaces.normal, spaces.source % forces.shape[1], motion, solid.inverse,
-            near.columns, near.shares, solid.response, forces,
-            (BATCH, ROUNDS, SWEEPS, self.tolerance), (yielding, most), push, taken,
+            spaces.index, spaces.gap, spaces.normal, source, motion, solid.inverse, near.columns, near.shares,
+            solid.response, forces, (BATCH, ROUNDS, SWEEPS, self.tolerance),
+            (yielding * near.softness[source], most[spaces.index]), push, taken,
         )  # fmt: skip
         return push, taken

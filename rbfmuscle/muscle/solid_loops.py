@@ -255,7 +255,7 @@ def _pairs_loop(index, normal, rows, answers, columns, shares, yielding):
             gram[d, c] = value
     least = 1e-7 * np.abs(np.diag(gram)).max()
     for c in range(size):
-        gram[c, c] += least + yielding
+        gram[c, c] += least + yielding[c]
     return gram
 
 
@@ -388,9 +388,9 @@ def contact_loop(
         _rows_loop(index[chosen], normal[chosen], response, columns, shares, rows)
         answers = np.empty((len(chosen), len(push)))
         _answers_loop(index[chosen], columns, shares, inverse, answers)
-        gram = _pairs_loop(index[chosen], normal[chosen], rows, answers, columns, shares, yielding)
+        gram = _pairs_loop(index[chosen], normal[chosen], rows, answers, columns, shares, yielding[chosen])
         strength = force[chosen]
-        solve_contact_forces(gram, need[chosen], strength, sweeps, 0.1 * tolerance, most[index[chosen]])
+        solve_contact_forces(gram, need[chosen], strength, sweeps, 0.1 * tolerance, most[chosen])
         for k in range(len(chosen)):
             force[chosen[k]] = strength[k]
         _push_loop(normal[chosen], strength, rows, answers, response, push, taken)

@@ -58,9 +58,12 @@ class Planes:
     ----------
     index, gap, normal
         As in :class:`HalfSpaces`, at the points ``anchor`` (c, 3).
+    softness : float
+        How far they yield to a force, relative to a bone; for models that solve for forces.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, softness: float = 1.0) -> None:
+        self.softness = softness
         self.set(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
 
     def set(self, index: Integers, gap: Floats, normal: Floats, anchor: Floats) -> None:

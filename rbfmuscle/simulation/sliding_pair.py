@@ -25,6 +25,8 @@ BETWEEN = 0.5
 SEARCH = 3.0
 # Distance [mm] between the surfaces as solved below which they are cut, and how deep an overlap may be.
 CUT_FROM, CUT_DEPTH = 3.0, 6.0
+# How far what holds muscles together yields to a force, relative to what keeps them apart.
+FASCIA = 100.0
 # How far a plane pushes out of a neighbour at most in one sub-step [mm].
 MOST = 0.5
 
@@ -53,7 +55,7 @@ class SlidingPair:
         limits: SlidingLimits,
     ) -> None:
         self.own, self.other, self.limits = own, other, limits
-        self.push, self.pull = Planes(), Planes()
+        self.push, self.pull = Planes(), Planes(FASCIA)
         self.free = stepper.contacts.free(len(stepper.model.contact_points()))
         #: Which points are linked, and how far each may be from the neighbour.
         self.linked = self.free.copy()
@@ -193,7 +195,7 @@ class BoneLink:
         points = stepper.model.contact_points()
         distance, _ = stepper.contacts.distance_and_direction(points, bone_index)
         self.linked = stepper.contacts.free(len(points)) & (distance < limits.threshold)
-        self.pull = Planes()
+        self.pull = Planes(FASCIA)
 
     def update(self) -> None:
         """Planes from the predicted state."""
