@@ -86,11 +86,17 @@ def evaluate(points: Floats, terms: Terms, kernel: Kernel, with_gradient: bool) 
 @compiled(error_model="numpy")
 def _evaluate_cubic_loop(points, terms, start, stop, value, gradient):
     """Value and, where there is room for it, gradient of the cubic kernel with epsilon 1 at points[start:stop]."""
+    wanted, centres, a, b = len(gradient) > 0, terms.centres, terms.a, terms.b
     for low in range(start, stop, _BLOCK):
         n = min(_BLOCK, stop - low)
         p, acc, g = _fill_block(points, terms, low, n)
-        _cubic_block_loop(terms, len(gradient) > 0, p, acc, g)
-        _polynomial_loop(terms, len(gradient) > 0, p, acc, g)
+        for j in range(centres.shape[1]):
+            at, slope = (centres[0, j], centres[1, j], centres[2, j]), (b[0, j], b[1, j], b[2, j])
+            if wanted:
+                _cubic_gradient_loop(p, at, a[j], slope, acc, g)
+            else:
+                _cubic_value_loop(p, at, a[j], slope, acc)
+        _polynomial_loop(terms, wanted, p, acc, g)
         _give_block_loop(terms.scale, low, n, acc, g, value, gradient)
 
 
@@ -125,20 +131,6 @@ def _give_block_loop(scale, low, n, acc, g, value, gradient):
         for i in range(n):
             for c in range(3):
                 gradient[low + i, c] = g[c, i] / scale
-
-
-@compiled(error_model="numpy")
-def _cubic_block_loop(terms, gradient, p, acc, g):
-    """Values, and gradients, of the cubic kernel with epsilon 1."""
-    centres, a, b = terms.centres, terms.a, terms.b
-    for j in range(centres.shape[1]):
-        at, slope = (centres[0, j], centres[1, j], centres[2, j]), (b[0, j], b[1, j], b[2, j])
-        if gradient and terms.hermite:
-            _cubic_hermite_gradient_loop(p, at, a[j], slope, acc, g)
-        elif gradient:
-            _cubic_gradient_loop(p, at, a[j], acc, g)
-        else:
-            _cubic_value_loop(p, at, a[j], slope, acc)
 
 
 @compiled(error_model="numpy")
@@ -211,19 +203,6 @@ def _polynomial_loop(terms, gradient, p, acc, g):
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
-def _cubic_gradient_loop(p, at, a, acc, g):
-    """acc += a r^3, g += 3 a r d."""
-    for i in range(acc.size):
-        dx, dy, dz = p[0, i] - at[0], p[1, i] - at[1], p[2, i] - at[2]
-        u = dx * dx + dy * dy + dz * dz
-        w = a * np.sqrt(u)
-        acc[i] += w * u
-        g[0, i] += 3.0 * w * dx
-        g[1, i] += 3.0 * w * dy
-        g[2, i] += 3.0 * w * dz
-
-
-@compiled(error_model="numpy", fastmath={"contract"})
 def _cubic_value_loop(p, at, a, b, acc):
     """acc += a r^3 - 3 r (B . d)."""
     bx, by, bz = b
@@ -234,7 +213,7 @@ def _cubic_value_loop(p, at, a, b, acc):
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
-def _cubic_hermite_gradient_loop(p, at, a, b, acc, g):
+def _cubic_gradient_loop(p, at, a, b, acc, g):
     """Adds 3 a r d - 3 r B - 3/r (B . d) d to g, the value to acc."""
     bx, by, bz = b
     for i in range(acc.size):

@@ -8,8 +8,8 @@ and Hermite fits need are ``2**k d^k phi / du^k``::
     k = 2   second  (phi'' - phi'/r) / r**2
 
 All of them, for all kernels, have the form ``s**j * (base(s) * A(s) + B(s))`` with polynomials A and B of
-degree four at most. A row lists j, A and B for k = 0, 1, 2; the loops in ``radial.py`` know the bases and
-no kernel.
+degree four at most. A row lists j, A and B of phi, the others follow; the loops in ``radial.py`` know the bases
+and no kernel.
 
 Sources: Fasshauer, *Meshfree Approximation Methods with MATLAB* (2007); Wendland (1995); Buhmann (2000);
 SciPy's ``RBFInterpolator`` for names and signs. ``skala_cervenka`` is second-hand: the formula r^2 (r^a - 1)
@@ -20,6 +20,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -116,131 +118,81 @@ class Kernel:
         return limit if power == 0 or limit == 0 else math.copysign(math.inf, limit)
 
 
-def _row(
-    power: float, inner: tuple[float, ...] = (), outer: tuple[float, ...] = (), extra: int = 0
-) -> Floats:
-    """One radial function: s**power (base * inner(s) + outer(s)); extra is the base's own exponent."""
-    row = np.zeros(2 + 2 * _TERMS)
-    row[0], row[1] = power, extra
-    row[2 : 2 + len(inner)] = inner
-    row[2 + _TERMS : 2 + _TERMS + len(outer)] = outer
-    return row
-
-
-def _power_rows(k: int, sign: float) -> list[Floats]:
-    """Odd polyharmonic sign * s**k."""
-    factors = np.cumprod([sign, k, k - 2])
-    return [_row(k - 2 * i, outer=(factors[i],)) for i in range(3)]
-
-
-def _binomial_rows(beta: float) -> list[Floats]:
-    """sign * (1 + s**2)**beta; the sign makes it conditionally positive definite."""
-    sign = (-1.0) ** max(math.ceil(beta), 0)
-    factors = np.cumprod([sign, 2 * beta, 2 * (beta - 1)])
-    return [_row(0, (factors[i],), extra=i) for i in range(3)]
-
-
-def _skala_rows(a: float) -> list[Floats]:
-    """s**2 (s**a - 1)."""
-    factors = np.cumprod([1.0, 2 + a, a])
-    outer = (-1.0, -2.0, 0.0)
-    return [_row(2 - 2 * i, (factors[i],), (outer[i],)) for i in range(3)]
-
-
 _E, _U, _T, _L = radial.EXP, radial.GAUSS, radial.CUT, radial.LOG
 _1, _Q, _P = radial.ONE, radial.BINOMIAL, radial.POWER
 
-# name, order m, C^k at 0, compact, has epsilon, own parameter, base, rows for k = 0, 1, 2
+
+class _Phi(NamedTuple):
+    """s**power (base * inner + outer), coefficients from the constant up; extra is the base's own exponent."""
+
+    power: int
+    inner: tuple[float | Fraction, ...] = ()
+    outer: tuple[float | Fraction, ...] = ()
+    extra: int = 0
+
+
+# name, order m, C^k at 0, compact, has epsilon, own parameter, base, phi
 _ROWS = [
-    ("linear", 1, 0, False, False, 0.0, _1, _power_rows(1, -1.0)),
-    ("cubic", 2, 2, False, False, 0.0, _1, _power_rows(3, 1.0)),
-    ("quintic", 3, 4, False, False, 0.0, _1, _power_rows(5, -1.0)),
-    ("septic", 4, 6, False, False, 0.0, _1, _power_rows(7, 1.0)),
-    (
-        "thin_plate_spline", 2, 1, False, False, 0.0, _L,
-        [_row(2, (1,)), _row(0, (2,), (1,)), _row(-2, (), (2,))],
-    ),
-    (
-        "polyharmonic_4", 3, 3, False, False, 0.0, _L,
-        [_row(4, (-1,)), _row(2, (-4,), (-1,)), _row(0, (-8,), (-6,))],
-    ),
-    ("gaussian", 0, 99, False, True, 0.0, _U, [_row(0, (1,)), _row(0, (-2,)), _row(0, (4,))]),
-    ("multiquadric", 1, 99, False, True, 0.5, _Q, _binomial_rows),
-    ("inverse_multiquadric", 0, 99, False, True, -0.5, _Q, _binomial_rows),
-    ("inverse_quadratic", 0, 99, False, True, -1.0, _Q, _binomial_rows),
-    ("generalised_multiquadric", 2, 99, False, True, 1.5, _Q, _binomial_rows),
-    (
-        "matern_12", 0, 0, False, True, 0.0, _E,
-        [_row(0, (1,)), _row(-1, (-1,)), _row(-3, (1, 1))],
-    ),
-    (
-        "matern_32", 0, 2, False, True, 0.0, _E,
-        [_row(0, (1, 1)), _row(0, (-1,)), _row(-1, (1,))],
-    ),
-    (
-        "matern_52", 0, 4, False, True, 0.0, _E,
-        [_row(0, (1, 1, 1 / 3)), _row(0, (-1 / 3, -1 / 3)), _row(0, (1 / 3,))],
-    ),
-    (
-        "matern_72", 0, 6, False, True, 0.0, _E,
-        [
-            _row(0, (1, 1, 2 / 5, 1 / 15)), _row(0, (-1 / 5, -1 / 5, -1 / 15)),
-            _row(0, (1 / 15, 1 / 15)),
-        ],
-    ),
-    (
-        "wendland_c0", 0, 0, True, True, 0.0, _T,
-        [_row(0, (1,), extra=2), _row(-1, (-2,), extra=1), _row(-3, (), (2,))],
-    ),
-    (
-        "wendland_c2", 0, 2, True, True, 0.0, _T,
-        [
-            _row(0, (1, 4), extra=4), _row(0, (-20,), extra=3),
-            _row(-1, (60,), extra=2),
-        ],
-    ),
-    (
-        "wendland_c4", 0, 4, True, True, 0.0, _T,
-        [
-            _row(0, (1, 6, 35 / 3), extra=6), _row(0, (-56 / 3, -280 / 3), extra=5),
-            _row(0, (560,), extra=4),
-        ],
-    ),
-    (
-        "wendland_c6", 0, 6, True, True, 0.0, _T,
-        [
-            _row(0, (1, 8, 25, 32), extra=8), _row(0, (-22, -154, -352), extra=7),
-            _row(0, (528, 3168), extra=6),
-        ],
-    ),
-    (
-        "wendland_51", 0, 2, True, True, 0.0, _T,
-        [
-            _row(0, (1, 5), extra=5), _row(0, (-30,), extra=4),
-            _row(-1, (120,), extra=3),
-        ],
-    ),
-    (
-        "buhmann", 0, 2, True, True, 0.0, _L,
-        [
-            _row(0, (0, 0, 0, 0, 12), (1, 0, -12, 32, -21)), _row(0, (0, 0, 48), (-24, 96, -72)),
-            _row(-1, (0, 96), (96, -96)),
-        ],
-    ),
-    ("skala_cervenka", 2, 3, False, False, 1.8, _P, _skala_rows),
-]  # fmt: skip
+    ("linear", 1, 0, False, False, 0.0, _1, _Phi(1, (), (-1,))),
+    ("cubic", 2, 2, False, False, 0.0, _1, _Phi(3, (), (1,))),
+    ("quintic", 3, 4, False, False, 0.0, _1, _Phi(5, (), (-1,))),
+    ("septic", 4, 6, False, False, 0.0, _1, _Phi(7, (), (1,))),
+    ("thin_plate_spline", 2, 1, False, False, 0.0, _L, _Phi(2, (1,))),
+    ("polyharmonic_4", 3, 3, False, False, 0.0, _L, _Phi(4, (-1,))),
+    ("gaussian", 0, 99, False, True, 0.0, _U, _Phi(0, (1,))),
+    # signs as conditional definiteness wants them
+    ("multiquadric", 1, 99, False, True, 0.5, _Q, _Phi(0, (-1,))),
+    ("inverse_multiquadric", 0, 99, False, True, -0.5, _Q, _Phi(0, (1,))),
+    ("inverse_quadratic", 0, 99, False, True, -1.0, _Q, _Phi(0, (1,))),
+    ("generalised_multiquadric", 2, 99, False, True, 1.5, _Q, _Phi(0, (1,))),
+    ("matern_12", 0, 0, False, True, 0.0, _E, _Phi(0, (1,))),
+    ("matern_32", 0, 2, False, True, 0.0, _E, _Phi(0, (1, 1))),
+    ("matern_52", 0, 4, False, True, 0.0, _E, _Phi(0, (1, 1, Fraction(1, 3)))),
+    ("matern_72", 0, 6, False, True, 0.0, _E, _Phi(0, (1, 1, Fraction(2, 5), Fraction(1, 15)))),
+    ("wendland_c0", 0, 0, True, True, 0.0, _T, _Phi(0, (1,), (), 2)),
+    ("wendland_c2", 0, 2, True, True, 0.0, _T, _Phi(0, (1, 4), (), 4)),
+    ("wendland_c4", 0, 4, True, True, 0.0, _T, _Phi(0, (1, 6, Fraction(35, 3)), (), 6)),
+    ("wendland_c6", 0, 6, True, True, 0.0, _T, _Phi(0, (1, 8, 25, 32), (), 8)),
+    ("wendland_51", 0, 2, True, True, 0.0, _T, _Phi(0, (1, 5), (), 5)),
+    ("buhmann", 0, 2, True, True, 0.0, _L, _Phi(0, (0, 0, 0, 0, 12), (1, 0, -12, 32, -21))),
+    ("skala_cervenka", 2, 3, False, False, 1.8, _P, _Phi(2, (1,), (-1,))),
+]
 
 
-def _build() -> dict[str, Kernel]:
-    kernels = {}
-    for name, order, smooth, compact, has_epsilon, parameter, base, rows in _ROWS:
-        table = np.array(rows(parameter) if callable(rows) else rows)
-        table.setflags(write=False)
-        kernels[name] = Kernel(name, order, compact, smooth, has_epsilon, parameter, base, table)
-    return kernels
+def _radial_rows(base: int, parameter: float, phi: _Phi) -> Floats:
+    """Rows (3, 2 + 2 * `_TERMS`) for k = 0, 1, 2: j, the base's own exponent, A, B; each is (1/s) d/ds of the last.
+
+    In fractions, so that what cancels is zero.
+    """
+    rows, exponent, size = np.zeros((3, 2 + 2 * _TERMS)), Fraction(parameter), _TERMS + 2
+    power, inner, outer, extra = phi
+    a, b = (np.array([Fraction(c) for c in (*part, *[0] * size)][:size]) for part in (inner, outer))
+    for row in rows:
+        lowest = int(np.flatnonzero((a != 0) | (b != 0))[0])
+        power, a, b = power + lowest, np.roll(a, -lowest), np.roll(b, -lowest)
+        row[:2], row[2 : 2 + _TERMS], row[2 + _TERMS :] = (power, extra), a[:_TERMS], b[:_TERMS]
+        slope, b = (power + np.arange(size)) * a, (power + np.arange(size)) * b
+        if base == radial.EXP:
+            slope = slope - np.roll(a, 1)
+        elif base == radial.GAUSS:
+            slope = slope - 2 * np.roll(a, 2)
+        elif base == radial.CUT:
+            slope, extra = slope - np.roll(slope + extra * a, 1), extra - 1
+        elif base == radial.BINOMIAL:
+            slope, extra = slope + np.roll(slope + 2 * (exponent - extra) * a, 2), extra + 1
+        elif base == radial.POWER:
+            slope = slope + exponent * a
+        elif base == radial.LOG:
+            b = b + a
+        power, a = power - 2, slope
+    rows.setflags(write=False)
+    return rows
 
 
-KERNELS = _build()
+KERNELS = {
+    name: Kernel(name, order, compact, smooth, has_epsilon, own, base, _radial_rows(base, own, phi))
+    for name, order, smooth, compact, has_epsilon, own, base, phi in _ROWS
+}
 
 
 def get_kernel(name: Kernel | str) -> Kernel:
