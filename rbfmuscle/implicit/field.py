@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.evaluation import Terms, evaluate
-from rbfmuscle.implicit.fit.assembly import Basis, check_count, frame, hermite_system, hermite_weights
-from rbfmuscle.implicit.fit.fitting import solve, solve_bounded
+from rbfmuscle.implicit.fit.assembly import Basis, centre_weights, check_count, frame, hermite_system
+from rbfmuscle.implicit.fit.fitting import solve
 from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
 from rbfmuscle.validation import (
     NumericalWarning,
@@ -48,8 +48,6 @@ class RBFField:
         Scaled coordinates are (x - origin) / scale.
     condition : float
         Estimate for the matrix that was factored.
-    smoothing : float
-        As given.
 
     Examples
     --------
@@ -65,24 +63,31 @@ class RBFField:
     def __init__(
         self,
         centres: Floats,
-        place: tuple[Floats, float],
-        kernel: Kernel,
         epsilon: float,
-        weights: Floats,
-        polynomial: tuple[Floats, Integers],
+        place: tuple[Floats, float],
+        system: tuple[Basis, Floats],
+        smoothing: float,
         condition: float,
-        smoothing: float = 0.0,
     ) -> None:
-        self.centres, (self.origin, self.scale) = centres, place
-        self.kernel, self.epsilon = kernel, epsilon
-        self.weights, (self.coefficients, self.powers) = weights, polynomial
-        self.condition, self.smoothing = condition, smoothing
-        rows = np.ascontiguousarray(weights.reshape(len(centres), -1).T)
+        if not (np.isfinite(smoothing) and smoothing >= 0.0):
+            raise UsageError(f"smoothing must be a number of at least 0, got {smoothing}")
+        if not condition >= 1.0:
+            raise UsageError(f"condition must be at least 1, got {condition}")
+        basis, right = system
+        found, self.coefficients, self.condition = solve(
+            basis, right, smoothing=smoothing, condition=condition
+        )
+        self.centres, self.kernel, self.epsilon = centres, basis.kernel, epsilon
+        self.weights, self.powers, (self.origin, self.scale) = (
+            centre_weights(basis, found),
+            basis.powers,
+            place,
+        )
+        rows = np.ascontiguousarray(self.weights.reshape(len(centres), -1).T)
         self._terms = Terms(
-            self.origin, self.scale, np.ascontiguousarray(((centres - self.origin) / self.scale).T),
+            self.origin, self.scale, np.ascontiguousarray(basis.points.T),
             rows[0], rows[1:] if len(rows) > 1 else np.zeros((3, len(centres))), len(rows) > 1,
-            float(epsilon * self.scale if kernel.has_epsilon else 1.0),
-            np.ascontiguousarray(self.coefficients, dtype=float), np.ascontiguousarray(self.powers),
+            basis.epsilon, self.coefficients, self.powers,
         )  # fmt: skip
 
     @classmethod
@@ -109,7 +114,7 @@ class RBFField:
         smoothing : float
             Added to the diagonal, in coordinates scaled to order one; 0 interpolates.
         condition : float
-            Bound, at least 1 [1]: a ridge keeps it (see `solve_bounded`).
+            Bound, at least 1 [1]: a ridge keeps it (see `solve`).
 
         Returns
         -------
@@ -129,9 +134,7 @@ class RBFField:
         origin, scale = frame(points)
         shape = epsilon * scale if kernel.has_epsilon else 1.0
         basis = Basis((points - origin) / scale, kernel, shape)
-        weights, coefficients, condition = _solve(basis, values, smoothing, condition)
-        polynomial = coefficients, basis.powers
-        return cls(points, (origin, scale), kernel, epsilon, weights, polynomial, condition, smoothing)
+        return cls(points, epsilon, (origin, scale), (basis, values), smoothing, condition)
 
     @classmethod
     def fit_hermite(
@@ -180,9 +183,7 @@ class RBFField:
         if derivatives not in ("all", "normal"):
             raise UsageError(f"derivatives must be 'all' or 'normal', got {derivatives!r}")
         basis, right, origin, scale = hermite_system(points, normals, kernel, epsilon, derivatives)
-        weights, coefficients, condition = _solve(basis, right, smoothing, condition)
-        weights, polynomial = hermite_weights(basis, weights), (coefficients, basis.powers)
-        fitted = cls(points, (origin, scale), kernel, epsilon, weights, polynomial, condition, smoothing)
+        fitted = cls(points, epsilon, (origin, scale), (basis, right), smoothing, condition)
         if kernel.has_epsilon:
             warn_if_narrow(fitted, points, normals)
         return fitted
@@ -207,17 +208,6 @@ class RBFField:
 
         result = extract_surface(self, points=self.centres, resolution=resolution)
         return trimesh.Trimesh(result.vertices, result.faces, process=False)
-
-
-def _solve(basis: Basis, right: Floats, smoothing: float, condition: float) -> tuple[Floats, Floats, float]:
-    """Weights, coefficients and condition, with a ridge where the condition has a bound."""
-    if not (np.isfinite(smoothing) and smoothing >= 0.0):
-        raise UsageError(f"smoothing must be a number of at least 0, got {smoothing}")
-    if not condition >= 1.0:
-        raise UsageError(f"condition must be at least 1, got {condition}")
-    if np.isfinite(condition):
-        return solve_bounded(basis, right, condition, smoothing=smoothing)
-    return solve(basis, right, smoothing=smoothing)
 
 
 def warn_if_narrow(fitted: RBFField, points: ArrayLike, normals: ArrayLike) -> None:

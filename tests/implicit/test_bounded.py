@@ -7,7 +7,7 @@ from scipy import linalg
 
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit.assembly import hermite_system
-from rbfmuscle.implicit.fit.fitting import solve_bounded
+from rbfmuscle.implicit.fit.fitting import solve
 from rbfmuscle.implicit.kernels.table import KERNELS
 from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import spacing, surface_error
@@ -40,7 +40,7 @@ def test_what_is_left_of_the_conditions_is_one_ridge_in_units_of_the_spacing(
 ):
     points, normals, _ = plate
     basis, right, *_ = hermite_system(points, normals, KERNELS[kernel], 0.1, derivatives)
-    weights, coefficients, condition = solve_bounded(basis, right, bound)
+    weights, coefficients, condition = solve(basis, right, condition=bound)
     matrix, unit = literal(basis)
     left = right - matrix @ weights - basis.polynomials.T @ coefficients
     ridge = (unit**2 * left) @ weights / (weights @ weights)

@@ -53,11 +53,6 @@ def monomial_gradients(points: Floats, powers: Integers) -> Floats:
     return out
 
 
-def hermite_polynomials(points: Floats, powers: Integers) -> Floats:
-    """Polynomial block (q, 4n): values, then the three derivatives, at each point."""
-    return np.hstack([monomials(points, powers), *monomial_gradients(points, powers)])
-
-
 @compiled(error_model="numpy")
 def _value_matrix_loop(x, epsilon, form, out):
     """out[j, i] = phi(|x_i - x_j|); x is (3, n)."""
@@ -122,12 +117,6 @@ def _hermite_columns_loop(j, e2, d, radial, out):
                 target[i] = -e2 * e2 * second[i] * dc[i] * de[i]
 
 
-def normal_polynomials(points: Floats, normals: Floats, powers: Integers) -> Floats:
-    """Polynomial block (q, 2n): values, then derivatives along the normals, at each point."""
-    along = np.einsum("cqn,nc->qn", monomial_gradients(points, powers), normals)
-    return np.hstack([monomials(points, powers), along])
-
-
 @compiled(error_model="numpy")
 def _normal_matrix_loop(x, normals, epsilon, form, out):
     """As `_hermite_matrix_loop`, with the derivative along the unit normal (3, n) alone.
@@ -154,8 +143,7 @@ def _normal_matrix_loop(x, normals, epsilon, form, out):
             slope[n + i] = -e2 * (first[i] * both + e2 * second[i] * at_i * at_j)
 
 
-# Of a basis without normals.
-NO_NORMALS = np.zeros((0, 3))
+_NO_NORMALS = np.zeros((0, 3))
 
 
 class Basis:
@@ -181,36 +169,31 @@ class Basis:
         epsilon: float,
         *,
         kind: str = "value",
-        normals: Floats = NO_NORMALS,
+        normals: Floats = _NO_NORMALS,
     ) -> None:
         self.points, self.kernel, self.epsilon = points, kernel, float(epsilon)
         self.kind, self.normals = kind, normals
         self.powers = exponents(kernel.degree)
+        blocks = [monomials(points, self.powers)]
         if kind == "gradient":
-            block = hermite_polynomials(points, self.powers)
+            blocks += [*monomial_gradients(points, self.powers)]
         elif kind == "normal":
-            block = normal_polynomials(points, normals, self.powers)
-        else:
-            block = monomials(points, self.powers)
-        self.polynomials = np.ascontiguousarray(block)
+            blocks += [np.einsum("cqn,nc->qn", monomial_gradients(points, self.powers), normals)]
+        self.polynomials = np.ascontiguousarray(np.hstack(blocks))
         self.size = self.polynomials.shape[1]
 
     def matrix(self) -> Floats:
         """A, lower triangle valid, Fortran order: (size, size)."""
-        kernel = self.kernel
-        out = np.empty((self.size, self.size))
-        first = (np.ascontiguousarray(self.points.T),)
-        if self.kind == "normal":
-            first += (np.ascontiguousarray(self.normals.T),)
-        if self.kind == "gradient" and kernel.plain_cube:
-            _cubic_hermite_matrix_loop(*first, float(self.epsilon), out)
-            return out.T
-        loop = {
-            "value": _value_matrix_loop,
-            "gradient": _hermite_matrix_loop,
-            "normal": _normal_matrix_loop,
-        }[self.kind]
-        loop(*first, self.epsilon, kernel.form, out)
+        out, form = np.empty((self.size, self.size)), self.kernel.form
+        x = np.ascontiguousarray(self.points.T)
+        if self.kind == "value":
+            _value_matrix_loop(x, self.epsilon, form, out)
+        elif self.kind == "normal":
+            _normal_matrix_loop(x, np.ascontiguousarray(self.normals.T), self.epsilon, form, out)
+        elif self.kernel.plain_cube:
+            _cubic_hermite_matrix_loop(x, self.epsilon, out)
+        else:
+            _hermite_matrix_loop(x, self.epsilon, form, out)
         return out.T
 
     def full_matrix(self) -> Floats:
@@ -250,8 +233,10 @@ def hermite_system(
     return basis, np.concatenate([np.zeros(len(points)), lengths]) * scale, origin, scale
 
 
-def hermite_weights(basis: Basis, weights: Floats) -> Floats:
-    """Rows (a, B) for each centre from the solution of a Hermite system: (K, 4)."""
+def centre_weights(basis: Basis, weights: Floats) -> Floats:
+    """Weights (K,), or of a Hermite fit rows (a, B) for each centre (K, 4), from the solution of a system."""
+    if basis.kind == "value":
+        return weights
     if basis.kind == "gradient":
         return weights.reshape(4, -1).T.copy()
     value, along = weights.reshape(2, -1)

@@ -15,8 +15,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import linalg
@@ -35,7 +34,9 @@ KEPT = 1e12
 _DEPENDENT = 1e-9
 
 
-def solve(basis: Basis, right: Floats, *, smoothing: float = 0.0) -> tuple[Floats, Floats, float]:
+def solve(
+    basis: Basis, right: Floats, *, smoothing: float = 0.0, condition: float = math.inf
+) -> tuple[Floats, Floats, float]:
     """Weights, polynomial coefficients and an estimate of the condition.
 
     Parameters
@@ -44,6 +45,9 @@ def solve(basis: Basis, right: Floats, *, smoothing: float = 0.0) -> tuple[Float
     right : (size,) ndarray
     smoothing : float
         Added to the diagonal (scaled coordinates).
+    condition : float
+        Bound [1]: a ridge of the largest eigenvalue over it, with derivatives in units of the centres' spacing, keeps
+        it; the conditions of the fit are then met to about one part in so many.
 
     Returns
     -------
@@ -51,64 +55,38 @@ def solve(basis: Basis, right: Floats, *, smoothing: float = 0.0) -> tuple[Float
     coefficients : (q,) ndarray
     condition : float
         Of the matrix on the weights that annihilate polynomials, 2-norm, by power iteration (a lower bound, usually
-        within 10). Where it is beyond `DOUBTFUL` that number, and a ridge keeps it at `KEPT`.
+        within 10). With a bound, of the matrix with its ridge in units of the spacing. Without one, where it is beyond
+        `DOUBTFUL` that number, and a ridge keeps it at `KEPT`.
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        If the system is singular; the message names the likely cause.
+        If the system is singular (the message names the likely cause), or the bound is more than floating-point
+        numbers hold.
 
     Warns
     -----
     NumericalWarning
-        Where a ridge was needed.
+        Where a ridge was needed without a bound.
     """
-    factor = factorise(_smoothed(basis, smoothing), basis.polynomials)
-    if factor is not None:
-        solution = factor.solve(right)
-        if solution[2] < DOUBTFUL:
+    bound = condition
+    if math.isinf(bound):
+        factor = _factorise(_smoothed(basis, smoothing), basis.polynomials)
+        solution = None if factor is None else factor.solve(right)
+        if solution is not None and solution[2] < DOUBTFUL:
             return solution
-    raise_if_singular(basis)
-    weights, coefficients, _ = solve_bounded(basis, right, KEPT, smoothing=smoothing)
-    _warn(basis)
-    return weights, coefficients, DOUBTFUL
-
-
-def solve_bounded(
-    basis: Basis, right: Floats, condition: float, *, smoothing: float = 0.0
-) -> tuple[Floats, Floats, float]:
-    """Weights, polynomial coefficients and an estimate of the condition, which a ridge keeps below the given one.
-
-    The ridge is the largest eigenvalue over the bound, with derivatives in units of the centres' spacing.
-
-    Parameters
-    ----------
-    basis : Basis
-    right : (size,) ndarray
-    condition : float
-        Bound [1]; the conditions of the fit are met to about one part in so many.
-    smoothing : float
-        As in `solve`.
-
-    Returns
-    -------
-    weights : (size,) ndarray
-    coefficients : (q,) ndarray
-    condition : float
-        Of the matrix with its ridge, in units of the spacing, on the weights that annihilate polynomials.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If the system is singular, or the bound is more than floating-point numbers hold.
-    """
-    factor, scale = _factorise_bounded(basis, condition, smoothing)
+        _raise_if_singular(basis)
+        bound = KEPT
+    factor, scale = _factorise_bounded(basis, bound, smoothing)
     weights, coefficients, found = factor.solve(scale * right)
+    if math.isinf(condition):
+        _warn(basis)
+        return scale * weights, coefficients, DOUBTFUL
     return scale * weights, coefficients, min(found, condition)
 
 
 def bounding_ridge(basis: Basis, condition: float) -> Floats:
-    """What `solve_bounded` adds to the diagonal (size,) for this bound."""
+    """What `solve` adds to the diagonal (size,) for this bound of the condition."""
     factor, scale = _factorise_bounded(basis, condition, 0.0)
     return np.asarray(factor.norm / condition / scale**2)
 
@@ -123,39 +101,26 @@ def _factorise_bounded(basis: Basis, condition: float, smoothing: float) -> tupl
         matrix[count:, count:] *= unit**2
     scale = np.ones(basis.size)
     scale[count:] = unit
-    factor = factorise(matrix, np.ascontiguousarray(basis.polynomials * scale), condition=condition)
+    factor = _factorise(matrix, np.ascontiguousarray(basis.polynomials * scale), condition)
     if factor is None:
-        raise_if_singular(basis)
+        _raise_if_singular(basis)
         raise np.linalg.LinAlgError(
             f"no Cholesky factor with a condition of {condition:g}; lower the bound or raise epsilon"
         )
     return factor, scale
 
 
-@dataclass(frozen=True)
-class Factor:
+class Factor(NamedTuple):
     """A factored matrix; letters as in the head of this file.
 
-    Attributes
-    ----------
-    lower : (size, size) ndarray, Fortran order
-        Cholesky factor of M; the upper triangle holds anything.
-    gamma : float
-    directions : (size, q) ndarray
-        Q.
-    triangle : (q, q) ndarray
-        R.
-    products : (size, q) ndarray
-        A Q.
-    norm : float
-        Estimate of the largest eigenvalue of A.
+    ``lower`` is the Cholesky factor of M (size, size), its upper triangle anything; ``directions`` Q (size, q),
+    ``triangle`` R (q, q), ``products`` A Q (size, q), ``norm`` an estimate of the largest eigenvalue of A.
     """
 
-    lower: np.ndarray
-    gamma: float
-    directions: np.ndarray
-    triangle: np.ndarray
-    products: np.ndarray
+    lower: Floats
+    directions: Floats
+    triangle: Floats
+    products: Floats
     norm: float
 
     def solve(self, right: Floats) -> tuple[Floats, Floats, float]:
@@ -163,7 +128,7 @@ class Factor:
         # one by one: dpotrs takes three times as long for the two columns there are
         solution, weakest = (
             blas.dtrsv(self.lower, blas.dtrsv(self.lower, column, lower=1), lower=1, trans=1)
-            for column in (self._project(right), probe(np.diagonal(self.lower)))
+            for column in (self._project(right), _probe(np.diagonal(self.lower)))
         )
         condition = max(1.0, self.norm * math.sqrt(weakest @ weakest))
         weights = self._project(solution)
@@ -187,25 +152,17 @@ def _smoothed(basis: Basis, smoothing: float) -> Floats:
     return matrix
 
 
-def factorise(matrix: Floats, polynomials: Floats, *, condition: float = math.inf) -> Factor | None:
-    """Factor of A on the weights that annihilate polynomials.
+def _factorise(matrix: Floats, polynomials: Floats, condition: float = math.inf) -> Factor | None:
+    """Factor of A (size, size), lower triangle valid, Fortran order, overwritten; polynomials (q, size).
 
-    Parameters
-    ----------
-    matrix : (size, size) ndarray
-        A: lower triangle valid, Fortran order; overwritten.
-    polynomials : (q, size) ndarray
-    condition : float
-        Bound: the largest eigenvalue on these weights, over the bound, is added to the diagonal, and is ``norm``.
-
-    Returns
-    -------
-    Factor or None
-        None where the matrix is not definite in floating-point numbers, or the polynomials are dependent.
+    The largest eigenvalue on the weights that annihilate polynomials, over the bound of the condition, is added to the
+    diagonal, and is ``norm``. None where the matrix is not definite in floating-point numbers, or the polynomials are
+    dependent.
     """
     q, size = polynomials.shape
-    norm = largest_eigenvalue(size, lambda vector: blas.dsymv(1.0, matrix, vector, lower=1))
-    gamma = 0.0
+    start = np.ones(size)
+    start[1::2] -= 1e-3
+    norm = _largest_eigenvalue(matrix, start, 2)
     directions, triangle, products = np.empty((size, 0)), np.empty((0, 0)), np.empty((size, 0))
     if q:
         directions, triangle = linalg.qr(polynomials.T, mode="economic", check_finite=False)
@@ -215,67 +172,34 @@ def factorise(matrix: Floats, polynomials: Floats, *, condition: float = math.in
         products = blas.dsymm(1.0, matrix, directions, lower=1)
         # through SciPy's BLAS, as NumPy's has threads of its own, which then wait on the same cores
         inner = blas.dgemm(1.0, directions, products, trans_a=1)
-        if size > q:
-            gamma = (np.trace(matrix) - np.trace(inner)) / (size - q)
+        gamma = (np.trace(matrix) - np.trace(inner)) / (size - q) if size > q else 0.0
         gamma = gamma if gamma > 0 else norm or 1.0
         half = blas.dgemm(-0.5, directions, inner + gamma * np.eye(q), beta=1.0, c=products)
         matrix = blas.dsyr2k(-1.0, directions, half, beta=1.0, c=matrix, lower=1, overwrite_c=1)
     if math.isfinite(condition):  # a constant vector is all but a polynomial, which M has no share of
-        start = probe(np.ones(size))
-        norm = largest_eigenvalue(
-            size, lambda vector: blas.dsymv(1.0, matrix, vector, lower=1), steps=6, start=start
-        )
+        norm = _largest_eigenvalue(matrix, _probe(np.ones(size)), 6)
         matrix.ravel(order="K")[:: size + 1] += norm / condition
     if factor_cholesky(matrix):
         return None
-    return Factor(matrix, gamma, directions, triangle, products, norm)
+    return Factor(matrix, directions, triangle, products, norm)
 
 
-def largest_eigenvalue(
-    size: int, multiply: Callable[[Floats], Floats], *, steps: int = 2, start: Floats | None = None
-) -> float:
-    """Largest eigenvalue of a symmetric matrix by a few steps of power iteration, a lower bound.
-
-    Parameters
-    ----------
-    size : int
-    multiply : callable
-        Vector (size,) -> matrix times vector.
-    steps : int
-    start : (size,) ndarray, optional
-        First vector; all but constant by default.
-
-    Returns
-    -------
-    float
-    """
-    if start is None:
-        vector = np.full(size, 1.0)
-        vector[1::2] -= 1e-3
-    else:
-        vector = start.copy()
+def _largest_eigenvalue(matrix: Floats, vector: Floats, steps: int) -> float:
+    """Largest eigenvalue of a symmetric matrix by power iteration from a vector (size,), a lower bound."""
     norm = 0.0
     for _ in range(steps):
-        vector /= math.sqrt(vector @ vector)
-        vector = multiply(vector)
+        vector = blas.dsymv(1.0, matrix, vector / math.sqrt(vector @ vector), lower=1)
         norm = math.sqrt(vector @ vector)
         if norm == 0.0:  # one centre of a kernel that is 0 there
             break
     return norm
 
 
-def probe(pivots: Floats) -> Floats:
-    """Probe for the smallest eigenvector: random signs, and the unit vector of the smallest pivot.
+def _probe(pivots: Floats) -> Floats:
+    """Vector (size,) of length about one that holds some of the smallest eigenvector, from the factor's diagonal.
 
-    Parameters
-    ----------
-    pivots : (size,) ndarray
-        Diagonal of the Cholesky factor.
-
-    Returns
-    -------
-    (size,) ndarray
-        Of length about one; the length of the solution for it is an estimate of 1 / (smallest eigenvalue).
+    Random signs, and the unit vector of the smallest pivot; the length of the solution for it is an estimate of
+    1 / (smallest eigenvalue).
     """
     size = len(pivots)
     signs = np.where((np.arange(size) * 0x9E3779B1) >> 7 & 1, 1.0, -1.0) / math.sqrt(2 * size)
@@ -288,11 +212,11 @@ def _warn(basis: Basis) -> None:
     remedy = "spread the centres or add smoothing"
     if basis.kernel.has_epsilon:
         remedy = f"raise epsilon (it is {basis.epsilon:.2g} in units of the extent), {remedy}"
-    close = _nearest_pair(basis.points)
-    pair = f"; centres {close[0]} and {close[1]} are only {close[2]:.1e} of the extent apart"
+    first, second, apart = _nearest_pair(basis.points)
+    pair = f"; centres {first} and {second} are only {apart:.1e} of the extent apart"
     warnings.warn(
         f"fit with kernel '{basis.kernel.name}' has a condition beyond {DOUBTFUL:g}: a ridge keeps it at {KEPT:g} and "
-        f"its conditions are met to a few digits only{pair if close[2] < 1e-5 else ''}; {remedy}",
+        f"its conditions are met to a few digits only{pair if apart < 1e-5 else ''}; {remedy}",
         NumericalWarning,
         stacklevel=4,
     )
@@ -307,7 +231,7 @@ def _nearest_pair(points: Floats) -> tuple[int, int, float]:
     return first, second, float(distance[nearest, 1])
 
 
-def raise_if_singular(basis: Basis) -> None:
+def _raise_if_singular(basis: Basis) -> None:
     """Raise LinAlgError if centres coincide or the polynomials are dependent on them."""
     points, q = basis.points, len(basis.powers)
     first, second, apart = _nearest_pair(points)
