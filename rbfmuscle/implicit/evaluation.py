@@ -24,18 +24,8 @@ _BLOCK, _SERIAL = 256, 200_000
 class Terms(NamedTuple):
     """A field as the loops read it, in the scaled coordinates (points - origin) / scale.
 
-    Attributes
-    ----------
-    origin : (3,) ndarray
-    scale : float
-    centres : (3, K) ndarray
-    a, b : (K,) and (3, K) ndarray
-        Weights of the values, and of the derivatives.
-    hermite : bool
-        Whether ``b`` counts.
-    epsilon : float
-    coefficients, powers : (q,) and (q, 3) ndarray
-        Of the polynomial.
+    ``centres`` (3, K); ``a`` (K,) and ``b`` (3, K) are the weights of the values and of the derivatives, of which the
+    latter count where ``hermite``; ``coefficients`` (q,) and ``powers`` (q, 3) are the polynomial's.
     """
 
     origin: np.ndarray
@@ -50,21 +40,7 @@ class Terms(NamedTuple):
 
 
 def evaluate(points: Floats, terms: Terms, kernel: Kernel, with_gradient: bool) -> tuple[Floats, Floats]:
-    """A field and its gradient.
-
-    Parameters
-    ----------
-    points : (n, 3) ndarray
-    terms : Terms
-    kernel : Kernel
-    with_gradient : bool
-
-    Returns
-    -------
-    value : (n,) ndarray
-    gradient : (n, 3) ndarray
-        With respect to points; empty where it is not wanted.
-    """
+    """A field's values (n,) at points (n, 3), and its gradients (n, 3) by these, which are empty where not wanted."""
     count = len(points)
     value, gradient = np.empty(count), np.empty((count if with_gradient else 0, 3))
     cubic, form = kernel.plain_cube and terms.epsilon == 1.0, kernel.form

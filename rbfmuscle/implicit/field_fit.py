@@ -21,15 +21,8 @@ SAFETY = 0.5
 class FieldFit:
     """How the field through a muscle's centres is fitted.
 
-    Attributes
-    ----------
-    kernel : Kernel
-    epsilon : float
-        Its shape parameter [1 / length].
-    derivatives : {"all", "normal"}
-        What the fit meets at a centre.
-    condition : float
-        Bound of its condition, which a ridge keeps.
+    ``epsilon`` is the kernel's shape parameter [1 / length], ``derivatives`` ("all" or "normal") what the fit meets at
+    a centre, ``condition`` the bound that a ridge keeps.
     """
 
     kernel: Kernel
@@ -63,25 +56,11 @@ def wanted_derivatives(count: int, *, fitted: bool) -> str:
 
 
 def off_surface_points(points: Floats, normals: Floats) -> tuple[Floats, Floats]:
-    """Points on and off a surface with their signed distances, for fits to values.
+    """Points (3K, 3) on, outside and inside a surface with signed distances (3K,) 0, +d and -d, for fits to values.
 
-    Each point x gives f(x) = 0, f(x + d n) = d and f(x - d n) = -d (Carr et al. 2001). The step d is half the median
-    distance to the nearest other point, and at most half the radius of the empty ball that touches the surface in x,
-    so that x stays the nearest of all points to x + d n.
-
-    Parameters
-    ----------
-    points : (K, 3) ndarray
-        Positions on the surface, two or more [scene unit].
-    normals : (K, 3) ndarray
-        Unit outward normals.
-
-    Returns
-    -------
-    points : (3K, 3) ndarray
-        On the surface, outside, inside.
-    values : (3K,) ndarray
-        0, then +d, then -d.
+    Each point x (K, 3), two or more, with unit outward normal n gives f(x) = 0, f(x + d n) = d and f(x - d n) = -d
+    (Carr et al. 2001). The step d is half the median distance to the nearest other point, and at most half the radius
+    of the empty ball that touches the surface in x, so that x stays the nearest of all points to x + d n.
     """
     steps = np.empty((2, len(points)))
     nearest = np.empty(len(points))

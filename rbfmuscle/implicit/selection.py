@@ -44,17 +44,10 @@ Trial = tuple[float, float, float]
 
 
 class EpsilonChoice(NamedTuple):
-    """A chosen shape parameter.
+    """A chosen shape parameter [1/length].
 
-    Attributes
-    ----------
-    epsilon : float
-        [1/length]
-    error : float
-        Root mean square distance of the held-out points [length].
-    condition : float
-    broken : str
-        Why no zero set that was extracted is that of the surface, empty where one is.
+    ``error`` is the root mean square distance of the held-out points [length]; ``broken`` says why no zero set that was
+    extracted is that of the surface, empty where one is.
     """
 
     epsilon: float
@@ -64,13 +57,7 @@ class EpsilonChoice(NamedTuple):
 
 
 def spacing(points: ArrayLike) -> Floats:
-    """Distance (n,) of each point to the nearest other.
-
-    Raises
-    ------
-    UsageError
-        For fewer than two points, or coinciding ones.
-    """
+    """Distance (n,) of each point to the nearest other; UsageError for fewer than two points, or coinciding ones."""
     points = check_points(points)
     if len(points) < 2:
         raise UsageError(f"spacing needs at least 2 points, got {len(points)}")
@@ -81,23 +68,11 @@ def spacing(points: ArrayLike) -> Floats:
 
 
 def surface_error(fitted: RBFField, points: Floats, reach: float) -> float:
-    """Root mean square distance of a field's surface from points that should lie on it, to first order.
+    """Root mean square distance of a field's surface from points (n, 3) that should lie on it, to first order [length].
 
-    |f| / |grad f|, at most ``reach``. Where the field is flat it knows no surface, though it may be 0: beyond a few
-    such points, as thin rims have, each counts as missed by ``reach``.
-
-    Parameters
-    ----------
-    fitted : RBFField
-        Of slope one near its surface, as a fit to unit normals or distances is.
-    points : (n, 3) array_like
-    reach : float
-        Mean distance of the centres to the nearest other [length].
-
-    Returns
-    -------
-    float
-        [length]
+    |f| / |grad f| for a field of slope one near its surface, as a fit to unit normals or distances is; at most
+    ``reach``, the mean distance of the centres to the nearest other. Where the field is flat it knows no surface,
+    though it may be 0: beyond a few such points, as thin rims have, each counts as missed by ``reach``.
     """
     value, gradient = fitted.value_and_gradient(points)
     slope = np.linalg.norm(gradient, axis=1)
@@ -114,7 +89,7 @@ def choose_epsilon(
     held_out: ArrayLike,
     distance: Callable[[Floats], Floats] | None = None,
 ) -> EpsilonChoice:
-    """Search the epsilon of a fit.
+    """Search the epsilon of a fit to points with normals (K, 3).
 
     Parameters
     ----------
@@ -125,10 +100,6 @@ def choose_epsilon(
         Other points of the surface, spread evenly over it.
     distance : callable, optional
         ``(n, 3) -> (n,)``, distance to the surface, signed or not; with it zero sets are extracted.
-
-    Returns
-    -------
-    EpsilonChoice
 
     Raises
     ------

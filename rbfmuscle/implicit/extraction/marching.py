@@ -27,16 +27,8 @@ SEARCHED, MARGIN = 64, 0.075
 class Grid:
     """A regular grid of cubic cells.
 
-    Attributes
-    ----------
-    origin : (3,) ndarray
-        Position of node (0, 0, 0) [scene unit].
-    spacing : float
-        Edge of a cell [scene unit].
-    shape : tuple of int
-        Nodes along each axis.
-    axes : (3, 3) ndarray
-        Rows are the grid's unit axes in world coordinates.
+    ``origin`` (3,) is the position of node (0, 0, 0), ``spacing`` the edge of a cell [scene unit], ``shape`` the number
+    of nodes along each axis. Rows of ``axes`` (3, 3) are the grid's unit axes in world coordinates.
     """
 
     origin: np.ndarray
@@ -48,22 +40,10 @@ class Grid:
     def around(
         cls, points: ArrayLike, *, resolution: int = 48, padding: int = 3, axes: ArrayLike | None = None
     ) -> Grid:
-        """Grid around points, with ``resolution`` cells along their longest side.
+        """Grid around points (n, 3), with so many cells (at least 4) along their longest side.
 
-        Parameters
-        ----------
-        points : (n, 3) array_like
-        resolution : int
-            At least 4.
-        padding : int
-            Cells added on each side, at least 1.
-        axes : (3, 3) array_like, optional
-            Rotation whose rows are the grid's axes; those of the world by default.
-
-        Raises
-        ------
-        ValueError
-            On no or coinciding points, numbers out of range, or too many nodes.
+        ``padding`` cells, at least 1, are added on each side. Rows of ``axes`` (3, 3), a rotation, are the grid's axes;
+        those of the world by default. ValueError on no or coinciding points, numbers out of range, or too many nodes.
         """
         points = check_points(points)
         axes = np.eye(3) if axes is None else np.asarray(axes, dtype=np.float64)
@@ -104,15 +84,7 @@ class Grid:
 
 
 class LevelSet:
-    """Triangles of the zero set of max(field - level, -cut) on a grid.
-
-    Parameters
-    ----------
-    grid : Grid
-    field : Field
-        Negative inside.
-    cut : ClipDistance, optional
-    """
+    """Triangles of the zero set of max(field - level, -cut) on a grid; the field is negative inside."""
 
     def __init__(self, grid: Grid, field: Field, cut: ClipDistance | None = None) -> None:
         self.grid, self.field, self.cut = grid, field, cut
@@ -145,14 +117,8 @@ class LevelSet:
 class Sheets(NamedTuple):
     """Sheets of a level set beside a surface.
 
-    Attributes
-    ----------
-    stray : int
-        Sheets beside that nearest to most points which stand off the surface by more than a cell.
-    is_open : bool
-        Whether a sheet leaves the box.
-    found : bool
-        Whether there is any sheet.
+    ``stray`` counts those, beside the one nearest to most points, that stand off the surface by more than a cell;
+    ``is_open`` says whether a sheet leaves the box, ``found`` whether there is any.
     """
 
     stray: int
@@ -176,10 +142,6 @@ def find_sheets(field: Field, points: Floats, distance: Callable[[Floats], Float
     distance : callable
         ``(n, 3) -> (n,)``, distance to the surface, signed or not. Where a muscle is thinner than a cell, its own sheet
         falls into pieces on the grid: these lie within a cell of it and do not count.
-
-    Returns
-    -------
-    Sheets
     """
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     grid = Grid.around(points, resolution=SEARCHED, padding=round(MARGIN * SEARCHED), axes=axes)

@@ -56,12 +56,8 @@ MEET = 4
 class FittedMesh(ExtractedSurface):
     """A material mesh on a level set.
 
-    Attributes
-    ----------
-    left : int
-        Vertices that were kept from a level set far from where the material carries them.
-    crossing : int
-        Triangles that still cross others.
+    ``left`` counts vertices that were kept from a level set far from where the material carries them, ``crossing`` the
+    triangles that still cross others.
     """
 
     left: int = 0
@@ -80,22 +76,9 @@ def project_to_level_set(
 ) -> FittedMesh:
     """Bring a triangulation onto the zero set of max(field - level, -cut) that has a volume.
 
-    Parameters
-    ----------
-    mesh : MaterialMesh
-    vertices : (n, 3) ndarray
-        Where the material carries them [scene unit].
-    field, cut, volume, level, obstacles
-        As for `rbfmuscle.implicit.extraction.surface.extract_surface`.
-
-    Returns
-    -------
-    FittedMesh
-
-    Raises
-    ------
-    ValueError
-        On NaN in field or cut, and where no level gives the volume.
+    ``vertices`` (n, 3) are where the material carries them [scene unit]; field, cut, volume, level and obstacles are
+    those of `rbfmuscle.implicit.extraction.surface.extract_surface`. ValueError on NaN in field or cut, and where no
+    level gives the volume.
     """
     fitting = CarriedMaterial(mesh, vertices, field, cut, float(level))
     fitting.reach(volume)
@@ -112,20 +95,8 @@ def carry_material(
 ) -> FittedMesh:
     """A triangulation where the material is, out of the bones and blown up to a volume: for want of a level set.
 
-    Parameters
-    ----------
-    mesh, vertices, volume, cut, obstacles
-        As for `project_to_level_set`.
-
-    Returns
-    -------
-    FittedMesh
-        All of its vertices are ``left``.
-
-    Raises
-    ------
-    ValueError
-        Where so much of it is in the bones that nothing can be blown up to the volume.
+    Arguments as for `project_to_level_set`. All vertices of the result are ``left``. ValueError where so much of it is
+    in the bones that nothing can be blown up to the volume.
     """
     fitting = CarriedMaterial(mesh, vertices, None, cut, 0.0)
     fitting.inflate(volume)
@@ -133,16 +104,7 @@ def carry_material(
 
 
 class CarriedMaterial:
-    """A material mesh on its way from where the material takes it.
-
-    Parameters
-    ----------
-    mesh : MaterialMesh
-    vertices : (n, 3) ndarray
-        Where the material carries them [scene unit].
-    field : Field or None
-    cut : ClipDistance or None
-    level : float
+    """A material mesh on its way from where the material takes it, ``vertices`` (n, 3) [scene unit].
 
     Attributes
     ----------
@@ -217,10 +179,12 @@ class CarriedMaterial:
         # So large that no corner is farther than 1.3 of it from its triangle's middle.
         spacing = max(self.edge, 0.52 * self.mesh.longest(vertices))
         if self.projector.bounds is not None:
-            near = self.projector.bounds.distance(vertices) < NEAR_BONE * spacing
+            near = (
+                self.projector.bounds.below(vertices) < self.projector.bounds.steepest * NEAR_BONE * spacing
+            )
             faces = faces[near[faces].any(axis=1)]
         if len(faces):
-            self.pushed |= self.projector.push_off(faces, obstacles, self.level, spacing, PUSHED * self.edge)
+            self.pushed |= self.projector.push_off(faces, obstacles, spacing, PUSHED * self.edge)
 
     def gather(self) -> None:
         """Close the surface over what is deep in a bone: a sheet that is folded over it would cross itself."""

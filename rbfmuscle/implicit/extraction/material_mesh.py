@@ -8,14 +8,7 @@ from rbfmuscle.jit import compiled
 
 
 class MaterialMesh:
-    """A closed triangulation of fixed topology.
-
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-        At rest.
-    faces : (m, 3) ndarray of int
-        Closed, outward.
+    """A closed triangulation of fixed topology: vertices (n, 3) at rest, outward faces (m, 3).
 
     Attributes
     ----------

@@ -14,16 +14,12 @@ from rbfmuscle.jit import compiled
 CHORD, MARGIN, BESIDE = 0.35, 0.5, 0.3
 # Room for pairs of a point and a triangle near it, at first, for each triangle.
 PAIRS = 2
-# Cells of a grid for each point.
-CELLS = 5
+# Cells of a grid for each point; passes over the points that are pushed off.
+CELLS, ROUNDS = 5, 4
 
 
 class PointGrid:
-    """Points sorted by the cells of a grid, some times as many cells as points: those of a surface leave most empty.
-
-    Parameters
-    ----------
-    points : (k, 3) ndarray
+    """Points (k, 3), sorted by the cells of a grid: some times as many as points, as a surface leaves most empty.
 
     Attributes
     ----------
@@ -42,11 +38,8 @@ class PointGrid:
         sides = np.maximum(extent / size, 1e-2)
         self.edge = size * float(sides.prod() / (CELLS * max(len(points), 1))) ** (1.0 / 3.0)
         self.shape = (extent / self.edge).astype(np.int64) + 1
-        cell = ((points - self.low) / self.edge).astype(np.int64) @ (
-            self.shape[1] * self.shape[2],
-            self.shape[2],
-            1,
-        )
+        strides = self.shape[1] * self.shape[2], self.shape[2], 1
+        cell = ((points - self.low) / self.edge).astype(np.int64) @ strides
         order = np.argsort(cell, kind="stable")
         self.points = np.ascontiguousarray(points[order])
         self.start = np.searchsorted(cell[order], np.arange(int(self.shape.prod()) + 1))
@@ -57,26 +50,11 @@ Obstacles = list[tuple[PointGrid, Floats]]
 
 
 class NearTriangles(NamedTuple):
-    """Obstacle points that triangles are near, and which.
-
-    Attributes
-    ----------
-    points : (p, 3) ndarray
-        In the world.
-    first : (p + 1,) ndarray of int
-        Where the triangles of each point begin in ``faces``.
-    faces : (k,) ndarray of int
-    """
+    """Points (p, 3) in the world that triangles are near: those of point k are ``faces[first[k] : first[k + 1]]``."""
 
     points: Floats
     first: Integers
     faces: Integers
-
-    def only(self, which: Booleans) -> NearTriangles:
-        """Those of some points, by a mask (p,)."""
-        count = np.diff(self.first)
-        first = np.concatenate([[0], np.cumsum(count[which])])
-        return NearTriangles(self.points[which], first, self.faces[np.repeat(which, count)])
 
 
 def near_triangles(obstacles: Obstacles, vertices: Floats, faces: Integers, margin: float) -> NearTriangles:
@@ -85,7 +63,6 @@ def near_triangles(obstacles: Obstacles, vertices: Floats, faces: Integers, marg
     Parameters
     ----------
     obstacles : list of pairs of PointGrid and (4, 4) ndarray
-        Points, and the pose that takes them to the world.
     vertices : (n, 3) ndarray
     faces : (m, 3) ndarray of int
     margin : float
@@ -94,7 +71,15 @@ def near_triangles(obstacles: Obstacles, vertices: Floats, faces: Integers, marg
     points, counts, near = [np.zeros((0, 3))], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for grid, pose in obstacles:
         local = np.ascontiguousarray((vertices - pose[:3, 3]) @ pose[:3, :3])
-        count, found = _near_grid(local, faces, margin, grid)
+        cells, room = (grid.points, grid.start, grid.low, grid.edge, grid.shape), PAIRS * len(faces)
+        while True:
+            count, pairs = np.zeros(len(grid.points), dtype=np.int64), np.empty((room, 2), dtype=np.int64)
+            met = _near_loop(local, faces, margin, cells, count, pairs)
+            if met <= room:
+                break
+            room = met
+        found = np.empty(met, dtype=np.int64)
+        _sort_loop(pairs[:met], np.cumsum(count) - count, found)
         rows = np.flatnonzero(count)
         points.append(grid.points[rows] @ pose[:3, :3].T + pose[:3, 3])
         counts.append(count[rows])
@@ -103,25 +88,8 @@ def near_triangles(obstacles: Obstacles, vertices: Floats, faces: Integers, marg
     return NearTriangles(np.concatenate(points), first, np.concatenate(near))
 
 
-def _near_grid(
-    vertices: Floats, faces: Integers, margin: float, grid: PointGrid
-) -> tuple[Integers, Integers]:
-    """Number of triangles (k,) near each point of a grid, and these triangles, point by point."""
-    cells = grid.points, grid.start, grid.low, grid.edge, grid.shape
-    room = PAIRS * len(faces)
-    while True:
-        count, pairs = np.zeros(len(grid.points), dtype=np.int64), np.empty((room, 2), dtype=np.int64)
-        met = _near_loop(vertices, faces, margin, cells, count, pairs)
-        if met <= room:
-            break
-        room = met
-    found, place = np.empty(met, dtype=np.int64), np.cumsum(count) - count
-    _sort_loop(pairs[:met], place, found)
-    return count, found
-
-
 def push_off_points(
-    vertices: Floats, faces: Integers, near: NearTriangles, spacing: float, tolerance: float, rounds: int = 4
+    vertices: Floats, faces: Integers, near: NearTriangles, spacing: float, tolerance: float
 ) -> Booleans:
     """Move the vertices of triangles that obstacle points have come through, into the surface.
 
@@ -148,7 +116,7 @@ def push_off_points(
         Vertices that were moved.
     """
     moved = np.zeros(len(vertices), dtype=np.bool_)
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         if not _push_loop(vertices, faces, near, spacing, tolerance, moved):
             break
     return moved
@@ -218,9 +186,8 @@ def _push_loop(vertices, faces, near_points, spacing, tolerance, moved):
         nx, ny, nz, square, _, at_b, at_c = _shadow(vertices, faces, best, x, y, z)
         weight = 1.0 - (at_b + at_c) / square, at_b / square, at_c / square
         # Half the tolerance is left, so that rounding does not ask for another round.
-        way = (
-            (signed - 0.5 * tolerance) / (weight[0] ** 2 + weight[1] ** 2 + weight[2] ** 2) / np.sqrt(square)
-        )
+        way = (signed - 0.5 * tolerance) / (weight[0] ** 2 + weight[1] ** 2 + weight[2] ** 2)
+        way /= np.sqrt(square)
         for k in range(3):
             v = faces[best, k]
             moved[v] = True

@@ -7,7 +7,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.fields import ClipDistance, Field
 from rbfmuscle.geometry.surfaces import volume_cubic
-from rbfmuscle.implicit.extraction.obstacles import CHORD, MARGIN, Obstacles, near_triangles, push_off_points
+from rbfmuscle.implicit.extraction.obstacles import MARGIN, Obstacles, near_triangles, push_off_points
 from rbfmuscle.jit import compiled
 
 # What is no deeper in the cut than this share of a cell counts as out of it.
@@ -15,16 +15,7 @@ OUT = 1e-5
 
 
 class CutBounds:
-    """Answers of a cut at places where vertices were, from which lower bounds follow where they are now.
-
-    Parameters
-    ----------
-    places : (n, 3) ndarray
-    values : (n,) ndarray
-        Values there, or lower bounds.
-    steepest : float
-        Of the cut.
-    """
+    """Values (n,) of a cut, or lower bounds, at places (n, 3) where vertices were: bounds where those are now."""
 
     def __init__(self, places: Floats, values: Floats, steepest: float) -> None:
         self.places, self.values, self.steepest = places.copy(), values.copy(), steepest
@@ -35,15 +26,11 @@ class CutBounds:
         found: Floats = self.values[rows] - self.steepest * np.sqrt(np.einsum("nd,nd->n", away, away))
         return found
 
-    def distance(self, vertices: Floats) -> Floats:
-        """How far (n,) vertices (n, 3) are from the cut at least."""
-        return self.below(vertices) / self.steepest
-
 
 class Projector:
-    """Vertices on their way to the zero set of max(f - level, -d).
+    """Vertices (n, 3) on their way to the zero set of max(f - level, -d).
 
-    ``near_cut`` (n,) marks the vertices that may lie on or come to the cut.
+    ``near_cut`` (n,) marks those that may lie on or come to the cut; ``spacing`` is the length of edges or cells.
     """
 
     def __init__(
@@ -54,18 +41,14 @@ class Projector:
         spacing: float,
         near_cut: Booleans,
     ) -> None:
-        self.vertices = vertices
-        self.spacing = spacing
-        self._field, self._cut = field, cut
-        self._near_cut = near_cut
+        self.vertices, self.spacing = vertices, spacing
+        self._field, self._cut, self._near_cut = field, cut, near_cut
         # What is known before the first step: the field with its gradient, and the cut by values or lower bounds.
         self.known: tuple[Floats, Floats] | None = None
         self.bounds: CutBounds | None = None
-        # Distance (n,) from the cut at which vertices that fall into it end.
-        self.clearance = np.zeros(len(vertices))
-        # Steepness (n,) of the field below which steps are shortened, not lengthened by a gradient that fades.
-        self.least = np.zeros(len(vertices))
-        self.slope = np.zeros(len(vertices))
+        # Distance (n,) from the cut at which vertices that fall into it end, and steepness (n,) of the field below
+        # which steps are shortened, not lengthened by a gradient that fades.
+        self.clearance, self.least, self.slope = np.zeros((3, len(vertices)))
         self.on_field = np.ones(len(vertices), dtype=bool)
         self._direction = np.zeros_like(vertices)
 
@@ -169,25 +152,13 @@ class Projector:
             change += lack / rate
         return change
 
-    def push_off(
-        self, faces: Integers, obstacles: Obstacles, level: float, spacing: float, tolerance: float
-    ) -> Booleans:
+    def push_off(self, faces: Integers, obstacles: Obstacles, spacing: float, tolerance: float) -> Booleans:
         """Move the vertices around points that came through a triangle; these (n,) no longer follow the level.
 
-        Parameters
-        ----------
-        faces : (m, 3) ndarray of int
-            Triangles that are looked at.
-        obstacles : list of pairs of PointGrid and (4, 4) ndarray
-        level : float
-            Of the field.
-        spacing, tolerance : float
-            As for `push_off_points`.
+        ``faces`` (m, 3) are the triangles that are looked at; spacing and tolerance are those of `push_off_points`.
         """
         pushed = np.zeros(len(self.vertices), dtype=np.bool_)
         near = near_triangles(obstacles, self.vertices, faces, MARGIN * spacing)
-        if self._field is not None and len(near.points):
-            near = near.only(self._field(near.points) - level < CHORD * spacing)
         for _ in range(2):
             rows = np.flatnonzero(push_off_points(self.vertices, faces, near, spacing, tolerance))
             pushed[rows] = True

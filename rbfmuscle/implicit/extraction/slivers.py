@@ -23,19 +23,8 @@ def mend_slivers(
 ) -> tuple[MaterialMesh, Floats]:
     """A mesh of the same vertices and genus with fewer slivers and triangles that look inwards, none if possible.
 
-    Parameters
-    ----------
-    mesh : MaterialMesh
-    vertices : (n, 3) ndarray
-        On the surface [scene unit].
-    onto : callable
-        Brings vertices (n, 3) of a mesh back onto the surface.
-
-    Returns
-    -------
-    mesh : MaterialMesh
-        Another one where edges were flipped.
-    vertices : (n, 3) ndarray
+    ``vertices`` (n, 3) lie on the surface [scene unit]; ``onto`` brings vertices (n, 3) of a mesh back onto it. The
+    mesh is another one where edges were flipped.
     """
     quality = triangle_quality(vertices, mesh.faces, vertex_normals(vertices, mesh.faces))
     best, least, waited = (mesh, vertices), _faults(quality), 0
@@ -60,15 +49,7 @@ def mend_slivers(
 
 
 def triangle_quality(vertices: Floats, faces: Integers, normals: Floats) -> Floats:
-    """Smallest angle (m,) of each triangle [degree], negative where it looks away from the normals of its corners.
-
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-    faces : (m, 3) ndarray of int
-    normals : (n, 3) ndarray
-        Of the vertices.
-    """
+    """Smallest angle (m,) of each triangle [degree], negative where it looks away from its corners' normals (n, 3)."""
     corners = vertices[faces]
     sides = np.roll(corners, -1, axis=1) - corners
     inwards = (np.einsum("mkd,md->mk", normals[faces], np.cross(sides[:, 0], sides[:, 1])) < 0.0).all(axis=1)
@@ -84,18 +65,7 @@ def _faults(quality: Floats) -> tuple[int, int]:
 
 
 def flip_edges(vertices: Floats, faces: Integers) -> Integers:
-    """Triangles with an edge of each bad one flipped where that makes the pair better; the same array if none is.
-
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-    faces : (m, 3) ndarray of int
-        Closed.
-
-    Returns
-    -------
-    (m, 3) ndarray of int
-    """
+    """Faces (m, 3) of a closed mesh, an edge of each bad one flipped where that helps; the same array if none is."""
     normals, count = vertex_normals(vertices, faces), len(vertices)
     bad = np.flatnonzero(triangle_quality(vertices, faces, normals) < LEAST_ANGLE)
     sides = faces.astype(np.int64) * count + np.roll(faces, -1, axis=1)

@@ -151,7 +151,7 @@ def _finish(
     obstacles: Obstacles,
 ) -> ExtractedSurface:
     spacing = projector.spacing
-    projector.push_off(faces, obstacles, level, spacing, 0.01 * spacing)
+    projector.push_off(faces, obstacles, spacing, 0.01 * spacing)
     if target is not None:
         step = projector.volume_step(faces, target, steps=3)
         level += step

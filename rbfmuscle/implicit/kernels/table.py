@@ -196,18 +196,7 @@ KERNELS = {
 
 
 def get_kernel(name: Kernel | str) -> Kernel:
-    """Look a kernel up by name.
-
-    Parameters
-    ----------
-    name : str or Kernel
-        A key of ``KERNELS``; a Kernel is handed back as it is.
-
-    Raises
-    ------
-    UsageError
-        For an unknown name, with the nearest right one.
-    """
+    """Look a kernel up by name; a Kernel is handed back. UsageError names the nearest right one for an unknown name."""
     if isinstance(name, Kernel):
         return name
     if name not in KERNELS:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -18,12 +18,11 @@ from rbfmuscle.jit import compiled
 FINENESS = 2.5
 
 
-@dataclass(frozen=True)
-class FineMesh:
+class FineMesh(NamedTuple):
     """The input mesh with its long edges split."""
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    vertices: Floats
+    faces: Integers
 
 
 def refine_mesh(vertices: Floats, faces: Integers, count: int) -> FineMesh:
@@ -50,14 +49,13 @@ def _split_edges(
     number = (middle >= 0).sum(axis=1)
     pieces = [faces[number == 0]]
     for corner in range(3):
-        f, m = np.roll(faces, -corner, axis=1), np.roll(middle, -corner, axis=1)
-        a, b, c, ab, bc, ca = f[:, 0], f[:, 1], f[:, 2], m[:, 0], m[:, 1], m[:, 2]
+        a, b, c = np.roll(faces, -corner, axis=1).T
+        ab, bc, ca = np.roll(middle, -corner, axis=1).T
         one = (number == 1) & (ab >= 0)
         two = (number == 2) & (ca < 0)
         # Of the two ways to halve the quadrilateral left over, the shorter diagonal.
-        centre = 0.5 * (vertices[a] + vertices[b]), 0.5 * (vertices[b] + vertices[c])
-        short = np.linalg.norm(centre[1] - vertices[a], axis=1) < np.linalg.norm(
-            centre[0] - vertices[c], axis=1
+        short = np.linalg.norm(0.5 * (vertices[b] + vertices[c]) - vertices[a], axis=1) < np.linalg.norm(
+            0.5 * (vertices[a] + vertices[b]) - vertices[c], axis=1
         )
         for rows, triangles in (
             (one, ((a, ab, c), (ab, b, c))),
@@ -65,10 +63,8 @@ def _split_edges(
             (two & ~short, ((ab, b, bc), (a, ab, c), (ab, bc, c))),
         ):
             pieces += [np.column_stack(t)[rows] for t in triangles]
-    a, b, c = faces.T
-    ab, bc, ca = middle.T
-    for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)):
-        pieces.append(np.column_stack(t)[number == 3])
+    (a, b, c), (ab, bc, ca) = faces.T, middle.T
+    pieces += [np.column_stack(t)[number == 3] for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
     return np.vstack([vertices, vertices[ends].mean(axis=1)]), np.vstack(pieces)
 
 
@@ -77,8 +73,11 @@ def cluster_mesh(fine: FineMesh, density: Floats, count: int, seed: int) -> tupl
     area = np.linalg.norm(face_normals(fine.vertices, fine.faces), axis=1)
     weight = np.bincount(fine.faces.ravel(), np.repeat(area / 3, 3), len(fine.vertices)) * density
     edges = unique_edges(fine.faces)
-    start, other = _neighbours(edges, len(fine.vertices))
-    tail = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    # Rows of neighbours: those of v are other[start[v]:start[v + 1]].
+    tail = np.concatenate([edges[:, 0], edges[:, 1]])
+    order = np.argsort(tail, kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(tail, minlength=len(fine.vertices)))])
+    tail, other = tail[order], np.concatenate([edges[:, 1], edges[:, 0]])[order]
     length = np.linalg.norm(fine.vertices[tail] - fine.vertices[other], axis=1)
     stretch = np.sqrt(density)
     length *= 0.5 * (stretch[tail] + stretch[other])
@@ -90,15 +89,6 @@ def cluster_mesh(fine: FineMesh, density: Floats, count: int, seed: int) -> tupl
     _mark_loose(tail, other, weight, labels, count)
     _join_loop(start, other, labels)
     return contract_clusters(fine.faces, labels, weight, count)
-
-
-def _neighbours(edges: Integers, size: int) -> tuple[Integers, Integers]:
-    """Rows of neighbours: those of v are ``other[start[v]:start[v + 1]]``."""
-    tail = np.concatenate([edges[:, 0], edges[:, 1]])
-    head = np.concatenate([edges[:, 1], edges[:, 0]])
-    order = np.argsort(tail, kind="stable")
-    start = np.concatenate([[0], np.cumsum(np.bincount(tail, minlength=size))])
-    return start, head[order]
 
 
 @compiled

@@ -18,23 +18,22 @@ from rbfmuscle.validation import MeshError
 def contract_clusters(
     faces: Integers, labels: Integers, weights: Floats, count: int
 ) -> tuple[Integers, Integers]:
-    """Contract a closed mesh to ``count`` vertices, following a clustering as far as the topology allows.
+    """Contract a closed, oriented 2-manifold to ``count`` vertices, as a clustering says where the topology allows it.
 
     Parameters
     ----------
-    faces : (m, 3) int array
-        Closed, consistently oriented 2-manifold.
-    labels : (n,) int array
+    faces : (m, 3) ndarray of int
+    labels : (n,) ndarray of int
         Cluster of each vertex, 0 .. count - 1.
-    weights : (n,) array
+    weights : (n,) ndarray
         Vertex weights [area]; the heaviest piece of a cluster that falls apart keeps its name.
     count : int
-        Vertices wanted, at least 4 a connected component (more for handles).
+        At least 4 a connected component (more for handles).
 
     Returns
     -------
     labels : (n,) ndarray
-        Final cluster of each vertex: equal to the input but for pieces that had to change.
+        Equal to the input but for pieces that had to change.
     control_faces : (k, 3) ndarray
         Triangles over the ``count`` clusters, oriented like ``faces``.
 
@@ -49,8 +48,7 @@ def contract_clusters(
     out[tail] = np.arange(len(tail))
     used = out >= 0
     parent = np.arange(len(labels))
-    label = labels.astype(np.int64)
-    weight = weights.astype(np.float64).copy()
+    label, weight = labels.astype(np.int64), weights.astype(np.float64)
     live = _contract_loop(tail, twin, out, parent, label, weight, int(used.sum()), count)
     if live != count:
         raise MeshError(
@@ -61,10 +59,10 @@ def contract_clusters(
     order = np.full(len(labels), -1)
     # A cluster keeps its number where it can, so that results do not hinge on vertex order.
     order[roots[np.argsort(label[roots], kind="stable")]] = np.arange(count)
-    final = order[_find_roots_loop(parent)]
-    alive = tail.reshape(-1, 3)
-    alive = alive[alive[:, 0] >= 0]
-    return final, order[alive]
+    while (parent[parent] != parent).any():
+        parent = parent[parent]
+    control = tail.reshape(-1, 3)
+    return order[parent], order[control[control[:, 0] >= 0]]
 
 
 @compiled
@@ -129,25 +127,6 @@ def _contract(h, tail, twin, out, parent, weight):
 
 
 @compiled
-def _contract_inside(edges, pieces, mark, live, count):
-    """Contract edges inside clusters until none can be; return the number of vertices left."""
-    tail, twin, out = edges
-    parent, label, weight = pieces
-    changed = True
-    while changed and live > count:
-        changed = False
-        for h in range(len(tail)):
-            if tail[h] < 0 or live <= count:
-                continue
-            a, b = tail[h], tail[twin[h]]
-            if label[a] == label[b] and weight[a] >= weight[b] and _is_contractible(h, tail, twin, mark):
-                _contract(h, tail, twin, out, parent, weight)
-                live -= 1
-                changed = True
-    return live
-
-
-@compiled
 def _contract_one(tail, twin, out, parent, label, weight, mark, main):
     """Contract the lightest left-over piece into a neighbour; any light pair where no such piece can be."""
     best, best_cost = -1, np.inf
@@ -165,10 +144,22 @@ def _contract_one(tail, twin, out, parent, label, weight, mark, main):
 
 @compiled
 def _contract_loop(tail, twin, out, parent, label, weight, live, count):
+    """Contract edges inside clusters, then left-over pieces one by one; return the number of vertices left."""
     mark = np.full(len(parent), -1)
     main = np.full(label.max() + 1, -1)
     while True:
-        live = _contract_inside((tail, twin, out), (parent, label, weight), mark, live, count)
+        changed = True
+        while changed and live > count:
+            changed = False
+            for h in range(len(tail)):
+                if tail[h] < 0 or live <= count:
+                    continue
+                a, b = tail[h], tail[twin[h]]
+                inside = label[a] == label[b] and weight[a] >= weight[b]
+                if inside and _is_contractible(h, tail, twin, mark):
+                    _contract(h, tail, twin, out, parent, weight)
+                    live -= 1
+                    changed = True
         if live <= count:
             return live
         main[:] = -1
@@ -178,14 +169,3 @@ def _contract_loop(tail, twin, out, parent, label, weight, live, count):
         if not _contract_one(tail, twin, out, parent, label, weight, mark, main):
             return live
         live -= 1
-
-
-@compiled
-def _find_roots_loop(parent):
-    root = np.empty_like(parent)
-    for v in range(len(parent)):
-        r = v
-        while parent[r] != r:
-            r = parent[r]
-        root[v] = r
-    return root

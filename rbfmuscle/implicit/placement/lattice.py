@@ -24,17 +24,7 @@ LEAST_REGION = 0.3  # of the mean volume of the regions
 
 @dataclass(frozen=True)
 class Embedding:
-    """Shape functions at points.
-
-    Attributes
-    ----------
-    indices : (n, 27) ndarray of int
-        Nodes of each point.
-    weights : (n, 27) ndarray
-        Values of their shape functions.
-    slopes : (n, 27, 3) ndarray
-        Gradients of these, by rest coordinates [1 / length].
-    """
+    """Shape functions at n points: 27 nodes of each, their values, their gradients (n, 27, 3) by rest coordinates."""
 
     indices: np.ndarray
     weights: np.ndarray
@@ -44,13 +34,8 @@ class Embedding:
 class Lattice:
     """Cells of a box along a mesh's principal axes that hold some of its volume, and their nodes.
 
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-        Of the rest mesh.
-    faces : (m, 3) ndarray of int
-    nodes : int
-        About how many nodes are wanted. Shape functions are quadratic B-splines along each axis.
+    Of vertices (n, 3) and faces (m, 3) of the rest mesh; ``nodes`` says about how many are wanted. Shape functions are
+    quadratic B-splines along each axis.
 
     Attributes
     ----------

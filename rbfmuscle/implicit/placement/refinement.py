@@ -56,8 +56,7 @@ def fit_sample(
     ----------
     sample : SurfaceSample
         Of the mesh, with unit normals.
-    vertices : (n, 3) array_like
-    faces : (m, 3) array_like of int
+    vertices, faces : (n, 3) and (m, 3) array_like
     fit : FieldFit
         Of the field that will be fitted to it, to all derivatives.
     seed : int
@@ -68,7 +67,7 @@ def fit_sample(
     Returns
     -------
     SurfaceSample
-        Points and normals are those of all rounds, the given ones included, whose field misses the mesh least.
+        Of the round, the given sample included, whose field misses the mesh least.
 
     Raises
     ------

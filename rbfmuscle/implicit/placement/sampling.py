@@ -33,16 +33,9 @@ PLACEMENTS = ("even", "adaptive", "greedy")
 
 @dataclass(frozen=True)
 class SurfaceSample:
-    """Points on a closed mesh with what the surface looks like there.
+    """Points (K, 3) on a closed mesh [scene unit] with unit outward normals (K, 3) there.
 
-    Attributes
-    ----------
-    points : (K, 3) ndarray
-        Positions on the surface [scene unit].
-    normals : (K, 3) ndarray
-        Unit outward normals.
-    control_faces : (m, 3) ndarray
-        Closed, outward, 2-manifold triangulation over the K points.
+    ``control_faces`` (m, 3) is a closed, outward, 2-manifold triangulation over the points.
     """
 
     points: np.ndarray
@@ -128,21 +121,11 @@ def _greedy_sample(fine: FineMesh, count: int, seed: int) -> SurfaceSample:
 
 
 def curvature_density(fine: FineMesh, count: int) -> Floats:
-    """Density of centres from how much the surface bends across one cell.
+    """Density of centres at the fine mesh's vertices (n,), 1 or more: how much the surface bends across one cell.
 
-    The mean squared turn of the normal along edges, per length squared, smoothed over a cell: it is the sum
-    of the squared principal curvatures up to a factor. The density is 1 + 4 (curvature x cell size)^2, so
-    that flat parts keep their even cover.
-
-    Parameters
-    ----------
-    fine : FineMesh
-    count : int
-
-    Returns
-    -------
-    (n,) ndarray
-        At the fine mesh's vertices, 1 or more.
+    The mean squared turn of the normal along edges, per length squared, smoothed over a cell: it is the sum of the
+    squared principal curvatures up to a factor. The density is 1 + 4 (curvature x cell size)^2, so that flat parts keep
+    their even cover.
     """
     area = np.linalg.norm(face_normals(fine.vertices, fine.faces), axis=1)
     normals = vertex_normals(fine.vertices, fine.faces)
@@ -168,14 +151,7 @@ def _edge_sum(i: Integers, j: Integers, values: Floats, size: int) -> Floats:
 
 
 def spread_points(vertices: Floats, faces: Integers, count: int, *, seed: int = 0) -> tuple[Floats, Integers]:
-    """Points on a mesh, evenly by area: one at random in each of ``count`` strips of equal area.
-
-    Returns
-    -------
-    points : (count, 3) ndarray
-    face : (count,) ndarray
-        Triangle that holds each.
-    """
+    """Points (count, 3) on a mesh, one in each strip of equal area, and the triangle (count,) that holds each."""
     vertices, faces = check_mesh(vertices, faces)
     rng = np.random.default_rng(seed)
     corners = vertices[faces]
@@ -196,6 +172,11 @@ def _gather(fine: FineMesh, count: int, labels: Integers, control: Integers) -> 
     # The nearest point of the cell itself, not of the mesh: that could lie on the other side of a thin sheet.
     points, piece, distance = np.zeros((count, 3)), np.zeros(count, dtype=np.int64), np.full(count, np.inf)
     _nearest_in_cell_loop(fine.vertices, fine.faces, corner, centroid, points, piece, distance)
+    for k in np.flatnonzero(np.isinf(distance)):  # a cell without a triangle of its own gives a vertex
+        places = np.flatnonzero(corner == k)
+        its = fine.vertices[fine.faces.ravel()[places]]
+        nearest = int(np.argmin(((its - centroid[k]) ** 2).sum(axis=1)))
+        points[k], piece[k] = its[nearest], places[nearest] // 3
     normals = _normals_at(fine, points, piece, corner)
     return SurfaceSample(points, normals, control)
 
@@ -221,7 +202,7 @@ def _normals_at(fine: FineMesh, points: Floats, piece: Integers, corner: Integer
 
 @compiled
 def _nearest_in_cell_loop(vertices, faces, corner, target, points, face, distance):
-    """Of the triangles wholly in cell k, the point nearest to target[k]; a cell without one gives a vertex.
+    """Of the triangles wholly in cell k, the point nearest to target[k].
 
     Triangles between cells are left out: at a thin rim two cells would take the same point of one.
     """
@@ -241,19 +222,3 @@ def _nearest_in_cell_loop(vertices, faces, corner, target, points, face, distanc
             face[k] = f
             for c in range(3):
                 points[k, c] = q[c]
-    whole = np.empty(len(distance), np.bool_)
-    for k in range(len(distance)):
-        whole[k] = distance[k] < np.inf
-    for f in range(len(faces)):
-        for c in range(3):
-            k = corner[f, c]
-            if whole[k]:
-                continue
-            square = 0.0
-            for a in range(3):
-                square += (vertices[faces[f, c], a] - target[k, a]) ** 2
-            if square < distance[k]:
-                distance[k] = square
-                face[k] = f
-                for a in range(3):
-                    points[k, a] = vertices[faces[f, c], a]
