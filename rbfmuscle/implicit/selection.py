@@ -7,6 +7,7 @@ zero sets of the best are extracted in their order, until one is a single closed
 
 from __future__ import annotations
 
+import contextlib
 import math
 import warnings
 from collections.abc import Callable
@@ -39,8 +40,14 @@ LOOKS, APART = 12, 1.15
 FLAT = 0.5
 _GOLDEN = 0.5 * (math.sqrt(5) - 1)
 
-Trial = tuple[float, float, float]
-"""epsilon, error, condition."""
+
+class Trial(NamedTuple):
+    """A fit of some epsilon, its error at the held-out points, infinite where there is no fit, and its condition."""
+
+    epsilon: float
+    error: float
+    condition: float
+    field: RBFField | None
 
 
 class EpsilonChoice(NamedTuple):
@@ -52,8 +59,7 @@ class EpsilonChoice(NamedTuple):
 
     epsilon: float
     error: float
-    condition: float
-    broken: str = ""
+    broken: str
 
 
 def spacing(points: ArrayLike) -> Floats:
@@ -113,82 +119,58 @@ def choose_epsilon(
             f"kernel '{fit.kernel.name}' has no shape parameter: epsilon does not change its interpolant"
         )
     points = check_points(points)
-    normals = check_vectors(normals, len(points))
-    search = _Search(points, normals, fit, check_points(held_out, name="held_out"))
-    order = search.run()
+    normals, reach = check_vectors(normals, len(points)), float(spacing(points).mean())
+    order = _search(points, normals, fit, check_points(held_out, name="held_out"), reach)
     if not order:
         raise np.linalg.LinAlgError(
             f"no epsilon of kernel '{fit.kernel.name}' gives a fit; take another kernel or spread the centres"
         )
-    (epsilon, error, found), broken = order[0], ""
-    if distance is not None:
-        sound, broken = _first_sound(search, order, distance)
-        epsilon, error, found = sound or order[0]
-    return EpsilonChoice(epsilon, error, found, broken)
+    found, broken = (order[0], "") if distance is None else _first_sound(order, points, reach, distance)
+    return EpsilonChoice((found or order[0]).epsilon, (found or order[0]).error, broken)
 
 
-class _Search:
-    """Fits by epsilon, and their errors at the held-out points."""
+def _search(points: Floats, normals: Floats, fit: FieldFit, held_out: Floats, reach: float) -> list[Trial]:
+    """Scan and narrow; the trials that have a fit, in the order of their worth."""
+    trials: dict[float, Trial] = {}
 
-    def __init__(self, points: Floats, normals: Floats, fit: FieldFit, held_out: Floats) -> None:
-        self.points, self.normals, self.fit, self.held_out = points, normals, fit, held_out
-        self.reach = float(spacing(points).mean())
-        self.trials: dict[float, Trial] = {}
-        self.fields: dict[float, RBFField] = {}
+    def error(epsilon: float) -> float:
+        if epsilon not in trials:
+            trials[epsilon] = Trial(epsilon, math.inf, math.inf, None)
+            with contextlib.suppress(np.linalg.LinAlgError):
+                field = replace(fit, epsilon=epsilon).fit(points, normals)
+                missed = surface_error(field, held_out, reach)
+                trials[epsilon] = Trial(epsilon, missed, field.condition, field)
+        return trials[epsilon].error
 
-    def attempt(self, epsilon: float) -> Trial:
-        """The trial of an epsilon, of infinite error where it cannot be fitted."""
-        if epsilon in self.trials:
-            return self.trials[epsilon]
-        trial = epsilon, math.inf, math.inf
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NumericalWarning)
-            try:
-                field = replace(self.fit, epsilon=epsilon).fit(self.points, self.normals)
-                trial = epsilon, surface_error(field, self.held_out, self.reach), field.condition
-                self.fields[epsilon] = field
-            except np.linalg.LinAlgError:
-                pass
-        self.trials[epsilon] = trial
-        return trial
-
-    def run(self) -> list[Trial]:
-        """Scan and narrow; the trials in the order of their worth."""
-        grid = np.geomspace(*SPAN, SCAN) / self.reach
-        best = min((self.attempt(float(epsilon)) for epsilon in grid), key=lambda trial: trial[1])
-        if math.isinf(best[1]):
-            return []
-        self._narrow(best[0] * grid[0] / grid[1], best[0] * grid[1] / grid[0])
-        tried = [trial for trial in self.trials.values() if math.isfinite(trial[1])]
-        limit = WITHIN * min(trial[1] for trial in tried)
-        return sorted(tried, key=lambda t: (t[1] > limit, t[2] if t[1] <= limit else t[1]))
-
-    def _narrow(self, low: float, high: float) -> None:
-        """Golden sections of the logarithm between low and high."""
-        a, b = math.log(low), math.log(high)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NumericalWarning)
+        grid = [float(epsilon) for epsilon in np.geomspace(*SPAN, SCAN) / reach]
+        best = min(grid, key=error)
+        # golden sections of the logarithm
+        a, b = math.log(best * grid[0] / grid[1]), math.log(best * grid[1] / grid[0])
         for _ in range(REFINE):
             x, y = b - _GOLDEN * (b - a), a + _GOLDEN * (b - a)
-            if self.attempt(math.exp(x))[1] <= self.attempt(math.exp(y))[1]:
-                b = y
-            else:
-                a = x
+            a, b = (a, y) if error(math.exp(x)) <= error(math.exp(y)) else (x, b)
+    tried = [trial for trial in trials.values() if math.isfinite(trial.error)]
+    limit = WITHIN * min((trial.error for trial in tried), default=0.0)
+    return sorted(tried, key=lambda t: (t.error > limit, t.condition if t.error <= limit else t.error))
 
 
 def _first_sound(
-    search: _Search, order: list[Trial], distance: Callable[[Floats], Floats]
+    order: list[Trial], points: Floats, reach: float, distance: Callable[[Floats], Floats]
 ) -> tuple[Trial | None, str]:
     """The first trial whose zero set is closed and has no stray sheets, or None and why there is none."""
     broken: list[float] = []
     stray, remedy = 0, "take more centres or another kernel"
     for trial in order:
-        if trial[1] >= FLAT * search.reach or len(broken) == LOOKS:
+        if trial.field is None or trial.error >= FLAT * reach or len(broken) == LOOKS:
             break
-        if any(max(trial[0] / epsilon, epsilon / trial[0]) < APART for epsilon in broken):
+        if any(max(trial.epsilon / epsilon, epsilon / trial.epsilon) < APART for epsilon in broken):
             continue
-        sheets = find_sheets(search.fields[trial[0]], search.points, distance)
+        sheets = find_sheets(trial.field, points, distance)
         if sheets.sound():
             return trial, ""
-        broken.append(trial[0])
+        broken.append(trial.epsilon)
         stray = max(stray, sheets.stray)
     if not broken:
         return None, f"the field is flat between the centres at every epsilon; {remedy}"

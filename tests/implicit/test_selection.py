@@ -2,7 +2,6 @@
 
 import warnings
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import (
     BOUND,
     SPAN,
+    Trial,
     _first_sound,
     choose_epsilon,
     spacing,
@@ -114,8 +114,6 @@ def test_miss_is_the_distance_to_first_order_and_a_flat_field_misses(plate):
 class Shape:
     """A field made of a function of points that is negative inside."""
 
-    condition = 1.0
-
     def __init__(self, function):
         self.function = function
 
@@ -159,23 +157,16 @@ def test_stray_and_open_sheets_in_the_box_are_seen():
     assert not find_sheets(Shape(lambda at: 1.0 + 0.0 * at[:, 0]), points, ball).found
 
 
-@pytest.fixture
-def first_sound():
-    """``first_sound(tried, field_of)``: of trials around a ball; ``field_of(epsilon)`` gives the field."""
+@pytest.mark.parametrize(
+    ("error", "start", "function"),
+    [
+        (0.1, "the level set is open", lambda at: at[:, 0] - 11.0),
+        (4.0, "the field is flat between the centres", lambda at: pytest.fail("extracted")),
+    ],
+)
+def test_what_is_open_or_flat_is_reported(error, start, function):
+    """Fits around a ball, whose centres are 5 apart."""
     points = np.vstack([10.0 * trimesh.creation.icosphere(subdivisions=2).vertices, [[15.0, 0.0, 0.0]]])
-
-    def ask(tried, field_of):
-        fields = {epsilon: field_of(epsilon) for epsilon, *_ in tried}
-        search = SimpleNamespace(points=points, reach=spacing(points).mean(), fields=fields)
-        return _first_sound(search, [tuple(row) for row in tried], ball)
-
-    return ask
-
-
-def test_what_is_open_or_flat_is_reported(first_sound):
-    tried = np.c_[[1.0, 2.0, 3.0], [0.1, 0.11, 0.12], [1e6, 1e6, 1e6]]
-    found, broken = first_sound(tried, lambda epsilon: Shape(lambda at: at[:, 0] - 11.0))
-    assert found is None and broken.startswith("the level set is open")
-    tried[:, 1] = 4.0  # the centres are 5 apart
-    found, broken = first_sound(tried, lambda epsilon: Shape(lambda at: pytest.fail("extracted")))
-    assert found is None and broken.startswith("the field is flat between the centres")
+    tried = [Trial(epsilon, error, 1e6, Shape(function)) for epsilon in (1.0, 2.0, 3.0)]
+    found, broken = _first_sound(tried, points, spacing(points).mean(), ball)
+    assert found is None and broken.startswith(start)
