@@ -80,19 +80,11 @@ def chosen_poses(scene: Scene) -> list[int]:
 
 
 def measure_run(saved: SavedRun, extra: dict[str, Any]) -> dict[str, Any]:
-    """Values of every measure but the distances for one model.
+    """Values of every measure but the distances for one model: muscle -> quantity -> value.
 
-    Parameters
-    ----------
-    saved : SavedRun
-    extra : dict
-        ``build`` [s], and where the motion has more than one frame ``turn`` and ``end``: surfaces by muscle
-        (vertices, faces) at the last pose and back at the first, by coarser steps.
-
-    Returns
-    -------
-    dict
-        muscle -> quantity -> value, and under ``"all"`` the worst over muscles, or the wall time.
+    Under ``"all"`` the worst over muscles, or the wall time. ``extra`` holds ``build`` [s], and where the motion has
+    more than one frame ``turn`` and ``end``: surfaces by muscle (vertices, faces) at the last pose and back at the
+    first, by coarser steps.
     """
     found = {}
     for muscle in saved.muscles:
@@ -123,13 +115,8 @@ def _worst(quantity, muscles):
 def add_distances(results: dict[str, Any], folder: Path, poses: list[int]) -> None:
     """Add the distances of each model's surfaces to those of the first, the worst of some poses.
 
-    Parameters
-    ----------
-    results : dict of str to dict
-        Model -> what `measure_run` found; takes ``distance_rms`` and ``distance_max``.
-    folder : pathlib.Path
-        With a run of each model.
-    poses : list of int
+    ``results`` holds what `measure_run` found by model, and takes ``distance_rms`` and ``distance_max``; the folder
+    holds a run of each model.
     """
     first, *others = (SavedRun(folder / name) for name in results)
     for found, run in zip(list(results.values())[1:], others):
@@ -149,24 +136,10 @@ def write_tables(
     labels: dict[str, str],
     poses: list[int],
 ) -> dict[str, Any]:
-    """Write ``comparison.json`` and ``comparison.csv``.
+    """Write ``comparison.json`` and ``comparison.csv``; what the JSON file holds.
 
-    Parameters
-    ----------
-    folder : pathlib.Path
-    scene : Scene
-    results : dict of str to dict
-        Model -> muscle or "all" -> quantity -> value.
-    failed : dict of str to str
-        Models that did not finish, and why.
-    labels : dict of str to str
-        Model -> what it is called.
-    poses : list of int
-
-    Returns
-    -------
-    dict
-        What the JSON file holds.
+    ``results`` are values by model, muscle or "all", and quantity; ``failed`` says by model why it did not finish,
+    ``labels`` what it is called.
     """
     units = {name: unit_text(m.kind, scene.units) for name, m in MEASURES.items()}
     table = {
@@ -216,12 +189,7 @@ def best_models(results: dict[str, Any], quantity: str, units: str) -> list[str]
 def describe(results: dict[str, Any], labels: dict[str, str], units: str) -> str:
     """One sentence: how the first model keeps out of bones at which price, and how near another comes at which price.
 
-    Parameters
-    ----------
-    results : dict of str to dict
-        As for `write_tables`; distances are to the first model.
-    labels : dict of str to str
-    units : str
+    Arguments are those of `write_tables`; distances are to the first model.
     """
     first, *others = results
     whole = {name: found[ALL] for name, found in results.items()}

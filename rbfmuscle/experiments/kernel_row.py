@@ -37,16 +37,10 @@ VOLUME_BOUND = 0.1
 
 
 class ReferenceSurface:
-    """The surface that is to be met, and how far another one is from it.
+    """The surface (vertices (n, 3), faces (m, 3)) that is to be met, and how far another one is from it.
 
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-    faces : (m, 3) ndarray of int
-    resolution : int
-        Cells along the longest side of extracted surfaces; as many as a muscle so slender needs where 0.
-    seed : int
-        Of the points.
+    ``resolution`` counts cells along the longest side of extracted surfaces; as many as a muscle so slender needs where
+    0. ``seed`` is that of the points.
     """
 
     def __init__(self, vertices: Floats, faces: Integers, resolution: int = 0, seed: int = 0) -> None:
@@ -71,17 +65,7 @@ class ReferenceSurface:
 
 
 class Measured(NamedTuple):
-    """What one row found.
-
-    Attributes
-    ----------
-    row : dict
-        As in `KernelStudy.rows`, without times.
-    sample : SurfaceSample
-        The centres that were fitted.
-    fit : FieldFit
-    surface : (vertices, faces) or None
-    """
+    """What one row found: a row of `KernelStudy.rows` without times, the fitted centres, how, and the surface."""
 
     row: dict
     sample: SurfaceSample
@@ -90,16 +74,7 @@ class Measured(NamedTuple):
 
 
 def measure_row(judge: ReferenceSurface, sample: SurfaceSample, kernel: Kernel, placement: str) -> Measured:
-    """One row of the table, its times left open, and its surface.
-
-    Parameters
-    ----------
-    judge : ReferenceSurface
-    sample : SurfaceSample
-        Greedy centres.
-    kernel : Kernel
-    placement : {"greedy", "fitted"}
-    """
+    """One row of the table, its times left open, and its surface; ``sample`` holds greedy centres."""
     placement = placement if kernel.hermite else "greedy"
     derivatives = wanted_derivatives(len(sample.points), fitted=placement == FITTED)
     fit = FieldFit(kernel, 1.0, derivatives, BOUND if kernel.has_epsilon else np.inf)
@@ -159,14 +134,7 @@ def _measure(
 
 
 def time_row(found: Measured, points: Floats) -> None:
-    """Write what a fit, and the values at 20,000 points, cost into a row [s of processor time, one thread].
-
-    Parameters
-    ----------
-    found : Measured
-    points : (n, 3) ndarray
-        Of the mesh [length].
-    """
+    """Write into a row what a fit, and values at 20,000 of the points (n, 3), cost [processor s, one thread]."""
     row, sample = found.row, found.sample
     with warnings.catch_warnings(), threads_limited(1):
         warnings.simplefilter("ignore", NumericalWarning)  # it stands in the row's condition

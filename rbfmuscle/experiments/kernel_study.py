@@ -203,12 +203,8 @@ def cost(row: dict) -> float:
 def recommend(rows: list[dict]) -> dict | None:
     """The quickest of the rows that err at most 5 % more than the best, None where every one is unfit.
 
-    Sound conditions come first; of rows alike in time, within 15 %, those without a parameter to choose.
-
-    Parameters
-    ----------
-    rows : list of dict
-        With ``rms, fit_time, evaluation_time, condition, epsilon, unfit``.
+    Sound conditions come first; of rows alike in time, within 15 %, those without a parameter to choose. Rows hold
+    ``rms, fit_time, evaluation_time, condition, epsilon, unfit``.
     """
     good = [row for row in rows if not row["unfit"]]
     if not good:

@@ -28,20 +28,10 @@ FINER_DOWN = ("contact.substep_angle", "motion.step")
 class SweepPoint:
     """One combination of settings of one scene.
 
-    Attributes
-    ----------
-    key : str
-        Hash of the scene's content and the settings.
-    scene : str
-        Name of the scene.
-    settings : dict
-        Dotted keys with their values, the model first.
-    model : str
-        Name of the model that the settings choose, "" where they choose none.
-    role : str
-        "reference", "default" (the scene's own settings, of this model) or "".
-    reference : str
-        Key of the point that its error is measured against, "" without a grid.
+    ``settings`` are dotted keys with their values, the model first; ``scene`` is a name. ``key`` is a hash of the
+    scene's content and the settings; ``model`` the model that they choose, "" where they choose none; ``role``
+    "reference", "default" (the scene's own settings, of this model) or ""; ``reference`` the key of the point that the
+    error is measured against, "" without a grid.
     """
 
     key: str
@@ -60,10 +50,7 @@ class SweepPoint:
 def parse_grid(texts: Sequence[str]) -> Grid:
     """Return the grid of ``["KEY=a,b,c", ...]``; "MODEL:KEY=a,b" holds for the points of that model only.
 
-    Raises
-    ------
-    UsageError
-        On text of another form, or a key given twice or without values.
+    UsageError on text of another form, or a key given twice or without values.
     """
     grid: Grid = []
     for text in texts:
@@ -98,7 +85,7 @@ def plan_sweep(
     frames: str | None = None,
     reference: Mapping[str, Any] | None = None,
 ) -> list[SweepPoint]:
-    """Lay out a sweep; nothing is run.
+    """Lay out a sweep scene by scene: references, the scene's own settings, the grid; nothing is run.
 
     Parameters
     ----------
@@ -112,11 +99,6 @@ def plan_sweep(
         Settings of the reference, over those that follow from the grid: the greatest number of centres, samples,
         nodes, iterations and cells in it and the least angle and step. With a ``model``, one reference serves all
         models; else each model of the grid has its own.
-
-    Returns
-    -------
-    list of SweepPoint
-        Scene by scene: references, the scene's own settings, the grid.
     """
     return [point for n, s in scenes.items() for point in _points(n, s, grid, frames, dict(reference or {}))]
 

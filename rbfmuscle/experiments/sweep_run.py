@@ -44,10 +44,7 @@ VALUES = ("error_rms", "error_max", *WORST, *TIMES)
 class SweepFolder:
     """``points/KEY.json`` (a result each) and ``references/KEY.npz`` (surfaces that errors are measured against).
 
-    Parameters
-    ----------
-    directory : path
-        Made where it is missing; raises UsageError where it cannot be written to.
+    The folder is made where it is missing; UsageError where it cannot be written to.
     """
 
     def __init__(self, directory: str | Path) -> None:

@@ -51,10 +51,7 @@ def sweep_rows(
 def pareto_front(errors: Sequence[float], times: Sequence[float]) -> list[int]:
     """Indices, by growing time, of the points that no other beats in error or time without losing in the other.
 
-    Parameters
-    ----------
-    errors, times : sequence of float
-        NaN takes no part.
+    Points of which error or time is NaN take no part.
     """
     front, least = [], math.inf
     for k in sorted(range(len(errors)), key=lambda k: (times[k], errors[k])):

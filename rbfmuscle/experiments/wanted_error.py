@@ -33,16 +33,8 @@ POWER = 1.4
 class WantedError:
     """What `reach_error` found.
 
-    Attributes
-    ----------
-    reached : bool
-    row : dict
-        As in `KernelStudy.rows`: the one that reached it, else the one of the smallest error.
-    error : float
-        Of that row [length].
-    wanted : float
-    tried : list of dict
-        ``kernel, centres, error`` of all that was measured, in order.
+    ``row`` is as in `KernelStudy.rows`: the one that reached the ``wanted`` error, else that of the smallest error;
+    ``error`` is its [length]; ``tried`` lists ``kernel, centres, error`` of all that was measured, in order.
     """
 
     reached: bool

@@ -32,12 +32,7 @@ def threads_limited(count: int) -> Iterator[None]:
 def connect_cluster(address: str) -> Client:
     """A client of a Dask scheduler, as soon as two workers are there: to one alone joblib sends nothing.
 
-    Raises
-    ------
-    MissingPartError
-        If Dask is not installed.
-    UsageError
-        If no scheduler with two workers answers.
+    MissingPartError if Dask is not installed, UsageError if no scheduler with two workers answers.
     """
     try:
         from distributed import Client

@@ -12,19 +12,10 @@ CALIPERS = 36  # directions in which a section's width is taken
 
 
 def belly_measures(vertices: Floats, faces: Integers, first: Floats, last: Floats) -> dict[str, float]:
-    """Greatest section of a closed surface across a line, where it lies, and how thick it is.
+    """Greatest section of a closed surface across the line between two points (3,), where it lies, and how thick it is.
 
-    Parameters
-    ----------
-    vertices, faces : (n, 3) and (m, 3) ndarray
-    first, last : (3,) ndarray
-        Ends of the line of action.
-
-    Returns
-    -------
-    dict
-        ``csa_max`` [unit²], ``csa_place`` (0 at ``first``, 1 at ``last``), ``belly_thickness``: the least width of
-        that section.
+    ``csa_max`` [unit²], ``csa_place`` (0 at ``first``, 1 at ``last``), and ``belly_thickness``, the least width of that
+    section.
     """
     length = float(np.linalg.norm(last - first))
     axis = (last - first) / length

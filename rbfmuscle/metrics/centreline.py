@@ -69,18 +69,7 @@ class Centreline:
         self.operator = slice_operator(vertices, faces, field, even)
 
     def points(self, vertices: Floats, poses: Mapping[str, Floats]) -> Floats:
-        """The line now.
-
-        Parameters
-        ----------
-        vertices : (n, 3) ndarray
-            The carried mesh.
-        poses : dict of str to (4, 4) ndarray
-
-        Returns
-        -------
-        (k, 3) ndarray
-        """
+        """The line now, (k, 3), from the carried mesh (n, 3) and the poses (4, 4) of the bones."""
         first, last = (carried_middle(end, poses) for end in self.ends)
         return np.vstack([first, self.operator @ vertices, last])
 
@@ -111,16 +100,10 @@ def resampled(line: Floats, segments: int) -> Floats:
 
 
 def end_groups(muscle: Muscle, joints: Sequence[Joint], moving: Collection[str] | None = None) -> list[End]:
-    """Split the attachments into origin and insertion.
+    """Split the attachments into origin and insertion, each a list of (holder, points, areas).
 
-    The origin is every attachment on the same rigid body as the first one; the rest is the insertion. Bones whose
-    joint does not move are one body with its parent. Where all are on one body, the first attachment is the origin.
-
-    Returns
-    -------
-    list of two lists of (holder, points, areas)
-        ``points`` (k, 3) are the attached vertices at rest, ``areas`` (k,) what each stands for: where triangles are
-        small there are more of them, which must not draw the end of a line there.
+    ``points`` (k, 3) are the attached vertices at rest, ``areas`` (k,) what each stands for: where triangles are small
+    there are more of them, which must not draw the end of a line there.
     """
     vertices = np.asarray(muscle.mesh.vertices, dtype=float)
     areas = vertex_areas(vertices, np.asarray(muscle.mesh.faces))
@@ -133,7 +116,11 @@ def end_groups(muscle: Muscle, joints: Sequence[Joint], moving: Collection[str] 
 def split_ends(
     muscle: Muscle, joints: Sequence[Joint], moving: Collection[str] | None = None
 ) -> list[list[Attachment]]:
-    """The attachments of the origin and those of the insertion, as `end_groups` has them."""
+    """The attachments of the origin and those of the insertion.
+
+    The origin is every attachment on the same rigid body as the first one; the rest is the insertion. Bones whose joint
+    does not move are one body with its parent. Where all are on one body, the first attachment is the origin.
+    """
     joint_of = {joint.child: joint for joint in joints}
 
     def body(bone):
@@ -164,21 +151,10 @@ def moving_joints(scene: Scene) -> set[str]:
 
 
 def slice_operator(vertices: Floats, faces: Integers, field: Floats, levels: Floats) -> sparse.csr_matrix:
-    """Sparse matrix that maps vertices to the centroids of the field's isolines.
+    """Sparse matrix (k, n), rows of sum one, that maps vertices to the centroids of a field's isolines.
 
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-        Positions whose isoline lengths weigh the centroids.
-    faces : (m, 3) ndarray of int
-    field : (n,) ndarray
-    levels : (k,) array_like
-        Each strictly between the least and the greatest value of the field.
-
-    Returns
-    -------
-    (k, n) scipy.sparse.csr_matrix
-        Rows sum to one.
+    The isolines' lengths at ``vertices`` (n, 3) weigh the centroids; ``field`` is (n,), and ``levels`` (k,) lie
+    strictly between its least and its greatest value.
     """
     (a, b, c), (s, t), row = _crossed_edges(faces, field, np.asarray(levels, dtype=float))
     p = vertices[a] + s[:, None] * (vertices[b] - vertices[a])
@@ -193,14 +169,7 @@ def slice_operator(vertices: Floats, faces: Integers, field: Floats, levels: Flo
 def isolines(
     vertices: Floats, faces: Integers, field: Floats, levels: Floats
 ) -> tuple[Floats, Floats, Integers]:
-    """Segments of a field's isolines on an outward surface, all in one direction.
-
-    Returns
-    -------
-    start, end : (s, 3) ndarray
-    level : (s,) ndarray of int
-        Place of each segment's level.
-    """
+    """Segments of a field's isolines on an outward surface, in one direction: start, end (s, 3), level's place (s,)."""
     (a, b, c), (s, t), row = _crossed_edges(faces, field, levels)
     start = vertices[a] + s[:, None] * (vertices[b] - vertices[a])
     end = vertices[a] + t[:, None] * (vertices[c] - vertices[a])

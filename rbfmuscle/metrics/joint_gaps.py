@@ -23,16 +23,7 @@ _VERTICES = 2000
 def joint_gaps(scene: Scene, frames: Iterable[int]) -> list[tuple[int, str, str, float]]:
     """How much wider than at rest the gap between the two bones of each joint is, by their vertices.
 
-    Parameters
-    ----------
-    scene : Scene
-    frames : iterable of int
-        Of the motion.
-
-    Returns
-    -------
-    list of (frame, parent, child, opening)
-        [scene unit], for joints whose bones meet at rest.
+    For some frames of the motion, of joints whose bones meet at rest: (frame, parent, child, opening [scene unit]).
     """
     vertices = {bone.name: np.asarray(bone.mesh.vertices, dtype=float) for bone in scene.bones}
     pairs = [(j.parent, j.child) for j in scene.joints if j.parent in vertices and j.child in vertices]

@@ -65,28 +65,17 @@ class MeshDistance:
         return self._exact.layout if "_exact" in self.__dict__ else self._known_layout
 
     def inside(self, points: ArrayLike, *, pose: Floats = _HERE) -> Booleans:
-        """Which points lie inside, (n,) ndarray of bool.
-
-        Parameters
-        ----------
-        points : (n, 3) array_like
-        pose : (4, 4) ndarray, optional
-            Carries the points into the mesh's coordinates.
-        """
+        """Which points (n, 3) lie inside, (n,), once a pose (4, 4) has carried them into the mesh's coordinates."""
         points = check_points(points)
         if self.closed:
             return self._columns.inside(points, pose)
         return self._wound(points @ pose[:3, :3].T + pose[:3, 3])
 
     def unsigned(self, points: ArrayLike, *, near: Integers | None = None) -> Floats:
-        """Distance to the surface, (n,) ndarray [scene unit].
+        """Distance (n,) of points (n, 3) to the surface [scene unit].
 
-        Parameters
-        ----------
-        points : (n, 3) array_like
-        near : (n,) ndarray of int, optional
-            Place in the tree of a triangle near each point, -1 where none is known; afterwards that of the nearest
-            one, for the next call with a mesh of the same layout.
+        ``near`` (n,) holds the place in the tree of a triangle near each point, -1 where none is known; afterwards that
+        of the nearest one, for the next call with a mesh of the same layout.
         """
         points = check_points(points)
         out, near = np.empty(len(points)), np.full(len(points), -1) if near is None else near
@@ -107,19 +96,7 @@ class MeshDistance:
         return distance, closest, normal
 
     def depth(self, points: ArrayLike, *, pose: Floats = _HERE) -> Floats:
-        """How deep points lie inside, 0 where outside.
-
-        Parameters
-        ----------
-        points : (n, 3) array_like
-        pose : (4, 4) ndarray, optional
-            Carries the points into the mesh's coordinates.
-
-        Returns
-        -------
-        (n,) ndarray
-            [scene unit]
-        """
+        """How deep points (n, 3) lie inside, (n,) [scene unit], 0 where outside; the pose is as for `inside`."""
         points = check_points(points)
         out, inside = np.zeros(len(points)), self.inside(points, pose=pose)
         if inside.any():

@@ -51,11 +51,8 @@ _OVERLAPS = ("penetration_max", "bone_penetration_max", "solver_penetration_max"
 class MuscleMeasures:
     """Measures muscles frame by frame; memory does not grow with surfaces.
 
-    Parameters
-    ----------
-    scene : Scene
-    carried : dict of str to (vertices, faces)
-        Carried meshes at rest, before the motion, of the models that are measured here.
+    ``carried`` holds the carried meshes (vertices, faces) at rest, before the motion, of the models that are measured
+    here.
     """
 
     def __init__(self, scene: Scene, carried: dict[str, Any]) -> None:
@@ -191,12 +188,9 @@ def _edge_operator(vertices: Floats, faces: Integers) -> sparse.csr_matrix:
 def surface_distance(
     vertices: Floats, faces: Integers, other_vertices: Floats, other_faces: Integers
 ) -> tuple[float, float]:
-    """Distance between two surfaces, from the vertices of each to the other.
+    """Distance between two surfaces, from the vertices of each to the other [scene unit].
 
-    Returns
-    -------
-    rms, worst : float
-        Root of the mean of both directions' mean squares, and the greatest distance of either [scene unit].
+    Root of the mean of both directions' mean squares, and the greatest distance of either.
     """
     there = MeshDistance(other_vertices, other_faces).unsigned(vertices)
     back = MeshDistance(vertices, faces).unsigned(other_vertices)

@@ -19,8 +19,8 @@ def moment_arms(
     """Moment arms -dl/dq along a motion.
 
     A parabola is fitted to the lengths of the frames within ``reach``, and always of both neighbours, as far as the
-    coordinate goes on alone and in one direction: with two neighbours it is the central difference, at an end
-    the difference to the one neighbour.
+    coordinate goes on alone and in one direction: with two neighbours it is the central difference, at an end the
+    difference to the one neighbour.
 
     Parameters
     ----------

@@ -14,14 +14,7 @@ if TYPE_CHECKING:
 
 
 class BoneProbe(MeshDistance):
-    """One bone, prepared once in its own coordinates.
-
-    Parameters
-    ----------
-    name : str
-    mesh : trimesh.Trimesh
-        Faces outward. Holes are allowed; the side then comes from winding numbers.
-    """
+    """One bone, prepared once in its own coordinates, faces outward; it may have holes."""
 
     def __init__(self, name: str, mesh: trimesh.Trimesh) -> None:
         super().__init__(mesh.vertices, mesh.faces, closed=bool(mesh.is_watertight))
@@ -30,20 +23,7 @@ class BoneProbe(MeshDistance):
 
 
 def surface_depth(vertices: Floats, probes: list[BoneProbe], poses: dict[str, Floats]) -> Floats:
-    """Depth of surface vertices inside the bones.
-
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-        World coordinates [scene unit].
-    probes : list of BoneProbe
-    poses : dict of str to (4, 4) ndarray
-
-    Returns
-    -------
-    (n,) ndarray
-        The greatest depth over all bones; 0 where a vertex is in none.
-    """
+    """Greatest depth (n,) of vertices (n, 3) in the bones, of poses (4, 4) by name; 0 where in none [scene unit]."""
     out = np.zeros(len(vertices))
     for probe in bones_about(vertices, probes, poses):
         np.maximum(out, probe.depth(vertices, pose=inverse_pose(poses[probe.name])), out=out)
@@ -73,20 +53,7 @@ def bones_about(vertices: Floats, probes: list[BoneProbe], poses: dict[str, Floa
 
 
 def bone_depth(surface: MeshDistance, probes: list[BoneProbe], poses: dict[str, Floats]) -> float:
-    """Greatest depth of any bone vertex inside a muscle's closed, outward surface.
-
-    Parameters
-    ----------
-    surface : MeshDistance
-        In world coordinates.
-    probes : list of BoneProbe
-    poses : dict of str to (4, 4) ndarray
-
-    Returns
-    -------
-    float
-        [scene unit]; 0 where no bone vertex is inside.
-    """
+    """Greatest depth of any bone vertex in a closed, outward surface in the world, 0 where none is [scene unit]."""
     near = bones_about(surface.vertices, probes, poses)
     depths = [surface.depth(probe.vertices, pose=poses[probe.name]).max(initial=0.0) for probe in near]
     return float(max(depths, default=0.0))

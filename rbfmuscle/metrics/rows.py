@@ -24,14 +24,8 @@ def frame_rows(
 ) -> list[Row]:
     """Rows of one frame.
 
-    Parameters
-    ----------
-    scene : Scene
-    frame : Frame
-    before : mapping of str to float or None
-        Coordinates of the frame before [radian or scene unit].
-    measured : mapping of str to mapping
-        Values by muscle (`ALL` for the whole scene) and quantity.
+    ``before`` are the coordinates of the frame before [radian or scene unit], None at the first; ``measured`` the
+    values by muscle (`ALL` for the whole scene) and quantity.
     """
     name, angle = _leading_coordinate(scene, frame, before)
     together = dict(measured.get(ALL, {}))
@@ -52,13 +46,8 @@ def moment_arm_rows(
 ) -> list[Row]:
     """Rows of the moment arms of all frames.
 
-    Parameters
-    ----------
-    scene : Scene
-    path : mapping of int to mapping
-        Coordinates of each frame [radian or scene unit], in the order of the motion.
-    lengths : mapping of str to mapping of int to float
-        Length of each muscle in each frame [scene unit].
+    ``path`` holds the coordinates of each frame [radian or scene unit], in the order of the motion; ``lengths`` the
+    length of each muscle in each frame [scene unit].
     """
     facts, rows = all_coordinates(scene.joints), []
     shifts = {name for name, fact in facts.items() if fact.motion == "translation"}

@@ -171,13 +171,8 @@ def _in_unit(value, quantity, unit):
 def muscle_limit(quantity: str, limit: float, found: Mapping[str, Mapping[str, Any]]) -> float:
     """Limit of one muscle: thin ones and those that are slack at rest have their own in place of the default.
 
-    Parameters
-    ----------
-    quantity : str
-    limit : float
-        Of all muscles, in the unit of ``metrics.csv``.
-    found : dict
-        Facts of the muscle by quantity.
+    ``limit`` is that of all muscles, in the unit of ``metrics.csv``; ``found`` holds the facts of the muscle by
+    quantity.
     """
     unit = found[quantity]["unit"]
     if quantity not in LIMITS or limit != _in_unit(LIMITS[quantity].value, quantity, unit):

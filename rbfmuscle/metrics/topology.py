@@ -13,13 +13,7 @@ if TYPE_CHECKING:
 
 
 def euler_characteristic(faces: Integers) -> int:
-    """Vertices less edges plus triangles; 2 for a sphere, two less for each handle.
-
-    Parameters
-    ----------
-    faces : (m, 3) ndarray of int
-        Vertices that no triangle uses do not count.
-    """
+    """Vertices less edges plus triangles, of those that faces (m, 3) use; 2 for a sphere, two less for each handle."""
     faces = np.asarray(faces, dtype=np.int64)
     ends = np.sort(np.concatenate([faces[:, :2], faces[:, 1:], faces[:, ::2]]), axis=1)
     edges = np.unique(ends[:, 0] * (faces.max(initial=0) + 1) + ends[:, 1])
@@ -29,13 +23,7 @@ def euler_characteristic(faces: Integers) -> int:
 def self_crossings(vertices: Floats, faces: Integers, *, tree: FaceTree | None = None) -> int:
     """Number of triangles that cross others of the same surface (`rbfmuscle.geometry.crossing.crossing_faces`).
 
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-        [scene unit]
-    faces : (m, 3) ndarray of int
-    tree : FaceTree, optional
-        Of these faces, from whatever moment, where it is at hand.
+    ``tree`` is of these faces, from whatever moment, where it is at hand.
     """
     tree = FaceTree(vertices, faces) if tree is None else tree
     return int(tree.crossing(vertices).sum())
