@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 _LEVELS = 120  # by which the line is measured at rest
 
-# Of origin or insertion each attachment: its bone or tendon, attached vertices (k, 3) at rest, the areas (k,) of these.
+# Of origin or insertion each attachment: its bone or tendon, attached vertices (k, 3) at rest, and their areas (k,):
+# where triangles are small there are more vertices, which must not draw the end of a line there.
 End = list[tuple[str, Floats, Floats]]
 
 
@@ -59,7 +60,14 @@ class Centreline:
         moving: Collection[str] | None = None,
         slices: int = 16,
     ) -> None:
-        self.ends = end_groups(muscle, joints, moving)
+        areas = vertex_areas(np.asarray(muscle.mesh.vertices, dtype=float), np.asarray(muscle.mesh.faces))
+        self.ends: list[End] = [
+            [
+                (a.holder, np.asarray(muscle.mesh.vertices[a.vertices], dtype=float), areas[a.vertices])
+                for a in group
+            ]
+            for group in split_ends(muscle, joints, moving)
+        ]
         sides = _sides(muscle, self.ends, vertices)
         field = harmonic_weights(vertices, faces, sides)[:, 1]
         levels = np.linspace(0.0, 1.0, _LEVELS + 2)[1:-1]
@@ -97,20 +105,6 @@ def resampled(line: Floats, segments: int) -> Floats:
     along = distance_along(line)
     even = np.linspace(0.0, along[-1], segments + 1)
     return np.stack([np.interp(even, along, column) for column in line.T], axis=1)
-
-
-def end_groups(muscle: Muscle, joints: Sequence[Joint], moving: Collection[str] | None = None) -> list[End]:
-    """Split the attachments into origin and insertion, each a list of (holder, points, areas).
-
-    ``points`` (k, 3) are the attached vertices at rest, ``areas`` (k,) what each stands for: where triangles are small
-    there are more of them, which must not draw the end of a line there.
-    """
-    vertices = np.asarray(muscle.mesh.vertices, dtype=float)
-    areas = vertex_areas(vertices, np.asarray(muscle.mesh.faces))
-    return [
-        [(a.holder, vertices[np.asarray(a.vertices)], areas[np.asarray(a.vertices)]) for a in group]
-        for group in split_ends(muscle, joints, moving)
-    ]
 
 
 def split_ends(

@@ -52,12 +52,11 @@ class MeshDistance:
         return ExactDistance(self.vertices, self.faces, layout=self._known_layout)
 
     @cached_property
-    def _wound(self) -> Callable[[Floats], Booleans]:
-        return inside_test(self.vertices, self.faces)
-
-    @cached_property
-    def _columns(self) -> Columns:
-        return Columns(self.vertices, self.faces)
+    def _inside(self) -> Callable[[Floats, Floats], Booleans]:
+        if self.closed:
+            return Columns(self.vertices, self.faces).inside
+        wound = inside_test(self.vertices, self.faces)
+        return lambda points, pose: wound(points @ pose[:3, :3].T + pose[:3, 3])
 
     @property
     def layout(self) -> Layout | None:
@@ -66,10 +65,7 @@ class MeshDistance:
 
     def inside(self, points: ArrayLike, *, pose: Floats = _HERE) -> Booleans:
         """Which points (n, 3) lie inside, (n,), once a pose (4, 4) has carried them into the mesh's coordinates."""
-        points = check_points(points)
-        if self.closed:
-            return self._columns.inside(points, pose)
-        return self._wound(points @ pose[:3, :3].T + pose[:3, 3])
+        return self._inside(check_points(points), pose)
 
     def unsigned(self, points: ArrayLike, *, near: Integers | None = None) -> Floats:
         """Distance (n,) of points (n, 3) to the surface [scene unit].

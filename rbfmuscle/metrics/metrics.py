@@ -12,13 +12,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.belly import belly_measures
-from rbfmuscle.metrics.centreline import (
-    Centreline,
-    carried_middle,
-    distance_along,
-    moving_joints,
-    resampled,
-)
+from rbfmuscle.metrics.centreline import Centreline, carried_middle, distance_along, moving_joints, resampled
 from rbfmuscle.metrics.geodesic import NODES, shortest_path
 from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.metrics.penetration import BoneProbe, bone_depth, surface_depth
@@ -33,13 +27,8 @@ if TYPE_CHECKING:
 Values = dict[str, float]
 
 _FROM_MODEL = (
-    "solver_penetration_max",
-    "sweeps",
-    "unfitted_fraction",
-    "condition",
-    "time_fit",
-    "time_extract",
-)
+    "solver_penetration_max", "sweeps", "unfitted_fraction", "condition", "time_fit", "time_extract",
+)  # fmt: skip
 
 # Events whose points stayed beyond a bone; those turned back or halved away are in events.csv only.
 _THROUGH = ("reported", "unresolved")

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Integers
 from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.surfaces import label_sheets
 
@@ -18,15 +18,6 @@ def euler_characteristic(faces: Integers) -> int:
     ends = np.sort(np.concatenate([faces[:, :2], faces[:, 1:], faces[:, ::2]]), axis=1)
     edges = np.unique(ends[:, 0] * (faces.max(initial=0) + 1) + ends[:, 1])
     return len(np.unique(faces)) - len(edges) + len(faces)
-
-
-def self_crossings(vertices: Floats, faces: Integers, *, tree: FaceTree | None = None) -> int:
-    """Number of triangles that cross others of the same surface (`rbfmuscle.geometry.crossing.crossing_faces`).
-
-    ``tree`` is of these faces, from whatever moment, where it is at hand.
-    """
-    tree = FaceTree(vertices, faces) if tree is None else tree
-    return int(tree.crossing(vertices).sum())
 
 
 def count_components(count: int, faces: Integers) -> int:
@@ -54,6 +45,6 @@ class SurfaceForm:
             self._found["euler"] = euler_characteristic(faces)
         drawn = surface.origin[0] if surface.origin is not None else surface
         if self._drawn is not drawn:
-            self._found["self_crossings"] = self_crossings(vertices, faces, tree=self._tree)
+            self._found["self_crossings"] = int(self._tree.crossing(vertices).sum())
         self._drawn = drawn
         return dict(self._found)
