@@ -7,12 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rbfmuscle.experiments.comparison import (
-    add_distances,
-    chosen_poses,
-    measure_run,
-    write_tables,
-)
+from rbfmuscle.experiments.comparison import add_distances, measure_run, write_tables
 from rbfmuscle.models import COMPARED, build_models, check_model_name, configure_scene, model_title
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.writer import check_writable
@@ -84,7 +79,9 @@ def compare_models(
     variants = _variants(configure_scene(open_scene(scene), frames=frames), list(models), settings or {})
     folder = Path(directory)
     check_writable(folder)
-    poses = chosen_poses(next(iter(variants.values())))
+    first = next(iter(variants.values()))
+    last = len(first.motion) - 1
+    poses = sorted({0, last // 2, last})
     results, failed = {}, {}
     for name, variant in variants.items():
         try:
@@ -96,7 +93,6 @@ def compare_models(
     with stage("distances between models"):
         add_distances(results, folder, poses)
     labels = {name: model_title(variant.muscles[0]) for name, variant in variants.items()}
-    first = next(iter(variants.values()))
     table = write_tables(folder, first, results, failed, labels=labels, poses=poses)
 
     from rbfmuscle.report.comparison_page import write_page

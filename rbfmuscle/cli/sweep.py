@@ -36,8 +36,7 @@ def sweep(
     scenes
         Scene files (TOML), or "phantom" for the embedded hip.
     grid
-        KEY=a,b,c with keys as for run --set, for instance model.centres=100,200,300; MODEL:KEY=a,b for one
-        model of a grid with model=...
+        KEY=a,b,c with keys as for run --set, for instance model.centres=100,200,300.
     reference
         KEY=VALUE settings of the reference that errors are measured against; by default the finest values
         of the grid.

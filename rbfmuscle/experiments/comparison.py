@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -45,25 +44,19 @@ MEASURES = {
     "volume_error": Measure("volume error", "1", LAW, 1e-5, "relative to the input mesh"),
     "penetration_max": Measure("surface in a bone", "length", LAW, 0.02, "deepest surface vertex in a bone"),
     "bone_penetration_max": Measure("bone in the muscle", "length", LAW, 0.02, "deepest bone vertex in it"),
-    "solver_penetration_max": Measure(
-        "before the cut", "length", LAW, 0.02, "model in a bone before the cut"
-    ),
+    "solver_penetration_max": Measure("before the cut", "length", LAW, 0.02, "model in a bone by then"),
     "components": Measure("pieces", "1", LAW, 0.0, "connected pieces of the surface, most in any frame"),
     "euler": Measure("Euler characteristic", "1", LAW, 0.0, "2 for a sphere, two less for a handle", 2.0),
     "self_crossings": Measure("self-crossings", "1", LAW, 0.0, "triangles that cross others of the surface"),
     "flicker": Measure("flicker", "length", LAW, 0.05, "surface against carried mesh, frame to frame"),
     "tunnelled": Measure("tunnelled points", "1", LAW, 0.0, "points beyond a bone"),
-    "return_rms": Measure(
-        "return error (RMS)", "length", LAW, 0.02, "first pose before and after the motion"
-    ),
+    "return_rms": Measure("return error (RMS)", "length", LAW, 0.02, "first pose before and after motion"),
     "return_max": Measure("return error (greatest)", "length", LAW, 0.1, "the same, greatest distance"),
     "step_rms": Measure("step dependence (RMS)", "length", LAW, 0.02, "last pose by coarser steps"),
     "step_max": Measure("step dependence (greatest)", "length", LAW, 0.1, "the same, greatest distance"),
     "rest_error_rms": Measure("rest error (RMS)", "length", MESH, 0.02, "surface to input mesh at rest"),
     "rest_error_max": Measure("rest error (greatest)", "length", MESH, 0.1, "the same, greatest distance"),
-    "distance_rms": Measure(
-        "distance (RMS)", "length", FIRST, 0.0, "to the first model's surface, worst pose"
-    ),
+    "distance_rms": Measure("distance (RMS)", "length", FIRST, 0.0, "to the first model's, worst pose"),
     "distance_max": Measure("distance (greatest)", "length", FIRST, 0.0, "the same, greatest distance"),
     "time_frame": Measure("time per frame", "s", COST, 0.0, "median of all muscles together, with surfaces"),
     "time_frame_p95": Measure("time per frame (95 %)", "s", COST, 0.0, "exceeded by one frame in 20"),
@@ -71,12 +64,6 @@ MEASURES = {
 }
 _FROM_METRICS = [name for name, m in MEASURES.items() if m.against in (LAW, MESH)]
 _TIE = 1.05
-
-
-def chosen_poses(scene: Scene) -> list[int]:
-    """First, middle and last frame of the motion, each once."""
-    last = len(scene.motion) - 1
-    return sorted({0, last // 2, last})
 
 
 def measure_run(saved: SavedRun, extra: dict[str, Any]) -> dict[str, Any]:
@@ -98,18 +85,16 @@ def measure_run(saved: SavedRun, extra: dict[str, Any]) -> dict[str, Any]:
                 pair = surface_distance(*saved.surface(muscle, saved.frames[frame]), *extra[part][muscle])
                 values[f"{name}_rms"], values[f"{name}_max"] = pair
         found[muscle] = values
-    together = {name: _worst(name, found.values()) for name in MEASURES}
+    together = {}
+    for name, measure in MEASURES.items():
+        worst = [values[name] for values in found.values() if values.get(name) is not None]
+        together[name] = max(worst, key=lambda v: abs(v - measure.ideal), default=None)
     wall = saved.series(ALL, "time_frame")[1][1:]
     if len(wall):
         together.update(time_frame=float(np.median(wall)), time_frame_p95=float(np.percentile(wall, 95)))
     together["time_build"] = extra["build"]
     found[ALL] = {name: value for name, value in together.items() if value is not None}
     return found
-
-
-def _worst(quantity, muscles):
-    values = [values[quantity] for values in muscles if values.get(quantity) is not None]
-    return max(values, key=lambda v: abs(v - MEASURES[quantity].ideal), default=None)
 
 
 def add_distances(results: dict[str, Any], folder: Path, poses: list[int]) -> None:
@@ -142,24 +127,16 @@ def write_tables(
     ``labels`` what it is called.
     """
     units = {name: unit_text(m.kind, scene.units) for name, m in MEASURES.items()}
-    table = {
-        "format": FORMAT,
-        "scene": scene.name,
-        "units": scene.units,
-        "frames": len(scene.motion),
-        "poses": poses,
-        "models": list(results),
-        "labels": {name: labels[name] for name in results},
-        "failed": failed,
-        "answer": describe(results, labels, scene.units),
-        "measures": {
-            name: {"title": m.title, "unit": units[name], "against": m.against, "meaning": m.meaning}
-            for name, m in MEASURES.items()
-        },
-        "results": results,
-        "machine": machine(),
-        "versions": versions(),
+    measures = {
+        name: {"title": m.title, "unit": units[name], "against": m.against, "meaning": m.meaning}
+        for name, m in MEASURES.items()
     }
+    table = {
+        "format": FORMAT, "scene": scene.name, "units": scene.units, "frames": len(scene.motion), "poses": poses,
+        "models": list(results), "labels": {name: labels[name] for name in results}, "failed": failed,
+        "answer": describe(results, labels, scene.units), "measures": measures, "results": results,
+        "machine": machine(), "versions": versions(),
+    }  # fmt: skip
     write_json(folder / "comparison.json", table)
     with open(folder / "comparison.csv", "w", encoding="utf-8", newline="") as file:
         rows = csv.writer(file, lineterminator="\n")
@@ -197,19 +174,21 @@ def describe(results: dict[str, Any], labels: dict[str, str], units: str) -> str
         name: max(v.get("penetration_max", 0.0), v.get("bone_penetration_max", 0.0))
         for name, v in whole.items()
     }
-    limit = KEPT_OUT / MM_PER_UNIT[units]
-    verb = "keeps out of" if depth[first] <= limit else "stands in"
+    verb = "keeps out of" if depth[first] <= KEPT_OUT / MM_PER_UNIT[units] else "stands in"
     text = f"{labels[first]} {verb} bones ({depth[first]:.2g} {units})"
     timed = [name for name in others if "time_frame" in whole[name] and "time_frame" in whole[first]]
     quick = min(timed, key=lambda name: whole[name]["time_frame"], default=None)
     if quick:
         ratio = whole[first]["time_frame"] / whole[quick]["time_frame"]
         text += f" at {ratio:.2g} times the time of {labels[quick]} ({depth[quick]:.2g} {units})"
-    near = min(others, key=lambda name: whole[name].get("distance_rms", math.inf), default=None)
-    away = f"{whole[near]['distance_rms']:.2g} {units} RMS" if near and "distance_rms" in whole[near] else ""
-    if near and near == quick:
+    apart = {name: whole[name]["distance_rms"] for name in others if "distance_rms" in whole[name]}
+    if not apart:
+        return f"{text}."
+    near = min(apart, key=apart.__getitem__)
+    away = f"{apart[near]:.2g} {units} RMS"
+    if near == quick:
         text += f"; the two lie {away} apart" if len(others) == 1 else f", which comes nearest to it ({away})"
-    elif near and away:
+    else:
         text += f"; {labels[near]}{',' if ',' in labels[near] else ''} comes within {away} of it"
         if near in timed:
             text += f" at {whole[near]['time_frame'] / whole[first]['time_frame']:.2g} times its time"

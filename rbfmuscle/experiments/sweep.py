@@ -16,8 +16,8 @@ from rbfmuscle.validation import UsageError
 if TYPE_CHECKING:
     from rbfmuscle.scene.scene import Scene
 
-# Model ("" for all), key and values of each setting that is varied.
-Grid = list[tuple[str, str, list[Any]]]
+# Values of each setting that is varied.
+Grid = dict[str, list[Any]]
 
 # Of these keys the reference takes the greatest value of the grid, or the least; of all others the scene's own.
 FINER_UP = ("model.centres", "model.samples", "model.nodes", "model.iterations", "model.resolution")
@@ -28,16 +28,14 @@ FINER_DOWN = ("contact.substep_angle", "motion.step")
 class SweepPoint:
     """One combination of settings of one scene.
 
-    ``settings`` are dotted keys with their values, the model first; ``scene`` is a name. ``key`` is a hash of the
-    scene's content and the settings; ``model`` the model that they choose, "" where they choose none; ``role``
-    "reference", "default" (the scene's own settings, of this model) or ""; ``reference`` the key of the point that the
-    error is measured against, "" without a grid.
+    ``key`` is a hash of the scene's content and the settings; ``scene`` a name; ``settings`` are dotted keys with their
+    values, the model first; ``role`` is "reference", "default" (the scene's own settings) or ""; ``reference`` is the
+    key of the point that the error is measured against, "" without a grid.
     """
 
     key: str
     scene: str
     settings: dict[str, Any]
-    model: str
     role: str
     reference: str
 
@@ -48,34 +46,21 @@ class SweepPoint:
 
 
 def parse_grid(texts: Sequence[str]) -> Grid:
-    """Return the grid of ``["KEY=a,b,c", ...]``; "MODEL:KEY=a,b" holds for the points of that model only.
-
-    UsageError on text of another form, or a key given twice or without values.
-    """
-    grid: Grid = []
+    """Return the grid of ``["KEY=a,b,c", ...]``; UsageError on other text, or a key given twice or without values."""
+    grid: Grid = {}
     for text in texts:
         name, found, values = text.partition("=")
-        model, has_model, key = name.strip().rpartition(":")
-        if not found or not key or not values.strip() or (has_model and not model):
+        key = name.strip()
+        if not found or not key or not values.strip():
             raise UsageError(f"{text!r} is not KEY=a,b,c, for instance model.centres=100,200,300")
-        if any(key == other and model in ("", m) for m, other, _ in grid):
+        if key in grid:
             raise UsageError(f"{key} is given twice in the grid")
-        grid.append((model, key, list(dict.fromkeys(_values(key, values)))))
-    for model, key, _ in grid:
-        if model and model not in _models(grid):
-            raise UsageError(f"{model}:{key} needs {model!r} among the grid's models (--grid model=...)")
+        try:
+            parts = tomllib.loads(f"value = [{values}]")["value"]
+        except tomllib.TOMLDecodeError:
+            parts = [parse_value(part.strip(), place=key) for part in values.split(",") if part.strip()]
+        grid[key] = list(dict.fromkeys(parts))
     return grid
-
-
-def _values(key, text):
-    try:
-        return tomllib.loads(f"value = [{text}]")["value"]
-    except tomllib.TOMLDecodeError:
-        return [parse_value(part.strip(), place=key) for part in text.split(",") if part.strip()]
-
-
-def _models(grid):
-    return next((values for _, key, values in grid if key == "model"), [""])
 
 
 def plan_sweep(
@@ -91,49 +76,35 @@ def plan_sweep(
     ----------
     scenes : dict of str to Scene
         By name.
-    grid : list of (model, key, values)
+    grid : dict of str to list
         From `parse_grid`; empty where scenes are compared as they are.
     frames : str, optional
         Frames of the motion, "A:B:S".
     reference : dict, optional
         Settings of the reference, over those that follow from the grid: the greatest number of centres, samples,
-        nodes, iterations and cells in it and the least angle and step. With a ``model``, one reference serves all
-        models; else each model of the grid has its own.
+        nodes, iterations and cells in it and the least angle and step.
     """
     return [point for n, s in scenes.items() for point in _points(n, s, grid, frames, dict(reference or {}))]
 
 
 def _points(name, scene, grid, frames, reference):
-    content = scene_content(scene, frames)
-    if not grid:
-        return [SweepPoint(point_key(content, {}), name, {}, "", "default", "")]
-    found = {}
-    for model in _models(grid):
-        best = reference.get("model", model)
-        finest = _settings(best, {**_finest(_axes(grid, best)), **reference})
+    content, found, target = scene_content(scene, frames), {}, ""
+    if grid:
+        up = {key: max(values) for key, values in grid.items() if key in FINER_UP}
+        down = {key: min(values) for key, values in grid.items() if key in FINER_DOWN}
+        finest = _model_first(up | down | reference)
         target = point_key(content, finest)
-        found[target] = SweepPoint(target, name, finest, best, "reference", target)
-        axes = _axes(grid, model)
-        for number, values in enumerate([(), *itertools.product(*axes.values())]):
-            settings = _settings(model, dict(zip(axes, values)))
-            key = point_key(content, settings)
-            role = "default" if number == 0 else ""
-            found.setdefault(key, SweepPoint(key, name, settings, model, role, target))
-    return sorted(found.values(), key=lambda point: ("reference", "default", "").index(point.role))
+        found[target] = SweepPoint(target, name, finest, "reference", target)
+    for number, values in enumerate([(), *itertools.product(*grid.values())]):
+        settings = _model_first(dict(zip(grid, values)))
+        key = point_key(content, settings)
+        found.setdefault(key, SweepPoint(key, name, settings, "" if number else "default", target))
+    return list(found.values())
 
 
-def _axes(grid, model):
-    return {key: values for only, key, values in grid if key != "model" and only in ("", model)}
-
-
-def _settings(model, others):
-    """The model first, as choosing another one drops its options."""
-    return {**({"model": model} if model else {}), **others}
-
-
-def _finest(axes):
-    up = {key: max(values) for key, values in axes.items() if key in FINER_UP}
-    return up | {key: min(values) for key, values in axes.items() if key in FINER_DOWN}
+def _model_first(settings):
+    """As choosing another model drops its options."""
+    return dict(sorted(settings.items(), key=lambda item: item[0] != "model"))
 
 
 def scene_content(scene: Scene, frames: str | None = None) -> str:

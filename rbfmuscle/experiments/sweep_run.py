@@ -29,14 +29,9 @@ Runner = Callable[["Scene", dict[str, Any], str | None], Any]
 POINT_ERRORS = (RBFMuscleError, ArithmeticError, LookupError, MemoryError, OSError, RuntimeError, ValueError)
 # Worst over muscles and frames, by magnitude.
 WORST = (
-    "volume_error",
-    "penetration_max",
-    "bone_penetration_max",
-    "solver_penetration_max",
-    "rest_error_rms",
-    "edge_strain_rms",
-    "components",
-)
+    "volume_error", "penetration_max", "bone_penetration_max", "solver_penetration_max", "rest_error_rms",
+    "edge_strain_rms", "components",
+)  # fmt: skip
 TIMES = ("time_frame", "time_frame_p95", "time_extract")
 VALUES = ("error_rms", "error_max", *WORST, *TIMES)
 
@@ -70,8 +65,13 @@ class SweepFolder:
         write_json(self.points / f"{result['key']}.json", result)
 
     def surfaces(self, key: str) -> Path:
-        """Surfaces of a reference."""
+        """File of the surfaces of a reference."""
         return self.references / f"{key}.npz"
+
+    def is_done(self, point: SweepPoint) -> bool:
+        """Whether a point need not be run again."""
+        kept = point.role != "reference" or self.surfaces(point.key).exists()
+        return kept and self.read(point.key).get("status") == "done"
 
 
 def run_sweep(
@@ -104,7 +104,7 @@ def run_sweep(
     from joblib import cpu_count, parallel_config
 
     folder = SweepFolder(directory)
-    left = [point for point in points if not _is_done(folder, point)]
+    left = [point for point in points if not folder.is_done(point)]
     for point in left:
         (folder.points / f"{point.key}.json").unlink(missing_ok=True)
     jobs = jobs or cpu_count()
@@ -125,11 +125,6 @@ def run_sweep(
             calls = [(runner, scenes[p.scene], p, folder, frames, threads) for p in stage]
             _side_by_side(calls, folder, -1 if cluster else jobs, advance)
     return len(left)
-
-
-def _is_done(folder, point):
-    done = folder.read(point.key).get("status") == "done"
-    return done and (point.role != "reference" or folder.surfaces(point.key).exists())
 
 
 def _side_by_side(calls, folder, jobs, advance):
@@ -209,13 +204,11 @@ def _errors(shown, path):
     if not path.exists():
         raise UsageError("its reference is missing: that point failed, or the folder is not shared")
     with np.load(path) as kept:
-        found = np.array(
-            [
-                surface_distance(*mesh, kept[f"{place}|0"], kept[f"{place}|1"])
-                for place, mesh in shown.items()
-                if f"{place}|0" in kept
-            ]
-        )
+        met = {place: mesh for place, mesh in shown.items() if f"{place}|0" in kept}
+        pairs = [
+            surface_distance(*mesh, *(kept[f"{place}|{k}"] for k in (0, 1))) for place, mesh in met.items()
+        ]
+    found = np.array(pairs)
     if not len(found):
         raise UsageError("no frame of this point is at a pose of the reference")
     return {"error_rms": math.sqrt(np.mean(found[:, 0] ** 2)), "error_max": float(found[:, 1].max())}

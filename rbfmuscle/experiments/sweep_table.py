@@ -29,22 +29,14 @@ def sweep_rows(
     for point in points:
         result = folder.read(point.key)
         values = result.get("values", {})
-        rows.append(
-            {
-                "scene": point.scene,
-                "units": units[point.scene],
-                "role": point.role,
-                "status": result.get("status", "missing"),
-                "front": False,
-                "settings": point.settings,
-                **{name: math.nan if values.get(name) is None else values[name] for name in VALUES},
-                **{name: result.get(name, "") for name in ("seconds", "threads", "machine", "error")},
-                "label": point.label,
-                "model": point.model,
-                "reference": point.reference,
-                "key": point.key,
-            }
-        )
+        row = {
+            "scene": point.scene, "units": units[point.scene], "role": point.role,
+            "status": result.get("status", "missing"), "front": False, "settings": point.settings,
+            **{name: math.nan if values.get(name) is None else values[name] for name in VALUES},
+            **{name: result.get(name, "") for name in ("seconds", "threads", "machine", "error")},
+            "label": point.label, "reference": point.reference, "key": point.key,
+        }  # fmt: skip
+        rows.append(row)
     return rows
 
 
@@ -75,11 +67,8 @@ def mark_front(rows: list[dict[str, Any]], quantity: str = "error_rms") -> list[
     """
     verdicts = []
     for group in dict.fromkeys(row["reference"] for row in rows if row["reference"]):
-        usable = [
-            row
-            for row in rows
-            if row["reference"] == group and row["status"] == "done" and row["role"] != "reference"
-        ]
+        mine = [row for row in rows if row["reference"] == group and row["role"] != "reference"]
+        usable = [row for row in mine if row["status"] == "done"]
         for k in pareto_front([r[quantity] for r in usable], [r["time_frame"] for r in usable]):
             usable[k]["front"] = True
         verdicts += [_judge(row, usable, quantity) for row in usable if row["role"] == "default"]
@@ -94,11 +83,9 @@ def _judge(default: dict[str, Any], rows: list[dict[str, Any]], quantity: str) -
     finer = [r for r in others if r["time_frame"] <= time and r[quantity] < error]
     faster = min(quicker, key=lambda r: r["time_frame"], default=None)
     better = min(finer, key=lambda r: r[quantity], default=None)
-    what = f"default of {default['model']}" if default["model"] else "default"
-    where = (
-        "on" if default["front"] else "within 10 % of" if factor <= NEAR else f"a factor of {factor:.2g} off"
-    )
-    text = f"{default['scene']}: the {what} lies {where} the Pareto front ({_figures(default, quantity)})"
+    off = "within 10 % of" if factor <= NEAR else f"a factor of {factor:.2g} off"
+    where = "on" if default["front"] else off
+    text = f"{default['scene']}: the default lies {where} the Pareto front ({_figures(default, quantity)})"
     for row, words in ((faster, "as accurate and quicker"), (better, "as quick and more accurate")):
         text += f"; {words}: {row['label']} ({_figures(row, quantity)})" if row else ""
     keys = {"faster": faster and faster["key"], "better": better and better["key"], "default": default["key"]}
@@ -126,7 +113,7 @@ def write_table(
     rows = sweep_rows(points, folder, units)
     verdicts = mark_front(rows, quantity)
     keys = list(dict.fromkeys(key for row in rows for key in row["settings"]))
-    columns = [name for name in rows[0] if name not in ("settings", "label", "model")]
+    columns = [name for name in rows[0] if name not in ("settings", "label")]
     part = folder.directory / ".sweep.csv.part"
     with open(part, "w", encoding="utf-8", newline="") as file:
         lines = csv.writer(file, lineterminator="\n")

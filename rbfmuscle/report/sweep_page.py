@@ -64,7 +64,7 @@ def front_picture(rows: Iterable[dict[str, Any]], quantity: str) -> str:
             1e3 * row["time_frame"],
             row[quantity],
             _short(row),
-            f"{row['scene']} {row['model']}".strip(),
+            f"{row['scene']} {row['settings'].get('model', '')}".strip(),
             row["role"] == "default",
             row["front"],
         )
