@@ -58,15 +58,9 @@ class NearTriangles(NamedTuple):
 
 
 def near_triangles(obstacles: Obstacles, vertices: Floats, faces: Integers, margin: float) -> NearTriangles:
-    """Obstacle points right above or below triangles, or nearly.
+    """Obstacle points right above or below triangles, or nearly, by no more than ``margin`` [scene unit].
 
-    Parameters
-    ----------
-    obstacles : list of pairs of PointGrid and (4, 4) ndarray
-    vertices : (n, 3) ndarray
-    faces : (m, 3) ndarray of int
-    margin : float
-        Greatest height above or below a triangle [scene unit].
+    Vertices (n, 3) are in the world, faces (m, 3) of int.
     """
     points, counts, near = [np.zeros((0, 3))], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for grid, pose in obstacles:
@@ -91,29 +85,12 @@ def near_triangles(obstacles: Obstacles, vertices: Floats, faces: Integers, marg
 def push_off_points(
     vertices: Floats, faces: Integers, near: NearTriangles, spacing: float, tolerance: float
 ) -> Booleans:
-    """Move the vertices of triangles that obstacle points have come through, into the surface.
+    """Move the vertices of triangles that obstacle points have come through, into the surface: a mask (n,) of these.
 
-    A point behind a triangle (inside the mesh) by more than ``tolerance`` moves its three corners along the
-    normal, by barycentric weights, until it is not. Points deeper than ``CHORD`` of the spacing are left alone: they
-    are behind another part of the muscle.
-
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-        Changed in place [scene unit].
-    faces : (m, 3) ndarray
-        Outward.
-    near : NearTriangles
-        Points that must stay outside.
-    spacing : float
-        Length of the triangles' edges [scene unit].
-    tolerance : float
-        [scene unit]
-
-    Returns
-    -------
-    (n,) ndarray of bool
-        Vertices that were moved.
+    A point behind a triangle (inside the mesh) by more than ``tolerance`` [scene unit] moves its three corners along
+    the normal, by barycentric weights, until it is not. Points deeper than ``CHORD`` of the spacing, the length of the
+    triangles' edges, are left alone: they are behind another part of the muscle. ``vertices`` (n, 3) [scene unit] are
+    changed in place; faces (m, 3) look outward.
     """
     moved = np.zeros(len(vertices), dtype=np.bool_)
     for _ in range(ROUNDS):
@@ -175,15 +152,19 @@ def _push_loop(vertices, faces, near_points, spacing, tolerance, moved):
     pushed = False
     for p in range(len(points)):
         x, y, z = points[p, 0], points[p, 1], points[p, 2]
-        best, least, signed = -1, spacing, -spacing
+        best, least, signed, found = -1, spacing, -spacing, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         for f in near[first[p] : first[p + 1]]:
-            depth = _depth_behind(vertices, faces, f, x, y, z)
+            shadow = _shadow(vertices, faces, f, x, y, z)
+            square, height, at_b, at_c = shadow[3], shadow[4], shadow[5], shadow[6]
+            if square == 0.0 or min(at_b, at_c, square - at_b - at_c) < -1e-9 * square:
+                continue  # beside it
+            depth = -height / np.sqrt(square)
             if abs(depth) < least:
-                best, least, signed = f, abs(depth), depth
+                best, least, signed, found = f, abs(depth), depth, shadow
         if signed <= tolerance or signed > CHORD * spacing:
             continue
         pushed = True
-        nx, ny, nz, square, _, at_b, at_c = _shadow(vertices, faces, best, x, y, z)
+        nx, ny, nz, square, _, at_b, at_c = found
         weight = 1.0 - (at_b + at_c) / square, at_b / square, at_c / square
         # Half the tolerance is left, so that rounding does not ask for another round.
         way = (signed - 0.5 * tolerance) / (weight[0] ** 2 + weight[1] ** 2 + weight[2] ** 2)
@@ -197,7 +178,7 @@ def _push_loop(vertices, faces, near_points, spacing, tolerance, moved):
     return pushed
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(error_model="numpy")
 def _shadow(vertices, faces, f, x, y, z):
     """Normal of a triangle, its square, the height of a point above it, and twice the areas at B and C.
 
@@ -212,13 +193,3 @@ def _shadow(vertices, faces, f, x, y, z):
     at_b = nx * (py * vz - pz * vy) + ny * (pz * vx - px * vz) + nz * (px * vy - py * vx)
     at_c = nx * (uy * pz - uz * py) + ny * (uz * px - ux * pz) + nz * (ux * py - uy * px)
     return nx, ny, nz, nx * nx + ny * ny + nz * nz, nx * px + ny * py + nz * pz, at_b, at_c
-
-
-@compiled(error_model="numpy")
-def _depth_behind(vertices, faces, f, x, y, z):
-    """How far a point lies behind a triangle; infinite if beside it."""
-    _, _, _, square, height, at_b, at_c = _shadow(vertices, faces, f, x, y, z)
-    least = -1e-9 * square
-    if square == 0.0 or at_b < least or at_c < least or square - at_b - at_c < least:
-        return np.inf
-    return -height / np.sqrt(square)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.fields import ClipDistance, Field
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction.marching import Grid, LevelSet, nearest_sheet
@@ -121,19 +121,20 @@ def _reach_volume(
         if found is None:
             return None
         vertices, faces, components = found
-        near_cut = _near_cut(level_set, vertices)
+        near_cut = np.zeros(len(vertices), dtype=np.bool_)  # what a shift by a cell may bring to the cut
+        if level_set.cut is not None:
+            near_cut = np.asarray(level_set.cut(vertices) < NEAR_CUT * spacing)
         projector = Projector(level_set.field, level_set.cut, vertices, spacing, near_cut)
         projector.project(level)
-        if target is None:
-            return _finish(projector, faces, target, level, components, obstacles)
-        step = projector.volume_step(faces, target)
+        step = 0.0 if target is None else projector.volume_step(faces, target)
         for _ in range(4):
             # Small steps move the vertices along the gradient; a large one needs another mesh.
-            if np.abs(step * projector.slope).max() > 0.25 * spacing:
+            moved = np.abs(step * projector.slope).max()
+            if moved > 0.25 * spacing:
                 break
             level += step
             projector.shift(step)
-            if np.abs(step * projector.slope).max() < 2e-3 * spacing:
+            if target is None or moved < 2e-3 * spacing:
                 return _finish(projector, faces, target, level, components, obstacles)
             projector.project(level)
             step = projector.volume_step(faces, target)
@@ -176,10 +177,3 @@ def _nearest_sheet(level_set: LevelSet, points: Floats, level: float) -> tuple[F
         return None
     number = np.cumsum(used) - 1
     return vertices[used], number[faces[used[faces[:, 0]]]], sheets
-
-
-def _near_cut(level_set: LevelSet, vertices: Floats) -> Booleans:
-    """Mask (n,) of the vertices that a shift by a cell may bring to the cut."""
-    if level_set.cut is None:
-        return np.zeros(len(vertices), dtype=np.bool_)
-    return np.asarray(level_set.cut(vertices) < NEAR_CUT * level_set.grid.spacing)

@@ -149,17 +149,8 @@ _NO_NORMALS = np.zeros((0, 3))
 class Basis:
     """Scaled centres, kernel and polynomial part of one fit.
 
-    Parameters
-    ----------
-    points : (K, 3) ndarray
-        Centres, scaled to order one.
-    kernel : Kernel
-    epsilon : float
-        In scaled coordinates.
-    kind : str
-        "value", "gradient" (values and all derivatives) or "normal" (values and normal derivatives).
-    normals : (K, 3) ndarray, optional
-        Unit normals, for kind "normal".
+    ``points`` (K, 3) are scaled to order one, as ``epsilon`` is. ``kind`` is "value", "gradient" (values and all
+    derivatives) or "normal" (values and derivatives along unit ``normals`` (K, 3)).
     """
 
     def __init__(

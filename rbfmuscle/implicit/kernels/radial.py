@@ -209,10 +209,6 @@ def _times_power_loop(power, u, s, values):
         for _ in range(power // 2):
             for i in range(u.size):
                 values[i] *= u[i]
-    elif power < 0:
+    for _ in range(-power):
         for i in range(u.size):
-            values[i] = values[i] / (s[i] if s[i] > 0.0 else 1.0)
-            values[i] = values[i] if s[i] > 0.0 else 0.0
-        for _ in range(-power - 1):
-            for i in range(u.size):
-                values[i] = values[i] / (s[i] if s[i] > 0.0 else 1.0)
+            values[i] = values[i] / s[i] if s[i] > 0.0 else 0.0

@@ -20,27 +20,10 @@ def contract_clusters(
 ) -> tuple[Integers, Integers]:
     """Contract a closed, oriented 2-manifold to ``count`` vertices, as a clustering says where the topology allows it.
 
-    Parameters
-    ----------
-    faces : (m, 3) ndarray of int
-    labels : (n,) ndarray of int
-        Cluster of each vertex, 0 .. count - 1.
-    weights : (n,) ndarray
-        Vertex weights [area]; the heaviest piece of a cluster that falls apart keeps its name.
-    count : int
-        At least 4 a connected component (more for handles).
-
-    Returns
-    -------
-    labels : (n,) ndarray
-        Equal to the input but for pieces that had to change.
-    control_faces : (k, 3) ndarray
-        Triangles over the ``count`` clusters, oriented like ``faces``.
-
-    Raises
-    ------
-    MeshError
-        If no contraction to so few vertices keeps the topology.
+    ``labels`` (n,) are the clusters of the vertices, 0 .. count - 1, ``weights`` (n,) their areas: the heaviest piece
+    of a cluster that falls apart keeps its name. ``count`` is at least 4 a connected component, more for handles.
+    Returns the final labels (n,), equal to those given but for pieces that had to change, and triangles (k, 3) over the
+    clusters, oriented like ``faces`` (m, 3). MeshError if no contraction to so few vertices keeps the topology.
     """
     twin = opposite_half_edges(faces)
     tail = faces.ravel().copy()

@@ -52,27 +52,11 @@ def fit_sample(
 ) -> SurfaceSample:
     """Centres moved along their normals, and normals turned, so that the field is small on the whole mesh.
 
-    Parameters
-    ----------
-    sample : SurfaceSample
-        Of the mesh, with unit normals.
-    vertices, faces : (n, 3) and (m, 3) array_like
-    fit : FieldFit
-        Of the field that will be fitted to it, to all derivatives.
-    seed : int
-        Of the points of the mesh.
-    rounds : int
-        The least-squares problem is that of the given centres; what their moves leave is met by further rounds of it.
-
-    Returns
-    -------
-    SurfaceSample
-        Of the round, the given sample included, whose field misses the mesh least.
-
-    Raises
-    ------
-    UsageError
-        For a kernel that is not smooth enough for a Hermite fit, or a fit to normal derivatives alone.
+    ``sample`` is one of the mesh (vertices (n, 3), faces (m, 3)) with unit normals, ``fit`` that of the field that will
+    be fitted to it, to all derivatives; ``seed`` is that of points of the mesh. The least-squares problem is that of
+    the given centres; what their moves leave is met by further rounds of it. Returns the sample of the round, the given
+    one included, whose field misses the mesh least. UsageError for a kernel that is not smooth enough for a Hermite
+    fit, or a fit to normal derivatives alone.
     """
     if not fit.kernel.hermite or fit.derivatives != "all":
         raise UsageError(
