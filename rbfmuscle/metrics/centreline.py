@@ -29,25 +29,12 @@ End = list[tuple[str, Floats, Floats]]
 
 
 class Centreline:
-    """The centreline of one muscle on a mesh of constant topology.
+    """The centreline of one muscle on a mesh of constant topology: vertices (n, 3) at rest [scene unit], faces (m, 3).
 
-    The harmonic field is 0 on the origin and 1 on the insertion. Slices are taken at levels whose centroids
-    lie evenly along the muscle at rest. Each centroid is a fixed linear combination of the vertices, so
-    the line costs one sparse product a frame. Its ends are the centroids of the attached patches of the
-    input mesh, by area, carried by their bones.
-
-    Parameters
-    ----------
-    muscle : Muscle
-        Input mesh and attachments.
-    joints : list of Joint
-        Bones that no joint separates count as one.
-    vertices, faces : (n, 3) and (m, 3) ndarray
-        The model's carried mesh at rest [scene unit].
-    moving : collection of str, optional
-        Names of the joints that move; all where not given.
-    slices : int
-        Points of the line between its ends.
+    The harmonic field is 0 on the origin and 1 on the insertion. So many slices are taken at levels whose centroids lie
+    evenly along the muscle at rest. Each centroid is a fixed linear combination of the vertices, so the line costs one
+    sparse product a frame. Its ends are the centroids of the attached patches of the input mesh, by area, carried by
+    their bones. Bones that no joint, or none of the ``moving`` ones, separates count as one.
     """
 
     def __init__(

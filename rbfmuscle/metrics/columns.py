@@ -32,17 +32,11 @@ class _Grid(NamedTuple):
 
 
 class Columns:
-    """Counts how often a closed mesh winds around points, along a line from each point in one direction.
+    """Counts how often a closed, consistently oriented mesh winds around points, along a line from each of them.
 
-    A triangle that the line leaves the mesh through counts one, one that it enters by minus one; the sum is the
-    winding number, exact also where the mesh is folded on itself. Edges are half open, so that a line through an edge
-    or a vertex is counted once. The line runs along the shortest side of the mesh's box.
-
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-    faces : (m, 3) ndarray of int
-        Closed, consistently oriented.
+    A triangle that the line leaves the mesh through counts one, one that it enters by minus one; the sum is the winding
+    number, exact also where the mesh is folded on itself. Edges are half open, so that a line through an edge or a
+    vertex is counted once. The line runs along the shortest side of the mesh's box.
     """
 
     def __init__(self, vertices: Floats, faces: Integers) -> None:

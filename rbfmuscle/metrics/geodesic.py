@@ -26,22 +26,11 @@ TOUCHING = 1e-9
 def shortest_path(
     line: Floats, probes: list[BoneProbe], poses: dict[str, Floats], *, offset: Floats | None = None
 ) -> Floats:
-    """Nodes of the shortest path over the bones between the ends of a line, beside which it begins.
+    """Nodes (`NODES`, 3) of the shortest path over the bones between the ends of a line, beside which it begins.
 
-    Parameters
-    ----------
-    line : (n, 3) ndarray
-        Which side of the bones the path takes.
-    probes : list of BoneProbe
-    poses : dict of str to (4, 4) ndarray
-        Of the bones.
-    offset : (`NODES`, 3) ndarray, optional
-        From the points at even distances along the line to where the string begins: what it was in the frame before.
-
-    Returns
-    -------
-    (`NODES`, 3) ndarray
-        Two nodes only where nothing lies between the ends.
+    ``line`` (n, 3) says which side of the bones the path takes; the bones have poses (4, 4) by name. ``offset``
+    (`NODES`, 3) leads from the points at even distances along the line to where the string begins: what it did in the
+    frame before. Two nodes only where nothing lies between the ends.
     """
     chord = np.linspace(line[0], line[-1], NODES)
     near = bones_about(line, probes, poses)

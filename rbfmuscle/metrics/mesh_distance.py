@@ -20,24 +20,12 @@ _HERE = np.eye(4)
 
 
 class MeshDistance:
-    """Exact distance of points to a closed, outward mesh; negative inside.
+    """Exact distance of points to an outward mesh (vertices (n, 3) [scene unit], faces (m, 3)); negative inside.
 
-    Its trees are built at the first call and kept, so that a bone's are built once, in the bone's own coordinates.
-
-    Parameters
-    ----------
-    vertices : (n, 3) array_like
-        [scene unit]
-    faces : (m, 3) array_like of int
-    closed : bool
-        False for a mesh with holes.
-    layout : Layout, optional
-        Of the same faces at another moment, as `ExactDistance` takes it.
-
-    Notes
-    -----
     A point is inside where the mesh winds around it: counted exactly for closed meshes (`Columns`); for those with
-    holes the winding number exceeds one half (Jacobson et al. 2013; Barill et al. 2018).
+    holes the winding number exceeds one half (Jacobson et al. 2013; Barill et al. 2018). The trees are built at the
+    first call and kept, so that a bone's are built once, in the bone's own coordinates. ``layout`` is that of the same
+    faces at another moment, as `ExactDistance` takes it.
     """
 
     def __init__(

@@ -16,26 +16,13 @@ _STILL = 1e-9
 def moment_arms(
     path: Sequence[Mapping[str, float]], lengths: Sequence[float], reach: Mapping[str, float] | None = None
 ) -> list[dict[str, float]]:
-    """Moment arms -dl/dq along a motion.
+    """Moment arms -dl/dq along a motion, for each frame by coordinate that moves alone before or after it.
 
     A parabola is fitted to the lengths of the frames within ``reach``, and always of both neighbours, as far as the
     coordinate goes on alone and in one direction: with two neighbours it is the central difference, at an end the
-    difference to the one neighbour.
-
-    Parameters
-    ----------
-    path : sequence of mapping of str to float
-        Coordinates of each frame [radian or scene unit].
-    lengths : sequence of float
-        Length in each frame [scene unit]; NaN where it is not known.
-    reach : mapping of str to float, optional
-        Of each coordinate [radian or scene unit]; `REACH` degrees where not given.
-
-    Returns
-    -------
-    list of dict of str to float
-        For each frame the moment arm about each coordinate that moves alone before or after it
-        [scene unit per radian, or 1].
+    difference to the one neighbour. ``path`` holds the coordinates of each frame and ``reach`` is that of each
+    coordinate, or `REACH` degrees [radian or scene unit]; ``lengths`` [scene unit] are NaN where not known. Moment arms
+    are in scene units per radian, or 1.
     """
     values, found = np.asarray(lengths, dtype=float), [dict[str, float]() for _ in path]
     for name, first, last in _single_motions(path, values):

@@ -32,10 +32,9 @@ def frame_rows(
     if scene.motion.times is not None:
         together["time"] = scene.motion.times[frame.index]
     together["time_frame"] = frame.wall
+    unit = {quantity: unit_text(kind, scene.units) for quantity, (kind, _) in QUANTITIES.items()}
     return [
-        Row(
-            frame.index, name, angle, muscle, quantity, value, unit_text(QUANTITIES[quantity][0], scene.units)
-        )
+        Row(frame.index, name, angle, muscle, quantity, value, unit[quantity])
         for muscle, values in {**measured, ALL: together}.items()
         for quantity, value in values.items()
     ]
@@ -58,9 +57,8 @@ def moment_arm_rows(
     }
     for muscle, found in lengths.items():
         along: Sequence[float] = [found.get(index, math.nan) for index in path]
-        for (index, coordinates), moments in zip(
-            path.items(), moment_arms(list(path.values()), along, reach)
-        ):
+        moments_along = moment_arms(list(path.values()), along, reach)
+        for (index, coordinates), moments in zip(path.items(), moments_along):
             for name, moment_arm in moments.items():
                 angle = shown_value(scene, name, coordinates.get(name, 0.0))
                 unit = "1" if name in shifts else scene.units

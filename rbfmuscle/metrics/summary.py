@@ -90,26 +90,19 @@ class Summary:
         }
 
     def _facts(self, quantity, found):
-        frames = [frame for frame, _ in found]
-        values = np.array([value for _, value in found])
-        finite = values[np.isfinite(values)]
+        frames, values = (np.array(part) for part in zip(*found))
         facts = {
-            "unit": self._units[quantity],
-            "count": len(values),
-            "first": float(values[0]),
-            "last": float(values[-1]),
-        }
-        if len(finite):
-            sound = np.where(np.isfinite(values), values, np.nan)
-            worst = int(np.nanargmin(sound) if quantity in LEAST else np.nanargmax(np.abs(sound)))
+            "unit": self._units[quantity], "count": len(values), "first": float(values[0]), "last": float(values[-1])
+        }  # fmt: skip
+        known = np.isfinite(values)
+        if known.any():
+            finite = values[known]
+            worst = int(np.argmin(finite) if quantity in LEAST else np.argmax(np.abs(finite)))
             facts |= {
-                "min": float(finite.min()),
-                "max": float(finite.max()),
-                "mean": float(finite.mean()),
-                "median": float(np.median(finite)),
-                "worst": float(values[worst]),
-                "worst_frame": frames[worst],
-            }
+                "min": float(finite.min()), "max": float(finite.max()), "mean": float(finite.mean()),
+                "median": float(np.median(finite)), "worst": float(finite[worst]),
+                "worst_frame": int(frames[known][worst]),
+            }  # fmt: skip
         return facts
 
 
@@ -232,10 +225,10 @@ def describe_verdict(table: Table, limits: Mapping[str, float], left_out: Sequen
         return text
     text += "; the bones are not" if any(row[0] == ALL for row in found) and not wrong else ""
     # The worst of each muscle first, then whatever else is beyond a limit.
-    first = sorted(
-        {row[0]: row for row in reversed(found)}.values(), key=lambda row: excess(*row[1:4]), reverse=True
-    )
-    named = [*first, *(row for row in found if row not in first)][:MOST_NAMED]
+    first = {row[0]: row for row in reversed(found)}.values()
+    named = [*(row for row in found if row in first), *(row for row in found if row not in first)][
+        :MOST_NAMED
+    ]
     remedies = dict.fromkeys(LIMITS[quantity].remedy for _, quantity, *_ in named if quantity in LIMITS)
     values = "; ".join(_describe_excess(row, table, left_out) for row in named)
     more = f" and {len(found) - len(named)} more" if len(found) > len(named) else ""
