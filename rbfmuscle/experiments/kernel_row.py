@@ -4,30 +4,32 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from rbfmuscle.experiments.workers import threads_limited
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.geometry.surfaces import face_normals, mesh_volume, vertex_areas
 from rbfmuscle.implicit.extraction.marching import find_sheets
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.field_fit import FieldFit, wanted_derivatives
-from rbfmuscle.implicit.kernels.table import Kernel
+from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
 from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
 from rbfmuscle.implicit.placement.sampling import SurfaceSample, spread_points
 from rbfmuscle.implicit.selection import BOUND, EpsilonChoice, choose_epsilon, spacing
 from rbfmuscle.metrics.mesh_distance import MeshDistance
-from rbfmuscle.validation import NumericalWarning
+from rbfmuscle.validation import NumericalWarning, UsageError, check_mesh
 
 # Points of the mesh at which errors are measured, and cells along the longest side (so many a mean radius, between two
 # bounds). With too few thin rims fall between the nodes: iliacus seems to miss 1.7 mm with 64, sartorius 7.3 with 128,
 # where they miss 0.9 and 1.2.
 JUDGES, CELLS, RANGE = 20_000, 5.0, (128, 320)
+# Placements of the centres of a muscle.
+PLACEMENTS = ("greedy", FITTED)
 # Points of the mesh that choose epsilon.
 HELD_OUT = 2000
 # Points of one timed evaluation, and the processor time after which enough of them, or of fits, are made [s].
@@ -40,21 +42,21 @@ class ReferenceSurface:
     """The surface (vertices (n, 3), faces (m, 3)) that is to be met, and how far another one is from it.
 
     ``resolution`` counts cells along the longest side of extracted surfaces; as many as a muscle so slender needs where
-    0. ``seed`` is that of the points.
+    0.
     """
 
-    def __init__(self, vertices: Floats, faces: Integers, resolution: int = 0, seed: int = 0) -> None:
+    def __init__(self, vertices: Floats, faces: Integers, resolution: int = 0) -> None:
         self.vertices, self.faces, self.volume = vertices, faces, mesh_volume(vertices, faces)
         radius = 2.0 * self.volume / vertex_areas(vertices, faces).sum()
         self.axes = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
         self.axes[2] *= np.sign(np.linalg.det(self.axes))
         self.resolution = resolution or int(np.clip(CELLS * np.ptp(vertices @ self.axes[0]) / radius, *RANGE))
         self.distance = MeshDistance(vertices, faces)
-        self.points, which = spread_points(vertices, faces, JUDGES, seed=seed)
+        self.points, which = spread_points(vertices, faces, JUDGES)
         normal = face_normals(vertices, faces)[which]
         self.normals = normal / np.linalg.norm(normal, axis=1)[:, None]
         # What chooses is not what judges.
-        self.held_out = spread_points(vertices, faces, HELD_OUT, seed=seed + 1)[0]
+        self.held_out = spread_points(vertices, faces, HELD_OUT, seed=1)[0]
 
     def apart(self, vertices: Floats, faces: Integers) -> tuple[float, float]:
         """RMS and greatest distance of a surface, both ways [length]."""
@@ -62,6 +64,16 @@ class ReferenceSurface:
         back = self.distance.unsigned(vertices)
         rms = float(np.sqrt(0.5 * ((there**2).mean() + (back**2).mean())))
         return rms, float(max(there.max(), back.max()))
+
+
+def check_request(
+    mesh: MeshLike, kernels: Iterable[str], placement: str
+) -> tuple[Floats, Integers, list[Kernel]]:
+    """Vertices and faces of a mesh, and kernels by name; MeshError and UsageError for what cannot be studied."""
+    named = [get_kernel(name) for name in kernels]
+    if placement not in PLACEMENTS:
+        raise UsageError(f"placement must be one of {', '.join(PLACEMENTS)}, got {placement!r}")
+    return *check_mesh(*(mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces))), named
 
 
 class Measured(NamedTuple):

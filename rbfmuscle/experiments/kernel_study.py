@@ -10,17 +10,16 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from rbfmuscle.experiments.kernel_row import Measured, ReferenceSurface, measure_row, time_row
+from rbfmuscle.experiments.kernel_row import Measured, ReferenceSurface, check_request, measure_row, time_row
 from rbfmuscle.experiments.sweep_table import pareto_front
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.implicit.kernels.table import KERNELS, Kernel, get_kernel
+from rbfmuscle.implicit.kernels.table import KERNELS, Kernel
 from rbfmuscle.implicit.placement.refinement import FITTED
 from rbfmuscle.implicit.placement.sampling import SurfaceSample, sample_surface
-from rbfmuscle.validation import NumericalWarning, UsageError, check_mesh
+from rbfmuscle.validation import NumericalWarning, UsageError
 
 CENTRES = (150, 300)
-PLACEMENTS = ("greedy", FITTED)
 # Errors this much apart are alike: points of another seed move them as far.
 ALIKE = 1.05
 # Rows beyond this condition are taken only where none that is as accurate is below it.
@@ -33,16 +32,10 @@ COARSEST = "linear"
 class KernelStudy:
     """What `study_kernels` found.
 
-    Attributes
-    ----------
-    rows : list of dict
-        One for each kernel and number of centres, the smallest error first; unfit ones (``unfit`` says why) last.
-        Lengths are in the mesh's unit, times in seconds of one thread.
-    surfaces : list of (vertices, faces)
-        Of the rows, in their order; None where there is none.
-    units : str
-    recommended : dict or None
-        The quickest row that errs at most 5 % more than the best; None where every one is unfit.
+    ``rows`` holds a dict for each kernel and number of centres, the smallest error first; unfit ones (``unfit`` says
+    why) last. Lengths are in the mesh's unit, times in seconds of one thread. ``surfaces`` (vertices, faces) are those
+    of the rows, None where there is none. ``recommended`` is the quickest row that errs at most 5 % more than the best,
+    None where every one is unfit.
     """
 
     rows: list[dict] = field(repr=False)
@@ -93,7 +86,6 @@ def study_kernels(
     centres: Sequence[int] = CENTRES,
     placement: str = FITTED,
     resolution: int = 0,
-    seed: int = 0,
     units: str = "",
     progress: Callable[[int, int], None] | None = None,
 ) -> KernelStudy:
@@ -111,7 +103,6 @@ def study_kernels(
         (`fit_sample`); kernels that are not C2 have greedy ones.
     resolution : int
         Cells along the longest side of the extracted surfaces; as many as a muscle so slender needs by default.
-    seed : int
     units : str
         Name of the mesh's unit, for the page.
     progress : callable, optional
@@ -136,14 +127,12 @@ def study_kernels(
     >>> study.rows[0]["kernel"]
     'cubic'
     """
-    vertices, faces = check_mesh(*(mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)))
-    chosen = [get_kernel(name) for name in (kernels or KERNELS)]
-    check_placement(placement)
+    vertices, faces, chosen = check_request(mesh, kernels or KERNELS, placement)
     if min(centres, default=0) < 8:
         raise UsageError(f"centres must be numbers of at least 8, got {list(centres)}")
-    judge, calls = ReferenceSurface(vertices, faces, resolution, seed), []
+    judge, calls = ReferenceSurface(vertices, faces, resolution), []
     for count in centres:
-        sample = sample_surface(vertices, faces, int(count), seed=seed, placement="greedy")
+        sample = sample_surface(vertices, faces, int(count), placement="greedy")
         calls += [(sample, kernel, placement) for kernel in chosen]
     found = _measure_all(judge, calls, progress)
     _refuse_coarse([one.row for one in found])
@@ -154,12 +143,6 @@ def study_kernels(
     rows = [one.row for one in found]
     _mark_front(rows)
     return KernelStudy(rows, [one.surface for one in found], units, recommend(rows))
-
-
-def check_placement(placement: str) -> None:
-    """Raise UsageError for a placement that centres of a muscle cannot have."""
-    if placement not in PLACEMENTS:
-        raise UsageError(f"placement must be one of {', '.join(PLACEMENTS)}, got {placement!r}")
 
 
 def _measure_all(

@@ -70,19 +70,11 @@ def plan_sweep(
     frames: str | None = None,
     reference: Mapping[str, Any] | None = None,
 ) -> list[SweepPoint]:
-    """Lay out a sweep scene by scene: references, the scene's own settings, the grid; nothing is run.
+    """Lay out a sweep scene by scene: reference, the scene's own settings, the grid; nothing is run.
 
-    Parameters
-    ----------
-    scenes : dict of str to Scene
-        By name.
-    grid : dict of str to list
-        From `parse_grid`; empty where scenes are compared as they are.
-    frames : str, optional
-        Frames of the motion, "A:B:S".
-    reference : dict, optional
-        Settings of the reference, over those that follow from the grid: the greatest number of centres, samples,
-        nodes, iterations and cells in it and the least angle and step.
+    Without a grid scenes (by name) are compared as they are. ``frames`` are those of the motion, "A:B:S". ``reference``
+    holds settings of the reference, over those that follow from the grid: the greatest number of centres, samples,
+    nodes, iterations and cells in it and the least angle and step.
     """
     return [point for n, s in scenes.items() for point in _points(n, s, grid, frames, dict(reference or {}))]
 

@@ -87,19 +87,10 @@ def run_sweep(
 ) -> int:
     """Run the points that the folder does not hold done, references first; how many were run.
 
-    Parameters
-    ----------
-    runner : callable
-        ``runner(scene, settings, frames)`` gives a finished `Run`; module-level, so that it can be sent away.
-    scenes, points, frames
-        As for `plan_sweep`.
-    directory : path
-    jobs : int, optional
-        Points beside each other, each with cores / jobs threads; all cores by default.
-    cluster : str, optional
-        Address of a Dask scheduler whose workers see the folder.
-    progress : callable, optional
-        ``progress(done, total)``.
+    ``runner(scene, settings, frames)`` gives a finished `Run`; it is module-level, so that it can be sent away.
+    ``scenes``, ``points`` and ``frames`` are those of `plan_sweep`. Of ``jobs`` points beside each other (as many as
+    cores by default) each has cores / jobs threads. ``cluster`` is the address of a Dask scheduler whose workers see
+    the folder; ``progress(done, total)`` is called along the way.
     """
     from joblib import cpu_count, parallel_config
 

@@ -56,14 +56,10 @@ def pareto_front(errors: Sequence[float], times: Sequence[float]) -> list[int]:
 def mark_front(rows: list[dict[str, Any]], quantity: str = "error_rms") -> list[dict[str, Any]]:
     """Mark the front among the points of each reference, and judge the default of each against ``time_frame``.
 
-    References take no part: their error is zero by definition.
-
-    Returns
-    -------
-    list of dict
-        ``factor``: the least by which both error and time of the default must fall to lie on the front, 1 on it;
-        ``near``: up to `NEAR`; ``faster``, ``better``: keys of the quickest point of no greater error and the most
-        accurate of no greater time, None where there is none; ``text``: all of it in words.
+    References take no part: their error is zero by definition. A verdict holds ``factor``: the least by which both
+    error and time of the default must fall to lie on the front, 1 on it; ``near``: up to `NEAR`; ``faster``,
+    ``better``: keys of the quickest point of no greater error and the most accurate of no greater time, None where
+    there is none; ``text``: all of it in words.
     """
     verdicts = []
     for group in dict.fromkeys(row["reference"] for row in rows if row["reference"]):

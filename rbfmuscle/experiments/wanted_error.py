@@ -9,16 +9,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cache, partial
 
 import numpy as np
 
-from rbfmuscle.experiments.kernel_row import Measured, ReferenceSurface, measure_row, time_row
-from rbfmuscle.experiments.kernel_study import check_placement, row_name
+from rbfmuscle.experiments.kernel_row import Measured, ReferenceSurface, check_request, measure_row, time_row
+from rbfmuscle.experiments.kernel_study import row_name
 from rbfmuscle.geometry.arrays import MeshLike
-from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
+from rbfmuscle.implicit.kernels.table import Kernel
 from rbfmuscle.implicit.placement.refinement import FITTED
-from rbfmuscle.implicit.placement.sampling import GREEDY_LARGEST, SurfaceSample, sample_surface
-from rbfmuscle.validation import UsageError, check_mesh
+from rbfmuscle.implicit.placement.sampling import GREEDY_LARGEST, sample_surface
+from rbfmuscle.validation import UsageError
 
 # Kernels that take part by default, the quickest first.
 CANDIDATES = ("cubic", "quintic", "skala_cervenka", "matern_52")
@@ -100,10 +101,8 @@ def reach_error(
     """
     if not 0.0 < error < np.inf:
         raise UsageError(f"error must be a positive length, got {error}")
-    named = [get_kernel(name) for name in (kernels or CANDIDATES)]
-    check_placement(placement)
-    surface = check_mesh(*(mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)))
-    search = _Search(ReferenceSurface(*surface), float(error), placement, progress)
+    vertices, faces, named = check_request(mesh, kernels or CANDIDATES, placement)
+    search = _Search(ReferenceSurface(vertices, faces), float(error), placement, progress)
     for kernel in named:
         search.try_kernel(kernel)
     return search.result()
@@ -120,7 +119,7 @@ class _Search:
         progress: Callable[[int, int], None] | None,
     ) -> None:
         self.judge, self.error, self.placement, self.progress = judge, error, placement, progress
-        self.samples: dict[int, SurfaceSample] = {}
+        self.sample = cache(partial(sample_surface, judge.vertices, judge.faces, placement="greedy"))
         self.found: dict[tuple[str, int], Measured] = {}
         self.best: tuple[str, int] | None = None
 
@@ -128,11 +127,7 @@ class _Search:
         """Error of a kernel with so many centres [length], infinite where it broke."""
         key = kernel.name, count
         if key not in self.found:
-            if count not in self.samples:
-                self.samples[count] = sample_surface(
-                    self.judge.vertices, self.judge.faces, count, placement="greedy"
-                )
-            self.found[key] = measure_row(self.judge, self.samples[count], kernel, self.placement)
+            self.found[key] = measure_row(self.judge, self.sample(count), kernel, self.placement)
             if self.progress is not None:
                 self.progress(len(self.found), max(len(self.found) + 1, 8))
         error = _error(self.found[key])
@@ -155,9 +150,8 @@ class _Search:
                 count = round(math.sqrt(low * high))
             else:  # by the power law, while one end is open
                 factor = (missed / self.error) ** (1.0 / POWER) if math.isfinite(missed) else 2.0
-                count = round(
-                    count * float(np.clip(factor, 0.4, 2.5)) * (0.9 if missed <= self.error else 1.1)
-                )
+                beyond = 0.9 if missed <= self.error else 1.1
+                count = round(count * float(np.clip(factor, 0.4, 2.5)) * beyond)
             count = int(np.clip(count, low + 1, high - 1)) if high > low + 1 else high
 
     def result(self) -> WantedError:
