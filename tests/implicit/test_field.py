@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.interpolate import RBFInterpolator
 
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit.assembly import Basis, frame
@@ -150,3 +151,21 @@ def test_one_and_four_centres():
 def test_wrong_arguments_are_refused(words, options):
     with pytest.raises(UsageError, match=words):
         RBFField.fit_hermite(*ellipsoid(20), **options)
+
+
+SHARED = dict.fromkeys(("linear", "cubic", "quintic", "thin_plate_spline"), 1.0) | dict.fromkeys(
+    ("multiquadric", "inverse_multiquadric", "inverse_quadratic"), 4.0
+)
+
+
+@pytest.mark.parametrize("kernel", [*SHARED, "gaussian"])
+@pytest.mark.parametrize("count", [500, 2000])
+def test_values_are_those_of_scipy(kernel, count):
+    rng, epsilon = np.random.default_rng(count), SHARED.get(kernel, 6.0)
+    points, where = rng.uniform(-1, 1, (count, 3)), rng.uniform(-0.9, 0.9, (500, 3))
+    values = np.sin(2 * points[:, 0]) + points[:, 1] * points[:, 2]
+    field = RBFField.fit(points, values, kernel=kernel, epsilon=epsilon)
+    # SciPy adds a constant where none is needed
+    degree = KERNELS[kernel].degree
+    expected = RBFInterpolator(points, values, kernel=kernel, epsilon=epsilon, degree=degree)(where)
+    assert np.abs(field(where) - expected).max() < 1e-8

@@ -26,17 +26,13 @@ def path_length(points):
     return distance_along(points)[-1]
 
 
-def wrapped():
-    """Length of a string from one side of a circle to the other: two tangents and an arc."""
-    tangent = np.sqrt(FAR**2 - RADIUS**2)
-    return 2 * tangent + RADIUS * (np.pi - 2 * np.arctan2(tangent, RADIUS))
-
-
 @pytest.mark.parametrize("height", [20.0, -20.0, 12.0])
 def test_string_over_a_ball_is_two_tangents_and_an_arc(height):
     path = shortest_path(over_the_ball(height), [ball()], {"ball": np.eye(4)})
+    tangent = np.sqrt(FAR**2 - RADIUS**2)
+    wrapped = 2 * tangent + RADIUS * (np.pi - 2 * np.arctan2(tangent, RADIUS))
     # 33 nodes cut the arc's corners, and the ball has facets: a thousandth of the length.
-    assert path_length(path) == pytest.approx(wrapped(), rel=1e-3)
+    assert path_length(path) == pytest.approx(wrapped, rel=1e-3)
     assert np.sign(path[len(path) // 2, 2]) == np.sign(height)
     assert np.linalg.norm(path[1:-1], axis=1).min() > 0.995 * RADIUS
 

@@ -256,13 +256,8 @@ class TestRows:
         bones[1].mesh.apply_translation([500, 0, 0])
         frames = [{"joint.bend": a} for a in (0.0, 0.1, 0.2)]
         return SimpleNamespace(
-            units="cm",
-            motion=Motion(frames),
-            bones=bones,
-            couplings=[],
-            joints=JOINTS,
-            muscles=[rod_muscle(mesh)],
-        )
+            units="cm", motion=Motion(frames), bones=bones, couplings=[], joints=JOINTS, muscles=[rod_muscle(mesh)]
+        )  # fmt: skip
 
     def frame(self, scene, index):
         """The rod stretched by 10 cm a radian, the limb going with it."""
@@ -318,12 +313,9 @@ class TestRows:
 
 
 def test_euler_of_sphere_torus_and_two_spheres():
-    sphere = trimesh.creation.icosphere(2)
-    torus = trimesh.creation.torus(3.0, 1.0)
+    sphere, torus = trimesh.creation.icosphere(2), trimesh.creation.torus(3.0, 1.0)
     two = trimesh.util.concatenate([sphere, sphere.copy().apply_translation([5, 0, 0])])
-    assert euler_characteristic(sphere.faces) == 2
-    assert euler_characteristic(torus.faces) == 0
-    assert euler_characteristic(two.faces) == 4
+    assert [euler_characteristic(mesh.faces) for mesh in (sphere, torus, two)] == [2, 0, 4]
 
 
 def literal_crossings(vertices, faces):
@@ -358,12 +350,8 @@ def test_crossings_are_those_of_a_literal_search():
 
 def test_moment_arms_of_the_real_hip_have_the_right_signs_and_sum(hip_scene):
     """Gluteus maximus and medius extend, the iliacus flexes; the adductor brevis flexes first, then extends."""
-    wanted = {
-        "gluteus_maximus": (-1, -1),
-        "gluteus_medius": (-1, -1),
-        "iliacus": (1, 1),
-        "adductor_brevis": (1, -1),
-    }
+    wanted = dict.fromkeys(("gluteus_maximus", "gluteus_medius"), (-1, -1))
+    wanted |= {"iliacus": (1, 1), "adductor_brevis": (1, -1)}
     made = simulate(hip_scene, settings={"output.surfaces": False}, frames="0:46:3")
     angle = np.array([frame.coordinates["hip.flexion"] for frame in made.frames])
     for muscle, signs in wanted.items():
