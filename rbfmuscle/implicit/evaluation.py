@@ -153,7 +153,8 @@ def _out_of_reach(ball, at, epsilon):
 @compiled(error_model="numpy")
 def _monomial_loop(p, i, j, k, factor, term, out):
     """out += factor x^i y^j z^k."""
-    term[:] = factor
+    for n in range(term.size):
+        term[n] = factor
     for axis, power in enumerate((i, j, k)):
         for _ in range(power):
             for n in range(term.size):

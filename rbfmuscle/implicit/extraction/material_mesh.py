@@ -55,12 +55,10 @@ def _edges_loop(vertices, faces):
     for f in range(len(faces)):
         for k in range(3):
             a, b = faces[f, k], faces[f, (k + 1) % 3]
-            x, y, z = (
-                vertices[a, 0] - vertices[b, 0],
-                vertices[a, 1] - vertices[b, 1],
-                vertices[a, 2] - vertices[b, 2],
-            )
-            length = np.sqrt(x * x + y * y + z * z)
+            square = 0.0
+            for d in range(3):
+                square += (vertices[a, d] - vertices[b, d]) ** 2
+            length = np.sqrt(square)
             total += length
             greatest = max(greatest, length)
     return total / (3.0 * len(faces)), greatest

@@ -98,23 +98,18 @@ def _hermite_columns_loop(j, e2, d, radial, out):
     (d/dx_c, d/dx_e) -(first * delta + second * d_c d_e).
     """
     n = d.shape[1]
-    phi, first, second = radial[0], radial[1], radial[2]
-    column = out[j]
     for i in range(j, n):
-        column[i] = phi[i]
+        out[j, i] = radial[0, i]
     for c in range(3):
-        target, dc = column[(c + 1) * n : (c + 2) * n], d[c]
         for i in range(n):
-            target[i] = e2 * first[i] * dc[i]
+            out[j, (c + 1) * n + i] = e2 * radial[1, i] * d[c, i]
     for e in range(3):
-        de = d[e]
-        column = out[(e + 1) * n + j]
+        column = (e + 1) * n + j
         for i in range(j, n):
-            column[(e + 1) * n + i] = -e2 * (first[i] + e2 * second[i] * de[i] * de[i])
+            out[column, (e + 1) * n + i] = -e2 * (radial[1, i] + e2 * radial[2, i] * d[e, i] * d[e, i])
         for c in range(e + 1, 3):
-            target, dc = column[(c + 1) * n : (c + 2) * n], d[c]
             for i in range(n):
-                target[i] = -e2 * e2 * second[i] * dc[i] * de[i]
+                out[column, (c + 1) * n + i] = -e2 * e2 * radial[2, i] * d[c, i] * d[e, i]
 
 
 @compiled(error_model="numpy")
