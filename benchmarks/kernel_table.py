@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from rbfmuscle.experiments.kernel_row import VOLUME_BOUND, ReferenceSurface, measure_row
+from rbfmuscle.experiments.kernel_study import VOLUME_BOUND, ReferenceSurface, measure_row
 from rbfmuscle.experiments.workers import threads_limited
 from rbfmuscle.implicit.extraction.marching import find_sheets
 from rbfmuscle.implicit.extraction.surface import extract_surface

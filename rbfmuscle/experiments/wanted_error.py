@@ -13,8 +13,7 @@ from functools import cache, partial
 
 import numpy as np
 
-from rbfmuscle.experiments.kernel_row import Measured, ReferenceSurface, check_request, measure_row, time_row
-from rbfmuscle.experiments.kernel_study import row_name
+from rbfmuscle.experiments import kernel_study
 from rbfmuscle.geometry.arrays import MeshLike
 from rbfmuscle.implicit.kernels.table import Kernel
 from rbfmuscle.implicit.placement.refinement import FITTED
@@ -46,7 +45,7 @@ class WantedError:
 
     def describe(self, name: str, units: str = "") -> str:
         """One line on the surface of this name: what reaches the wanted error, or what the best reached."""
-        unit, said = f" {units}" if units else "", row_name(self.row)
+        unit, said = f" {units}" if units else "", kernel_study.row_name(self.row)
         if self.row["unfit"]:
             return f"{name}: no field is fit; take more centres or another kernel"
         if self.reached:
@@ -101,8 +100,8 @@ def reach_error(
     """
     if not 0.0 < error < np.inf:
         raise UsageError(f"error must be a positive length, got {error}")
-    vertices, faces, named = check_request(mesh, kernels or CANDIDATES, placement)
-    search = _Search(ReferenceSurface(vertices, faces), float(error), placement, progress)
+    vertices, faces, named = kernel_study.check_request(mesh, kernels or CANDIDATES, placement)
+    search = _Search(kernel_study.ReferenceSurface(vertices, faces), float(error), placement, progress)
     for kernel in named:
         search.try_kernel(kernel)
     return search.result()
@@ -113,21 +112,21 @@ class _Search:
 
     def __init__(
         self,
-        judge: ReferenceSurface,
+        judge: kernel_study.ReferenceSurface,
         error: float,
         placement: str,
         progress: Callable[[int, int], None] | None,
     ) -> None:
         self.judge, self.error, self.placement, self.progress = judge, error, placement, progress
         self.sample = cache(partial(sample_surface, judge.vertices, judge.faces, placement="greedy"))
-        self.found: dict[tuple[str, int], Measured] = {}
+        self.found: dict[tuple[str, int], kernel_study.Measured] = {}
         self.best: tuple[str, int] | None = None
 
     def measure(self, kernel: Kernel, count: int) -> float:
         """Error of a kernel with so many centres [length], infinite where it broke."""
         key = kernel.name, count
         if key not in self.found:
-            self.found[key] = measure_row(self.judge, self.sample(count), kernel, self.placement)
+            self.found[key] = kernel_study.measure_row(self.judge, self.sample(count), kernel, self.placement)
             if self.progress is not None:
                 self.progress(len(self.found), max(len(self.found) + 1, 8))
         error = _error(self.found[key])
@@ -158,7 +157,7 @@ class _Search:
         """The row of fewest centres that reaches the error, or that of the smallest error."""
         found = min(self.found.values(), key=_error) if self.best is None else self.found[self.best]
         if not found.row["unfit"]:
-            time_row(found, self.judge.points)
+            kernel_study.time_row(found, self.judge.points)
         tried = [
             {"kernel": kernel, "centres": count, "error": _error(one)}
             for (kernel, count), one in self.found.items()
@@ -166,5 +165,5 @@ class _Search:
         return WantedError(self.best is not None, found.row, _error(found), self.error, tried)
 
 
-def _error(found: Measured) -> float:
+def _error(found: kernel_study.Measured) -> float:
     return math.inf if found.row["unfit"] else float(found.row["rms"])

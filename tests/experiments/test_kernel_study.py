@@ -13,8 +13,7 @@ from command_line import call
 
 import rbfmuscle as rm
 from rbfmuscle.experiments import kernel_study
-from rbfmuscle.experiments.kernel_row import ReferenceSurface
-from rbfmuscle.experiments.kernel_study import describe, recommend, row_toml
+from rbfmuscle.experiments.kernel_study import ReferenceSurface, describe, recommend, row_toml
 from rbfmuscle.report.kernel_page import answer, write_studies
 from rbfmuscle.validation import MeshError, UsageError
 
