@@ -70,10 +70,13 @@ def _count_loop(vertices, faces, grid, covered):
     u, v, w = grid.axes[0], grid.axes[1], grid.axes[2]
     x, y, fine = grid.low[u], grid.low[v], grid.fine
     for f in range(len(faces)):
-        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
-        left, right = int((min(a[u], b[u], c[u]) - x) * fine), int((max(a[u], b[u], c[u]) - x) * fine)
-        near, far = int((min(a[v], b[v], c[v]) - y) * fine), int((max(a[v], b[v], c[v]) - y) * fine)
-        bottom, top = min(a[w], b[w], c[w]), max(a[w], b[w], c[w])
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        left = int((min(vertices[a, u], vertices[b, u], vertices[c, u]) - x) * fine)
+        right = int((max(vertices[a, u], vertices[b, u], vertices[c, u]) - x) * fine)
+        near = int((min(vertices[a, v], vertices[b, v], vertices[c, v]) - y) * fine)
+        far = int((max(vertices[a, v], vertices[b, v], vertices[c, v]) - y) * fine)
+        bottom = min(vertices[a, w], vertices[b, w], vertices[c, w])
+        top = max(vertices[a, w], vertices[b, w], vertices[c, w])
         covered[f, 0], covered[f, 1], covered[f, 2], covered[f, 3] = left, right, near, far
         for j in range(near, far + 1):
             for cell in range(j * grid.width + left, j * grid.width + right + 1):

@@ -61,7 +61,8 @@ def _value_matrix_loop(x, epsilon, form, out):
     for j in range(n):
         _offsets_loop(x, (x[0, j], x[1, j], x[2, j]), epsilon * epsilon, d, u)
         _radial_loop(form, 1, u, work, radial)
-        out[j] = radial[0]
+        for i in range(n):
+            out[j, i] = radial[0, i]
 
 
 @compiled(error_model="numpy")
@@ -125,17 +126,15 @@ def _normal_matrix_loop(x, normals, epsilon, form, out):
     for j in range(n):
         _offsets_loop(x, (x[0, j], x[1, j], x[2, j]), e2, d, u)
         _radial_loop(form, 7, u, work, radial)
-        phi, first, second = radial[0], radial[1], radial[2]
-        value, slope = out[j], out[n + j]
         nx, ny, nz = normals[0, j], normals[1, j], normals[2, j]
         for i in range(j, n):
-            value[i] = phi[i]
+            out[j, i] = radial[0, i]
         for i in range(n):
             at_i = d[0, i] * normals[0, i] + d[1, i] * normals[1, i] + d[2, i] * normals[2, i]
             at_j = d[0, i] * nx + d[1, i] * ny + d[2, i] * nz
             both = nx * normals[0, i] + ny * normals[1, i] + nz * normals[2, i]
-            value[n + i] = e2 * first[i] * at_i
-            slope[n + i] = -e2 * (first[i] * both + e2 * second[i] * at_i * at_j)
+            out[j, n + i] = e2 * radial[1, i] * at_i
+            out[n + j, n + i] = -e2 * (radial[1, i] * both + e2 * radial[2, i] * at_i * at_j)
 
 
 _NO_NORMALS = np.zeros((0, 3))

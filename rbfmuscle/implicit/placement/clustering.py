@@ -16,6 +16,8 @@ from rbfmuscle.jit import compiled
 
 # Least ratio of cell size to edge length: about ten mesh vertices a cell, or cells get ragged.
 FINENESS = 2.5
+# Sweeps over the edges in which vertices change their cell, at most.
+ROUNDS = 200
 
 
 class FineMesh(NamedTuple):
@@ -85,7 +87,7 @@ def cluster_mesh(fine: FineMesh, density: Floats, count: int, seed: int) -> tupl
     first = used[np.random.default_rng(seed).integers(len(used))]
     labels = np.full(len(fine.vertices), -1)
     _farthest_loop(start, other, length, first, count, labels)
-    _equalise_loop(fine.vertices, weight, edges, labels, count, 200)
+    _equalise_loop(fine.vertices - fine.vertices.mean(axis=0), weight, edges, labels, count)
     _mark_loose(tail, other, weight, labels, count)
     _join_loop(start, other, labels)
     return contract_clusters(fine.faces, labels, weight, count)
@@ -129,22 +131,19 @@ def _cell_energy(moment, mass, k, sign, x, w):
 
 
 @compiled
-def _equalise_loop(vertices, weight, edges, labels, count, rounds):
+def _equalise_loop(vertices, weight, edges, labels, count):
     """Move vertices between neighbouring cells while that lowers the sum of the cells' inertias."""
     moment = np.zeros((count, 3))
     mass = np.zeros(count)
     members = np.zeros(count, dtype=np.int64)
-    origin = np.zeros(3)
-    for c in range(3):
-        origin[c] = vertices[:, c].mean()
     for v in range(len(labels)):
         k = labels[v]
         if k >= 0:
             mass[k] += weight[v]
             members[k] += 1
             for c in range(3):
-                moment[k, c] += weight[v] * (vertices[v, c] - origin[c])
-    for _ in range(rounds):
+                moment[k, c] += weight[v] * vertices[v, c]
+    for _ in range(ROUNDS):
         moved = 0
         for e in range(len(edges)):
             for side in range(2):
@@ -152,8 +151,7 @@ def _equalise_loop(vertices, weight, edges, labels, count, rounds):
                 old = labels[v]
                 if old == k or members[old] == 1:
                     continue
-                x = vertices[v] - origin
-                w = weight[v]
+                x, w = vertices[v], weight[v]
                 before = _cell_energy(moment, mass, old, 0.0, x, w) + _cell_energy(moment, mass, k, 0.0, x, w)
                 after = _cell_energy(moment, mass, old, -1.0, x, w) + _cell_energy(moment, mass, k, 1.0, x, w)
                 if after < before - 1e-12 * abs(before):
