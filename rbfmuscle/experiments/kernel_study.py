@@ -210,10 +210,8 @@ def describe(rows: list[dict]) -> str:
     tied = [row for row in good if row["rms"] <= ALIKE * least]
     use = f"use {best['kernel']} with {best['centres']} centres"
     if len(tied) == 1:
-        other = min((row["rms"] for row in good if row is not best), default=None)
-        behind = (
-            f", whose error is {100 * (1 - best['rms'] / other):.0f} % less than the next" if other else ""
-        )
+        less = 100 * (1 - best["rms"] / min((row["rms"] for row in good if row is not best), default=np.inf))
+        behind = f", whose error is {less:.0f} % less than the next" if len(good) > 1 else ""
         return f"{use[0].upper()}{use[1:]}{behind}."
     spread = 100 * (max(row["rms"] for row in tied) / least - 1)
     reason = "without a shape parameter to choose" if not best["epsilon"] else "of sound condition"
@@ -287,7 +285,10 @@ def study_kernels(
             time_row(one, judge.points)
     found.sort(key=lambda one: (bool(one.row["unfit"]), one.row["rms"] is None, one.row["rms"] or 0.0))
     rows = [one.row for one in found]
-    _mark_front(rows)
+    good = [row for row in rows if not row["unfit"]]
+    front = pareto_front([row["rms"] for row in good], [cost(row) for row in good])
+    for row in rows:  # no other row beats those of the front both in error and in time
+        row["front"] = any(row is good[index] for index in front)
     return KernelStudy(rows, [one.surface for one in found], units, recommend(rows))
 
 
@@ -346,13 +347,3 @@ def recommend(rows: list[dict]) -> dict | None:
         (row for row in sound if cost(row) <= 1.15 * quick),
         key=lambda row: (bool(row["epsilon"]), row["condition"]),
     )
-
-
-def _mark_front(rows: list[dict]) -> None:
-    """Mark what no other row beats both in error and in time."""
-    good = [row for row in rows if not row["unfit"]]
-    front = pareto_front([row["rms"] for row in good], [cost(row) for row in good])
-    for row in rows:
-        row["front"] = False
-    for index in front:
-        good[index]["front"] = True
