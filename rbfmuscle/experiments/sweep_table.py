@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -110,15 +109,13 @@ def write_table(
     verdicts = mark_front(rows, quantity)
     keys = list(dict.fromkeys(key for row in rows for key in row["settings"]))
     columns = [name for name in rows[0] if name not in ("settings", "label")]
-    part = folder.directory / ".sweep.csv.part"
-    with open(part, "w", encoding="utf-8", newline="") as file:
+    with open(folder.directory / "sweep.csv", "w", encoding="utf-8", newline="") as file:
         lines = csv.writer(file, lineterminator="\n")
         lines.writerow([*keys, *columns])
         for row in rows:
             values = [row["settings"].get(key, "") for key in keys] + [row[name] for name in columns]
             # Digits beyond nine places are rounding.
             lines.writerow([f"{round(v, 9):.6g}" if isinstance(v, float) else v for v in values])
-    os.replace(part, folder.directory / "sweep.csv")
     counts = {status: sum(r["status"] == status for r in rows) for status in ("done", "failed", "missing")}
     table = {"quantity": quantity, **counts, "verdicts": verdicts, "rows": rows}
     write_json(folder.directory / "sweep.json", table)
