@@ -15,15 +15,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rbfmuscle.experiments.sweep import SweepPoint
-from rbfmuscle.experiments.workers import connect_cluster, threads_limited
+from rbfmuscle.experiments.workers import threads_limited
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.metrics.quantities import ALL
-from rbfmuscle.output.writer import write_json
-from rbfmuscle.validation import RBFMuscleError, SolveError, UsageError
+from rbfmuscle.output.writer import check_writable, write_json
+from rbfmuscle.validation import MissingPartError, RBFMuscleError, SolveError, UsageError
 
 if TYPE_CHECKING:
+    from distributed import Client
+
     from rbfmuscle.scene.scene import Scene
 
+CONNECT_WITHIN = 20  # seconds for a scheduler and its first two workers
 Runner = Callable[["Scene", dict[str, Any], str | None], Any]
 # What a point may fail with and leave the others standing.
 POINT_ERRORS = (RBFMuscleError, ArithmeticError, LookupError, MemoryError, OSError, RuntimeError, ValueError)
@@ -45,13 +48,9 @@ class SweepFolder:
     def __init__(self, directory: str | Path) -> None:
         self.directory = Path(os.path.abspath(directory))
         self.points, self.references = self.directory / "points", self.directory / "references"
-        try:
-            for folder in (self.points, self.references):
-                folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UsageError(
-                f"cannot write to {directory}: {error.strerror}; choose another folder"
-            ) from None
+        check_writable(directory)
+        for folder in (self.points, self.references):
+            folder.mkdir(parents=True, exist_ok=True)
 
     def read(self, key: str) -> dict[str, Any]:
         """A point's result, empty where there is none."""
@@ -107,7 +106,7 @@ def run_sweep(
 
     with ExitStack() as stack:
         if cluster:
-            client = stack.enter_context(connect_cluster(cluster))
+            client = stack.enter_context(_connect_cluster(cluster))
             stack.enter_context(parallel_config(backend="dask", client=client))
         elif jobs > 1:
             stack.enter_context(parallel_config(backend="loky", inner_max_num_threads=threads))
@@ -116,6 +115,25 @@ def run_sweep(
             calls = [(runner, scenes[p.scene], p, folder, frames, threads) for p in stage]
             _side_by_side(calls, folder, -1 if cluster else jobs, advance)
     return len(left)
+
+
+def _connect_cluster(address: str) -> Client:
+    """A client of a Dask scheduler, as soon as two workers are there: to one alone joblib sends nothing.
+
+    MissingPartError if Dask is not installed, UsageError if no scheduler with two workers answers.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise MissingPartError(
+            "Dask is not installed, which --cluster needs: pip install 'rbfmuscle[cluster]'"
+        ) from error
+    try:
+        client = Client(address, timeout=CONNECT_WITHIN)
+        client.wait_for_workers(2, timeout=CONNECT_WITHIN)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"no Dask scheduler with two workers answers at {address!r} ({error})") from None
+    return client
 
 
 def _side_by_side(calls, folder, jobs, advance):

@@ -1,17 +1,9 @@
-"""What runs of an experiment are distributed to: threads, the workers of a cluster."""
+"""Threads that a run of an experiment may use."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
-
-from rbfmuscle.validation import MissingPartError, UsageError
-
-if TYPE_CHECKING:
-    from distributed import Client
-
-CONNECT_WITHIN = 20  # seconds for a scheduler and its first two workers
 
 
 @contextmanager
@@ -27,22 +19,3 @@ def threads_limited(count: int) -> Iterator[None]:
             yield
     finally:
         numba.set_num_threads(before)
-
-
-def connect_cluster(address: str) -> Client:
-    """A client of a Dask scheduler, as soon as two workers are there: to one alone joblib sends nothing.
-
-    MissingPartError if Dask is not installed, UsageError if no scheduler with two workers answers.
-    """
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise MissingPartError(
-            "Dask is not installed, which --cluster needs: pip install 'rbfmuscle[cluster]'"
-        ) from error
-    try:
-        client = Client(address, timeout=CONNECT_WITHIN)
-        client.wait_for_workers(2, timeout=CONNECT_WITHIN)
-    except (OSError, ValueError) as error:
-        raise UsageError(f"no Dask scheduler with two workers answers at {address!r} ({error})") from None
-    return client

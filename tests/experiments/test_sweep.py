@@ -204,7 +204,7 @@ def test_a_cluster_that_loses_one_of_two_workers_gives_the_same_table(finished, 
 
 def test_no_scheduler_is_said(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("rbfmuscle.experiments.workers.CONNECT_WITHIN", 2)
+    monkeypatch.setattr("rbfmuscle.experiments.sweep_run.CONNECT_WITHIN", 2)
     with pytest.raises(UsageError, match="no Dask scheduler"):
         sweep(tmp_path, cluster="tcp://127.0.0.1:1")
 
