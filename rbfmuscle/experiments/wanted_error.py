@@ -23,10 +23,8 @@ from rbfmuscle.validation import UsageError
 # Kernels that take part by default, the quickest first.
 CANDIDATES = ("cubic", "quintic", "skala_cervenka", "matern_52")
 FEWEST, MOST = 20, GREEDY_LARGEST
-# Numbers of centres closer than this share are alike.
-STEP = 0.04
-# Power of the number of centres by which the error falls.
-POWER = 1.4
+# Numbers of centres closer than this share are alike; power of the number by which the error falls.
+STEP, POWER = 0.04, 1.4
 
 
 @dataclass
