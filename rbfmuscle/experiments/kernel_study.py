@@ -150,7 +150,7 @@ def _measure(
 
 
 def time_row(found: Measured, points: Floats) -> None:
-    """Write into a row what a fit, and values at 20,000 of the points (n, 3), cost [processor s, one thread]."""
+    """Write into a row what a fit, and values at 20,000 points (n, 3), cost [s of processor time, one thread]."""
     row, sample = found.row, found.sample
     with warnings.catch_warnings(), threads_limited(1):
         warnings.simplefilter("ignore", NumericalWarning)  # it stands in the row's condition
