@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
 
@@ -15,20 +15,17 @@ def import_(
     model: Path,
     *,
     output: Output,
-    units: Literal["m", "cm", "mm"] = "m",
     geometry: Annotated[list[Path] | None, Parameter(negative="")] = None,
     motion: Path | None = None,
     muscles: Annotated[bool, Parameter(negative="--no-muscles")] = True,
     force: Flag = False,
 ) -> None:
-    """Write a scene file and its meshes from an OpenSim model (.osim).
+    """Write a scene file and its meshes from an OpenSim model (.osim), in metres.
 
     Parameters
     ----------
     model
         The model, of version 2 to 4; OpenSim itself is not needed.
-    units
-        Unit of the scene's lengths.
     geometry
         Folder with meshes, besides the model's own and its Geometry; repeatable.
     motion
@@ -47,7 +44,7 @@ def import_(
     for folder in geometry or []:
         if not folder.is_dir():
             raise UsageError(f"--geometry {folder}: no such folder")
-    found = import_osim(model, units=units, geometry=geometry, muscles=muscles)
+    found = import_osim(model, geometry=geometry, muscles=muscles)
     written = write_scene(found, output, motion=motion)
     for note in found.notes:
         print(f"note: {note}")

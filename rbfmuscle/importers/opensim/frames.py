@@ -4,7 +4,7 @@ import posixpath
 
 import numpy as np
 
-from rbfmuscle.importers.opensim.xml import Node
+from rbfmuscle.importers.opensim.xml import Node, plain_name
 from rbfmuscle.scene.joints.joint import frame_at
 from rbfmuscle.validation import SceneError
 
@@ -34,6 +34,7 @@ class Frames:
         raise SceneError(f"frame {path!r} is offset from itself; correct its parent")
 
     def _find(self, name, inside):
+        name = plain_name(name)
         guesses = [posixpath.normpath(posixpath.join(inside, name))]
         if "/" not in name:
             guesses += [f"/bodyset/{name}", f"/{name}", f"/componentset/{name}"]

@@ -29,12 +29,12 @@ def find_mesh(name: str, folders: list[Path]) -> Path | None:
 
 
 def body_meshes(
-    model: OsimModel, places: dict[str, np.ndarray], metre: float, geometry: list[Path]
+    model: OsimModel, places: dict[str, np.ndarray], geometry: list[Path]
 ) -> tuple[dict[str, ReadMesh], list[str]]:
     """One mesh for each body that shows any, in the scene's coordinates, and what could not be taken.
 
-    ``places`` are (4, 4) from every body to the ground in the rest pose [metre]; a metre is ``metre`` scene units;
-    ``geometry`` are folders with meshes, after the model's own and its ``Geometry``.
+    ``places`` are (4, 4) from every body to the ground in the rest pose [metre]; ``geometry`` are folders with meshes,
+    after the model's own and its ``Geometry``.
     """
     folders = [model.path.parent, model.path.parent / "Geometry", *geometry]
     parts, meshes, notes = {}, {}, []
@@ -46,7 +46,7 @@ def body_meshes(
             continue
         if file.name != Path(mesh.file).name:
             notes.append(f"body {mesh.body!r}: mesh {mesh.file!r} was read from {file.name!r}")
-        parts.setdefault(mesh.body, []).append((vertices * metre, faces, file.name))
+        parts.setdefault(mesh.body, []).append((vertices, faces, file.name))
     for body, found in parts.items():
         starts = np.cumsum([0, *(len(vertices) for vertices, _, _ in found)])
         vertices = np.concatenate([part[0] for part in found])

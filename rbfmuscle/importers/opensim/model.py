@@ -1,6 +1,5 @@
 """An OpenSim model as read: bodies, joints, couplings, meshes and muscles, in metres and radians."""
 
-import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -113,17 +112,12 @@ class OsimModel:
         return found
 
 
-def clean_name(name: str) -> str:
-    """The name in the scene: of letters, digits, ``_`` and ``-``."""
-    return re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_") or "body"
-
-
 def finish(model: OsimModel) -> OsimModel:
     """The model, what is not connected noted; SceneError if names are shared, or if one names what is not there."""
     coordinates = [name for joint in model.joints for name in joint.coordinates]
     joints = [joint.name for joint in model.joints]
     for what, names in (("bodies", model.bodies), ("joints", joints), ("coordinates", coordinates)):
-        for name, count in Counter(map(clean_name, names)).items():
+        for name, count in Counter(names).items():
             if count > 1:
                 raise SceneError(f"two {what} are named {name!r}; rename one")
     for joint in model.joints:

@@ -5,7 +5,7 @@ import numpy as np
 from rbfmuscle.importers.opensim.frames import Frames
 from rbfmuscle.importers.opensim.functions import read_function
 from rbfmuscle.importers.opensim.model import GROUND, ModelMuscle, OsimModel, WrapShape
-from rbfmuscle.importers.opensim.xml import Node
+from rbfmuscle.importers.opensim.xml import Node, plain_name
 from rbfmuscle.scene.joints.joint import frame_at
 
 # Force per area of muscle [N/m2] (Arnold et al. 2010, Ann Biomed Eng 38: 269; Rajagopal et al. 2016 have 60 N/cm2).
@@ -32,7 +32,7 @@ def read_muscles(model: OsimModel, node: Node, frames: Frames) -> list[ModelMusc
         if path is None or not force.word("optimal_fiber_length"):
             continue
         points = [_path_point(point, frames, resting) for point in path.objects("PathPointSet")]
-        names = [wrap.word("wrap_object") for wrap in path.objects("PathWrapSet")]
+        names = [plain_name(wrap.word("wrap_object")) for wrap in path.objects("PathWrapSet")]
         volume = force.number("max_isometric_force") * force.number("optimal_fiber_length") / SPECIFIC_TENSION
         wraps = [shapes[name] for name in names if name in shapes]
         muscles.append(ModelMuscle(force.name, [p for p in points if p is not None], wraps, volume))
@@ -52,7 +52,7 @@ def _path_point(point, frames, resting):
     body, frame = frames.place(point.word("socket_parent_frame") or point.word("body"))
 
     def value_of(tag):
-        return resting.get((point.word(f"socket_{tag}") or point.word(tag)).split("/")[-1], 0.0)
+        return resting.get(plain_name(point.word(f"socket_{tag}") or point.word(tag)).split("/")[-1], 0.0)
 
     if point.tag == "ConditionalPathPoint":
         low, high = point.numbers("range", "-1e9 1e9", count=2)

@@ -8,7 +8,7 @@ from rbfmuscle.importers.opensim.frames import Frames, socket
 from rbfmuscle.importers.opensim.functions import read_function
 from rbfmuscle.importers.opensim.model import GROUND, ModelJoint, ModelMesh, OsimModel, finish
 from rbfmuscle.importers.opensim.muscles import read_muscles
-from rbfmuscle.importers.opensim.xml import read_xml
+from rbfmuscle.importers.opensim.xml import plain_name, read_xml
 from rbfmuscle.scene.joints.functions import Constant, Linear, scaled
 from rbfmuscle.scene.joints.joint import KINDS, Coordinate, Coupling, TransformAxis, frame_at, motion_of
 from rbfmuscle.validation import SceneError
@@ -50,7 +50,7 @@ def _read_model(root, path):
     for defaults in node.findall("defaults"):
         node.remove(defaults)
     bodies = [body for body in node.objects("BodySet") if body.tag == "Body"]
-    model = OsimModel(node.name or path.stem, version, path)
+    model = OsimModel(node.name or plain_name(path.stem), version, path)
     model.bodies = [GROUND, *(body.name for body in bodies if body.name != GROUND)]
     units = node.word("length_units", "meters")
     if units not in ("meters", "m", "metres"):
@@ -100,7 +100,7 @@ def _read_nested(model, bodies):
         for joint in body.objects("Joint"):
             ends = []
             for name, where, turn in (
-                (joint.word("parent_body"), "location_in_parent", "orientation_in_parent"),
+                (plain_name(joint.word("parent_body")), "location_in_parent", "orientation_in_parent"),
                 (body.name, "location", "orientation"),
             ):
                 # Six digits: so OpenSim 4 rounds these when it reads an older file.
@@ -169,7 +169,7 @@ def _custom_axes(node, names):
         raise node.error("is written as OpenSim 1 did; open the model in OpenSim 4 and save it")
     axes = {}
     for axis in [] if table is None else table.nodes():
-        direction, of = axis.vector("axis", "1 0 0"), tuple(axis.word("coordinates").split())
+        direction, of = axis.vector("axis", "1 0 0"), axis.names("coordinates")
         function = read_function(axis)
         if function is None:
             if of:
@@ -218,8 +218,8 @@ def _read_couplings(model, node):
         function = read_function(constraint.child("coupled_coordinates_function"))
         if function is None:
             raise constraint.error("has no function; give it one")
-        of = tuple(constraint.word("independent_coordinate_names").split())
-        target = constraint.word("dependent_coordinate_name")
+        of = constraint.names("independent_coordinate_names")
+        target = plain_name(constraint.word("dependent_coordinate_name"))
         if not of or not target:
             raise constraint.error("names no coordinates; give it some")
         _check_count(function, len(of), constraint)

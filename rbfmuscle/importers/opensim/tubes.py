@@ -25,20 +25,17 @@ ROUNDS = 60
 
 @dataclass
 class Tube:
-    """A tube: vertices [scene unit], triangles, and the vertices that each bone holds."""
+    """A tube: vertices [metre], triangles, and the vertices that each bone holds."""
 
     vertices: np.ndarray
     faces: np.ndarray
     held: dict[str, np.ndarray]
 
 
-def make_tube(
-    muscle: ModelMuscle, places: dict[str, np.ndarray], bones: dict[str, ExactDistance], metre: float
-) -> Tube:
+def make_tube(muscle: ModelMuscle, places: dict[str, np.ndarray], bones: dict[str, ExactDistance]) -> Tube:
     """The tube of a muscle in the scene, or SceneError where no two bodies with a mesh hold it.
 
-    ``places`` are (4, 4) from every body of the model to the scene [scene unit], ``bones`` the meshes of those that
-    have one; a metre is ``metre`` scene units.
+    ``places`` are (4, 4) from every body of the model to the scene [metre], ``bones`` their meshes.
     """
     bodies = [body for body, _ in muscle.points]
     if len(set(bodies[:1] + bodies[-1:])) < 2 or muscle.volume <= 0.0:
@@ -46,24 +43,16 @@ def make_tube(
     for body in (bodies[0], bodies[-1]):
         if body not in bones:
             raise SceneError(f"muscle {muscle.name!r}: body {body!r} has no mesh to hold it")
-    volume = muscle.volume * metre**3
-    points = np.array([places[body][:3, :3] @ at * metre + places[body][:3, 3] for body, at in muscle.points])
+    points = np.array([places[body][:3, :3] @ at + places[body][:3, 3] for body, at in muscle.points])
     line, fixed = _middle_line(points)
     length = np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
     share = END_RADIUS + (1.0 - END_RADIUS) * np.sin(np.pi * np.linspace(0.0, 1.0, len(line)))
-    radius = share * np.sqrt(volume / (np.pi * length * np.mean(share**2)))
-    wraps = [(wrap, places[wrap.body] @ scaled(wrap.frame, metre)) for wrap in muscle.wraps]
-    line = _clear_line(line, fixed, radius, wraps, metre, list(bones.values()))
+    radius = share * np.sqrt(muscle.volume / (np.pi * length * np.mean(share**2)))
+    wraps = [(wrap, places[wrap.body] @ wrap.frame) for wrap in muscle.wraps]
+    line = _clear_line(line, fixed, radius, wraps, list(bones.values()))
     found = mesh_volume(*tube_mesh(line, radius))  # as its square, but for where sections run into each other
-    vertices, faces = tube_mesh(line, radius * np.sqrt(volume / found))
+    vertices, faces = tube_mesh(line, radius * np.sqrt(muscle.volume / found))
     return Tube(vertices, faces, _held(bodies, fixed, bones))
-
-
-def scaled(transform: np.ndarray, metre: float) -> np.ndarray:
-    """Return a rigid (4, 4) transform with its shift in other units."""
-    out = transform.copy()
-    out[:3, 3] *= metre
-    return out
 
 
 def _middle_line(points):
@@ -75,7 +64,7 @@ def _middle_line(points):
     return line, np.rint(along * (SECTIONS - 1)).astype(int)
 
 
-def _clear_line(line, fixed, radius, wraps, metre, bones):
+def _clear_line(line, fixed, radius, wraps, bones):
     """The line drawn straight between its points, out of wrapping shapes and, by its radius, out of bones."""
     line, start = line.copy(), line.copy()
     middle = np.arange(3, len(line) - 3)
@@ -84,8 +73,8 @@ def _clear_line(line, fixed, radius, wraps, metre, bones):
         line[fixed] = 0.5 * (line[fixed] + start[fixed])
         for wrap, frame in wraps:
             back = np.linalg.inv(frame)
-            local = (line @ back[:3, :3].T + back[:3, 3]) / metre
-            line = (_out_of_shape(wrap, local) * metre) @ frame[:3, :3].T + frame[:3, 3]
+            local = line @ back[:3, :3].T + back[:3, 3]
+            line = _out_of_shape(wrap, local) @ frame[:3, :3].T + frame[:3, 3]
         if number % 10 == 9:
             for bone in bones:
                 line[middle] = _out_of_bone(bone, line[middle], 0.8 * radius[middle])

@@ -71,16 +71,8 @@ def _muscle_text(directory, muscle):
 
 
 def _write_mesh(directory, folder, item):
-    """Write a mesh as binary PLY with positions in float64, so that nothing is rounded; return its file."""
-    (directory / folder).mkdir(exist_ok=True)
-    vertices = np.ascontiguousarray(item.mesh.vertices, dtype="<f8")
-    table = np.empty(len(item.mesh.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
-    table["count"], table["corners"] = 3, item.mesh.faces
-    head = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
-        "property double x\nproperty double y\nproperty double z\n"
-        f"element face {len(table)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
+    """Write a mesh and return its file."""
     file = f"{folder}/{item.name}.ply"
-    (directory / file).write_bytes(head.encode() + vertices.tobytes() + table.tobytes())
+    (directory / folder).mkdir(exist_ok=True)
+    item.mesh.export(directory / file)
     return file

@@ -19,6 +19,13 @@ MOST_DEPTH = 100
 _LEVELS = ("OpenSimDocument", "Model", "objects", "components", "frames")
 
 
+def plain_name(name: str) -> str:
+    """A name as a scene may have it, of letters, digits, ``_`` and ``-``; of a path every name."""
+    return "/".join(
+        word if word == ".." else re.sub(r"[^A-Za-z0-9_-]+", "_", word) for word in name.split("/")
+    )
+
+
 class Node(ElementTree.Element):
     """One element; ``owner`` is the element that it stands in."""
 
@@ -26,8 +33,8 @@ class Node(ElementTree.Element):
 
     @property
     def name(self) -> str:
-        """The attribute ``name``."""
-        return self.get("name", "")
+        """The attribute ``name``, plain."""
+        return plain_name(self.get("name", ""))
 
     @property
     def path(self) -> str:
@@ -67,6 +74,10 @@ class Node(ElementTree.Element):
     def word(self, tag: str, default: str = "") -> str:
         """Text of the child of that tag, without white space around it; the default where it is missing or empty."""
         return (self.findtext(tag) or "").strip() or default
+
+    def names(self, tag: str) -> tuple[str, ...]:
+        """The names in the child of that tag, plain."""
+        return tuple(map(plain_name, self.word(tag).split()))
 
     def truth(self, tag: str, default: bool = False) -> bool:
         """Whether the child of that tag says true."""

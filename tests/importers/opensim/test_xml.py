@@ -77,7 +77,7 @@ def test_two_colons_in_a_name_and_what_is_not_ascii_are_read(tmp_path):
     path = tmp_path / "good.osim"
     path.write_text('<A::B name="é"><!-- x::y --><c> 1 </c></A::B>', encoding="utf-8")
     root = read_xml(path)
-    assert root.tag == "A__B" and root.name == "é" and root.word("c") == "1"
+    assert root.tag == "A__B" and root.get("name") == "é" and root.word("c") == "1"
 
 
 def test_missing_file(tmp_path):
