@@ -9,12 +9,13 @@ from __future__ import annotations
 import re
 import tomllib
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-# Words of this length may differ from a known one by one letter, words of that length by two.
-ONE_LETTER, TWO_LETTERS = 5, 8
+# Fewest letters of a word that may be misspelt, and how much of it must agree with a known one (`difflib`'s ratio).
+FEWEST, LIKE = 5, 0.8
 MIDLINE = ("sacrum", "vertebra", "sternum", "skull", "mandible")
 _SIGNS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss", "é": "e", "è": "e", "ô": "o", "â": "a"})
 
@@ -143,26 +144,7 @@ def _taken_apart(word):
 
 
 def _nearest(word):
-    """The only known word that differs by a letter, or by two of a long one; empty where there is none."""
-    table, allowed = _table(), (len(word) >= ONE_LETTER) + (len(word) >= TWO_LETTERS)
-    near = {}
-    for known in table.known:
-        if len(known) >= ONE_LETTER and abs(len(known) - len(word)) <= allowed:
-            near.setdefault(_distance(word, known), []).append(known)
-    least = min(near, default=allowed + 1)
-    forms = {table.forms.get(known, known) for known in near.get(least, ())}
-    return min(near[least]) if least <= allowed and len(forms) == 1 else ""
-
-
-def _distance(one, two):
-    """Letters to change, add, drop or swap with the next (Damerau-Levenshtein)."""
-    rows = [list(range(len(two) + 1))]
-    for i, a in enumerate(one, start=1):
-        row = [i]
-        for j, b in enumerate(two, start=1):
-            cost = min(rows[-1][j] + 1, row[-1] + 1, rows[-1][j - 1] + (a != b))
-            if i > 1 and j > 1 and a == two[j - 2] and one[i - 2] == b:
-                cost = min(cost, rows[-2][j - 2] + 1)
-            row.append(cost)
-        rows.append(row)
-    return rows[-1][-1]
+    """The known word of which an unknown one may be a misspelling; empty where there is none."""
+    known = sorted(known for known in _table().known if len(known) >= FEWEST)
+    near = get_close_matches(word, known, n=1, cutoff=LIKE) if len(word) >= FEWEST else ()
+    return next(iter(near), "")

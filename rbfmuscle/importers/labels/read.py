@@ -4,10 +4,8 @@ Positions come out in millimetres in the frame of NIfTI (RAS: x to the right, y 
 order and the signs of the voxels' axes; NRRD files in LPS are turned.
 """
 
-import csv
 import json
 import re
-import tomllib
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -196,16 +194,12 @@ def _check_affine(affine, path):
 
 
 def read_names(path: Path) -> dict[int, str]:
-    """Names of labels from JSON, from lines as CSV, TSV or ITK-SNAP write them, or from a known table by its name."""
-    tables = tomllib.loads((Path(__file__).parent / "tables.toml").read_text(encoding="utf-8"))
-    if not path.exists() and path.name in tables:
-        return dict(enumerate(tables[path.name].split(), start=1))
+    """Names of labels from JSON, or from lines as CSV, TSV or ITK-SNAP write them."""
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
         names = _json_names(json.loads(text)) if path.suffix.lower() == ".json" else _row_names(text)
     except OSError as error:
-        known = ", ".join(tables)
-        raise UsageError(f"cannot read {path}: {error.strerror}; known tables: {known}") from None
+        raise UsageError(f"cannot read {path}: {error.strerror}; give a table of names") from None
     except (ValueError, RecursionError):
         raise UsageError(f"{path} is no JSON") from None
     if not names:
@@ -218,11 +212,9 @@ def _row_names(text):
     names = {}
     for line in text.splitlines():
         snap = re.match(r'\s*(\d+)\s+.*"([^"]+)"\s*$', line)
-        words = next(csv.reader([line.replace("\t", ",")], skipinitialspace=True), [])
-        if snap:
-            names[int(snap[1])] = snap[2]
-        elif len(words) >= 2 and words[0].strip().isdigit():
-            names[int(words[0])] = words[1].strip()
+        row = snap or re.match(r'\s*(\d+)\s*[,\t]\s*"?([^",\t]+)', line)
+        if row:
+            names[int(row[1])] = row[2].strip()
     return names
 
 
