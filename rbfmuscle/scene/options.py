@@ -31,64 +31,35 @@ DEEPEST = 20
 LARGEST_INTEGER = 2**53
 MAX_FRAMES = 100_000
 
-# Keys that were removed, and what to do instead; a key of a muscle or of its model (`model.KEY`) without the muscle.
+# What to do in place of keys that were removed: of a muscle, or of its model (`model.KEY`), without the muscle.
 # The table is deleted at 1.0.
-REMOVED_KEYS: dict[str, str] = {
-    "contact.from_rest": "delete the key: solve_pose(scene, models, coordinates) in Python solves a pose from rest",
-    "contact.margin": "delete the key: contact begins at the surface of the bone",
-    "contact.detector": "delete the key; for other fields call simulate(scene, fields={bone: field}) in Python",
-    "contact.tolerance": "delete the key: a bone's field errs by 0.4 % of the mean edge of its mesh",
-    "contact.still_angle": "delete the key: a muscle is solved whenever its bones move against each other",
-    "detect.tunnelling.smallest_step": "delete the key: steps are halved down to 0.1 degrees",
-    "sliding.strip": "delete the key: a linked point is free to 0.5 mm beyond its gap at rest",
-    "sliding.release": "delete the key: a point 5 mm beyond that is let go",
-    "sliding.join": "delete the key: points that come near a neighbour are linked",
-    "sliding.cut": "delete the key: overlaps that remain are cut midway in the surfaces",
-    "motion.degrees": "write inDegrees=yes or inDegrees=no into the header of the motion file",
-    "motion.max_substeps": "delete the key: a motion may take 100000 sub-steps",
-    "activation.from": "use a list of numbers, spread over the motion: [from, to]",
-    "activation.file": "read the file in Python and give the numbers as a list, spread over the motion",
-    "activation.to": "use a list of numbers, spread over the motion: [from, to]",
-    "shortening": "delete the key: a fully active fibre has no tension at half its slack length",
-    "optimal_fibre_length": "use fibre_stretch_at_rest: the mean length of the fibres in the scan over it",
-    "tendon.share": "give the share alone: tendon = 0.2",
-    "joint.rotations.scale": "multiply the numbers of the function by it",
-    "joint.translations.scale": "multiply the numbers of the function by it",
-    "coupling.scale": "multiply the numbers of the function by it",
-    "joint.rotations.natural_spline": "use spline",
-    "joint.translations.natural_spline": "use spline",
-    "joint.coordinates.*.default": "delete the key: a coordinate that a motion does not mention is at rest",
-    "tendon.vertices": "use tendon.length, measured from the attachments",
-    "coupling.natural_spline": "use spline",
-    "model.seed": "delete the key: samples and centres are always the same",
-    "model.tolerance": 'use a model whose sweeps go on until none moves a vertex, for instance "pbd-converged"',
-    "model.across": "delete the key: the muscle is an elastic solid, set its model.nodes",
-    "model.across_weight": "delete the key: the muscle is an elastic solid, set its model.nodes",
-    "model.acceleration": "delete the key: each solve combines five iterations",
-    "model.contacts": "delete the key: all contacts near a bone are solved together",
-    "model.inside": "use model.nodes: every RBF muscle is carried by an elastic solid",
-    "model.stretch_high": "delete the key: use model.fibre_ratio, the stiffness along the fibres",
-    "model.stretch_hold": "use model.fibre_ratio, the stiffness along the fibres",
-    "model.stretch_low": "use model.slack: fibres shorten freely to 1 / slack of their length in the scan",
-    "model.prediction": 'use model = "pbd-paper", or delete the key: vertices are carried along by the bones',
-    "model.damping": 'use model = "pbd-paper", or delete the key',
-    "model.limits": 'use model = "pbd-paper", or delete the key: edges beyond 0.6 or 2.2 times their length are hard',
-    "model.soft_length": 'use model = "pbd-paper", or delete the key: long edges are softer',
-    "model.edge": "delete the key: edges across the fibres are as stiff as PBD makes them",
-    "model.arap_compliance": "delete the key: the compliance of an edge is one over its weight",
-    "model.arap_reach": "delete the key: a global step carries 3 % of the muscle's diagonal",
-    "model.swelling_reach": "delete the key: the freedom to swell ends within 4 % of the muscle's diagonal",
-    "model.contact": "delete the key: bones are met by the vertices of a mesh muscle",
-    "model.sound": "delete the key: surfaces of mesh models are not kept from crossing themselves",
-    "model.self_collision": "delete the key: surfaces of mesh models are not kept from crossing themselves",
-    "model.response": 'use model = "pbd-paper", or delete the key: ways out of several bones are added up',
-    "model.derivatives": "delete the key: up to 200 centres, and fitted ones, meet all derivatives",
-    "output.preview": "use output.report = false, which leaves out report.html and preview.webp",
-    "output.metrics": "delete the key: every run is measured",
-    "output.fibres": "delete the key: fibres of a run are no longer followed; those of a scene still steer its muscles",
-    "output.moment_arms": "delete the key: moment arms are measured along every motion, about what moves alone",
-    "opensim": "delete the table: runs are no longer compared with the muscle paths of an OpenSim model",
+_REPLACED = {
+    "delete the key": (
+        "contact.margin contact.tolerance contact.still_angle detect.tunnelling.smallest_step sliding.strip "
+        "sliding.release sliding.join sliding.cut motion.max_substeps shortening joint.coordinates.*.default "
+        "model.seed model.acceleration model.contacts model.edge model.arap_compliance model.arap_reach "
+        "model.swelling_reach model.contact model.sound model.self_collision model.derivatives "
+        "output.metrics output.fibres output.moment_arms"
+    ),
+    "delete the table": "opensim",
+    "delete the key: solve_pose(scene, models, coordinates) in Python solves a pose from rest": "contact.from_rest",
+    "delete the key: call simulate(scene, fields={bone: field}) in Python for other fields": "contact.detector",
+    "write inDegrees=yes or inDegrees=no into the header of the motion file": "motion.degrees",
+    "use a list of numbers, spread over the motion": "activation.from activation.to activation.file",
+    "use fibre_stretch_at_rest: the mean length of the fibres in the scan over it": "optimal_fibre_length",
+    "use tendon.length, measured from the attachments": "tendon.share tendon.vertices",
+    "multiply the numbers of the function by it": "joint.rotations.scale joint.translations.scale coupling.scale",
+    "use spline": "joint.rotations.natural_spline joint.translations.natural_spline coupling.natural_spline",
+    'use a model whose sweeps go on until none moves a vertex, for instance "pbd-converged"': "model.tolerance",
+    "use model.nodes: every RBF muscle is carried by an elastic solid": "model.inside model.across model.across_weight",
+    "use model.fibre_ratio, the stiffness along the fibres": "model.stretch_high model.stretch_hold",
+    "use model.slack: fibres shorten freely to 1 / slack of their length in the scan": "model.stretch_low",
+    'use model = "pbd-paper", or delete the key': (
+        "model.prediction model.damping model.limits model.soft_length model.response"
+    ),
+    "use output.report = false, which leaves out report.html and preview.webp": "output.preview",
 }
+REMOVED_KEYS = {key: remedy for remedy, keys in _REPLACED.items() for key in keys.split()}
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, NamedTuple
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag
+from pydantic import BeforeValidator, Field
 
 from rbfmuscle.geometry.arrays import Booleans
 from rbfmuscle.scene.options import Positive, Table
@@ -15,7 +15,7 @@ TENDON_STRAIN = 0.033
 
 
 class TendonTable(Table):
-    """``tendon`` as a table: where the tendon is, and its strain at full activation.
+    """``tendon``: where the tendon is, and its strain at full activation.
 
     ``length`` from every attachment, or from the bone ``at`` alone. The strain of 0.033 at the greatest isometric force
     is Zajac's (Critical Reviews in Biomedical Engineering 17, 1989).
@@ -34,12 +34,6 @@ def _check_activation(value: Any) -> Any:
     return value
 
 
-Tendon = Annotated[
-    Annotated[float, Field(gt=0, lt=1), Tag("number")] | Annotated[TendonTable, Tag("table")],
-    Discriminator(lambda value: "table" if isinstance(value, (dict, Table)) else "number"),
-]
-
-
 class ContractionTable(Table):
     """The keys of one muscle that contracts.
 
@@ -49,12 +43,12 @@ class ContractionTable(Table):
         0 to 1; waypoints are spread evenly over the motion.
     fibre_stretch_at_rest : float, optional
         Stretch of the fibres in the scan pose against their slack length.
-    tendon : number (a share of the length at every attachment) or table, optional
+    tendon : TendonTable, optional
     """
 
     activation: Annotated[float | list[float], BeforeValidator(_check_activation)] = 0.0
     fibre_stretch_at_rest: Annotated[float, Field(gt=0.2, lt=5)] | None = None
-    tendon: Tendon | None = None
+    tendon: TendonTable | None = None
 
 
 def contraction_keys(given: Mapping[str, Any], *, muscle: str) -> ContractionTable | None:

@@ -27,9 +27,9 @@ def resolve_contraction(muscle: Muscle) -> Contraction:
     """
     keys = muscle.contraction or ContractionTable()
     _check_fibres(muscle)
-    strain = keys.tendon.strain if isinstance(keys.tendon, TendonTable) else TENDON_STRAIN
-    stretch = keys.fibre_stretch_at_rest
-    return Contraction(stretch or 1.0, _tendon(muscle, keys.tendon), strain, stretch is not None)
+    stretch, tendon = keys.fibre_stretch_at_rest, keys.tendon
+    strain = TENDON_STRAIN if tendon is None else tendon.strain
+    return Contraction(stretch or 1.0, _tendon(muscle, tendon), strain, stretch is not None)
 
 
 def _check_fibres(muscle):
@@ -46,25 +46,17 @@ def _check_fibres(muscle):
             )
 
 
-def _tendon(muscle: Muscle, given: float | TendonTable | None) -> Booleans:
-    """Vertices (n,) that are tendon: up to a length from the attachments, or a share of the way to the others."""
-    vertices = np.asarray(muscle.mesh.vertices, dtype=float)
-    tendon = np.zeros(len(vertices), dtype=bool)
+def _tendon(muscle: Muscle, given: TendonTable | None) -> Booleans:
+    """Vertices (n,) that are tendon: up to a length from the attachments."""
+    free = np.ones(len(muscle.mesh.vertices), dtype=bool)
     if given is None:
-        return tendon
+        return ~free
     place = f"muscle {muscle.name!r} tendon"
     bones = [attachment.bone for attachment in muscle.attachments]
-    at, length = (given.at, given.length) if isinstance(given, TendonTable) else (None, None)
-    if at is not None and at not in bones:
-        raise SceneError(f"{place}: not attached to {at!r}, {did_you_mean(at, bones)}")
-    for bone in set(bones) if at is None else [at]:
-        here, others = (
-            np.concatenate([a.vertices for a in muscle.attachments if (a.bone == bone) is same])
-            for same in (True, False)
-        )
-        away = _along_surface(muscle.mesh, here)
-        tendon |= away <= (given * away[others].mean() if length is None else length)
-    free = np.ones(len(vertices), dtype=bool)
+    if given.at is not None and given.at not in bones:
+        raise SceneError(f"{place}: not attached to {given.at!r}, {did_you_mean(given.at, bones)}")
+    start = np.concatenate([a.vertices for a in muscle.attachments if given.at in (None, a.bone)])
+    tendon = _along_surface(muscle.mesh, start) <= given.length
     free[np.concatenate([a.vertices for a in muscle.attachments])] = False
     if not (free & ~tendon).any():
         raise SceneError(f"{place}: covers all of the muscle, leave a belly that can contract")
