@@ -71,7 +71,7 @@ def add_joint(
     axes : dict of str -> (3,) array_like
         Axis of each coordinate, in any length.
     **keys
-        Any other key of ``[[joint]]`` [degree, scene unit]: ``type``, ``orientation``, ``coordinates``, ...
+        Any other key of ``[[joint]]`` [degree, scene unit]: ``type``, ``coordinates``, ``rotations``, ...
     """
     row: dict[str, Any] = {"name": name, "parent": parent, "child": child, **keys}
     if centre is not None:

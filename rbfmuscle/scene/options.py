@@ -47,6 +47,7 @@ _REPLACED = {
     "write inDegrees=yes or inDegrees=no into the header of the motion file": "motion.degrees",
     "use a list of numbers, spread over the motion": "activation.from activation.to activation.file",
     "use fibre_stretch_at_rest: the mean length of the fibres in the scan over it": "optimal_fibre_length",
+    "give the axes in the scene's directions": "joint.orientation",
     "use tendon.length, measured from the attachments": "tendon.share tendon.vertices",
     "multiply the numbers of the function by it": "joint.rotations.scale joint.translations.scale coupling.scale",
     "use spline": "joint.rotations.natural_spline joint.translations.natural_spline coupling.natural_spline",

@@ -144,8 +144,7 @@ def test_moving_the_whole_scene_moves_the_result(name):
     turn[:3, 3] = [500.0, -300, 200]
     for thing in [*scene.bones, *scene.muscles]:
         thing.mesh.apply_transform(turn)
-    for joint in scene.joints:
-        joint.frame = turn @ joint.frame
+    scene.joints = [joint.moved(turn) for joint in scene.joints]
     moved, _ = _run(name, scene, surfaces=False)
     expected = plain[-1].carried["strap0"][0] @ turn[:3, :3].T + turn[:3, 3]
     # The ball has no axes of its own, so the grid of its distance field lies in it in another way: 2 µm.

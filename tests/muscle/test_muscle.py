@@ -62,9 +62,7 @@ def _surface(turn=(0.0, 0.0, 0.0), shift=(0.0, 0.0, 0.0), scale=1.0, units="mm")
     moved = np.vstack([np.column_stack([scale * rotation, shift]), [0, 0, 0, 1]])
     for thing in [*scene.bones, *scene.muscles]:
         thing.mesh.vertices = trimesh.transform_points(thing.mesh.vertices, moved)
-    for joint in scene.joints:
-        middle = trimesh.transform_points(joint.frame[None, :3, 3], moved)[0]
-        joint.frame = np.vstack([np.column_stack([rotation @ joint.frame[:3, :3], middle]), [0, 0, 0, 1]])
+    scene.joints = [joint.moved(moved) for joint in scene.joints]
     scene.motion = Motion([{"hip.flexion": np.radians(30.0)}])
     model = build_model(scene.muscles[0], scene, "rbf")
     (frame,) = simulate_frames(scene, [model])

@@ -3,9 +3,10 @@
 import posixpath
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from rbfmuscle.importers.opensim.xml import Node, plain_name
-from rbfmuscle.scene.joints.joint import frame_at
 from rbfmuscle.validation import SceneError
 
 _DEEPEST = 50
@@ -27,9 +28,7 @@ class Frames:
             if path in self.bodies:
                 return self.bodies[path], transform
             frame = self.offsets[path]
-            transform = (
-                frame_at(frame.vector("translation"), frame.vector("orientation").tolist()) @ transform
-            )
+            transform = frame_at(frame.vector("translation"), frame.vector("orientation")) @ transform
             path = self._find(socket(frame, "parent") or "..", path)
         raise SceneError(f"frame {path!r} is offset from itself; correct its parent")
 
@@ -42,6 +41,13 @@ class Frames:
             if guess in self.bodies or guess in self.offsets:
                 return guess
         raise SceneError(f"{inside}: there is no frame {name!r}; correct the socket")
+
+
+def frame_at(origin: ArrayLike, orientation: ArrayLike = (0.0, 0.0, 0.0)) -> np.ndarray:
+    """The frame (4, 4) at ``origin`` (3,), turned about its own x, then y, then z [radian]."""
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = Rotation.from_euler("XYZ", orientation).as_matrix(), origin
+    return frame
 
 
 def socket(node: Node, name: str) -> str:

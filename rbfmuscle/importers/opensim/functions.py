@@ -4,7 +4,6 @@ import itertools
 
 from rbfmuscle.importers.opensim.xml import Node
 from rbfmuscle.scene.joints.functions import (
-    Constant,
     Function,
     Linear,
     PiecewiseLinear,
@@ -29,7 +28,7 @@ def read_function(node: Node | None) -> Function | None:
 
 def _read(node):
     if node.tag == "Constant":
-        return Constant(node.number("value"))
+        return Linear((), node.number("value"))
     if node.tag == "LinearFunction":
         *slopes, constant = node.numbers("coefficients", "1 0")
         return Linear(tuple(slopes), constant)

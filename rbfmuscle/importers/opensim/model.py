@@ -18,7 +18,7 @@ GROUND = "ground"
 class ModelJoint(Joint):
     """A joint between two bodies: ``X_child = X_parent P J(q) C^-1``, with P and C the joint's frames (4, 4) in them.
 
-    Its own ``frame`` is the identity.
+    Its own centre is the origin.
     """
 
     parent_frame: np.ndarray = field(default_factory=lambda: np.eye(4))

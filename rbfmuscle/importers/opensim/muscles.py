@@ -2,11 +2,10 @@
 
 import numpy as np
 
-from rbfmuscle.importers.opensim.frames import Frames
+from rbfmuscle.importers.opensim.frames import Frames, frame_at
 from rbfmuscle.importers.opensim.functions import read_function
 from rbfmuscle.importers.opensim.model import GROUND, ModelMuscle, OsimModel, WrapShape
 from rbfmuscle.importers.opensim.xml import Node, plain_name
-from rbfmuscle.scene.joints.joint import frame_at
 
 # Force per area of muscle [N/m2] (Arnold et al. 2010, Ann Biomed Eng 38: 269; Rajagopal et al. 2016 have 60 N/cm2).
 SPECIFIC_TENSION = 61e4

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
-from rbfmuscle.importers.opensim.frames import Frames, socket
+from rbfmuscle.importers.opensim.frames import Frames, frame_at, socket
 from rbfmuscle.importers.opensim.functions import read_function
 from rbfmuscle.importers.opensim.model import GROUND, ModelJoint, ModelMesh, OsimModel, finish
 from rbfmuscle.importers.opensim.muscles import read_muscles
 from rbfmuscle.importers.opensim.xml import plain_name, read_xml
-from rbfmuscle.scene.joints.functions import Constant, Linear, scaled
-from rbfmuscle.scene.joints.joint import KINDS, Coordinate, Coupling, TransformAxis, frame_at, motion_of
+from rbfmuscle.scene.joints.functions import Linear, scaled
+from rbfmuscle.scene.joints.joint import KINDS, Coordinate, Coupling, TransformAxis, motion_of
 from rbfmuscle.validation import SceneError
 
 # From this version on joints stand in a set of their own and name their frames.
@@ -151,13 +151,13 @@ def _joint(node, ends, holder, model):
             "translation": tuple(TransformAxis(a, (n,)) for a, n in zip(shifts, names[len(turns) :])),
         }
     slopes = [
-        (sort, axis.coordinates, axis.function.slopes[0] if isinstance(axis.function, Linear) else 0.0)
+        (sort, axis.coordinates, next(iter(getattr(axis.function, "slopes", ())), 0.0))
         for sort, group in axes.items()
         for axis in group
     ]
     coordinates = {inner.name: _coordinate(inner, motion_of(inner.name, slopes), model) for inner in found}
     return ModelJoint(
-        node.name, parent, child, np.eye(4), coordinates, axes["rotation"], axes["translation"], kind,
+        node.name, parent, child, np.zeros(3), coordinates, axes["rotation"], axes["translation"], kind,
         parent_frame=first, child_frame=second,
     )  # fmt: skip
 
@@ -190,7 +190,7 @@ def _check_count(function, count, node):
     if isinstance(function, Linear) and len(function.slopes) > count:
         slopes = len(function.slopes)
         raise node.error(f"a linear function of {slopes} coordinates, {count} are named")
-    if count == 0 and not isinstance(function, (Constant, Linear)):
+    if count == 0 and not isinstance(function, Linear):
         raise node.error("a function of a coordinate, and none is named")
 
 

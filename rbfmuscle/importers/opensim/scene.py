@@ -69,8 +69,8 @@ def import_osim(path: Path | str, *, geometry: list[Path] | None = None, muscles
     for joint, backward in model.tree():
         full |= {name: f"{joint.name}.{name}" for name in joint.coordinates}
         parent, child = (joint.child, joint.parent) if backward else (joint.parent, joint.child)
-        frame = places[joint.parent] @ joint.parent_frame
-        scene.place_joint(replace(joint, parent=parent, child=child, frame=frame, backward=backward))
+        placed = joint.moved(places[joint.parent] @ joint.parent_frame)
+        scene.place_joint(replace(placed, parent=parent, child=child, backward=backward))
     for coupling in model.couplings:
         if all(name in full for name in (coupling.coordinate, *coupling.of)):
             of = tuple(full[name] for name in coupling.of)

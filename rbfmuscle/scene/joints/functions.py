@@ -1,4 +1,4 @@
-"""Functions of joint coordinates: constant, linear, polynomial, piecewise linear, splines.
+"""Functions of joint coordinates: linear, polynomial, piecewise linear, splines.
 
 Each takes the values of its coordinates in order and returns one number; those of one variable take the first.
 ``rescaled`` gives the function in other units, ``g(f_k q_k) = output * self(q)``, f the ``inputs``.
@@ -14,23 +14,8 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Constant:
-    """The same value at every coordinate."""
-
-    value: float
-
-    def __call__(self, *values: float) -> float:
-        """Value at these coordinates."""
-        return self.value
-
-    def rescaled(self, inputs: list[float], output: float) -> "Constant":
-        """Return the function in other units."""
-        return Constant(self.value * output)
-
-
-@dataclass(frozen=True)
 class Linear:
-    """``c1 q1 + ... + cn qn + constant``."""
+    """``c1 q1 + ... + cn qn + constant``; without slopes a constant."""
 
     slopes: tuple[float, ...]
     constant: float = 0.0
@@ -53,10 +38,7 @@ class Polynomial:
 
     def __call__(self, *values: float) -> float:
         """Value at these coordinates."""
-        total = 0.0
-        for coefficient in self.coefficients:
-            total = total * values[0] + coefficient
-        return total
+        return float(np.polyval(self.coefficients, values[0]))
 
     def rescaled(self, inputs: list[float], output: float) -> "Polynomial":
         """Return the function in other units."""
@@ -110,7 +92,7 @@ class Spline(PiecewiseLinear):
     degree = 3
 
 
-Function = Constant | Linear | Polynomial | PiecewiseLinear
+Function = Linear | Polynomial | PiecewiseLinear
 
 
 def scaled(function: Function, factor: float) -> Function:

@@ -1,16 +1,17 @@
 """A joint: coordinates that move one bone against another, and the table of the kinds of joint.
 
-Every kind is rotations about axes that are carried along by those before them, and a shift along the joint's own
-axes, which is not turned by them (Seth et al. 2010, the custom joint of Simbody); what a kind fixes is how many
+Every kind is rotations about axes that are carried along by those before them, and a shift along axes that are not
+turned by them (Seth et al. 2010, the custom joint of Simbody); what a kind fixes is how many
 there are, and that each follows one coordinate.
 """
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from typing import Literal, NamedTuple, TypeAlias
+from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple, Self, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbfmuscle.scene.joints.functions import Function, Linear
 
@@ -79,7 +80,7 @@ class Coordinate:
 
 @dataclass(frozen=True)
 class TransformAxis:
-    """A direction (3,) in the joint's frame, and the function of coordinates that turns about or shifts along it."""
+    """A direction (3,), and the function of coordinates that turns about or shifts along it."""
 
     direction: tuple[float, float, float]
     coordinates: tuple[str, ...] = ()
@@ -92,12 +93,12 @@ class TransformAxis:
 
 @dataclass
 class Joint:
-    """Moves ``child`` (and all that hangs on it) against ``parent``.
+    """Moves ``child`` (and all that hangs on it) against ``parent``; all is in the scene's coordinates at rest.
 
     Attributes
     ----------
-    frame : (4, 4) ndarray
-        The joint's frame on the parent, in the scene's coordinates at rest.
+    centre : (3,) ndarray
+        What a ball turns about.
     coordinates : dict of str to Coordinate
     rotations, translations : tuple of TransformAxis
         In order; the first rotation is the outermost.
@@ -110,18 +111,13 @@ class Joint:
     name: str
     parent: str
     child: str
-    frame: np.ndarray = field(repr=False)
+    centre: np.ndarray = field(repr=False)
     coordinates: dict[str, Coordinate]
     rotations: tuple[TransformAxis, ...] = ()
     translations: tuple[TransformAxis, ...] = ()
     kind: str = "ball"
     backward: bool = False
     _rest: tuple[dict[str, float], np.ndarray] | None = field(default=None, repr=False, compare=False)
-
-    @property
-    def centre(self) -> np.ndarray:
-        """Origin (3,) of the frame [scene unit]: what a ball turns about."""
-        return self.frame[:3, 3]
 
     def motion(self, values: dict[str, float], rest: dict[str, float]) -> np.ndarray:
         """Return the (4, 4) motion of the child against the parent, scene coordinates, the identity at rest.
@@ -135,18 +131,24 @@ class Joint:
         transform = self.displacement(values) @ self._rest[1]
         return np.linalg.inv(transform) if self.backward else transform
 
+    def moved(self, pose: np.ndarray) -> Self:
+        """Return the joint where a pose (4, 4) takes it."""
+        turns, shifts = (
+            tuple(replace(axis, direction=tuple((pose[:3, :3] @ axis.direction).tolist())) for axis in axes)
+            for axes in (self.rotations, self.translations)
+        )
+        centre = pose[:3, :3] @ self.centre + pose[:3, 3]
+        return replace(self, centre=centre, rotations=turns, translations=shifts, _rest=None)
+
     def displacement(self, values: dict[str, float]) -> np.ndarray:
         """Return the (4, 4) motion in scene coordinates from where every function is zero."""
         transform = np.eye(4)
         for axis in self.translations:
-            transform[:3, 3] += axis.amount(values) * self._turned(axis.direction)
+            transform[:3, 3] += axis.amount(values) * np.asarray(axis.direction)
         for axis in self.rotations:
             if angle := axis.amount(values):
-                transform = transform @ rotation_about(self._turned(axis.direction), angle, self.centre)
+                transform = transform @ rotation_about(axis.direction, angle, self.centre)
         return transform
-
-    def _turned(self, direction):
-        return self.frame[:3, :3] @ np.asarray(direction)
 
 
 @dataclass(frozen=True)
@@ -177,7 +179,7 @@ def motion_of(name: str, axes: Iterable[tuple[MotionKind, Sequence[str], float]]
     return found
 
 
-def rotation_about(axis: np.ndarray, angle: float, centre: np.ndarray) -> np.ndarray:
+def rotation_about(axis: ArrayLike, angle: float, centre: np.ndarray) -> np.ndarray:
     """Return the (4, 4) rotation by ``angle`` [radian] about an axis through ``centre`` (Rodrigues)."""
     x, y, z = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -185,21 +187,3 @@ def rotation_about(axis: np.ndarray, angle: float, centre: np.ndarray) -> np.nda
     pose[:3, :3] += math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
     pose[:3, 3] = centre - pose[:3, :3] @ centre
     return pose
-
-
-def frame_at(origin: np.ndarray, orientation: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)) -> np.ndarray:
-    """Return the (4, 4) frame at ``origin`` (3,), turned about its own x, then y, then z [radian]."""
-    frame = np.eye(4)
-    for axis, angle in zip((X, Y, Z), orientation):
-        if angle:
-            frame = frame @ rotation_about(np.array(axis), angle, np.zeros(3))
-    frame[:3, 3] = origin
-    return frame
-
-
-def frame_angles(rotation: np.ndarray) -> tuple[float, float, float]:
-    """Return the angles [radian] about its own x, y, z that make a (3, 3) rotation, as `frame_at` takes them."""
-    y = math.atan2(rotation[0, 2], math.hypot(rotation[0, 0], rotation[0, 1]))
-    if math.hypot(rotation[0, 0], rotation[0, 1]) < 1e-12:  # x and z turn about the same line
-        return math.atan2(rotation[2, 1], rotation[1, 1]), y, 0.0
-    return math.atan2(-rotation[1, 2], rotation[2, 2]), y, math.atan2(-rotation[0, 1], rotation[0, 0])

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from rbfmuscle.scene.joints.functions import Constant, Function, Linear, PiecewiseLinear, Polynomial, Spline
+from rbfmuscle.scene.joints.functions import Function, Linear, PiecewiseLinear, Polynomial, Spline
 from rbfmuscle.scene.joints.joint import (
     IDENTITY,
     KINDS,
@@ -18,8 +18,6 @@ from rbfmuscle.scene.joints.joint import (
     Coupling,
     Joint,
     TransformAxis,
-    frame_angles,
-    frame_at,
     motion_of,
 )
 from rbfmuscle.scene.joints.skeleton import all_coordinates
@@ -61,8 +59,6 @@ class FunctionTable(Table):
         if len(given) > 1:
             raise SceneError(f"{place}: give one function, not {' and '.join(given)}")
         found = self._in_file_units(given[0], len(inputs), place)
-        if found == IDENTITY and inputs == [output]:
-            return found
         return found.rescaled([FACTORS[motion] for motion in inputs], FACTORS[output])
 
     def slope(self) -> float:
@@ -72,7 +68,7 @@ class FunctionTable(Table):
 
     def _in_file_units(self, kind, count, place):
         if kind == "constant":
-            return Constant(self.constant)
+            return Linear((), self.constant)
         if kind == "linear":
             values = self.linear or [1.0, 0.0]
             if len(values) != count + 1:
@@ -128,7 +124,6 @@ class JointTable(Table):
     child: str
     type: Literal["fixed", "hinge", "slider", "universal", "ball", "planar", "free", "custom"] = "ball"
     centre: Vector | None = None
-    orientation: Vector | None = None
     axes: dict[str, Axis] | None = None
     coordinates: dict[str, CoordinateTable] = Field(default_factory=dict)
     rotations: list[AxisTable] = Field(default_factory=list, max_length=3)
@@ -140,12 +135,10 @@ class JointTable(Table):
         place = f"joint {self.name!r}"
         if self.centre is None and self.type != "fixed":
             raise SceneError(f"{place}: centre is missing, give the joint's place at rest")
-        frame = frame_at(
-            np.array(self.centre or (0.0, 0.0, 0.0)), np.radians(self.orientation or (0.0, 0.0, 0.0))
-        )
+        centre = np.array(self.centre or (0.0, 0.0, 0.0))
         coordinates, turns, shifts = self._custom(place) if self.type == "custom" else self._of_kind(place)
         return Joint(
-            self.name, self.parent, self.child, frame, coordinates, turns, shifts, self.type, self.backward
+            self.name, self.parent, self.child, centre, coordinates, turns, shifts, self.type, self.backward
         )
 
     def _of_kind(self, place):
@@ -249,9 +242,6 @@ def joint_row(joint: Joint) -> dict:
         row["type"] = joint.kind
     if joint.kind != "fixed":
         row["centre"] = joint.centre.tolist()
-    turned = joint.frame[:3, :3]
-    if not np.array_equal(turned, np.eye(3)):
-        row["orientation"] = [math.degrees(angle) for angle in frame_angles(turned)]
     if joint.kind == "custom":
         for motion, axes in (("rotation", joint.rotations), ("translation", joint.translations)):
             if axes:
@@ -296,10 +286,12 @@ def _function_row(function: Function, inputs: Sequence[str], output: str) -> dic
     if function == IDENTITY and inputs == [output]:
         return {}
     function = function.rescaled([1.0 / FACTORS[motion] for motion in inputs], 1.0 / FACTORS[output])
-    if isinstance(function, Constant):
-        return {"constant": function.value}
     if isinstance(function, Linear):
-        return {"linear": [*function.slopes, function.constant]}
+        return (
+            {"linear": [*function.slopes, function.constant]}
+            if function.slopes
+            else {"constant": function.constant}
+        )
     if isinstance(function, Polynomial):
         return {"polynomial": list(function.coefficients)}
     points = {"x": list(function.x), "y": list(function.y)}
