@@ -20,9 +20,9 @@ ASCII, ENCODED = "vtp-Ascii-None", "vtp-Appended-LZMA-UInt32-encoded"
 
 
 def assert_is_ball(path):
-    data = read_polydata(path)
-    np.testing.assert_array_equal(data.triangles, BALL.faces)
-    np.testing.assert_allclose(data.points, BALL.vertices, atol=2e-6)  # float32
+    points, triangles = read_polydata(path)
+    np.testing.assert_array_equal(triangles, BALL.faces)
+    np.testing.assert_allclose(points, BALL.vertices, atol=2e-6)  # float32
 
 
 def assert_refused(path, capfd):
@@ -47,7 +47,7 @@ class TestWholeFiles:
             f"# vtk DataFile Version 3.0\ncube\nASCII\nDATASET POLYDATA\nPOINTS 8 float\n{points}\n"
             "POLYGONS 2 10\n4 0 3 2 1\n4 4 5 6 7\nTRIANGLE_STRIPS 1 11\n10 4 0 5 1 6 2 7 3 4 0\n"
         )
-        cube = trimesh.Trimesh(*read_polydata(path)[:2], process=False)
+        cube = trimesh.Trimesh(*read_polydata(path), process=False)
         assert abs(cube.volume) == pytest.approx(1.0) and len(cube.faces) == 12
 
 

@@ -1,4 +1,4 @@
-"""Reading muscle fibres: polylines from JSON, or from VTK and VTP PolyData."""
+"""Reading muscle fibres: polylines from JSON."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.scene.meshes.polydata import read_polydata
-from rbfmuscle.validation import MeshError, SceneError, check_points, is_file, shown
+from rbfmuscle.validation import SceneError, check_points, is_file, shown
 
 
 def read_fibres(fibres: Any, *, scale: float = 1.0, muscle: str = "") -> list[Floats]:
@@ -42,18 +41,10 @@ def read_fibres(fibres: Any, *, scale: float = 1.0, muscle: str = "") -> list[Fl
 
 
 def _read_lines(path, place):
-    suffix = path.suffix.lower()
-    if suffix not in (".json", ".vtk", ".vtp"):
-        raise SceneError(f"{place}: fibres are read from .json, .vtk or .vtp")
     if not is_file(path):
         raise SceneError(f"{place}: no such file")
     try:
-        if suffix != ".json":
-            data = read_polydata(path)
-            return [data.points[line] for line in data.lines]
         found = json.loads(path.read_text(encoding="utf-8"))
-    except MeshError as error:
-        raise SceneError(f"{place}: {error}") from None
     except OSError as error:
         raise SceneError(f"{place}: cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:

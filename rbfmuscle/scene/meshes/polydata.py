@@ -10,7 +10,6 @@ import subprocess
 import threading
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -23,16 +22,8 @@ MEMORY = 8 << 30  # Address space of the process that reads [bytes]: a small fil
 _LOCK = threading.Lock()
 
 
-class PolyData(NamedTuple):
-    """Points (n, 3), triangles (m, 3), and the point numbers of each line."""
-
-    points: Floats
-    triangles: Integers
-    lines: list[Integers]
-
-
-def read_polydata(path: str | Path) -> PolyData:
-    """Return what a ``.vtk`` or ``.vtp`` file of PolyData holds; polygons and strips as triangles."""
+def read_polydata(path: str | Path) -> tuple[Floats, Integers]:
+    """Return points (n, 3) and triangles (m, 3) of a ``.vtk`` or ``.vtp`` file of PolyData; polygons and strips split."""
     with _LOCK:
         child = _child(os.getpid())
         assert child.stdout is not None  # start_child asks for a pipe
@@ -40,14 +31,14 @@ def read_polydata(path: str | Path) -> PolyData:
             send(child.stdin, str(Path(path).absolute()))
             if not select.select([child.stdout], [], [], PATIENCE)[0]:
                 raise EOFError
-            found = pickle.load(child.stdout)
+            found: tuple[Floats, Integers] | str = pickle.load(child.stdout)
         except (OSError, EOFError, pickle.UnpicklingError):
             end_child(child)
             _child.cache_clear()
             found = "VTK ends, or does not end, at it"
     if isinstance(found, str):
         raise MeshError(f"{path}: not a readable file of VTK PolyData ({found}); export the mesh again")
-    return PolyData(*found)
+    return found
 
 
 @cache
@@ -73,7 +64,7 @@ def _answer() -> None:
             outbox.put(" ".join(str(error).split())[:200] or type(error).__name__)
 
 
-def _read(path: str) -> tuple[Floats, Integers, list[Integers]]:
+def _read(path: str) -> tuple[Floats, Integers]:
     import pyvista
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
@@ -85,12 +76,10 @@ def _read(path: str) -> tuple[Floats, Integers, list[Integers]]:
             raise ValueError("it holds fewer numbers than it declares")
         if not isinstance(data, pyvista.PolyData) or not data.n_points:
             raise ValueError("no points" if isinstance(data, pyvista.PolyData) else type(data).__name__)
-        lines, corners = (_cells(cells, data.n_points) for cells in (data.GetLines(), data.GetPolys()))
-        sides, numbers = corners
+        sides, numbers = _cells(data.GetPolys(), data.n_points)
         if data.n_strips or (np.diff(sides) != 3).any():
             sides, numbers = _cells(data.triangulate().GetPolys(), data.n_points)
-    chains = np.split(lines[1], lines[0][1:-1]) if len(lines[1]) else []
-    return np.array(data.points, dtype=np.float64), numbers.reshape(-1, 3), chains
+    return np.array(data.points, dtype=np.float64), numbers.reshape(-1, 3)
 
 
 def _cells(cells, points):

@@ -6,9 +6,8 @@ Vertex numbers in files stay usable: a read mesh knows which of its vertices eac
 from __future__ import annotations
 
 import io
+import itertools
 import os
-import re
-import struct
 import warnings
 from pathlib import Path
 
@@ -31,18 +30,6 @@ from rbfmuscle.validation import (
 # In any unit: beyond it, squares of squares of lengths leave the range in which volumes are exact.
 LARGEST_COORDINATE = 1e12
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".vtk", ".vtp")
-
-# What reading a damaged file raises.
-UNREADABLE = (
-    ValueError,
-    KeyError,
-    IndexError,
-    TypeError,
-    AttributeError,
-    EOFError,
-    DeprecationWarning,
-    struct.error,
-)
 
 
 def read_mesh(
@@ -137,10 +124,10 @@ def read_arrays(path: Path) -> tuple[Floats, Integers]:
     if not content:
         raise MeshError(f"{path}: the file is empty")
     if suffix in (".vtk", ".vtp"):
-        return read_polydata(path)[:2]
+        return read_polydata(path)
     try:
-        return _read_trimesh(content, suffix[1:])
-    except UNREADABLE as error:
+        return _read_obj(content) if suffix == ".obj" else _read_trimesh(content, suffix[1:])
+    except Exception as error:  # noqa: BLE001 - any error of a library becomes one line
         why = shown(" ".join(str(error).split())) or type(error).__name__
         raise MeshError(f"{path}: not a readable {suffix[1:].upper()} file ({why})") from None
 
@@ -157,42 +144,33 @@ def _neighbours(path):
 
 
 def _read_trimesh(content, kind):
-    """Vertices and triangles of an STL, OBJ or PLY file, with the vertex numbers of the file."""
+    """Vertices and triangles of an STL or PLY file, with the vertex numbers of the file."""
     import trimesh
 
-    if kind == "obj":
-        # Positions and corners alone: numbers of textures and normals would split vertices.
-        rows = [re.sub(rb"#.*|/\S*", b"", line).split() for line in content.splitlines()]
-        rows = [row for row in rows if row[:1] in ([b"v"], [b"f"])]
-        _count_from_first(rows)
-        content = b"\n".join(map(b" ".join, rows))
-        content.decode("ascii")  # trimesh leaves out what is not
-    options = {"process": False, "force": "mesh", "skip_materials": True, "maintain_order": True}
     with warnings.catch_warnings():
         # Older NumPy warns of text that is no number and goes on.
         warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
-        mesh = trimesh.load(io.BytesIO(content), file_type=kind, **options)
+        mesh = trimesh.load(io.BytesIO(content), file_type=kind, process=False, force="mesh")
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(getattr(mesh, "faces", ()), np.int64)
-    faces = faces.reshape(-1, 3)
-    if len(vertices) and vertices.shape[1] != 3:
-        raise ValueError("a vertex has fewer than three coordinates")
     if kind == "stl":  # each triangle has its own vertices: merged in order of first use
         # Bytes sort faster than rows; 0.0 is -0.0.
         rows = np.ascontiguousarray(vertices + 0.0).view("V24").ravel()
         _, first, inverse = np.unique(rows, return_index=True, return_inverse=True)
         order = np.argsort(first)
         vertices, faces = vertices[first[order]], np.argsort(order)[inverse][faces]
-    return vertices.reshape(-1, 3), faces
+    return vertices, faces.reshape(-1, 3)
 
 
-def _count_from_first(rows: list[list[bytes]]) -> None:
-    """Replace the vertex numbers of faces that count back from the last vertex so far, in place."""
-    count = 0
-    for row in rows:
-        count += row[0] == b"v"
-        for k, word in enumerate(row):
-            if row[0] == b"f" and word.startswith(b"-"):
-                number = int(word) + count + 1
-                if number < 1:
-                    raise ValueError(f"a face counts back by {int(word)}, {count} vertices stand before it")
-                row[k] = b"%d" % number
+def _read_obj(content):
+    """Vertices and triangles of an OBJ file; numbers of textures and normals do not split vertices."""
+    vertices, faces = [], []
+    for line in content.splitlines():
+        key, *words = line.partition(b"#")[0].split() or [b""]
+        if key == b"v":
+            x, y, z = map(float, words[:3])
+            vertices.append((x, y, z))
+        elif key == b"f":
+            numbers = [int(word.partition(b"/")[0]) for word in words]
+            corners = [number - 1 if number > 0 else len(vertices) + number for number in numbers]
+            faces += [(corners[0], *side) for side in itertools.pairwise(corners[1:])]
+    return np.array(vertices).reshape(-1, 3), np.array(faces, dtype=np.int64).reshape(-1, 3)
