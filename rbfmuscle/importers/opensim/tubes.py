@@ -101,16 +101,10 @@ def _out_of_shape(wrap: WrapShape, points: Any) -> Any:
 
 
 def _out_of_bone(bone, points, reach):
-    distance = bone.signed_distance(points, reach=float(reach.max()))
-    near = np.isfinite(distance) & (distance < reach)
-    if not near.any():
-        return points
-    closest = bone.nearest(points[near])[1]
-    away = (points[near] - closest) * np.where(distance[near] < 0.0, -1.0, 1.0)[:, None]
-    size = np.maximum(np.linalg.norm(away, axis=1), 1e-12)[:, None]
-    out = points.copy()
-    out[near] = closest + away / size * reach[near][:, None]
-    return out
+    """Points (n, 3) no nearer to a bone than ``reach`` (n,), those deeper in it left where they are."""
+    distance, closest, *_ = bone.nearest(points, reach=float(reach.max()))
+    away = (points - closest) / np.where(distance == 0.0, 1.0, distance)[:, None]
+    return np.where((distance < reach)[:, None], closest + away * reach[:, None], points)
 
 
 def _held(bodies, fixed, bones):

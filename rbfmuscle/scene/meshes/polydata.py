@@ -23,7 +23,7 @@ _LOCK = threading.Lock()
 
 
 def read_polydata(path: str | Path) -> tuple[Floats, Integers]:
-    """Return points (n, 3) and triangles (m, 3) of a ``.vtk`` or ``.vtp`` file of PolyData; polygons and strips split."""
+    """Return points (n, 3) and triangles (m, 3) of a ``.vtk`` or ``.vtp`` file; polygons and strips split."""
     with _LOCK:
         child = _child(os.getpid())
         assert child.stdout is not None  # start_child asks for a pipe
