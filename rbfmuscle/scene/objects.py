@@ -90,37 +90,34 @@ class Muscle:
     tendons: list[TendonEnd] = field(default_factory=list)
 
 
+@dataclass(eq=False)
 class Motion:
     """The frames of a motion, each a dict of "joint.coordinate" -> value [radian or scene unit].
 
-    Parameters
+    Attributes
     ----------
     frames : list of dict
         A coordinate that is absent stays at rest.
-    options : MotionOptions, optional
+    options : MotionOptions
         What the frames were made from.
     times : list of float, optional
         Time of each frame [s], where a motion file gives it.
-    progress : (n,) ndarray, optional
+    progress : (n,) ndarray
         Where each frame lies in the whole motion, 0 to 1; even where not given.
     notes : list of str
         Warnings: coordinates that leave their range, columns that were not used.
     """
 
-    def __init__(
-        self,
-        frames: Sequence[dict[str, float]] = ({},),
-        *,
-        options: MotionOptions | None = None,
-        times: Sequence[float] | None = None,
-        progress: Floats | None = None,
-        notes: Sequence[str] = (),
-    ) -> None:
-        self.frames = [dict(frame) for frame in frames]
-        self.options = options or MotionOptions()
-        self.times = None if times is None else list(times)
-        self.progress = np.linspace(0.0, 1.0, len(self.frames)) if progress is None else progress
-        self.notes = list(notes)
+    frames: Sequence[dict[str, float]] = ({},)
+    _: KW_ONLY
+    options: MotionOptions = field(default_factory=MotionOptions)
+    times: Sequence[float] | None = None
+    progress: Floats = field(default_factory=lambda: np.empty(0))
+    notes: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if not len(self.progress):
+            self.progress = np.linspace(0.0, 1.0, len(self.frames))
 
     @property
     def coordinates(self) -> list[str]:

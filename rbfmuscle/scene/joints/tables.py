@@ -135,45 +135,22 @@ class JointTable(Table):
         place = f"joint {self.name!r}"
         if self.centre is None and self.type != "fixed":
             raise SceneError(f"{place}: centre is missing, give the joint's place at rest")
-        centre = np.array(self.centre or (0.0, 0.0, 0.0))
-        coordinates, turns, shifts = self._custom(place) if self.type == "custom" else self._of_kind(place)
-        return Joint(
-            self.name, self.parent, self.child, centre, coordinates, turns, shifts, self.type, self.backward
-        )
-
-    def _of_kind(self, place):
-        kind = KINDS[self.type]
-        if self.rotations or self.translations:
-            raise SceneError(f"{place}: rotations and translations belong to type 'custom', give axes")
-        axes = self.axes or dict(zip(self.coordinates, [*kind.rotations, *kind.translations]))
-        count = len(axes) or len(self.coordinates)
-        if not kind.least <= count <= kind.most:
-            words = f"{kind.least}" if kind.least == kind.most else f"{kind.least} to {kind.most}"
-            raise SceneError(
-                f"{place}: a {self.type} joint has {words} coordinates, {count} are given; name them in axes"
-            )
-        self._check_known(axes, place)
-        turning = count if self.type == "ball" else len(kind.rotations)
-        coordinates = {}
-        for k, name in enumerate(axes):
-            motion = "rotation" if k < turning else "translation"
-            table = self.coordinates.get(name, CoordinateTable())
-            if table.motion not in (None, motion):
-                raise SceneError(f"{place}: {name!r} is a {motion} here, not a {table.motion}")
-            coordinates[name] = table.coordinate(motion)
-        made = tuple(TransformAxis(unit(axis), (name,)) for name, axis in axes.items())
-        return coordinates, made[:turning], made[turning:]
-
-    def _custom(self, place):
-        if self.axes:
+        groups: dict[Any, list[AxisTable]] = {"rotation": self.rotations, "translation": self.translations}
+        if self.type != "custom":
+            groups = self._axes_of_kind(place)
+        elif self.axes:
             raise SceneError(f"{place}: a custom joint has rotations and translations instead of axes")
-        groups = {"rotation": self.rotations, "translation": self.translations}
         tables = [(motion, table) for motion, group in groups.items() for table in group]
         named = dict.fromkeys(name for _, table in tables for name in table.coordinates)
-        self._check_known(named, place)
+        for name in self.coordinates:
+            if name not in named:
+                raise SceneError(
+                    f"{place}: coordinate {name!r} moves nothing, {did_you_mean(name, list(named))}"
+                )
+        slopes = [(motion, table.coordinates, table.slope()) for motion, table in tables]
         coordinates = {
-            name: self.coordinates.get(name, CoordinateTable()).coordinate(self._motion_of(name, tables))
-            for name in {**self.coordinates, **named}
+            name: self.coordinates.get(name, CoordinateTable()).coordinate(motion_of(name, slopes))
+            for name in named
         }
 
         def axis(motion, number, table):
@@ -185,20 +162,26 @@ class JointTable(Table):
             tuple(axis(motion, number, table) for number, table in enumerate(group, 1))
             for motion, group in groups.items()
         )
-        return coordinates, turns, shifts
+        centre = np.array(self.centre or (0.0, 0.0, 0.0))
+        return Joint(
+            self.name, self.parent, self.child, centre, coordinates, turns, shifts, self.type, self.backward
+        )
 
-    def _motion_of(self, name, tables):
-        declared = self.coordinates.get(name)
-        if declared is not None and declared.motion is not None:
-            return declared.motion
-        return motion_of(name, [(motion, table.coordinates, table.slope()) for motion, table in tables])
-
-    def _check_known(self, used, place):
-        for name in self.coordinates:
-            if name not in used:
-                raise SceneError(
-                    f"{place}: coordinate {name!r} moves nothing, {did_you_mean(name, list(used))}"
-                )
+    def _axes_of_kind(self, place):
+        """Tables of the rotations and of the translations that the kind has, each of one coordinate."""
+        kind = KINDS[self.type]
+        if self.rotations or self.translations:
+            raise SceneError(f"{place}: rotations and translations belong to type 'custom', give axes")
+        axes = self.axes or dict(zip(self.coordinates, [*kind.rotations, *kind.translations]))
+        count = len(axes) or len(self.coordinates)
+        if not kind.least <= count <= kind.most:
+            words = f"{kind.least}" if kind.least == kind.most else f"{kind.least} to {kind.most}"
+            raise SceneError(
+                f"{place}: a {self.type} joint has {words} coordinates, {count} are given; name them in axes"
+            )
+        tables = [AxisTable(axis=list(axis), coordinates=[name]) for name, axis in axes.items()]
+        turning = count if self.type == "ball" else len(kind.rotations)
+        return {"rotation": tables[:turning], "translation": tables[turning:]}
 
 
 class CouplingTable(FunctionTable):
