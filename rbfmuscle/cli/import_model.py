@@ -16,7 +16,6 @@ def import_(
     *,
     output: Output,
     geometry: Annotated[list[Path] | None, Parameter(negative="")] = None,
-    motion: Path | None = None,
     muscles: Annotated[bool, Parameter(negative="--no-muscles")] = True,
     force: Flag = False,
 ) -> None:
@@ -28,8 +27,6 @@ def import_(
         The model, of version 2 to 4; OpenSim itself is not needed.
     geometry
         Folder with meshes, besides the model's own and its Geometry; repeatable.
-    motion
-        A .mot or .sto file for the scene's motion.
     muscles
         Make a tube of each muscle of the model, along its path.
     force
@@ -45,7 +42,7 @@ def import_(
         if not folder.is_dir():
             raise UsageError(f"--geometry {folder}: no such folder")
     found = import_osim(model, geometry=geometry, muscles=muscles)
-    written = write_scene(found, output, motion=motion)
+    written = write_scene(found, output)
     for note in found.notes:
         print(f"note: {note}")
     scene = found.scene

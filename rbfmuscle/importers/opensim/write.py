@@ -1,6 +1,5 @@
 """Writing an imported scene to a folder: a TOML file that a person can read, and the meshes that it names."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -11,36 +10,23 @@ from rbfmuscle.scene.joints.tables import coupling_row, joint_row
 from rbfmuscle.validation import UsageError
 
 
-def write_scene(found: Imported, directory: Path, *, motion: Path | None = None) -> Path:
-    """Write ``scene.toml``, meshes and attachments to a folder, and return the scene file.
-
-    ``motion`` is a file that the scene shall follow, checked against its coordinates.
-    """
+def write_scene(found: Imported, directory: Path) -> Path:
+    """Write ``scene.toml``, meshes and attachments to a folder, and return the scene file."""
     directory, scene = Path(directory), found.scene
     target = directory / "scene.toml"
     facts = {"format": 1, "name": scene.name, "units": scene.units}
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        tail = []
-        if motion is not None:
-            file = os.path.relpath(Path(motion).resolve(), directory.resolve())
-            scene.set_motion(file=file, folder=directory)
-            found.notes += scene.motion.notes
-            tail = [table_text("[motion]", {"file": file})]
-        parts = [_head(found)]
         facts |= {"left_out": scene.left_out} if scene.left_out else {}
         facts |= {"superior": scene.superior, "anterior": scene.anterior}
-        parts.append(table_text("[scene]", facts))
-        for bone in scene.bones:
-            row = {"name": bone.name, "mesh": _write_mesh(directory, "bones", bone)}
-            parts.append(table_text("[[bone]]", row))
-        parts += [
-            table_text("[[bone]]   # no mesh: it carries joints only", {"name": n}) for n in scene.links
-        ]
+        bones = [{"name": bone.name, "mesh": _write_mesh(directory, "bones", bone)} for bone in scene.bones]
+        parts = [_head(found), table_text("[scene]", facts)]
+        parts += [table_text("[[bone]]", row) for row in bones]
+        parts += [table_text("[[bone]]   # no mesh: joints only", {"name": name}) for name in scene.links]
         parts += [table_text("[[joint]]", joint_row(joint)) for joint in scene.joints]
         parts += [table_text("[[coupling]]", coupling_row(c, scene.joints)) for c in scene.couplings]
         parts += [_muscle_text(directory, muscle) for muscle in scene.muscles]
-        target.write_text("\n".join(parts + tail), encoding="utf-8")
+        target.write_text("\n".join(parts), encoding="utf-8")
     except OSError as error:
         raise UsageError(f"cannot write to {directory}: {error.strerror}; choose another --output") from None
     return target

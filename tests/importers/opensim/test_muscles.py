@@ -60,7 +60,8 @@ def test_muscles_of_published_models_are_written_and_load(osim_data, tmp_path):
     model = read_osim(path)
     assert len(model.muscles) == 9
     found = import_osim(path)
-    scene = Scene.load(write_scene(found, tmp_path, motion=path.parent / "leg69_IK_swing.mot"))
+    scene = Scene.load(write_scene(found, tmp_path))
+    scene = scene.with_options({"motion.file": str(path.parent / "leg69_IK_swing.mot")})
     assert len(scene.muscles) == 9 and scene.superior == [0.0, 1.0, 0.0]
     assert all(finding.level != "error" for finding in scene.check())
     for known, muscle in zip(model.muscles, scene.muscles):
