@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from rbfmuscle.cli.app import run_command
 from rbfmuscle.geometry.coarse import clustered
-from rbfmuscle.importers.guess.attachments import AttachmentGuess, Ends, _best_of, _tendon
+from rbfmuscle.importers.guess.attachments import Ends, _best_of
 from rbfmuscle.importers.guess.guess import _leave_out, guess_scene, write_scene
 from rbfmuscle.importers.guess.joints import Face, fit_ball, fit_hinge, guess_joints
 from rbfmuscle.importers.guess.landmarks import CONDYLE, fit_condyles
@@ -121,19 +121,6 @@ def test_ends_of_a_bent_tube_are_its_tips():
     z = np.sort(mesh.vertices[list(ends.tips), 2])
     assert z[0] < mesh.bounds[0][2] + 5 and z[1] > mesh.bounds[1][2] - 5
     assert ends.along(0)[ends.tips[0]] == 0.0 and ends.along(0)[ends.tips[1]] == 1.0
-
-
-def test_a_tendon_goes_straight_to_the_nearest_place_of_its_bone():
-    bone = trimesh.creation.cylinder(radius=8, height=100, sections=48).apply_translation([0, 0, -55])
-    belly = trimesh.creation.capsule(height=30, radius=4).apply_translation([40, 0, 45])
-    lower = Part("lower", "lower.ply", SimpleNamespace(mesh=bone))
-    held = np.flatnonzero(belly.vertices[:, 2] < belly.vertices[:, 2].min() + 3)
-    found = _tendon(
-        AttachmentGuess(lower, held, 60.0, ""), Part("belly", "belly.ply", SimpleNamespace(mesh=belly)), []
-    )
-    away = ((bone.vertices - belly.vertices[held].mean(axis=0)) ** 2).sum(axis=1)
-    assert found.bone is lower and not found.via
-    np.testing.assert_array_equal(found.to, bone.vertices[np.argmin(away)])
 
 
 def test_muscles_without_the_bones_of_their_names_still_make_a_scene(tmp_path):
@@ -306,6 +293,12 @@ def test_tendons_of_the_leg_go_where_the_bellies_end_short(leg_guess):
             if gap["least"] > 50.0:
                 # The patches were chosen by other rules, so their nearest vertices differ by some millimetres.
                 assert gaps[name, bone] == pytest.approx(gap["least"], abs=8.0), name
+    for muscle in guess.muscles:  # straight to the nearest place of the bone
+        for hold in muscle.holds:
+            if hold.tendon is not None and not hold.tendon.via:
+                away = hold.bone.points - muscle.muscle.points[hold.vertices].mean(axis=0)
+                place = hold.bone.points[np.argmin((away**2).sum(axis=1))]
+                assert hold.tendon.bone is hold.bone and (hold.tendon.to == place).all()
     rectus = next(m for m in guess.muscles if m.muscle.name == "rectus_femoris")
     (tendon,) = [hold.tendon for hold in rectus.holds if hold.tendon is not None]
     assert tendon.bone.name == "tibia" and [bone.name for bone, _ in tendon.via] == ["patella"] * 2

@@ -59,22 +59,32 @@ class TestFormats:
 
 
 class TestMending:
-    def test_inward_mesh_is_turned_and_said_so(self, tmp_path):
-        read = read_mesh(write(tmp_path / "a.ply", ball().vertices, ball().faces[:, ::-1]))
-        assert read.mesh.volume > 0
-        assert any("inward" in note for note in read.notes)
-
-    def test_some_turned_triangles_are_turned_back(self, tmp_path):
-        faces = ball().faces.copy()
-        faces[::7] = faces[::7, ::-1]
-        read = read_mesh(write(tmp_path / "a.ply", ball().vertices, faces))
-        assert read.mesh.volume == pytest.approx(ball().volume, rel=1e-6)
-        assert any("wrong way" in note for note in read.notes)
-
-    def test_small_hole_is_closed_and_a_large_one_refused(self, tmp_path):
+    @pytest.mark.parametrize("kind", ["inward", "wrong way", "1 small holes", "1 dangling", "1 loose parts"])
+    def test_what_is_mended_is_noted_and_the_ball_is_whole(self, tmp_path, kind):
         mesh = ball()
-        read = read_mesh(write(tmp_path / "small.ply", mesh.vertices, mesh.faces[1:]))
-        assert read.closed and any("holes" in note for note in read.notes)
+        vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+        if kind == "inward":
+            faces = faces[:, ::-1]
+        elif kind == "wrong way":
+            faces[::7] = faces[::7, ::-1]
+        elif kind == "1 small holes":
+            faces = faces[1:]
+        elif kind == "1 dangling":
+            vertices = np.vstack([vertices, [[0, 0, 60.0]]])
+            faces = np.vstack([faces, [[*faces[0, :2], len(mesh.vertices)]]])
+        else:
+            crumb = trimesh.creation.icosphere(subdivisions=0, radius=0.5).apply_translation([50, 0, 0])
+            vertices, faces = (
+                np.vstack([vertices, crumb.vertices]),
+                np.vstack([faces, crumb.faces + len(vertices)]),
+            )
+        read = read_mesh(write(tmp_path / "a.ply", vertices, faces))
+        assert read.closed and read.mesh.volume == pytest.approx(mesh.volume, rel=1e-6)
+        assert any(kind in note for note in read.notes)
+        assert (read.vertex_map[len(mesh.vertices) :] == -1).all()
+
+    def test_large_hole_is_refused_but_of_a_bone(self, tmp_path):
+        mesh = ball()
         cut = mesh.faces[mesh.triangles_center[:, 2] < 8]
         path = write(tmp_path / "large.ply", mesh.vertices, cut)
         with pytest.raises(MeshError, match=r"large\.ply.*open.*boundary edges, one at \(.*\); close"):
@@ -99,20 +109,7 @@ class TestMending:
         assert read.vertex_map[5] == -1 and read.vertex_map[6] == 5
         assert any("2 degenerate or repeated" in note for note in read.notes)
 
-    def test_dangling_triangle_is_dropped(self, tmp_path):
-        mesh = ball()
-        vertices = np.vstack([mesh.vertices, [[0, 0, 60.0]]])
-        faces = np.vstack([mesh.faces, [[*mesh.faces[0, :2], len(mesh.vertices)]]])
-        read = read_mesh(write(tmp_path / "fin.ply", vertices, faces))
-        assert read.closed and read.vertex_map[-1] == -1
-        assert any("1 dangling" in note for note in read.notes)
-
-    def test_crumbs_are_dropped_and_real_parts_refused(self, tmp_path):
-        crumb = trimesh.creation.icosphere(subdivisions=0, radius=0.5)
-        crumb.apply_translation([50, 0, 0])
-        both = trimesh.util.concatenate([ball(), crumb])
-        read = read_mesh(write(tmp_path / "a.ply", both.vertices, both.faces))
-        assert read.mesh.volume == pytest.approx(ball().volume, rel=1e-6)
+    def test_two_parts_are_refused(self, tmp_path):
         twins = trimesh.util.concatenate([ball(), ball().apply_translation([60, 0, 0])])
         with pytest.raises(MeshError, match="2 separate parts"):
             read_mesh(write(tmp_path / "b.ply", twins.vertices, twins.faces))
