@@ -14,7 +14,7 @@ from rbfmuscle.scene.joints.skeleton import all_coordinates, joint_poses, joint_
 from rbfmuscle.scene.joints.tables import FACTORS, full_name
 from rbfmuscle.scene.motion_file import read_motion_file
 from rbfmuscle.scene.objects import Motion, SceneData
-from rbfmuscle.scene.options import MAX_FRAMES, MotionOptions, RampOptions
+from rbfmuscle.scene.options import MAX_FRAMES, MotionOptions
 from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.validation import SceneError, did_you_mean
 
@@ -147,10 +147,36 @@ def _asked_frames(options, facts):
         return {full_name(name, list(facts), place="[motion]"): value for name, value in table.items()}
 
     if options.ramp is not None:
-        return _ramp_frames(named(options.ramp), facts)
+        ramps = named(options.ramp)
+        starts = {name: ramp.start for name, ramp in ramps.items() if ramp.start is not None}
+        stops, steps = (
+            [starts, {name: ramp.end for name, ramp in ramps.items()}],
+            [r.step for r in ramps.values()],
+        )
+        return _frames_between(stops, list(ramps), steps, facts)
     if options.waypoints is not None:
-        return _waypoint_frames([named(stop) for stop in options.waypoints], options.step, facts)
+        stops = [named(stop) for stop in options.waypoints]
+        return _frames_between(
+            stops, list(dict.fromkeys(itertools.chain(*stops))), options.step or 1.0, facts
+        )
     return [{}]
+
+
+def _frames_between(stops, names, steps, facts):
+    """Frames from stop to stop [degree or scene unit] in whole steps; the coordinate that needs most sets the pace."""
+    table = np.array([[stop.get(name, np.nan) for name in names] for stop in stops]).reshape(len(stops), -1)
+    factors = np.array([FACTORS[facts[name].motion] for name in names])
+    for column, name in enumerate(names):  # what a stop does not mention stays where it was, at rest at first
+        held = facts[name].rest / factors[column]
+        for row in range(len(stops)):
+            held = table[row, column] = held if np.isnan(table[row, column]) else table[row, column]
+    rows = [table[0]]
+    with np.errstate(over="ignore"):
+        paces = (np.abs(np.diff(table, axis=0)) / steps).max(axis=1, initial=0.0)
+        _check_count(np.ceil(paces).sum())
+    for pace, (before, after) in zip(paces.tolist(), itertools.pairwise(table)):
+        rows.extend(before + t * (after - before) for t in _marks(pace)[1:])
+    return [dict(zip(names, (row * factors).tolist())) for row in rows]
 
 
 def _refuse_followers(frames, followers, facts):
@@ -186,45 +212,9 @@ def _range_notes(frames: list[dict[str, float]], facts: dict[str, Coordinate]) -
     return notes
 
 
-def _ramp_frames(ramps: dict[str, RampOptions], facts: dict[str, Coordinate]) -> list[dict[str, float]]:
-    """All coordinates go together; the one that needs most steps sets the pace, its last may be short."""
-    start = {n: _shown_rest(facts[n]) if ramp.start is None else ramp.start for n, ramp in ramps.items()}
-    pace = max((abs(ramp.end - start[n]) / ramp.step for n, ramp in ramps.items()), default=0.0)
-    return [
-        {n: (start[n] + t * (r.end - start[n])) * FACTORS[facts[n].motion] for n, r in ramps.items()}
-        for t in _marks(pace)
-    ]
-
-
-def _shown_rest(facts):
-    """A coordinate's rest value as files have it [degree or scene unit]."""
-    return facts.rest / FACTORS[facts.motion]
-
-
-def _waypoint_frames(stops, step, facts):
-    names = list(dict.fromkeys(name for stop in stops for name in stop))
-    table = np.array([[stop.get(name, np.nan) for name in names] for stop in stops])
-    for column, name in enumerate(names):  # what a waypoint does not mention stays where it was
-        held = _shown_rest(facts[name])
-        for row in range(len(stops)):
-            held = table[row, column] = held if np.isnan(table[row, column]) else table[row, column]
-    rows = [table[0]]
-    with np.errstate(over="ignore"):
-        paces = np.abs(np.diff(table, axis=0)).max(axis=1, initial=0.0) / step
-        _check_count(np.ceil(paces).sum())
-    for pace, (before, after) in zip(paces.tolist(), itertools.pairwise(table)):
-        rows.extend(before + t * (after - before) for t in _marks(pace)[1:])
-    factors = np.array([FACTORS[facts[name].motion] for name in names])
-    return [dict(zip(names, (row * factors).tolist())) for row in rows]
-
-
 def _marks(pace):
     """Fractions of the path at whole steps, then the end: 2.5 steps give 0, 0.4, 0.8, 1."""
-    _check_count(pace)
-    if pace == 0:
-        return [0.0]
-    count = math.ceil(pace - 1e-9)
-    return [*(k / pace for k in range(count)), 1.0]
+    return [*(k / pace for k in range(math.ceil(pace - 1e-9))), 1.0] if pace else [0.0]
 
 
 def _check_count(count):
