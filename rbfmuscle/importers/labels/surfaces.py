@@ -2,8 +2,8 @@
 
 The mask of a label, 1/2 inside and -1/2 outside, is smoothed by I - (I - G)^4, G a Gaussian of 1.3 voxels:
 flat to fourth order in the pass band, so that curved surfaces are not drawn in as they are by G alone. Where two
-labels share a face, the fields are each other's negative there and so are their zero sets. The level is then
-shifted to the label's volume, a few hundredths of a voxel.
+labels share a face, the fields are each other's negative there and their zero sets are the same. The surface is
+then shifted to the label's volume, by a few hundredths of a voxel.
 """
 
 from __future__ import annotations
@@ -24,8 +24,6 @@ from rbfmuscle.validation import MeshError
 SMOOTHING, PASSES = 1.3, 4
 # Voxels kept around a label, beyond which the filter sees nothing.
 MARGIN = 6
-# Greatest shift of the level, as a share of the jump across a face.
-MOST_SHIFT = 0.35
 # Share of the largest piece from which on a piece belongs to a bone of several parts.
 PIECE = 0.01
 # Edge of the surface's triangles [voxels], and rounds in which triangles that cross are drawn apart.
@@ -49,6 +47,7 @@ def label_surface(volume: LabelVolume, label: int, *, pieces: bool = False) -> L
     """
     import igl
     import trimesh
+    from skimage.measure import marching_cubes
 
     name, notes = volume.name(label), []
     box = find_objects((volume.labels == label).astype(np.int8))[0]
@@ -58,13 +57,14 @@ def label_surface(volume: LabelVolume, label: int, *, pieces: bool = False) -> L
     if count < 27:
         raise MeshError(f"{volume.source}: label {name!r} has {count} voxels, too few for a surface")
     smooth = smooth_mask(mask)
-    vertices, faces, level = _contour(smooth, count)
+    vertices, faces, _, _ = marching_cubes(-smooth, 0.0, allow_degenerate=False)
+    vertices, faces = vertices.astype(np.float64), faces.astype(np.int64)
     # Fewer triangles by quadric edge collapse (Garland and Heckbert 1997), of about the edge that is wanted.
     target = max(200, int(vertex_areas(vertices, faces).sum() / (np.sqrt(3.0) / 4.0 * EDGE**2)))
     if target < len(faces):
         vertices, faces = (np.asarray(part) for part in igl.qslim(vertices, faces, target)[:2])
     faces = faces.astype(np.int64)
-    vertices = _to_volume(_untangled(vertices, faces, smooth - level), faces, count)
+    vertices = _to_volume(_untangled(vertices, faces, smooth), faces, count)
     corner = np.array([part.start for part in box]) - MARGIN
     world = (vertices + corner) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
     mesh = trimesh.Trimesh(world, faces, process=False)
@@ -101,20 +101,6 @@ def _without_islands(mask, notes, least):
     if hollow:
         notes.append(f"holes of {hollow} voxels filled")
     return filled
-
-
-def _contour(smooth, wanted):
-    """Vertices and triangles of the level that encloses about the wanted number of voxels, and the level."""
-    from skimage.measure import marching_cubes
-
-    level = change = 0.0
-    for _ in range(3):
-        level = float(np.clip(level + change, -MOST_SHIFT, MOST_SHIFT))
-        vertices, faces, _, _ = marching_cubes(-smooth, -level, allow_degenerate=False)
-        vertices, faces = vertices.astype(np.float64), faces.astype(np.int64)
-        volume, area = abs(mesh_volume(vertices, faces)), vertex_areas(vertices, faces).sum()
-        change = 0.5 * (volume - wanted) / area  # across a face the field falls by one over about two voxels
-    return vertices, faces, level
 
 
 def _untangled(vertices, faces, smooth):
