@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import MeshLike
@@ -73,11 +72,14 @@ def add_joint(
     **keys
         Any other key of ``[[joint]]`` [degree, scene unit]: ``type``, ``coordinates``, ``rotations``, ...
     """
-    row: dict[str, Any] = {"name": name, "parent": parent, "child": child, **keys}
-    if centre is not None:
-        row["centre"] = _plain(centre)
-    if axes:
-        row["axes"] = {key: _plain(axis) for key, axis in axes.items()}
+    row = {
+        "name": name,
+        "parent": parent,
+        "child": child,
+        "centre": centre,
+        "axes": axes and dict(axes),
+        **keys,
+    }
     return place_joint(scene, JointTable.build(row, place=f"joint {name!r}: ").joint())
 
 
@@ -221,11 +223,3 @@ def _check_new_bone(scene, name):
     check_new_name(scene.bones, name, "bone")
     if name in scene.links:
         raise SceneError(f"bone {name!r} is given twice")
-
-
-def _plain(vector: ArrayLike) -> Any:
-    """A vector as a list of floats, for its table to check; anything else as it is."""
-    try:
-        return np.asarray(vector, dtype=float).tolist()
-    except (TypeError, ValueError):
-        return vector

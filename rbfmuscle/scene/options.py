@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -66,7 +67,20 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
-Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
+
+
+def _listed(vector: Any) -> Any:
+    """An array or a tuple as a list; anything else as it is."""
+    return (
+        vector.tolist()
+        if isinstance(vector, np.ndarray)
+        else list(vector)
+        if isinstance(vector, tuple)
+        else vector
+    )
+
+
+Vector = Annotated[list[Finite], Field(min_length=3, max_length=3), BeforeValidator(_listed)]
 
 
 def in_folder(name: object, info: ValidationInfo) -> Path:
@@ -151,12 +165,6 @@ class Table(BaseModel):
             return cls.model_validate(values, context={"folder": folder})
         except ValidationError as error:
             raise SceneError(f"{place}{describe_error(error)}") from None
-
-    def changed(self, key: str, value: object, *, place: str, folder: Path | None = None) -> Self:
-        """Return a copy with the dotted ``key`` set to ``value``, checked again."""
-        values = self.model_dump(by_alias=True, exclude_unset=True)
-        set_dotted(values, key, value, place=place)
-        return type(self).build(values, place=f"{place}: ", folder=folder)
 
 
 def set_dotted(table: dict[str, Any], key: str, value: object, *, place: str) -> None:

@@ -106,7 +106,9 @@ def _apply(scene, key, value):
         scene.motion = make_motion(scene, options)
     else:
         table = getattr(scene, head) or {"sliding": SlidingOptions, "detect": DetectOptions}[head]()
-        setattr(scene, head, table.changed(rest, value, place=key))
+        values = table.model_dump(by_alias=True, exclude_unset=True)
+        set_dotted(values, rest, value, place=key)
+        setattr(scene, head, table.build(values, place=f"{key}: "))
 
 
 def _set_models(muscles: Sequence[Muscle], model: str | dict[str, Any]) -> None:

@@ -138,6 +138,10 @@ def flat(vertices, faces):
     vertices[:, 0] = 34.0
 
 
+def straight(vertices, faces):
+    vertices[:, :2] = 34.0
+
+
 def inside_out_half(vertices, faces):
     upper = vertices[:, 2] > -10
     vertices[upper, 2] = -20 - vertices[upper, 2]
@@ -162,9 +166,9 @@ class TestMeshes:
             assert mesh.is_watertight
             check_volume(np.asarray(mesh.vertices), np.asarray(mesh.faces), "a.stl")
 
-    @pytest.mark.parametrize("change", [flat, inside_out_half], ids=lambda change: change.__name__)
+    @pytest.mark.parametrize("change", [flat, straight, inside_out_half], ids=lambda change: change.__name__)
     def test_surface_without_an_inside_is_refused(self, change):
-        with pytest.raises(MeshError, match=r"encloses no volume|passes through itself"):
+        with pytest.raises(MeshError, match="passes through itself"):
             prepare_mesh(*shape(change), place="a.ply", name="a")
 
     @pytest.mark.parametrize("value", [1e300, -1e38, np.nan, np.inf])

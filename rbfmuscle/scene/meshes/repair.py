@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 MERGE_TOLERANCE = 1e-7  # of the diagonal: float32 files repeat vertices to about this
 HOLE_LIMIT = 0.1  # of the diagonal: a longer rim (of more than four edges) is not closed by guesswork
-LEAST_COMPACTNESS = 1e-6  # volume over area^1.5; a ball has 0.094, a sheet 200 x 200 x 0.05 mm 2.4e-5
 TWISTED_NOTED = 0.005  # of the area
 MOST_TWISTED = 0.3  # of the area: of more it cannot be said what is inside
 WINDING_SAMPLES = 1500  # triangles asked, before and behind them by a small share of their size:
@@ -119,17 +118,11 @@ def _check_inside(state, place):
 
     A flat or twisted surface may be closed and consistently oriented, and still have no inside.
     """
-    mesh, volume = state.mesh, float(_cones(state.vertices, state.faces).sum())
-    if not volume > LEAST_COMPACTNESS * mesh.area**1.5:
-        raise MeshError(
-            f"{place}: the surface encloses no volume ({volume:.3g}, of an area of {mesh.area:.3g}): it is flat "
-            "or twisted through itself; export the mesh again"
-        )
-    wrong = _twisted_share(mesh)
+    wrong, volume = _twisted_share(state.mesh), float(_cones(state.vertices, state.faces).sum())
     if wrong > MOST_TWISTED:
         raise MeshError(
-            f"{place}: the surface passes through itself, {100 * wrong:.0f} % of it does not bound its inside, so its "
-            f"volume ({volume:.4g}) means nothing; repair it, for instance by remeshing"
+            f"{place}: the surface is flat or passes through itself, {100 * wrong:.0f} % of it does not bound its "
+            f"inside, so its volume ({volume:.4g}) means nothing; repair it, for instance by remeshing"
         )
     if wrong > TWISTED_NOTED:
         state.notes.append(f"the surface passes through itself over {100 * wrong:.2g} % of its area")
@@ -145,7 +138,7 @@ def _twisted_share(mesh):
     vertices, faces = np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces)
     before, behind = igl.fast_winding_number(vertices, faces, asked).reshape(2, -1)
     wrong = (np.abs(before) > 0.4) | (np.abs(behind - 1.0) > 0.4)
-    return float(area[wrong].sum() / area.sum())
+    return float(area[wrong].sum() / area.sum()) if len(area) else 1.0
 
 
 def _cones(vertices: Floats, faces: Integers) -> Floats:
