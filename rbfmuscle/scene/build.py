@@ -72,14 +72,8 @@ def add_joint(
     **keys
         Any other key of ``[[joint]]`` [degree, scene unit]: ``type``, ``coordinates``, ``rotations``, ...
     """
-    row = {
-        "name": name,
-        "parent": parent,
-        "child": child,
-        "centre": centre,
-        "axes": axes and dict(axes),
-        **keys,
-    }
+    row = {"name": name, "parent": parent, "child": child, "centre": centre, "axes": axes and dict(axes)}
+    row |= keys
     return place_joint(scene, JointTable.build(row, place=f"joint {name!r}: ").joint())
 
 

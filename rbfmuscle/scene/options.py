@@ -71,13 +71,7 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 
 def _listed(vector: Any) -> Any:
     """An array or a tuple as a list; anything else as it is."""
-    return (
-        vector.tolist()
-        if isinstance(vector, np.ndarray)
-        else list(vector)
-        if isinstance(vector, tuple)
-        else vector
-    )
+    return np.asarray(vector).tolist() if isinstance(vector, (np.ndarray, tuple)) else vector
 
 
 Vector = Annotated[list[Finite], Field(min_length=3, max_length=3), BeforeValidator(_listed)]
