@@ -160,7 +160,7 @@ def _select(table, read, bone, place):
         distance = np.linalg.norm(points - table.sphere.centre, axis=1)
         limit, what = table.sphere.radius, "sphere.radius"
     else:
-        distance = signed_distances(points, bone.mesh)
+        distance = ExactMeshes().distances(points, bone.mesh)
         limit, what = table.near, "near"
     chosen = np.flatnonzero(distance <= limit)
     if len(chosen) == 0:
@@ -171,11 +171,6 @@ def _select(table, read, bone, place):
     return chosen
 
 
-def signed_distances(points: Floats, mesh: trimesh.Trimesh) -> Floats:
-    """Exact distance of points to a mesh, negative inside (by pseudonormals, or winding numbers if open)."""
-    return ExactMeshes().distances(points, mesh)
-
-
 class ExactMeshes:
     """Exact distances to meshes, each of which is sorted once for all questions."""
 
@@ -184,7 +179,7 @@ class ExactMeshes:
         self._known: dict[int, tuple[Any, ExactDistance, Any]] = {}
 
     def distances(self, points: Floats, mesh: trimesh.Trimesh) -> Floats:
-        """Distance of points (n, 3) to a mesh, negative inside, (n,)."""
+        """Distance (n,) of points (n, 3) to a mesh, negative inside (by pseudonormals, or winding numbers if open)."""
         points = np.ascontiguousarray(points, dtype=np.float64)
         if id(mesh) not in self._known:
             inside = None if mesh.is_watertight else inside_test(mesh.vertices, mesh.faces)

@@ -42,7 +42,7 @@ class Finding:
 
 
 def check_scene(scene: SceneData, exact: ExactMeshes | None = None) -> list[Finding]:
-    """Return all findings about a scene, the worst first; nothing is solved or changed.
+    """Return all findings about a scene, the first error among them, the worst first; nothing is solved or changed.
 
     ``exact`` keeps what was prepared for distances to the bones' meshes, for later calls.
     """
@@ -55,17 +55,13 @@ def check_scene(scene: SceneData, exact: ExactMeshes | None = None) -> list[Find
     findings += [Finding("warning", name, unusable) for name in scene.left_out]
     findings += [Finding("warning", "motion", note) for note in scene.motion.notes]
     findings += _rest_overlaps(scene, exact)
-    wrong = {}
-    for test in (
-        lambda: validate(scene),
-        lambda: check_extents(scene),
-        lambda: findings.extend(bone_findings(bone_collisions(scene, exact=exact), scene.units)),
-    ):
-        try:
-            test()
-        except RBFMuscleError as error:
-            wrong[str(error)] = Finding("error", scene.name, str(error))
-    return sort_findings([*findings, *wrong.values()])
+    try:
+        findings += bone_findings(bone_collisions(scene, exact=exact), scene.units)
+        check_extents(scene)
+        validate(scene)
+    except RBFMuscleError as error:
+        findings.append(Finding("error", scene.name, str(error)))
+    return sort_findings(findings)
 
 
 def sort_findings(findings: Iterable[Finding]) -> list[Finding]:

@@ -10,7 +10,7 @@ from rbfmuscle.scene.joints.joint import Coordinate
 from rbfmuscle.scene.options import MAX_FRAMES
 from rbfmuscle.validation import SceneError, is_file, shown_path
 
-YES, NO = ("yes", "true", "1"), ("no", "false", "0")
+IN_DEGREES = dict.fromkeys(("yes", "true", "1"), math.pi / 180) | dict.fromkeys(("no", "false", "0"), 1.0)
 
 
 def read_motion_file(
@@ -108,6 +108,6 @@ def _angle_factor(path, header):
     if said is None:
         words = "angles are taken as radians; add inDegrees=yes to its header"
         return 1.0, [f"{path} does not say inDegrees: {words}"]
-    if said not in (*YES, *NO):
+    if said not in IN_DEGREES:
         raise SceneError(f"[motion]: {path}: inDegrees={said} is neither yes nor no")
-    return math.pi / 180 if said in YES else 1.0, []
+    return IN_DEGREES[said], []

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.scene.attachments import signed_distances
+from rbfmuscle.scene.attachments import ExactMeshes
 from rbfmuscle.scene.objects import Attachment
 from rbfmuscle.scene.options import DetectOptions, TunnellingOptions
 from rbfmuscle.scene.phantom_shapes import Tube, ball, blend, carve, ellipsoid, plate, rod, solid_mesh
@@ -93,7 +93,8 @@ def _parts(spacing):
     for name, tube in MUSCLES.items():
         vertices, faces, u = tube.mesh(spacing)
         first, last = ATTACHED_ENDS.get(name, USUAL_ENDS)
-        near = {bone.name: signed_distances(vertices, bone.mesh) <= ATTACHED_WITHIN for bone in scene.bones}
+        exact = ExactMeshes()
+        near = {bone.name: exact.distances(vertices, bone.mesh) <= ATTACHED_WITHIN for bone in scene.bones}
         attach = [
             Attachment("pelvis", np.flatnonzero((u <= first) & near["pelvis"])),
             Attachment("femur", np.flatnonzero((u >= last) & near["femur"])),

@@ -117,7 +117,6 @@ class Joint:
     translations: tuple[TransformAxis, ...] = ()
     kind: str = "ball"
     backward: bool = False
-    _rest: tuple[dict[str, float], np.ndarray] | None = field(default=None, repr=False, compare=False)
 
     def motion(self, values: dict[str, float], rest: dict[str, float]) -> np.ndarray:
         """Return the (4, 4) motion of the child against the parent, scene coordinates, the identity at rest.
@@ -126,9 +125,7 @@ class Joint:
         """
         if values == rest:
             return np.eye(4)
-        if self._rest is None or self._rest[0] != rest:
-            self._rest = dict(rest), np.linalg.inv(self.displacement(rest))
-        transform = self.displacement(values) @ self._rest[1]
+        transform = self.displacement(values) @ np.linalg.inv(self.displacement(rest))
         return np.linalg.inv(transform) if self.backward else transform
 
     def moved(self, pose: np.ndarray) -> Self:
@@ -138,7 +135,7 @@ class Joint:
             for axes in (self.rotations, self.translations)
         )
         centre = pose[:3, :3] @ self.centre + pose[:3, 3]
-        return replace(self, centre=centre, rotations=turns, translations=shifts, _rest=None)
+        return replace(self, centre=centre, rotations=turns, translations=shifts)
 
     def displacement(self, values: dict[str, float]) -> np.ndarray:
         """Return the (4, 4) motion in scene coordinates from where every function is zero."""
