@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 # Section of a tendon as it is drawn, over the mean section of its muscle.
 THIN = 0.05
+# Points of a belly's end that are kept out of bones, at most.
+PATCH = 16
 
 
 class SphereTable(Table):
@@ -113,7 +115,8 @@ def tendon_ends(muscle: Muscle, scene: SceneData) -> list[TendonEnd]:
             section = abs(muscle.mesh.volume) / np.linalg.norm(vertices - middle, axis=1).max()
             thin = float(np.sqrt(THIN * section / np.pi))
             radii = radius, min(thin, radius)
-            ends.append(TendonEnd(attachment.holder, vertices[attachment.vertices], middle, radii, line))
+            patch = vertices[attachment.vertices[:: -(-len(attachment.vertices) // PATCH)]]
+            ends.append(TendonEnd(attachment.holder, patch, middle, radii, line))
     held = [attachment for attachment in muscle.attachments if attachment.tendon is None]
     widest = max(held, key=lambda attachment: areas[attachment.vertices].sum(), default=None)
     for end in ends:

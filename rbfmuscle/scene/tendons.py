@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple, TypeAlias
 
@@ -30,8 +31,8 @@ STIFFNESS_RATIO = TENDON_STRAIN / BELLY_STRAIN
 CHORD = 0.06
 # Steps to the place of the end where its tendon has the wanted length, and the relative error that ends them.
 STEPS, TOLERANCE = 8, 1e-9
-# Points of a tendon as it is drawn, and of the belly's end that are kept out of bones, at most.
-NODES, PATCH = 33, 16
+# Points of a tendon as it is drawn.
+NODES = 33
 
 # A bone and a point (3,) of it at rest [scene unit].
 BonePoint: TypeAlias = tuple[str, Floats]
@@ -87,24 +88,22 @@ class _Mark(NamedTuple):
     legs: int
 
 
+@dataclass(eq=False)
 class TendonEnd:
     """The end of a belly that a tendon joins to a bone.
 
-    Parameters
+    Attributes
     ----------
     name : str
         Of the end among the poses.
     patch : (n, 3) ndarray
-        The end's vertices at rest [scene unit].
+        Vertices of the end at rest [scene unit].
     middle : (3,) ndarray
         Of the patch.
     radii : (float, float)
         Of the belly there, and of the tendon as it is drawn [scene unit].
     line : list of BonePoint
         Via points, then the insertion.
-
-    Attributes
-    ----------
     other : list of BonePoint
         The muscle's other end: a point of its bone, or of its tendon the insertion and the via points.
     slack : float
@@ -113,14 +112,14 @@ class TendonEnd:
         Bones that string and tendon go around.
     """
 
-    def __init__(
-        self, name: str, patch: Floats, middle: Floats, radii: tuple[float, float], line: list[BonePoint]
-    ) -> None:
-        self.name, self.middle, self.radii, self.line = name, middle, radii, line
-        self.patch = patch[:: -(-len(patch) // PATCH)]
-        self.other: list[BonePoint] = []
-        self.obstacles: Sequence[Bone] = ()
-        self.slack = 0.0
+    name: str
+    patch: Floats
+    middle: Floats
+    radii: tuple[float, float]
+    line: list[BonePoint]
+    other: list[BonePoint] = field(default_factory=list)
+    slack: float = 0.0
+    obstacles: Sequence[Bone] = ()
 
     @cached_property
     def length(self) -> float:
