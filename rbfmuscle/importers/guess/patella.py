@@ -1,7 +1,7 @@
 """The patella against the femur while the knee bends: in its groove, its ligament as long as at rest.
 
-In the plane of knee flexion the patella turns by 0.7 of the knee's angle (Amis et al. 2006), keeps its least gap to
-the groove of the femur (outline of trochlea and condyles beside it about the knee's axis), and lies where the
+In the plane of knee flexion the patella turns by 0.7 of the knee's angle (Amis et al. 2006), keeps its distance from
+the middle of its groove (a circle through the outline of the trochlea about the knee's axis), and lies where the
 ligament from its apex to the tibial tuberosity has its length at rest (as in the model of Yamaguchi and Zajac 1989).
 Points of the plane are complex numbers about the knee's axis: forwards, and i times downwards.
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from rbfmuscle.importers.guess.anatomy import JointGuess, rounded
-from rbfmuscle.importers.guess.landmarks import across, unit
+from rbfmuscle.importers.guess.landmarks import across, fit_sphere, unit
 
 # Knee flexion from the rest pose [degree] at which the path is taken.
 FLEXIONS = tuple(range(0, 131, 10))
@@ -20,8 +20,8 @@ TURN = 0.7
 GROOVE, TUBEROSITY = 10.0, 15.0
 # Length of the ligament that anatomy allows [mm].
 LIGAMENT = (25.0, 80.0)
-# Angles about the knee's axis that the outline covers, its steps, the order of the polynomial through it [degree].
-OUTLINE, STEP, ORDER = (-50.0, 125.0), 5.0, 6
+# Angles about the knee's axis that the outline covers, its steps [degree], and the fewest points of it.
+OUTLINE, STEP, FEWEST = (-30.0, 90.0), 5.0, 6
 
 
 def place_patellae(joints: list[JointGuess], millimetre: float) -> None:
@@ -48,16 +48,16 @@ def _put_in_groove(joint, knee, millimetre):
         away = away[np.abs(away @ axis - side) < half * millimetre]
         return away @ front + 1j * (away @ down)
 
-    groove = _Groove(flat(np.vstack([femur.points, femur.faces[0]]), GROOVE))
+    groove = _outline(flat(np.vstack([femur.points, femur.faces[0]]), GROOVE))
     outline = flat(joint.child.points, np.inf)
     shin, apex = flat(knee.child.points, TUBEROSITY), outline[np.argmax(outline.imag)]
     gaps = np.abs(shin - apex) / millimetre
     shin = shin[(gaps > LIGAMENT[0]) & (gaps < LIGAMENT[1]) & (shin.imag > apex.imag)]
-    middle = outline.mean()
-    if len(shin) == 0 or not groove.low < np.angle(middle, deg=True) < groove.high:
+    if len(shin) == 0 or len(groove) < FEWEST:
         return False
-    tuberosity = shin[np.argmax(shin.real)]
-    shifts = _follow(groove, outline, middle, apex, tuberosity)
+    middle, tuberosity = outline.mean(), shin[np.argmax(shin.real)]
+    centre, _ = fit_sphere(np.stack([groove.real, groove.imag], axis=1), np.ones(len(groove)))
+    shifts = _follow(complex(*centre), middle, apex, tuberosity)
     flexions = np.array(FLEXIONS, dtype=float)
 
     def table(direction, values):
@@ -76,40 +76,26 @@ def _put_in_groove(joint, knee, millimetre):
     return True
 
 
-class _Groove:
-    """Outline of the femur about the knee's axis in the plane of flexion."""
-
-    def __init__(self, points):
-        angle, marks, radii = np.angle(points, deg=True), [], []
-        for low in np.arange(*OUTLINE, STEP):
-            inside = np.abs(points[(angle >= low) & (angle < low + STEP)])
-            if len(inside) > 3:
-                marks.append(low + 0.5 * STEP)
-                radii.append(np.percentile(inside, 95))
-        self.low, self.high = (marks[0], marks[-1]) if marks else (0.0, 0.0)
-        if marks:
-            self.curve = np.polynomial.Polynomial.fit(marks, radii, min(ORDER, max(len(marks) - 2, 1)))
-
-    def gap(self, outline):
-        """Least distance of an outline to the groove, towards the knee's axis."""
-        angle = np.clip(np.angle(outline, deg=True), self.low, self.high)
-        return float((np.abs(outline) - self.curve(angle)).min())
+def _outline(points):
+    """The outermost points of the femur about the knee's axis, step by step of the angle."""
+    angle, found = np.angle(points, deg=True), []
+    for low in np.arange(*OUTLINE, STEP):
+        inside = np.abs(points[(angle >= low) & (angle < low + STEP)])
+        if len(inside) > 3:
+            found.append(np.percentile(inside, 95) * _turn(low + 0.5 * STEP))
+    return np.array(found)
 
 
-def _follow(groove, outline, middle, apex, tuberosity):
-    """Shifts of the patella: at each flexion the place along the groove, from the one before on."""
-    length, least, shifts = abs(apex - tuberosity), groove.gap(outline), []
-    angle, radius = float(np.angle(middle, deg=True)), float(abs(middle))
+def _follow(centre, middle, apex, tuberosity):
+    """Shifts of the patella: at each flexion the place about the groove's centre, from the one before on."""
+    length, angle, shifts = abs(apex - tuberosity), 0.0, []
     for flexion in FLEXIONS:
-        end, turn, best = tuberosity * _turn(flexion), _turn(TURN * flexion), (np.inf, 0.0, 0.0)
-        for tried in np.arange(angle, angle + 20.0, 0.5) if flexion else (angle,):
-            outward, there = _turn(tried), radius
-            for _ in range(6):
-                there += least - groove.gap((outline - middle) * turn + there * outward)
-            error = abs(abs(there * outward + (apex - middle) * turn - end) - length)
-            best = min(best, (error, float(tried), there))
-        _, angle, radius = best
-        shifts.append(radius * _turn(angle) - middle)
+        end, tip = tuberosity * _turn(flexion), (apex - middle) * _turn(TURN * flexion)
+        tried = np.arange(angle, angle + 20.0, 0.5) if flexion else np.zeros(1)
+        places = centre + (middle - centre) * _turn(tried)
+        best = np.argmin(np.abs(np.abs(places + tip - end) - length))
+        angle = tried[best]
+        shifts.append(places[best] - middle)
     return np.array(shifts)
 
 
