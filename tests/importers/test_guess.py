@@ -11,7 +11,6 @@ import trimesh
 from command_line import call
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.cli.app import run_command
 from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.importers.guess.attachments import Ends, _best_of
 from rbfmuscle.importers.guess.guess import _leave_out, guess_scene, write_scene
@@ -262,22 +261,6 @@ def test_muscles_of_the_leg_hang_on_the_right_bones_at_the_right_places(leg_gues
     assert {name for name in last if last[name] != first[name]} == {"hip.flexion"} and not scene.motion.notes
 
 
-def test_what_is_written_of_meshes_in_metres_passes_check_and_runs(tmp_path, capsys):
-    scene = phantom_scene(spacing=6.0)
-    for item in scene.bones + scene.muscles[:2]:
-        mesh = item.mesh.copy()
-        mesh.apply_scale(0.001)
-        mesh.export(tmp_path / f"{item.name}.ply")
-    file = tmp_path / "scene.toml"
-    assert run_command(["new", str(tmp_path)]) == 0
-    assert "units are m: " in capsys.readouterr().out
-    assert run_command(["new", str(tmp_path)]) == 2 and "--force" in capsys.readouterr().err
-    assert run_command(["check", str(file)]) == 0
-    quick = ["--set", "output.report=false", "--model", "pbd"]
-    assert run_command(["run", str(file), "-o", str(tmp_path / "out"), "--frames", "0:5", *quick]) == 0
-    assert len(SavedRun(tmp_path / "out").frames) == 5
-
-
 def test_tendons_of_the_leg_go_where_the_bellies_end_short(leg_guess):
     """Beside the ends that carriers hold in data/leg; the quadriceps' goes on from the patella to the tibia."""
     guess, facts, _ = leg_guess
@@ -346,21 +329,29 @@ def test_nothing_is_left_behind_that_does_not_load(tmp_path):
     assert not file.exists()
 
 
-def test_a_bone_that_cannot_be_used_is_in_the_verdict_wherever_it_is_said(tmp_path, capsys):
-    _phantom_meshes(tmp_path)
+def test_meshes_in_metres_make_a_scene_that_runs_and_a_bone_that_cannot_be_used_is_in_the_verdict(
+    tmp_path, capsys
+):
+    meshes, out = phantom_scene(spacing=6.0), tmp_path / "out"
+    for item in meshes.bones + meshes.muscles[:2]:
+        item.mesh.copy().apply_scale(0.001).export(tmp_path / f"{item.name}.ply")
     (tmp_path / "sacrum.stl").write_bytes(b"nothing")
-    scene, out = tmp_path / "scene.toml", tmp_path / "out"
-    assert call(capsys, "new", tmp_path, "--units", "mm")[0] == 0
-    assert "sacrum: no mesh of this bone could be used" in call(capsys, "check", scene)[1]
-    run = ("run", scene, "-o", out, "--model", "pbd", "--frames", "0:1", "--set", "output.surfaces=false")
+    scene = tmp_path / "scene.toml"
+    code, printed, _ = call(capsys, "new", tmp_path)
+    assert code == 0 and "units are m: " in printed
+    code, _, err = call(capsys, "new", tmp_path)
+    assert code == 2 and "--force" in err
+    code, printed, _ = call(capsys, "check", scene)
+    assert code == 0 and "sacrum: no mesh of this bone could be used" in printed
+    run = ("run", scene, "-o", out, "--model", "pbd", "--frames", "0:5")
     code, printed, _ = call(capsys, *run)
     verdict = json.loads((out / "run.json").read_text(encoding="utf-8"))["verdict"]
-    assert code == 0 and f"verdict: {verdict}" in printed
+    assert code == 0 and f"verdict: {verdict}" in printed and len(SavedRun(out).frames) == 5
     assert "the bones, bones left out (sacrum) 1 at frame 0 (limit 0)" in verdict
     report = (out / "report.html").read_text(encoding="utf-8")
     answer, _, detail = verdict.partition(". ")
     assert 'class="answer bad"' in report and answer[1:] in report and detail in report
-    code, _, err = call(capsys, *run, "--fail-on", "bones_left_out")
+    code, _, err = call(capsys, *run, "--set", "output.surfaces=false", "--fail-on", "bones_left_out")
     assert code == 6 and "bones_left_out = 1 > 0" in err
 
 

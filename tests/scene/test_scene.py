@@ -9,7 +9,6 @@ import trimesh
 
 from rbfmuscle.scene import options
 from rbfmuscle.scene.check import bone_collisions, check_initial
-from rbfmuscle.scene.file import read_scene_file
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import SceneError, UsageError
 
@@ -152,6 +151,19 @@ class TestMistakes:
             ('name = "biceps"', 'name = "../x"', r"muscle name '../x' may hold letters"),
             ("[scene]", "[scene", r"not valid TOML.*line 2"),
             ('"report"', '"reprot"', r"\[detect\] tunnelling action: .*'reprot'"),
+            ('mesh = "lower.ply"', 'mesh = "lower.ply"\nx = 1', r"\[\[bone\]\] 'lower': unknown key 'x'"),
+            ('name = "lower"\n', "", r"\[\[bone\]\] 2 name: field required"),
+            ("[defaults]", '[defaults]\nattach = [ { bone = "arm", x = 1 } ]', r"\[defaults\] attach 1: unknown"),
+            (
+                "near = 4",
+                "sphere = { centre = [0, 0, 0], radius = 1, x = 1 }",
+                r"\[\[muscle\]\] 'biceps' attach 1 sphere: unknown",
+            ),
+            ('"lower.txt"', "3.5", r"\[\[muscle\]\] 'biceps' attach 2 vertices: "),
+            ("step = 10", "step = 10, x = 1", r"\[motion\] ramp elbow.flexion: unknown key"),
+            ("{ from = 0, to = 20, step = 10 }", "3", r"ramp elbow.flexion: input should be a table, got 3"),
+            ('action = "report"', "x = 1", r"\[detect\] tunnelling: unknown key"),
+            ("[contact]", "[output]\nsurfaces = 3\n[contact]", r"\[output\] surfaces: .* a valid boolean, got 3"),
         ],
     )  # fmt: skip
     def test_one_line_names_file_place_and_remedy(self, folder, old, new, message):
@@ -277,32 +289,3 @@ class TestCheck:
         assert depths[15] == pytest.approx(0.7, abs=0.3)
         assert depths[22] == pytest.approx(9, abs=1)
         assert bone_collisions(Scene.load(hip_data / "gluteus.toml")) == []
-
-
-HEAD = '[scene]\nformat = 1\nunits = "mm"\n'
-BONES = '[[bone]]\nname = "trunk"\nmesh = "t.ply"\n[[bone]]\nname = "arm"\nmesh = "a.ply"\n'
-MUSCLE = '[[muscle]]\nname = "strap"\nmesh = "m.ply"\n'
-SPHERE = '{ bone = "arm", sphere = { centre = [0, 0, 0], radius = 1, x = 1 } }'
-
-WRONG = [
-    ("[scene]\nx = 1\n", "not valid TOML"),
-    (BONES + "x = 1\n", "[[bone]] 'arm': unknown key 'x'"),
-    (BONES + '[[bone]]\nmesh = "t.ply"\nx = 1\n', "[[bone]] 3: unknown key 'x'"),
-    (BONES + "[[bone]]\n", "[[bone]] 3 name: field required"),
-    ('[defaults]\nattach = [ { bone = "arm", x = 1 } ]\n', "[defaults] attach 1: unknown key"),
-    (MUSCLE + f'attach = [ {{ bone = "arm" }}, {SPHERE} ]\n', "[[muscle]] 'strap' attach 2 sphere: unknown"),
-    (MUSCLE + 'attach = [ { bone = "arm", vertices = 3.5 } ]\n', "[[muscle]] 'strap' attach 1 vertices: "),
-    ('[motion]\nramp = { "a.b" = { to = 1, step = 1, x = 1 } }\n', "[motion] ramp a.b: unknown key"),
-    ('[motion]\nramp = { "a.b" = 3 }\n', "[motion] ramp a.b: input should be a table, got 3"),
-    ("[detect]\ntunnelling = { x = 1 }\n", "[detect] tunnelling: unknown key"),
-    ("[output]\nsurfaces = 3\n", "[output] surfaces: input should be a valid boolean, got 3"),
-]
-
-
-@pytest.mark.parametrize(("text", "message"), WRONG, ids=[message[:30] for _, message in WRONG])
-def test_wrong_key_or_value_is_named_with_its_place(tmp_path, text, message):
-    path = tmp_path / "s.toml"
-    path.write_text(HEAD + text)
-    with pytest.raises(SceneError) as caught:
-        read_scene_file(path)
-    assert str(caught.value).startswith(f"{path}: {message}")
