@@ -27,27 +27,25 @@ MeshInput: TypeAlias = str | Path | ReadMesh | MeshLike
 _NAME_CHARACTERS = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-")
 
 
-def add_bone(scene: S, name: str, mesh: MeshInput, *, scale: float = 1.0) -> S:
+def add_bone(scene: S, name: str, mesh: MeshInput | None = None, *, scale: float = 1.0) -> S:
     """Add a bone and return the scene.
 
     Parameters
     ----------
     name : str
-    mesh : path, trimesh.Trimesh, (vertices, faces) or ReadMesh
-        Mended where that is safe; holes are kept, with a note.
+    mesh : path, trimesh.Trimesh, (vertices, faces) or ReadMesh, optional
+        Mended where that is safe; holes are kept, with a note. A bone without one carries joints only.
     scale : float
         Factor from the mesh's unit to the scene's.
     """
-    _check_new_bone(scene, name)
-    read = as_mesh(mesh, name, scale, may_be_open=True)
-    scene.bones.append(Bone(name, read.mesh, read.source, read.closed, read.notes))
-    return scene
-
-
-def add_link(scene: S, name: str) -> S:
-    """Add a bone without a mesh, which carries joints only, and return the scene."""
-    _check_new_bone(scene, name)
-    scene.links.append(name)
+    check_new_name(scene.bones, name, "bone")
+    if name in scene.links:
+        raise SceneError(f"bone {name!r} is given twice")
+    if mesh is None:
+        scene.links.append(name)
+    else:
+        read = as_mesh(mesh, name, scale, may_be_open=True)
+        scene.bones.append(Bone(name, read.mesh, read.source, read.closed, read.notes))
     return scene
 
 
@@ -211,9 +209,3 @@ def check_new_name(items: Sequence[Bone | Joint | Muscle], name: str, what: str)
         )
     if any(item.name == name for item in items):
         raise SceneError(f"{what} {name!r} is given twice")
-
-
-def _check_new_bone(scene, name):
-    check_new_name(scene.bones, name, "bone")
-    if name in scene.links:
-        raise SceneError(f"bone {name!r} is given twice")

@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError, field_validator
 
 from rbfmuscle.scene.activation.keys import ContractionTable
 from rbfmuscle.scene.attachments import AttachTable
-from rbfmuscle.scene.build import add_bone, add_link, add_muscle, place_coupling, place_joint, validate
+from rbfmuscle.scene.build import add_bone, add_muscle, place_coupling, place_joint, validate
 from rbfmuscle.scene.check import check_centre, check_place, check_size
 from rbfmuscle.scene.joints.skeleton import all_coordinates
 from rbfmuscle.scene.joints.tables import (
@@ -178,12 +178,9 @@ def _fill(scene: SceneData, tables: SceneFile) -> None:
     about = tables.scene
     scene.left_out, scene.superior, scene.anterior = about.left_out, about.superior, about.anterior
     for bone in tables.bone:
-        if bone.mesh is None:
-            add_link(scene, bone.name)
-            continue
-        read = read_mesh(bone.mesh, name=bone.name, scale=bone.scale, may_be_open=True)
-        check_size(scene, "bone", bone.name, read)
-        add_bone(scene, bone.name, read)
+        add_bone(scene, bone.name, bone.mesh, scale=bone.scale)
+        if bone.mesh is not None:
+            check_size(scene, "bone", bone.name, scene.bones[-1])
     for joint in tables.joint:
         place_joint(scene, joint.joint())
         check_centre(scene, joint.name, scene.joints[-1].centre)

@@ -53,8 +53,6 @@ class Tube:
         first, last = first / legs[0], last / legs[1]
         angle = np.arccos(np.clip(first @ last, -1, 1))
         cut = self.radius * np.tan(angle / 2)
-        if cut > legs.min():
-            raise ValueError(f"radius {self.radius} does not fit into legs of {legs.tolist()}")
         return start, first, last, legs, angle, cut
 
     @property

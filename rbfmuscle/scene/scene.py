@@ -34,7 +34,6 @@ class Scene(SceneData):
 
     load = classmethod(load_scene)
     add_bone = build.add_bone
-    add_link = build.add_link
     add_joint = build.add_joint
     place_joint = build.place_joint
     add_coupling = build.add_coupling

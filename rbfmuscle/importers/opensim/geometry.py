@@ -6,7 +6,7 @@ import numpy as np
 
 from rbfmuscle.importers.opensim.model import ModelMesh, OsimModel
 from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, ReadMesh, prepare_mesh, read_arrays
-from rbfmuscle.validation import MeshError
+from rbfmuscle.validation import MeshError, check_mesh
 
 # A mesh wider than this [m] is a floor or a wall, not a bone.
 WIDEST = 3.0
@@ -67,11 +67,7 @@ def _placed(mesh: ModelMesh, place: np.ndarray, folders: list[Path]) -> tuple[Pa
     if file is None:
         where = ", ".join(str(folder) for folder in folders)
         raise MeshError(f"it is not there (looked in {where}); give its folder with --geometry")
-    vertices, faces = read_arrays(file)
-    if len(vertices) == 0 or len(faces) == 0:
-        raise MeshError("it has no triangles")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise MeshError("a triangle names a vertex that is not there")
+    vertices, faces = check_mesh(*read_arrays(file))
     transform = place @ mesh.transform
     vertices = (vertices * mesh.scale) @ transform[:3, :3].T + transform[:3, 3]
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))

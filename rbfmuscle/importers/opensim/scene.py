@@ -63,7 +63,7 @@ def import_osim(path: Path | str, *, geometry: list[Path] | None = None, muscles
             scene.add_bone(body, meshes[body])
             notes += [f"body {body!r}: {note}" for note in meshes[body].notes]
         else:
-            scene.add_link(body)
+            scene.add_bone(body)
             scene.left_out += [body] if any(mesh.body == body for mesh in model.meshes) else []
     full = {}
     for joint, backward in model.tree():
