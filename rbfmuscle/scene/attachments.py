@@ -47,6 +47,7 @@ class SphereTable(Table):
 
 
 def _check_vertices(value: object, info: ValidationInfo) -> object:
+    value = value.tolist() if isinstance(value, np.ndarray) else value
     if isinstance(value, (list, tuple)) and all(type(number) is int for number in value):
         return list(value)
     if value is None or isinstance(value, (str, Path)):
@@ -83,10 +84,7 @@ def resolve_attachments(
         place = f"muscle {muscle!r} attach {number + 1}: "
         if not isinstance(entry, AttachTable):
             row = vars(entry) if isinstance(entry, Attachment) else entry
-            plain = {
-                k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in row.items() if k != "holder"
-            }
-            entry = AttachTable.build(plain, place=place)
+            entry = AttachTable.build({k: v for k, v in row.items() if k != "holder"}, place=place)
         bone = find_named(bones, entry.bone, "bone", place=place)
         holder = "" if entry.tendon is None else f"{muscle} tendon {number + 1} to {bone.name}"
         held = Attachment(bone.name, np.unique(_select(entry, read, bone, place)), entry.tendon, holder)
