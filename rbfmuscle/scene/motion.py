@@ -60,9 +60,10 @@ def slice_motion(motion: Motion, frames: slice) -> Motion:
 
 def rest_coordinates(scene: SceneData) -> dict[str, float]:
     """Return the coordinates whose rest value is not zero, by full name [radian or scene unit]."""
-    if not any(facts.rest for joint in scene.joints for facts in joint.coordinates.values()):
+    facts = all_coordinates(scene.joints)
+    if not any(coordinate.rest for coordinate in facts.values()):
         return {}
-    return {name: value for name, value in resolve({}, scene.joints, scene.couplings).items() if value}
+    return {name: value for name, value in resolve({}, facts, scene.couplings).items() if value}
 
 
 def completed(scene: SceneData, coordinates: Mapping[str, float]) -> dict[str, float]:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from rbfmuscle.scene.joints.functions import Linear, PiecewiseLinear, Polynomial, Spline
 from rbfmuscle.scene.joints.joint import KINDS
-from rbfmuscle.scene.joints.skeleton import resolve
+from rbfmuscle.scene.joints.skeleton import all_coordinates, resolve
 from rbfmuscle.scene.joints.tables import JointTable, joint_row
 from rbfmuscle.scene.motion import bone_poses, step_angle, turned_angle
 from rbfmuscle.scene.objects import Motion
@@ -145,7 +145,7 @@ class TestCoordinates:
         poses = bone_poses(scene, {"x.x": 20 * DEG})
         assert turned_angle(poses["c"][:3, :3]) == pytest.approx(2.0 * DEG)
         assert turned_angle(poses["d"][:3, :3]) == pytest.approx(4.0 * DEG)  # 5, of which 1 is at rest
-        assert resolve({}, scene.joints, scene.couplings)["z.z"] == pytest.approx(1.0 * DEG)
+        assert resolve({}, all_coordinates(scene.joints), scene.couplings)["z.z"] == pytest.approx(1.0 * DEG)
         with pytest.raises(SceneError, match="follows itself"):
             scene.add_coupling("x", ["z"])
         with pytest.raises(SceneError, match="follows other coordinates"):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.scene.joints.joint import Coordinate, Coupling, Joint
-from rbfmuscle.scene.joints.skeleton import ordered
+from rbfmuscle.scene.joints.skeleton import ordered, resolve
 from rbfmuscle.validation import SceneError
 
 GROUND = "ground"
@@ -77,14 +77,6 @@ class OsimModel:
         """Every coordinate by its bare name, which is unique in a model."""
         return {name: facts for joint in self.joints for name, facts in joint.coordinates.items()}
 
-    def resolve(self, values: dict[str, float] | None = None) -> dict[str, float]:
-        """Value of every coordinate when some are set [radian, metre]: locks, clamps and couplings honoured."""
-        values = values or {}
-        found = {n: c.honoured(values[n]) if n in values else c.rest for n, c in self.coordinates().items()}
-        for coupling in self.couplings:
-            found[coupling.coordinate] = coupling.function(*(found[name] for name in coupling.of))
-        return found
-
     def tree(self) -> Iterator[tuple[ModelJoint, bool]]:
         """Joints from the ground outwards; the flag says that the joint is walked from its child to its parent.
 
@@ -98,8 +90,8 @@ class OsimModel:
             yield ready, backward
 
     def transforms(self, values: dict[str, float] | None = None) -> dict[str, np.ndarray]:
-        """The (4, 4) transform from every body to the ground [metre], with values as for `resolve`."""
-        resolved = self.resolve(values)
+        """The (4, 4) transform from every body to the ground [metre], at values of coordinates by bare names."""
+        resolved = resolve(values or {}, self.coordinates(), self.couplings)
         found = {body: np.eye(4) for body in self.bodies}
         for joint, backward in self.tree():
             moved = joint.displacement(resolved)

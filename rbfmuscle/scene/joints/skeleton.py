@@ -14,16 +14,13 @@ def all_coordinates(joints: list[Joint]) -> dict[str, Coordinate]:
 
 
 def resolve(
-    coordinates: dict[str, float], joints: list[Joint], couplings: list[Coupling]
+    asked: dict[str, float], coordinates: dict[str, Coordinate], couplings: list[Coupling]
 ) -> dict[str, float]:
-    """Return the value that every coordinate takes when some are asked for.
+    """Return the value that every coordinate takes when some are asked for, by the same names [radian or scene unit].
 
-    Locked ones stay, clamped ones are cut to their range, those that follow others follow; absent ones are at rest. All
-    have full names [radian or scene unit].
+    Locked ones stay, clamped ones are cut to their range, those that follow others follow; absent ones are at rest.
     """
-    values = {}
-    for name, facts in all_coordinates(joints).items():
-        values[name] = facts.honoured(coordinates[name]) if name in coordinates else facts.rest
+    values = {n: facts.honoured(asked[n]) if n in asked else facts.rest for n, facts in coordinates.items()}
     for coupling in couplings:  # in an order in which what they follow is known
         values[coupling.coordinate] = coupling.function(*(values[name] for name in coupling.of))
     return values
@@ -80,7 +77,7 @@ def joint_values(
     joints: list[Joint], couplings: list[Coupling], coordinates: dict[str, float]
 ) -> dict[str, dict[str, float]]:
     """Return the values that `resolve` gives, by joint and bare name."""
-    values = resolve(coordinates, joints, couplings)
+    values = resolve(coordinates, all_coordinates(joints), couplings)
     return {
         joint.name: {name: values[f"{joint.name}.{name}"] for name in joint.coordinates} for joint in joints
     }
