@@ -55,33 +55,32 @@ class FunctionTable(Table):
 
     def function(self, inputs: list[str], output: str, *, place: str) -> Function:
         """Return the function in inner units; ``inputs`` and ``output`` are kinds of motion, keys of `FACTORS`."""
-        given = [name for name in FUNCTIONS if getattr(self, name) is not None] or ["linear"]
+        given = [name for name in FUNCTIONS if getattr(self, name) is not None]
+        count, points = len(inputs), self.piecewise or self.spline
         if len(given) > 1:
             raise SceneError(f"{place}: give one function, not {' and '.join(given)}")
-        found = self._in_file_units(given[0], len(inputs), place)
+        found: Function
+        if self.constant is not None:
+            found = Linear((), self.constant)
+        elif count != 1 and (self.polynomial or points):
+            raise SceneError(f"{place}: {given[0]} is of 1 coordinate, {count} are given")
+        elif self.polynomial is not None:
+            found = Polynomial(tuple(self.polynomial))
+        elif points is not None:
+            found = (Spline if self.spline else PiecewiseLinear)(tuple(points.x), tuple(points.y))
+        else:
+            *slopes, constant = self.linear or [1.0, 0.0]
+            if len(slopes) != count:
+                raise SceneError(
+                    f"{place}: linear needs a slope for each of {count} coordinates and a constant, got {self.linear}"
+                )
+            found = Linear(tuple(slopes), constant)
         return found.rescaled([FACTORS[motion] for motion in inputs], FACTORS[output])
 
     def slope(self) -> float:
         """The first slope of a linear function, 0 of any other."""
         plain = all(getattr(self, name) is None for name in FUNCTIONS)
         return 1.0 if plain else (self.linear or [0.0])[0]
-
-    def _in_file_units(self, kind, count, place):
-        if kind == "constant":
-            return Linear((), self.constant)
-        if kind == "linear":
-            values = self.linear or [1.0, 0.0]
-            if len(values) != count + 1:
-                raise SceneError(
-                    f"{place}: linear needs a slope for each of {count} coordinates and a constant, got {values}"
-                )
-            return Linear(tuple(values[:-1]), values[-1])
-        if count != 1:
-            raise SceneError(f"{place}: {kind} is of 1 coordinate, {count} are given")
-        if kind == "polynomial":
-            return Polynomial(tuple(self.polynomial))
-        points = getattr(self, kind)
-        return {"piecewise": PiecewiseLinear, "spline": Spline}[kind](tuple(points.x), tuple(points.y))
 
 
 class AxisTable(FunctionTable):
