@@ -120,11 +120,8 @@ def _away_from_bones(scene, low, high):
 
 
 def _likely_scale(millimetres):
-    """The power of ten among the usual unit mistakes that brings the size nearest to 300 mm."""
-    best = min(
-        (0.001, 0.1, 0.01, 10.0, 100.0, 1000.0),
-        key=lambda s: abs(math.log(max(millimetres, 1e-12) * s / 300)),
-    )
+    """The power of ten that brings the size nearest to 300 mm."""
+    best = 10.0 ** round(math.log10(300.0 / max(millimetres, 1e-12)))
     return f"{best:g} times the present one would make it {millimetres * best:.4g} mm"
 
 

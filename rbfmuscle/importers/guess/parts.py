@@ -153,8 +153,6 @@ def _sort_unknown(found, unknown):
 
 def _can_be_muscle(part):
     """Whether a mesh is one closed surface."""
-    if not part.mesh.is_watertight:
-        return False
     try:
         prepare_mesh(part.mesh.vertices, part.mesh.faces, place=part.file, name=part.name)
     except MeshError:

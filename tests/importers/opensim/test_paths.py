@@ -31,13 +31,6 @@ def test_fit_holds_at_poses_that_it_has_not_seen():
     assert np.sqrt(np.mean((path.arms(held) - arms) ** 2)) < 1e-2
 
 
-def test_arms_are_minus_the_derivative_of_the_length():
-    path, q, h = fit_path("m", ("a.x", "b.y"), *made()), np.array([[0.3, 0.5]]), 1e-6
-    for k, step in enumerate(np.eye(2) * h):
-        slope = (path.length(q + step) - path.length(q - step)) / (2 * h)
-        assert path.arms(q)[0, k] == pytest.approx(-slope[0], rel=1e-6)
-
-
 def test_file_is_in_metres_with_terms_in_the_order_of_opensim(tmp_path):
     assert exponents(2, 2).tolist() == [[0, 0], [0, 1], [0, 2], [1, 0], [1, 1], [2, 0]]
     path = FittedPath("soleus", ("ankle.angle", "rail.s"), 1, np.array([300.0, 2.0, -40.0]))
