@@ -66,7 +66,6 @@ REMOVED_KEYS = {key: remedy for remedy, keys in _REPLACED.items() for key in key
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 def _listed(vector: Any) -> Any:

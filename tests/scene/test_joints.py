@@ -107,6 +107,8 @@ class TestKinds:
                 "linear needs a slope",
             ),
             ({**Q, "coordinates": {"q": {"range": [3, 1]}}}, "range must go upwards"),
+            ({**Q, "coordinates": {"q": {"motion": "translation"}}}, "'q' is a rotation here, not a translation"),
+            ({**Q, "coordinates": {"p": {}}}, "coordinate 'p' moves nothing"),
         ],
     )  # fmt: skip
     def test_wrong_tables_are_named(self, row, message):

@@ -139,18 +139,20 @@ class JointTable(Table):
             groups = self._axes_of_kind(place)
         elif self.axes:
             raise SceneError(f"{place}: a custom joint has rotations and translations instead of axes")
-        tables = [(motion, table) for motion, group in groups.items() for table in group]
+        tables = [(sort, table) for sort, group in groups.items() for table in group]
         named = dict.fromkeys(name for _, table in tables for name in table.coordinates)
         for name in self.coordinates:
             if name not in named:
                 raise SceneError(
                     f"{place}: coordinate {name!r} moves nothing, {did_you_mean(name, list(named))}"
                 )
-        slopes = [(motion, table.coordinates, table.slope()) for motion, table in tables]
-        coordinates = {
-            name: self.coordinates.get(name, CoordinateTable()).coordinate(motion_of(name, slopes))
-            for name in named
-        }
+        slopes = [(sort, table.coordinates, table.slope()) for sort, table in tables]
+        coordinates = {}
+        for name in named:
+            motion, table = motion_of(name, slopes), self.coordinates.get(name, CoordinateTable())
+            if self.type != "custom" and table.motion not in (None, motion):
+                raise SceneError(f"{place}: {name!r} is a {motion} here, not a {table.motion}")
+            coordinates[name] = table.coordinate(motion)
 
         def axis(motion, number, table):
             inputs = [coordinates[name].motion for name in table.coordinates]
