@@ -173,16 +173,15 @@ def parse_value(text: str, *, place: str) -> dict[str, Any] | int | str:
 
 def parse_slice(text: str) -> slice:
     """Return the slice of "A:B:S" (each part may be empty), or of a single frame "A"."""
-    parts = text.split(":")
     try:
-        numbers = [int(part) if part.strip() else None for part in parts]
+        numbers = [int(part) if part.strip() else None for part in text.split(":")]
+        if len(numbers) == 1:
+            first = int(text)
+            return slice(first, first + 1 or None)
+        if len(numbers) > 3 or numbers[2:] == [0]:
+            raise ValueError
     except ValueError:
-        numbers = []
-    if not 1 <= len(numbers) <= 3 or (len(numbers) == 1 and numbers[0] is None) or numbers[2:] == [0]:
         raise UsageError(
             f"frames {text!r} must look like A:B:S (whole numbers, S not 0), for instance 0:46:5"
-        )
-    first = numbers[0]
-    if len(numbers) == 1 and first is not None:
-        return slice(first, first + 1 or None)
+        ) from None
     return slice(*numbers)

@@ -120,7 +120,7 @@ def _read_words(name):
         if word in table.sides:
             sides.add(table.sides[word])
             continue
-        parts = [word] if word in table.known else _taken_apart(word)
+        parts = _taken_apart(word)
         if not parts:
             near = _nearest(word)
             parts = [near or word]
@@ -132,15 +132,12 @@ def _read_words(name):
 
 def _taken_apart(word):
     """Known words that a word is written together of, none where it is not; the fewest, of three letters or more."""
-    known, best = _table().known | set(_table().sides), {0: []}
-    for end in range(3, len(word) + 1):
-        for start in list(best):
-            part = word[start:end]
-            if len(part) >= 3 and part in known:
-                parts = [*best[start], part]
-                if end not in best or len(parts) < len(best[end]):
-                    best[end] = parts
-    return best.get(len(word), []) if len(word) >= 6 else []
+    known = _table().known | set(_table().sides)
+    if word in known:
+        return [word]
+    heads = [word[:k] for k in range(3, len(word) - 2) if word[:k] in known]
+    found = [[head, *rest] for head in heads if (rest := _taken_apart(word[len(head) :]))]
+    return min(found, key=len, default=[])
 
 
 def _nearest(word):
