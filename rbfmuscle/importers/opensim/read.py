@@ -15,18 +15,8 @@ from rbfmuscle.validation import SceneError
 
 # From this version on joints stand in a set of their own and name their frames.
 SOCKETS = 40000
-# What OpenSim calls a joint -> kind in our table, where the coordinates are in the same order.
-JOINT_KINDS = {
-    "WeldJoint": "fixed",
-    "PinJoint": "hinge",
-    "SliderJoint": "slider",
-    "UniversalJoint": "universal",
-    "BallJoint": "ball",
-    "GimbalJoint": "ball",
-    "PlanarJoint": "planar",
-    "FreeJoint": "free",
-    "CustomJoint": "custom",
-}
+# What OpenSim calls otherwise than our table of joints; where both have one, its coordinates are in the same order.
+RENAMED = {"weld": "fixed", "pin": "hinge", "gimbal": "ball"}
 
 
 def read_osim(path: Path | str) -> OsimModel:
@@ -134,8 +124,9 @@ def _add_mesh(model, file, body, scale, transform, shown):
 def _joint(node, ends, holder, model):
     """One joint from its element, its ends as (body, frame), and the tag of what holds its coordinates."""
     (parent, first), (child, second) = ends
-    kind = JOINT_KINDS.get(node.tag)
-    if kind is None:
+    kind = node.tag.removesuffix("Joint").lower()
+    kind = RENAMED.get(kind, kind)
+    if kind not in KINDS:
         why = f"is not in the table of joints, so body {child!r} cannot be placed"
         raise node.error(f"{parent} to {child}: its kind {why}; replace it by a CustomJoint in OpenSim")
     found = [inner for inner in node.objects(holder) if inner.tag == "Coordinate"]
