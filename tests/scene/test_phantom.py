@@ -8,11 +8,6 @@ from rbfmuscle.scene.phantom import MUSCLES, phantom_scene
 from rbfmuscle.scene.phantom_shapes import Tube
 
 
-@pytest.fixture(scope="module")
-def scene():
-    return phantom_scene()
-
-
 class TestTube:
     def test_straight_tube_with_fullness_two_is_an_ellipsoid(self):
         tube = Tube(
@@ -38,6 +33,5 @@ class TestTube:
         assert errors[0] / errors[1] > 3 and errors[1] / errors[2] > 3  # second order, 4 in the limit
 
 
-class TestScene:
-    def test_check_finds_nothing_wrong(self, scene):
-        assert [finding for finding in scene.check() if finding.level != "note"] == []
+def test_check_finds_nothing_wrong():
+    assert [finding for finding in phantom_scene().check() if finding.level != "note"] == []

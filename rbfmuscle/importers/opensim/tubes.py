@@ -15,6 +15,7 @@ from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.geometry.tubes import SIDES, tube_mesh
 from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
+from rbfmuscle.scene.taut_line import points_along
 from rbfmuscle.validation import SceneError
 
 # Sections along a tube; radius at the ends against the middle; share of the length held at an end.
@@ -58,10 +59,8 @@ def make_tube(muscle: ModelMuscle, places: dict[str, np.ndarray], bones: dict[st
 def _middle_line(points):
     """Points (n, 3) evenly along a path, and the place in them of each of its points."""
     along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
-    along /= max(along[-1], 1e-300)
-    marks = np.linspace(0.0, 1.0, SECTIONS)
-    line = np.column_stack([np.interp(marks, along, points[:, k]) for k in range(3)])
-    return line, np.rint(along * (SECTIONS - 1)).astype(int)
+    line = points_along(points, np.linspace(0.0, along[-1], SECTIONS))
+    return line, np.rint(along / max(along[-1], 1e-300) * (SECTIONS - 1)).astype(int)
 
 
 def _clear_line(line, fixed, radius, wraps, bones):
